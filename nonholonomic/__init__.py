@@ -1,0 +1,14 @@
+"""The ground that the models stand on: surfaces, integration, sweeps, tables. Knows neither top nor stroller."""
+
+import os
+
+import jax
+
+# Float64 throughout, unless the user chose otherwise; it has to be set before the first array is made.
+if "JAX_ENABLE_X64" not in os.environ:
+    jax.config.update("jax_enable_x64", True)
+
+from .surface import AbstractSurface as AbstractSurface
+from .surface import Cylinder as Cylinder
+from .surface import Plane as Plane
+from .surface import Sphere as Sphere

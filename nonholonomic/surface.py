@@ -1,0 +1,233 @@
+"""Arenas: the surfaces on which a body slides, rolls or drives.
+
+Every surface answers two kinds of question, and a new surface is one new class.
+
+In a frame that moves with the body, (t1, t2, n) with n the unit normal from the arena into the room where the body is:
+how the frame turns with the velocity (the shape operator), which way is up, and how the place changes. This is what a
+field that is integrated needs; components that vanish identically are `None` (see `vector.py`).
+
+In the fixed frame (x, y, z), z up: position, normal, frame. This is what a picture and a fixed-frame model need.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from .validation import as_number, require
+from .vector import Component, Vector, dot, multiply, subtract
+
+Place = tuple[Float[Array, "..."], ...]
+Tangent = tuple[Component, Component]
+
+
+def carried(vector: tuple[Component, ...], turning: Tangent) -> tuple[Component, ...]:
+    """Rate of the components of a fixed vector in a moving frame with t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2)."""
+    along_normal = dot(turning, vector[:2])
+    return (multiply(turning[0], vector[2]), multiply(turning[1], vector[2]), subtract(None, along_normal))
+
+
+class AbstractSurface(eqx.Module):
+    """A surface described by a moving frame (t1, t2, n), with n pointing into the room where the body is.
+
+    With V the velocity along the surface, the normal turns as n' = -(o1 t1 + o2 t2), where (o1, o2) = S V and S is the
+    shape operator, positive where the surface is concave towards the room. The frame does not turn about n, so the
+    components of a fixed vector change as `carried` states.
+    """
+
+    @abc.abstractmethod
+    def parallel(self, distance: Float[ArrayLike, "..."]) -> "AbstractSurface":
+        """The surface at the given distance [m] into the room, on which the centre of a ball of that radius runs.
+
+        **Raises:** `ValueError` if such a ball does not fit.
+        """
+
+    @abc.abstractmethod
+    def place(self, eta: Float[ArrayLike, "..."]) -> Place:
+        """The integrated coordinates at the angle `eta` [rad] from the lowest point, in the x-z plane."""
+
+    @abc.abstractmethod
+    def place_rate(self, place: Place, turning: Tangent) -> Place:
+        """Rate of change [1/s] of `place` when the frame turns at the given rates [rad/s]."""
+
+    @abc.abstractmethod
+    def turning(self, velocity: Tangent) -> Tangent:
+        """Rates (o1, o2) = S V [rad/s] at which the normal turns for the velocity (V1, V2) [m/s]."""
+
+    @abc.abstractmethod
+    def vertical(self, place: Place) -> Vector:
+        """Components of the upward vertical in the moving frame."""
+
+    @abc.abstractmethod
+    def height(self, place: Place) -> Component:
+        """Height [m] above the lowest point of the surface."""
+
+    @abc.abstractmethod
+    def path(self, eta: Float[ArrayLike, "..."]) -> Place:
+        """Cyclic coordinates at the start, which a field needs only if the path is to be drawn."""
+
+    @abc.abstractmethod
+    def path_rate(self, path: Place, velocity: Tangent, turning: Tangent) -> Place:
+        """Rate of change of `path`."""
+
+    @abc.abstractmethod
+    def angle(self, place: Place, path: Place) -> Float[Array, "..."]:
+        """Angle eta [rad] from the lowest point."""
+
+    @abc.abstractmethod
+    def frame(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
+        """The vectors t1, t2 and n in the fixed frame (x, y, z), each a tuple of three arrays."""
+
+    @abc.abstractmethod
+    def position(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
+        """Position (x, y, z) [m] in the fixed frame; the origin is the arena's centre, or its point below the start."""
+
+
+class Plane(AbstractSurface):
+    """A level plane; the frame is the fixed one and nothing turns."""
+
+    def parallel(self, distance: Float[ArrayLike, "..."]) -> "Plane":
+        return self
+
+    def place(self, eta: Float[ArrayLike, "..."]) -> Place:
+        return ()
+
+    def place_rate(self, place: Place, turning: Tangent) -> Place:
+        return ()
+
+    def turning(self, velocity: Tangent) -> Tangent:
+        return (None, None)
+
+    def vertical(self, place: Place) -> Vector:
+        return (None, None, 1.0)
+
+    def height(self, place: Place) -> Component:
+        return None
+
+    def path(self, eta: Float[ArrayLike, "..."]) -> Place:
+        zero = jnp.zeros_like(as_number(eta))
+        return (zero, zero)
+
+    def path_rate(self, path: Place, velocity: Tangent, turning: Tangent) -> Place:
+        return velocity
+
+    def angle(self, place: Place, path: Place) -> Float[Array, "..."]:
+        return jnp.zeros_like(path[0])
+
+    def frame(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
+        zero, one = jnp.zeros_like(path[0]), jnp.ones_like(path[0])
+        return (one, zero, zero), (zero, one, zero), (zero, zero, one)
+
+    def position(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
+        return (path[0], path[1], jnp.zeros_like(path[0]))
+
+
+class Cylinder(AbstractSurface):
+    """The inside of a cylinder with a horizontal axis along y; t1 points along growing eta, t2 along y.
+
+    **Arguments:**
+
+    - `radius`: radius of the arena [m], positive.
+    """
+
+    radius: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def __check_init__(self):
+        require(self.radius, "surface radius", above=0.0)
+
+    def parallel(self, distance: Float[ArrayLike, "..."]) -> "Cylinder":
+        require(self.radius, "surface radius", above=distance, why="the body must fit inside")
+        return Cylinder(self.radius - distance)
+
+    def place(self, eta: Float[ArrayLike, "..."]) -> Place:
+        return (jnp.sin(eta), jnp.cos(eta))
+
+    def place_rate(self, place: Place, turning: Tangent) -> Place:
+        sine, cosine = place
+        return (multiply(turning[0], cosine), -multiply(turning[0], sine))
+
+    def turning(self, velocity: Tangent) -> Tangent:
+        return (velocity[0] / self.radius, None)
+
+    def vertical(self, place: Place) -> Vector:
+        sine, cosine = place
+        return (sine, None, cosine)
+
+    def height(self, place: Place) -> Component:
+        return self.radius * (1.0 - place[1])
+
+    def path(self, eta: Float[ArrayLike, "..."]) -> Place:
+        eta = as_number(eta)
+        return (eta, jnp.zeros_like(eta))
+
+    def path_rate(self, path: Place, velocity: Tangent, turning: Tangent) -> Place:
+        return (turning[0], velocity[1])
+
+    def angle(self, place: Place, path: Place) -> Float[Array, "..."]:
+        return path[0]
+
+    def frame(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
+        sine, cosine = place
+        zero, one = jnp.zeros_like(sine), jnp.ones_like(sine)
+        return (cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)
+
+    def position(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
+        sine, cosine = place
+        return (self.radius * sine, path[1], -self.radius * cosine)
+
+
+class Sphere(AbstractSurface):
+    """The inside of a sphere; the frame is carried parallel to itself, so no place is singular.
+
+    The place is the vertical seen in the moving frame; the path adds the horizontal x axis seen in it.
+
+    **Arguments:**
+
+    - `radius`: radius of the arena [m], positive.
+    """
+
+    radius: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def __check_init__(self):
+        require(self.radius, "surface radius", above=0.0)
+
+    def parallel(self, distance: Float[ArrayLike, "..."]) -> "Sphere":
+        require(self.radius, "surface radius", above=distance, why="the body must fit inside")
+        return Sphere(self.radius - distance)
+
+    def place(self, eta: Float[ArrayLike, "..."]) -> Place:
+        eta = as_number(eta)
+        return (jnp.sin(eta), jnp.zeros_like(eta), jnp.cos(eta))
+
+    def place_rate(self, place: Place, turning: Tangent) -> Place:
+        return carried(place, turning)
+
+    def turning(self, velocity: Tangent) -> Tangent:
+        return (velocity[0] / self.radius, velocity[1] / self.radius)
+
+    def vertical(self, place: Place) -> Vector:
+        return (place[0], place[1], place[2])
+
+    def height(self, place: Place) -> Component:
+        return self.radius * (1.0 - place[2])
+
+    def path(self, eta: Float[ArrayLike, "..."]) -> Place:
+        eta = as_number(eta)
+        return (jnp.cos(eta), jnp.zeros_like(eta), -jnp.sin(eta))
+
+    def path_rate(self, path: Place, velocity: Tangent, turning: Tangent) -> Place:
+        return carried(path, turning)
+
+    def angle(self, place: Place, path: Place) -> Float[Array, "..."]:
+        return jnp.arctan2(jnp.hypot(place[0], place[1]), place[2])
+
+    def frame(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
+        x, z = path, place
+        y = (z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0])
+        return (x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2])
+
+    def position(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
+        normal = self.frame(place, path)[2]
+        return tuple(-self.radius * component for component in normal)

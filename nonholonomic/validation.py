@@ -1,0 +1,71 @@
+"""Checks of arguments, made on concrete numbers before anything compiles; traced numbers pass through."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+def as_number(value: Any) -> Float[Array, "..."]:
+    """Convert to a floating-point array of the default precision; what cannot be converted is left for `require`."""
+    try:
+        return jnp.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        return value
+
+
+def is_traced(value: Any) -> bool:
+    """Whether the value is known only while JAX runs a transformation."""
+    return isinstance(value, jax.core.Tracer)
+
+
+def shown(value: Any) -> str:
+    """The value as it reads best in a message: a plain number where it is one."""
+    array = np.asarray(value)
+    return repr(array.item()) if array.ndim == 0 and array.dtype != object else repr(value)
+
+
+def require(
+    value: Any,
+    name: str,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    below: float | None = None,
+    at_most: float | None = None,
+    why: str = "",
+) -> None:
+    """Raise `ValueError` unless every number in `value` is finite and within the bounds.
+
+    **Arguments:**
+
+    - `value`: a number or an array of numbers; a traced value or traced bounds pass unchecked.
+    - `name`: what to call it in the message.
+    - `above`, `at_least`, `below`, `at_most`: bounds, each a number.
+    - `why`: a remark to append to the message.
+
+    **Raises:** `ValueError` that names the argument, its value and what is allowed.
+    """
+    if is_traced(value):
+        return
+    # A pytree rebuilt by a JAX transformation may hold placeholders; they never reach here through a constructor.
+    try:
+        numbers = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} = {value!r} is not a number") from None
+    remark = f" ({why})" if why else ""
+    if not np.all(np.isfinite(numbers)):
+        raise ValueError(f"{name} = {shown(value)} must be finite{remark}")
+    bounds = (
+        (above, np.greater, "greater than"),
+        (at_least, np.greater_equal, "at least"),
+        (below, np.less, "less than"),
+        (at_most, np.less_equal, "at most"),
+    )
+    for bound, holds, words in bounds:
+        if bound is None or is_traced(bound):
+            continue
+        if not np.all(holds(numbers, np.asarray(bound, dtype=float))):
+            raise ValueError(f"{name} = {shown(value)} must be {words} {shown(bound)}{remark}")

@@ -1,0 +1,132 @@
+"""The equations of motion of the tippe top, in vector form and free of trigonometry (`tippe.md`, section 2).
+
+State, in the arena's moving frame (t1, t2, n): velocity (u1, u2) of the centre of mass along the arena, axis
+(e1, e2, e3), angular momentum (L1, L2, L3) about the centre of mass, then the arena's place. The velocity along n follows
+from the axis, because the contact persists. Cyclic coordinates (position, spin angle) are not part of it.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nonholonomic.surface import AbstractSurface, Tangent, carried
+from nonholonomic.vector import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors
+
+from .friction import AbstractFriction, Slip
+from .top import Top
+
+#: Where the axis' component along n stands in the state: cos(theta).
+COS_THETA = 4
+
+
+class Motion(NamedTuple):
+    """What the equations of motion give for one state, every vector in the moving frame."""
+
+    rate: tuple[Component, ...]
+    normal_force: Float[Array, "..."]
+    friction: tuple[Component, Component]
+    slip: Slip
+    velocity: Tangent
+    turning: Tangent
+    spin_momentum: Float[Array, "..."]
+
+
+class Dynamics(eqx.Module):
+    """A scene with the combinations of its numbers that every evaluation needs, computed once."""
+
+    parallel: AbstractSurface
+    friction: AbstractFriction
+    radius: Float[Array, "..."]
+    offset: Float[Array, "..."]
+    mass: Float[Array, "..."]
+    gravity: Float[Array, "..."]
+    per_mass: Float[Array, "..."]
+    per_transverse: Float[Array, "..."]
+    axial_excess: Float[Array, "..."]
+    coupling: Float[Array, "..."]
+
+    @classmethod
+    def of(
+        cls, body: Top, surface: AbstractSurface, friction: AbstractFriction, gravity: Float[Array, "..."]
+    ) -> "Dynamics":
+        """The equations for a body on an arena.
+
+        **Arguments:** as for `Scene`.
+        """
+        return cls(
+            parallel=surface.parallel(body.radius),
+            friction=friction,
+            radius=body.radius,
+            offset=body.offset,
+            mass=body.mass,
+            gravity=gravity,
+            per_mass=1.0 / body.mass,
+            per_transverse=1.0 / body.I1,
+            axial_excess=1.0 / body.I3 - 1.0 / body.I1,
+            coupling=body.mass * body.offset / body.I1,
+        )
+
+    def motion(self, state: Float[Array, "components ..."]) -> Motion:
+        """Evaluate the equations of motion, the normal force solved for with friction in it.
+
+        **Arguments:**
+
+        - `state`: (8 + the arena's place, ...) as the module states it.
+
+        **Returns:** a `Motion`; `rate` is (m/s^2, 1/s, N m, 1/s). Source: `tippe.md`, section 2 (i)-(iii).
+        """
+        u1, u2 = state[0], state[1]
+        e: Vector = (state[2], state[3], state[4])
+        L: Vector = (state[5], state[6], state[7])
+        place = tuple(state[8:])
+        R, a = self.radius, self.offset
+
+        # The axis turns with the body; V is the velocity of the sphere's centre, o the turning of the frame with it.
+        e_dot = scale(self.per_transverse, cross(L, e))
+        V = (u1 + a * e_dot[0], u2 + a * e_dot[1])
+        o = self.parallel.turning(V)
+        up = self.parallel.vertical(place)
+
+        spin_momentum = dot(L, e)
+        along_axis = self.axial_excess * spin_momentum
+        w1 = self.per_transverse * L[0] + along_axis * e[0]
+        w2 = self.per_transverse * L[1] + along_axis * e[1]
+        slip = Slip(V[0] - R * w2, V[1] + R * w1)
+        f1, f2 = self.friction.per_normal_force(slip).force
+
+        # Moment per unit normal force of (f1, f2, 1) at the contact r = a e - R n.
+        r1, r2, r3 = a * e[0], a * e[1], a * e[2] - R
+        M1 = subtract(r2, multiply(r3, f2))
+        M2 = subtract(multiply(r3, f1), r1)
+        M3 = subtract(multiply(r1, f2), multiply(r2, f1))
+
+        # n . acceleration of the centre = centripetal; N is on both sides through M.
+        centripetal = dot(V, o)
+        pull = add(multiply(self.gravity, up[2]), centripetal)
+        load = self.mass * pull - self.coupling * (L[0] * e_dot[1] - L[1] * e_dot[0])
+        N = load / (1.0 + self.coupling * (M1 * e[1] - M2 * e[0]))
+
+        thrust = N * self.per_mass
+        u3 = multiply(-a, e_dot[2]) if o != (None, None) else None
+        u1_dot = add(multiply(thrust, f1), multiply(-self.gravity, up[0]), multiply(o[0], u3))
+        u2_dot = add(multiply(thrust, f2), multiply(-self.gravity, up[1]), multiply(o[1], u3))
+        e_dot = sum_vectors(e_dot, carried(e, o))
+        L_dot = sum_vectors(scale(N, (M1, M2, M3)), carried(L, o))
+        rate = (u1_dot, u2_dot, *e_dot, *L_dot, *self.parallel.place_rate(place, o))
+        return Motion(rate, N, (f1, f2), slip, V, o, spin_momentum)
+
+    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+        """Rate of change of the state, (components, ...)."""
+        return stacked(self.motion(state).rate, state)
+
+    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Normal force as a fraction of the weight, plus the round-off that a start with N = 0 exactly is allowed."""
+        return self.motion(state).normal_force / (self.mass * self.gravity) + 1e-12
+
+
+def stacked(rate: tuple[Component, ...], state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+    """Stack components along axis 0, with zeros where one vanishes identically."""
+    zero = jnp.zeros_like(state[0])
+    return jnp.stack([zero if component is None else jnp.broadcast_to(component, zero.shape) for component in rate])

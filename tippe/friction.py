@@ -1,0 +1,89 @@
+"""Friction at the contact point, per unit normal force. A new law is one new class."""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nonholonomic.validation import as_number, require
+from nonholonomic.vector import Component
+
+
+class Slip(NamedTuple):
+    """Velocity of the material contact point along the arena, in the moving frame [m/s]."""
+
+    x: Float[Array, "..."]
+    y: Float[Array, "..."]
+
+
+class ContactLoad(NamedTuple):
+    """What friction does at the contact per unit normal force: the tangential force [1] in the moving frame."""
+
+    force: tuple[Component, Component]
+
+
+class AbstractFriction(eqx.Module):
+    """A friction law whose force is proportional to the normal force."""
+
+    @abc.abstractmethod
+    def per_normal_force(self, slip: Slip) -> ContactLoad:
+        """The load per unit normal force.
+
+        **Arguments:**
+
+        - `slip`: slip velocity [m/s].
+
+        **Returns:** a `ContactLoad`; a component is `None` where it vanishes identically.
+        """
+
+
+class Frictionless(AbstractFriction):
+    """No friction: the arena pushes along its normal only."""
+
+    def per_normal_force(self, slip: Slip) -> ContactLoad:
+        return ContactLoad(force=(None, None))
+
+
+class Viscous(AbstractFriction):
+    """Viscous sliding friction, F = -mu N v_s (Rutstam 2012, eq. 1.1).
+
+    **Arguments:**
+
+    - `mu`: coefficient [s/m], at least 0.
+    """
+
+    mu: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def __check_init__(self):
+        require(self.mu, "mu", at_least=0.0)
+
+    def per_normal_force(self, slip: Slip) -> ContactLoad:
+        return ContactLoad(force=(-self.mu * slip.x, -self.mu * slip.y))
+
+
+class Coulomb(AbstractFriction):
+    """Regularised Coulomb friction, F = -mu N v_s / sqrt(v_s^2 + slip_speed^2) (`tippe.md`, section 3).
+
+    The regularisation creeps: below the slip speed the law is viscous with the coefficient mu / slip_speed, and a top
+    that would stick and roll under exact Coulomb friction may still turn over, in a time that grows as 1 / slip_speed.
+    Quote a result only together with its slip speed.
+
+    **Arguments:**
+
+    - `mu`: coefficient of friction [1], at least 0.
+    - `slip_speed`: speed [m/s] at which the force reaches 71 % of its limit, positive.
+    """
+
+    mu: Float[Array, "..."] = eqx.field(converter=as_number)
+    slip_speed: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def __check_init__(self):
+        require(self.mu, "mu", at_least=0.0)
+        require(self.slip_speed, "slip_speed", above=0.0)
+
+    def per_normal_force(self, slip: Slip) -> ContactLoad:
+        speed = jnp.sqrt(slip.x * slip.x + slip.y * slip.y + self.slip_speed * self.slip_speed)
+        factor = -self.mu / speed
+        return ContactLoad(force=(factor * slip.x, factor * slip.y))

@@ -1,0 +1,33 @@
+"""How a run starts."""
+
+import math
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from nonholonomic.validation import as_number, require
+
+
+class Launch(eqx.Module):
+    """A start with the angular velocity along the axis, w = spin e, and the centre at rest.
+
+    **Arguments:**
+
+    - `theta`: angle [rad] from the arena's normal to the axis, in [0, pi]; 0 is stem out, pi is stem in.
+    - `spin`: angular velocity about the axis [rad/s].
+    - `eta`: angle [rad] of the place from the arena's lowest point, in [-pi, pi].
+    - `azimuth`: direction [rad] in which the axis leans, from growing eta towards y.
+
+    **Raises:** `ValueError` for numbers outside these ranges.
+    """
+
+    theta: Float[Array, "..."] = eqx.field(converter=as_number)
+    spin: Float[Array, "..."] = eqx.field(converter=as_number)
+    eta: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+    azimuth: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+
+    def __check_init__(self):
+        require(self.theta, "theta", at_least=0.0, at_most=math.pi)
+        require(self.spin, "spin")
+        require(self.eta, "eta", at_least=-math.pi, at_most=math.pi)
+        require(self.azimuth, "azimuth")

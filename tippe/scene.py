@@ -1,0 +1,125 @@
+"""The scene: what moves, on what arena, with what friction, under what gravity."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nonholonomic.surface import AbstractSurface, Plane
+from nonholonomic.validation import as_number, require
+from nonholonomic.vector import dot, multiply
+
+from .dynamics import COS_THETA, Dynamics
+from .friction import AbstractFriction, Frictionless
+from .launch import Launch
+from .top import Top
+
+
+class Scene(eqx.Module):
+    """A tippe top on an arena.
+
+    Every number in it is a leaf of a pytree: it can be swept, traced and differentiated.
+
+    **Arguments:**
+
+    - `body`: a `Top`.
+    - `surface`: the arena: `Plane()`, `Cylinder(radius)` or `Sphere(radius)`; the top runs inside the last two.
+    - `friction`: `Frictionless()`, `Viscous(mu)` or `Coulomb(mu, slip_speed)`.
+    - `gravity`: acceleration of free fall [m/s^2], positive.
+
+    **Raises:** `ValueError` if a part is of the wrong kind, if the top does not fit into the arena, or if gravity is not
+    positive.
+    """
+
+    body: Top
+    surface: AbstractSurface = Plane()
+    friction: AbstractFriction = Frictionless()
+    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81)
+
+    def __check_init__(self):
+        parts = (("body", self.body, Top), ("surface", self.surface, AbstractSurface))
+        for name, part, kind in (*parts, ("friction", self.friction, AbstractFriction)):
+            if not isinstance(part, kind):
+                raise ValueError(f"{name} = {part!r} must be a {kind.__name__.removeprefix('Abstract')}")
+        require(self.gravity, "gravity", above=0.0)
+        self.surface.parallel(self.body.radius)
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """The equations of motion, with the combinations of the scene's numbers that they need."""
+        return Dynamics.of(self.body, self.surface, self.friction, self.gravity)
+
+    def state(self, launch: Launch) -> Float[Array, "components ..."]:
+        """The state at the start of a run (see `dynamics.py` for its components).
+
+        **Arguments:**
+
+        - `launch`: a `Launch` whose numbers, like the scene's, are scalars or one per lane.
+
+        **Returns:** an array (components, ...) in SI units.
+        """
+        sine = jnp.sin(launch.theta)
+        e = (sine * jnp.cos(launch.azimuth), sine * jnp.sin(launch.azimuth), jnp.cos(launch.theta))
+        L = tuple(self.body.I3 * launch.spin * component for component in e)
+        zero = jnp.zeros_like(launch.theta)
+        return jnp.stack(jnp.broadcast_arrays(zero, zero, *e, *L, *self.surface.place(launch.eta)))
+
+    def scales(self, launch: Launch) -> Float[Array, "components ..."]:
+        """Magnitudes by which absolute errors of the state are measured, component by component.
+
+        Velocities count in units of sqrt(g R), directions in units of 1, angular momenta in units of the launch's own,
+        or of I1 sqrt(g / R) where that is more.
+
+        **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
+        """
+        one = jnp.ones_like(launch.theta)
+        rate = jnp.sqrt(self.gravity / self.body.radius)
+        velocity = rate * self.body.radius
+        momentum = jnp.maximum(self.body.I3 * jnp.abs(launch.spin), self.body.I1 * rate)
+        place = [one for _ in self.surface.place(launch.eta)]
+        return jnp.stack(jnp.broadcast_arrays(velocity, velocity, one, one, one, *([momentum] * 3), *place))
+
+    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+        """Rate of change of the state: (m/s^2, 1/s, N m, 1/s) for (velocity, axis, angular momentum, place)."""
+        return self.dynamics.field(state)
+
+    def normal_force(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Force of the arena on the top along n [N]; at zero the contact is lost."""
+        return self.dynamics.motion(state).normal_force
+
+    def slip_velocity(self, state: Float[Array, "components ..."]) -> Float[Array, "2 ..."]:
+        """Velocity of the material contact point in the moving frame [m/s]."""
+        return jnp.stack(self.dynamics.motion(state).slip)
+
+    def friction_power(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Power of friction N f.v_s [W], at most 0 (`tippe.md`, section 2)."""
+        motion = self.dynamics.motion(state)
+        power = multiply(motion.normal_force, dot(motion.friction, motion.slip))
+        return jnp.zeros_like(motion.normal_force) if power is None else power
+
+    def energy(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Kinetic energy plus weight times the height of the centre of mass above the arena's lowest point [J]."""
+        body, dynamics = self.body, self.dynamics
+        e, L, place = tuple(state[2:5]), tuple(state[5:8]), tuple(state[8:])
+        e3_dot = (L[0] * e[1] - L[1] * e[0]) / body.I1
+        speed2 = state[0] ** 2 + state[1] ** 2 + (body.offset * e3_dot) ** 2
+        axial = dot(L, e)
+        rotation = (dot(L, L) - axial**2) / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
+        climb = dynamics.parallel.height(place)
+        height = body.radius - body.offset * dot(e, dynamics.parallel.vertical(place))
+        height = height if climb is None else height + climb
+        return 0.5 * body.mass * speed2 + rotation + body.mass * self.gravity * height
+
+    def jellett(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Jellett's quantity L.(R n - a e) [kg m^3/s]: constant on the plane for every friction at the contact point.
+
+        On a curved arena it changes at the rate R L.n' (`tippe.md`, section 2).
+        """
+        return self.body.radius * state[7] - self.body.offset * dot(tuple(state[2:5]), tuple(state[5:8]))
+
+    def theta(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Angle [rad] from the arena's normal to the axis, in [0, pi]."""
+        return jnp.arctan2(jnp.hypot(state[2], state[3]), state[COS_THETA])
+
+    def spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Angular velocity about the axis, w.e [rad/s]."""
+        return dot(tuple(state[2:5]), tuple(state[5:8])) / self.body.I3
