@@ -1,16 +1,13 @@
-"""Tippe top by Lagrange's equations in Euler angles: a reference in plain NumPy and SciPy.
-
-Units are SI throughout: kg, m, s, rad, N. Nothing is scaled.
+"""Tippe top by Lagrange's equations in Euler angles: a reference in plain NumPy and SciPy, SI units.
 
 Coordinates q = (u, y, d, theta, phi, psi)
-  u      place of the sphere's centre O across the arena: x [m] on the plane z = 0; the angle eta [rad]
-         from the lowest line inside a horizontal cylinder whose axis is y
-  y      place of O along y [m]
+  u, y   place of the sphere's centre O across the arena and along y [m]; u is x [m] on the plane z = 0, and
+         the angle eta [rad] from the lowest line inside a horizontal cylinder whose axis is y
   d      gap between sphere and arena [m]; released only to find the normal force, then d = d' = d'' = 0
   theta, phi, psi   Euler angles [rad] of the body in the FIXED frame: the axis (stem) is
-         e = (sin theta cos phi, sin theta sin phi, cos theta) in the components of the chart, and psi
-         turns about e. The polar axis of a chart is world "x", "y" or "z"; two charts have their
-         poles at different places, so that running both guards against a passage close to one.
+         e = (sin theta cos phi, sin theta sin phi, cos theta) in the components of the chart; psi turns
+         about e. The polar axis of a chart is world "x", "y" or "z"; a run that comes close to the pole
+         of its chart goes on in another one (tops do pass within 1e-5 rad of the vertical).
 
 Velocity of O:  O' = rho u' t + y' y + d' n, with rho = 1, t = x, n = z on the plane, and
   rho = surface_radius - radius - d, t = (cos u, 0, sin u), n = (-sin u, 0, cos u) in the cylinder.
@@ -21,26 +18,25 @@ Contact: the constraint d = 0 has the multiplier N (normal force). The friction 
 contact point, whose velocity in the arena's tangent plane is v; its generalised force is N f . dv/dq'.
   viscous f = -mu v (mu in s/m);  Coulomb f = -mu v / sqrt(v^2 + slip_speed^2);  frictionless f = 0.
 Lagrange's equations with d'' = 0 are six linear equations in (u'', y'', theta'', phi'', psi'', N).
-
-u, theta, phi and the five rates are integrated; x, y and psi are cyclic (or absent) and are left out.
+u, theta, phi and the five rates are integrated; x, y and psi are cyclic and matter to nothing else.
 """
 from dataclasses import dataclass
-from math import atan2, cos, hypot, pi, sin, sqrt
+from math import atan2, cos, hypot, inf, pi, sin, sqrt
 
 import numpy as np
 from scipy.integrate import DOP853
 from scipy.optimize import brentq
 
-Y = (0.0, 1.0, 0.0)
-UP = (0.0, 0.0, 1.0)
+X, Y, UP = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 TURN = {"z": 0, "x": 1, "y": 2}          # cyclic turn that takes the polar axis to the third place
-NEAR_ANGLE, NEAR_LOSS = 0.1, 0.5         # closeness (in cos theta, in weights) at which a step is searched
-SUBDIVISIONS = 8
+NEAR = np.array((0.1, 0.5))              # gaps (see `gaps`) below which a step is searched for an event,
+SUBDIVISIONS = 8                         # at this many places;
+TOUCH = 1e-9                             # a gap below zero by less than this is no event
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Top, arena, friction and start, in SI units; theta, eta and azimuth as seen from the normal n."""
+    """Top, arena, friction and start; theta, eta and azimuth as seen from the arena's normal n."""
     mass: float
     radius: float
     offset: float
@@ -56,70 +52,50 @@ class Scene:
     gravity: float = 9.81
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """How a run ended, with the highest theta [rad] and lowest N [weights] met on the way."""
-    status: str                          # inverted, contact_lost, not_inverted or failed
-    time: float                          # s; inf if not inverted by t1
-    theta: float                         # rad, angle from n to the stem at the end
-    highest: float
-    lowest: float
-
-
 def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def in_chart(vector, pole):
     """Components of a world vector in the chart with this polar axis."""
-    k = TURN[pole]
-    return vector[k:] + vector[:k]
+    return vector[TURN[pole]:] + vector[:TURN[pole]]
 
 
 def arena(scene, u, pole):
     """Tangent t and normal n at u, dO/du = rho t, and the turning rate k of t and n with u."""
     if scene.surface_radius is None:
-        return in_chart((1.0, 0.0, 0.0), pole), in_chart(UP, pole), 1.0, 0.0
-    c, s = cos(u), sin(u)
-    return (in_chart((c, 0.0, s), pole), in_chart((-s, 0.0, c), pole),
-            scene.surface_radius - scene.radius, 1.0)
+        return in_chart(X, pole), in_chart(UP, pole), 1.0, 0.0
+    t, n = (cos(u), 0.0, sin(u)), (-sin(u), 0.0, cos(u))
+    return in_chart(t, pole), in_chart(n, pole), scene.surface_radius - scene.radius, 1.0
 
 
 def axis(theta, phi):
-    """e, its derivatives by theta and phi, and its second derivative by theta and phi."""
+    """e, its derivatives by theta and by phi, and its mixed second derivative."""
     st, ct, sp, cp = sin(theta), cos(theta), sin(phi), cos(phi)
     return (st * cp, st * sp, ct), (ct * cp, ct * sp, -st), (-st * sp, st * cp, 0.0), (-ct * sp, ct * cp, 0.0)
 
 
 def friction(scene, vt, vy):
     """Tangential force per unit normal force."""
-    if scene.slip_speed is None:
-        return -scene.mu * vt, -scene.mu * vy
-    size = sqrt(vt * vt + vy * vy + scene.slip_speed ** 2)
+    size = 1.0 if scene.slip_speed is None else sqrt(vt * vt + vy * vy + scene.slip_speed ** 2)
     return -scene.mu * vt / size, -scene.mu * vy / size
 
 
 def accelerations(scene, state, pole="z"):
     """(u'', y'', theta'', phi'', psi'', N) at state = (u, theta, phi, u', y', theta', phi', psi').
-
     Rows are Lagrange's equations of u, y, d, theta, phi, psi: (mass matrix) q'' + bias = N (1 for d, friction),
-    where bias = d(dT/dq')/dt at q'' = 0, less dT/dq, plus dU/dq.
-    """
+    where bias = d(dT/dq')/dt at q'' = 0, less dT/dq, plus dU/dq."""
     u, th, ph, du, dy, dth, dph, dps = state
     m, a, R, I3 = scene.mass, scene.offset, scene.radius, scene.I3
     t, n, rho, k = arena(scene, u, pole)
     y, up = in_chart(Y, pole), in_chart(UP, pole)
     e, e1, e2, e12 = axis(th, ph)
-    st, ct = sin(th), cos(th)
-    kth = (-sin(ph), cos(ph), 0.0)                                     # axis of theta'
-    J = scene.I1 + m * a * a
-    w3, ma, mg = dps + dph * ct, m * a, m * scene.gravity
+    st, ct, kth = sin(th), cos(th), (-sin(ph), cos(ph), 0.0)           # kth: axis of theta'
+    J, ma, mg, w3 = scene.I1 + m * a * a, m * a, m * scene.gravity, dps + dph * ct
     # e'' at theta'' = phi'' = 0: -e theta'^2 + 2 e12 theta' phi' + e22 phi'^2
-    bend = (-e[0] * dth * dth + 2 * e12[0] * dth * dph - e[0] * dph * dph,
-            -e[1] * dth * dth + 2 * e12[1] * dth * dph - e[1] * dph * dph, -e[2] * dth * dth)
+    bend = [2 * p * dth * dph - q * dth * dth - r * dph * dph for p, q, r in zip(e12, e, (e[0], e[1], 0.0))]
     climb = k * rho * du * du                                          # O''.n at u'' = 0
-    te1, te2, ye1, ye2 = dot(t, e1), dot(t, e2), dot(y, e1), dot(y, e2)
-    ne1, ne2 = dot(n, e1), dot(n, e2)
+    te1, te2, ye1, ye2, ne1, ne2 = dot(t, e1), dot(t, e2), dot(y, e1), dot(y, e2), dot(n, e1), dot(n, e2)
     # velocity of the contact point v = O' - R w x n along t and y; its derivatives by the rates
     t3, t4, t5 = -R * dot(kth, y), -R * y[2], -R * dot(e, y)
     y3, y4, y5 = R * dot(kth, t), R * t[2], R * dot(e, t)
@@ -132,8 +108,7 @@ def accelerations(scene, state, pole="z"):
         (-ma * rho * te2, -ma * ye2, 0.0, J * st * st + I3 * ct * ct, I3 * ct, -ft * t4 - fy * y4),
         (0.0, 0.0, 0.0, I3 * ct, I3, -ft * t5 - fy * y5)))
     bias = np.array((
-        -ma * rho * dot(t, bend) + mg * rho * dot(t, up),
-        -ma * dot(y, bend),
+        -ma * rho * dot(t, bend) + mg * rho * dot(t, up), -ma * dot(y, bend),
         m * climb - ma * dot(n, bend) + mg * dot(n, up),
         -ma * climb * ne1 - J * dph * dph * st * ct + I3 * w3 * dph * st - mg * a * dot(up, e1),
         -ma * climb * ne2 + 2 * J * st * ct * dth * dph - I3 * st * dth * (w3 + ct * dph) - mg * a * dot(up, e2),
@@ -143,16 +118,12 @@ def accelerations(scene, state, pole="z"):
 
 def kinetic_potential(scene, q, dq, pole="z"):
     """T and U written out as in the heading, q = (u, y, d, theta, phi, psi); takes complex numbers too."""
-    u, _, d, th, ph, _ = q
-    du, dy, dd, dth, dph, dps = dq
+    (u, _, d, th, ph, _), (du, dy, dd, dth, dph, dps) = q, dq
     st, ct, sp, cp = np.sin(th), np.cos(th), np.sin(ph), np.cos(ph)
-    e = np.array((st * cp, st * sp, ct))
-    de = np.array((ct * cp * dth - st * sp * dph, ct * sp * dth + st * cp * dph, -st * dth))
-    back = 3 - TURN[pole]                                              # chart to world components
-    e, de = np.roll(e, -back), np.roll(de, -back)
-    if scene.surface_radius is None:
-        height, dO = scene.radius + d, np.array((du, dy, dd))
-    else:
+    e, de = (st * cp, st * sp, ct), (ct * cp * dth - st * sp * dph, ct * sp * dth + st * cp * dph, -st * dth)
+    e, de = np.roll(e, TURN[pole]), np.roll(de, TURN[pole])            # from the chart to the world
+    height, dO = scene.radius + d, np.array((du, dy, dd))
+    if scene.surface_radius is not None:
         rho, s, c = scene.surface_radius - scene.radius - d, np.sin(u), np.cos(u)
         height, dO = -rho * c, np.array((rho * du * c - dd * s, dy, rho * du * s + dd * c))
     ds = dO - scene.offset * de
@@ -162,33 +133,45 @@ def kinetic_potential(scene, q, dq, pole="z"):
 
 def lagrange_forces(scene, q, dq, ddq, pole="z"):
     """d(dL/dq')/dt - dL/dq straight from T and U, by complex steps: a check on `accelerations`."""
-    tiny, unit, q, dq, ddq = 1e-30, np.eye(6), np.array(q), np.array(dq), np.array(ddq)
-    ahead, speed = q + 1j * tiny * dq, dq + 1j * tiny * ddq
-
-    def along(k):
-        # T is quadratic in q', so half the difference over +-unit is dT/dq' exactly
-        return [kinetic_potential(scene, ahead, speed + sign * unit[k], pole)[0] for sign in (1, -1)]
-
-    def slope(k):
-        T, U = kinetic_potential(scene, q + 1j * tiny * unit[k], dq, pole)
-        return (T - U).imag / tiny
-
-    return np.array([(along(k)[0] - along(k)[1]).imag / (2 * tiny) - slope(k) for k in range(6)])
+    L = lambda q, dq: np.subtract(*kinetic_potential(scene, q, dq, pole))
+    h, units, q, dq, ddq = 1e-30, np.eye(6), np.array(q), np.array(dq), np.array(ddq)
+    ahead, rate = q + 1j * h * dq, dq + 1j * h * ddq
+    momenta = [(L(ahead, rate + unit) - L(ahead, rate - unit)) / 2 for unit in units]  # exact: L is quadratic in q'
+    return np.array([p.imag - L(q + 1j * h * unit, dq).imag for p, unit in zip(momenta, units)]) / h
 
 
 def energy(scene, state, pole="z"):
     """T + U [J] at an eight-number state (height zero: plane, or axis of the cylinder)."""
-    u, th, ph, du, dy, dth, dph, dps = state
-    return sum(kinetic_potential(scene, (u, 0.0, 0.0, th, ph, 0.0), (du, dy, 0.0, dth, dph, dps), pole))
+    q, dq = (state[0], 0.0, 0.0, *state[1:3], 0.0), (*state[3:5], 0.0, *state[5:])
+    return sum(kinetic_potential(scene, q, dq, pole))
+
+
+def in_angles(e, de, w3):
+    """theta, phi and theta', phi', psi' from e, e' in the chart and the spin w3 about e."""
+    th, ph = atan2(hypot(e[0], e[1]), e[2]), atan2(e[1], e[0])
+    _, e1, e2, _ = axis(th, ph)
+    dph = dot(de, e2) / sin(th) ** 2
+    return (th, ph), (dot(de, e1), dph, w3 - dph * cos(th))
 
 
 def start(scene, pole="z"):
     """State at launch: centre at rest, angular velocity = spin times e."""
     t, n, _, _ = arena(scene, scene.eta, pole)
-    y, c, s = in_chart(Y, pole), cos(scene.theta), sin(scene.theta)
-    e = [c * n[i] + s * (cos(scene.azimuth) * t[i] + sin(scene.azimuth) * y[i]) for i in range(3)]
-    place = 0.0 if scene.surface_radius is None else scene.eta
-    return np.array((place, atan2(hypot(e[0], e[1]), e[2]), atan2(e[1], e[0]), 0.0, 0.0, 0.0, 0.0, scene.spin))
+    p, q = cos(scene.azimuth), sin(scene.azimuth)
+    e = [cos(scene.theta) * c + sin(scene.theta) * (p * a + q * b) for a, b, c in zip(t, in_chart(Y, pole), n)]
+    place, rate = in_angles(e, (0.0, 0.0, 0.0), scene.spin)
+    return np.array((0.0 if scene.surface_radius is None else scene.eta, *place, 0.0, 0.0, *rate))
+
+
+def best_chart(state, pole):
+    """The same state in the chart whose pole is farthest from e: (state, pole)."""
+    u, th, ph, du, dy, dth, dph, dps = state
+    e, e1, e2, _ = axis(th, ph)
+    back = {"z": "z", "x": "y", "y": "x"}[pole]                        # undoes the turn to this chart
+    e, de = in_chart(e, back), in_chart(tuple(dth * p + dph * q for p, q in zip(e1, e2)), back)
+    pole = min("xyz", key=lambda new: abs(in_chart(e, new)[2]))
+    place, rate = in_angles(in_chart(e, pole), in_chart(de, pole), dps + dph * cos(th))
+    return np.array((u, *place, du, dy, *rate)), pole
 
 
 def tilt(scene, state, pole="z"):
@@ -198,80 +181,69 @@ def tilt(scene, state, pole="z"):
     return atan2(hypot(dot(t, e), dot(in_chart(Y, pole), e)), dot(n, e))
 
 
-def solver(scene, t0, state, t1, rtol, pole):
+def gaps(scene, angle, state, pole):
+    """What is left before theta = angle (as a difference of cosines) and before N = 0 (in weights)."""
+    N = accelerations(scene, state.tolist(), pole)[5]
+    return np.array((cos(tilt(scene, state, pole)) - cos(angle), N / (scene.mass * scene.gravity)))
+
+
+def solver(scene, t0, state, t1, rtol, pole, first=None):
     """DOP853 with absolute tolerance rtol on the angles (phi may wind up) and rtol of sqrt(g/R) on the rates."""
-    def rate(_, state):
-        now = state.tolist()
-        forward = accelerations(scene, now, pole)
-        return np.array((now[3], now[5], now[6], *forward[:5]))
-
+    rate = lambda _, x: np.concatenate((x[[3, 5, 6]], accelerations(scene, x.tolist(), pole)[:5]))
     swing = sqrt(max(scene.gravity, 1.0) / scene.radius)
-    absolute = rtol * np.array((1.0, 1.0, 1.0, swing, swing * scene.radius, swing, swing, swing))
-    if scene.surface_radius is None:
-        absolute[[0, 3]] *= scene.radius
-    relative = np.array((3e-14,) * 3 + (rtol,) * 5)
-    return DOP853(rate, t0, state, t1, rtol=relative, atol=absolute)
+    length = scene.radius if scene.surface_radius is None else 1.0     # u is a length or an angle
+    absolute = rtol * np.array((length, 1.0, 1.0, swing * length, swing * scene.radius, swing, swing, swing))
+    return DOP853(rate, t0, state, t1, rtol=np.array((3e-14,) * 3 + (rtol,) * 5), atol=absolute, first_step=first)
 
 
-def advance(scene, t0, state, t1, rtol, pole):
-    """State at t1, by steps of the solver that end there exactly."""
-    run = solver(scene, t0, state, t1, rtol, pole)
-    while run.status == "running" and t1 > t0:
-        run.step()
-    return run.y
-
-
-def events(scene, angle, pole):
-    """The two functions that cross zero downwards: tilt still to go (as cosines), and N in weights."""
-    weight, target = scene.mass * scene.gravity, cos(angle)
-    return {"inverted": (lambda state: cos(tilt(scene, state, pole)) - target, NEAR_ANGLE),
-            "contact_lost": (lambda state: accelerations(scene, state.tolist(), pole)[5] / weight, NEAR_LOSS)}
-
-
-def crossing(gap, near, t0, state, ends, t1, dense, repeat):
-    """First fall of `gap` through zero in the step (t0, t1]: bracket on the dense output, then polish by
-    integrating afresh from the step's start, so that the time is as accurate as the steps themselves."""
-    if min(ends) > near:
-        return None
-    times = np.linspace(t0, t1, SUBDIVISIONS + 1)
+def crossing(gap, ends, run, again):
+    """First fall of `gap` through zero in the last step of `run`, or inf. Bracketed on the dense output, then
+    polished by integrating `again` from the step's start: the time is as accurate as the steps themselves."""
+    dense, (times, piece) = run.dense_output(), np.linspace(run.t_old, run.t, SUBDIVISIONS + 1, retstep=True)
     values = [ends[0], *(gap(dense(t)) for t in times[1:-1]), ends[1]]
-    for k in range(SUBDIVISIONS):
-        if values[k + 1] < 0.0:
-            low, high = max(t0, times[k] - 0.1 * (t1 - t0)), min(t1, times[k + 1] + 0.1 * (t1 - t0))
-            if gap(repeat(low)) <= 0.0 or gap(repeat(high)) >= 0.0:    # a touch, or a start at zero
-                return times[k] if values[k] <= 0.0 else times[k + 1]
-            return brentq(lambda t: gap(repeat(t)), low, high, xtol=1e-15, rtol=1e-15)
-    return None
+    k = next((k for k in range(1, SUBDIVISIONS + 1) if values[k] < -TOUCH), 0)
+    if k == 0:
+        return inf
+    low, high = max(run.t_old, times[k - 1] - piece), min(run.t, times[k] + piece)
+    if gap(again(low)) <= 0.0 or gap(again(high)) >= 0.0:              # no more than a touch away from here
+        return float(times[k])
+    return brentq(lambda t: gap(again(t)), low, high, xtol=1e-15, rtol=1e-15)
 
 
-def follow(scene, t1, angle=0.95 * pi, rtol=1e-12, pole="z"):
-    """Run from launch until theta reaches `angle`, N falls to zero, or t1 [s]; returns an Outcome."""
-    state, watch = start(scene, pole), events(scene, angle, pole)
-    old = {name: gap(state) for name, (gap, _) in watch.items()}
-    highest, lowest = scene.theta, old["contact_lost"]
-    if scene.theta >= angle or lowest < -1e-9:
-        return Outcome("inverted" if scene.theta >= angle else "contact_lost", 0.0, scene.theta, highest, lowest)
+def follow(scene, t1, angle=0.95 * pi, rtol=1e-12, pole="x", closest=0.3):
+    """Run from launch until theta reaches `angle`, N falls to zero, or t1 [s]. Returns (status, time [s], theta
+    [rad], least gaps at the ends of the steps before that); the time is inf if there was no event by t1.
+    The chart is changed when sin theta of the chart falls below `closest`."""
+    state, names = start(scene, pole), ("inverted", "contact_lost")
+    old = spare = gaps(scene, angle, state, pole)
+    if min(old) < -TOUCH:
+        return names[int(old[0] >= -TOUCH)], 0.0, scene.theta, spare
+
+    def again(t):
+        part = solver(scene, run.t_old, state, t, rtol, pole)
+        while part.status == "running" and t > run.t_old:
+            part.step()
+        return part.y
+
     run = solver(scene, 0.0, state, t1, rtol, pole)
     while run.status == "running":
         run.step()
         if run.status == "failed" or not np.all(np.isfinite(run.y)):
-            return Outcome("failed", run.t, tilt(scene, state, pole), highest, lowest)
-        new, dense, found = {name: gap(run.y) for name, (gap, _) in watch.items()}, None, []
-        repeat = lambda t: advance(scene, run.t_old, state, t, rtol, pole)
-        for name, (gap, near) in watch.items():
-            if min(old[name], new[name]) <= near:
-                dense = dense or run.dense_output()
-                time = crossing(gap, near, run.t_old, state, (old[name], new[name]), run.t, dense, repeat)
-                found += [] if time is None else [(time, name)]
-        if found:
-            time, name = min(found)
-            return Outcome(name, float(time), tilt(scene, repeat(time), pole), highest, lowest)
-        state, old = run.y, new
-        highest, lowest = max(highest, tilt(scene, state, pole)), min(lowest, new["contact_lost"])
-    return Outcome("not_inverted", float("inf"), tilt(scene, state, pole), highest, lowest)
+            return "failed", run.t, tilt(scene, state, pole), spare
+        new = gaps(scene, angle, run.y, pole)
+        times = [crossing(lambda x: gaps(scene, angle, x, pole)[k], (old[k], new[k]), run, again)
+                 if min(old[k], new[k]) < NEAR[k] else inf for k in (0, 1)]
+        time = min(times)
+        if time < inf:
+            return names[times.index(time)], time, tilt(scene, again(time), pole), spare
+        state, old, spare = run.y, new, np.minimum(spare, new)
+        if sin(state[1]) < closest and run.status == "running":
+            state, pole = best_chart(state, pole)
+            run = solver(scene, run.t, state, t1, rtol, pole, min(run.step_size, t1 - run.t))
+    return "not_inverted", inf, tilt(scene, state, pole), spare
 
 
-def inversion(scene, t1, angle=0.95 * pi, rtol=1e-12, pole="z"):
-    """(status, time [s], theta [rad]); scene: a Scene, or a dict of its fields."""
-    outcome = follow(Scene(**scene) if isinstance(scene, dict) else scene, t1, angle, rtol, pole)
-    return outcome.status, outcome.time, outcome.theta
+def inversion(scene, t1, angle=0.95 * pi, rtol=1e-12):
+    """(status, time [s], theta [rad]); status: inverted, contact_lost, not_inverted or failed; time: inf if
+    there was no event by t1; theta: angle from n to the stem at the end. scene: a Scene, or a dict of its fields."""
+    return follow(Scene(**scene) if isinstance(scene, dict) else scene, t1, angle, rtol)[:3]

@@ -1,0 +1,142 @@
+"""One explicit Runge-Kutta step of many lanes, from a Diffrax solver's tableau, with the stages written out."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Lanes = Float[Array, " lanes"]
+States = Float[Array, "components lanes"]
+
+
+class Step(NamedTuple):
+    """A step that was tried: where it leads, the rate there, its error estimate and what was seen on the way."""
+
+    state: States
+    rate: States
+    error: States
+    watched: Lanes | None
+    first_negative: Lanes | None
+
+
+def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
+    """The tableau of an explicit, embedded Runge-Kutta solver of Diffrax.
+
+    **Raises:** `ValueError` for a solver that is not one.
+    """
+    tableau = getattr(solver, "tableau", None)
+    if not isinstance(solver, diffrax.AbstractERK) or not isinstance(tableau, diffrax.ButcherTableau):
+        raise ValueError(f"solver = {solver!r} must be an explicit Runge-Kutta solver of Diffrax, such as Dopri8()")
+    return tableau
+
+
+def explicit_step(
+    tableau: diffrax.ButcherTableau,
+    field: Callable[[Lanes, States], States],
+    watch: Callable[[Lanes, States], Lanes] | None,
+    time: Lanes,
+    state: States,
+    rate: States,
+    length: Lanes,
+) -> Step:
+    """Try one step in every lane.
+
+    Each stage's derivatives form one array behind an optimisation barrier. Without it the compiler fuses every output
+    with all the stages before it and evaluates the whole history again for each component.
+
+    **Arguments:**
+
+    - `tableau`: the method.
+    - `field`: (time [s], state) -> rate of the state.
+    - `watch`: (time, state) -> a number per lane that should stay positive, or `None`. It is evaluated at the end and at
+      three stages between, together with `field`, so that what both need is computed once.
+    - `time`, `state`, `rate`: where the step starts, and the field there.
+    - `length`: length of the step [s], one per lane.
+
+    **Returns:** a `Step`. `watched` is the watched number at the end; `first_negative` the fraction of the step of the
+    first stage at which it was negative, 2 if it never was.
+    """
+
+    rates, watched, end = [rate], None, state
+    first_negative = None if watch is None else jnp.full_like(length, 2.0)
+    looks = _places_to_look(tableau.c)
+    for stage, (fraction, row) in enumerate(zip(tableau.c, tableau.a_lower, strict=True)):
+        end = state + length * _weighted(row, rates)
+        at = time + float(fraction) * length
+        if watch is not None and stage in looks:
+            stage_rate, seen = jax.lax.optimization_barrier((field(at, end), watch(at, end)))
+            first_negative = jnp.minimum(first_negative, jnp.where(seen < 0.0, float(fraction), 2.0))
+        else:
+            stage_rate = jax.lax.optimization_barrier(field(at, end))
+        rates.append(stage_rate)
+    if tableau.fsal:
+        last_rate = rates[-1]
+    else:
+        end = state + length * _weighted(tableau.b_sol, rates)
+        last_rate = jax.lax.optimization_barrier(field(time + length, end))
+    if watch is not None:
+        watched = watch(time + length, end)
+    return Step(end, last_rate, length * _weighted(tableau.b_error, rates), watched, first_negative)
+
+
+def _places_to_look(fractions: Float[Array, " stages"]) -> set[int]:
+    """The stages nearest to 1/4, 1/2 and 3/4 of the step: what happens between its ends is looked for there."""
+    between = [stage for stage, fraction in enumerate(fractions) if 0.0 < fraction < 1.0]
+    return {min(between, key=lambda stage: abs(fractions[stage] - part)) for part in (0.25, 0.5, 0.75) if between}
+
+
+def _weighted(weights: Float[Array, " stages"], rates: list[States]) -> States:
+    """Sum of the rates with the given weights, leaving out those of weight 0."""
+    total = None
+    for weight, rate in zip(weights, rates, strict=True):
+        if weight != 0.0:
+            term = float(weight) * rate
+            total = term if total is None else total + term
+    return jnp.zeros_like(rates[0]) if total is None else total
+
+
+def scaled_error(error: States, before: States, after: States, rtol: float, atol: States) -> Lanes:
+    """Root mean square over the components of the error in units of the tolerance (Diffrax's norm and scale)."""
+    scale = atol + rtol * jnp.maximum(jnp.abs(before), jnp.abs(after))
+    ratio = error / scale
+    return jnp.sqrt(jnp.mean(ratio * ratio, axis=0))
+
+
+def inverse_root(value: Lanes, order: int) -> Lanes:
+    """`value**(-1/order)`; square roots alone where the order is a power of 2, because `pow` costs twenty of them."""
+    if order & (order - 1) == 0:
+        while order > 1:
+            value, order = jnp.sqrt(value), order // 2
+        return 1.0 / value
+    return value ** (-1.0 / order)
+
+
+def first_length(
+    field: Callable[[Lanes, States], States],
+    time: Lanes,
+    state: States,
+    rate: States,
+    order: int,
+    rtol: float,
+    atol: States,
+) -> Lanes:
+    """Length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section II.4), as Diffrax selects it."""
+    scale = atol + jnp.abs(state) * rtol
+
+    def size(vector: States) -> Lanes:
+        return jnp.sqrt(jnp.mean((vector / scale) ** 2, axis=0))
+
+    magnitude, slope = size(state), size(rate)
+    flat = (magnitude < 1e-5) | (slope < 1e-5)
+    trial = jnp.where(flat, 1e-6, 0.01 * magnitude / jnp.where(flat, 1.0, slope))
+    bend = size(field(time + trial, state + trial * rate) - rate) / trial
+    steepest = jnp.maximum(slope, bend)
+    length = jnp.where(
+        steepest <= 1e-15,
+        jnp.maximum(1e-6, trial * 1e-3),
+        inverse_root(jnp.maximum(steepest, 1e-15) * 100.0, order),
+    )
+    return jnp.minimum(100.0 * trial, length)

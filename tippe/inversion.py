@@ -1,0 +1,221 @@
+"""Inversion: when the axis first reaches an angle, for one launch or for every cell of a grid."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from nonholonomic.ensemble import Outcome, lanes_for, traced_march
+from nonholonomic.lockstep import CROSSED, REACHED_END, AbstractProblem
+from nonholonomic.runge_kutta import explicit_tableau
+from nonholonomic.validation import as_number, require
+
+from .dynamics import COS_THETA, Dynamics
+from .launch import Launch
+from .scene import Scene
+
+#: The absolute tolerance is this part of the relative one, in units of the state's own magnitudes.
+ABSOLUTE = 0.1
+
+
+class InversionProblem(AbstractProblem):
+    """Launches that end when theta reaches an angle or the contact is lost."""
+
+    dynamics: Dynamics
+    cos_angle: Float[Array, "..."]
+    states: Float[Array, "components cells"]
+    scales: Float[Array, "components cells"]
+
+    @classmethod
+    def of(cls, scene: Scene, launch: Launch, angle: Float[ArrayLike, "..."], cells: int) -> "InversionProblem":
+        """The problem of the given number of cells; the numbers of scene and launch are scalars or one per cell."""
+        states = scene.state(launch)
+        shape = (states.shape[0], cells)
+        states = jnp.broadcast_to(states.reshape(shape[0], -1), shape)
+        scales = jnp.broadcast_to(scene.scales(launch).reshape(shape[0], -1), shape)
+        return cls(scene.dynamics, jnp.cos(angle), states, scales)
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        return self.states, self.scales
+
+    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.dynamics.field(state)
+
+    def crossing(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
+        return state[COS_THETA] - self.cos_angle
+
+    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
+        return self.dynamics.contact_margin(state)
+
+
+def inversion_time(
+    scene: Scene,
+    launch: Launch,
+    t1: float,
+    angle: Float[ArrayLike, ""] = 0.95 * math.pi,
+    tolerance: float = 1e-9,
+    crossing: str = "first",
+    solver: diffrax.AbstractERK | None = None,
+) -> Float[Array, ""]:
+    """Time at which theta reaches an angle; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
+
+    The derivative is that of the event's time by the implicit function theorem; it is 0 where the result is infinite.
+    Differentiating costs one forward-mode pass for each number that is differentiated.
+
+    **Arguments:**
+
+    - `scene`, `launch`: as for `simulate`, every number a scalar.
+    - `t1`: horizon [s], positive.
+    - `angle`: angle [rad] to be reached, in (0, pi].
+    - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
+    - `crossing`: "first" for the first time theta reaches the angle, "last" for the up-crossing after which theta stays
+      above it until `t1`.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
+
+    **Returns:** the time [s]; infinite if the top has not inverted by `t1` or has lost contact before.
+
+    **Raises:** `ValueError` for arguments outside these ranges.
+    """
+    solver = diffrax.Dopri8() if solver is None else solver
+    check_run(scene, launch, t1, tolerance)
+    check_event(angle, crossing)
+    explicit_tableau(solver)
+    inputs = (scene, launch, as_number(angle), as_number(t1), as_number(tolerance))
+    leaves, structure = jax.tree.flatten(inputs)
+    for leaf in leaves:
+        if jnp.ndim(leaf) != 0:
+            raise ValueError(f"inversion_time takes one number for each argument, not an array of shape {leaf.shape}")
+    return _differentiable(_Run(structure, solver, crossing == "last"), len(leaves))(*leaves)
+
+
+class _Run(NamedTuple):
+    """What of a call is not a number."""
+
+    structure: jax.tree_util.PyTreeDef
+    solver: diffrax.AbstractERK
+    last: bool
+
+
+def _differentiable(run: _Run, count: int) -> Callable[..., Float[Array, ""]]:
+    """The event's time as a function of the call's numbers, with its derivative and its batching."""
+
+    @jax.custom_jvp
+    def event_time(*leaves):
+        return _batched(functools.partial(_event_times, run))(*leaves)
+
+    @functools.partial(event_time.defjvp, symbolic_zeros=True)
+    def variation(leaves, tangents):
+        # Horizon and tolerance, the last two numbers, do not move the event.
+        zero = jax.custom_derivatives.SymbolicZero
+        active = [i for i in range(count - 2) if not isinstance(tangents[i], zero)]
+        time = event_time(*leaves)
+        if not active:
+            return time, jnp.zeros_like(time)
+        slopes = _slopes(run, active)(*leaves)
+        return time, sum(slope * tangents[i] for slope, i in zip(slopes, active, strict=True))
+
+    return event_time
+
+
+def _slopes(run: _Run, active: list[int]) -> Callable[..., list[Float[Array, ""]]]:
+    """The derivatives of the event's time with respect to the active numbers, as a function of the call's numbers."""
+    function = functools.partial(_event_slopes, run, active)
+
+    @jax.custom_jvp
+    def slopes(*leaves):
+        return _batched(function)(*leaves)
+
+    @slopes.defjvp
+    def second_variation(leaves, tangents):
+        # `_batched` would mark the value as batched where only the variation is, so it is left out here.
+        return jax.jvp(lambda *numbers: [result[0] for result in function(1, *numbers)], leaves, tangents)
+
+    return slopes
+
+
+def _batched(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a function of numbers that are scalars or one per cell run a batch as cells of one block."""
+
+    @jax.custom_batching.custom_vmap
+    def one(*leaves):
+        return jax.tree.map(lambda result: result[0], function(1, *leaves))
+
+    @one.def_vmap
+    def many(size, batched, *leaves):
+        results = function(size, *leaves)
+        return results, jax.tree.map(lambda _: True, results)
+
+    return one
+
+
+def _event_times(run: _Run, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
+    """The event's time in every cell, infinite where there is none."""
+    scene, launch, angle, t1, tolerance = jax.tree.unflatten(run.structure, leaves)
+    problem = InversionProblem.of(scene, launch, angle, cells)
+    tolerance = jnp.min(tolerance)
+    outcome, _ = traced_march(
+        problem,
+        jnp.max(t1),
+        jnp.asarray(cells),
+        tolerance,
+        ABSOLUTE * tolerance,
+        solver=run.solver,
+        lanes=lanes_for(cells),
+        passes=run.last,
+    )
+    inverted = is_inverted(outcome, problem, run.last)
+    return jnp.where(inverted, outcome.crossing_time, jnp.inf)
+
+
+def _event_slopes(run: _Run, active: list[int], cells: int, *leaves: Float[Array, "..."]) -> list[Float[Array, " cells"]]:
+    """Derivatives of the event's time with respect to the active numbers, 0 where there is no event.
+
+    Cells do not influence one another, so moving a number in all of them at once gives every cell its own derivative.
+    """
+
+    def times(*moving):
+        moved = list(leaves)
+        for i, leaf in zip(active, moving, strict=True):
+            moved[i] = leaf
+        time = _event_times(run, cells, *moved)
+        # The derivative of the infinite result is that of a constant.
+        return jnp.where(jnp.isfinite(time), time, 0.0)
+
+    point = tuple(leaves[i] for i in active)
+    if len(active) == 1:
+        return [jax.jvp(times, point, (jnp.ones_like(point[0]),))[1]]
+    directions = tuple(
+        jnp.zeros((len(active), *leaf.shape), leaf.dtype).at[k].set(1.0) for k, leaf in enumerate(point)
+    )
+    slopes = jax.vmap(lambda *direction: jax.jvp(times, point, direction)[1])(*directions)
+    return list(slopes)
+
+
+def is_inverted(outcome: Outcome, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:
+    """Which cells count as inverted: those that reached the angle, or that end above it where the last crossing counts."""
+    if not last:
+        return outcome.status == CROSSED
+    above = problem.crossing(outcome.state) <= 0.0
+    return (outcome.status == REACHED_END) & above & jnp.isfinite(outcome.crossing_time)
+
+
+def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any) -> None:
+    """Raise `ValueError` unless these are a scene, a launch, a positive horizon and a tolerance in range."""
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene = {scene!r} must be a Scene")
+    if not isinstance(launch, Launch):
+        raise ValueError(f"launch = {launch!r} must be a Launch")
+    require(t1, "t1", above=0.0)
+    require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+
+
+def check_event(angle: Any, crossing: Any) -> None:
+    """Raise `ValueError` unless the angle is in (0, pi] and the crossing a known word."""
+    require(angle, "angle", above=0.0, at_most=math.pi)
+    if crossing not in ("first", "last"):
+        raise ValueError(f"crossing = {crossing!r} must be 'first' or 'last'")

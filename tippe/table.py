@@ -1,0 +1,128 @@
+"""Tables of inversion times over the grid of launches and friction."""
+
+import math
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nonholonomic.ensemble import compiled_march, lanes_for
+from nonholonomic.lockstep import FAILED, GUARD_LOST
+from nonholonomic.paths import description, with_numbers
+from nonholonomic.runge_kutta import explicit_tableau
+from nonholonomic.sweep import Axis, Variable, axis, sweep
+from nonholonomic.table import Table
+
+from .inversion import ABSOLUTE, InversionProblem, check_event, check_run, is_inverted
+from .launch import Launch
+from .scene import Scene
+
+WORDS = ("inverted", "not_inverted", "contact_lost", "failed")
+
+VARIABLES = {
+    "time": Variable("s", np.float64),
+    "status": Variable("1", np.int8, WORDS),
+    "end_time": Variable("s", np.float64),
+    "end_theta": Variable("rad", np.float64),
+    "steps": Variable("1", np.int64),
+    "rejected": Variable("1", np.int64),
+}
+
+UNITS = {"mass": "kg", "radius": "m", "offset": "m", "I1": "kg m2", "I3": "kg m2", "gravity": "m s-2"}
+UNITS |= {"theta": "rad", "eta": "rad", "azimuth": "rad", "spin": "rad s-1", "slip_speed": "m s-1"}
+
+
+def inversion_table(
+    scene: Scene,
+    *,
+    theta: Any,
+    spin: Any,
+    eta: Any = 0.0,
+    mu: Any = None,
+    t1: float,
+    angle: float = 0.95 * math.pi,
+    tolerance: float = 1e-9,
+    crossing: str = "first",
+    path: Any = None,
+    azimuth: Any = 0.0,
+    axes: dict[str, Any] | None = None,
+    solver: diffrax.AbstractERK | None = None,
+) -> Table:
+    """Inversion times over a grid of launches and scenes, in one batched call on all cores.
+
+    **Arguments:**
+
+    - `scene`: the scene, every number a scalar.
+    - `theta`, `spin`, `eta`, `azimuth`: of the launch, as for `Launch`; `mu`: of the scene's friction, its own by default.
+      A list or array becomes an axis of the table, in the order (theta, eta, mu, spin, azimuth); a number does not.
+    - `t1`: horizon [s].
+    - `angle`: angle [rad] that counts as inverted.
+    - `tolerance`: relative tolerance of the integration.
+    - `crossing`: "first" for the first time theta reaches the angle; "last" for the up-crossing after which theta stays
+      above it until `t1` (first crossings are ill-conditioned where theta oscillates about the angle).
+    - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
+    - `axes`: further axes, path of a number -> values, such as `{"scene.body.offset": [0.005, 0.006]}`.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
+
+    **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
+    "contact_lost", "failed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was lost, when
+    and at what angle), `steps` and `rejected`.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
+    """
+    solver = diffrax.Dopri8() if solver is None else solver
+    check_event(angle, crossing)
+    explicit_tableau(solver)
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene = {scene!r} must be a Scene")
+    given = {"launch.theta": theta, "launch.eta": eta, "scene.friction.mu": mu, "launch.spin": spin}
+    given |= {"launch.azimuth": azimuth} | (axes or {})
+    given = {number: values for number, values in given.items() if values is not None}
+    fixed = {number: value for number, value in given.items() if np.ndim(value) == 0}
+    grid = [_axis(number, values) for number, values in given.items() if number not in fixed]
+    roots = with_numbers({"scene": scene, "launch": Launch(theta=0.0, spin=0.0)}, fixed)
+    check_run(roots["scene"], roots["launch"], t1, tolerance)
+    # The modules check every value of every axis here, before anything compiles.
+    for one in grid:
+        with_numbers(roots, {one.path: one.values})
+    last = crossing == "last"
+
+    def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
+        cells = with_numbers(roots, columns)
+        size = next((len(values) for values in columns.values()), 1)
+        problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
+        outcome, _ = compiled_march(
+            problem,
+            jnp.asarray(t1, float),
+            jnp.asarray(count),
+            jnp.asarray(tolerance, float),
+            jnp.asarray(ABSOLUTE * tolerance, float),
+            solver=solver,
+            lanes=lanes_for(size),
+            passes=last,
+        )
+        inverted = is_inverted(outcome, problem, last)
+        return {
+            "time": np.where(inverted, outcome.crossing_time, np.inf),
+            "status": np.select(
+                [inverted, outcome.status == GUARD_LOST, outcome.status == FAILED], [0, 2, 3], 1
+            ).astype(np.int8),
+            "end_time": np.asarray(outcome.end_time),
+            "end_theta": np.asarray(jax.vmap(scene.theta, 1)(outcome.state)),
+            "steps": np.asarray(outcome.steps),
+            "rejected": np.asarray(outcome.rejected),
+        }
+
+    request = description("scene", roots["scene"]) | description("launch", roots["launch"])
+    request |= {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
+    request |= {"solver": type(solver).__name__}
+    request |= {one.path: "an axis" for one in grid}
+    return sweep(run, grid, VARIABLES, request, path=path)
+
+
+def _axis(path: str, values: Any) -> Axis:
+    """The axis of a number, under its last name and with its unit."""
+    name = path.rsplit(".", 1)[-1]
+    return axis(name, path, UNITS.get(name, "1"), values)
