@@ -129,8 +129,10 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
         # Positive at both ends but negative at a stage between: end the step at that stage and look again.
         beyond_between = good & ~ends_beyond & (tried.first_negative < 1.0)
         low, high, margin_low, margin_high, guess = _narrow(block, margin)
-        width = jnp.abs(guess - block.length)
-        hit = running & block.searching & ((width <= LOCATED * high) | (high - low <= 0.0))
+        close = block.searching & (jnp.abs(guess - block.length) <= 4.0 * LOCATED * high)
+        # A run that goes on must start beyond the event, or it would find the same one again.
+        hit = running & close & (margin <= 0.0)
+        guess = jnp.where(close & ~hit, block.length + 2.0 * LOCATED * high, guess)
     free = running & ~block.searching
     forward = free & good & ~ends_beyond & ~beyond_between
 
@@ -168,7 +170,7 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     at_end = running & (status == RUNNING) & moved & (time >= control.t1)
     status = jnp.where(at_end, REACHED_END, status)
     tiny = 8.0 * jnp.finfo(time.dtype).eps * jnp.maximum(time, 1e-3)
-    stuck = ~searching & ~at_end & (length <= tiny) | (steps >= control.max_steps)
+    stuck = free & ~forward & ~searching & (length <= tiny) | (steps >= control.max_steps)
     status = jnp.where(running & (status == RUNNING) & stuck, FAILED, status)
     # The last step ends on the horizon exactly: what is left of it may differ from the length by round-off.
     left = control.t1 - time

@@ -11,6 +11,7 @@ import numpy as np
 from nonholonomic.ensemble import compiled_march, lanes_for
 from nonholonomic.lockstep import FAILED, GUARD_LOST
 from nonholonomic.paths import description, with_numbers
+from nonholonomic.reference import march_by_diffrax
 from nonholonomic.runge_kutta import explicit_tableau
 from nonholonomic.sweep import Axis, Variable, axis, sweep
 from nonholonomic.table import Table
@@ -49,6 +50,7 @@ def inversion_table(
     azimuth: Any = 0.0,
     axes: dict[str, Any] | None = None,
     solver: diffrax.AbstractERK | None = None,
+    method: str = "ensemble",
 ) -> Table:
     """Inversion times over a grid of launches and scenes, in one batched call on all cores.
 
@@ -65,6 +67,8 @@ def inversion_table(
     - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
     - `axes`: further axes, path of a number -> values, such as `{"scene.body.offset": [0.005, 0.006]}`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
+    - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which knows first
+      crossings only.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
     "contact_lost", "failed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was lost, when
@@ -75,6 +79,10 @@ def inversion_table(
     solver = diffrax.Dopri8() if solver is None else solver
     check_event(angle, crossing)
     explicit_tableau(solver)
+    if method not in ("ensemble", "diffrax"):
+        raise ValueError(f"method = {method!r} must be 'ensemble' or 'diffrax'")
+    if method == "diffrax" and crossing != "first":
+        raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
     given = {"launch.theta": theta, "launch.eta": eta, "scene.friction.mu": mu, "launch.spin": spin}
@@ -93,16 +101,20 @@ def inversion_table(
         cells = with_numbers(roots, columns)
         size = next((len(values) for values in columns.values()), 1)
         problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
-        outcome, _ = compiled_march(
-            problem,
-            jnp.asarray(t1, float),
-            jnp.asarray(count),
-            jnp.asarray(tolerance, float),
-            jnp.asarray(ABSOLUTE * tolerance, float),
-            solver=solver,
-            lanes=lanes_for(size),
-            passes=last,
-        )
+        horizon, rtol = jnp.asarray(t1, float), jnp.asarray(tolerance, float)
+        if method == "diffrax":
+            outcome = march_by_diffrax(problem, horizon, rtol, ABSOLUTE * rtol, solver=solver)
+        else:
+            outcome, _ = compiled_march(
+                problem,
+                horizon,
+                jnp.asarray(count),
+                rtol,
+                ABSOLUTE * rtol,
+                solver=solver,
+                lanes=lanes_for(size),
+                passes=last,
+            )
         inverted = is_inverted(outcome, problem, last)
         return {
             "time": np.where(inverted, outcome.crossing_time, np.inf),
@@ -117,7 +129,7 @@ def inversion_table(
 
     request = description("scene", roots["scene"]) | description("launch", roots["launch"])
     request |= {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
-    request |= {"solver": type(solver).__name__}
+    request |= {"solver": type(solver).__name__, "method": method}
     request |= {one.path: "an axis" for one in grid}
     return sweep(run, grid, VARIABLES, request, path=path)
 

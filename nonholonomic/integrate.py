@@ -1,0 +1,206 @@
+"""One trajectory with Diffrax: any of its solvers, dense output or given times, and the end of the model's validity."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+from jaxtyping import Array, ArrayLike, Float
+
+from .lockstep import AbstractProblem
+
+#: Steps that are integrated and stored at once; a longer run is made of several such pieces.
+PIECE = 2048
+
+#: Places in every step at which the guard is looked at, besides its ends.
+LOOKS = np.arange(1, 8) / 8.0
+
+
+class Path(NamedTuple):
+    """A run: its times and states, the pieces of its dense output, how it ended and what it took."""
+
+    times: Float[Array, " times"]
+    states: Float[Array, "components times"]
+    pieces: list[Any]
+    guard_lost: bool
+    failed: bool
+    accepted: int
+    rejected: int
+
+    def at(self, times: Float[Array, " times"]) -> Float[Array, "components times"]:
+        """States at the given times, by the dense output; times must lie within the run."""
+        states = np.repeat(self.states[:, :1], len(times), axis=1)
+        for piece in self.pieces:
+            here = (times > float(piece.t0)) & (times <= float(piece.t1))
+            if here.any():
+                states[:, here] = np.asarray(_evaluate(piece, jnp.asarray(times)[here])).T
+        return states
+
+
+@eqx.filter_jit
+def _evaluate(piece: diffrax.Solution, times: Float[Array, " times"]) -> Float[Array, "times components"]:
+    return jax.vmap(piece.evaluate)(times)
+
+
+def _control(rtol: Float[ArrayLike, ""], atol: Float[Array, " components"]) -> diffrax.PIDController:
+    # The greatest error counts, not the mean: cyclic coordinates that ride along must not dilute the others' errors.
+    return diffrax.PIDController(rtol, atol, norm=optimistix.max_norm)
+
+
+@eqx.filter_jit
+def _piece(
+    problem: AbstractProblem,
+    t0: Float[Array, ""],
+    t1: Float[Array, ""],
+    first: Float[Array, ""] | None,
+    state: Float[Array, " components"],
+    solver: diffrax.AbstractSolver,
+    rtol: Float[Array, ""],
+    atol: Float[Array, " components"],
+) -> tuple[diffrax.Solution, Float[Array, " steps"]]:
+    """At most `PIECE` steps, and the least value of the guard seen in each."""
+    watched = problem.guard(t0, state) is not None
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
+        solver,
+        t0,
+        t1,
+        first,
+        state,
+        args=problem,
+        stepsize_controller=_control(rtol, atol),
+        saveat=diffrax.SaveAt(t0=True, steps=True, dense=True),
+        max_steps=PIECE,
+        event=diffrax.Event(lambda t, y, args, **_: args.guard(t, y) < 0.0) if watched else None,
+        throw=False,
+    )
+    ends = solution.ts
+    lengths = jnp.where(jnp.isfinite(ends[1:]), ends[1:] - ends[:-1], 0.0)
+    begins = jnp.where(jnp.isfinite(ends[:-1]), ends[:-1], t0)
+
+    def least(begin, length):
+        at = begin + length * jnp.asarray([*LOOKS, 1.0])
+        return jnp.min(jax.vmap(lambda t: problem.guard(t, solution.evaluate(t)))(at))
+
+    guards = jax.vmap(least)(begins, lengths) if watched else jnp.ones_like(lengths)
+    return solution, guards
+
+
+def follow(
+    problem: AbstractProblem,
+    t1: float,
+    *,
+    solver: diffrax.AbstractSolver,
+    rtol: float,
+    atol: float,
+    first: float | None = None,
+) -> Path:
+    """Integrate one run step by step until `t1` or until the model ceases to hold.
+
+    **Arguments:**
+
+    - `problem`: with a `start()` of shape (components,).
+    - `t1`: horizon [s].
+    - `solver`: any solver of Diffrax.
+    - `rtol`, `atol`: relative tolerance, and absolute tolerance in units of the problem's magnitudes.
+    - `first`: length of the first step [s], by default selected as Diffrax does.
+
+    **Returns:** a `Path` with the accepted steps; it ends where the guard reaches zero, found on the dense output.
+    """
+    state, scales = problem.start()
+    state, scales = jnp.asarray(state), jnp.asarray(scales)
+    time = jnp.zeros((), state.dtype)
+    times, states, pieces = [np.zeros(1)], [np.asarray(state)[:, None]], []
+    accepted = rejected = 0
+    end, lost, failed = jnp.asarray(t1, state.dtype), False, False
+    length = None if first is None else jnp.asarray(first, state.dtype)
+    margin = problem.guard(time, state)
+    if margin is not None and float(margin) <= 0.0:
+        return Path(times[0], states[0], [], True, False, 0, 0)
+    while float(time) < t1 and not (lost or failed):
+        solution, guards = _piece(problem, time, end, length, state, solver, jnp.asarray(rtol), atol * scales)
+        steps = int(solution.stats["num_accepted_steps"])
+        accepted, rejected = accepted + steps, rejected + int(solution.stats["num_rejected_steps"])
+        ts, ys = np.asarray(solution.ts[1 : steps + 1]), np.asarray(solution.ys[1 : steps + 1]).T
+        finite = np.isfinite(ts) & np.all(np.isfinite(ys), axis=0)
+        out = np.flatnonzero(np.asarray(guards[:steps]) < 0.0)
+        if out.size:
+            lost, steps = True, int(out[0]) + 1
+            begin = float(ts[out[0] - 1]) if out[0] else float(time)
+            ts, ys, finite = ts[:steps].copy(), ys[:, :steps].copy(), finite[:steps]
+            ts[-1] = _loss(problem, solution, begin, float(ts[-1]))
+            ys[:, -1] = np.asarray(solution.evaluate(ts[-1]))
+        failed = steps == 0 or not finite.all()
+        good = int(finite.sum()) if finite.all() else int(np.argmin(finite))
+        times.append(ts[:good])
+        states.append(ys[:, :good])
+        pieces.append(solution)
+        if good:
+            length = jnp.asarray(ts[-1] - (ts[-2] if good > 1 else float(time)))
+            time, state = jnp.asarray(ts[good - 1]), jnp.asarray(ys[:, good - 1])
+        failed = failed or (not lost and solution.result == diffrax.RESULTS.dt_min_reached)
+    return Path(np.concatenate(times), np.concatenate(states, axis=1), pieces, lost, failed, accepted, rejected)
+
+
+def _loss(problem: AbstractProblem, solution: diffrax.Solution, begin: float, end: float) -> float:
+    """The first time in a step at which the guard is zero, by bisection on the dense output."""
+    evaluate = eqx.filter_jit(lambda s, t: problem.guard(t, s.evaluate(t)))
+    previous = begin
+    for fraction in (*LOOKS, 1.0):
+        at = begin + (end - begin) * fraction
+        if float(evaluate(solution, jnp.asarray(at))) < 0.0:
+            break
+        previous = at
+    low, high = previous, at
+    while high - low > 4.0 * np.finfo(float).eps * max(high, 1e-3):
+        middle = 0.5 * (low + high)
+        if not low < middle < high:
+            break
+        negative = float(evaluate(solution, jnp.asarray(middle))) < 0.0
+        low, high = (low, middle) if negative else (middle, high)
+    return low
+
+
+def sample(
+    problem: AbstractProblem,
+    times: Float[Array, " times"],
+    t1: Float[Array, ""],
+    *,
+    solver: diffrax.AbstractSolver,
+    rtol: float,
+    atol: float,
+    adjoint: diffrax.AbstractAdjoint,
+    max_steps: int = 65536,
+) -> tuple[Float[Array, "components times"], Float[Array, ""], Array, dict[str, Any]]:
+    """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
+
+    The guard is looked at where steps end, and the run ends before the step at whose end it is negative.
+
+    **Arguments:** as for `follow`; `times`: growing, in [0, t1]; `adjoint`: how Diffrax differentiates; `max_steps`: bound
+    on the steps.
+
+    **Returns:** the states, infinite after the end of the run; the time at which the run ended; whether the guard ended it;
+    Diffrax's statistics.
+    """
+    state, scales = problem.start()
+    watched = problem.guard(jnp.zeros_like(t1), state) is not None
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
+        solver,
+        0.0,
+        t1,
+        None,
+        state,
+        args=problem,
+        stepsize_controller=_control(rtol, jax.lax.stop_gradient(atol * scales)),
+        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=times), diffrax.SubSaveAt(t1=True)]),
+        max_steps=max_steps,
+        event=diffrax.Event(lambda t, y, args, **_: args.guard(t, y) < 0.0) if watched else None,
+        adjoint=adjoint,
+        throw=False,
+    )
+    lost = jnp.zeros((), bool) if solution.event_mask is None else solution.event_mask
+    return solution.ys[0].T, solution.ts[1][0], lost, solution.stats

@@ -1,0 +1,209 @@
+"""The main job, `python -m tippe`: the papers' two inversion tables, and the same launches on the plane."""
+
+import argparse
+import math
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from nonholonomic.surface import Cylinder, Plane
+from nonholonomic.table import Table
+
+from . import paper
+from .friction import AbstractFriction, Coulomb, Viscous
+from .launch import Launch
+from .plot import Panel, draw_launches
+from .scene import Scene
+from .table import inversion_table
+from .top import Top
+from .trajectory import simulate
+
+#: Times at which theta is drawn.
+SAMPLES = 1500
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options of the main job; the defaults are the declared top and the papers' launches."""
+    told = argparse.ArgumentParser(
+        prog="python -m tippe",
+        description="Inversion times of a tippe top inside a cylinder (the paper's Tables 2 and 3) and on the plane. "
+        "Prints them beside the printed ones, writes an HDF5 table for each arena and a picture of theta(t).",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    top = told.add_argument_group("the top (the paper's Table 1 lost its numbers: these are Rutstam's)")
+    top.add_argument("--mass", type=float, default=0.02, help="mass [kg]")
+    top.add_argument("--radius", type=float, default=0.02, help="radius R of the sphere [m]")
+    top.add_argument("--offset", type=float, default=0.006, help="distance of the centre of mass from the centre [m]")
+    top.add_argument("--I1", type=float, help="transverse moment of inertia [kg m^2] (default: 131/350 m R^2)")
+    top.add_argument("--I3", type=float, help="axial moment of inertia [kg m^2] (default: 2/5 m R^2)")
+    scene = told.add_argument_group("the scene")
+    scene.add_argument("--cylinder-radius", type=float, default=0.3, help="radius of the cylinder [m]")
+    scene.add_argument("--mu", type=float, default=0.3, help="friction: viscous [s/m], or Coulomb [1] with --slip-speed")
+    scene.add_argument("--slip-speed", type=float, help="regularised Coulomb friction with this slip speed [m/s]")
+    scene.add_argument("--gravity", type=float, default=9.81, help="acceleration of free fall [m/s^2]")
+    launch = told.add_argument_group("the launches")
+    launch.add_argument("--theta", type=float, nargs="+", default=list(paper.THETAS), help="inclinations theta(0) [rad]")
+    launch.add_argument("--eta", type=float, nargs="+", default=[0.0, math.pi / 2.0], help="places eta(0) [rad]")
+    launch.add_argument("--beta1", type=float, default=paper.BETA1, help="I3 w3 at the start [kg m^2/s]")
+    launch.add_argument("--spin", type=float, help="spin w3 at the start [rad/s], instead of --beta1")
+    run = told.add_argument_group("the run")
+    run.add_argument("--t1", type=float, default=60.0, help="horizon [s]")
+    run.add_argument("--angle", type=float, default=0.95 * math.pi, help="angle that counts as inverted [rad]")
+    run.add_argument("--tolerance", type=float, default=1e-9, help="relative tolerance of the integration")
+    run.add_argument("--out", type=Path, default=Path("tippe-out"), help="folder for the tables and the picture")
+    return told
+
+
+def scenes(options: argparse.Namespace) -> dict[str, Scene]:
+    """The two arenas with the declared top."""
+    inertia = options.mass * options.radius**2
+    I1 = 131.0 / 350.0 * inertia if options.I1 is None else options.I1
+    I3 = 0.4 * inertia if options.I3 is None else options.I3
+    top = Top(options.mass, options.radius, options.offset, I1, I3)
+    friction: AbstractFriction = Viscous(options.mu)
+    if options.slip_speed is not None:
+        friction = Coulomb(options.mu, options.slip_speed)
+    arenas = {"cylinder": Cylinder(options.cylinder_radius), "plane": Plane()}
+    return {name: Scene(top, arena, friction, options.gravity) for name, arena in arenas.items()}
+
+
+def spin_of(options: argparse.Namespace, scene: Scene) -> float:
+    """The launches' spin [rad/s]."""
+    return options.beta1 / float(scene.body.I3) if options.spin is None else options.spin
+
+
+def tables(options: argparse.Namespace) -> dict[tuple[str, str], Table]:
+    """The table of each arena for the first and for the last crossing of the angle, each written to its file."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    found = {}
+    for name, scene in scenes(options).items():
+        for crossing in ("first", "last"):
+            found[name, crossing] = inversion_table(
+                scene,
+                theta=options.theta,
+                # On the plane every place is alike.
+                eta=options.eta if name == "cylinder" else 0.0,
+                spin=spin_of(options, scene),
+                t1=options.t1,
+                angle=options.angle,
+                tolerance=options.tolerance,
+                crossing=crossing,
+                path=options.out / f"{name}_{crossing}.h5",
+            )
+    return found
+
+
+def printed_times(options: argparse.Namespace, eta: float) -> list[str] | None:
+    """The paper's column for a place, if these are its launches."""
+    for table in (paper.TABLE_2, paper.TABLE_3):
+        if list(options.theta) == [row.theta for row in table.rows] and math.isclose(eta, table.eta):
+            return ["-" if row.time is None else f"{row.time:g}" for row in table.rows]
+    return None
+
+
+def columns(options: argparse.Namespace, found: dict[tuple[str, str], Table]) -> list[tuple[str, list[str]]]:
+    """The columns of the report: a heading of two words or more, and an entry for every theta(0)."""
+    shown = [("theta(0)|[rad]", [f"{theta:.4g}" for theta in options.theta])]
+    places = [("cylinder", f"eta={eta:.4g}", (slice(None), i)) for i, eta in enumerate(options.eta)]
+    for arena, place, cells in [*places, ("plane", "", (slice(None),))]:
+        for crossing in ("first", "last"):
+            table = found[arena, crossing]
+            entries = [_entry(t, word) for t, word in zip(table.time[cells], table.status[cells], strict=True)]
+            shown.append((f"{arena} {place}|{crossing} [s]", entries))
+        printed = printed_times(options, options.eta[cells[1]]) if arena == "cylinder" else None
+        if printed is not None:
+            shown.append(("paper|[s]", printed))
+    return shown
+
+
+def _entry(seconds: float, word: str) -> str:
+    if word == "inverted":
+        return f"{seconds:.4f}"
+    return {"not_inverted": "-", "contact_lost": "lost contact", "failed": "failed"}[word]
+
+
+def report(options: argparse.Namespace, found: dict[tuple[str, str], Table]) -> str:
+    """The tables side by side, as text."""
+    scene = scenes(options)["cylinder"]
+    body = scene.body
+    shown = columns(options, found)
+    heads = [heading.split("|") for heading, _ in shown]
+    widths = [max(len(text) for text in (*head, *entries)) for head, (_, entries) in zip(heads, shown, strict=True)]
+    rows = [list(row) for row in zip(*heads, strict=True)]
+    rows += [list(row) for row in zip(*(entries for _, entries in shown), strict=True)]
+    lines = [
+        "Inversion of a tippe top: time at which theta reaches "
+        f"{options.angle:.4g} rad, for the first time (first) and for good (last).",
+        f"Top: m = {float(body.mass):g} kg, R = {float(body.radius):g} m, a = {float(body.offset):g} m, "
+        f"I1 = {float(body.I1):.4g}, I3 = {float(body.I3):.4g} kg m^2; friction {_friction(scene.friction)}; "
+        f"cylinder {options.cylinder_radius:g} m.",
+        "The paper's Table 1 lost its numbers, so this top is a declared one (Rutstam's): compare trends, not digits.",
+        f"-: not inverted within {options.t1:g} s.",
+        "",
+    ]
+    lines += ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join(lines)
+
+
+def _friction(law: AbstractFriction) -> str:
+    if isinstance(law, Coulomb):
+        return f"Coulomb mu = {float(law.mu):g}, slip speed {float(law.slip_speed):g} m/s"
+    return f"viscous mu = {float(law.mu):g} s/m"
+
+
+def picture(options: argparse.Namespace, found: dict[tuple[str, str], Table]) -> Any:
+    """theta(t) of every launch, all launches of a place in one batched run."""
+    times = np.linspace(0.0, options.t1, SAMPLES)
+    panels = []
+    arenas = scenes(options)
+    places = [("cylinder", eta, (slice(None), i)) for i, eta in enumerate(options.eta)]
+
+    @jax.jit
+    def theta_of(scene: Scene, launches: Launch) -> Any:
+        run = jax.vmap(lambda launch: simulate(scene, launch, options.t1, times, options.tolerance).theta)
+        return run(launches)
+
+    for arena, eta, cells in [*places, ("plane", 0.0, (slice(None),))]:
+        table = found[arena, "last"]
+        thetas = np.asarray(options.theta)
+        spin = np.full_like(thetas, spin_of(options, arenas[arena]))
+        launches = Launch(thetas, spin, np.full_like(thetas, eta), np.zeros_like(thetas))
+        theta = np.asarray(theta_of(arenas[arena], launches))
+        title = f"cylinder, η(0) = {eta:.4g}" if arena == "cylinder" else "plane"
+        panels.append(Panel(title, times, theta, thetas, table.time[cells]))
+    return draw_launches(panels, options.angle)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the main job.
+
+    **Arguments:** `arguments`: the command line, by default that of the process.
+
+    **Returns:** the exit status: 0, or 2 for input that cannot be used.
+    """
+    options = parser().parse_args(arguments)
+    started = time.perf_counter()
+    try:
+        found = tables(options)
+        print(report(options, found))
+        written = sorted({str(options.out / f"{arena}_{crossing}.h5") for arena, crossing in found})
+        if find_spec("matplotlib") is None:
+            print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
+        else:
+            written.append(str(options.out / "theta.png"))
+            picture(options, found).savefig(written[-1], dpi=130)
+    except (ValueError, OSError) as error:
+        print(f"python -m tippe: {error}", file=sys.stderr)
+        return 2
+    cells = sum(table.time.size for table in found.values())
+    print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. Wrote {', '.join(written)}.")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

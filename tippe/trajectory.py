@@ -1,0 +1,277 @@
+"""One run of a tippe top, with its path."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic.integrate import follow, sample
+from nonholonomic.lockstep import AbstractProblem
+from nonholonomic.validation import as_number, is_traced, require
+from nonholonomic.vector import dot
+
+from .dynamics import Dynamics, stacked
+from .inversion import ABSOLUTE, check_run
+from .launch import Launch
+from .scene import Scene
+
+
+class Run(AbstractProblem):
+    """A launch with its cyclic coordinates: the state, the arena's path, the spin angle and the work of friction."""
+
+    dynamics: Dynamics
+    axial: Float[Array, ""]
+    state: Float[Array, " components"]
+    path: Float[Array, " components"]
+    scales: Float[Array, " components"]
+
+    @classmethod
+    def of(cls, scene: Scene, launch: Launch) -> "Run":
+        """The run of one launch."""
+        state, path = scene.state(launch), jnp.stack(scene.surface.path(launch.eta))
+        radius, weight = scene.body.radius, scene.body.mass * scene.gravity
+        extra = jnp.stack([*([radius] * len(path)), jnp.ones(()), weight * radius])
+        return cls(scene.dynamics, scene.body.I3, state, path, jnp.concatenate([scene.scales(launch), extra]))
+
+    def start(self) -> tuple[Float[Array, " components"], Float[Array, " components"]]:
+        return jnp.concatenate([self.state, self.path, jnp.zeros(2)]), self.scales
+
+    def field(self, time: Float[Array, ""], state: Float[Array, " components"]) -> Float[Array, " components"]:
+        lean, path = state[: len(self.state)], tuple(state[len(self.state) : -2])
+        motion = self.dynamics.motion(lean)
+        path_rate = self.dynamics.parallel.path_rate(path, motion.velocity, motion.turning)
+        force = dot(motion.friction, motion.slip)
+        power = None if force is None else motion.normal_force * force
+        return stacked((*motion.rate, *path_rate, motion.spin_momentum / self.axial, power), state)
+
+    def crossing(self, state: Float[Array, " components"]) -> None:
+        return None
+
+    def guard(self, time: Float[Array, ""], state: Float[Array, " components"]) -> Float[Array, ""]:
+        return self.dynamics.contact_margin(state[: len(self.state)])
+
+
+class Trajectory(eqx.Module):
+    """A run of a tippe top.
+
+    Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame
+    (t1, t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre.
+
+    `status` is "reached t1", "contact_lost" or "failed" (a code 0, 1, 2 inside a transformation); the run ends at
+    `end_time`. `stats` holds accepted and rejected steps, the greatest drift of |e| and the greatest energy residual
+    |E - E(0) - work of friction| [J].
+    """
+
+    t: Float[Array, " times"]
+    scene: Scene
+    states: Float[Array, "components times"]
+    path: Float[Array, "paths times"]
+    spin_angle: Float[Array, " times"]
+    work: Float[Array, " times"]
+    status: Any
+    end_time: Float[Array, ""]
+    stats: dict[str, Any]
+    dense: Any
+
+    @property
+    def theta(self) -> Float[Array, " times"]:
+        """Angle from the normal to the axis [rad]."""
+        return self.scene.theta(self.states)
+
+    @property
+    def eta(self) -> Float[Array, " times"]:
+        """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
+        return self.scene.surface.angle(tuple(self.states[8:]), tuple(self.path))
+
+    @property
+    def azimuth(self) -> Float[Array, " times"]:
+        """Direction in which the axis leans [rad], from t1 towards t2, in (-pi, pi]."""
+        return jnp.arctan2(self.states[3], self.states[2])
+
+    @property
+    def spin(self) -> Float[Array, " times"]:
+        """Angular velocity about the axis [rad/s]."""
+        return self.scene.spin(self.states)
+
+    @property
+    def axis(self) -> Float[Array, "times 3"]:
+        """The unit vector e along the axis."""
+        return self._fixed(tuple(self.states[2:5]))
+
+    @property
+    def angular_momentum(self) -> Float[Array, "times 3"]:
+        """Angular momentum about the centre of mass [kg m^2/s]."""
+        return self._fixed(tuple(self.states[5:8]))
+
+    @property
+    def velocity(self) -> Float[Array, "times 3"]:
+        """Velocity of the sphere's centre [m/s]."""
+        V = self.scene.dynamics.motion(self.states).velocity
+        return self._fixed((*V, jnp.zeros_like(V[0])))
+
+    @property
+    def position(self) -> Float[Array, "times 3"]:
+        """Position of the sphere's centre [m]; the plane is z = 0, the cylinder's axis x = z = 0."""
+        foot = self.scene.surface.position(tuple(self.states[8:]), tuple(self.path))
+        normal = self.scene.surface.frame(tuple(self.states[8:]), tuple(self.path))[2]
+        return jnp.stack([q + self.scene.body.radius * n for q, n in zip(foot, normal, strict=True)], axis=-1)
+
+    @property
+    def energy(self) -> Float[Array, " times"]:
+        """Kinetic and potential energy [J]."""
+        return self.scene.energy(self.states)
+
+    @property
+    def jellett(self) -> Float[Array, " times"]:
+        """Jellett's quantity [kg m^3/s]; constant on the plane."""
+        return self.scene.jellett(self.states)
+
+    @property
+    def normal_force(self) -> Float[Array, " times"]:
+        """Normal force [N]."""
+        return self.scene.normal_force(self.states)
+
+    @property
+    def slip(self) -> Float[Array, "times 2"]:
+        """Velocity of the contact point along the arena, in the moving frame [m/s]."""
+        return self.scene.slip_velocity(self.states).T
+
+    def at(self, times: Float[Array, " times"]) -> "Trajectory":
+        """The same run at other times, from the dense output.
+
+        **Arguments:** `times`: increasing, within [0, `end_time`] [s].
+
+        **Raises:** `ValueError` for times outside the run, or if the run was made inside a transformation.
+        """
+        if self.dense is None:
+            raise ValueError("a run made inside jit, vmap or grad has no dense output: hand `times` to simulate")
+        times = np.asarray(times, dtype=float)
+        require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
+        return _cut(self, times, self.dense.at(times))
+
+    def _fixed(self, vector: tuple[Array, Array, Array]) -> Float[Array, "times 3"]:
+        frame = self.scene.surface.frame(tuple(self.states[8:]), tuple(self.path))
+        return jnp.stack([dot(vector, directions) for directions in zip(*frame, strict=True)], axis=-1)
+
+    def __str__(self) -> str:
+        if is_traced(self.t):
+            return f"Trajectory({len(self.t)} times, traced)"
+        end = f"{float(self.end_time):.6g} s"
+        ending = {"reached t1": f"ran to {end}", "contact_lost": f"lost contact at {end}"}
+        lines = [
+            f"Trajectory of {len(self.t)} times, {ending.get(self.status, f'failed at {end}')}",
+            f"  theta: {float(self.theta[0]):.6g} to {float(self.theta[-1]):.6g} rad",
+        ]
+        if "accepted" in self.stats:
+            lines.append(f"  steps: {self.stats['accepted']} accepted, {self.stats['rejected']} rejected")
+            lines.append(f"  drift of |e|: {self.stats['axis_drift']:.1e}")
+            lines.append(f"  energy residual: {self.stats['energy_residual']:.1e} J of {float(self.energy[0]):.4g} J")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+STATUS = ("reached t1", "contact_lost", "failed")
+
+
+def simulate(
+    scene: Scene,
+    launch: Launch,
+    t1: float,
+    times: Any = None,
+    tolerance: float = 1e-9,
+    solver: diffrax.AbstractSolver | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+) -> Trajectory:
+    """Run one launch until `t1` or until contact is lost.
+
+    Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run are then not
+    finite, and `status` and `end_time` say so.
+
+    **Arguments:**
+
+    - `scene`, `launch`: every number a scalar.
+    - `t1`: horizon [s].
+    - `times`: times of the result [s], increasing, within [0, t1]; by default those of the accepted steps. Outside of
+      transformations `Trajectory.at` gives others afterwards.
+    - `tolerance`: relative tolerance; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
+    - `solver`: any solver of Diffrax, `Dopri8()` by default.
+    - `adjoint`: how Diffrax differentiates, `RecursiveCheckpointAdjoint()` by default (reverse mode; use `ForwardMode()`
+      for `jvp` and `jacfwd`).
+
+    **Returns:** a `Trajectory`.
+
+    **Raises:** `ValueError` for arguments out of range.
+    """
+    check_run(scene, launch, t1, tolerance)
+    solver = diffrax.Dopri8() if solver is None else solver
+    if not isinstance(solver, diffrax.AbstractSolver):
+        raise ValueError(f"solver = {solver!r} must be a solver of Diffrax, such as Dopri8()")
+    if times is not None:
+        times = as_number(times)
+        require(times, "times", at_least=0.0, at_most=t1)
+        if jnp.ndim(times) != 1 or times.shape[0] == 0:
+            raise ValueError(f"times must be a non-empty list, not of shape {jnp.shape(times)}")
+        if not is_traced(times) and np.any(np.diff(times) <= 0.0):
+            raise ValueError("times must increase")
+    run = Run.of(scene, launch)
+    if any(is_traced(leaf) for leaf in jax.tree.leaves((run, times, t1))):
+        return _traced(scene, run, times, t1, tolerance, solver, adjoint)
+    path = follow(run, float(t1), solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
+    trajectory = _as_trajectory(scene, run, path)
+    if times is None:
+        return trajectory
+    return trajectory.at(np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)])
+
+
+def _traced(
+    scene: Scene,
+    run: Run,
+    times: Any,
+    t1: Any,
+    tolerance: Any,
+    solver: diffrax.AbstractSolver,
+    adjoint: diffrax.AbstractAdjoint | None,
+) -> Trajectory:
+    if times is None:
+        raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
+    adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+    states, end, lost, stats = sample(
+        run, times, as_number(t1), solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance, adjoint=adjoint
+    )
+    status = jnp.where(lost, 1, jnp.where(end < t1, 2, 0))
+    return Trajectory(times, scene, *_parts(run, states), status, end, stats, None)
+
+
+def _parts(run: Run, states: Float[Array, "components times"]) -> tuple[Any, Any, Any, Any]:
+    """State, path, spin angle and work."""
+    lean = len(run.state)
+    return states[:lean], states[lean:-2], states[-2], states[-1]
+
+
+def _as_trajectory(scene: Scene, run: Run, path: Any) -> Trajectory:
+    status = STATUS[1 if path.guard_lost else 2 if path.failed else 0]
+    lean, cyclic, spin_angle, work = _parts(run, jnp.asarray(path.states))
+    energy = scene.energy(lean)
+    stats = {
+        "accepted": path.accepted,
+        "rejected": path.rejected,
+        "axis_drift": float(jnp.max(jnp.abs(jnp.sqrt(jnp.sum(lean[2:5] ** 2, axis=0)) - 1.0))),
+        "energy_residual": float(jnp.max(jnp.abs(energy - energy[0] - work))),
+    }
+    times = jnp.asarray(path.times)
+    return Trajectory(times, scene, lean, cyclic, spin_angle, work, status, times[-1], stats, path)
+
+
+def _cut(trajectory: Trajectory, times: Any, states: Any) -> Trajectory:
+    run_size = trajectory.states.shape[0]
+    return eqx.tree_at(
+        lambda one: (one.t, one.states, one.path, one.spin_angle, one.work),
+        trajectory,
+        (jnp.asarray(times), *(jnp.asarray(part) for part in (states[:run_size], states[run_size:-2], states[-2], states[-1]))),
+    )
