@@ -96,9 +96,7 @@ def march(
     def store(outcome: Outcome, block: Block) -> Outcome:
         ended = (block.status != RUNNING) & (block.cell < cells)
         to = jnp.where(ended, block.cell, capacity)
-        found = Outcome(
-            block.status, block.crossing_time, block.time, block.state, block.steps, block.rejected
-        )
+        found = Outcome(block.status, block.crossing_time, block.time, block.state, block.steps, block.rejected)
         return jax.tree.map(lambda all, some: all.at[..., to].set(some, mode="drop"), outcome, found)
 
     def run_and_refill(carry):
@@ -131,6 +129,8 @@ def march(
     outcome = store(outcome, block)
     if not passes and problem.crossing(outcome.state) is not None:
         time = crossing_time(problem, outcome.end_time, outcome.state)
+        # A cell that starts beyond the event is there at once.
+        time = jnp.where(outcome.end_time > 0.0, time, 0.0)
         outcome = outcome._replace(crossing_time=jnp.where(outcome.status == CROSSED, time, jnp.inf))
     return outcome, iterations
 

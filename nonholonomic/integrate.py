@@ -182,7 +182,7 @@ def sample(
     **Arguments:** as for `follow`; `times`: growing, in [0, t1]; `adjoint`: how Diffrax differentiates; `max_steps`: bound
     on the steps.
 
-    **Returns:** the states, infinite after the end of the run; the time at which the run ended; whether the guard ended it;
+    **Returns:** the states, not a number after the end of the run; the time at which the run ended; whether the guard ended it;
     Diffrax's statistics.
     """
     state, scales = problem.start()
@@ -203,4 +203,7 @@ def sample(
         throw=False,
     )
     lost = jnp.zeros((), bool) if solution.event_mask is None else solution.event_mask
-    return solution.ys[0].T, solution.ts[1][0], lost, solution.stats
+    end = solution.ts[1][0]
+    # Not a number, rather than infinite: an angle of infinite components would look like an angle.
+    states = jnp.where(times <= end, solution.ys[0].T, jnp.nan)
+    return states, end, lost, solution.stats

@@ -35,7 +35,9 @@ def march_by_diffrax(
     def one(here: AbstractProblem, state: Array, scale: Array) -> Outcome:
         conditions = {
             CROSSED: None if problem.crossing(starts) is None else (lambda t, y, args, **_: args.crossing(y)),
-            GUARD_LOST: None if problem.guard(starts[0], starts) is None else (lambda t, y, args, **_: args.guard(t, y)),
+            GUARD_LOST: None
+            if problem.guard(starts[0], starts) is None
+            else (lambda t, y, args, **_: args.guard(t, y)),
         }
         conditions = {code: condition for code, condition in conditions.items() if condition is not None}
         event = diffrax.Event(list(conditions.values()), root_finder=optimistix.Newton(1e-13, 1e-13))

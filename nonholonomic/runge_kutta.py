@@ -53,6 +53,7 @@ def explicit_step(
     - `field`: (time [s], state) -> rate of the state.
     - `watch`: (time, state) -> a number per lane that should stay positive, or `None`. It is evaluated at the end and at
       three stages between, together with `field`, so that what both need is computed once.
+      What is negative for less than a quarter of a step may pass unseen.
     - `time`, `state`, `rate`: where the step starts, and the field there.
     - `length`: length of the step [s], one per lane.
 

@@ -6,20 +6,23 @@ In a frame that moves with the body, (t1, t2, n) with n the unit normal from the
 how the frame turns with the velocity (the shape operator), which way is up, and how the place changes. This is what a
 field that is integrated needs; components that vanish identically are `None` (see `vector.py`).
 
-In the fixed frame (x, y, z), z up: position, normal, frame. This is what a picture and a fixed-frame model need.
+In the fixed frame (x, y, z), z up: position, normal, frame. This is what a picture needs. A model that lives in the
+fixed frame asks the surface as a ground (see `ground.py`).
 """
 
 import abc
-from typing import Any
+import math
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .validation import as_number, require
+from .ground import AbstractGround, AbstractQuadric, Place
+from .validation import as_number, is_traced, require
 from .vector import Component, Vector, dot, multiply, subtract
 
-Place = tuple[Float[Array, "..."], ...]
 Tangent = tuple[Component, Component]
 
 
@@ -85,10 +88,33 @@ class AbstractSurface(eqx.Module):
         """Position (x, y, z) [m] in the fixed frame; the origin is the arena's centre, or its point below the start."""
 
 
-class Plane(AbstractSurface):
-    """A level plane; the frame is the fixed one and nothing turns."""
+def none_if_zero(value: Any) -> Any:
+    """A number as an array, or `None` for one that is known to be zero everywhere, which then costs nothing."""
+    if value is None:
+        return None
+    number = as_number(value)
+    return number if is_traced(number) or np.any(np.asarray(number) != 0.0) else None
+
+
+class Plane(AbstractSurface, AbstractGround):
+    """A plane; its frame does not turn. A level one, which is all that a rolling ball is offered, carries no terms.
+
+    **Arguments:**
+
+    - `tilt`: angle [rad] by which the plane rises along its own x axis, in [-pi/2, pi/2].
+    """
+
+    axes: ClassVar[int] = 2
+
+    tilt: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
+
+    def __check_init__(self):
+        if self.tilt is not None:
+            require(self.tilt, "tilt", at_least=-math.pi / 2.0, at_most=math.pi / 2.0)
 
     def parallel(self, distance: Float[ArrayLike, "..."]) -> "Plane":
+        if self.tilt is not None:
+            raise ValueError(f"surface = {self!r} must be level for a rolling ball")
         return self
 
     def place(self, eta: Float[ArrayLike, "..."]) -> Place:
@@ -122,6 +148,40 @@ class Plane(AbstractSurface):
 
     def position(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
         return (path[0], path[1], jnp.zeros_like(path[0]))
+
+    @property
+    def up(self) -> Vector:
+        return (None, None, 1.0) if self.tilt is None else (jnp.sin(self.tilt), None, jnp.cos(self.tilt))
+
+    def outward(self, position: Vector) -> Vector:
+        return (None, None, 1.0)
+
+    def outward_rate(self, position: Vector, velocity: Vector) -> Vector:
+        return (None, None, None)
+
+    def elevation(self, position: Vector) -> Component:
+        return dot(position, self.up)
+
+    def gaussian_curvature(self, position: Vector) -> Component:
+        return None
+
+    def chart(self, place: Place) -> tuple[Vector, Vector, Vector]:
+        one = jnp.ones_like(place[0])
+        return (place[0], place[1], None), (one, jnp.zeros_like(one), None), (jnp.zeros_like(one), one, None)
+
+    def place_at(self, position: Vector) -> Place:
+        return position[:2]
+
+    def departure(self, position: Vector) -> Component:
+        return None
+
+    def in_fixed_frame(self, vector: Vector) -> tuple[Any, Any, Any]:
+        x, y, z = vector
+        z = jnp.zeros_like(x) if z is None else z
+        if self.tilt is None:
+            return (x, y, z)
+        sine, cosine = jnp.sin(self.tilt), jnp.cos(self.tilt)
+        return (x * cosine - z * sine, y, x * sine + z * cosine)
 
 
 class Cylinder(AbstractSurface):
@@ -178,8 +238,8 @@ class Cylinder(AbstractSurface):
         return (self.radius * sine, path[1], -self.radius * cosine)
 
 
-class Sphere(AbstractSurface):
-    """The inside of a sphere; the frame is carried parallel to itself, so no place is singular.
+class Sphere(AbstractSurface, AbstractQuadric):
+    """A sphere, for a rolling ball its inside; the frame is carried parallel to itself, so no place is singular.
 
     The place is the vertical seen in the moving frame; the path adds the horizontal x axis seen in it.
 
@@ -231,3 +291,7 @@ class Sphere(AbstractSurface):
     def position(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
         normal = self.frame(place, path)[2]
         return tuple(-self.radius * component for component in normal)
+
+    @property
+    def semi_axes(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        return self.radius, self.radius

@@ -75,7 +75,8 @@ def sweep(
     **Raises:** `OSError` or `ValueError` if the file cannot be written or holds another request.
     """
     coords = {one.name: one.values for one in axes}
-    units = {one.name: one.unit for one in axes} | {name: one.unit for name, one in variables.items()}
+    units = {one.name: one.unit for one in axes}
+    units |= {name: one.unit for name, one in variables.items() if one.words is None}
     cells = int(np.prod([len(one.values) for one in axes], dtype=int))
     block = block_for(cells) if block is None else block
     firsts = range(0, cells, block)

@@ -31,10 +31,10 @@ def require(
     value: Any,
     name: str,
     *,
-    above: float | None = None,
-    at_least: float | None = None,
-    below: float | None = None,
-    at_most: float | None = None,
+    above: Any = None,
+    at_least: Any = None,
+    below: Any = None,
+    at_most: Any = None,
     why: str = "",
 ) -> None:
     """Raise `ValueError` unless every number in `value` is finite and within the bounds.

@@ -5,11 +5,10 @@ vanishes identically (no curvature on a plane, no force without friction). Sums 
 `None`, so one formula serves every scene and a scene evaluates only the terms it has.
 """
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
-from jaxtyping import Array, Float
-
-Component: TypeAlias = Float[Array, "..."] | float | None
+#: An array over the lanes, a number, or `None` where the component vanishes identically.
+Component: TypeAlias = Any
 Vector: TypeAlias = tuple[Component, Component, Component]
 
 

@@ -43,11 +43,15 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--I3", type=float, help="axial moment of inertia [kg m^2] (default: 2/5 m R^2)")
     scene = told.add_argument_group("the scene")
     scene.add_argument("--cylinder-radius", type=float, default=0.3, help="radius of the cylinder [m]")
-    scene.add_argument("--mu", type=float, default=0.3, help="friction: viscous [s/m], or Coulomb [1] with --slip-speed")
+    scene.add_argument(
+        "--mu", type=float, default=0.3, help="friction: viscous [s/m], or Coulomb [1] with --slip-speed"
+    )
     scene.add_argument("--slip-speed", type=float, help="regularised Coulomb friction with this slip speed [m/s]")
     scene.add_argument("--gravity", type=float, default=9.81, help="acceleration of free fall [m/s^2]")
     launch = told.add_argument_group("the launches")
-    launch.add_argument("--theta", type=float, nargs="+", default=list(paper.THETAS), help="inclinations theta(0) [rad]")
+    launch.add_argument(
+        "--theta", type=float, nargs="+", default=list(paper.THETAS), help="inclinations theta(0) [rad]"
+    )
     launch.add_argument("--eta", type=float, nargs="+", default=[0.0, math.pi / 2.0], help="places eta(0) [rad]")
     launch.add_argument("--beta1", type=float, default=paper.BETA1, help="I3 w3 at the start [kg m^2/s]")
     launch.add_argument("--spin", type=float, help="spin w3 at the start [rad/s], instead of --beta1")

@@ -172,7 +172,9 @@ def _event_times(run: _Run, cells: int, *leaves: Float[Array, "..."]) -> Float[A
     return jnp.where(inverted, outcome.crossing_time, jnp.inf)
 
 
-def _event_slopes(run: _Run, active: list[int], cells: int, *leaves: Float[Array, "..."]) -> list[Float[Array, " cells"]]:
+def _event_slopes(
+    run: _Run, active: list[int], cells: int, *leaves: Float[Array, "..."]
+) -> list[Float[Array, " cells"]]:
     """Derivatives of the event's time with respect to the active numbers, 0 where there is no event.
 
     Cells do not influence one another, so moving a number in all of them at once gives every cell its own derivative.
@@ -189,9 +191,7 @@ def _event_slopes(run: _Run, active: list[int], cells: int, *leaves: Float[Array
     point = tuple(leaves[i] for i in active)
     if len(active) == 1:
         return [jax.jvp(times, point, (jnp.ones_like(point[0]),))[1]]
-    directions = tuple(
-        jnp.zeros((len(active), *leaf.shape), leaf.dtype).at[k].set(1.0) for k, leaf in enumerate(point)
-    )
+    directions = tuple(jnp.zeros((len(active), *leaf.shape), leaf.dtype).at[k].set(1.0) for k, leaf in enumerate(point))
     slopes = jax.vmap(lambda *direction: jax.jvp(times, point, direction)[1])(*directions)
     return list(slopes)
 

@@ -1,5 +1,6 @@
 """One run of a tippe top, with its path."""
 
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -55,8 +56,20 @@ class Run(AbstractProblem):
         return self.dynamics.contact_margin(state[: len(self.state)])
 
 
+def _of_each_run(function: Callable[["Trajectory"], Array]) -> property:
+    """A property of one run that is, for a batch of runs as `vmap` returns it, the property of each."""
+
+    def get(self):
+        mapped = function
+        for _ in range(self.t.ndim - 1):
+            mapped = eqx.filter_vmap(mapped)
+        return mapped(self)
+
+    return property(get, doc=function.__doc__)
+
+
 class Trajectory(eqx.Module):
-    """A run of a tippe top.
+    """A run of a tippe top, or a batch of runs, with the batch first.
 
     Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame
     (t1, t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre.
@@ -77,65 +90,65 @@ class Trajectory(eqx.Module):
     stats: dict[str, Any]
     dense: Any
 
-    @property
+    @_of_each_run
     def theta(self) -> Float[Array, " times"]:
         """Angle from the normal to the axis [rad]."""
         return self.scene.theta(self.states)
 
-    @property
+    @_of_each_run
     def eta(self) -> Float[Array, " times"]:
         """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
         return self.scene.surface.angle(tuple(self.states[8:]), tuple(self.path))
 
-    @property
+    @_of_each_run
     def azimuth(self) -> Float[Array, " times"]:
         """Direction in which the axis leans [rad], from t1 towards t2, in (-pi, pi]."""
         return jnp.arctan2(self.states[3], self.states[2])
 
-    @property
+    @_of_each_run
     def spin(self) -> Float[Array, " times"]:
         """Angular velocity about the axis [rad/s]."""
         return self.scene.spin(self.states)
 
-    @property
+    @_of_each_run
     def axis(self) -> Float[Array, "times 3"]:
         """The unit vector e along the axis."""
         return self._fixed(tuple(self.states[2:5]))
 
-    @property
+    @_of_each_run
     def angular_momentum(self) -> Float[Array, "times 3"]:
         """Angular momentum about the centre of mass [kg m^2/s]."""
         return self._fixed(tuple(self.states[5:8]))
 
-    @property
+    @_of_each_run
     def velocity(self) -> Float[Array, "times 3"]:
         """Velocity of the sphere's centre [m/s]."""
         V = self.scene.dynamics.motion(self.states).velocity
         return self._fixed((*V, jnp.zeros_like(V[0])))
 
-    @property
+    @_of_each_run
     def position(self) -> Float[Array, "times 3"]:
         """Position of the sphere's centre [m]; the plane is z = 0, the cylinder's axis x = z = 0."""
         foot = self.scene.surface.position(tuple(self.states[8:]), tuple(self.path))
         normal = self.scene.surface.frame(tuple(self.states[8:]), tuple(self.path))[2]
         return jnp.stack([q + self.scene.body.radius * n for q, n in zip(foot, normal, strict=True)], axis=-1)
 
-    @property
+    @_of_each_run
     def energy(self) -> Float[Array, " times"]:
         """Kinetic and potential energy [J]."""
         return self.scene.energy(self.states)
 
-    @property
+    @_of_each_run
     def jellett(self) -> Float[Array, " times"]:
         """Jellett's quantity [kg m^3/s]; constant on the plane."""
         return self.scene.jellett(self.states)
 
-    @property
+    @_of_each_run
     def normal_force(self) -> Float[Array, " times"]:
         """Normal force [N]."""
         return self.scene.normal_force(self.states)
 
-    @property
+    @_of_each_run
     def slip(self) -> Float[Array, "times 2"]:
         """Velocity of the contact point along the arena, in the moving frame [m/s]."""
         return self.scene.slip_velocity(self.states).T
@@ -158,8 +171,8 @@ class Trajectory(eqx.Module):
         return jnp.stack([dot(vector, directions) for directions in zip(*frame, strict=True)], axis=-1)
 
     def __str__(self) -> str:
-        if is_traced(self.t):
-            return f"Trajectory({len(self.t)} times, traced)"
+        if is_traced(self.t) or self.t.ndim > 1:
+            return f"Trajectory of {self.t.shape} times"
         end = f"{float(self.end_time):.6g} s"
         ending = {"reached t1": f"ran to {end}", "contact_lost": f"lost contact at {end}"}
         lines = [
@@ -190,8 +203,8 @@ def simulate(
 ) -> Trajectory:
     """Run one launch until `t1` or until contact is lost.
 
-    Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run are then not
-    finite, and `status` and `end_time` say so.
+    Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run are then not a
+    number, and `status` and `end_time` say so.
 
     **Arguments:**
 
@@ -273,5 +286,8 @@ def _cut(trajectory: Trajectory, times: Any, states: Any) -> Trajectory:
     return eqx.tree_at(
         lambda one: (one.t, one.states, one.path, one.spin_angle, one.work),
         trajectory,
-        (jnp.asarray(times), *(jnp.asarray(part) for part in (states[:run_size], states[run_size:-2], states[-2], states[-1]))),
+        (
+            jnp.asarray(times),
+            *(jnp.asarray(part) for part in (states[:run_size], states[run_size:-2], states[-2], states[-1])),
+        ),
     )

@@ -20,6 +20,7 @@ contact point, whose velocity in the arena's tangent plane is v; its generalised
 Lagrange's equations with d'' = 0 are six linear equations in (u'', y'', theta'', phi'', psi'', N).
 u, theta, phi and the five rates are integrated; x, y and psi are cyclic and matter to nothing else.
 """
+
 from dataclasses import dataclass
 from math import atan2, cos, hypot, inf, pi, sin, sqrt
 
@@ -28,15 +29,16 @@ from scipy.integrate import DOP853
 from scipy.optimize import brentq
 
 X, Y, UP = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-TURN = {"z": 0, "x": 1, "y": 2}          # cyclic turn that takes the polar axis to the third place
-NEAR = np.array((0.1, 0.5))              # gaps (see `gaps`) below which a step is searched for an event,
-SUBDIVISIONS = 8                         # at this many places;
-TOUCH = 1e-9                             # a gap below zero by less than this is no event
+TURN = {"z": 0, "x": 1, "y": 2}  # cyclic turn that takes the polar axis to the third place
+NEAR = np.array((0.1, 0.5))  # gaps (see `gaps`) below which a step is searched for an event,
+SUBDIVISIONS = 8  # at this many places;
+TOUCH = 1e-9  # a gap below zero by less than this is no event
 
 
 @dataclass(frozen=True)
 class Scene:
     """Top, arena, friction and start; theta, eta and azimuth as seen from the arena's normal n."""
+
     mass: float
     radius: float
     offset: float
@@ -46,8 +48,8 @@ class Scene:
     spin: float
     eta: float = 0.0
     azimuth: float = 0.0
-    mu: float = 0.0                      # s/m if slip_speed is None, else a pure number
-    slip_speed: float | None = None      # m/s; None: viscous
+    mu: float = 0.0  # s/m if slip_speed is None, else a pure number
+    slip_speed: float | None = None  # m/s; None: viscous
     surface_radius: float | None = None  # m; None: the plane
     gravity: float = 9.81
 
@@ -58,7 +60,7 @@ def dot(a, b):
 
 def in_chart(vector, pole):
     """Components of a world vector in the chart with this polar axis."""
-    return vector[TURN[pole]:] + vector[:TURN[pole]]
+    return vector[TURN[pole] :] + vector[: TURN[pole]]
 
 
 def arena(scene, u, pole):
@@ -77,7 +79,7 @@ def axis(theta, phi):
 
 def friction(scene, vt, vy):
     """Tangential force per unit normal force."""
-    size = 1.0 if scene.slip_speed is None else sqrt(vt * vt + vy * vy + scene.slip_speed ** 2)
+    size = 1.0 if scene.slip_speed is None else sqrt(vt * vt + vy * vy + scene.slip_speed**2)
     return -scene.mu * vt / size, -scene.mu * vy / size
 
 
@@ -90,29 +92,36 @@ def accelerations(scene, state, pole="z"):
     t, n, rho, k = arena(scene, u, pole)
     y, up = in_chart(Y, pole), in_chart(UP, pole)
     e, e1, e2, e12 = axis(th, ph)
-    st, ct, kth = sin(th), cos(th), (-sin(ph), cos(ph), 0.0)           # kth: axis of theta'
+    st, ct, kth = sin(th), cos(th), (-sin(ph), cos(ph), 0.0)  # kth: axis of theta'
     J, ma, mg, w3 = scene.I1 + m * a * a, m * a, m * scene.gravity, dps + dph * ct
     # e'' at theta'' = phi'' = 0: -e theta'^2 + 2 e12 theta' phi' + e22 phi'^2
     bend = [2 * p * dth * dph - q * dth * dth - r * dph * dph for p, q, r in zip(e12, e, (e[0], e[1], 0.0))]
-    climb = k * rho * du * du                                          # O''.n at u'' = 0
+    climb = k * rho * du * du  # O''.n at u'' = 0
     te1, te2, ye1, ye2, ne1, ne2 = dot(t, e1), dot(t, e2), dot(y, e1), dot(y, e2), dot(n, e1), dot(n, e2)
     # velocity of the contact point v = O' - R w x n along t and y; its derivatives by the rates
     t3, t4, t5 = -R * dot(kth, y), -R * y[2], -R * dot(e, y)
     y3, y4, y5 = R * dot(kth, t), R * t[2], R * dot(e, t)
     ft, fy = friction(scene, rho * du + t3 * dth + t4 * dph + t5 * dps, dy + y3 * dth + y4 * dph + y5 * dps)
-    matrix = np.array((
-        (m * rho * rho, 0.0, -ma * rho * te1, -ma * rho * te2, 0.0, -ft * rho),
-        (0.0, m, -ma * ye1, -ma * ye2, 0.0, -fy),
-        (0.0, 0.0, -ma * ne1, -ma * ne2, 0.0, -1.0),
-        (-ma * rho * te1, -ma * ye1, J, 0.0, 0.0, -ft * t3 - fy * y3),
-        (-ma * rho * te2, -ma * ye2, 0.0, J * st * st + I3 * ct * ct, I3 * ct, -ft * t4 - fy * y4),
-        (0.0, 0.0, 0.0, I3 * ct, I3, -ft * t5 - fy * y5)))
-    bias = np.array((
-        -ma * rho * dot(t, bend) + mg * rho * dot(t, up), -ma * dot(y, bend),
-        m * climb - ma * dot(n, bend) + mg * dot(n, up),
-        -ma * climb * ne1 - J * dph * dph * st * ct + I3 * w3 * dph * st - mg * a * dot(up, e1),
-        -ma * climb * ne2 + 2 * J * st * ct * dth * dph - I3 * st * dth * (w3 + ct * dph) - mg * a * dot(up, e2),
-        -I3 * st * dth * dph))
+    matrix = np.array(
+        (
+            (m * rho * rho, 0.0, -ma * rho * te1, -ma * rho * te2, 0.0, -ft * rho),
+            (0.0, m, -ma * ye1, -ma * ye2, 0.0, -fy),
+            (0.0, 0.0, -ma * ne1, -ma * ne2, 0.0, -1.0),
+            (-ma * rho * te1, -ma * ye1, J, 0.0, 0.0, -ft * t3 - fy * y3),
+            (-ma * rho * te2, -ma * ye2, 0.0, J * st * st + I3 * ct * ct, I3 * ct, -ft * t4 - fy * y4),
+            (0.0, 0.0, 0.0, I3 * ct, I3, -ft * t5 - fy * y5),
+        )
+    )
+    bias = np.array(
+        (
+            -ma * rho * dot(t, bend) + mg * rho * dot(t, up),
+            -ma * dot(y, bend),
+            m * climb - ma * dot(n, bend) + mg * dot(n, up),
+            -ma * climb * ne1 - J * dph * dph * st * ct + I3 * w3 * dph * st - mg * a * dot(up, e1),
+            -ma * climb * ne2 + 2 * J * st * ct * dth * dph - I3 * st * dth * (w3 + ct * dph) - mg * a * dot(up, e2),
+            -I3 * st * dth * dph,
+        )
+    )
     return np.linalg.solve(matrix, -bias)
 
 
@@ -121,13 +130,13 @@ def kinetic_potential(scene, q, dq, pole="z"):
     (u, _, d, th, ph, _), (du, dy, dd, dth, dph, dps) = q, dq
     st, ct, sp, cp = np.sin(th), np.cos(th), np.sin(ph), np.cos(ph)
     e, de = (st * cp, st * sp, ct), (ct * cp * dth - st * sp * dph, ct * sp * dth + st * cp * dph, -st * dth)
-    e, de = np.roll(e, TURN[pole]), np.roll(de, TURN[pole])            # from the chart to the world
+    e, de = np.roll(e, TURN[pole]), np.roll(de, TURN[pole])  # from the chart to the world
     height, dO = scene.radius + d, np.array((du, dy, dd))
     if scene.surface_radius is not None:
         rho, s, c = scene.surface_radius - scene.radius - d, np.sin(u), np.cos(u)
         height, dO = -rho * c, np.array((rho * du * c - dd * s, dy, rho * du * s + dd * c))
     ds = dO - scene.offset * de
-    T = (scene.mass * (ds @ ds) + scene.I1 * (dth ** 2 + dph ** 2 * st ** 2) + scene.I3 * (dps + dph * ct) ** 2) / 2
+    T = (scene.mass * (ds @ ds) + scene.I1 * (dth**2 + dph**2 * st**2) + scene.I3 * (dps + dph * ct) ** 2) / 2
     return T, scene.mass * scene.gravity * (height - scene.offset * e[2])
 
 
@@ -167,7 +176,7 @@ def best_chart(state, pole):
     """The same state in the chart whose pole is farthest from e: (state, pole)."""
     u, th, ph, du, dy, dth, dph, dps = state
     e, e1, e2, _ = axis(th, ph)
-    back = {"z": "z", "x": "y", "y": "x"}[pole]                        # undoes the turn to this chart
+    back = {"z": "z", "x": "y", "y": "x"}[pole]  # undoes the turn to this chart
     e, de = in_chart(e, back), in_chart(tuple(dth * p + dph * q for p, q in zip(e1, e2)), back)
     pole = min("xyz", key=lambda new: abs(in_chart(e, new)[2]))
     place, rate = in_angles(in_chart(e, pole), in_chart(de, pole), dps + dph * cos(th))
@@ -191,7 +200,7 @@ def solver(scene, t0, state, t1, rtol, pole, first=None):
     """DOP853 with absolute tolerance rtol on the angles (phi may wind up) and rtol of sqrt(g/R) on the rates."""
     rate = lambda _, x: np.concatenate((x[[3, 5, 6]], accelerations(scene, x.tolist(), pole)[:5]))
     swing = sqrt(max(scene.gravity, 1.0) / scene.radius)
-    length = scene.radius if scene.surface_radius is None else 1.0     # u is a length or an angle
+    length = scene.radius if scene.surface_radius is None else 1.0  # u is a length or an angle
     absolute = rtol * np.array((length, 1.0, 1.0, swing * length, swing * scene.radius, swing, swing, swing))
     return DOP853(rate, t0, state, t1, rtol=np.array((3e-14,) * 3 + (rtol,) * 5), atol=absolute, first_step=first)
 
@@ -205,7 +214,7 @@ def crossing(gap, ends, run, again):
     if k == 0:
         return inf
     low, high = max(run.t_old, times[k - 1] - piece), min(run.t, times[k] + piece)
-    if gap(again(low)) <= 0.0 or gap(again(high)) >= 0.0:              # no more than a touch away from here
+    if gap(again(low)) <= 0.0 or gap(again(high)) >= 0.0:  # no more than a touch away from here
         return float(times[k])
     return brentq(lambda t: gap(again(t)), low, high, xtol=1e-15, rtol=1e-15)
 
@@ -231,8 +240,12 @@ def follow(scene, t1, angle=0.95 * pi, rtol=1e-12, pole="x", closest=0.3):
         if run.status == "failed" or not np.all(np.isfinite(run.y)):
             return "failed", run.t, tilt(scene, state, pole), spare
         new = gaps(scene, angle, run.y, pole)
-        times = [crossing(lambda x: gaps(scene, angle, x, pole)[k], (old[k], new[k]), run, again)
-                 if min(old[k], new[k]) < NEAR[k] else inf for k in (0, 1)]
+        times = [
+            crossing(lambda x: gaps(scene, angle, x, pole)[k], (old[k], new[k]), run, again)
+            if min(old[k], new[k]) < NEAR[k]
+            else inf
+            for k in (0, 1)
+        ]
         time = min(times)
         if time < inf:
             return names[times.index(time)], time, tilt(scene, again(time), pole), spare

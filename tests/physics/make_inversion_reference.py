@@ -27,6 +27,7 @@ mostly the error of that second run, and so larger than the error of the values.
 
 Run: python make_inversion_reference.py   (about two minutes)
 """
+
 import csv
 from collections import Counter
 from dataclasses import asdict
@@ -34,7 +35,6 @@ from math import cos, inf, pi, sqrt
 from pathlib import Path
 
 import numpy as np
-
 from lagrange_top import Scene, follow
 
 SEED = 20240611
@@ -42,8 +42,21 @@ T1, ANGLE, MARGIN, AGREEMENT, ROUGH_AGREEMENT = 8.0, 0.95 * pi, 1e-3, 1e-9, 1e-4
 FAMILIES = ("plane-viscous", "plane-Coulomb", "cylinder-viscous", "cylinder-Coulomb")
 QUOTA = {"inverted": 5, "contact_lost": 3, "not_inverted": 2}
 FASTEST = 400.0
-PARAMETERS = ("mass", "radius", "offset", "I1", "I3", "surface_radius", "mu", "slip_speed", "gravity",
-              "theta", "spin", "eta", "azimuth")
+PARAMETERS = (
+    "mass",
+    "radius",
+    "offset",
+    "I1",
+    "I3",
+    "surface_radius",
+    "mu",
+    "slip_speed",
+    "gravity",
+    "theta",
+    "spin",
+    "eta",
+    "azimuth",
+)
 
 
 def five_digits(value):
@@ -64,8 +77,17 @@ def draw(rng, family):
     a, I3 = R * rng.uniform(0.1, 0.35), mass * R * R * rng.uniform(0.3, 0.45)
     I1, theta = I3 * rng.uniform(0.9, 1.1), rng.uniform(0.05, 0.5)
     spin = threshold_spin(mass, R, a, I1, I3, theta) * rng.uniform(0.5, 3.0)
-    values = dict(mass=mass, radius=R, offset=a, I1=I1, I3=I3, theta=theta, spin=spin,
-                  azimuth=rng.uniform(-pi, pi), mu=rng.uniform(0.1, 0.5))
+    values = dict(
+        mass=mass,
+        radius=R,
+        offset=a,
+        I1=I1,
+        I3=I3,
+        theta=theta,
+        spin=spin,
+        azimuth=rng.uniform(-pi, pi),
+        mu=rng.uniform(0.1, 0.5),
+    )
     if family.endswith("Coulomb"):
         values["slip_speed"] = rng.uniform(0.02, 0.2)
     if family.startswith("cylinder"):

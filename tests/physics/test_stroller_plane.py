@@ -69,7 +69,7 @@ def test_heading_on_a_tilted_plane_is_a_pendulum():
 
 
 def test_rolling_resistance_stops_the_stroller_after_its_distance():
-    """Section 7: v0^2 / (2 c g) on a level plane; 2.2938 m against 2.2936 m at v_s = 0.01 m/s, the difference of order v_s."""
+    """Section 7: v0^2 / (2 c g) on a level plane; 2.2938 m against 2.2936 m at v_s = 0.01 m/s, the rest as v_s^2."""
     v, c = 1.5, 0.05
     distance = v**2 / (2.0 * c * 9.81)
     errors = []
@@ -90,7 +90,7 @@ def test_side_forces_at_locked_steering_are_those_of_a_turn():
 
 
 def test_side_forces_add_up_to_the_centripetal_force():
-    """The wheels' forces across, from the second derivative of the path: m a = lambda_1 left + lambda_2 left_front + F."""
+    """The wheels' forces across, from the second derivative of the path: m a = lambda_1 left + lambda_2 left_f + F."""
     scene = Scene(Stroller(1.7, 0.7, 0.9, 0.05, centre=0.3), Plane(0.2), gravity=9.81, fork="absolute")
     state = scene.state(Launch((0.1, 0.2), 0.7, 1.3, 0.5, 0.8))
 
@@ -119,12 +119,12 @@ def test_stroller_at_rest_on_a_slope_is_held_by_its_wheels():
 
 
 def test_centre_of_mass_ahead_of_the_axle_comes_to_rest_at_the_lowest_point_of_its_circle():
-    """Damped at locked steering, e_up v + b left_up Omega = 0 at rest: tan(th) = l / (b tan(phi)), and the energy adds up."""
+    """At rest at locked steering, e_up v + b left_up Omega = 0: tan(th) = l / (b tan(phi)); and the energy adds up."""
     scene = Scene(Stroller(1.7, 0.7, 0.9, 0.05, centre=0.3), Plane(0.2), Damping(2.0))
     run = stroller.simulate(scene, Launch((0.0, 0.0), -np.pi / 2, 0.0, 0.5), 80.0, tolerance=1e-11)
     np.testing.assert_allclose(np.tan(run.heading[-1]), 0.7 / (0.3 * np.tan(0.5)), rtol=1e-8)
     np.testing.assert_allclose(run.energy_residual, 0.0, atol=1e-10)
-    assert float(run.energy[-1]) < float(run.energy[0]) - 0.5
+    assert float(run.energy[-1]) < float(run.energy[0]) - 0.1
 
 
 def test_spring_returns_the_fork():

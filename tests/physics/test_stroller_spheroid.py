@@ -120,7 +120,7 @@ def test_small_oscillation_about_a_parallel():
     phi = np.arctan(L * S / h_mu)
     chart = Chart(Scene(BODY, Spheroid(2.0, 1.1), gravity=WEIGHTLESS))
     state = jnp.array([eta, 0.3, 0.0, phi, v / np.cos(phi), 0.0])
-    jacobian = jax.jacfwd(lambda state: Hamel(chart).field(0.0, state))(state)
+    jacobian = jax.jit(jax.jacfwd(lambda state: Hamel(chart).field(0.0, state)))(state)
     # eta and psi oscillate at fixed steering and speed.
     frequency = np.max(np.imag(np.linalg.eigvals(np.asarray(jacobian)[np.ix_([0, 2], [0, 2])])))
     curvature = 1.1**2 / h_eta**4
@@ -128,7 +128,7 @@ def test_small_oscillation_about_a_parallel():
     # And of the P-form, whose pairs of eigenvalues it must be among.
     scene = chart.scene
     start = scene.state(Launch((0.3, eta), 0.0, v, phi))
-    rates = np.linalg.eigvals(jax.jacfwd(lambda state: frame_field(scene, state))(start))
+    rates = np.linalg.eigvals(jax.jit(jax.jacfwd(lambda state: frame_field(scene, state)))(start))
     assert np.min(np.abs(rates - 1j * frequency)) < 5e-9
 
 

@@ -1,0 +1,243 @@
+"""The equations of motion of the stroller in the P-form (`stroller.md`, section 5): no pole, no tan(phi).
+
+State, vectors in the ground's axes: position r of the rear axle, heading e, steering angle phi, quasi-momentum
+P = w sqrt(M_w) with w the speed of the front wheel and M_w its reduced mass, and the rate sg of the fork, phi' or, with
+a fork that turns with the frame, phi' + Omega. Then the work [J] done so far by the inputs and by friction, where there
+are any. The energy P^2/2 + J_f sg^2/2 + V is quadratic in the state, V linear but for the spring, so the implicit
+midpoint rule keeps its balance exactly.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nonholonomic.ground import AbstractGround
+from nonholonomic.vector import Component, Vector, add, cross, dot, multiply, scale, subtract
+
+from .friction import AbstractFriction, Drag, Rolling
+from .heading import AbstractHeading
+from .input import Input, Motion
+from .stroller import Stroller
+
+State = Float[Array, "components ..."]
+
+
+class Geometry(NamedTuple):
+    """How a state stands and moves, before any force is known."""
+
+    motion: Motion
+    momentum: Float[Array, "..."]
+    fork_rate: Float[Array, "..."]
+    normal: Vector
+    normal_rate: Vector
+    direction: Vector
+    velocity: Vector
+    left: Vector
+    lead: Component
+    gauge: Float[Array, "..."]
+    sine: Float[Array, "..."]
+    cosine: Float[Array, "..."]
+    normal_force: Component
+    front_load: Component
+
+
+class Forces(NamedTuple):
+    """Drive force [N] and steering torque [N m] of the input, and the friction."""
+
+    drive: Component
+    torque: Component
+    drag: Drag
+
+
+class Power(NamedTuple):
+    """Power [W] through each port: of the drive and the steering torque, and of friction at each of its places."""
+
+    drive: Component
+    steering: Component
+    rear: Component
+    front: Component
+    yaw: Component
+    fork: Component
+
+
+class Dynamics(eqx.Module):
+    """A scene with its choices resolved.
+
+    `side` is 1 outside and -1 inside; `absolute` is 1 where the fork turns with the frame and `None` where it does not.
+    """
+
+    body: Stroller
+    surface: AbstractGround
+    friction: AbstractFriction
+    gravity: Float[Array, "..."]
+    heading: AbstractHeading
+    side: float = eqx.field(static=True)
+    absolute: float | None = eqx.field(static=True)
+
+    def unpack(self, state: State) -> tuple[Vector, Vector, State]:
+        """Position, heading and the rest of a state."""
+        place, turned = self.surface.axes, self.surface.axes + self.heading.axes(self.surface)
+        return padded(state[:place]), padded(state[place:turned]), state[turned:]
+
+    def inertia(self, direction: Vector, lead: Component, sine: Component, cosine: Component) -> Component:
+        """Reduced mass M_w = m cos^2(phi) d.d + J nu^2 sin^2(phi) / l^2 [kg] of the front wheel's speed."""
+        arm = multiply(lead, sine, 1.0 / self.body.wheelbase)
+        along = multiply(self.body.mass, cosine, cosine, self.heading.square(direction))
+        return along + self.body.inertia * arm * arm
+
+    def geometry(self, state: State) -> Geometry:
+        """Velocities, rates and normal force at a state (components, ...)."""
+        body, surface, side = self.body, self.surface, self.side
+        r, e, (phi, P, fork_rate) = (*self.unpack(state)[:2], self.unpack(state)[2][:3])
+        sine, cosine = jnp.sin(phi), jnp.cos(phi)
+        n = surface.outward(r)
+        unit = self.heading.unit(e, n)
+        d, lead = self.heading.direction(unit, n, side), self.heading.lead(n, side)
+        gauge = 1.0 / jnp.sqrt(self.inertia(d, lead, sine, cosine))
+        wheel = P * gauge
+        velocity = scale(wheel * cosine, d)
+        turning = surface.outward_rate(r, velocity)
+        front_speed = multiply(wheel, lead)
+        yaw_rate = front_speed * sine / body.wheelbase
+        motion = Motion(
+            position=r,
+            heading=unit,
+            steering=phi,
+            speed=front_speed * cosine,
+            front_speed=front_speed,
+            yaw_rate=yaw_rate,
+            steering_rate=subtract(fork_rate, multiply(self.absolute, yaw_rate)),
+        )
+        weight = multiply(side, body.mass * self.gravity, dot(n, surface.up))
+        normal_force = subtract(weight, multiply(side, body.mass, dot(turning, velocity)))
+        share = None if body.centre is None else body.centre / body.wheelbase
+        return Geometry(
+            motion=motion,
+            momentum=P,
+            fork_rate=fork_rate,
+            normal=n,
+            normal_rate=turning,
+            direction=d,
+            velocity=velocity,
+            left=scale(side, cross(n, d)),
+            lead=lead,
+            gauge=gauge,
+            sine=sine,
+            cosine=cosine,
+            normal_force=normal_force,
+            front_load=multiply(normal_force, share),
+        )
+
+    def forces(self, t: Float[Array, "..."], geometry: Geometry, input: Input | None) -> Forces:
+        """What drives and what brakes, at a time [s]."""
+        motion = geometry.motion
+        drive, torque = (None, None) if input is None else input(t, motion)
+        rear_load = subtract(geometry.normal_force, geometry.front_load)
+        speeds = (motion.speed, motion.front_speed, motion.yaw_rate, motion.steering_rate)
+        return Forces(drive, torque, self.friction.drag(Rolling(*speeds, rear_load, geometry.front_load)))
+
+    def fork_torque(self, geometry: Geometry, forces: Forces) -> Component:
+        """All torque [N m] about the steering axis."""
+        spring = multiply(self.body.steering_spring, geometry.motion.steering)
+        return subtract(add(forces.torque, forces.drag.steering), spring)
+
+    def power(self, geometry: Geometry, forces: Forces) -> Power:
+        """Power [W] through each port."""
+        motion, drag = geometry.motion, forces.drag
+        return Power(
+            drive=multiply(forces.drive, motion.speed),
+            steering=multiply(forces.torque, motion.steering_rate),
+            rear=multiply(drag.rear, motion.speed),
+            front=multiply(drag.front, motion.front_speed),
+            yaw=multiply(drag.yaw, motion.yaw_rate),
+            fork=multiply(drag.steering, motion.steering_rate),
+        )
+
+    def field(self, t: Float[Array, "..."], state: State, input: Input | None = None) -> State:
+        """Rate of change of the state, (components, ...)."""
+        body, g, e = self.body, self.geometry(state), self.unpack(state)[1]
+        forces = self.forces(t, g, input)
+        drag, torque = forces.drag, self.fork_torque(g, forces)
+        arm = g.sine / body.wheelbase
+        weight = body.mass * self.gravity
+        # The centre of mass ahead of the axle swings with the yaw; its weight then has a moment about the normal.
+        across = cross(g.normal, e)
+        swing = multiply(weight, body.centre, self.side, dot(across, self.surface.up))
+        turning = subtract(drag.yaw, add(multiply(self.absolute, torque), swing))
+        pushing = add(multiply(g.cosine, add(forces.drive, drag.rear)), drag.front, multiply(arm, turning))
+        falling = multiply(weight, g.cosine, dot(g.direction, self.surface.up))
+        momentum_rate = multiply(g.gauge, subtract(multiply(g.lead, pushing), falling))
+        heading_rate = self.heading.rate(e, g.normal, g.normal_rate, g.motion.yaw_rate, self.side)
+        power = self.power(g, forces)
+        return stacked(
+            (
+                *g.velocity[: self.surface.axes],
+                *heading_rate[: self.heading.axes(self.surface)],
+                g.motion.steering_rate,
+                momentum_rate,
+                multiply(torque, 1.0 / body.steering_inertia),
+                *((power.drive, power.steering) if input is not None else ()),
+                *((add(*power[2:]),) if self.friction.dissipates else ()),
+            ),
+            state,
+        )
+
+    def energy(self, state: State) -> Float[Array, "..."]:
+        """Energy H = P^2/2 + J_f sg^2/2 + m g z + k phi^2/2 [J], z the height of the centre of mass."""
+        r, e, (phi, P, fork_rate) = (*self.unpack(state)[:2], self.unpack(state)[2][:3])
+        body = self.body
+        height = add(self.surface.elevation(r), multiply(body.centre, dot(e, self.surface.up)))
+        kinetic = 0.5 * (P * P + body.steering_inertia * fork_rate * fork_rate)
+        return add(kinetic, multiply(body.mass * self.gravity, height), multiply(0.5, body.steering_spring, phi, phi))
+
+    def side_force(
+        self, t: Float[Array, "..."], state: State, input: Input | None
+    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Side forces [N] of the ground on the rear axle and on the front wheel, to the left of each.
+
+        From the balance of momentum across and of spin about the normal (`stroller.md`, section 4), solved without
+        dividing by cos(phi). They hold for the intrinsic heading.
+        """
+        body = self.body
+
+        def speeds(state):
+            motion = self.geometry(state).motion
+            return motion.speed, motion.yaw_rate
+
+        rate = self.field(t, state, input)
+        (v, yaw), (v_rate, yaw_acceleration) = jax.jvp(speeds, (state,), (rate,))
+        g = self.geometry(state)
+        forces = self.forces(t, g, input)
+        weight, up = body.mass * self.gravity, self.surface.up
+        climb, bank = multiply(weight, dot(g.direction, up)), multiply(weight, dot(g.left, up))
+        centre_along = subtract(v_rate, multiply(body.centre, yaw, yaw))
+        centre_across = add(multiply(v, yaw), multiply(body.centre, yaw_acceleration))
+        along = add(body.mass * centre_along, climb, subtract(None, add(forces.drive, forces.drag.rear)))
+        spin = add(
+            body.inertia * yaw_acceleration,
+            multiply(body.mass, body.centre, v, yaw),
+            multiply(body.centre, bank),
+            multiply(self.absolute, self.fork_torque(g, forces)),
+            subtract(None, forces.drag.yaw),
+        )
+        front = g.cosine * spin / body.wheelbase - g.sine * along
+        # Curvature turns the frame as it is carried along, and the spin it has answers with a force across.
+        carried = add(body.inertia * yaw, multiply(self.absolute, body.steering_inertia, g.fork_rate))
+        gyration = multiply(self.surface.gaussian_curvature(g.motion.position), carried, v)
+        across = subtract(add(body.mass * centre_across, bank), add(gyration, multiply(forces.drag.front, g.sine)))
+        return across - front * g.cosine, front
+
+
+def padded(components: State) -> Vector:
+    """Components as a vector whose missing last ones vanish identically."""
+    vector = (*components, None, None)
+    return vector[0], vector[1], vector[2]
+
+
+def stacked(rates: tuple[Component, ...], state: State) -> State:
+    """Stack components along axis 0, with zeros where one vanishes identically."""
+    zero = jnp.zeros_like(state[0])
+    return jnp.stack([zero if rate is None else jnp.broadcast_to(rate, zero.shape) for rate in rates])

@@ -1,0 +1,120 @@
+"""Friction of the wheels and of the fork, along the velocities that the constraints leave free. A law is one class."""
+
+import abc
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nonholonomic.validation import as_number, require
+from nonholonomic.vector import Component
+
+
+class Rolling(NamedTuple):
+    """How the stroller moves: speeds [m/s] at which the wheels roll, rates [rad/s], loads [N] on the axles.
+
+    A load is `None` where it is exactly zero, as on the front axle with the centre of mass on the rear one.
+    """
+
+    rear_speed: Float[Array, "..."]
+    front_speed: Float[Array, "..."]
+    yaw_rate: Float[Array, "..."]
+    steering_rate: Float[Array, "..."]
+    rear_load: Component
+    front_load: Component
+
+
+class Drag(NamedTuple):
+    """What friction does: forces [N] along the wheels, torques [N m] about the normal and the steering axis."""
+
+    rear: Component = None
+    front: Component = None
+    yaw: Component = None
+    steering: Component = None
+
+
+class AbstractFriction(eqx.Module):
+    """A friction law."""
+
+    #: Whether the law can take energy; the work of one that cannot is not recorded.
+    dissipates: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def drag(self, rolling: Rolling) -> Drag:
+        """Forces and torques of friction.
+
+        **Arguments:**
+
+        - `rolling`: a `Rolling`.
+
+        **Returns:** a `Drag`; a part is `None` where it vanishes identically.
+        """
+
+
+class Frictionless(AbstractFriction):
+    """No friction: the wheels roll freely and do not slip sideways."""
+
+    dissipates: ClassVar[bool] = False
+
+    def drag(self, rolling: Rolling) -> Drag:
+        return Drag()
+
+
+class Damping(AbstractFriction):
+    """Viscous damping of the four free velocities, a Rayleigh function (`stroller.md`, section 7).
+
+    **Arguments:**
+
+    - `rolling`: c_v [N s/m] of the rear wheels' speed, at least 0.
+    - `front`: c_w [N s/m] of the front wheel's speed, at least 0.
+    - `scrub`: c_O [N m s] of the yaw rate, at least 0.
+    - `steering`: c_s [N m s] of the steering rate, at least 0.
+    """
+
+    rolling: Float[Array, "..."] = eqx.field(converter=as_number)
+    front: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+    scrub: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+    steering: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+
+    def __check_init__(self):
+        for name in ("rolling", "front", "scrub", "steering"):
+            require(getattr(self, name), name, at_least=0.0)
+
+    def drag(self, rolling: Rolling) -> Drag:
+        return Drag(
+            rear=-self.rolling * rolling.rear_speed,
+            front=-self.front * rolling.front_speed,
+            yaw=-self.scrub * rolling.yaw_rate,
+            steering=-self.steering * rolling.steering_rate,
+        )
+
+
+class RollingResistance(AbstractFriction):
+    """Rolling resistance F = -c N tanh(v / v_s) of each axle under its load N (`stroller.md`, section 7).
+
+    The regularisation creeps: a stroller on a slope too gentle to overcome the resistance does not stop, it goes on at
+    a speed of the order of v_s. An axle off the ground has no resistance.
+
+    **Arguments:**
+
+    - `coefficient`: c [1], at least 0.
+    - `speed`: v_s [m/s] at which 76 % of the resistance is reached, positive.
+    """
+
+    coefficient: Float[Array, "..."] = eqx.field(converter=as_number)
+    speed: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def __check_init__(self):
+        require(self.coefficient, "coefficient", at_least=0.0)
+        require(self.speed, "speed", above=0.0)
+
+    def drag(self, rolling: Rolling) -> Drag:
+        return Drag(
+            rear=self.resistance(rolling.rear_load, rolling.rear_speed),
+            front=self.resistance(rolling.front_load, rolling.front_speed),
+        )
+
+    def resistance(self, load: Component, speed: Float[Array, "..."]) -> Component:
+        """Force [N] along a wheel with the given load [N] that rolls at the given speed [m/s]."""
+        return None if load is None else -self.coefficient * jnp.maximum(load, 0.0) * jnp.tanh(speed / self.speed)

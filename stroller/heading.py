@@ -1,0 +1,120 @@
+"""Two readings of "the wheels do not slip sideways" on a curved ground; on a plane they are one.
+
+Both say that the rear axle moves with the velocity w cos(phi) d and that the heading turns at the rate
+w nu sin(phi) / l, with w the one free speed of the motion. They differ in the direction d, in the factor nu, and in
+what it is that turns.
+"""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nonholonomic.ground import AbstractGround
+from nonholonomic.vector import Component, Vector, cross, dot, multiply, scale, subtract, sum_vectors
+
+VERTICAL: Vector = (None, None, 1.0)
+
+
+class AbstractHeading(eqx.Module):
+    """What a heading is, and how it directs and turns the stroller. Vectors are in the ground's axes."""
+
+    @abc.abstractmethod
+    def axes(self, ground: AbstractGround) -> int:
+        """How many components of the heading do not vanish identically."""
+
+    @abc.abstractmethod
+    def unit(self, heading: Vector, normal: Vector) -> Vector:
+        """The heading put right where an integration has made it drift off the ground or off unit length.
+
+        A right one stays as it is, and so does the rate at which it turns.
+        """
+
+    @abc.abstractmethod
+    def direction(self, heading: Vector, normal: Vector, side: float) -> Vector:
+        """The vector d along the ground, given the outward normal, and 1 for a stroller outside or -1 inside."""
+
+    @abc.abstractmethod
+    def square(self, direction: Vector) -> Component:
+        """The square d.d."""
+
+    @abc.abstractmethod
+    def lead(self, normal: Vector, side: float) -> Component:
+        """The factor nu."""
+
+    @abc.abstractmethod
+    def rate(self, heading: Vector, normal: Vector, normal_rate: Vector, turn: Component, side: float) -> Vector:
+        """Rate [1/s] of a heading that turns at the rate `turn` [rad/s] to the driver's left."""
+
+    @abc.abstractmethod
+    def at_angle(self, angle: Float[Array, "..."], east: Vector, north: Vector) -> Vector:
+        """The heading at an angle [rad], given the unit vectors of the place."""
+
+    @abc.abstractmethod
+    def angle(self, heading: Vector, east: Vector, north: Vector) -> Float[Array, "..."]:
+        """The angle [rad] of a heading, in (-pi, pi]."""
+
+
+class Intrinsic(AbstractHeading):
+    """The heading is a unit vector e along the ground that turns about the normal: d = e, nu = 1 (section 4)."""
+
+    def axes(self, ground: AbstractGround) -> int:
+        return ground.axes
+
+    def unit(self, heading: Vector, normal: Vector) -> Vector:
+        tangent = sum_vectors(heading, scale(subtract(None, dot(heading, normal)), normal))
+        return scale(1.0 / jnp.sqrt(dot(tangent, tangent)), tangent)
+
+    def direction(self, heading: Vector, normal: Vector, side: float) -> Vector:
+        return heading
+
+    def square(self, direction: Vector) -> Component:
+        return 1.0
+
+    def lead(self, normal: Vector, side: float) -> Component:
+        return 1.0
+
+    def rate(self, heading: Vector, normal: Vector, normal_rate: Vector, turn: Component, side: float) -> Vector:
+        yaw = scale(multiply(side, turn), normal)
+        return cross(sum_vectors(yaw, cross(normal, normal_rate)), heading)
+
+    def at_angle(self, angle: Float[Array, "..."], east: Vector, north: Vector) -> Vector:
+        return sum_vectors(scale(jnp.cos(angle), east), scale(jnp.sin(angle), north))
+
+    def angle(self, heading: Vector, east: Vector, north: Vector) -> Float[Array, "..."]:
+        return jnp.arctan2(dot(heading, north), dot(heading, east))
+
+
+class Projected(AbstractHeading):
+    """The heading is a horizontal unit vector h, as in the paper: d = h n_z - z (h.n), nu = n_z (section 3).
+
+    The velocity along d has the horizontal component n_z h, so the paper's speed is w cos(phi) n_z, which passes
+    through zero at the equator. Where d = 0 the constraints lose rank.
+    """
+
+    def axes(self, ground: AbstractGround) -> int:
+        return 2
+
+    def unit(self, heading: Vector, normal: Vector) -> Vector:
+        return scale(1.0 / jnp.sqrt(dot(heading, heading)), heading)
+
+    def direction(self, heading: Vector, normal: Vector, side: float) -> Vector:
+        lift = scale(subtract(None, dot(heading, normal)), VERTICAL)
+        return scale(side, sum_vectors(scale(normal[2], heading), lift))
+
+    def square(self, direction: Vector) -> Component:
+        return dot(direction, direction)
+
+    def lead(self, normal: Vector, side: float) -> Component:
+        return multiply(side, normal[2])
+
+    def rate(self, heading: Vector, normal: Vector, normal_rate: Vector, turn: Component, side: float) -> Vector:
+        # The driver's left is to the left as seen from above on either side, as the paper's equations have it.
+        return cross(scale(turn, VERTICAL), heading)
+
+    def at_angle(self, angle: Float[Array, "..."], east: Vector, north: Vector) -> Vector:
+        return (jnp.cos(angle), jnp.sin(angle), None)
+
+    def angle(self, heading: Vector, east: Vector, north: Vector) -> Float[Array, "..."]:
+        return jnp.arctan2(heading[1], heading[0])

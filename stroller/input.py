@@ -1,0 +1,54 @@
+"""What drives the stroller: a function of time and motion that gives the drive force and the steering torque.
+
+Any function `(t, motion) -> (force, torque)` will do. It is called with arrays of any shape, one number per lane, so it
+is to be written with `jax.numpy` and without `if`. One that is an `equinox.Module` may hold numbers to differentiate.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from nonholonomic.validation import as_number, require
+from nonholonomic.vector import Vector
+
+
+class Motion(NamedTuple):
+    """What an input may know of the stroller's state.
+
+    `position` [m] of the rear axle and `heading` [1], a unit vector, are tuples of components in the ground's axes, the
+    third `None` on a plane; `steering` [rad], `speed` [m/s] of the rear axle, `front_speed` [m/s] at which the front
+    wheel rolls, `yaw_rate` [rad/s] and `steering_rate` [rad/s], positive to the driver's left.
+    """
+
+    position: Vector
+    heading: Vector
+    steering: Float[Array, "..."]
+    speed: Float[Array, "..."]
+    front_speed: Float[Array, "..."]
+    yaw_rate: Float[Array, "..."]
+    steering_rate: Float[Array, "..."]
+
+
+Input: TypeAlias = Callable[[Float[Array, "..."], Motion], tuple[Float[Array, "..."], Float[Array, "..."]]]
+
+
+class Steady(eqx.Module):
+    """A constant drive force and steering torque.
+
+    **Arguments:**
+
+    - `force`: drive force [N] along the heading at the rear axle.
+    - `torque`: torque [N m] of the frame on the fork, positive to the driver's left.
+    """
+
+    force: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+    torque: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+
+    def __check_init__(self):
+        require(self.force, "force")
+        require(self.torque, "torque")
+
+    def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        return self.force, self.torque

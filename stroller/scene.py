@@ -1,0 +1,182 @@
+"""The scene: what rolls, on what ground, with what friction, under what gravity."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic.ground import AbstractGround
+from nonholonomic.surface import Plane
+from nonholonomic.validation import as_number, is_traced, require
+from nonholonomic.vector import multiply
+
+from .dynamics import Dynamics, State, stacked
+from .friction import AbstractFriction, Frictionless
+from .heading import Intrinsic, Projected
+from .launch import Launch
+from .stroller import Stroller
+
+SIDES = {"outside": 1.0, "inside": -1.0}
+FORKS = {"relative": None, "absolute": 1.0}
+HEADINGS = {"intrinsic": Intrinsic(), "projected": Projected()}
+
+#: Cosine of the steering angle, or of the slope, below which a start cannot be told from one at a right angle.
+RIGHT_ANGLE = 1e-9
+
+
+def require_word(word: Any, name: str, words: dict[str, Any]) -> None:
+    """Raise `ValueError` unless `word` is one of the words."""
+    if not isinstance(word, str) or word not in words:
+        raise ValueError(f"{name} = {word!r} must be one of {', '.join(map(repr, words))}")
+
+
+class Scene(eqx.Module):
+    """A stroller on a ground.
+
+    Every number in it is a leaf of a pytree: it can be swept, traced and differentiated.
+
+    **Arguments:**
+
+    - `body`: a `Stroller`.
+    - `surface`: the ground: `Plane(tilt)`, `Sphere(radius)` or `Spheroid(equatorial, polar)`.
+    - `friction`: `Frictionless()`, `Damping(rolling, front, scrub, steering)` or
+      `RollingResistance(coefficient, speed)`.
+    - `gravity`: acceleration of free fall [m/s^2], at least 0.
+    - `side`: "outside" or "inside" of a sphere or spheroid.
+    - `fork`: "relative" if the fork's inertia resists the steering rate phi' alone, "absolute" if it resists its whole
+      rate phi' + Omega about the steering axis, as a rigid fork does.
+    - `heading`: "intrinsic", or "projected" to reproduce the paper, which constrains the horizontal projection of the
+      velocities (`stroller.md`, section 3, tells why that is not the default).
+
+    **Raises:** `ValueError` if a part is of the wrong kind, a word is not one of these, or a number is out of range.
+    """
+
+    body: Stroller
+    surface: AbstractGround = Plane()
+    friction: AbstractFriction = Frictionless()
+    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81)
+    side: str = eqx.field(static=True, default="outside")
+    fork: str = eqx.field(static=True, default="relative")
+    heading: str = eqx.field(static=True, default="intrinsic")
+
+    def __check_init__(self):
+        parts = (("body", self.body, Stroller), ("surface", self.surface, AbstractGround))
+        for name, part, kind in (*parts, ("friction", self.friction, AbstractFriction)):
+            if not isinstance(part, kind):
+                raise ValueError(f"{name} = {part!r} must be a {kind.__name__.removeprefix('Abstract')}")
+        require(self.gravity, "gravity", at_least=0.0)
+        require_word(self.side, "side", SIDES)
+        require_word(self.fork, "fork", FORKS)
+        require_word(self.heading, "heading", HEADINGS)
+        flat = isinstance(self.surface, Plane)
+        if flat and self.side == "inside":
+            raise ValueError("side = 'inside' must be 'outside' on a Plane")
+        if not flat and self.body.centre is not None:
+            raise ValueError(f"centre = {self.body.centre!r} must be 0.0 on a curved surface, where it is not exact")
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """The equations of motion, with the scene's choices resolved."""
+        return Dynamics(
+            body=self.body,
+            surface=self.surface,
+            friction=self.friction,
+            gravity=self.gravity,
+            heading=HEADINGS[self.heading],
+            side=SIDES[self.side],
+            absolute=FORKS[self.fork],
+        )
+
+    def check(self, launch: Launch) -> None:
+        """Raise `ValueError` if the scene cannot start as the launch says."""
+        if not isinstance(launch, Launch):
+            raise ValueError(f"launch = {launch!r} must be a Launch")
+        if not isinstance(self.surface, Plane):
+            limit = math.pi / 2.0 + 1e-12
+            require(
+                launch.place[1], "place[1]", at_least=-limit, at_most=limit, why="reduced latitude, from -pi/2 to pi/2"
+            )
+        if is_traced(launch.steering) or is_traced(launch.speed) or is_traced(launch.place[1]):
+            return
+        sideways = np.abs(np.cos(np.asarray(launch.steering))) < RIGHT_ANGLE
+        if np.any(sideways & (np.asarray(launch.speed) != 0.0)):
+            raise ValueError(
+                f"steering = {launch.steering!r} must differ from a right angle for speed = {launch.speed!r}: "
+                "the rear axle stands still when the front wheel stands across"
+            )
+        if self.heading == "projected" and not isinstance(self.surface, Plane):
+            level = np.abs(np.sin(np.asarray(launch.place[1]))) < RIGHT_ANGLE
+            if np.any(level):
+                raise ValueError(
+                    f"place[1] = {launch.place[1]!r} must differ from 0 for heading = 'projected': on the equator no "
+                    "horizontal speed belongs to a motion along the ground, and the constraints may lose rank"
+                )
+
+    def state(self, launch: Launch, driven: bool = False) -> State:
+        """The state at the start of a run (see `dynamics.py` for its components).
+
+        **Arguments:**
+
+        - `launch`: a `Launch` whose numbers, like the scene's, are scalars or one per lane.
+        - `driven`: whether there is an input, whose work the state then records.
+
+        **Returns:** an array (components, ...) in SI units.
+        """
+        dynamics = self.dynamics
+        position, east, north = self.surface.chart(launch.place)
+        heading = dynamics.heading.at_angle(launch.heading, east, north)
+        normal = self.surface.outward(position)
+        direction = dynamics.heading.direction(heading, normal, dynamics.side)
+        lead = dynamics.heading.lead(normal, dynamics.side)
+        sine, cosine = jnp.sin(launch.steering), jnp.cos(launch.steering)
+        wheel = launch.speed / (cosine * lead)
+        momentum = wheel * jnp.sqrt(dynamics.inertia(direction, lead, sine, cosine))
+        fork_rate = launch.steering_rate
+        if dynamics.absolute is not None:
+            fork_rate = fork_rate + wheel * lead * sine / self.body.wheelbase
+        axes = (*position[: self.surface.axes], *heading[: dynamics.heading.axes(self.surface)])
+        works = (None,) * (2 * driven + self.friction.dissipates)
+        start = (*axes, launch.steering, momentum, fork_rate, *works)
+        shape = jnp.broadcast_arrays(*(component for component in start if component is not None))[0]
+        return stacked(start, shape[None])
+
+    def scales(self, launch: Launch, driven: bool = False) -> State:
+        """Magnitudes by which absolute errors of the state are measured, component by component.
+
+        Positions count in wheelbases, directions and angles in units of 1, the rest in units of the launch's own speeds
+        or of a fall through a wheelbase, whichever is more.
+
+        **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
+        """
+        body, dynamics = self.body, self.dynamics
+        one = jnp.ones_like(self.state(launch, driven)[0])
+        rate = jnp.sqrt(self.gravity / body.wheelbase) + jnp.abs(launch.steering_rate) + 1e-3
+        rate = rate + jnp.abs(launch.speed) / body.wheelbase
+        speed = rate * body.wheelbase
+        places, headings = self.surface.axes, dynamics.heading.axes(self.surface)
+        motion = (one, jnp.sqrt(body.mass) * speed, rate)
+        works = (body.mass * speed**2,) * (2 * driven + self.friction.dissipates)
+        return stacked((*(body.wheelbase,) * places, *(one,) * headings, *motion, *works), one[None])
+
+    def energy(self, state: State) -> Float[Array, "..."]:
+        """Kinetic and potential energy [J] at a state."""
+        return self.dynamics.energy(state)
+
+    def work(self, state: State) -> Float[Array, "..."]:
+        """Work [J] done on the stroller so far by its inputs and by friction, negative where they took energy."""
+        first = self.surface.axes + self.dynamics.heading.axes(self.surface) + 3
+        return jnp.sum(state[first:], axis=0)
+
+    def rank(self, state: State) -> Float[Array, "..."]:
+        """Reduced mass M_w relative to m + J/l^2: at zero the constraints lose rank and the motion is undetermined."""
+        body, geometry = self.body, self.dynamics.geometry(state)
+        whole = body.mass + body.inertia / body.wheelbase**2
+        return 1.0 / (whole * geometry.gauge**2)
+
+    def contact(self, state: State) -> Float[Array, "..."]:
+        """Force of the ground on the stroller along its normal [N]; negative where the ground would have to pull."""
+        force = self.dynamics.geometry(state).normal_force
+        return jnp.broadcast_to(multiply(1.0, force), state[0].shape)

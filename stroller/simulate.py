@@ -1,0 +1,114 @@
+"""Run the stroller from a launch."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from nonholonomic.midpoint import ImplicitMidpoint
+from nonholonomic.validation import as_number, is_traced, require
+
+from .input import Input
+from .launch import Launch
+from .scene import Scene
+from .trajectory import Stats, Trajectory, Watch, read_off, watched
+
+#: How many times are saved where none are asked for.
+DEFAULT_TIMES = 201
+
+
+def simulate(
+    scene: Scene,
+    launch: Launch,
+    t1: Float[ArrayLike, ""],
+    input: Input | None = None,
+    times: Float[ArrayLike, " times"] | None = None,
+    tolerance: float = 1e-9,
+    solver: diffrax.AbstractSolver | None = None,
+    max_steps: int = 65536,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+) -> Trajectory:
+    """Run the stroller from a launch until `t1`.
+
+    **Arguments:**
+
+    - `scene`: a `Scene`.
+    - `launch`: a `Launch`.
+    - `t1`: end of the run [s], positive.
+    - `input`: a function `(t, motion) -> (drive force [N], steering torque [N m])` (see `input.py`), or `None`.
+    - `times`: times [s] to report, increasing, within [0, t1]; by default 201 equally spaced ones.
+    - `tolerance`: relative tolerance, and absolute tolerance in units of the scene's magnitudes, of an adaptive solver.
+    - `solver`: any Diffrax solver, by default `diffrax.Dopri8()`, or an `ImplicitMidpoint`.
+    - `max_steps`: a run that needs more has failed.
+    - `adjoint`: how Diffrax differentiates, by default for `jax.grad`; `diffrax.ForwardMode()` for `jax.jacfwd`.
+
+    **Returns:** a `Trajectory`; its `status` tells whether the run came to its end and what it met on the way.
+
+    **Raises:** `ValueError` for a launch that the scene cannot start from, or times that are not increasing.
+    """
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene = {scene!r} must be a Scene")
+    scene.check(launch)
+    require(t1, "t1", above=0.0)
+    require(tolerance, "tolerance", above=0.0, below=1.0)
+    times = jnp.linspace(0.0, t1, DEFAULT_TIMES) if times is None else as_number(times)
+    if times.ndim != 1 or times.size < 1:
+        raise ValueError(f"times = {times!r} must be a list of at least one time")
+    require(times, "times", at_least=0.0, at_most=t1)
+    if not is_traced(times) and np.any(np.diff(np.asarray(times)) <= 0.0):
+        raise ValueError(f"times = {times!r} must be increasing")
+    solver = diffrax.Dopri8() if solver is None else solver
+    adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+    grid = None
+    if isinstance(solver, ImplicitMidpoint):
+        grid = even_steps(times, t1, solver.step_length)
+        max_steps = grid.size
+    sol = solve(scene, launch, input, as_number(t1), times, grid, as_number(tolerance), solver, max_steps, adjoint)
+    stats = Stats(
+        sol.stats["num_accepted_steps"], sol.stats["num_rejected_steps"], sol.result == diffrax.RESULTS.successful
+    )
+    (t, states), (step_times, watch) = zip(sol.ts, sol.ys, strict=True)
+    return read_off(scene, input, t, states.T, Watch(step_times, *watch), stats)
+
+
+def even_steps(
+    times: Float[Array, " times"], t1: Float[ArrayLike, ""], longest: Float[Array, ""]
+) -> Float[Array, " steps"]:
+    """Times from 0 to `t1` at most `longest` apart that fall on every one of `times`, evenly between them."""
+    knots = np.union1d(np.asarray(times), [0.0, float(t1)])
+    counts = np.ceil(np.diff(knots) / float(longest) * (1.0 - 1e-12)).astype(int)
+    pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots, knots[1:], counts, strict=False)]
+    return jnp.asarray(np.concatenate([*pieces, knots[-1:]]))
+
+
+@eqx.filter_jit
+def solve(scene, launch, input, t1, times, grid, tolerance, solver, max_steps, adjoint) -> diffrax.Solution:
+    """Integrate, saving the states at `times` and, at every step, what a `Watch` follows."""
+    start = scene.state(launch, input is not None)
+    if grid is None:
+        scales = scene.scales(launch, input is not None)
+        controller = diffrax.PIDController(rtol=tolerance, atol=tolerance * jax.lax.stop_gradient(scales))
+        # Steps end on the times of output, where interpolation would lose a digit or two.
+        controller = diffrax.ClipStepSizeController(controller, step_ts=times)
+    else:
+        controller = diffrax.StepTo(grid)
+    dynamics = scene.dynamics
+    subs = (
+        diffrax.SubSaveAt(ts=times),
+        diffrax.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: watched(scene, y)),
+    )
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: dynamics.field(t, y, input)),
+        solver,
+        t0=jnp.zeros_like(t1),
+        t1=t1,
+        dt0=None,
+        y0=start,
+        saveat=diffrax.SaveAt(subs=subs),
+        stepsize_controller=controller,
+        max_steps=max_steps,
+        adjoint=adjoint,
+        throw=False,
+    )

@@ -1,0 +1,42 @@
+"""The body: a rigid frame on two rear wheels, with one front wheel in a fork that steers."""
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from nonholonomic.surface import none_if_zero
+from nonholonomic.validation import as_number, require
+
+
+class Stroller(eqx.Module):
+    """A stroller: wheels without mass or width, the steering axis through the front wheel's contact point.
+
+    **Arguments:**
+
+    - `mass`: mass [kg], positive.
+    - `wheelbase`: distance l [m] from the middle of the rear axle to the front contact point, positive.
+    - `inertia`: moment of inertia J [kg m^2] in yaw about the middle of the rear axle, positive.
+    - `steering_inertia`: moment of inertia J_f [kg m^2] of the fork about the steering axis, positive.
+    - `steering_spring`: stiffness [N m/rad] of a spring that pulls the fork straight, at least 0.
+    - `centre`: distance b [m] of the centre of mass ahead of the rear axle, in [0, `wheelbase`]; `inertia` is at least
+      `mass` b^2. It puts load on the front wheel. The equations hold for b > 0 on a plane.
+
+    **Raises:** `ValueError` for numbers outside these ranges.
+    """
+
+    mass: Float[Array, "..."] = eqx.field(converter=as_number)
+    wheelbase: Float[Array, "..."] = eqx.field(converter=as_number)
+    inertia: Float[Array, "..."] = eqx.field(converter=as_number)
+    steering_inertia: Float[Array, "..."] = eqx.field(converter=as_number)
+    steering_spring: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
+    centre: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
+
+    def __check_init__(self):
+        for name in ("mass", "wheelbase", "inertia", "steering_inertia"):
+            require(getattr(self, name), name, above=0.0)
+        if self.steering_spring is not None:
+            require(self.steering_spring, "steering_spring", at_least=0.0)
+        if self.centre is not None:
+            require(self.centre, "centre", at_least=0.0)
+            require(self.centre, "centre", at_most=self.wheelbase, why="the wheelbase")
+            least = self.mass * self.centre**2
+            require(self.inertia, "inertia", at_least=least, why="mass centre^2, as it is about the rear axle")

@@ -1,0 +1,260 @@
+"""One run of the stroller, and what can be read off it."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from nonholonomic.formulation import Multipliers
+from nonholonomic.vector import Component, dot, multiply, scale, sum_vectors
+
+from .charts import Chart, coordinates_and_rates
+from .dynamics import Power, State, padded
+from .input import Input
+from .scene import Scene
+
+#: Reduced mass, relative to its largest, below which the constraints count as having lost rank.
+RANK_LOST = 1e-8
+#: Pull on the ground, relative to the weight, that still counts as round-off.
+CONTACT_ROUND_OFF = 1e-12
+
+
+class Watch(NamedTuple):
+    """What is followed from one step of the integration to the next; unused entries are infinite or NaN."""
+
+    time: Float[Array, " steps"]
+    normal_force: Float[Array, " steps"]
+    steering_cosine: Float[Array, " steps"]
+    rank: Float[Array, " steps"]
+
+
+class Stats(NamedTuple):
+    """Numbers of accepted and rejected steps, and whether the integration came to its end."""
+
+    steps: Int[Array, ""]
+    rejected: Int[Array, ""]
+    finished: Bool[Array, ""]
+
+
+class Trajectory(eqx.Module):
+    """A run, at the times asked for. Times are the first axis of every array.
+
+    - `t` [s]; `place`: (x, y) [m] or (mu, eta) [rad], (times, 2); `position` [m] in the fixed frame, z up, (times, 3);
+    - `heading` [rad], as in `Launch`; `direction`: the same as a unit vector in the fixed frame, (times, 3);
+    - `steering` [rad], `steering_rate` [rad/s], `yaw_rate` [rad/s], `speed` of the rear axle and `front_speed` at which
+      the front wheel rolls [m/s];
+    - `energy` [J], `work` [J] done so far by inputs and friction, `power` [W] through each port (a `Power`);
+    - `side_force` [N] of the ground on the rear axle and the front wheel, to the left of each, (times, 2);
+    - `normal_force` [N] of the ground, and `load` [N] on the rear and the front axle, (times, 2);
+    - `constraint` [m/s]: speed at which the rear axle and the front wheel slip sideways, (times, 2);
+    - `departure`: how far the position is off the ground, relative to its size: an error of the integration;
+    - `watch` and `stats`: what the integration passed, step by step.
+    """
+
+    t: Float[Array, " times"]
+    place: Float[Array, "times 2"]
+    position: Float[Array, "times 3"]
+    heading: Float[Array, " times"]
+    direction: Float[Array, "times 3"]
+    steering: Float[Array, " times"]
+    speed: Float[Array, " times"]
+    front_speed: Float[Array, " times"]
+    steering_rate: Float[Array, " times"]
+    yaw_rate: Float[Array, " times"]
+    energy: Float[Array, " times"]
+    work: Float[Array, " times"]
+    power: Power
+    side_force: Float[Array, "times 2"]
+    normal_force: Float[Array, " times"]
+    load: Float[Array, "times 2"]
+    constraint: Float[Array, "times 2"]
+    departure: Float[Array, " times"]
+    state: Float[Array, "times components"]
+    watch: Watch
+    stats: Stats
+
+    @property
+    def energy_residual(self) -> Float[Array, " times"]:
+        """Energy less its start and the work done since [J]: zero for an exact solution."""
+        return self.energy - self.energy[0] - self.work
+
+    def grip(self) -> Float[Array, "times 2"]:
+        """Coefficient of friction that each axle needs in order not to slip; infinite for a force without a load."""
+        force = jnp.abs(self.side_force)
+        return jnp.where(force == 0.0, 0.0, force / jnp.maximum(self.load, 0.0))
+
+    def grip_margin(self, coefficient: Float[Array, ""]) -> Float[Array, "times 2"]:
+        """Side force [N] that each axle has left before it slips, given a coefficient of friction [1]."""
+        return coefficient * jnp.maximum(self.load, 0.0) - jnp.abs(self.side_force)
+
+    @property
+    def contact_lost_at(self) -> float:
+        """Time [s] at which the ground first has to pull to keep the stroller on it; infinite if it never has to."""
+        force = np.asarray(self.watch.normal_force)
+        allowed = -CONTACT_ROUND_OFF * np.max(np.abs(force[np.isfinite(force)]), initial=0.0)
+        return first_crossing(self.watch.time, self.watch.normal_force, allowed)
+
+    @property
+    def rank_lost_at(self) -> float:
+        """Time [s] at which the constraints first lose rank, which only a projected heading can do; else infinite."""
+        return first_crossing(self.watch.time, self.watch.rank, RANK_LOST)
+
+    @property
+    def jackknifed_at(self) -> Float[np.ndarray, " times"]:
+        """Times [s] at which the steering angle passes a right angle, where the rear axle reverses."""
+        time, cosine = np.asarray(self.watch.time), np.asarray(self.watch.steering_cosine)
+        before, after = cosine[:-1], cosine[1:]
+        passes = np.flatnonzero((before > 0.0) != (after > 0.0))
+        passes = passes[np.isfinite(after[passes])]
+        share = before[passes] / (before[passes] - after[passes])
+        return time[passes] + share * (time[passes + 1] - time[passes])
+
+    @property
+    def status(self) -> str:
+        """`failed`, `rank_lost`, `contact_lost` or `completed`: the first of these words that holds.
+
+        After `contact_lost` the run goes on as if the ground could pull.
+        """
+        if not (bool(self.stats.finished) and np.all(np.isfinite(self.state))):
+            return "failed"
+        if np.isfinite(self.rank_lost_at):
+            return "rank_lost"
+        return "contact_lost" if np.isfinite(self.contact_lost_at) else "completed"
+
+    def __str__(self) -> str:
+        jackknives = self.jackknifed_at
+        lines = [
+            f"Trajectory of {self.t.size} times, {float(self.t[0]):g} s to {float(self.t[-1]):g} s: {self.status}",
+            f"  steps           {int(self.stats.steps)}, of which {int(self.stats.rejected)} rejected",
+            f"  end             place {shown(self.place[-1])}, heading {float(self.heading[-1]):.6g} rad, "
+            f"speed {float(self.speed[-1]):.6g} m/s, steering {float(self.steering[-1]):.6g} rad",
+            f"  energy          {float(self.energy[0]):.6g} J to {float(self.energy[-1]):.6g} J, "
+            f"work {float(self.work[-1]):.6g} J, residual {float(jnp.max(jnp.abs(self.energy_residual))):.1e} J",
+            f"  normal force    {float(jnp.min(self.normal_force)):.6g} N to {float(jnp.max(self.normal_force)):.6g} N",
+            f"  side forces     up to {shown(jnp.max(jnp.abs(self.side_force), axis=0))} N, rear and front",
+            f"  no-slip         {float(jnp.max(jnp.abs(self.constraint))):.1e} m/s",
+        ]
+        if np.isfinite(self.contact_lost_at):
+            lines.append(f"  contact lost    at {self.contact_lost_at:.6g} s; from there the ground pulls")
+        if np.isfinite(self.rank_lost_at):
+            lines.append(f"  rank lost       at {self.rank_lost_at:.6g} s; from there the motion is undetermined")
+        if jackknives.size:
+            lines.append(f"  jackknifed      at {', '.join(f'{time:.6g}' for time in jackknives)} s")
+        return "\n".join(lines)
+
+
+def shown(numbers: Float[Array, " n"]) -> str:
+    """Numbers in brackets, to six digits."""
+    return f"({', '.join(f'{float(number):.6g}' for number in numbers)})"
+
+
+def first_crossing(time: Float[Array, " steps"], value: Float[Array, " steps"], level: float) -> float:
+    """Time at which a value known at some times first falls below a level, by linear interpolation."""
+    time, value = np.asarray(time), np.asarray(value)
+    below = np.flatnonzero((value < level) & np.isfinite(time))
+    if below.size == 0:
+        return float("inf")
+    after = int(below[0])
+    if after == 0:
+        return float(time[0])
+    share = (value[after - 1] - level) / (value[after - 1] - value[after])
+    return float(time[after - 1] + share * (time[after] - time[after - 1]))
+
+
+def watched(scene: Scene, state: State) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Normal force [N], cosine of the steering angle, and relative reduced mass at a state."""
+    geometry = scene.dynamics.geometry(state)
+    return scene.contact(state), geometry.cosine, scene.rank(state)
+
+
+def side_slip(scene: Scene, rate: State, state: State) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Speeds [m/s] at which the rear axle and the front wheel slip sideways when the state changes at `rate`.
+
+    They come from the rates of the position r and of the heading, with the front wheel l ahead of the rear axle.
+    """
+    dynamics, body = scene.dynamics, scene.body
+
+    def heading_components(state):
+        return [component for component in dynamics.geometry(state).motion.heading if component is not None]
+
+    g = dynamics.geometry(state)
+    velocity = dynamics.unpack(rate)[0]
+    turning = padded(jax.jvp(heading_components, (state,), (rate,))[1])
+    if scene.heading == "projected":
+        along, left = g.motion.heading, (-g.motion.heading[1], g.motion.heading[0], None)
+    else:
+        along, left = g.direction, g.left
+    sideways = sum_vectors(scale(-g.sine, along), scale(g.cosine, left))
+    front = sum_vectors(velocity, scale(multiply(body.wheelbase, dot(turning, left)), left))
+    return dot(velocity, left), dot(front, sideways)
+
+
+def spread(component: Component, like: Float[Array, "..."]) -> Float[Array, "..."]:
+    """A component as an array, zeros where it vanishes identically."""
+    return jnp.zeros_like(like) if component is None else jnp.broadcast_to(component, like.shape)
+
+
+def side_force(
+    scene: Scene, t: Float[Array, " times"], states: Float[Array, "components times"], input: Input | None
+) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
+    """Side forces [N] on the rear axle and the front wheel, to the left of each."""
+    if scene.heading == "intrinsic":
+        return scene.dynamics.side_force(t, states, input)
+    # The paper's constraints act along the horizontal, not along the axle; their forces are its multipliers.
+    chart = Chart(scene, input)
+
+    def multipliers(t, state):
+        return Multipliers(chart).multipliers(t, *coordinates_and_rates(scene, t, state, input))
+
+    rear, front = jax.vmap(multipliers, in_axes=(0, 1), out_axes=1)(t, states)
+    return rear, front
+
+
+@eqx.filter_jit
+def read_off(
+    scene: Scene,
+    input: Input | None,
+    t: Float[Array, " times"],
+    states: Float[Array, "components times"],
+    watch: Watch,
+    stats: Stats,
+) -> Trajectory:
+    """The trajectory of the given states at the given times."""
+    dynamics, surface = scene.dynamics, scene.surface
+    g = dynamics.geometry(states)
+    motion, like = g.motion, states[0]
+    place = surface.place_at(motion.position)
+    _, east, north = surface.chart(place)
+    power = dynamics.power(g, dynamics.forces(t, g, input))
+    normal_force = spread(g.normal_force, like)
+    front_load = spread(g.front_load, like)
+
+    def columns(*components):
+        return jnp.stack([spread(component, like) for component in components], axis=-1)
+
+    return Trajectory(
+        t=t,
+        place=columns(*place),
+        position=columns(*surface.in_fixed_frame(motion.position)),
+        heading=dynamics.heading.angle(motion.heading, east, north),
+        direction=columns(*surface.in_fixed_frame(motion.heading)),
+        steering=motion.steering,
+        speed=motion.speed,
+        front_speed=motion.front_speed,
+        steering_rate=spread(motion.steering_rate, like),
+        yaw_rate=motion.yaw_rate,
+        energy=scene.energy(states),
+        work=scene.work(states),
+        power=Power(*(spread(part, like) for part in power)),
+        side_force=columns(*side_force(scene, t, states, input)),
+        normal_force=normal_force,
+        load=columns(normal_force - front_load, front_load),
+        constraint=columns(*side_slip(scene, dynamics.field(t, states, input), states)),
+        departure=spread(surface.departure(motion.position), like),
+        state=states.T,
+        watch=watch,
+        stats=stats,
+    )

@@ -1,0 +1,102 @@
+"""What must not change, or change at a known rate: energy, Jellett's constant, the length of the axis."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close, random_states, rutstam_top
+
+import tippe
+
+LAWS = {
+    "frictionless": tippe.Frictionless(),
+    "viscous": tippe.Viscous(0.3),
+    "coulomb": tippe.Coulomb(0.3, 0.05),
+}
+ARENAS = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3), "sphere": tippe.Sphere(0.3)}
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_jelletts_constant_on_the_plane(law):
+    """lambda is constant to 1e-9 over 30 s for every friction at the contact point, and |e| = 1 with it."""
+    scene = tippe.Scene(rutstam_top(), tippe.Plane(), LAWS[law])
+    run = tippe.simulate(scene, tippe.Launch(0.1, 100.0), 30.0, tolerance=1e-11)
+    assert run.status == "reached t1"
+    assert_close(run.jellett, run.jellett[0], rtol=1e-9)
+    assert run.stats["axis_drift"] < 1e-9
+
+
+def test_the_axis_keeps_its_length_without_projection(rutstam_scene):
+    """|e| = 1 to 1e-9 at tolerance 1e-10, through the whole inversion."""
+    run = tippe.simulate(rutstam_scene, tippe.Launch(0.1, 155.0), 8.0, tolerance=1e-10)
+    assert run.stats["axis_drift"] < 1e-9
+
+
+@pytest.mark.parametrize("arena", ARENAS)
+@pytest.mark.parametrize("law", LAWS)
+def test_energy_changes_by_the_work_of_friction(arena, law):
+    """dE = integral of N f.v_s dt to 1e-8 of E; without friction E is constant, with it E never grows."""
+    scene = tippe.Scene(rutstam_top(), ARENAS[arena], LAWS[law])
+    run = tippe.simulate(scene, tippe.Launch(0.3, 100.0, eta=0.4 if arena != "plane" else 0.0), 2.0, tolerance=1e-10)
+    energy = np.asarray(run.energy)
+    assert run.stats["energy_residual"] < 1e-8 * energy[0]
+    assert np.all(np.diff(energy) <= 1e-12 * energy[0])
+    if law == "frictionless":
+        assert_close(energy, energy[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("arena", ARENAS)
+@pytest.mark.parametrize("law", LAWS)
+def test_rates_of_energy_and_jellett_at_random_states(arena, law):
+    """dE/dt = N f.v_s and dlambda/dt = R L.n' (0 on the plane), term by term, at 200 random states."""
+    scene = tippe.Scene(rutstam_top(), ARENAS[arena], LAWS[law])
+    states = random_states(scene, 200)
+    rates = scene.field(states)
+    _, energy_rate = jax.jvp(scene.energy, (states,), (rates,))
+    scale = np.abs(np.asarray(scene.energy(states))) * 100.0
+    assert_close(energy_rate / scale, scene.friction_power(states) / scale, atol=1e-13)
+    assert np.all(np.asarray(scene.friction_power(states)) * np.sign(scene.normal_force(states)) <= 0.0)
+    _, jellett_rate = jax.jvp(scene.jellett, (states,), (rates,))
+    motion = scene.dynamics.motion(states)
+    turning = [jnp.zeros(200) if part is None else part for part in motion.turning]
+    expected = -scene.body.radius * (turning[0] * states[5] + turning[1] * states[6])
+    size = float(scene.body.radius) * float(scene.body.I3) * 100.0 * 100.0
+    assert_close(jellett_rate / size, expected / size, atol=1e-13)
+
+
+def test_jellett_is_not_constant_in_the_cylinder():
+    """There it changes by R L.n' along the way, by tens of percent."""
+    scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.2), tippe.Viscous(0.3))
+    run = tippe.simulate(scene, tippe.Launch(0.1, 120.0, eta=0.3), 3.0)
+    assert float(jnp.max(jnp.abs(run.jellett / run.jellett[0] - 1.0))) > 0.1
+
+
+def test_position_is_the_integral_of_velocity(rutstam_scene):
+    """The path's rate, on dense output, is the velocity of the centre: plane, cylinder and sphere."""
+    for arena in ARENAS.values():
+        scene = tippe.Scene(rutstam_top(), arena, tippe.Viscous(0.3))
+        run = tippe.simulate(scene, tippe.Launch(0.4, 120.0, eta=0.3), 0.5, tolerance=1e-11)
+        middle, step = np.linspace(0.1, 0.4, 7), 1e-4
+        ahead, behind = run.at(middle + step), run.at(middle - step)
+        difference = (np.asarray(ahead.position) - np.asarray(behind.position)) / (2.0 * step)
+        assert_close(difference, run.at(middle).velocity, atol=2e-5)
+        assert_close(np.linalg.norm(run.axis, axis=1), 1.0, atol=1e-10)
+
+
+def test_a_frictionless_run_goes_back_to_its_start():
+    """Reversing velocity and angular momentum retraces the way (time reversal)."""
+    from dataclasses import replace
+
+    import diffrax
+
+    from nonholonomic.integrate import follow
+    from tippe.trajectory import Run
+
+    scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Frictionless())
+    run = Run.of(scene, tippe.Launch(0.3, 60.0, eta=0.5))
+    there = follow(run, 1.0, solver=diffrax.Dopri8(), rtol=1e-12, atol=1e-13).states[:10, -1]
+    sign = np.array([-1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0, 1.0])
+    back = replace(run, state=jnp.asarray(there * sign))
+    home = follow(back, 1.0, solver=diffrax.Dopri8(), rtol=1e-12, atol=1e-13).states[:10, -1] * sign
+    assert_close(home[2:5], run.state[2:5], atol=1e-8)
+    assert_close(home[8:], run.state[8:], atol=1e-8)

@@ -1,0 +1,248 @@
+"""Runs: integrators, energy audit, reports, gradients, bad input."""
+
+import itertools
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import stroller
+from stroller import (
+    Damping,
+    ImplicitMidpoint,
+    Launch,
+    Plane,
+    RollingResistance,
+    Scene,
+    Sphere,
+    Spheroid,
+    Steady,
+    Stroller,
+)
+
+BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
+FULL = Scene(BODY, Spheroid(2.0, 1.1), Damping(0.3, 0.2, 0.1, 0.15), side="inside", fork="absolute")
+LAUNCH = Launch((0.3, -0.6), 0.5, 1.5, 0.2, 0.1)
+
+
+def push(t, motion):
+    return 2.0 * jnp.cos(t) + 0.5 * motion.speed, 0.1 * jnp.sin(2.0 * t) - 0.2 * motion.steering
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return stroller.simulate(FULL, LAUNCH, 10.0, push, times=jnp.linspace(0.0, 10.0, 11), tolerance=1e-12)
+
+
+@pytest.mark.parametrize(("side", "fork"), [("inside", "absolute"), ("outside", "relative")])
+def test_midpoint_rule_balances_energy_to_round_off(side, fork):
+    """Section 10b: 20 000 steps with friction and drive leave less than 1e-11 J, and the constraints at 1e-12 m/s."""
+    scene = Scene(BODY, Spheroid(2.0, 1.1), Damping(0.3, 0.2, 0.1, 0.15), side=side, fork=fork)
+    run = stroller.simulate(scene, LAUNCH, 200.0, push, solver=ImplicitMidpoint(0.01))
+    assert int(run.stats.steps) == 20_000
+    assert bool(run.stats.finished)
+    assert float(jnp.max(jnp.abs(run.work))) > 1.0
+    np.testing.assert_allclose(run.energy_residual, 0.0, atol=1e-11)
+    np.testing.assert_allclose(run.constraint, 0.0, atol=1e-12)
+    np.testing.assert_allclose(run.departure, 0.0, atol=2e-13)
+
+
+def test_midpoint_rule_is_of_second_order(reference):
+    """Halving the step divides the error by four."""
+    times = jnp.linspace(0.0, 10.0, 11)
+    errors = []
+    for step in (0.02, 0.01):
+        run = stroller.simulate(FULL, LAUNCH, 10.0, push, times=times, solver=ImplicitMidpoint(step))
+        errors.append(float(jnp.linalg.norm(run.position[3] - reference.position[3])))
+    np.testing.assert_allclose(errors[0] / errors[1], 4.0, rtol=0.03)
+
+
+def test_midpoint_steps_end_on_the_times_asked_for():
+    run = stroller.simulate(FULL, LAUNCH, 1.0, push, times=[0.0, 0.333, 1.0], solver=ImplicitMidpoint(0.1))
+    np.testing.assert_allclose(run.t, [0.0, 0.333, 1.0], rtol=1e-15)
+    assert int(run.stats.steps) == 4 + 7
+    np.testing.assert_allclose(run.energy_residual, 0.0, atol=1e-13)
+
+
+def test_adaptive_energy_error_follows_the_tolerance():
+    """Dopri8: the residual of energy against work falls with the tolerance, at the pace of the tolerance or better."""
+    tolerances = np.array([1e-5, 1e-7, 1e-9, 1e-11])
+    residuals = [energy_residual(tolerance) for tolerance in tolerances]
+    order = np.polyfit(np.log(tolerances), np.log(residuals), 1)[0]
+    assert 0.8 < order < 1.3
+    assert residuals[-1] < 1e-9
+
+
+def energy_residual(tolerance):
+    """Largest difference [J] between energy and start plus work, after five and ten seconds."""
+    run = stroller.simulate(FULL, LAUNCH, 10.0, push, times=[0.0, 5.0, 10.0], tolerance=tolerance)
+    return float(jnp.max(jnp.abs(run.energy_residual)))
+
+
+def test_any_diffrax_solver_will_do(reference):
+    """Tsit5 at its own tolerance ends where Dopri8 does."""
+    run = stroller.simulate(
+        FULL, LAUNCH, 10.0, push, times=jnp.linspace(0.0, 10.0, 11), tolerance=1e-10, solver=diffrax.Tsit5()
+    )
+    np.testing.assert_allclose(run.position, reference.position, atol=1e-7)
+
+
+def test_ports_and_power(reference):
+    """The port of the drive is the speed and that of the torque the steering rate; their products are the power."""
+    force, torque = push(reference.t, reference)
+    np.testing.assert_allclose(reference.power.drive, force * reference.speed, rtol=1e-14)
+    np.testing.assert_allclose(reference.power.steering, torque * reference.steering_rate, rtol=1e-13)
+    np.testing.assert_allclose(reference.power.rear, -0.3 * reference.speed**2, rtol=1e-14)
+    np.testing.assert_allclose(reference.power.fork, -0.15 * reference.steering_rate**2, rtol=1e-14)
+    assert reference.stats.finished
+
+
+def test_runs_are_vmapped_and_scene_numbers_too():
+    """simulate under vmap over speeds gives the single runs."""
+    speeds = jnp.array([0.5, 1.0, 1.5])
+
+    def end(speed):
+        launch = Launch((0.3, -0.6), 0.5, speed, 0.2, 0.1)
+        return stroller.simulate(FULL, launch, 2.0, push, times=[2.0], tolerance=1e-10).position[0]
+
+    together = jax.jit(jax.vmap(end))(speeds)
+    np.testing.assert_allclose(together[1], end(1.0), atol=1e-9)
+
+
+def central_difference(function, tree, where, scale):
+    """Central difference of a function of a tree by one of its numbers, at the step where it changes least."""
+    steps = scale * np.array([3e-3, 1e-3, 3e-4, 1e-4])
+    value = where(tree)
+    slopes = []
+    for h in steps:
+        ends = [function(eqx.tree_at(where, tree, value + offset)) for offset in (-2 * h, -h, h, 2 * h)]
+        slopes.append((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * h))
+    changes = [np.max(np.abs(a - b)) for a, b in itertools.pairwise(slopes)]
+    return slopes[int(np.argmin(changes)) + 1]
+
+
+NUMBERS = {
+    "mass": lambda scene: scene.body.mass,
+    "wheelbase": lambda scene: scene.body.wheelbase,
+    "inertia": lambda scene: scene.body.inertia,
+    "steering inertia": lambda scene: scene.body.steering_inertia,
+    "steering spring": lambda scene: scene.body.steering_spring,
+    "equatorial": lambda scene: scene.surface.equatorial,
+    "polar": lambda scene: scene.surface.polar,
+    "rolling": lambda scene: scene.friction.rolling,
+    "front": lambda scene: scene.friction.front,
+    "scrub": lambda scene: scene.friction.scrub,
+    "steering": lambda scene: scene.friction.steering,
+    "gravity": lambda scene: scene.gravity,
+}
+
+
+@pytest.fixture(scope="module")
+def sensitivities():
+    """Scene, final position as a function of it, and its reverse-mode derivatives."""
+    body = Stroller(1.7, 0.7, 0.4, 0.05, steering_spring=0.3)
+    scene = Scene(body, Spheroid(2.0, 1.1), Damping(0.3, 0.2, 0.1, 0.15), side="inside", fork="absolute")
+
+    @jax.jit
+    def end(scene):
+        return stroller.simulate(scene, LAUNCH, 2.0, push, times=[2.0], tolerance=1e-13).position[0]
+
+    return scene, end, jax.jit(jax.jacrev(end))(scene)
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_gradient_of_the_final_position(sensitivities, name):
+    """Every number of the scene, reverse mode against central differences of fourth order over a scan of steps."""
+    scene, end, gradient = sensitivities
+    where = NUMBERS[name]
+    expected = central_difference(end, scene, where, float(where(scene)))
+    np.testing.assert_allclose(where(gradient), expected, rtol=1e-7, atol=1e-7 * np.max(np.abs(expected)))
+
+
+def test_every_number_of_the_scene_has_its_gradient_tested(sensitivities):
+    scene, _, _ = sensitivities
+    assert len(jax.tree.leaves(scene)) == len(NUMBERS)
+
+
+def test_gradients_of_tilt_and_rolling_resistance_and_centre():
+    """The numbers of the other scenes, forward mode."""
+    body = Stroller(1.7, 0.7, 0.9, 0.05, centre=0.3)
+    scene = Scene(body, Plane(0.3), RollingResistance(0.05, 0.1))
+
+    @jax.jit
+    def end(scene):
+        launch = Launch((0.3, -0.6), 0.5, 1.5, 0.2, 0.1)
+        adjoint = diffrax.ForwardMode()
+        return stroller.simulate(scene, launch, 1.0, times=[1.0], tolerance=1e-13, adjoint=adjoint).position[0]
+
+    gradient = jax.jit(jax.jacfwd(end))(scene)
+    for where in (
+        lambda scene: scene.surface.tilt,
+        lambda scene: scene.friction.coefficient,
+        lambda scene: scene.friction.speed,
+        lambda scene: scene.body.centre,
+    ):
+        expected = central_difference(end, scene, where, float(where(scene)))
+        np.testing.assert_allclose(where(gradient), expected, rtol=1e-7, atol=1e-7 * np.max(np.abs(expected)))
+
+
+def test_a_run_that_cannot_finish_says_so():
+    run = stroller.simulate(FULL, LAUNCH, 10.0, push, max_steps=5)
+    assert run.status == "failed"
+    assert "failed" in str(run)
+
+
+def test_trajectory_reads_well():
+    text = str(stroller.simulate(FULL, LAUNCH, 10.0, push))
+    for words in ("201 times, 0 s to 10 s: completed", "energy", "residual", "normal force", "side forces", "no-slip"):
+        assert words in text
+
+
+BAD = [
+    (lambda: Stroller(0.0, 0.7, 0.4, 0.05), r"mass = 0\.0 must be greater than 0\.0"),
+    (lambda: Stroller(1.7, -0.7, 0.4, 0.05), r"wheelbase = -0\.7 must be greater than 0\.0"),
+    (lambda: Stroller(1.7, 0.7, 0.4, float("nan")), r"steering_inertia = nan must be finite"),
+    (lambda: Stroller(1.7, 0.7, 0.4, 0.05, centre=0.8), r"centre = 0\.8 must be at most 0\.7"),
+    (lambda: Stroller(1.7, 0.7, 0.1, 0.05, centre=0.5), r"inertia = 0\.1 must be at least 0\.425"),
+    (lambda: Stroller(1.7, 0.7, 0.4, 0.05, steering_spring=-1.0), r"steering_spring = -1\.0 must be at least 0\.0"),
+    (lambda: Damping(-0.1), r"rolling = -0\.1 must be at least 0\.0"),
+    (lambda: RollingResistance(0.1, 0.0), r"speed = 0\.0 must be greater than 0\.0"),
+    (lambda: Steady(force="much"), r"force = 'much' is not a number"),
+    (lambda: Launch(0.3, 0.0, 1.0), r"place = 0\.3 must be a pair of numbers"),
+    (lambda: Launch((0.0, 0.0), 0.0, np.inf), r"speed = inf must be finite"),
+    (lambda: Scene("pram"), r"body = 'pram' must be a Stroller"),
+    (lambda: Scene(BODY, surface=3.0), r"surface = 3\.0 must be a Ground"),
+    (lambda: Scene(BODY, friction=0.1), r"friction = 0\.1 must be a Friction"),
+    (lambda: Scene(BODY, gravity=-1.0), r"gravity = -1\.0 must be at least 0\.0"),
+    (lambda: Scene(BODY, side="under"), r"side = 'under' must be one of 'outside', 'inside'"),
+    (lambda: Scene(BODY, fork=1), r"fork = 1 must be one of 'relative', 'absolute'"),
+    (lambda: Scene(BODY, heading="north"), r"heading = 'north' must be one of 'intrinsic', 'projected'"),
+    (lambda: Scene(BODY, side="inside"), r"side = 'inside' must be 'outside' on a Plane"),
+    (lambda: Scene(Stroller(1.7, 0.7, 0.9, 0.05, centre=0.3), Sphere(1.0)), r"centre = .* must be 0\.0 on a curved"),
+    (lambda: stroller.simulate(BODY, LAUNCH, 1.0), r"scene = .* must be a Scene"),
+    (lambda: stroller.simulate(FULL, 1.0, 1.0), r"launch = 1\.0 must be a Launch"),
+    (lambda: stroller.simulate(FULL, LAUNCH, 0.0), r"t1 = 0\.0 must be greater than 0\.0"),
+    (lambda: stroller.simulate(FULL, LAUNCH, 1.0, times=[0.0, 2.0]), r"times = .* must be at most 1\.0"),
+    (lambda: stroller.simulate(FULL, LAUNCH, 1.0, times=[0.5, 0.2]), r"times = .* must be increasing"),
+    (lambda: stroller.simulate(FULL, LAUNCH, 1.0, times=0.5), r"times = .* must be a list"),
+    (lambda: stroller.simulate(FULL, LAUNCH, 1.0, tolerance=0.0), r"tolerance = 0\.0 must be greater than 0\.0"),
+    (lambda: stroller.simulate(FULL, Launch((0.0, 1.6), 0.0, 1.0), 1.0), r"place\[1\] = 1\.6 must be at most 1\.57"),
+    (
+        lambda: stroller.simulate(FULL, Launch((0.0, 0.1), 0.0, 1.0, np.pi / 2), 1.0),
+        r"steering = .* must differ from a right angle",
+    ),
+    (
+        lambda: stroller.simulate(Scene(BODY, Sphere(1.0), heading="projected"), Launch((0.0, 0.0), 0.0, 1.0), 1.0),
+        r"place\[1\] = .* must differ from 0 for heading = 'projected'",
+    ),
+    (lambda: ImplicitMidpoint(0.0), r"step_length = 0\.0 must be greater than 0\.0"),
+]
+
+
+@pytest.mark.parametrize(("build", "message"), BAD)
+def test_bad_input_is_refused_by_name(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()

@@ -1,0 +1,21 @@
+"""The README's example runs as it stands, and its commands are the ones that work."""
+
+import re
+from pathlib import Path
+
+README = (Path(__file__).parents[1] / "README.md").read_text()
+
+
+def test_the_ten_lines_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    code = re.search(r"```python\n(.*?)```", README, re.DOTALL).group(1)
+    # A coarser grid of the same shape: the example's own takes longer than a test should.
+    exec(code.replace("36", "4").replace("51", "10"), {})
+    assert (tmp_path / "table.h5").exists()
+    assert (tmp_path / "table.png").exists()
+    assert "5.96" in capsys.readouterr().out
+
+
+def test_every_file_it_names_exists():
+    for name in re.findall(r"`((?:tests|tippe|nonholonomic|stroller|benchmarks|docs)/[\w/.]*)`", README):
+        assert (Path(__file__).parents[1] / name).exists(), name

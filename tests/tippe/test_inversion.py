@@ -1,0 +1,127 @@
+"""`inversion_time` as a function: its transformations, its derivatives, its answers where there is no inversion."""
+
+import math
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close, rutstam_top
+
+import tippe
+
+
+def time_of(mu=0.3, theta=0.1, spin=155.0, offset=0.006, tolerance=1e-11, crossing="first", t1=20.0):
+    top = rutstam_top()
+    top = tippe.Top(top.mass, top.radius, offset, top.I1, top.I3)
+    scene = tippe.Scene(top, tippe.Plane(), tippe.Viscous(mu))
+    return tippe.inversion_time(scene, tippe.Launch(theta, spin), t1, tolerance=tolerance, crossing=crossing)
+
+
+def central_difference(function, point, steps):
+    """Central differences with one Richardson step, for every step of a scan; the pair that agrees best is taken."""
+    plain = [(function(point + h) - function(point - h)) / (2.0 * h) for h in steps]
+    better = [(4.0 * fine - coarse) / 3.0 for coarse, fine in zip(plain[:-1], plain[1:], strict=True)]
+    gaps = [abs(a - b) for a, b in zip(better[:-1], better[1:], strict=True)]
+    return better[int(np.argmin(gaps)) + 1]
+
+
+#: Numbers of the scene and launch, where they are and the first step of the scan.
+NUMBERS = {"mu": (0.3, 4e-5), "theta": (0.1, 2e-5), "spin": (155.0, 4e-3), "offset": (0.006, 2e-7)}
+
+
+def test_all_derivatives_agree_with_central_differences():
+    """grad with respect to mu, theta, spin and offset: 1e-5 relative, of differences whose step was scanned."""
+    points = tuple(jnp.asarray(point) for point, _ in NUMBERS.values())
+    gradient = jax.grad(lambda numbers: time_of(*numbers))(points)
+    for i, (point, step) in enumerate(NUMBERS.values()):
+
+        def moved(value, i=i):
+            numbers = list(points)
+            numbers[i] = jnp.asarray(value)
+            return float(time_of(*numbers))
+
+        expected = central_difference(moved, point, [step / 2.0**k for k in range(5)])
+        assert_close(gradient[i], expected, rtol=1e-5)
+
+
+def test_transformations_agree():
+    """jit, vmap, grad, jvp and hessian give one another's numbers."""
+    mus = jnp.array([0.25, 0.3, 0.35])
+    times = np.array([float(time_of(mu)) for mu in mus])
+    assert_close(jax.jit(jax.vmap(time_of))(mus), times, rtol=1e-9)
+    value, slope = jax.jvp(time_of, (0.3,), (1.0,))
+    assert_close(value, times[1], rtol=1e-12)
+    slopes = jax.jit(jax.vmap(jax.grad(time_of)))(mus)
+    assert_close(slopes[1], slope, rtol=1e-6)
+
+
+def test_second_derivative():
+    """jax.hessian against differences of the gradient."""
+    slope = jax.grad(time_of)
+    expected = central_difference(slope, 0.3, [2e-5, 1e-5, 5e-6, 2.5e-6])
+    assert_close(jax.hessian(time_of)(0.3), expected, rtol=1e-4)
+
+
+def test_no_inversion_is_infinite_with_derivative_zero():
+    """Too little spin, too short a horizon, contact lost: infinite, and nothing is not a number."""
+    for arguments in ({"spin": 40.0}, {"t1": 2.0}, {"spin": 190.0}):
+        value, slope = jax.value_and_grad(lambda mu, kw=arguments: time_of(mu, **kw))(0.3)
+        assert np.isinf(value)
+        assert slope == 0.0
+
+
+def test_a_top_exactly_upright_never_leaves():
+    assert np.isinf(time_of(theta=0.0))
+
+
+def test_a_top_that_starts_beyond_the_angle_is_inverted_at_once():
+    assert time_of(theta=3.1) == 0.0
+
+
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Bosh3()])
+def test_other_solvers_agree(solver):
+    scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
+    launch = tippe.Launch(0.1, 155.0)
+    tolerance = 1e-7 if isinstance(solver, diffrax.Bosh3) else 1e-10
+    value = tippe.inversion_time(scene, launch, 10.0, tolerance=tolerance, solver=solver)
+    assert_close(value, time_of(), rtol=30.0 * tolerance * 100.0)
+
+
+def test_first_and_last_crossing_in_the_cylinder():
+    """Down the wall theta swings past the angle and back; the last up-crossing is that of the trajectory."""
+    scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Viscous(0.3))
+    launch = tippe.Launch(0.3, 78.125, eta=math.pi / 2.0)
+    run = tippe.simulate(scene, launch, 15.0, tolerance=1e-10)
+    angle = 0.95 * math.pi
+    fine = np.linspace(0.0, 15.0, 60001)
+    beyond = np.asarray(run.at(fine).theta) >= angle
+    ups = fine[1:][beyond[1:] & ~beyond[:-1]]
+    first = tippe.inversion_time(scene, launch, 15.0)
+    last = tippe.inversion_time(scene, launch, 15.0, crossing="last")
+    assert len(ups) > 5
+    assert 0.0 <= ups[0] - first < 2.6e-4
+    assert 0.0 <= ups[-1] - last < 2.6e-4
+    assert_close(run.at([float(first), float(last)]).theta, angle, atol=1e-7)
+
+
+BAD = [
+    ({"t1": -1.0}, "t1 = -1.0 must be greater than 0"),
+    ({"t1": math.nan}, "t1 = nan must be finite"),
+    ({"angle": 4.0}, "angle = 4.0 must be at most 3.14159"),
+    ({"tolerance": 0.0}, "tolerance = 0.0 must be at least 1e-14"),
+    ({"crossing": "second"}, "crossing = 'second' must be 'first' or 'last'"),
+    ({"solver": diffrax.Kvaerno5()}, "must be an explicit Runge-Kutta solver"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD)
+def test_bad_arguments_are_named(rutstam_scene, arguments, message):
+    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+        tippe.inversion_time(rutstam_scene, tippe.Launch(0.1, 155.0), **({"t1": 10.0} | arguments))
+
+
+def test_arrays_are_refused_with_a_hint(rutstam_scene):
+    with pytest.raises(ValueError, match=r"one number for each argument, not an array of shape \(2,\)"):
+        tippe.inversion_time(rutstam_scene, tippe.Launch([0.1, 0.2], 155.0), 10.0)

@@ -1,0 +1,54 @@
+"""`python -m tippe`."""
+
+import json
+
+import pytest
+import xarray
+
+from tippe.__main__ import main, parser
+
+SMALL = ["--theta", "0.1", "0.3", "--eta", "0", "--t1", "12", "--tolerance", "1e-7"]
+
+
+def test_the_main_job_prints_writes_and_draws(tmp_path, capsys):
+    assert main([*SMALL, "--out", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr().out
+    assert "Table 1 lost its numbers" in told
+    assert "first [s]" in told
+    assert "9.98" in told
+    assert (tmp_path / "out" / "theta.png").read_bytes().startswith(b"\x89PNG")
+    with xarray.open_dataset(tmp_path / "out" / "cylinder_first.h5", engine="h5netcdf") as data:
+        assert data["time"].dims == ("theta", "eta")
+        assert json.loads(data.attrs["request"])["scene.surface"] == "Cylinder"
+    # The same again is read from the files; another scene in the same folder is refused.
+    assert main([*SMALL, "--out", str(tmp_path / "out")]) == 0
+    capsys.readouterr()
+    assert main([*SMALL, "--mu", "0.2", "--out", str(tmp_path / "out")]) == 2
+    told = capsys.readouterr().err
+    assert "scene.friction.mu is 0.3 there and 0.2 here" in told
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--mass", "-1"], "mass = -1.0 must be greater than 0.0"),
+        (["--offset", "0.03"], "offset = 0.03 must be less than 0.02"),
+        (["--cylinder-radius", "0.01"], "surface radius = 0.01 must be greater than 0.02"),
+        (["--theta", "4"], "theta = .*4.* must be at most 3.14159"),
+        (["--mu", "nan"], "mu = nan must be finite"),
+        (["--out", "/proc/nowhere"], "/proc/nowhere"),
+    ],
+)
+def test_bad_input_is_one_clear_line(arguments, message, capsys, tmp_path):
+    import re
+
+    assert main([*SMALL, "--out", str(tmp_path), *arguments]) == 2
+    told = capsys.readouterr().err.strip()
+    assert re.search(message, told)
+    assert len(told.splitlines()) == 1
+
+
+def test_every_option_is_explained():
+    told = parser().format_help()
+    for word in ("mass [kg]", "cylinder", "[rad/s]", "slip speed", "horizon", "Table 1"):
+        assert word in told

@@ -1,0 +1,100 @@
+"""Scenes, tops, laws and launches: what is refused, and what an evaluation costs."""
+
+import math
+from collections import Counter
+
+import jax
+import jax.numpy as jnp
+import pytest
+from conftest import assert_close, random_states, rutstam_top
+
+import tippe
+
+GOOD = {"mass": 0.02, "radius": 0.02, "offset": 0.006, "I1": 3e-6, "I3": 3.2e-6}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mass": -1.0}, "mass = -1.0 must be greater than 0.0"),
+        ({"mass": 0.0}, "mass = 0.0 must be greater than 0.0"),
+        ({"mass": math.nan}, "mass = nan must be finite"),
+        ({"mass": "heavy"}, "mass = 'heavy' is not a number"),
+        ({"radius": math.inf}, "radius = inf must be finite"),
+        ({"offset": 0.02}, "offset = 0.02 must be less than 0.02"),
+        ({"offset": -0.001}, "offset = -0.001 must be at least 0.0"),
+        ({"I1": 0.0}, "I1 = 0.0 must be greater than 0.0"),
+        ({"I3": 6.1e-6}, "I3 = 6.1e-06 must be at most 6e-06"),
+    ],
+)
+def test_impossible_tops_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        tippe.Top(**(GOOD | change))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: tippe.Viscous(-0.1), "mu = -0.1 must be at least 0.0"),
+        (lambda: tippe.Coulomb(0.3, 0.0), "slip_speed = 0.0 must be greater than 0.0"),
+        (lambda: tippe.Coulomb(math.nan, 0.1), "mu = nan must be finite"),
+        (lambda: tippe.Cylinder(0.0), "surface radius = 0.0 must be greater than 0.0"),
+        (lambda: tippe.Scene(rutstam_top(), tippe.Cylinder(0.02)), "surface radius = 0.02 must be greater than 0.02"),
+        (lambda: tippe.Scene(rutstam_top(), tippe.Sphere(0.01)), "surface radius = 0.01 must be greater than 0.02"),
+        (lambda: tippe.Scene(rutstam_top(), gravity=-9.81), "gravity = -9.81 must be greater than 0.0"),
+        (lambda: tippe.Scene(rutstam_top(), surface="plane"), "surface = 'plane' must be a Surface"),
+        (lambda: tippe.Scene(rutstam_top(), friction=0.3), "friction = 0.3 must be a Friction"),
+        (lambda: tippe.Scene("top"), "body = 'top' must be a Top"),
+        (lambda: tippe.Launch(-0.1, 100.0), "theta = -0.1 must be at least 0.0"),
+        (lambda: tippe.Launch(3.2, 100.0), "theta = 3.2 must be at most 3.14159"),
+        (lambda: tippe.Launch(0.1, math.nan), "spin = nan must be finite"),
+        (lambda: tippe.Launch(0.1, 100.0, eta=4.0), "eta = 4.0 must be at most 3.14159"),
+    ],
+)
+def test_bad_scenes_and_launches_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_traced_numbers_pass_the_checks():
+    """A scene can be built inside a transformation, whatever the numbers."""
+    energy = jax.jit(lambda mass: tippe.Scene(tippe.Top(mass, 0.02, 0.006, 3e-6, 3.2e-6)).body.mass * 2.0)
+    assert energy(-1.0) == -2.0
+
+
+#: The lean field's cost in tippe.md, section 2 (i)-(iii), counted by operator overloading.
+YARDSTICK = {
+    ("plane", "frictionless"): 53,
+    ("plane", "viscous"): 63,
+    ("plane", "coulomb"): 69,
+    ("cylinder", "viscous"): 83,
+    ("cylinder", "coulomb"): 89,
+    ("sphere", "viscous"): 101,
+    ("sphere", "coulomb"): 107,
+}
+
+
+@pytest.mark.parametrize(("arena", "law"), YARDSTICK)
+def test_the_field_costs_what_the_lean_one_does(arena, law):
+    """A scene evaluates only the terms it has: within 2 operations of the yardstick, no trigonometry, no power."""
+    surface = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3), "sphere": tippe.Sphere(0.3)}[arena]
+    friction = {"frictionless": tippe.Frictionless(), "viscous": tippe.Viscous(0.3), "coulomb": tippe.Coulomb(0.3, 0.1)}
+    scene = tippe.Scene(rutstam_top(), surface, friction[law])
+    dynamics, states = scene.dynamics, random_states(scene, 7)
+    equations = jax.make_jaxpr(lambda state: dynamics.motion(state).rate)(states).jaxpr.eqns
+    moves = {"squeeze", "slice", "broadcast_in_dim", "neg"}
+    arithmetic = {"add", "sub", "mul", "div", "sqrt"}
+    on_lanes = Counter(one.primitive.name for one in equations if one.outvars[0].aval.shape == (7,))
+    assert set(on_lanes) <= arithmetic | moves
+    assert sum(count for name, count in on_lanes.items() if name in arithmetic) <= YARDSTICK[arena, law] + 2
+
+
+def test_one_function_serves_one_state_and_a_block():
+    """A field on (components,) and on (components, lanes), and with one scene a lane, gives the same numbers."""
+    scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Coulomb(0.3, 0.1))
+    states = random_states(scene, 5)
+    block = scene.field(states)
+    for lane in range(5):
+        assert_close(scene.field(states[:, lane]), block[:, lane], rtol=1e-12, atol=1e-12)
+    wide = tippe.Scene(rutstam_top(), tippe.Cylinder(jnp.full(5, 0.3)), tippe.Coulomb(jnp.full(5, 0.3), 0.1))
+    assert_close(wide.field(states), block, rtol=1e-12, atol=1e-12)

@@ -1,0 +1,196 @@
+"""Steady motions of the tippe top: zeros of the field, thresholds against eigenvalues, groups."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import tippe
+from tippe import steady
+
+RNG = np.random.default_rng(7)
+
+
+def body(alpha, gamma, mass=0.02, radius=0.02, inertia=0.4):
+    """A top from its proportions alpha = a / R, gamma = I1 / I3 and inertia = I3 / (m R^2)."""
+    I3 = inertia * mass * radius**2
+    return tippe.Top(mass, radius, alpha * radius, gamma * I3, I3)
+
+
+def scene(alpha, gamma, mu=0.3, surface=None):
+    return tippe.Scene(body(alpha, gamma), surface or tippe.Plane(), tippe.Viscous(mu))
+
+
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(0, 0, None))
+def standing_growth(one, spin, inverted):
+    return steady.growth_rate(steady.standing_matrix(one, spin, inverted))
+
+
+@eqx.filter_jit
+@eqx.filter_vmap
+def tumbling_growth(one, motion):
+    return steady.growth_rate(steady.tumbling_matrix(one, motion))
+
+
+def many(count, alpha, gamma):
+    """Scenes on the plane, one per lane."""
+    mass, radius = RNG.uniform(0.005, 0.05, count), RNG.uniform(0.01, 0.03, count)
+    tops = body(alpha, gamma, mass, radius, RNG.uniform(0.3, 0.45, count))
+    return tippe.Scene(
+        tops, friction=tippe.Viscous(RNG.uniform(0.1, 0.5, count)), gravity=RNG.uniform(5.0, 15.0, count)
+    )
+
+
+def lanes_of_group_two(count):
+    alpha = RNG.uniform(0.05, 0.4, count)
+    return many(count, alpha, RNG.uniform(np.maximum(1.01 - alpha, 0.51), 0.99 + alpha))
+
+
+@pytest.mark.parametrize(
+    "surface", [tippe.Plane(), tippe.Cylinder(0.3), tippe.Sphere(0.3)], ids=["plane", "cylinder", "sphere"]
+)
+@pytest.mark.parametrize("inverted", [False, True], ids=["upright", "inverted"])
+def test_a_standing_top_is_a_zero_of_the_field(surface, inverted):
+    """At the lowest point, at any spin, to 1e-12."""
+    one = scene(0.3, 0.94, surface=surface)
+    np.testing.assert_allclose(one.field(steady.standing_state(one, 80.0, inverted)), 0.0, atol=1e-12)
+
+
+def test_a_tumbling_top_is_a_zero_of_the_field_seen_while_precessing():
+    """300 tops of group II at any inclination: residual below 1e-12 of phi' times the state (Rutstam 2012, eq. 2.8)."""
+    scenes = lanes_of_group_two(300)
+    motion = steady.tumbling(scenes, RNG.uniform(0.05, 3.09, 300))
+
+    @jax.vmap
+    def residual(one, motion):
+        state = steady.tumbling_state(one, motion)
+        turned = motion.precession * steady.quarter_turn(state)
+        scales = one.scales(tippe.Launch(motion.theta, motion.spin))
+        still = jnp.abs(one.field(state) - turned) / scales / motion.precession
+        return (
+            jnp.max(still),
+            one.jellett(state) / motion.jellett - 1.0,
+            one.normal_force(state) / one.body.mass / one.gravity,
+        )
+
+    still, jellett, weights = residual(scenes, motion)
+    assert jnp.max(still) < 1e-12
+    np.testing.assert_allclose(jellett, 0.0, atol=1e-12)
+    np.testing.assert_allclose(weights, 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("inverted", [False, True], ids=["upright", "inverted"])
+def test_eigenvalues_of_a_standing_top_change_sign_at_the_critical_spin(inverted):
+    """300 tops: the growth rate changes sign within 1e-6 of the formula's spin, upwards upright, downwards inverted."""
+    scenes = lanes_of_group_two(300)
+    critical = (steady.inverted_critical_spin if inverted else steady.upright_critical_spin)(scenes)
+    sign = -1.0 if inverted else 1.0
+    assert jnp.all(sign * standing_growth(scenes, critical * (1.0 + 1e-6), inverted) > 0.0)
+    assert jnp.all(sign * standing_growth(scenes, critical * (1.0 - 1e-6), inverted) < 0.0)
+
+
+def test_tops_of_groups_one_and_three_have_no_critical_spin():
+    """Group I stands upright at every spin; group III never stands inverted: 1000 rad/s and more make no difference."""
+    alpha, spins = 0.3, np.linspace(1.0, 3000.0, 50)
+    for gamma, inverted, name in ((0.65, False, "I"), (1.35, True, "III")):
+        one = scene(alpha, gamma)
+        assert steady.group(one.body) == name
+        assert (steady.inverted_critical_spin if inverted else steady.upright_critical_spin)(one) == jnp.inf
+        lanes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, spins.shape), one)
+        growth = standing_growth(lanes, jnp.asarray(spins), inverted)
+        assert jnp.all(growth > 0.0) if inverted else jnp.all(growth < 0.0)
+    assert steady.group(body(alpha, 0.94)) == "II"
+
+
+def test_a_tumbling_top_is_stable_where_jelletts_constant_grows_with_the_angle():
+    """600 tops: the sign of the growth rate is that of the criterion, except within 1e-4 of marginal."""
+    scenes = lanes_of_group_two(600)
+    theta = jnp.asarray(RNG.uniform(0.05, 3.09, 600))
+    motion = steady.tumbling(scenes, theta)
+    growth = tumbling_growth(scenes, motion)
+    slope = jax.vmap(jax.grad(lambda angle, one: steady.tumbling(one, angle).jellett))(theta, scenes) / motion.jellett
+    clear = jnp.abs(slope) > 1e-4
+    stable = steady.tumbling_is_stable(scenes, theta)
+    assert jnp.sum(clear & stable) > 100
+    assert jnp.sum(clear & ~stable) > 10
+    assert jnp.all((growth < 0.0)[clear] == stable[clear])
+    assert jnp.all((slope > 0.0)[clear] == stable[clear])
+
+
+def test_the_growth_rate_of_a_tumbling_top_vanishes_at_the_fold_of_jelletts_constant():
+    """alpha = 0.3, gamma = 0.75: the sign changes within 1e-6 in spin of the extremum of J over theta."""
+    one = scene(0.3, 0.75)
+    assert steady.folds(one.body)
+    slope = jax.jit(jax.vmap(jax.grad(lambda theta: steady.tumbling(one, theta).jellett)))
+    folds = steady.roots_by_halving(slope, jnp.linspace(0.01, 3.13, 500))
+    assert folds.size > 0
+    beside = jnp.concatenate([folds - 3e-8, folds + 3e-8])
+    motion = steady.tumbling(one, beside)
+    lanes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, beside.shape), one)
+    before, after = jnp.split(tumbling_growth(lanes, motion), 2)
+    assert jnp.all(before * after < 0.0)
+    spins = motion.spin.reshape(2, -1)
+    assert jnp.all(jnp.abs(spins[1] / spins[0] - 1.0) < 1e-6)
+
+
+def test_jelletts_constant_has_a_fold_exactly_where_the_classification_says():
+    """2000 tops of group II: an extremum of J over the tumbling angles exists if and only if gamma < 1 - delta."""
+    count = 2000
+    scenes = lanes_of_group_two(count)
+    theta = jnp.linspace(1e-4, np.pi - 1e-4, 4001)
+    stable = jax.jit(jax.vmap(lambda one: jnp.all(steady.tumbling_is_stable(one, theta))))(scenes)
+    expected = [steady.folds(jax.tree.map(lambda leaf, lane=lane: leaf[lane], scenes.body)) for lane in range(count)]
+    assert 100 < sum(expected) < count - 100
+    assert np.array_equal(~np.asarray(stable), expected)
+
+
+def test_thresholds_of_rutstams_top():
+    """lambda_thres = 3.4575e-6 kg m^3/s, upright unstable above 27.41 rad/s (Rutstam, SIGMA 8 (2012) 019)."""
+    one = scene(0.3, 235 / 250)
+    upright, inverted = steady.jellett_thresholds(one)
+    np.testing.assert_allclose(inverted, 3.4575e-6, rtol=2e-5)
+    np.testing.assert_allclose(steady.upright_critical_spin(one), 27.41, rtol=2e-4)
+    np.testing.assert_allclose(inverted / (one.body.I3 * (one.body.radius - one.body.offset)), 77.18, rtol=2e-4)
+    # A standing top has the constant of the tumbling tops next to it.
+    near = steady.tumbling(one, jnp.array([1e-6, np.pi - 1e-6])).jellett
+    np.testing.assert_allclose(near, [upright, inverted], rtol=1e-9)
+
+
+def test_cohens_top_with_a_smaller_axial_inertia_tumbles_at_an_intermediate_angle():
+    """I3 = 0.8 I1, 100 rad/s from theta = 0.1: theta = 2.077 rad, phi' = 55.8, psi' = -11.16 rad/s (Cohen 1977)."""
+    I1 = 0.4 * 0.015 * 0.025**2
+    one = tippe.Scene(tippe.Top(0.015, 0.025, 0.005, I1, 0.8 * I1), friction=tippe.Viscous(0.3))
+    assert steady.group(one.body) == "III"
+    angles = steady.tumbling_angles(one, float(one.jellett(one.state(tippe.Launch(0.1, 100.0)))))
+    ends = [theta for theta in angles if steady.tumbling_is_stable(one, theta)]
+    motion = steady.tumbling(one, ends[0])
+    psi_dot = motion.spin - motion.precession * jnp.cos(motion.theta)
+    np.testing.assert_allclose([*ends, motion.precession, psi_dot], [2.07687, 55.784, -11.157], rtol=1e-4)
+
+
+def test_the_steady_motions_are_the_extrema_of_the_effective_energy():
+    """Minima where the tumbling top is stable, maxima where it is not, at the same Jellett constant."""
+    one = scene(0.3, 0.75)
+    energy = jax.grad(lambda theta, jellett: steady.effective_energy(one, theta, jellett))
+    curvature = jax.grad(energy)
+    seen = set()
+    for theta in np.linspace(0.1, 3.0, 30):
+        motion = steady.tumbling(one, theta)
+        stable = bool(steady.tumbling_is_stable(one, theta))
+        seen.add(stable)
+        # The effective energy has its extremum there, and the angles found from J include it.
+        assert abs(energy(motion.theta, motion.jellett)) < 1e-14
+        assert (curvature(motion.theta, motion.jellett) > 0.0) == stable
+    assert seen == {True, False}
+    several = steady.tumbling_angles(one, float(motion.jellett))
+    assert any(abs(theta - 3.0) < 1e-9 for theta in several)
+
+
+def test_no_steady_tumbling_where_the_lever_is_negative_or_the_arena_is_curved():
+    """Group I has no tumbling top near the upright one; a cylinder has none at all."""
+    with pytest.raises(ValueError, match="no tumbling top at this inclination"):
+        steady.tumbling(scene(0.3, 0.6), 0.1)
+    with pytest.raises(ValueError, match="must be a Plane"):
+        steady.tumbling(scene(0.3, 0.94, surface=tippe.Cylinder(0.3)), 1.0)

@@ -1,0 +1,308 @@
+"""Inversion tables: their axes, files, resumption and faults."""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import h5py
+import jax
+import numpy as np
+import pytest
+import xarray
+from conftest import assert_close, rutstam_top
+
+import tippe
+from nonholonomic import sweep as sweeping
+
+THETA, SPIN = [0.08, 0.1, 0.12], [90.0, 110.0]
+
+
+@pytest.fixture(scope="module")
+def table(rutstam_scene_module) -> tippe.Table:
+    return tippe.inversion_table(rutstam_scene_module, theta=THETA, spin=SPIN, t1=12.0)
+
+
+@pytest.fixture(scope="module")
+def rutstam_scene_module() -> tippe.Scene:
+    return tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
+
+
+def test_axes_come_in_their_order_and_scalars_are_none(rutstam_scene_module):
+    table = tippe.inversion_table(
+        rutstam_scene_module, theta=[0.1, 0.2], spin=[100.0, 120.0, 140.0], eta=0.0, mu=[0.2, 0.3, 0.4, 0.5], t1=0.1
+    )
+    assert list(table.coords) == ["theta", "mu", "spin"]
+    assert table.time.shape == table.status.shape == table.shape == (2, 4, 3)
+    single = tippe.inversion_table(rutstam_scene_module, theta=0.1, spin=100.0, t1=0.1)
+    assert single.shape == ()
+    assert single.status == "not_inverted"
+
+
+def test_every_cell_is_inversion_time(table, rutstam_scene_module):
+    for i, theta in enumerate(THETA):
+        for j, spin in enumerate(SPIN):
+            expected = tippe.inversion_time(rutstam_scene_module, tippe.Launch(theta, spin), 12.0)
+            assert_close(table.time[i, j], expected, rtol=1e-8)
+    assert (table.status == "inverted").all()
+    assert_close(table.end_theta, 0.95 * math.pi, atol=1e-7)
+
+
+@pytest.mark.parametrize("arena", [tippe.Plane(), tippe.Cylinder(0.3)])
+def test_the_same_table_by_vmapped_diffrax(arena):
+    """Equal to ten times the tolerance; status in every cell, contact loss among them."""
+    scene = tippe.Scene(rutstam_top(), arena, tippe.Viscous(0.3))
+    arguments = {"theta": THETA, "spin": [60.0, 110.0, 190.0], "t1": 12.0, "tolerance": 1e-9}
+    fast = tippe.inversion_table(scene, **arguments)
+    slow = tippe.inversion_table(scene, method="diffrax", **arguments)
+    assert (fast.status == slow.status).all()
+    assert set(np.unique(fast.status)) == {"not_inverted", "inverted", "contact_lost"}
+    inverted = fast.status == "inverted"
+    assert_close(fast.time[inverted], slow.time[inverted], rtol=1e-8)
+    # Diffrax looks for the loss of contact where steps end only, so it may miss a first, short one.
+    assert np.all(fast.end_time <= slow.end_time + 1e-7)
+
+
+def test_contact_is_lost_where_the_normal_force_first_vanishes(rutstam_scene_module):
+    table = tippe.inversion_table(rutstam_scene_module, theta=[0.1], spin=[190.0], t1=12.0, tolerance=1e-10)
+    run = tippe.simulate(rutstam_scene_module, tippe.Launch(0.1, 190.0), 12.0, tolerance=1e-10)
+    assert run.status == "contact_lost"
+    assert_close(run.end_time, table.end_time[0, 0], atol=1e-7)
+    assert_close(run.theta[-1], table.end_theta[0, 0], atol=1e-6)
+    force = np.asarray(run.at(np.linspace(0.0, float(run.end_time), 40001)).normal_force)
+    weight = 0.02 * 9.81
+    assert force[:-1].min() > 0.0
+    assert abs(force[-1]) < 1e-6 * weight
+
+
+def test_a_further_axis_by_its_path(rutstam_scene_module):
+    offsets = [0.005, 0.006]
+    table = tippe.inversion_table(
+        rutstam_scene_module, theta=0.1, spin=155.0, t1=20.0, axes={"scene.body.offset": offsets}
+    )
+    assert list(table.coords) == ["offset"]
+    assert_close(table.time[1], 5.9693, atol=6e-5)
+
+
+def test_grids_larger_than_a_block_are_cut_and_joined(rutstam_scene_module, monkeypatch):
+    """The order of cells survives blocks, threads and refilled lanes."""
+    monkeypatch.setattr(sweeping, "block_for", lambda cells: 16)
+    theta, spin = np.linspace(0.05, 0.6, 9), np.linspace(60.0, 200.0, 11)
+    cut = tippe.inversion_table(rutstam_scene_module, theta=theta, spin=spin, t1=4.0)
+    monkeypatch.undo()
+    whole = tippe.inversion_table(rutstam_scene_module, theta=theta, spin=spin, t1=4.0)
+    assert (cut.status == whole.status).all()
+    assert_close(cut.end_theta, whole.end_theta, atol=1e-9)
+    assert_close(cut.end_time, whole.end_time, rtol=1e-9)
+
+
+def test_a_scene_that_changes_only_in_numbers_does_not_compile_again(rutstam_scene_module, table):
+    with jax.log_compiles(False), _count_compilations() as count:
+        other = tippe.Scene(tippe.Top(0.03, 0.025, 0.005, 5e-6, 5.5e-6), tippe.Plane(), tippe.Viscous(0.2))
+        tippe.inversion_table(other, theta=[0.07, 0.11, 0.2], spin=[95.0, 130.0], t1=9.0)
+    assert count.of("march") == 0
+
+
+class _count_compilations:
+    """Counts what JAX compiles, by the name of the function."""
+
+    def __enter__(self):
+        self.names = []
+        self.before = jax.config.jax_log_compiles
+        import logging
+
+        self.handler = logging.Handler()
+        self.handler.emit = lambda record: self.names.append(record.getMessage())
+        logging.getLogger("jax").addHandler(self.handler)
+        self.level = logging.getLogger("jax").level
+        jax.config.update("jax_log_compiles", True)
+        return self
+
+    def __exit__(self, *_):
+        import logging
+
+        logging.getLogger("jax").removeHandler(self.handler)
+        jax.config.update("jax_log_compiles", self.before)
+
+    def of(self, name: str) -> int:
+        return sum("Finished XLA compilation" in message and name in message for message in self.names)
+
+
+def test_the_file_opens_in_xarray_with_names_and_units(rutstam_scene_module, tmp_path, table):
+    path = tmp_path / "table.h5"
+    written = tippe.inversion_table(rutstam_scene_module, theta=THETA, spin=SPIN, t1=12.0, path=path)
+    with xarray.open_dataset(path, engine="h5netcdf") as data:
+        assert data["time"].dims == ("theta", "spin")
+        assert data["time"].attrs["units"] == "s"
+        assert data["spin"].attrs["units"] == "rad s-1"
+        assert_close(data["theta"], THETA)
+        assert_close(data["time"].sel(theta=0.1, spin=110.0), table.time[1, 1], rtol=1e-12)
+        assert data["status"].attrs["flag_meanings"].split()[0] == "inverted"
+        request = json.loads(data.attrs["request"])
+        assert request["scene.body.mass"] == 0.02
+        assert request["scene.friction"] == "Viscous"
+        assert request["tolerance"] == 1e-9
+        assert "jax" in json.loads(data.attrs["versions"])
+    loaded = tippe.Table.load(path)
+    assert list(loaded.coords) == list(written.coords)
+    for name in ("time", "status", "end_theta", "steps"):
+        np.testing.assert_array_equal(loaded.variables[name], written.variables[name])
+
+
+def test_save_and_load_return_the_same(table, tmp_path):
+    table.save(tmp_path / "saved.h5")
+    loaded = tippe.Table.load(tmp_path / "saved.h5")
+    np.testing.assert_array_equal(loaded.time, table.time)
+    np.testing.assert_array_equal(loaded.status, table.status)
+    assert loaded.units == table.units
+    assert json.loads(loaded.attributes["request"]) == json.loads(table.attributes["request"])
+
+
+def test_an_interrupted_sweep_resumes_and_recomputes_no_finished_block(rutstam_scene_module, tmp_path, monkeypatch):
+    monkeypatch.setattr(sweeping, "block_for", lambda cells: 8)
+    monkeypatch.setattr(sweeping, "workers", lambda: 1)
+    path, arguments = (
+        tmp_path / "table.h5",
+        {"theta": np.linspace(0.05, 0.3, 8), "spin": [80.0, 100.0, 120.0], "t1": 2.0},
+    )
+    written = sweeping.BlockFile.write
+    done = []
+
+    def until_the_second(self, block, first, values):
+        if len(done) == 1:
+            raise KeyboardInterrupt
+        done.append(block)
+        written(self, block, first, values)
+
+    monkeypatch.setattr(sweeping.BlockFile, "write", until_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
+    part = tippe.Table.load(path)
+    assert (part.status == "pending").sum() == 16
+    again = []
+
+    def counted(self, block, first, values):
+        again.append(block)
+        written(self, block, first, values)
+
+    monkeypatch.setattr(sweeping.BlockFile, "write", counted)
+    whole = tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
+    assert sorted(again + done) == [0, 1, 2]
+    monkeypatch.setattr(sweeping.BlockFile, "write", written)
+    fresh = tippe.inversion_table(rutstam_scene_module, **arguments)
+    np.testing.assert_array_equal(whole.status, fresh.status)
+    assert_close(whole.end_theta, fresh.end_theta, atol=1e-12)
+    tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
+    assert sorted(again + done) == [0, 1, 2]
+
+
+KILLED = """
+import sys, numpy as np, tippe
+from nonholonomic import sweep
+sweep.block_for = lambda cells: 4
+sweep.workers = lambda: 1
+mass, radius = 0.02, 0.02
+top = tippe.Top(mass, radius, 0.006, 131 / 350 * mass * radius**2, 0.4 * mass * radius**2)
+scene = tippe.Scene(top, tippe.Plane(), tippe.Viscous(0.3))
+print("started", flush=True)
+tippe.inversion_table(scene, theta=np.linspace(0.05, 0.3, 400), spin=[80.0, 100.0], t1=5.0, path=sys.argv[1])
+"""
+
+
+def test_a_killed_sweep_leaves_a_file_that_opens_and_resumes(tmp_path):
+    """SIGKILL in the middle: what is marked finished is right, and the rest is pending."""
+    path = tmp_path / "table.h5"
+    process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE)
+    finished = 0
+    deadline = time.monotonic() + 120.0
+    while finished < 3 and time.monotonic() < deadline:
+        time.sleep(0.02)
+        if path.exists():
+            with h5py.File(path, "r") as file:
+                finished = int(file["block_finished"][()].sum())
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    part = tippe.Table.load(path)
+    with h5py.File(path, "r") as file:
+        marks = file["block_finished"][()].astype(bool)
+    assert 3 <= marks.sum() < 200
+    cells = part.status.ravel().reshape(200, 4)
+    assert (cells[marks] != "pending").all()
+    scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
+    fresh = tippe.inversion_table(scene, theta=np.linspace(0.05, 0.3, 400), spin=[80.0, 100.0], t1=5.0)
+    known = part.status != "pending"
+    np.testing.assert_array_equal(part.status[known], fresh.status[known])
+    assert_close(part.end_theta[known], fresh.end_theta[known], atol=1e-9)
+
+
+def test_a_file_of_another_scene_is_refused_by_name(rutstam_scene_module, tmp_path):
+    path, arguments = tmp_path / "table.h5", {"theta": THETA, "spin": SPIN, "t1": 0.1}
+    tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
+    other = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.2))
+    with pytest.raises(
+        ValueError, match=r"table\.h5 holds the result of another run: scene\.friction\.mu is 0\.3 there"
+    ):
+        tippe.inversion_table(other, path=path, **arguments)
+    with pytest.raises(ValueError, match="the axis spin differs"):
+        tippe.inversion_table(rutstam_scene_module, path=path, **(arguments | {"spin": [90.0, 111.0]}))
+
+
+def test_unwritable_corrupt_and_foreign_files_are_named(rutstam_scene_module, tmp_path):
+    arguments = {"theta": THETA, "spin": SPIN, "t1": 0.1}
+    with pytest.raises(OSError, match=r"cannot write .*nowhere"):
+        tippe.inversion_table(rutstam_scene_module, path=tmp_path / "nowhere" / "table.h5", **arguments)
+    noise = tmp_path / "noise.h5"
+    noise.write_bytes(b"not a table" * 100)
+    foreign = tmp_path / "foreign.h5"
+    with h5py.File(foreign, "w") as file:
+        file["x"] = 1.0
+    cut = tmp_path / "cut.h5"
+    tippe.inversion_table(rutstam_scene_module, path=cut, **arguments)
+    cut.write_bytes(cut.read_bytes()[:2000])
+    for path in (noise, foreign, cut):
+        with pytest.raises(OSError, match=f"cannot read .*{path.name}"):
+            tippe.Table.load(path)
+        with pytest.raises(OSError, match=f"cannot read .*{path.name}"):
+            tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
+    with pytest.raises(OSError, match="no such file"):
+        tippe.Table.load(tmp_path / "missing.h5")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"theta": []}, "theta must be a number or a non-empty list"),
+        ({"theta": [0.1, math.nan]}, "theta = .* must be finite"),
+        ({"theta": [0.1, 3.2]}, "theta = .* must be at most 3.14159"),
+        ({"theta": [[0.1]]}, "theta must be a number or a non-empty list"),
+        ({"mu": [-0.1, 0.2]}, "mu = .* must be at least 0.0"),
+        ({"axes": {"scene.body.weight": [1.0]}}, "unknown axis 'scene.body.weight': .*scene.body.mass"),
+        ({"axes": {"scene.body.offset": [0.006, 0.03]}}, "offset = .* must be less than 0.02"),
+        ({"method": "magic"}, "method = 'magic' must be"),
+        ({"crossing": "last", "method": "diffrax"}, "crossing = 'last' must be 'first'"),
+        ({"t1": 0.0}, "t1 = 0.0 must be greater than 0.0"),
+    ],
+)
+def test_bad_tables_are_refused_before_anything_compiles(rutstam_scene_module, change, message):
+    with pytest.raises(ValueError, match=message):
+        tippe.inversion_table(rutstam_scene_module, **({"theta": THETA, "spin": SPIN, "t1": 1.0} | change))
+
+
+def test_a_frictionless_scene_has_no_mu_to_vary():
+    scene = tippe.Scene(rutstam_top())
+    with pytest.raises(ValueError, match=r"unknown axis 'scene\.friction\.mu'"):
+        tippe.inversion_table(scene, theta=0.1, spin=100.0, mu=[0.1, 0.2], t1=1.0)
+
+
+def test_a_table_prints_and_draws(table):
+    assert "theta (3), spin (2)" in str(table)
+    assert "6 inverted" in str(table)
+    figure = table.plot()
+    assert figure.axes[0].get_xlabel() == "theta [rad]"
+    with pytest.raises(ValueError, match="variable = 'status' must be a numeric variable"):
+        table.plot("status")
+    with pytest.raises(AttributeError, match="no variable 'tme'; it has time"):
+        _ = table.tme

@@ -1,0 +1,111 @@
+"""`simulate`: its times, its solvers, its transformations and what it refuses."""
+
+import math
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close, rutstam_top
+
+import tippe
+
+LAUNCH = tippe.Launch(0.1, 155.0)
+
+
+def test_a_run_prints_what_it_took(rutstam_scene):
+    told = str(tippe.simulate(rutstam_scene, LAUNCH, 1.0))
+    for word in ("ran to 1 s", "accepted", "rejected", "drift of |e|", "energy residual"):
+        assert word in told
+
+
+def test_given_times_and_dense_output_agree(rutstam_scene):
+    times = np.linspace(0.0, 1.0, 11)
+    whole = tippe.simulate(rutstam_scene, LAUNCH, 1.0)
+    given = tippe.simulate(rutstam_scene, LAUNCH, 1.0, times=times)
+    assert_close(given.t, times)
+    assert_close(given.theta, whole.at(times).theta)
+    assert given.axis.shape == given.angular_momentum.shape == given.velocity.shape == given.position.shape == (11, 3)
+    assert given.slip.shape == (11, 2)
+    assert_close(given.theta[0], 0.1, rtol=1e-12)
+    assert_close(given.spin[0], 155.0, rtol=1e-12)
+    assert_close(given.velocity[0], 0.0)
+    with pytest.raises(ValueError, match=r"times = .* must be at most 1\.0 \(the run ends there\)"):
+        whole.at([0.5, 1.5])
+
+
+def test_more_steps_than_a_piece_holds(rutstam_scene):
+    """A long run is made of pieces; the seams are not seen."""
+    run = tippe.simulate(rutstam_scene, LAUNCH, 8.0, tolerance=3e-14)
+    assert run.stats["accepted"] > 4096
+    assert_close(run.jellett, run.jellett[0], rtol=1e-10)
+    assert np.all(np.diff(run.t) > 0.0)
+    assert_close(run.t[-1], 8.0)
+
+
+@pytest.mark.parametrize(("solver", "tolerance"), [(diffrax.Tsit5(), 1e-9), (diffrax.Kvaerno5(), 1e-7)])
+def test_other_solvers_agree(rutstam_scene, solver, tolerance):
+    expected = tippe.simulate(rutstam_scene, LAUNCH, 0.3, times=[0.3], tolerance=1e-11)
+    run = tippe.simulate(rutstam_scene, LAUNCH, 0.3, times=[0.3], tolerance=tolerance, solver=solver)
+    assert_close(run.axis, expected.axis, atol=1e3 * tolerance)
+
+
+def test_the_derivative_of_a_trajectory(rutstam_scene):
+    """Reverse mode through the checkpointed adjoint and forward mode, against a central difference."""
+
+    def theta(mu, adjoint=None):
+        scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(mu))
+        return tippe.simulate(scene, LAUNCH, 0.5, times=[0.25, 0.5], tolerance=1e-11, adjoint=adjoint).theta[-1]
+
+    reverse = jax.grad(theta)(0.3)
+    forward = jax.jacfwd(lambda mu: theta(mu, diffrax.ForwardMode()))(0.3)
+    assert_close(forward, reverse, rtol=1e-9)
+    steps = [4e-4, 2e-4, 1e-4]
+    plain = [(theta(0.3 + h) - theta(0.3 - h)) / (2.0 * h) for h in steps]
+    assert_close((4.0 * plain[2] - plain[1]) / 3.0, reverse, rtol=1e-7)
+
+
+def test_a_batch_of_runs_says_which_lost_contact():
+    scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Coulomb(0.3, 0.05))
+    launches = tippe.Launch(jnp.full(2, 0.1), jnp.array([100.0, 155.0]), jnp.zeros(2), jnp.zeros(2))
+    times = np.linspace(0.0, 1.0, 21)
+    runs = jax.vmap(lambda launch: tippe.simulate(scene, launch, 1.0, times=times))(launches)
+    assert runs.status.tolist() == [0, 1]
+    assert_close(runs.end_time[0], 1.0)
+    # tippe.md, section 3: Coulomb, 0.05 m/s, 155 rad/s loses contact at 0.79 s.
+    assert_close(runs.end_time[1], 0.79, atol=6e-3)
+    assert np.isfinite(runs.theta[0]).all()
+    one = tippe.simulate(scene, tippe.Launch(0.1, 100.0), 1.0, times=times)
+    assert_close(runs.theta[0], one.theta, rtol=1e-7)
+    assert_close(runs.position[0], one.position, atol=1e-8)
+    assert not np.isfinite(runs.theta[1][times > runs.end_time[1]]).any()
+
+
+def test_a_ceiling_start_has_no_contact(rutstam_scene):
+    scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Viscous(0.3))
+    run = tippe.simulate(scene, tippe.Launch(0.1, 100.0, eta=3.0), 1.0)
+    assert run.status == "contact_lost"
+    assert run.end_time == 0.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"t1": -1.0}, "t1 = -1.0 must be greater than 0"),
+        ({"times": [0.5, 2.0]}, "times = .* must be at most 1.0"),
+        ({"times": [0.5, 0.4]}, "times must increase"),
+        ({"times": []}, "times must be a non-empty list"),
+        ({"solver": "Dopri8"}, "solver = 'Dopri8' must be a solver of Diffrax"),
+        ({"launch": 3}, "launch = 3 must be a Launch"),
+        ({"tolerance": math.nan}, "tolerance = nan must be finite"),
+    ],
+)
+def test_bad_arguments_are_named(rutstam_scene, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        tippe.simulate(**({"scene": rutstam_scene, "launch": LAUNCH, "t1": 1.0} | arguments))
+
+
+def test_times_are_needed_inside_a_transformation(rutstam_scene):
+    with pytest.raises(ValueError, match="times must be given inside jit"):
+        jax.jit(lambda theta: tippe.simulate(rutstam_scene, tippe.Launch(theta, 155.0), 1.0).theta)(0.1)

@@ -1,0 +1,270 @@
+"""Steady motions of the tippe top, their stability, and the thresholds and groups that follow (`tippe.md`, section 6).
+
+A standing top spins with its axis along the normal: upright (stem out, theta = 0) or inverted (stem in, theta = pi). On
+the plane there are tumbling tops between: the axis precesses at a fixed inclination, the centre of mass at rest,
+without slip. The formulas hold for every friction law that vanishes with the slip only; alpha = a / R and gamma = I1 /
+I3.
+
+The stability matrices are Jacobians of the scene's own field, less the directions that are neutral by symmetry or by
+conservation, so that an eigenvalue with positive real part is an instability and nothing else.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from nonholonomic.surface import Plane
+from nonholonomic.validation import as_number, require
+
+from .launch import Launch
+from .scene import Scene
+from .top import Top
+
+
+def proportions(body: Top) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """The two numbers that classify a top: alpha = a / R and gamma = I1 / I3."""
+    return body.offset / body.radius, body.I1 / body.I3
+
+
+def group(body: Top) -> str:
+    """Which of the three groups a top belongs to (Rutstam 2012; Ciocci et al. 2012).
+
+    **Returns:** "I" if gamma < 1 - alpha: it stands upright at every spin and never inverts; "III" if gamma > 1 +
+    alpha: it never stands inverted, and ends tumbling; "II" between: it inverts if Jellett's constant is large enough.
+    """
+    alpha, gamma = (float(number) for number in proportions(body))
+    return "I" if gamma <= 1.0 - alpha else "III" if gamma >= 1.0 + alpha else "II"
+
+
+def folds(body: Top) -> bool:
+    """Whether Jellett's constant has an extremum over the tumbling angles of a top of group II, and so hysteresis.
+
+    It has none if gamma > 1 - delta, delta = (1 + 6 alpha + alpha^2 - (1 - alpha) sqrt(1 + 14 alpha + alpha^2)) / 8.
+    """
+    alpha, gamma = proportions(body)
+    delta = (1.0 + 6.0 * alpha + alpha**2 - (1.0 - alpha) * jnp.sqrt(1.0 + 14.0 * alpha + alpha**2)) / 8.0
+    return bool(gamma < 1.0 - delta)
+
+
+# Standing tops
+
+
+def _root_of_ratio(value: Float[Array, "..."], excess: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Square root of value / excess, or infinity where the excess is not positive."""
+    return jnp.where(excess > 0.0, jnp.sqrt(value / jnp.where(excess > 0.0, excess, 1.0)), jnp.inf)
+
+
+def upright_critical_spin(scene: Scene) -> Float[Array, "..."]:
+    """Spin [rad/s] above which the upright top on the plane is unstable; infinite if it never is.
+
+    omega^2 = m g a (1 - alpha)^2 / (I3 (gamma - 1 + alpha)).
+    """
+    alpha, gamma = proportions(scene.body)
+    weight = scene.body.mass * scene.gravity * scene.body.offset
+    return _root_of_ratio(weight * (1.0 - alpha) ** 2 / scene.body.I3, gamma - 1.0 + alpha)
+
+
+def inverted_critical_spin(scene: Scene) -> Float[Array, "..."]:
+    """Spin [rad/s] above which the inverted top on the plane is stable; infinite if it never is.
+
+    omega^2 = m g a (1 + alpha)^2 / (I3 (1 + alpha - gamma)).
+    """
+    alpha, gamma = proportions(scene.body)
+    weight = scene.body.mass * scene.gravity * scene.body.offset
+    return _root_of_ratio(weight * (1.0 + alpha) ** 2 / scene.body.I3, 1.0 + alpha - gamma)
+
+
+def jellett_thresholds(scene: Scene) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Jellett's constant [kg m^3/s] of the standing tops at their critical spins, upright and inverted.
+
+    Below the first, the upright top is stable; above the second, the inverted one is (Rutstam's lambda_thres).
+    """
+    body = scene.body
+    upright = (body.radius - body.offset) * body.I3 * upright_critical_spin(scene)
+    inverted = (body.radius + body.offset) * body.I3 * inverted_critical_spin(scene)
+    return upright, inverted
+
+
+def standing_state(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = False) -> Float[Array, " components"]:
+    """State of the vector form of a standing top at the arena's lowest point.
+
+    **Arguments:**
+
+    - `scene`: a `Scene` on any arena.
+    - `spin`: angular velocity about the axis [rad/s].
+    - `inverted`: whether the stem points into the arena.
+    """
+    state = scene.state(Launch(0.0, spin))
+    # The axis and the angular momentum point along n; only their components 4 and 7 are not 0.
+    return state.at[np.array([4, 7])].multiply(-1.0 if inverted else 1.0)
+
+
+@eqx.filter_jit
+def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = False) -> Float[Array, "k k"]:
+    """Matrix [1/s] of the linear motion near a standing top, on any arena.
+
+    Components along n (of axis, angular momentum and vertical) change at second order only and are left out.
+
+    **Arguments:** as for `standing_state`.
+
+    **Returns:** (k, k), for the velocity, axis, angular momentum and place across n, in the units of `Scene.scales`.
+    """
+    state = standing_state(scene, spin, inverted)
+    across = [0, 1, 2, 3, 5, 6, *range(8, state.size - 1)]
+    scales = scene.scales(Launch(0.0, spin))
+    jacobian = jax.jacfwd(scene.field)(state) * scales / scales[:, None]
+    return jacobian[np.ix_(across, across)]
+
+
+# Tumbling tops on the plane
+
+
+class Tumbling(NamedTuple):
+    """A steady precession on the plane, the centre of mass at rest and the contact point without slip.
+
+    - `theta`: inclination [rad].
+    - `precession`: phi' [rad/s].
+    - `spin`: omega3 [rad/s].
+    - `jellett`: Jellett's constant [kg m^3/s].
+    """
+
+    theta: Float[Array, "..."]
+    precession: Float[Array, "..."]
+    spin: Float[Array, "..."]
+    jellett: Float[Array, "..."]
+
+
+def _lever_and_inertia(scene: Scene, theta: Float[ArrayLike, "..."]):
+    """D = I3 (alpha - cos) + I1 cos and G = I1 sin^2 + I3 (cos - alpha)^2 [kg m^2]."""
+    alpha, _ = proportions(scene.body)
+    s, c = jnp.sin(theta), jnp.cos(theta)
+    lever = scene.body.I3 * (alpha - c) + scene.body.I1 * c
+    return lever, scene.body.I1 * s**2 + scene.body.I3 * (c - alpha) ** 2
+
+
+def tumbling(scene: Scene, theta: Float[ArrayLike, "..."]) -> Tumbling:
+    """The tumbling top at an inclination, the one of its two senses with positive phi'.
+
+    phi'^2 = m g a / D, omega3 = (cos - alpha) phi', J = R G phi', with D = I3 (alpha - cos) + I1 cos and
+    G = I1 sin^2 + I3 (cos - alpha)^2 (Rutstam 2012, eq. 2.8).
+
+    **Arguments:**
+
+    - `scene`: a `Scene` on the plane.
+    - `theta`: inclination [rad] with D > 0; in group II that is every inclination.
+
+    **Raises:** `ValueError` if the arena is not a plane, or if no tumbling top exists at the inclination.
+    """
+    _on_a_plane(scene)
+    theta = as_number(theta)
+    lever, inertia = _lever_and_inertia(scene, theta)
+    require(lever, "I3 (alpha - cos(theta)) + I1 cos(theta)", above=0.0, why="no tumbling top at this inclination")
+    alpha, _ = proportions(scene.body)
+    precession = jnp.sqrt(scene.body.mass * scene.gravity * scene.body.offset / lever)
+    spin = (jnp.cos(theta) - alpha) * precession
+    return Tumbling(theta, precession, spin, scene.body.radius * inertia * precession)
+
+
+def tumbling_is_stable(scene: Scene, theta: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
+    """Whether the tumbling top is stable: J^2 grows with theta there, that is 4 D^2 + G (I1 - I3) > 0."""
+    lever, inertia = _lever_and_inertia(scene, theta)
+    return 4.0 * lever**2 + inertia * (scene.body.I1 - scene.body.I3) > 0.0
+
+
+def effective_energy(
+    scene: Scene, theta: Float[ArrayLike, "..."], jellett: Float[ArrayLike, "..."]
+) -> Float[Array, "..."]:
+    """Least energy [J] of a top with the given inclination and Jellett's constant: J^2 / (2 R^2 G) + m g (R - a cos).
+
+    Its extrema over theta are the steady motions, its minima the stable ones.
+    """
+    body = scene.body
+    _, inertia = _lever_and_inertia(scene, theta)
+    height = body.radius - body.offset * jnp.cos(theta)
+    return as_number(jellett) ** 2 / (2.0 * body.radius**2 * inertia) + body.mass * scene.gravity * height
+
+
+def tumbling_angles(scene: Scene, jellett: float, samples: int = 2001) -> list[float]:
+    """Every inclination [rad] at which a tumbling top has the given Jellett's constant, in rising order.
+
+    **Arguments:**
+
+    - `scene`: a `Scene` on the plane with concrete numbers.
+    - `jellett`: Jellett's constant [kg m^3/s], of either sign.
+    - `samples`: points of the grid on which brackets are sought; each is then closed in on by halving.
+    """
+    _on_a_plane(scene)
+    grid = jnp.linspace(0.0, jnp.pi, samples)
+
+    def slope(theta):
+        return jax.vmap(jax.grad(lambda angle: effective_energy(scene, angle, jellett)))(theta) / jnp.sin(theta)
+
+    return [float(root) for root in roots_by_halving(slope, grid[1:-1])]
+
+
+def roots_by_halving(function: Callable[[Array], Array], grid: Float[Array, " n"]) -> Float[Array, " roots"]:
+    """Zeros of a function of many numbers between neighbours of a grid where it changes sign, to rounding error."""
+    values = function(grid)
+    found = np.flatnonzero(np.sign(values[:-1]) != np.sign(values[1:]))
+    low, high, sign = grid[found], grid[found + 1], np.sign(values[found])
+    for _ in range(60 if found.size else 0):
+        middle = 0.5 * (low + high)
+        same = np.sign(function(middle)) == sign
+        low, high = jnp.where(same, middle, low), jnp.where(same, high, middle)
+    return jnp.asarray(0.5 * (low + high))
+
+
+def tumbling_state(scene: Scene, motion: Tumbling) -> Float[Array, " 8"]:
+    """State of the vector form of a tumbling top whose axis leans towards t1."""
+    body, s, c = scene.body, jnp.sin(motion.theta), jnp.cos(motion.theta)
+    zero = jnp.zeros_like(s)
+    across, along = -body.I1 * motion.precession * s, body.I3 * motion.spin
+    return jnp.stack([zero, zero, s, zero, c, across * c + along * s, zero, -across * s + along * c])
+
+
+def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
+    """Rate of a state of the plane when everything turns about the vertical at 1 rad/s."""
+    zero = jnp.zeros_like(state[0])
+    turned = [-state[1], state[0], -state[3], state[2], zero, -state[6], state[5], zero]
+    return jnp.stack(turned)
+
+
+@eqx.filter_jit
+def tumbling_matrix(scene: Scene, motion: Tumbling) -> Float[Array, "5 5"]:
+    """Matrix [1/s] of the linear motion near a tumbling top, seen by an observer who precesses with it.
+
+    Taken on the five directions that keep |e| and Jellett's constant and do not merely turn the top about the vertical.
+
+    **Arguments:**
+
+    - `scene`: a `Scene` on the plane, with friction.
+    - `motion`: from `tumbling`.
+    """
+    state = tumbling_state(scene, motion)
+    scales = scene.scales(Launch(motion.theta, motion.spin))
+
+    def seen(scaled):
+        whole = scaled * scales
+        return (scene.field(whole) - motion.precession * quarter_turn(whole)) / scales
+
+    scaled = state / scales
+    length = jax.grad(lambda x: jnp.sum((x * scales)[2:5] ** 2))(scaled)
+    jellett = jax.grad(lambda x: scene.jellett(x * scales))(scaled)
+    excluded = jnp.stack([length, jellett, quarter_turn(state) / scales], axis=1)
+    basis = jnp.linalg.qr(excluded / jnp.linalg.norm(excluded, axis=0), mode="complete")[0][:, 3:]
+    return basis.T @ jax.jacfwd(seen)(scaled) @ basis
+
+
+def growth_rate(matrix: Float[Array, "k k"]) -> Float[Array, ""]:
+    """Largest real part [1/s] of the eigenvalues of a stability matrix: positive if the motion is unstable."""
+    return jnp.max(jnp.linalg.eigvals(matrix).real)
+
+
+def _on_a_plane(scene: Scene) -> None:
+    if not isinstance(scene.surface, Plane):
+        raise ValueError(f"surface = {scene.surface!r} must be a Plane: elsewhere no top tumbles steadily")
