@@ -15,4 +15,6 @@ from .launch import Launch as Launch
 from .scene import Scene as Scene
 from .simulate import simulate as simulate
 from .stroller import Stroller as Stroller
+from .table import Table as Table
+from .table import sweep as sweep
 from .trajectory import Trajectory as Trajectory
