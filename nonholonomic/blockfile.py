@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 from jaxtyping import Shaped
 
-from .hdf5 import BLOCKS, PENDING, read_grid, write_grid
+from .hdf5 import BLOCKS, PENDING, read_grid, stored_array, write_grid
 from .table import same_request
 
 Values = Shaped[np.ndarray, "..."]
@@ -38,8 +38,9 @@ class BlockFile:
             layout.write(self.path)
         self.cells = layout.cells
         with h5py.File(self.path, "r") as file:
-            places = {name: (file[name].id.get_offset(), file[name].dtype) for name in (*layout.kinds, BLOCKS)}
-            blocks = file[BLOCKS].shape[0]
+            arrays = {name: stored_array(file, name) for name in (*layout.kinds, BLOCKS)}
+            places = {name: (array.id.get_offset(), array.dtype) for name, array in arrays.items()}
+            blocks = len(arrays[BLOCKS])
         try:
             self._maps = {
                 name: np.memmap(self.path, dtype, "r+", offset, (blocks if name == BLOCKS else self.cells,))
@@ -60,7 +61,7 @@ class BlockFile:
         if difference is not None:
             raise ValueError(f"{self.path} holds the result of another run: {difference}; give another path")
         with h5py.File(self.path, "r") as file:
-            if BLOCKS not in file or file[BLOCKS].shape[0] != layout.blocks:
+            if BLOCKS not in file or len(stored_array(file, BLOCKS)) != layout.blocks:
                 raise ValueError(f"{self.path} was not written by a sweep in {layout.blocks} blocks; give another path")
 
     @property

@@ -123,13 +123,25 @@ def read_grid(path: Any) -> tuple[dict[str, Values], dict[str, Values], dict[str
         raise OSError(f"cannot read {path}: it is not a table of nonholonomic, or it is damaged ({error})") from None
 
 
+def stored_array(file: h5py.File, name: str) -> h5py.Dataset:
+    """The array of that name in a file.
+
+    **Raises:** `KeyError` if there is nothing of that name, `ValueError` if it is not an array.
+    """
+    stored = file[name]
+    if not isinstance(stored, h5py.Dataset):
+        raise ValueError(f"{name} is not an array")
+    return stored
+
+
 def _contents(file: h5py.File) -> tuple[dict[str, Values], dict[str, Values], dict[str, str], dict[str, Any]]:
     coords, variables, units = {}, {}, {}
     if "request" not in file.attrs:
         raise ValueError("it names no request")
-    for name in json.loads(file.attrs["axes"]):
-        coords[name] = file[name][()]
-        units[name] = str(file[name].attrs["units"])
+    for name in json.loads(str(file.attrs["axes"])):
+        stored = stored_array(file, name)
+        coords[name] = stored[()]
+        units[name] = str(stored.attrs["units"])
     for name, stored in file.items():
         if name in coords or name in ("block", BLOCKS):
             continue

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from .lockstep import AbstractProblem
 
@@ -22,15 +22,15 @@ LOOKS = np.arange(1, 8) / 8.0
 class Path(NamedTuple):
     """A run: its times and states, the pieces of its dense output, how it ended and what it took."""
 
-    times: Float[Array, " times"]
-    states: Float[Array, "components times"]
+    times: Float[np.ndarray, " times"]
+    states: Float[np.ndarray, "components times"]
     pieces: list[Any]
     guard_lost: bool
     failed: bool
     accepted: int
     rejected: int
 
-    def at(self, times: Float[Array, " times"]) -> Float[Array, "components times"]:
+    def at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "components times"]:
         """States at the given times, by the dense output; times must lie within the run."""
         states = np.repeat(self.states[:, :1], len(times), axis=1)
         for piece in self.pieces:
@@ -45,7 +45,19 @@ def _evaluate(piece: diffrax.Solution, times: Float[Array, " times"]) -> Float[A
     return jax.vmap(piece.evaluate)(times)
 
 
-def _control(rtol: Float[ArrayLike, ""], atol: Float[Array, " components"]) -> diffrax.PIDController:
+def saved(solution: diffrax.Solution) -> tuple[Any, Any]:
+    """Times and states that a solution holds; Diffrax declares that there may be none."""
+    return solution.ts, solution.ys
+
+
+def _guard(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array, " components"]) -> Float[Array, ""]:
+    """The guard of a problem that has one."""
+    guard = problem.guard(time, state)
+    assert guard is not None
+    return guard
+
+
+def _control(rtol: float | Float[Array, ""], atol: Float[Array, " components"]) -> diffrax.PIDController:
     # The greatest error counts, not the mean: cyclic coordinates that ride along must not dilute the others' errors.
     return diffrax.PIDController(rtol, atol, norm=optimistix.max_norm)
 
@@ -77,13 +89,13 @@ def _piece(
         event=diffrax.Event(lambda t, y, args, **_: args.guard(t, y) < 0.0) if watched else None,
         throw=False,
     )
-    ends = solution.ts
+    ends, _ = saved(solution)
     lengths = jnp.where(jnp.isfinite(ends[1:]), ends[1:] - ends[:-1], 0.0)
     begins = jnp.where(jnp.isfinite(ends[:-1]), ends[:-1], t0)
 
     def least(begin, length):
         at = begin + length * jnp.asarray([*LOOKS, 1.0])
-        return jnp.min(jax.vmap(lambda t: problem.guard(t, solution.evaluate(t)))(at))
+        return jnp.min(jax.vmap(lambda t: _guard(problem, t, solution.evaluate(t)))(at))
 
     guards = jax.vmap(least)(begins, lengths) if watched else jnp.ones_like(lengths)
     return solution, guards
@@ -124,7 +136,8 @@ def follow(
         solution, guards = _piece(problem, time, end, length, state, solver, jnp.asarray(rtol), atol * scales)
         steps = int(solution.stats["num_accepted_steps"])
         accepted, rejected = accepted + steps, rejected + int(solution.stats["num_rejected_steps"])
-        ts, ys = np.asarray(solution.ts[1 : steps + 1]), np.asarray(solution.ys[1 : steps + 1]).T
+        ts, ys = saved(solution)
+        ts, ys = np.asarray(ts[1 : steps + 1]), np.asarray(ys[1 : steps + 1]).T
         finite = np.isfinite(ts) & np.all(np.isfinite(ys), axis=0)
         out = np.flatnonzero(np.asarray(guards[:steps]) < 0.0)
         if out.size:
@@ -141,13 +154,13 @@ def follow(
         if good:
             length = jnp.asarray(ts[-1] - (ts[-2] if good > 1 else float(time)))
             time, state = jnp.asarray(ts[good - 1]), jnp.asarray(ys[:, good - 1])
-        failed = failed or (not lost and solution.result == diffrax.RESULTS.dt_min_reached)
+        failed = failed or (not lost and bool(solution.result == diffrax.RESULTS.dt_min_reached))
     return Path(np.concatenate(times), np.concatenate(states, axis=1), pieces, lost, failed, accepted, rejected)
 
 
 def _loss(problem: AbstractProblem, solution: diffrax.Solution, begin: float, end: float) -> float:
     """The first time in a step at which the guard is zero, by bisection on the dense output."""
-    evaluate = eqx.filter_jit(lambda s, t: problem.guard(t, s.evaluate(t)))
+    evaluate = eqx.filter_jit(lambda s, t: _guard(problem, t, s.evaluate(t)))
     previous = begin
     for fraction in (*LOOKS, 1.0):
         at = begin + (end - begin) * fraction
@@ -203,7 +216,8 @@ def sample(
         throw=False,
     )
     lost = jnp.zeros((), bool) if solution.event_mask is None else solution.event_mask
-    end = solution.ts[1][0]
+    (_, ends), (states, _) = saved(solution)
+    end = ends[0]
     # Not a number, rather than infinite: an angle of infinite components would look like an angle.
-    states = jnp.where(times <= end, solution.ys[0].T, jnp.nan)
+    states = jnp.where(times <= end, states.T, jnp.nan)
     return states, end, lost, solution.stats

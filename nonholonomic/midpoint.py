@@ -1,6 +1,6 @@
 """The implicit midpoint rule, whose energy balance closes to round-off on the P-form."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -58,7 +58,8 @@ class ImplicitMidpoint(diffrax.AbstractSolver):
 
         z, corrections = jax.lax.scan(improve, guess, length=ITERATIONS)
         converged = corrections[-1] < 1e3 * jnp.finfo(y0.dtype).eps
-        result = diffrax.RESULTS.where(converged, diffrax.RESULTS.successful, diffrax.RESULTS.nonlinear_divergence)
+        diverged: Any = diffrax.RESULTS.nonlinear_divergence
+        result = diffrax.RESULTS.where(converged, diffrax.RESULTS.successful, diverged)
         y1 = y0 + z
         return y1, None, dict(y0=y0, y1=y1), None, result
 

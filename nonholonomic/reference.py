@@ -8,6 +8,7 @@ import optimistix
 from jaxtyping import Array, Float
 
 from .ensemble import Outcome
+from .integrate import saved
 from .lockstep import CROSSED, FAILED, GUARD_LOST, REACHED_END, AbstractProblem
 
 
@@ -54,7 +55,8 @@ def march_by_diffrax(
             event=event if conditions else None,
             throw=False,
         )
-        end, final = solution.ts[0], solution.ys[0]
+        ends, finals = saved(solution)
+        end, final = ends[0], finals[0]
         status = jnp.where(end >= t1, REACHED_END, FAILED)
         for code, happened in zip(conditions, solution.event_mask or [], strict=True):
             status = jnp.where(happened, code, status)
@@ -67,5 +69,5 @@ def march_by_diffrax(
             solution.stats["num_rejected_steps"],
         )
 
-    out = Outcome(0, 0, 0, -1, 0, 0)
+    out = Outcome._make((0, 0, 0, -1, 0, 0))
     return jax.vmap(one, in_axes=(varying, -1, -1), out_axes=out)(problem, starts, scales)

@@ -2,9 +2,9 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 
@@ -18,7 +18,7 @@ def as_number(value: Any) -> Float[Array, "..."]:
 
 def is_traced(value: Any) -> bool:
     """Whether the value is known only while JAX runs a transformation."""
-    return isinstance(value, jax.core.Tracer)
+    return isinstance(value, Tracer)
 
 
 def shown(value: Any) -> str:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.formulation import AbstractSystem, Coordinates
+from nonholonomic.ground import AbstractQuadric
 from nonholonomic.linear import inverse
 from nonholonomic.surface import Plane
 from nonholonomic.vector import add, multiply, subtract
@@ -40,11 +41,16 @@ class Chart(AbstractSystem):
     def dimension(self) -> int:
         return 4
 
+    @property
+    def quadric(self) -> AbstractQuadric | None:
+        """The sphere or spheroid; `None` on a plane."""
+        return self.scene.surface if isinstance(self.scene.surface, AbstractQuadric) else None
+
     def ground_metric(self, q: Coordinates) -> Float[Array, " 2"]:
         """Squares of the scale factors of the first two coordinates [m^2 or 1]."""
-        if isinstance(self.scene.surface, Plane):
+        if self.quadric is None:
             return jnp.ones(2)
-        equatorial, polar = self.scene.surface.semi_axes
+        equatorial, polar = self.quadric.semi_axes
         sine, cosine = jnp.sin(q[0]), jnp.cos(q[0])
         return jnp.array([(equatorial * sine) ** 2 + (polar * cosine) ** 2, (equatorial * cosine) ** 2])
 
@@ -52,9 +58,9 @@ class Chart(AbstractSystem):
         """The one-forms long, lat and yaw, a row each: what the rear axle rolls, slips to the left, and turns left."""
         zero, one = jnp.zeros(()), jnp.ones(())
         sine, cosine = jnp.sin(q[2]), jnp.cos(q[2])
-        if isinstance(self.scene.surface, Plane):
+        if self.quadric is None:
             return jnp.array([[cosine, sine, zero, zero], [-sine, cosine, zero, zero], [zero, zero, one, zero]])
-        equatorial, _ = self.scene.surface.semi_axes
+        equatorial, _ = self.quadric.semi_axes
         if self.scene.heading == "projected":
             # The pull-back of cos(theta) dx + sin(theta) dy and its like by x = A cos(eta) cos(mu), y = ... sin(mu).
             inwards, across = -equatorial * jnp.sin(q[0]), equatorial * jnp.cos(q[0])
@@ -82,12 +88,12 @@ class Chart(AbstractSystem):
 
     def potential(self, q: Coordinates) -> Float[Array, ""]:
         scene = self.scene
-        if isinstance(scene.surface, Plane):
+        if self.quadric is None:
             slope = scene.surface.up[0]
             along = add(q[0], multiply(scene.body.centre, jnp.cos(q[2])))
             height = multiply(along, slope)
         else:
-            height = scene.surface.semi_axes[1] * (1.0 + jnp.sin(q[0]))
+            height = self.quadric.semi_axes[1] * (1.0 + jnp.sin(q[0]))
         weight = multiply(scene.body.mass * scene.gravity, height)
         spring = multiply(0.5, scene.body.steering_spring, q[3], q[3])
         return add(jnp.zeros(()), weight, spring)
@@ -114,15 +120,16 @@ class Chart(AbstractSystem):
         rows = jnp.stack([long, front, yaw, jnp.zeros(4).at[3].set(1.0)])
         load = self.normal_force(q, rate)
         front_load = None if body.centre is None else load * body.centre / body.wheelbase
-        return rows, Rolling(*(rows @ rate), subtract(load, front_load), front_load)
+        v, w, yaw_rate, steering_rate = rows @ rate
+        return rows, Rolling(v, w, yaw_rate, steering_rate, subtract(load, front_load), front_load)
 
     def normal_force(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
         """Normal force [N], from the principal curvatures A c / h_eta^3 and c / (A h_eta) of a spheroid."""
         scene = self.scene
         weight = scene.body.mass * scene.gravity
-        if isinstance(scene.surface, Plane):
-            return weight * scene.surface.up[2]
-        equatorial, polar = scene.surface.semi_axes
+        if self.quadric is None:
+            return multiply(weight, scene.surface.up[2])
+        equatorial, polar = self.quadric.semi_axes
         squares = self.ground_metric(q)
         h_eta = jnp.sqrt(squares[0])
         curvatures = jnp.array([equatorial * polar / h_eta**3, polar / (equatorial * h_eta)])
@@ -131,7 +138,7 @@ class Chart(AbstractSystem):
 
     def motion(self, q: Coordinates, rolling: Rolling) -> Motion:
         """What an input sees."""
-        place = (q[0], q[1]) if isinstance(self.scene.surface, Plane) else (q[1], q[0])
+        place = (q[0], q[1]) if self.quadric is None else (q[1], q[0])
         position, east, north = self.scene.surface.chart(place)
         heading = self.scene.dynamics.heading.at_angle(q[2], east, north)
         return Motion(position, heading, q[3], *rolling[:4])

@@ -320,7 +320,7 @@ def render() -> str:
         "",
         '"Vector Fields of the Dynamics of Non-Holonomic Constraint System With Elliptical Configuration Space".',
         "D stands for sinh²ξ + sin²η. The corrected forms are functions of `stroller/paper.py`; the tests are in",
-        "`tests/stroller/test_paper.py`, and show that the corrected form follows from the position on the spheroid",
+        "`tests/stroller/test_stroller_paper.py`, and show that the corrected form follows from the position on the spheroid",
         "and, where the verdict is *wrong*, that the printed one does not. `stroller.paper.render()` gives this page.",
         "",
         "The paper announces friction, a constrained Levi-Civita connection, Poincare's equations and graphs; none of",

@@ -1,5 +1,7 @@
 """Run the stroller from a launch."""
 
+from typing import Any
+
 import diffrax
 import equinox as eqx
 import jax
@@ -10,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from nonholonomic.midpoint import ImplicitMidpoint
 from nonholonomic.validation import as_number, is_traced, require
 
+from .dynamics import State
 from .input import Input
 from .launch import Launch
 from .scene import Scene
@@ -60,21 +63,20 @@ def simulate(
     if not is_traced(times) and np.any(np.diff(np.asarray(times)) <= 0.0):
         raise ValueError(f"times = {times!r} must be increasing")
     solver = diffrax.Dopri8() if solver is None else solver
+    end = as_number(t1)
     adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
     grid = None
     if isinstance(solver, ImplicitMidpoint):
-        grid = even_steps(times, t1, solver.step_length)
+        grid = even_steps(times, end, solver.step_length)
         max_steps = grid.size
-    sol = solve(scene, launch, input, as_number(t1), times, grid, as_number(tolerance), solver, max_steps, adjoint)
-    stats = Stats(
-        sol.stats["num_accepted_steps"], sol.stats["num_rejected_steps"], sol.result == diffrax.RESULTS.successful
+    states, watch, stats = solve(
+        scene, launch, input, end, times, grid, as_number(tolerance), solver, max_steps, adjoint
     )
-    (t, states), (step_times, watch) = zip(sol.ts, sol.ys, strict=True)
-    return read_off(scene, input, t, states.T, Watch(step_times, *watch), stats)
+    return read_off(scene, input, times, states, watch, stats)
 
 
 def even_steps(
-    times: Float[Array, " times"], t1: Float[ArrayLike, ""], longest: Float[Array, ""]
+    times: Float[Array, " times"], t1: Float[Array, ""], longest: Float[Array, ""]
 ) -> Float[Array, " steps"]:
     """Times from 0 to `t1` at most `longest` apart that fall on every one of `times`, evenly between them."""
     knots = np.union1d(np.asarray(times), [0.0, float(t1)])
@@ -84,8 +86,8 @@ def even_steps(
 
 
 @eqx.filter_jit
-def solve(scene, launch, input, t1, times, grid, tolerance, solver, max_steps, adjoint) -> diffrax.Solution:
-    """Integrate, saving the states at `times` and, at every step, what a `Watch` follows."""
+def solve(scene, launch, input, t1, times, grid, tolerance, solver, max_steps, adjoint) -> tuple[State, Watch, Stats]:
+    """Integrate; the states at `times`, what a `Watch` follows at every step, and statistics."""
     start = scene.state(launch, input is not None)
     if grid is None:
         scales = scene.scales(launch, input is not None)
@@ -99,7 +101,7 @@ def solve(scene, launch, input, t1, times, grid, tolerance, solver, max_steps, a
         diffrax.SubSaveAt(ts=times),
         diffrax.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: watched(scene, y)),
     )
-    return diffrax.diffeqsolve(
+    solution: Any = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: dynamics.field(t, y, input)),
         solver,
         t0=jnp.zeros_like(t1),
@@ -112,3 +114,7 @@ def solve(scene, launch, input, t1, times, grid, tolerance, solver, max_steps, a
         adjoint=adjoint,
         throw=False,
     )
+    counts, finished = solution.stats, solution.result == diffrax.RESULTS.successful
+    stats = Stats(counts["num_accepted_steps"], counts["num_rejected_steps"], finished)
+    states, followed = solution.ys
+    return states.T, Watch(solution.ts[1], *followed), stats

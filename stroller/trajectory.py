@@ -151,9 +151,9 @@ def shown(numbers: Float[Array, " n"]) -> str:
     return f"({', '.join(f'{float(number):.6g}' for number in numbers)})"
 
 
-def first_crossing(time: Float[Array, " steps"], value: Float[Array, " steps"], level: float) -> float:
+def first_crossing(times: Float[Array, " steps"], values: Float[Array, " steps"], level: float) -> float:
     """Time at which a value known at some times first falls below a level, by linear interpolation."""
-    time, value = np.asarray(time), np.asarray(value)
+    time, value = np.asarray(times), np.asarray(values)
     below = np.flatnonzero((value < level) & np.isfinite(time))
     if below.size == 0:
         return float("inf")

@@ -186,11 +186,13 @@ def test_negative_baumgarte_rate_is_refused():
 def test_formulations_serve_many_states():
     """vmap over states, and a gradient through the data: d(v')/d(ahead) = omega^2."""
     q, rate, expected = sleigh_motion()
-    many = jax.vmap(Hamel(SLEIGH).acceleration, in_axes=(None, 0, 0))(0.0, jnp.stack([q, q]), jnp.stack([rate, rate]))
+    many = jax.jit(jax.vmap(lambda q, rate: Hamel(SLEIGH).acceleration(0.0, q, rate)))(
+        jnp.stack([q, q]), jnp.stack([rate, rate])
+    )
     np.testing.assert_allclose(many, jnp.stack([expected, expected]), rtol=1e-13)
 
     def forward(ahead):
         sleigh = eqx.tree_at(lambda s: s.ahead, SLEIGH, ahead)
         return Multipliers(sleigh).acceleration(0.0, q, rate) @ jnp.array([jnp.cos(q[2]), jnp.sin(q[2]), 0.0])
 
-    np.testing.assert_allclose(jax.grad(forward)(SLEIGH.ahead), 1.3**2, rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.grad(forward))(SLEIGH.ahead), 1.3**2, rtol=1e-12)

@@ -157,6 +157,7 @@ def report(options: argparse.Namespace, found: dict[tuple[str, str], Table]) -> 
 def _friction(law: AbstractFriction) -> str:
     if isinstance(law, Coulomb):
         return f"Coulomb mu = {float(law.mu):g}, slip speed {float(law.slip_speed):g} m/s"
+    assert isinstance(law, Viscous)
     return f"viscous mu = {float(law.mu):g} s/m"
 
 

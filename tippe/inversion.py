@@ -96,7 +96,8 @@ def inversion_time(
 class _Run(NamedTuple):
     """What of a call is not a number."""
 
-    structure: jax.tree_util.PyTreeDef
+    # JAX's PyTreeDef, which type checkers take for a variable.
+    structure: Any
     solver: diffrax.AbstractERK
     last: bool
 

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.integrate import follow, sample
 from nonholonomic.lockstep import AbstractProblem
@@ -153,7 +153,7 @@ class Trajectory(eqx.Module):
         """Velocity of the contact point along the arena, in the moving frame [m/s]."""
         return self.scene.slip_velocity(self.states).T
 
-    def at(self, times: Float[Array, " times"]) -> "Trajectory":
+    def at(self, times: Float[ArrayLike, " times"]) -> "Trajectory":
         """The same run at other times, from the dense output.
 
         **Arguments:** `times`: increasing, within [0, `end_time`] [s].

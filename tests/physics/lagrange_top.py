@@ -95,7 +95,9 @@ def accelerations(scene, state, pole="z"):
     st, ct, kth = sin(th), cos(th), (-sin(ph), cos(ph), 0.0)  # kth: axis of theta'
     J, ma, mg, w3 = scene.I1 + m * a * a, m * a, m * scene.gravity, dps + dph * ct
     # e'' at theta'' = phi'' = 0: -e theta'^2 + 2 e12 theta' phi' + e22 phi'^2
-    bend = [2 * p * dth * dph - q * dth * dth - r * dph * dph for p, q, r in zip(e12, e, (e[0], e[1], 0.0))]
+    bend = [
+        2 * p * dth * dph - q * dth * dth - r * dph * dph for p, q, r in zip(e12, e, (e[0], e[1], 0.0), strict=True)
+    ]
     climb = k * rho * du * du  # O''.n at u'' = 0
     te1, te2, ye1, ye2, ne1, ne2 = dot(t, e1), dot(t, e2), dot(y, e1), dot(y, e2), dot(n, e1), dot(n, e2)
     # velocity of the contact point v = O' - R w x n along t and y; its derivatives by the rates
@@ -142,11 +144,14 @@ def kinetic_potential(scene, q, dq, pole="z"):
 
 def lagrange_forces(scene, q, dq, ddq, pole="z"):
     """d(dL/dq')/dt - dL/dq straight from T and U, by complex steps: a check on `accelerations`."""
-    L = lambda q, dq: np.subtract(*kinetic_potential(scene, q, dq, pole))
+
+    def L(q, dq):
+        return np.subtract(*kinetic_potential(scene, q, dq, pole))
+
     h, units, q, dq, ddq = 1e-30, np.eye(6), np.array(q), np.array(dq), np.array(ddq)
     ahead, rate = q + 1j * h * dq, dq + 1j * h * ddq
     momenta = [(L(ahead, rate + unit) - L(ahead, rate - unit)) / 2 for unit in units]  # exact: L is quadratic in q'
-    return np.array([p.imag - L(q + 1j * h * unit, dq).imag for p, unit in zip(momenta, units)]) / h
+    return np.array([p.imag - L(q + 1j * h * unit, dq).imag for p, unit in zip(momenta, units, strict=True)]) / h
 
 
 def energy(scene, state, pole="z"):
@@ -167,7 +172,10 @@ def start(scene, pole="z"):
     """State at launch: centre at rest, angular velocity = spin times e."""
     t, n, _, _ = arena(scene, scene.eta, pole)
     p, q = cos(scene.azimuth), sin(scene.azimuth)
-    e = [cos(scene.theta) * c + sin(scene.theta) * (p * a + q * b) for a, b, c in zip(t, in_chart(Y, pole), n)]
+    e = [
+        cos(scene.theta) * c + sin(scene.theta) * (p * a + q * b)
+        for a, b, c in zip(t, in_chart(Y, pole), n, strict=True)
+    ]
     place, rate = in_angles(e, (0.0, 0.0, 0.0), scene.spin)
     return np.array((0.0 if scene.surface_radius is None else scene.eta, *place, 0.0, 0.0, *rate))
 
@@ -177,7 +185,7 @@ def best_chart(state, pole):
     u, th, ph, du, dy, dth, dph, dps = state
     e, e1, e2, _ = axis(th, ph)
     back = {"z": "z", "x": "y", "y": "x"}[pole]  # undoes the turn to this chart
-    e, de = in_chart(e, back), in_chart(tuple(dth * p + dph * q for p, q in zip(e1, e2)), back)
+    e, de = in_chart(e, back), in_chart(tuple(dth * p + dph * q for p, q in zip(e1, e2, strict=True)), back)
     pole = min("xyz", key=lambda new: abs(in_chart(e, new)[2]))
     place, rate = in_angles(in_chart(e, pole), in_chart(de, pole), dps + dph * cos(th))
     return np.array((u, *place, du, dy, *rate)), pole
@@ -198,7 +206,10 @@ def gaps(scene, angle, state, pole):
 
 def solver(scene, t0, state, t1, rtol, pole, first=None):
     """DOP853 with absolute tolerance rtol on the angles (phi may wind up) and rtol of sqrt(g/R) on the rates."""
-    rate = lambda _, x: np.concatenate((x[[3, 5, 6]], accelerations(scene, x.tolist(), pole)[:5]))
+
+    def rate(_, x):
+        return np.concatenate((x[[3, 5, 6]], accelerations(scene, x.tolist(), pole)[:5]))
+
     swing = sqrt(max(scene.gravity, 1.0) / scene.radius)
     length = scene.radius if scene.surface_radius is None else 1.0  # u is a length or an angle
     absolute = rtol * np.array((length, 1.0, 1.0, swing * length, swing * scene.radius, swing, swing, swing))
@@ -241,7 +252,7 @@ def follow(scene, t1, angle=0.95 * pi, rtol=1e-12, pole="x", closest=0.3):
             return "failed", run.t, tilt(scene, state, pole), spare
         new = gaps(scene, angle, run.y, pole)
         times = [
-            crossing(lambda x: gaps(scene, angle, x, pole)[k], (old[k], new[k]), run, again)
+            crossing(lambda x, k=k, pole=pole: gaps(scene, angle, x, pole)[k], (old[k], new[k]), run, again)
             if min(old[k], new[k]) < NEAR[k]
             else inf
             for k in (0, 1)

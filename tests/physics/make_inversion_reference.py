@@ -115,7 +115,7 @@ def judge(scene, wanted):
     error = difference(fine, check)
     if error > AGREEMENT or difference(fine, quick) > ROUGH_AGREEMENT:
         return f"sensitive: {fine[0]}"
-    missed = min(gap for name, gap in zip(("inverted", "contact_lost"), fine[3]) if name != fine[0])
+    missed = min(gap for name, gap in zip(("inverted", "contact_lost"), fine[3], strict=True) if name != fine[0])
     return "close miss: " + fine[0] if missed < MARGIN else (*fine[:3], error)
 
 

@@ -20,7 +20,7 @@ GROUNDS = {
     "intrinsic inside": dict(surface=Spheroid(2.0, 1.1), side="inside"),
     "projected": dict(surface=Spheroid(2.0, 1.1), heading="projected", side="inside"),
 }
-CASES = [(ground, fork) for ground in GROUNDS for fork in ("relative", "absolute")]
+CASES = [(ground, fork) for ground in ("plane", "intrinsic inside", "projected") for fork in ("relative", "absolute")]
 
 
 class Push(eqx.Module):

@@ -1,0 +1,78 @@
+"""What every benchmark needs: the machine, the versions, clocks, and rows that go to the screen, a CSV and the README."""
+
+import csv
+import os
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+PACKAGES = ("nonholonomic", "jax", "diffrax", "numpy", "scipy", "numba", "heyoka", "CyRK", "scikit-sundae")
+
+
+class Timed(NamedTuple):
+    """A result, with the least wall time and the least CPU time of the process [s] over the runs, compilation apart."""
+
+    result: Any
+    wall: float
+    cpu: float
+    first: float
+
+
+def timed(run: Callable[[], Any], runs: int = 3) -> Timed:
+    """Call once to warm up, then `runs` times."""
+    started = time.perf_counter()
+    result = jax.block_until_ready(run())
+    first = time.perf_counter() - started
+    walls, cpus = [], []
+    for _ in range(runs):
+        started, spent = time.perf_counter(), time.process_time()
+        result = jax.block_until_ready(run())
+        walls.append(time.perf_counter() - started)
+        cpus.append(time.process_time() - spent)
+    return Timed(result, min(walls), min(cpus), first)
+
+
+def machine() -> str:
+    """The processor, its cores and the versions, in two lines."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        model = next((line.split(":")[1].strip() for line in info.read_text().splitlines() if "model name" in line), model)
+    found = []
+    for name in PACKAGES:
+        try:
+            found.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            found.append(f"{name} missing")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+    return f"{model}, {cores} cores{load}, {platform.system()}, Python {platform.python_version()}\n{', '.join(found)}"
+
+
+def one_core() -> None:
+    """Keep this process on one core, so that CPU time and wall time tell the same story."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+
+def table(rows: list[dict[str, str]]) -> str:
+    """Rows as a Markdown table."""
+    names = list(rows[0])
+    widths = {name: max(len(name), *(len(row[name]) for row in rows)) for name in names}
+    lines = ["| " + " | ".join(name.ljust(widths[name]) for name in names) + " |"]
+    lines.append("| " + " | ".join("-" * widths[name] for name in names) + " |")
+    lines += ["| " + " | ".join(row[name].ljust(widths[name]) for name in names) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def write_csv(path: Path, rows: list[dict[str, str]]) -> None:
+    """Rows as a CSV."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)

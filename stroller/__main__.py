@@ -1,0 +1,189 @@
+"""The main job, `python -m stroller`: rides on a plane and inside a spheroid, with and without friction, and their audit."""
+
+import argparse
+import json
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from nonholonomic.ground import AbstractGround, Spheroid
+from nonholonomic.midpoint import ImplicitMidpoint
+from nonholonomic.surface import Plane
+from nonholonomic.sweep import versions
+from nonholonomic.table import Table
+
+from .friction import Damping, Frictionless
+from .launch import Launch
+from .plot import draw_rides
+from .scene import FORKS, Scene
+from .simulate import simulate
+from .stroller import Stroller
+from .trajectory import Trajectory
+
+RIDES = ("without friction", "with friction")
+
+
+class Helm:
+    """Steer to and fro about straight ahead, and pull with a constant force: a torque towards a moving angle."""
+
+    def __init__(self, force: float, angle: float, period: float):
+        self.force, self.angle, self.period = force, angle, period
+
+    def __call__(self, t: Any, motion: Any) -> tuple[Any, Any]:
+        wanted = self.angle * jnp.sin(2.0 * jnp.pi * t / self.period)
+        return self.force, 1.0 * (wanted - motion.steering) - 0.3 * motion.steering_rate
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options of the main job; the defaults are those of a light stroller."""
+    told = argparse.ArgumentParser(
+        prog="python -m stroller",
+        description="Rides of a stroller on a plane and inside a spheroid, with and without friction, steered to and fro "
+        "and pulled. Prints the energy audit of both integrators, writes an HDF5 file and a picture.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    body = told.add_argument_group("the stroller")
+    body.add_argument("--mass", type=float, default=12.0, help="mass [kg]")
+    body.add_argument("--wheelbase", type=float, default=0.7, help="rear axle to front wheel [m]")
+    body.add_argument("--inertia", type=float, default=1.5, help="yaw inertia about the rear axle [kg m^2]")
+    body.add_argument("--steering-inertia", type=float, default=0.05, help="inertia of the fork [kg m^2]")
+    scene = told.add_argument_group("the scene")
+    scene.add_argument("--tilt", type=float, default=0.05, help="tilt of the plane [rad]")
+    scene.add_argument("--equatorial", type=float, default=6.0, help="equatorial radius of the spheroid [m]")
+    scene.add_argument("--polar", type=float, default=3.0, help="polar semi-axis of the spheroid [m]")
+    scene.add_argument(
+        "--damping", type=float, nargs=4, default=[2.0, 1.0, 0.2, 0.05], help="rolling, front, scrub, steering"
+    )
+    scene.add_argument("--gravity", type=float, default=9.81, help="acceleration of free fall [m/s^2]")
+    scene.add_argument("--fork", choices=list(FORKS), default="absolute", help="what the fork's inertia resists")
+    ride = told.add_argument_group("the ride")
+    ride.add_argument("--speed", type=float, default=2.0, help="speed at the start [m/s]")
+    ride.add_argument("--force", type=float, default=1.0, help="drive force [N]")
+    ride.add_argument("--steer", type=float, default=0.3, help="steering angle aimed at [rad]")
+    ride.add_argument("--period", type=float, default=6.0, help="period of the steering [s]")
+    ride.add_argument("--t1", type=float, default=20.0, help="end of the ride [s]")
+    ride.add_argument("--tolerance", type=float, default=1e-9, help="relative tolerance of Dopri8")
+    ride.add_argument("--step", type=float, default=0.01, help="step of the implicit midpoint rule [s]")
+    ride.add_argument("--out", type=Path, default=Path("stroller-out"), help="folder for the file and the picture")
+    return told
+
+
+def scenes(options: argparse.Namespace) -> dict[tuple[str, str], tuple[Scene, Launch]]:
+    """The four rides: (ground, friction) -> scene and launch."""
+    body = Stroller(options.mass, options.wheelbase, options.inertia, options.steering_inertia)
+    spheroid = Spheroid(options.equatorial, options.polar)
+    grounds: dict[str, tuple[AbstractGround, str, Launch]] = {
+        "plane": (Plane(options.tilt), "outside", Launch((0.0, 0.0), 1.2, options.speed)),
+        "inside the spheroid": (spheroid, "inside", Launch((0.0, -0.9), 0.4, options.speed)),
+    }
+    laws = dict(zip(RIDES, (Frictionless(), Damping(*options.damping)), strict=True))
+    return {
+        (ground, ride): (Scene(body, surface, law, options.gravity, side=side, fork=options.fork), launch)
+        for ground, (surface, side, launch) in grounds.items()
+        for ride, law in laws.items()
+    }
+
+
+def audit(name: str, runs: dict[str, Trajectory]) -> list[str]:
+    """The lines of the energy audit of one ride, one for each integrator."""
+    lines = []
+    for solver, run in runs.items():
+        residual, slip = (float(jnp.max(jnp.abs(part))) for part in (run.energy_residual, run.constraint))
+        numbers = (float(run.energy[0]), float(run.energy[-1]), float(run.work[-1]))
+        columns = " ".join(f"{number:12.6f}" for number in numbers)
+        steps = int(run.stats.steps)
+        least = float(jnp.min(run.normal_force))
+        lines.append(
+            f"{name:38s} {solver:10s} {columns} {residual:10.1e} {slip:10.1e} {least:10.3f} {steps:6d}  {run.status}"
+        )
+    return lines
+
+
+def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
+    """The largest residual of energy against work over the tolerance of Dopri8, for the last ride."""
+    scene, launch = list(scenes(options).values())[-1]
+    lines = ["Dopri8 inside the spheroid, with friction: residual [J] of energy against work over the tolerance"]
+    for tolerance in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12):
+        # Few times of output, so that the tolerance alone chooses the steps.
+        run = simulate(scene, launch, options.t1, helm, times=jnp.linspace(0.0, options.t1, 3), tolerance=tolerance)
+        residual = float(jnp.max(jnp.abs(run.energy_residual)))
+        lines.append(f"  {tolerance:7.0e}  {residual:8.1e}  in {int(run.stats.steps)} steps")
+    return lines
+
+
+def table(options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory]) -> Table:
+    """The rides as a table over ride and time."""
+    runs = list(rides.values())
+    columns: dict[str, tuple[str, Any]] = {
+        **{f"place_{k + 1}": ("m or rad", lambda run, k=k: run.place[:, k]) for k in range(2)},
+        **{axis: ("m", lambda run, k=k: run.position[:, k]) for k, axis in enumerate("xyz")},
+        "heading": ("rad", lambda run: run.heading),
+        "steering": ("rad", lambda run: run.steering),
+        "steering_rate": ("rad s-1", lambda run: run.steering_rate),
+        "speed": ("m s-1", lambda run: run.speed),
+        "yaw_rate": ("rad s-1", lambda run: run.yaw_rate),
+        "energy": ("J", lambda run: run.energy),
+        "work": ("J", lambda run: run.work),
+        "drive_power": ("W", lambda run: run.power.drive),
+        "steering_power": ("W", lambda run: run.power.steering),
+        "friction_power": ("W", lambda run: sum(run.power[2:])),
+        "rear_side_force": ("N", lambda run: run.side_force[:, 0]),
+        "front_side_force": ("N", lambda run: run.side_force[:, 1]),
+        "normal_force": ("N", lambda run: run.normal_force),
+    }
+    coords = {"ride": np.arange(len(runs)), "t": np.asarray(runs[0].t)}
+    variables = {name: np.stack([np.asarray(read(run)) for run in runs]) for name, (_, read) in columns.items()}
+    units = {"ride": "1", "t": "s"} | {name: unit for name, (unit, _) in columns.items()}
+    request = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
+    request["ride"] = [", ".join(name) for name in rides]
+    attributes = {"request": json.dumps(request), "axes": json.dumps(list(coords)), "versions": json.dumps(versions())}
+    return Table(coords, variables, units, attributes)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the main job.
+
+    **Arguments:** `arguments`: the command line, by default that of the process.
+
+    **Returns:** the exit status: 0, or 2 for input that cannot be used.
+    """
+    options = parser().parse_args(arguments)
+    started = time.perf_counter()
+    try:
+        print(
+            f"{'ride':38s} {'solver':10s} {'E start [J]':>12s} {'E end [J]':>12s} {'work [J]':>12s} "
+            f"{'residual':>10s} {'slip [m/s]':>10s} {'N min [N]':>10s} {'steps':>6s}  status"
+        )
+        rides, helm = {}, Helm(options.force, options.steer, options.period)
+        for name, (scene, launch) in scenes(options).items():
+            runs = {
+                "Dopri8": simulate(scene, launch, options.t1, helm, tolerance=options.tolerance),
+                "midpoint": simulate(scene, launch, options.t1, helm, solver=ImplicitMidpoint(options.step)),
+            }
+            rides[name] = runs["Dopri8"]
+            print("\n".join(audit(", ".join(name), runs)), flush=True)
+        print("\n" + "\n".join(tolerance_curve(options, helm)))
+        options.out.mkdir(parents=True, exist_ok=True)
+        written = [options.out / "rides.h5"]
+        table(options, rides).save(written[0])
+        if find_spec("matplotlib") is None:
+            print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
+        else:
+            written.append(options.out / "rides.png")
+            grounds = {ground: scene.surface for (ground, _), (scene, _) in scenes(options).items()}
+            draw_rides(grounds, rides).savefig(written[1], dpi=110)
+    except (ValueError, OSError) as error:
+        print(f"python -m stroller: {error}", file=sys.stderr)
+        return 2
+    print(f"\n{2 * len(rides)} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
+    print(f"Wrote {', '.join(map(str, written))}.")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

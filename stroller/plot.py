@@ -1,0 +1,67 @@
+"""The picture of the main job (needs matplotlib): paths on the ground, speed, energy and side forces."""
+
+from typing import Any
+
+import numpy as np
+
+from nonholonomic.ground import AbstractGround
+from nonholonomic.surface import Plane
+
+from .trajectory import Trajectory
+
+#: One colour for each ride of a ground: without and with friction.
+COLOURS = ("tab:blue", "tab:red")
+
+
+def draw_rides(grounds: dict[str, AbstractGround], rides: dict[tuple[str, str], Trajectory]) -> Any:
+    """Draw rides, a row of pictures for each ground.
+
+    **Arguments:**
+
+    - `grounds`: name of a ground -> the ground.
+    - `rides`: (name of a ground, name of a ride) -> its trajectory.
+
+    **Returns:** a matplotlib figure.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(18.0, 4.2 * len(grounds)), layout="constrained")
+    layout = figure.add_gridspec(len(grounds), 4, width_ratios=(1.5, 1.0, 1.0, 1.0))
+    for row, (name, ground) in enumerate(grounds.items()):
+        here = {ride: run for (where, ride), run in rides.items() if where == name}
+        space = figure.add_subplot(layout[row, 0], projection="3d")
+        _draw_ground(space, ground, here)
+        panels = [figure.add_subplot(layout[row, column]) for column in (1, 2, 3)]
+        for colour, (ride, run) in zip(COLOURS, here.items(), strict=False):
+            space.plot(*np.asarray(run.position).T, color=colour, linewidth=1.4, label=ride)
+            panels[0].plot(run.t, run.speed, color=colour, label=ride)
+            panels[1].plot(run.t, run.energy, color=colour, label=ride)
+            panels[1].plot(run.t, run.energy[0] + run.work, color="black", linewidth=0.8, linestyle=":")
+            panels[2].plot(run.t, run.side_force[:, 0], color=colour, label=f"rear, {ride}")
+            panels[2].plot(run.t, run.side_force[:, 1], color=colour, linestyle="--", label=f"front, {ride}")
+        space.set_title(name)
+        space.legend(fontsize="small")
+        for panel, label in zip(panels, ("speed [m/s]", "energy [J]", "side force [N]"), strict=True):
+            panel.set_xlabel("t [s]")
+            panel.set_ylabel(label)
+            panel.legend(fontsize="small")
+        panels[1].set_title("dotted: start plus work", fontsize="small")
+    return figure
+
+
+def _draw_ground(space: Any, ground: AbstractGround, rides: dict[str, Trajectory]) -> None:
+    """A wire frame of the ground as far as the rides go."""
+    places = np.concatenate([np.asarray(run.place) for run in rides.values()])
+    if isinstance(ground, Plane):
+        first, second = (np.linspace(part.min() - 0.3, part.max() + 0.3, 12) for part in places.T)
+    else:
+        first = np.linspace(-np.pi, np.pi, 49)
+        second = np.linspace(-np.pi / 2, min(places[:, 1].max() + 0.1, np.pi / 2), 13)
+    grid = tuple(np.meshgrid(first, second, indexing="ij"))
+    x, y, z = (np.asarray(part) for part in ground.in_fixed_frame(ground.chart(grid)[0]))
+    space.plot_wireframe(x, y, z, color="0.75", linewidth=0.4)
+    space.set_xlabel("x [m]")
+    space.set_ylabel("y [m]")
+    space.set_zlabel("z [m]")
+    space.locator_params(nbins=4)
+    space.set_aspect("equal")

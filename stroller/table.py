@@ -1,0 +1,213 @@
+"""Many rides in one batched call: every combination of some numbers of scene, launch and input."""
+
+import dataclasses
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic import sweep as grids
+from nonholonomic.ensemble import compiled_march, lanes_for
+from nonholonomic.lockstep import CROSSED, FAILED, GUARD_LOST, AbstractProblem
+from nonholonomic.paths import description, with_numbers
+from nonholonomic.runge_kutta import explicit_tableau
+from nonholonomic.surface import Plane
+from nonholonomic.sweep import Axis, Variable, axis
+from nonholonomic.table import Table
+from nonholonomic.validation import as_number, require
+
+from .dynamics import State
+from .input import Input
+from .launch import Launch
+from .scene import Scene
+from .trajectory import CONTACT_ROUND_OFF, RANK_LOST
+
+WORDS = ("completed", "contact_lost", "rank_lost", "failed")
+
+VARIABLES = {
+    "x": Variable("m", np.float64),
+    "y": Variable("m", np.float64),
+    "z": Variable("m", np.float64),
+    "heading": Variable("rad", np.float64),
+    "end_steering": Variable("rad", np.float64),
+    "end_speed": Variable("m s-1", np.float64),
+    "energy": Variable("J", np.float64),
+    "residual": Variable("J", np.float64),
+    "contact_time": Variable("s", np.float64),
+    "end_time": Variable("s", np.float64),
+    "status": Variable("1", np.int8, WORDS),
+    "steps": Variable("1", np.int64),
+    "rejected": Variable("1", np.int64),
+}
+
+UNITS = {"mass": "kg", "wheelbase": "m", "inertia": "kg m2", "steering_inertia": "kg m2", "centre": "m"}
+UNITS |= {"steering_spring": "N m rad-1", "gravity": "m s-2", "tilt": "rad", "radius": "m", "equatorial": "m"}
+UNITS |= {"polar": "m", "rolling": "N s m-1", "front": "N s m-1", "scrub": "N m s", "coefficient": "1"}
+UNITS |= {"speed": "m s-1", "steering_rate": "rad s-1", "force": "N", "torque": "N m", "heading": "rad"}
+
+#: A place is a pair; its parts are axes under these names, with their units on a plane and elsewhere.
+PLACES = {"launch.place[0]": ("x0", "mu0"), "launch.place[1]": ("y0", "eta0")}
+
+
+class RideProblem(AbstractProblem):
+    """Rides of many cells. Where contact is watched, a ride ends where the ground would have to pull."""
+
+    scene: Scene
+    input: Input | None
+    states: Float[Array, "components cells"]
+    scales: Float[Array, "components cells"]
+    press: Float[Array, "..."]
+    watched: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, scene: Scene, launch: Launch, input: Input | None, cells: int, watched: bool) -> "RideProblem":
+        """The problem of the given number of cells; every number is a scalar or one per cell."""
+        driven = input is not None
+
+        def spread(states):
+            return jnp.broadcast_to(states.reshape(states.shape[0], -1), (states.shape[0], cells))
+
+        press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
+        states, scales = spread(scene.state(launch, driven)), spread(scene.scales(launch, driven))
+        return cls(scene, input, states, scales, press, watched and not isinstance(scene.surface, Plane))
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        return self.states, self.scales
+
+    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.scene.dynamics.field(time, state, self.input)
+
+    def crossing(self, state: Float[Array, "components lanes"]) -> Any:
+        return self.scene.contact(state) / self.press + CONTACT_ROUND_OFF if self.watched else None
+
+    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.scene.rank(state) / RANK_LOST - 1.0 if self.scene.heading == "projected" else None
+
+
+def sweep(
+    scene: Scene,
+    launch: Launch,
+    t1: float,
+    *,
+    axes: dict[str, Any],
+    input: Input | None = None,
+    tolerance: float = 1e-9,
+    solver: diffrax.AbstractERK | None = None,
+    path: Any = None,
+) -> Table:
+    """The ends of all rides over a grid of numbers, in one batched call on all cores.
+
+    **Arguments:**
+
+    - `scene`, `launch`, `input`: as for `simulate`, every number a scalar.
+    - `t1`: end of every ride [s].
+    - `axes`: path of a number -> values, such as `{"launch.speed": [1.0, 2.0], "scene.surface.polar": [0.8, 0.9]}`; the
+      parts of the place are `"launch.place[0]"` and `"launch.place[1]"`, the numbers of an input that is a module are
+      under `"input."`. The first axis varies slowest.
+    - `tolerance`: relative tolerance of the integration.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
+    - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
+
+    **Returns:** a `Table` of the rides' ends: position `x`, `y`, `z` [m] in the fixed frame, `heading`, `end_steering`
+    [rad], `end_speed` [m/s], `energy` [J], `residual` [J] of energy against work, `contact_time` [s] at which the ground
+    first had to pull (infinite if never; the ride goes on), `end_time` [s], `status` ("completed", "contact_lost",
+    "rank_lost" where a projected heading ended the ride, "failed"), `steps` and `rejected`.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
+    """
+    solver = diffrax.Dopri8() if solver is None else solver
+    explicit_tableau(solver)
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene = {scene!r} must be a Scene")
+    scene.check(launch)
+    require(t1, "t1", above=0.0)
+    require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+    roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
+    grid = named_axes(axes, isinstance(scene.surface, Plane))
+    # The modules check every value of every axis here, before anything compiles.
+    for one in grid:
+        changed = replaced(roots, {one.path: one.values})
+        changed["scene"].check(changed["launch"])
+
+    def march(cells: dict[str, Any], size: int, count: int, watched: bool) -> tuple[RideProblem, Any]:
+        problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", input), size, watched)
+        numbers = (as_number(t1), jnp.asarray(count), as_number(tolerance), as_number(0.1 * tolerance))
+        return problem, compiled_march(problem, *numbers, solver=solver, lanes=lanes_for(size))[0]
+
+    def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
+        cells = replaced(roots, columns)
+        size = next((len(values) for values in columns.values()), 1)
+        problem, outcome = march(cells, size, count, watched=True)
+        lost = np.asarray(outcome.status == CROSSED)
+        contact_time = np.where(lost, outcome.end_time, np.inf)
+        if lost.any() or (count == 0 and problem.watched):
+            problem, outcome = march(cells, size, count, watched=False)
+        words = np.select([outcome.status == FAILED, outcome.status == GUARD_LOST, lost], [3, 2, 1], 0)
+        ends = read_ends(problem, outcome.state)
+        return {name: np.asarray(values) for name, values in ends.items()} | {
+            "contact_time": contact_time,
+            "end_time": np.asarray(outcome.end_time),
+            "status": words.astype(np.int8),
+            "steps": np.asarray(outcome.steps),
+            "rejected": np.asarray(outcome.rejected),
+        }
+
+    request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
+    request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
+    request |= {"solver": type(solver).__name__, "input": "none" if input is None else described(input)}
+    request |= {one.path: "an axis" for one in grid}
+    return grids.sweep(run, grid, VARIABLES, request, path=path)
+
+
+def read_ends(problem: RideProblem, states: Float[Array, "components cells"]) -> dict[str, Float[Array, " cells"]]:
+    """What the table shows of the states at the ends of the rides."""
+    return _read_ends(problem.scene, states, problem.states)
+
+
+@eqx.filter_jit
+def _read_ends(scene: Scene, states: State, starts: State) -> dict[str, Float[Array, " cells"]]:
+    dynamics, surface = scene.dynamics, scene.surface
+    motion = dynamics.geometry(states).motion
+    _, east, north = surface.chart(surface.place_at(motion.position))
+    energy = scene.energy(states)
+    position = surface.in_fixed_frame(motion.position)
+    return dict(zip("xyz", position, strict=True)) | {
+        "heading": dynamics.heading.angle(motion.heading, east, north),
+        "end_steering": motion.steering,
+        "end_speed": motion.speed,
+        "energy": energy,
+        "residual": energy - scene.energy(starts) - scene.work(states),
+    }
+
+
+def named_axes(axes: dict[str, Any], flat: bool) -> list[Axis]:
+    """The axes of the table, each under the last part of its path, or the last two where that is not enough."""
+    lasts = [path.rsplit(".", 1)[-1] for path in axes]
+    grid = []
+    for path, last in zip(axes, lasts, strict=True):
+        name, unit = last, UNITS.get(last, "1")
+        if path in PLACES:
+            name, unit = PLACES[path][0 if flat else 1], "m" if flat else "rad"
+        elif lasts.count(last) > 1 or last in VARIABLES:
+            name = "_".join(path.split(".")[-2:])
+        if path.endswith("steering"):
+            unit = "N m s" if "friction" in path else "rad"
+        grid.append(axis(name, path, unit, axes[path]))
+    return grid
+
+
+def replaced(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Scene, launch and input with some of their numbers replaced."""
+    place = [values.get(path, part) for path, part in zip(PLACES, roots["launch"].place, strict=True)]
+    roots = roots | {"launch": dataclasses.replace(roots["launch"], place=tuple(place))}
+    return with_numbers(roots, {path: one for path, one in values.items() if path not in PLACES})
+
+
+def described(input: Any) -> Any:
+    """An input as plain data; a function can only be told by its name."""
+    if isinstance(input, eqx.Module):
+        return description("input", input)
+    return getattr(input, "__qualname__", repr(input))

@@ -1,0 +1,132 @@
+"""Sweeps and the main job."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray
+
+import stroller
+from stroller import Damping, Launch, Plane, Scene, Sphere, Spheroid, Steady, Stroller, Table
+from stroller.__main__ import main
+from stroller.table import named_axes
+
+BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
+LAUNCH = Launch((0.3, -0.6), 0.5, 1.5, 0.2, 0.1)
+BOWL = Scene(BODY, Spheroid(2.0, 1.1), Damping(0.3, 0.2, 0.1, 0.15), side="inside", fork="absolute")
+AXES = {
+    "launch.speed": [1.0, 1.5],
+    "launch.steering": [0.2, 0.3],
+    "scene.body.wheelbase": [0.6, 0.7],
+    "scene.friction.rolling": [0.1, 0.3],
+    "scene.surface.polar": [0.9, 1.1],
+    "input.force": [0.0, 0.5],
+}
+
+
+@pytest.fixture(scope="module")
+def bowl(tmp_path_factory):
+    """Speed, steering, wheelbase, friction, shape and drive in one call, and the file it wrote."""
+    path = tmp_path_factory.mktemp("sweep") / "bowl.h5"
+    return stroller.sweep(BOWL, LAUNCH, 3.0, input=Steady(), axes=AXES, path=path), path
+
+
+@pytest.mark.parametrize("cell", [(0, 0, 0, 0, 0, 0), (1, 0, 1, 1, 1, 1), (1, 1, 0, 1, 0, 1)])
+def test_cells_are_the_single_rides(bowl, cell):
+    """Every cell of the table is what `simulate` gives for its numbers."""
+    table, _ = bowl
+    speed, steering, wheelbase, rolling, polar, force = (
+        values[k] for values, k in zip(AXES.values(), cell, strict=True)
+    )
+    scene = Scene(
+        dataclasses.replace(BODY, wheelbase=wheelbase),
+        Spheroid(2.0, polar),
+        Damping(rolling, 0.2, 0.1, 0.15),
+        side="inside",
+        fork="absolute",
+    )
+    launch = Launch((0.3, -0.6), 0.5, speed, steering, 0.1)
+    run = stroller.simulate(scene, launch, 3.0, Steady(force), times=[3.0], tolerance=1e-11)
+    np.testing.assert_allclose([table.x[cell], table.y[cell], table.z[cell]], run.position[0], atol=1e-8)
+    np.testing.assert_allclose(table.end_speed[cell], run.speed[0], atol=1e-8)
+    np.testing.assert_allclose(table.heading[cell], run.heading[0], atol=1e-8)
+    np.testing.assert_allclose(table.energy[cell], run.energy[0], atol=1e-8)
+
+
+def test_table_is_labelled_and_its_file_opens_in_xarray(bowl):
+    table, path = bowl
+    assert list(table.coords) == ["speed", "steering", "wheelbase", "rolling", "polar", "force"]
+    assert table.shape == (2,) * 6
+    assert np.all(table.status == "completed")
+    assert np.all(np.abs(table.residual) < 1e-8)
+    with xarray.open_dataset(path, engine="h5netcdf") as stored:
+        np.testing.assert_array_equal(stored["end_speed"].values, table.end_speed)
+        assert stored["wheelbase"].attrs["units"] == "m"
+    np.testing.assert_array_equal(Table.load(path).x, table.x)
+
+
+def test_lost_contact_is_marked_with_its_time():
+    """Outside a sphere from its top: contact ends at cos = 2/3 (1 + v0^2 / (2 g R)), the time is that of `simulate`."""
+    scene, launch = Scene(BODY, Sphere(1.4)), Launch((0.0, np.pi / 2), 0.0, 0.5)
+    table = stroller.sweep(scene, launch, 1.4, axes={"launch.speed": [0.05, 0.5]})
+    assert list(table.status) == ["completed", "contact_lost"]
+    assert table.contact_time[0] == np.inf
+    assert table.end_time[1] == 1.4
+    at = float(table.contact_time[1])
+    run = stroller.simulate(scene, launch, 1.4, times=[at, 1.4], tolerance=1e-11)
+    expected = 1.4 * 2.0 / 3.0 * (1.0 + 0.5**2 / (2.0 * 9.81 * 1.4))
+    np.testing.assert_allclose(run.position[0, 2], expected, rtol=1e-8)
+    np.testing.assert_allclose(table.z[1], run.position[1, 2], atol=1e-8)
+
+
+def test_places_are_axes_too():
+    """On a level plane the ride does not depend on where it starts."""
+    scene = Scene(BODY, Plane())
+    axes = {"launch.place[0]": [0.0, 1.0, 2.0], "launch.place[1]": [0.0, 5.0]}
+    table = stroller.sweep(scene, Launch((0.0, 0.0), 0.5, 1.0, 0.3), 2.0, axes=axes)
+    assert list(table.coords) == ["x0", "y0"]
+    moved = table.x - np.asarray(axes["launch.place[0]"])[:, None]
+    np.testing.assert_allclose(moved, moved[0, 0], atol=1e-12)
+    R = 0.7 / np.tan(0.3)
+    np.testing.assert_allclose(moved[0, 0], R * (np.sin(0.5 + 2.0 / R) - np.sin(0.5)), atol=1e-8)
+
+
+def test_axes_of_one_name_are_told_apart():
+    grid = named_axes({"launch.steering": [0.1], "scene.friction.steering": [0.2]}, False)
+    assert [(one.name, one.unit) for one in grid] == [("launch_steering", "rad"), ("friction_steering", "N m s")]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(axes={"scene.body.colour": [1.0]}), r"unknown axis 'scene\.body\.colour'"),
+        (dict(axes={"launch.speed": []}), r"speed must be a number or a non-empty list"),
+        (dict(axes={"scene.body.mass": [1.0, -1.0]}), r"mass = .* must be greater than 0\.0"),
+        (dict(axes={"launch.place[1]": [0.0, 2.0]}), r"place\[1\] = .* must be at most 1\.57"),
+        (dict(axes={}, tolerance=1.0), r"tolerance = 1\.0 must be at most"),
+    ],
+)
+def test_bad_sweeps_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        stroller.sweep(BOWL, LAUNCH, 1.0, **change)
+
+
+def test_main_job(tmp_path, capsys):
+    """`python -m stroller` prints an audit that closes and writes its file and picture."""
+    assert main(["--t1", "2", "--out", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    audit = [line.split() for line in printed.splitlines() if "midpoint" in line]
+    assert len(audit) == 4
+    assert all(float(columns[-5]) < 1e-11 for columns in audit)
+    assert (tmp_path / "rides.png").stat().st_size > 10_000
+    with xarray.open_dataset(tmp_path / "rides.h5", engine="h5netcdf") as stored:
+        assert dict(stored.sizes) == {"ride": 4, "t": 201}
+        energy = stored["energy"].values
+        np.testing.assert_allclose(energy, energy[:, :1] + stored["work"].values, atol=1e-8)
+        assert float(jnp.max(stored["friction_power"].values[[1, 3]])) < 0.0
+
+
+def test_main_job_refuses_bad_input(tmp_path, capsys):
+    assert main(["--mass", "-1", "--out", str(tmp_path)]) == 2
+    assert "mass = -1.0 must be greater than 0.0" in capsys.readouterr().err
