@@ -59,7 +59,8 @@ def heyoka_scalar(task: Task) -> Callable[[float], Any]:
             made[tolerance] = heyoka.taylor_adaptive(system, [1.0] * len(variables), tol=tolerance, t_events=events)
         integrator, answers = made[tolerance], []
         for start in task.starts.T:
-            integrator.reset_cooldowns()
+            if task.angle is not None:
+                integrator.reset_cooldowns()
             integrator.time, integrator.state[:] = 0.0, start
             integrator.propagate_until(task.t1)
             answers.append(integrator.state[2:5].copy() if task.angle is None else integrator.time)

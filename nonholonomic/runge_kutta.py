@@ -65,7 +65,7 @@ def explicit_step(
     first_negative = None if watch is None else jnp.full_like(length, 2.0)
     looks = _places_to_look(tableau.c)
     for stage, (fraction, row) in enumerate(zip(tableau.c, tableau.a_lower, strict=True)):
-        end = state + length * _weighted(row, rates)
+        end = _moved(state, length, row, rates)
         at = time + float(fraction) * length
         if watch is not None and stage in looks:
             stage_rate, seen = jax.lax.optimization_barrier((field(at, end), watch(at, end)))
@@ -76,7 +76,7 @@ def explicit_step(
     if tableau.fsal:
         last_rate = rates[-1]
     else:
-        end = state + length * _weighted(tableau.b_sol, rates)
+        end = _moved(state, length, tableau.b_sol, rates)
         last_rate = jax.lax.optimization_barrier(field(time + length, end))
     if watch is not None:
         watched = watch(time + length, end)
@@ -87,6 +87,20 @@ def _places_to_look(fractions: Float[Array, " stages"]) -> set[int]:
     """The stages nearest to 1/4, 1/2 and 3/4 of the step: what happens between its ends is looked for there."""
     between = [stage for stage, fraction in enumerate(fractions) if 0.0 < fraction < 1.0]
     return {min(between, key=lambda stage: abs(fractions[stage] - part)) for part in (0.25, 0.5, 0.75) if between}
+
+
+def _moved(state: States, length: Lanes, weights: Array, rates: list[States]) -> States:
+    """The state moved along the weighted sum of the rates, joined from two halves.
+
+    Joining, with a barrier behind it, makes the compiler store the result. It would otherwise evaluate the sum anew for
+    every quantity of the field that depends on it; a barrier alone does not keep it from that.
+    """
+    half = state.shape[0] // 2
+    parts = [
+        state[rows] + length * _weighted(weights, [rate[rows] for rate in rates])
+        for rows in (slice(half), slice(half, None))
+    ]
+    return jax.lax.optimization_barrier(jnp.concatenate(parts))
 
 
 def _weighted(weights: Float[Array, " stages"], rates: list[States]) -> States:
