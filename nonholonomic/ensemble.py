@@ -15,6 +15,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlib
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
@@ -27,6 +28,7 @@ from .lockstep import (
     AbstractProblem,
     Block,
     Control,
+    Search,
     attempt,
     crossing_time,
     least_margin,
@@ -52,7 +54,7 @@ class Outcome(NamedTuple):
 
 def march(
     problem: AbstractProblem,
-    t1: Float[Array, ""],
+    t1: Float[Array, "..."],
     cells: Int[Array, ""],
     rtol: Float[Array, ""],
     atol: Float[Array, ""],
@@ -60,7 +62,7 @@ def march(
     solver: diffrax.AbstractERK,
     lanes: int,
     passes: bool = False,
-    max_steps: int = 10_000_000,
+    max_steps: int = 2_000_000,
     one_kernel: bool = False,
 ) -> tuple[Outcome, Int[Array, ""]]:
     """Run every cell of a problem from t = 0 to its event, to the end of the model's validity, or to `t1`.
@@ -68,7 +70,7 @@ def march(
     **Arguments:**
 
     - `problem`: the number of cells is the last axis of its `start()`.
-    - `t1`: horizon [s].
+    - `t1`: horizon [s], one for all or one per cell.
     - `cells`: how many of the problem's cells to run; the rest is padding, so that one compiled program serves grids of
       different sizes.
     - `rtol`, `atol`: relative tolerance, and absolute tolerance in units of the problem's magnitudes.
@@ -76,7 +78,8 @@ def march(
     - `lanes`: how many cells advance together.
     - `passes`: whether a run goes on through the event, in either direction, rather than ending there.
     - `max_steps`: a cell that needs more has failed.
-    - `one_kernel`: whether to have the loop compiled into a single kernel on a CPU, which halves its cost.
+    - `one_kernel`: whether to have the loop compiled into a single kernel on a CPU, which halves its cost
+      but is not for every problem: see `single_kernel_march`.
 
     **Returns:** the `Outcome`, and the number of lockstep iterations, each of which advanced `lanes` lanes.
     """
@@ -107,6 +110,7 @@ def march(
     def run_and_refill(carry):
         block, queued, outcome, iterations = carry
         here, atol_here = pick(problem, block.cell), pick(atols, block.cell)
+        control_here = control._replace(t1=pick(t1, block.cell))
         # While cells wait, stop to refill once a sixteenth of the lanes is idle; then run to the last lane.
         least_active = jnp.where(queued < cells, lanes - max(1, lanes // 16), 0)
 
@@ -114,7 +118,7 @@ def march(
             return jnp.sum(inner[0].status == RUNNING) > least_active
 
         def step(inner):
-            return attempt(here, control, atol_here, inner[0]), inner[1] + 1
+            return attempt(here, control_here, atol_here, inner[0]), inner[1] + 1
 
         def run(inner):
             return jax.lax.while_loop(enough_active, step, inner)
@@ -159,11 +163,18 @@ def _in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return called
 
 
-#: `march`, compiled on its own and as fast as can be. Wide vectors pay here, although compilers shy away from them: the sums
-#: over stages are streams of multiply-adds. JAX takes such an option only for the outermost compiled function. It is not
-#: for second derivatives: XLA (jaxlib 0.10.2) aborts when it puts those into one kernel.
-compiled_march = eqx.filter_jit(compiler_options={"xla_cpu_prefer_vector_width": 512})(
-    functools.partial(march, one_kernel=True)
+#: JAX takes compiler options only for the outermost compiled function. Wide vectors pay here, although compilers shy away
+#: from them: the sums over stages are streams of multiply-adds.
+_alone = eqx.filter_jit(compiler_options={"xla_cpu_prefer_vector_width": 512})
+
+#: `march`, compiled on its own.
+compiled_march = _alone(march)
+
+#: The same with the loop in one kernel, twice as fast on a CPU. XLA aborts the process on some programs (jaxlib 0.10.2: where
+#: components of the field vanish identically, and on second derivatives), so this is for problems that a test has gone
+#: through, and with other versions of jaxlib it is `compiled_march`.
+single_kernel_march = (
+    _alone(functools.partial(march, one_kernel=True)) if jaxlib.__version__.startswith("0.10.") else compiled_march
 )
 
 #: `march`, for use inside other transformed functions.
@@ -188,28 +199,29 @@ def _fresh_block(
 ) -> Block:
     """Every cell at its start; one that starts beyond the event or beyond the guard has ended."""
     zero, none = jnp.zeros_like(lengths), jnp.zeros(lengths.shape, int)
+    no = jnp.zeros(lengths.shape, bool)
     crossing, guard = problem.crossing(states), problem.guard(zero, states)
-    beyond = jnp.zeros(lengths.shape, bool) if crossing is None else crossing <= 0.0
+    beyond = no
+    if crossing is not None:
+        # On the event exactly, it is the way onwards that counts.
+        falls = jax.jvp(problem.crossing, (states,), (rates,))[1] <= 0.0
+        beyond = (crossing < 0.0) | ((crossing == 0.0) & (falls | (not control.passes)))
     side = jnp.where(beyond & control.passes, -1.0, 1.0).astype(lengths.dtype)
     status = jnp.where(beyond & (not control.passes), CROSSED, RUNNING)
     if guard is not None:
         status = jnp.where(guard <= 0.0, GUARD_LOST, status)
-    margin = least_margin(problem, side, zero, states)
     return Block(
         cell=jnp.arange(lengths.shape[0]),
         status=status,
         time=zero,
         state=states,
         rate=rates,
-        margin=zero if margin is None else stop_gradient(margin),
         length=lengths,
         side=side,
+        margin=stop_gradient(least_margin(problem, side, zero, states)),
         crossing_time=jnp.where(beyond, zero, jnp.inf),
-        searching=jnp.zeros(lengths.shape, bool),
-        low=zero,
-        high=zero,
-        margin_low=zero,
-        margin_high=zero,
+        searching=no,
+        search=Search(zero, zero, zero, zero, zero, none),
         steps=none,
         rejected=none,
     )

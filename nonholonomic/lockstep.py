@@ -14,15 +14,18 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from .runge_kutta import Lanes, States, explicit_step, inverse_root, scaled_error
+from .runge_kutta import Lanes, States, Step, explicit_step, inverse_root, scaled_error
 
 RUNNING, REACHED_END, CROSSED, GUARD_LOST, FAILED = range(5)
 
 #: Step control as in Diffrax's I controller with its defaults.
 SAFETY, SHRINK, GROW = 0.9, 0.2, 10.0
 
-#: An event is located once the next trial would differ by less than this part of the step.
+#: An event is located once the next trial would differ by less than this part of the step in which it lies.
 LOCATED = 1e-10
+
+#: Trials after which the far end of what is left of the step is taken for the event.
+MOST_TRIALS = 64
 
 
 class AbstractProblem(eqx.Module):
@@ -49,20 +52,44 @@ class AbstractProblem(eqx.Module):
 
 
 class Control(NamedTuple):
-    """How steps are taken: the method, its tolerances, and whether a run goes on through its event."""
+    """How steps are taken.
+
+    `tableau` and `order` are the method's; `rtol` the relative tolerance; `t1` the horizon [s], one for all or one per lane;
+    a lane that needs more than `max_steps` has failed; `passes` says whether a run goes on through its event.
+    """
 
     tableau: diffrax.ButcherTableau
     order: int
     rtol: Float[Array, ""]
-    t1: Float[Array, ""]
+    t1: Float[Array, "..."]
     max_steps: int
     passes: bool
 
 
-class Block(NamedTuple):
-    """The lanes of a block. `margin` is the least of crossing and guard; it is positive until an event.
+class Search(NamedTuple):
+    """Where a lane looks for its event: between the step lengths `low` and `high` [s], with the margins found there.
 
-    While a lane is `searching`, its event lies between the step lengths `low` and `high`.
+    `stride` is the length of the step in which the search began, `trials` counts the steps tried since.
+    """
+
+    low: Lanes
+    high: Lanes
+    margin_low: Lanes
+    margin_high: Lanes
+    stride: Lanes
+    trials: Int[Array, " lanes"]
+
+
+class Block(NamedTuple):
+    """The lanes of a block.
+
+    - `cell`: which cell of the problem a lane runs; `status`: one of the codes above.
+    - `time` [s], `state`, `rate`: where the lane is, and the field there.
+    - `length`: of the step to be tried [s].
+    - `side`: 1 before the event, -1 beyond it; `margin`: the least of `side` times the crossing function and the guard.
+    - `crossing_time`: of the last event that was passed [s], infinite if there was none.
+    - `searching`: whether the lane looks for an event, `search`: where.
+    - `steps`: tried so far, `rejected`: by step control.
     """
 
     cell: Int[Array, " lanes"]
@@ -70,24 +97,21 @@ class Block(NamedTuple):
     time: Lanes
     state: States
     rate: States
-    margin: Lanes
     length: Lanes
     side: Lanes
+    margin: Lanes
     crossing_time: Lanes
     searching: Bool[Array, " lanes"]
-    low: Lanes
-    high: Lanes
-    margin_low: Lanes
-    margin_high: Lanes
+    search: Search
     steps: Int[Array, " lanes"]
     rejected: Int[Array, " lanes"]
 
 
-def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: States) -> Lanes | None:
+def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: States) -> Lanes:
     """The least of the problem's crossing function, counted positive on the lane's side of the event, and its guard."""
     crossing, guard = problem.crossing(state), problem.guard(time, state)
     if crossing is None:
-        return guard
+        return jnp.ones_like(side) if guard is None else guard
     return side * crossing if guard is None else jnp.minimum(side * crossing, guard)
 
 
@@ -103,130 +127,115 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
 
     **Returns:** the block after the attempt.
     """
-    watched = least_margin(problem, block.side, block.time, block.state) is not None
 
     def watch(time: Lanes, state: States) -> Lanes:
         return least_margin(problem, block.side, time, state)
 
-    tried = explicit_step(
-        control.tableau,
-        problem.field,
-        watch if watched else None,
-        block.time,
-        block.state,
-        block.rate,
-        block.length,
-    )
+    here = (block.time, block.state, block.rate, block.length)
+    tried = explicit_step(control.tableau, problem.field, watch, *here)
     running = block.status == RUNNING
-    error = scaled_error(*stop_gradient((tried.error, block.state, tried.state)), control.rtol, atol)
-    # A step into nonsense counts as one with a huge error.
-    error = jnp.where(jnp.isfinite(error), error, jnp.inf)
-    good = error <= 1.0
-    ends_beyond = beyond_between = hit = jnp.zeros_like(running)
-    if watched:
-        margin = stop_gradient(tried.watched)
-        ends_beyond = good & (margin <= 0.0)
-        # Positive at both ends but negative at a stage between: end the step at that stage and look again.
-        beyond_between = good & ~ends_beyond & (tried.first_negative < 1.0)
-        low, high, margin_low, margin_high, guess = _narrow(block, margin)
-        close = block.searching & (jnp.abs(guess - block.length) <= 4.0 * LOCATED * high)
-        # A run that goes on must start beyond the event, or it would find the same one again.
-        hit = running & close & (margin <= 0.0)
-        guess = jnp.where(close & ~hit, block.length + 2.0 * LOCATED * high, guess)
     free = running & ~block.searching
-    forward = free & good & ~ends_beyond & ~beyond_between
+    error = scaled_error(*stop_gradient((tried.error, block.state, tried.state)), control.rtol, atol)
+    margin = stop_gradient(tried.watched)
+    # A step into nonsense counts as one with a huge error.
+    error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
+    good = error <= 1.0
+    # Negative at a stage: end the step there and look again, so that the first event of several is found.
+    between = good & (tried.first_negative < 1.0)
+    beyond = good & ~between & (margin <= 0.0)
+    forward = free & good & ~between & ~beyond
 
-    factor = SAFETY * inverse_root(jnp.maximum(error, 1e-30), control.order)
-    factor = jnp.where(good, jnp.clip(factor, 1.0, GROW), jnp.clip(factor, SHRINK, SAFETY))
-    length = block.length * factor
-    if watched:
-        length = jnp.where(beyond_between, block.length * tried.first_negative, length)
+    search, guess, found = _narrow(block, margin)
+    hit = running & found
+    searching = (block.searching | (free & beyond)) & ~hit
+    moved = forward | hit
+    time = jnp.where(moved, block.time + block.length, block.time)
 
-    moved = forward
-    status, side, latest = block.status, block.side, block.crossing_time
-    time = jnp.where(forward, block.time + block.length, block.time)
-    searching = block.searching
-    if watched:
-        starts_search = free & ends_beyond
-        searching = (searching | starts_search) & ~hit
-        length = jnp.where(searching, guess, length)
-        moved = forward | hit
-        by_guard = hit & _is_guard(problem, block.time + block.length, tried.state)
-        time = jnp.where(hit, block.time + block.length, time)
-        ends_run = by_guard if control.passes else hit
-        status = jnp.where(ends_run, jnp.where(by_guard, GUARD_LOST, CROSSED), status)
-        crossed = hit & ~by_guard
-        if control.passes:
-            # Only the way from positive to negative is the event; the way back is passed in silence.
-            counts = crossed & (side > 0.0)
-            latest = jnp.where(counts, crossing_time(problem, time, tried.state), latest)
-            side = jnp.where(crossed, -side, side)
-        # Just past a crossing the margin is round-off of either sign.
-        margin = jnp.where(crossed, jnp.abs(margin), margin)
-    state = jnp.where(moved, tried.state, block.state)
-    rate = jnp.where(moved, tried.rate, block.rate)
-
+    length = block.length * _factor(error, good, control.order)
+    length = jnp.where(between, block.length * tried.first_negative, length)
+    length = jnp.where(searching, guess, jnp.where(hit, search.stride, length))
+    status, side, latest = _fate(problem, control, block, tried, time, hit)
+    ended = running & (status == RUNNING) & moved & (time >= control.t1)
     steps = block.steps + running
-    at_end = running & (status == RUNNING) & moved & (time >= control.t1)
-    status = jnp.where(at_end, REACHED_END, status)
+    # Written so that a length that is not a number counts as stuck.
     tiny = 8.0 * jnp.finfo(time.dtype).eps * jnp.maximum(time, 1e-3)
-    stuck = free & ~forward & ~searching & (length <= tiny) | (steps >= control.max_steps)
-    status = jnp.where(running & (status == RUNNING) & stuck, FAILED, status)
+    stuck = free & ~forward & ~searching & ~(length > tiny)
+    stuck |= forward & (time == block.time) & (block.length > 0.0)
+    failed = running & (status == RUNNING) & ~ended & (stuck | (steps >= control.max_steps))
+    status = jnp.where(failed, FAILED, jnp.where(ended, REACHED_END, status))
     # The last step ends on the horizon exactly: what is left of it may differ from the length by round-off.
     left = control.t1 - time
     length = jnp.where(~searching & (length >= left * (1.0 - 1e-12)), left, length)
-    length = jnp.where(status == RUNNING, length, 0.0)
     return Block(
         cell=block.cell,
         status=status,
-        time=jnp.where(at_end, control.t1, time),
-        state=state,
-        rate=rate,
-        margin=jnp.where(moved, margin, block.margin) if watched else block.margin,
-        length=length,
+        time=jnp.where(ended, control.t1, time),
+        state=jnp.where(moved, tried.state, block.state),
+        rate=jnp.where(moved, tried.rate, block.rate),
+        length=jnp.where(status == RUNNING, length, 0.0),
         side=side,
+        # Just past a crossing the margin is round-off of either sign.
+        margin=jnp.where(hit, jnp.abs(margin), jnp.where(forward, margin, block.margin)),
         crossing_time=latest,
         searching=searching,
-        low=low if watched else block.low,
-        high=high if watched else block.high,
-        margin_low=margin_low if watched else block.margin_low,
-        margin_high=margin_high if watched else block.margin_high,
+        search=search,
         steps=steps,
-        rejected=block.rejected + (free & ~forward & ~ends_beyond),
+        rejected=block.rejected + (free & ~forward & ~beyond),
     )
 
 
-def _is_guard(problem: AbstractProblem, time: Lanes, state: States) -> Bool[Array, " lanes"]:
-    """Whether a located event is that of the guard: the function that is closer to zero made it."""
-    crossing, guard = problem.crossing(state), problem.guard(time, state)
-    if crossing is None or guard is None:
-        return jnp.full(time.shape, crossing is None)
-    return jnp.abs(guard) < jnp.abs(crossing)
+def _factor(error: Lanes, good: Bool[Array, " lanes"], order: int) -> Lanes:
+    """By how much the next step is longer, as Diffrax's I controller has it."""
+    factor = SAFETY * inverse_root(jnp.maximum(error, 1e-30), order)
+    return jnp.where(good, jnp.clip(factor, 1.0, GROW), jnp.clip(factor, SHRINK, SAFETY))
 
 
-def _narrow(block: Block, margin: Lanes) -> tuple[Lanes, ...]:
-    """Narrow the bracket by what the attempt found and propose the next length (Anderson and Bjorck, BIT 13 (1973) 253).
+def _fate(
+    problem: AbstractProblem, control: Control, block: Block, tried: Step, time: Lanes, hit: Bool[Array, " lanes"]
+) -> tuple[Int[Array, " lanes"], Lanes, Lanes]:
+    """Status, side and latest crossing time of the lanes, where `hit` says that an event was located."""
+    crossing, guard = problem.crossing(tried.state), problem.guard(time, tried.state)
+    by_guard = hit if crossing is None else hit & (False if guard is None else guard <= 0.0)
+    crossed = jnp.zeros_like(hit) if crossing is None else hit & (block.side * crossing <= 0.0)
+    if not control.passes:
+        status = jnp.where(hit, jnp.where(by_guard, GUARD_LOST, CROSSED), block.status)
+        return status, block.side, block.crossing_time
+    # Only the way from positive to negative is the event; the way back is passed in silence.
+    counts = crossed & (block.side > 0.0)
+    latest = jnp.where(counts, crossing_time(problem, time, tried.state), block.crossing_time)
+    return jnp.where(by_guard, GUARD_LOST, block.status), jnp.where(crossed, -block.side, block.side), latest
+
+
+def _narrow(block: Block, margin: Lanes) -> tuple[Search, Lanes, Bool[Array, " lanes"]]:
+    """Narrow the bracket by what the attempt found (Anderson and Bjorck, BIT 13 (1973) 253).
 
     A lane that is not searching yet opens its bracket with the step it just took.
+
+    **Returns:** the bracket, the length to try next, and whether the attempt ended on the event.
     """
-    opens = ~block.searching
-    old_low = jnp.where(opens, 0.0, block.low)
-    old_high = jnp.where(opens, block.length, block.high)
-    old_margin_low = jnp.where(opens, block.margin, block.margin_low)
-    old_margin_high = jnp.where(opens, margin, block.margin_high)
+    opens, was = ~block.searching, block.search
     replaces_high = margin <= 0.0
     # The end that stays is given less weight, so that it moves too in the next trial.
-    fade_low = _fade(margin, old_margin_high)
-    fade_high = _fade(margin, old_margin_low)
-    low = jnp.where(opens | replaces_high, old_low, block.length)
-    high = jnp.where(opens | ~replaces_high, old_high, block.length)
-    margin_low = jnp.where(opens, old_margin_low, jnp.where(replaces_high, old_margin_low * fade_low, margin))
-    margin_high = jnp.where(opens, old_margin_high, jnp.where(replaces_high, margin, old_margin_high * fade_high))
-    slope = margin_high - margin_low
-    guess = low - margin_low * (high - low) / jnp.where(slope == 0.0, 1.0, slope)
-    middle = 0.5 * (low + high)
-    guess = jnp.where((guess > low) & (guess < high), guess, middle)
-    return low, high, margin_low, margin_high, guess
+    weighted_low = was.margin_low * _fade(margin, was.margin_high)
+    weighted_high = was.margin_high * _fade(margin, was.margin_low)
+    search = Search(
+        low=jnp.where(opens, 0.0, jnp.where(replaces_high, was.low, block.length)),
+        high=jnp.where(opens | replaces_high, block.length, was.high),
+        margin_low=jnp.where(opens, block.margin, jnp.where(replaces_high, weighted_low, margin)),
+        margin_high=jnp.where(opens | replaces_high, margin, weighted_high),
+        stride=jnp.where(opens, block.length, was.stride),
+        trials=jnp.where(opens, 0, was.trials + 1),
+    )
+    rise = search.margin_high - search.margin_low
+    guess = search.low - search.margin_low * (search.high - search.low) / jnp.where(rise == 0.0, 1.0, rise)
+    guess = jnp.where(jnp.isfinite(guess), jnp.clip(guess, search.low, search.high), search.high)
+    located = max(LOCATED, 8.0 * float(jnp.finfo(margin.dtype).eps)) * search.stride
+    tired = search.trials >= MOST_TRIALS
+    close = block.searching & ((jnp.abs(guess - block.length) <= 2.0 * located) | tired)
+    # A run that goes on must start beyond the event, or it would find the same one again.
+    found = close & replaces_high
+    beyond = jnp.where(tired, search.high, jnp.minimum(block.length + located, search.high))
+    return search, jnp.where(close & ~found, beyond, guess), found
 
 
 def _fade(margin: Lanes, replaced: Lanes) -> Lanes:

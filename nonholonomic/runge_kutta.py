@@ -18,8 +18,8 @@ class Step(NamedTuple):
     state: States
     rate: States
     error: States
-    watched: Lanes | None
-    first_negative: Lanes | None
+    watched: Lanes
+    first_negative: Lanes
 
 
 def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
@@ -36,7 +36,7 @@ def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
 def explicit_step(
     tableau: diffrax.ButcherTableau,
     field: Callable[[Lanes, States], States],
-    watch: Callable[[Lanes, States], Lanes] | None,
+    watch: Callable[[Lanes, States], Lanes],
     time: Lanes,
     state: States,
     rate: States,
@@ -51,7 +51,7 @@ def explicit_step(
 
     - `tableau`: the method.
     - `field`: (time [s], state) -> rate of the state.
-    - `watch`: (time, state) -> a number per lane that should stay positive, or `None`. It is evaluated at the end and at
+    - `watch`: (time, state) -> a number per lane that should stay positive. It is evaluated at the end and at
       three stages between, together with `field`, so that what both need is computed once.
       What is negative for less than a quarter of a step may pass unseen.
     - `time`, `state`, `rate`: where the step starts, and the field there.
@@ -61,13 +61,13 @@ def explicit_step(
     first stage at which it was negative, 2 if it never was.
     """
 
-    rates, watched, end = [rate], None, state
-    first_negative = None if watch is None else jnp.full_like(length, 2.0)
+    rates, end = [rate], state
+    first_negative = jnp.full_like(length, 2.0)
     looks = _places_to_look(tableau.c)
     for stage, (fraction, row) in enumerate(zip(tableau.c, tableau.a_lower, strict=True)):
         end = _moved(state, length, row, rates)
         at = time + float(fraction) * length
-        if watch is not None and stage in looks:
+        if stage in looks:
             stage_rate, seen = jax.lax.optimization_barrier((field(at, end), watch(at, end)))
             first_negative = jnp.minimum(first_negative, jnp.where(seen < 0.0, float(fraction), 2.0))
         else:
@@ -78,9 +78,8 @@ def explicit_step(
     else:
         end = _moved(state, length, tableau.b_sol, rates)
         last_rate = jax.lax.optimization_barrier(field(time + length, end))
-    if watch is not None:
-        watched = watch(time + length, end)
-    return Step(end, last_rate, length * _weighted(tableau.b_error, rates), watched, first_negative)
+    error = length * _weighted(tableau.b_error, rates)
+    return Step(end, last_rate, error, watch(time + length, end), first_negative)
 
 
 def _places_to_look(fractions: Float[Array, " stages"]) -> set[int]:

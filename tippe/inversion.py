@@ -158,10 +158,11 @@ def _event_times(run: _Run, cells: int, *leaves: Float[Array, "..."]) -> Float[A
     """The event's time in every cell, infinite where there is none."""
     scene, launch, angle, t1, tolerance = jax.tree.unflatten(run.structure, leaves)
     problem = InversionProblem.of(scene, launch, angle, cells)
+    # One tolerance serves a block: the smallest of a batch.
     tolerance = jnp.min(tolerance)
     outcome, _ = traced_march(
         problem,
-        jnp.max(t1),
+        t1,
         jnp.asarray(cells),
         tolerance,
         ABSOLUTE * tolerance,

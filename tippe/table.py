@@ -8,17 +8,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nonholonomic.ensemble import compiled_march, lanes_for
+from nonholonomic.ensemble import compiled_march, lanes_for, single_kernel_march
 from nonholonomic.lockstep import FAILED, GUARD_LOST
 from nonholonomic.paths import description, with_numbers
 from nonholonomic.reference import march_by_diffrax
 from nonholonomic.runge_kutta import explicit_tableau
+from nonholonomic.surface import Cylinder, Plane, Sphere
 from nonholonomic.sweep import Axis, Variable, axis, sweep
 from nonholonomic.table import Table
 
+from .friction import Coulomb, Viscous
 from .inversion import ABSOLUTE, InversionProblem, check_event, check_run, is_inverted
 from .launch import Launch
 from .scene import Scene
+
+#: Arenas, laws and solvers whose loops XLA is known to compile into one kernel; a test goes through them all.
+SINGLE_KERNEL = (Plane, Cylinder, Sphere, Viscous, Coulomb, diffrax.Dopri8, diffrax.Dopri5, diffrax.Tsit5)
 
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed")
 
@@ -96,6 +101,8 @@ def inversion_table(
     for one in grid:
         with_numbers(roots, {one.path: one.values})
     last = crossing == "last"
+    tried = all(type(part) in SINGLE_KERNEL for part in (scene.surface, scene.friction, solver))
+    march = single_kernel_march if tried else compiled_march
 
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
         cells = with_numbers(roots, columns)
@@ -105,7 +112,7 @@ def inversion_table(
         if method == "diffrax":
             outcome = march_by_diffrax(problem, horizon, rtol, ABSOLUTE * rtol, solver=solver)
         else:
-            outcome, _ = compiled_march(
+            outcome, _ = march(
                 problem,
                 horizon,
                 jnp.asarray(count),
