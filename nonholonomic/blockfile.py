@@ -3,6 +3,11 @@
 from pathlib import Path
 from typing import Any
 
+try:
+    import fcntl
+except ImportError:  # not a POSIX system
+    fcntl = None
+
 import h5py
 import numpy as np
 from jaxtyping import Shaped
@@ -31,7 +36,18 @@ class BlockFile:
         **Raises:** `OSError` that names the path if it cannot be read or written; `ValueError` that names the first
         difference if it holds the result of another request.
         """
-        self.path = Path(path)
+        try:
+            self.path = Path(path)
+        except TypeError:
+            raise ValueError(f"path = {path!r} must be the path of a file") from None
+        self._lock, self._maps = self._locked(), {}
+        try:
+            self._open(layout)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, layout: "Layout") -> None:
         if self.path.exists():
             self._check(layout)
         else:
@@ -49,8 +65,35 @@ class BlockFile:
         except OSError as error:
             raise OSError(f"cannot write {self.path}: {error.strerror}") from None
 
+    def _locked(self) -> Any:
+        """Keep other processes from filling in the same file; the system lets go of it when the process ends."""
+        if fcntl is None:
+            return None
+        beside = self.path.with_name(self.path.name + ".lock")
+        try:
+            lock = beside.open("w")
+        except OSError as error:
+            raise OSError(f"cannot write {self.path}: {error.strerror}") from None
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+            raise OSError(f"cannot write {self.path}: another process is writing it") from None
+        return lock
+
+    def close(self) -> None:
+        """Let other processes have the file."""
+        self._maps.clear()
+        if self._lock is not None:
+            self.path.with_name(self.path.name + ".lock").unlink(missing_ok=True)
+            self._lock.close()
+
+    def values(self) -> dict[str, Values]:
+        """The numbers in the file, variable by variable, cells in a row."""
+        return {name: np.array(values) for name, values in self._maps.items() if name != BLOCKS}
+
     def _check(self, layout: "Layout") -> None:
-        coords, _, _, attributes = read_grid(self.path)
+        coords, _, _, attributes, _ = read_grid(self.path)
         difference = same_request(str(attributes["request"]), layout.attributes["request"])
         if difference is None:
             for name, values in layout.coords.items():
@@ -59,7 +102,9 @@ class BlockFile:
         if difference is None and list(coords) != list(layout.coords):
             difference = f"its axes are {', '.join(coords)}"
         if difference is not None:
-            raise ValueError(f"{self.path} holds the result of another run: {difference}; give another path")
+            raise ValueError(
+                f"{self.path} holds the result of another run: {difference}; give another path or remove the file"
+            )
         with h5py.File(self.path, "r") as file:
             if BLOCKS not in file or len(stored_array(file, BLOCKS)) != layout.blocks:
                 raise ValueError(f"{self.path} was not written by a sweep in {layout.blocks} blocks; give another path")

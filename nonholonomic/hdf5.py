@@ -17,8 +17,8 @@ from jaxtyping import Shaped
 
 Values = Shaped[np.ndarray, "..."]
 
-#: Stored for a cell that has not been computed.
-PENDING = -1
+#: Stored for a cell that has not been computed, and the word for it.
+PENDING, UNREACHED = -1, "pending"
 
 #: Where a sweep marks its finished blocks.
 BLOCKS = "block_finished"
@@ -39,12 +39,14 @@ def write_grid(
 
     - `path`: where to write; a file that exists is replaced.
     - `coords`, `variables`, `units`, `attributes`: as in `Table`.
-    - `words`: for variables that hold codes already, the words they stand for, code 0 first.
+    - `words`: for variables of words, or of codes that stand for them, the words in the order of their codes.
     - `blocks`: number of blocks that are still to be filled in.
 
     **Raises:** `OSError` that names the path if it cannot be written.
     """
     path = Path(path)
+    if path.is_dir():
+        raise OSError(f"cannot write {path}: it is a folder")
     try:
         handle, scratch = tempfile.mkstemp(dir=path.parent, prefix=path.name + ".", suffix=".part")
         os.close(handle)
@@ -90,8 +92,10 @@ def _fill(
         values = np.asarray(values)
         meanings = words.get(name)
         if values.dtype.kind == "U":
-            meanings = tuple(dict.fromkeys(values.ravel().tolist()))
-            codes = {word: code for code, word in enumerate(meanings)}
+            known = meanings or ()
+            met = (word for word in dict.fromkeys(values.ravel().tolist()) if word not in (*known, UNREACHED))
+            meanings = (*known, *met)
+            codes = {word: code for code, word in enumerate(meanings)} | {UNREACHED: PENDING}
             values = np.vectorize(codes.get, otypes=[np.int8])(values)
         stored = file.create_dataset(name, data=values)
         for axis, coordinate in enumerate(coords):
@@ -107,19 +111,21 @@ def _fill(
         finished.dims[0].attach_scale(file["block"])
 
 
-def read_grid(path: Any) -> tuple[dict[str, Values], dict[str, Values], dict[str, str], dict[str, Any]]:
+def read_grid(path: Any) -> tuple[Any, ...]:
     """Read what `write_grid` wrote.
 
-    **Returns:** `coords`, `variables`, `units`, `attributes`.
+    **Returns:** `coords`, `variables`, `units`, `attributes` and `words`, as in `Table`.
 
     **Raises:** `OSError` that names the path if it cannot be read or holds no grid.
     """
     if not Path(path).exists():
         raise FileNotFoundError(f"no such file: {path}")
+    if Path(path).is_dir():
+        raise OSError(f"cannot read {path}: it is a folder")
     try:
         with h5py.File(path, "r") as file:
             return _contents(file)
-    except (OSError, KeyError, ValueError, RuntimeError) as error:
+    except (OSError, KeyError, IndexError, ValueError, TypeError, AttributeError, RuntimeError) as error:
         raise OSError(f"cannot read {path}: it is not a table of nonholonomic, or it is damaged ({error})") from None
 
 
@@ -134,8 +140,8 @@ def stored_array(file: h5py.File, name: str) -> h5py.Dataset:
     return stored
 
 
-def _contents(file: h5py.File) -> tuple[dict[str, Values], dict[str, Values], dict[str, str], dict[str, Any]]:
-    coords, variables, units = {}, {}, {}
+def _contents(file: h5py.File) -> tuple[Any, ...]:
+    coords, variables, units, words = {}, {}, {}, {}
     if "request" not in file.attrs:
         raise ValueError("it names no request")
     for name in json.loads(str(file.attrs["axes"])):
@@ -149,10 +155,10 @@ def _contents(file: h5py.File) -> tuple[dict[str, Values], dict[str, Values], di
         if values.shape != tuple(len(axis) for axis in coords.values()):
             raise ValueError(f"{name} has the wrong shape")
         if "flag_meanings" in stored.attrs:
-            meanings = np.array([*str(stored.attrs["flag_meanings"]).split(), "pending"])
-            values = meanings[values]
+            words[name] = tuple(str(stored.attrs["flag_meanings"]).split())
+            values = np.array([*words[name], UNREACHED])[values]
         else:
             units[name] = str(stored.attrs["units"])
         variables[name] = values
     attributes = {name: file.attrs[name] for name in file.attrs if name != "Conventions"}
-    return coords, variables, units, attributes
+    return coords, variables, units, attributes, words

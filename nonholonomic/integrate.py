@@ -186,7 +186,7 @@ def sample(
     rtol: float,
     atol: float,
     adjoint: diffrax.AbstractAdjoint,
-    max_steps: int = 65536,
+    max_steps: int = 1_000_000,
 ) -> tuple[Float[Array, "components times"], Float[Array, ""], Array, dict[str, Any]]:
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 

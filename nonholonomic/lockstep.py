@@ -215,13 +215,15 @@ def _narrow(block: Block, margin: Lanes) -> tuple[Search, Lanes, Bool[Array, " l
     """
     opens, was = ~block.searching, block.search
     replaces_high = margin <= 0.0
+    # Just past a crossing the margin is round-off, or 0, and would send the search back to that crossing.
+    start = jnp.maximum(block.margin, -1e-3 * margin)
     # The end that stays is given less weight, so that it moves too in the next trial.
     weighted_low = was.margin_low * _fade(margin, was.margin_high)
     weighted_high = was.margin_high * _fade(margin, was.margin_low)
     search = Search(
         low=jnp.where(opens, 0.0, jnp.where(replaces_high, was.low, block.length)),
         high=jnp.where(opens | replaces_high, block.length, was.high),
-        margin_low=jnp.where(opens, block.margin, jnp.where(replaces_high, weighted_low, margin)),
+        margin_low=jnp.where(opens, start, jnp.where(replaces_high, weighted_low, margin)),
         margin_high=jnp.where(opens | replaces_high, margin, weighted_high),
         stride=jnp.where(opens, block.length, was.stride),
         trials=jnp.where(opens, 0, was.trials + 1),

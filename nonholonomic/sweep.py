@@ -3,17 +3,19 @@
 import json
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Shaped
 from tqdm import tqdm
 
 from .blockfile import BlockFile, Layout
+from .hdf5 import UNREACHED
 from .table import Table
 from .validation import require
 
@@ -80,16 +82,15 @@ def sweep(
     cells = int(np.prod([len(one.values) for one in axes], dtype=int))
     block = block_for(cells) if block is None else block
     firsts = range(0, cells, block)
+    request = request | {"float": str(np.dtype(jnp.result_type(float)))}
     attributes = {
         "request": json.dumps(request),
         "axes": json.dumps([one.name for one in axes]),
         "versions": json.dumps(versions()),
     }
     words = {name: one.words for name, one in variables.items() if one.words is not None}
-    layout = Layout(coords, {name: one.kind for name, one in variables.items()}, units, words, attributes, len(firsts))
-    file = None if path is None else BlockFile(path, layout)
-    todo = [i for i in range(len(firsts)) if file is None or i not in file.finished]
-    results = {name: values.reshape(-1) for name, values in layout.empty().items()}
+    kinds = {name: one.kind for name, one in variables.items()}
+    layout = Layout(coords, kinds, units, words, attributes, len(firsts))
 
     def columns(index: int) -> dict[str, Values]:
         cell = np.minimum(np.arange(firsts[index], firsts[index] + block), cells - 1)
@@ -100,39 +101,50 @@ def sweep(
         count = min(block, cells - firsts[index])
         return {name: values[:count] for name, values in run(columns(index), count).items()}
 
-    if todo:
-        run(columns(todo[0]), 0)
-        with (
-            ThreadPoolExecutor(workers()) as pool,
-            # `disable=None` shows the bar on a terminal only.
-            tqdm(total=cells, unit="cell", disable=None if len(todo) > 1 else True) as bar,
-        ):
-            bar.update(cells - sum(min(block, cells - firsts[i]) for i in todo))
-            pending = {pool.submit(work, i): i for i in todo}
-            try:
-                for future in as_completed(pending):
-                    index, values = pending[future], future.result()
-                    for name, some in values.items():
-                        results[name][firsts[index] : firsts[index] + len(some)] = some
-                    if file is not None:
-                        file.write(index, firsts[index], values)
-                    bar.update(len(next(iter(values.values()))))
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-    if file is not None:
-        return Table.load(path)
-    found = {name: values.reshape(layout.shape) for name, values in results.items()}
-    found |= {name: np.array(words[name])[found[name]] for name in words}
-    return Table(coords, found, units, attributes)
+    file = None if path is None else BlockFile(path, layout)
+    try:
+        found = {name: values.reshape(-1) for name, values in layout.empty().items()} if file is None else file.values()
+        todo = [index for index in range(len(firsts)) if file is None or index not in file.finished]
+        # `disable=None` shows the bar on a terminal only.
+        with tqdm(total=cells, unit="cell", disable=None if len(todo) > 1 else True) as bar:
+            bar.update(cells - sum(min(block, cells - firsts[index]) for index in todo))
+            if todo:
+                run(columns(todo[0]), 0)
+            for index, values in _as_they_finish(work, todo):
+                for name, some in values.items():
+                    found[name][firsts[index] : firsts[index] + len(some)] = some
+                if file is not None:
+                    file.write(index, firsts[index], values)
+                bar.update(min(block, cells - firsts[index]))
+    finally:
+        if file is not None:
+            file.close()
+    shaped = {name: values.reshape(layout.shape) for name, values in found.items()}
+    shaped |= {name: np.array([*words[name], UNREACHED])[shaped[name]] for name in words}
+    return Table(coords, shaped, units, attributes, words)
+
+
+def _as_they_finish(work: Callable[[int], Any], todo: list[int]) -> Iterator[tuple[int, Any]]:
+    """Run the blocks on all cores; an exception, Ctrl-C included, waits for none that has not started."""
+    pool = ThreadPoolExecutor(workers())
+    try:
+        pending = {pool.submit(work, index): index for index in todo}
+        for future in as_completed(pending):
+            yield pending[future], future.result()
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def block_for(cells: int) -> int:
-    """Cells in a block: few sizes, so that few programs are compiled, and enough blocks to keep every core busy."""
-    small, middle, large = (64, 512, 4096) if jax.default_backend() == "cpu" else (4096, 65536, 1048576)
-    if cells <= small:
+    """Cells in a block: few sizes, so that few programs are compiled, and many blocks, to be shared out and stored.
+
+    It does not depend on the number of cores, so that a file can be resumed on another machine.
+    """
+    if jax.default_backend() != "cpu":
+        return 65536 if cells > 4096 else 4096
+    if cells <= 64:
         return 1 << (cells - 1).bit_length()
-    return middle if cells <= 2 * large else large
+    return 128 if cells <= 4096 else 512
 
 
 def workers() -> int:

@@ -21,12 +21,14 @@ class Table(eqx.Module):
     - `variables`: name -> array over the grid; `status` is an array of words.
     - `units`: name of a coordinate or variable -> its unit.
     - `attributes`: what was computed, with what versions: plain data.
+    - `words`: variable that consists of words -> the words, in the order of the numbers that stand for them in a file.
     """
 
     coords: dict[str, Values]
     variables: dict[str, Values]
     units: dict[str, str]
     attributes: dict[str, Any]
+    words: dict[str, tuple[str, ...]] = eqx.field(default_factory=dict)
 
     def __getattr__(self, name: str) -> Values:
         # Reached only for names that are not fields.
@@ -45,7 +47,7 @@ class Table(eqx.Module):
 
         **Raises:** `OSError` that names the path if it cannot be written.
         """
-        write_grid(path, self.coords, self.variables, self.units, self.attributes)
+        write_grid(path, self.coords, self.variables, self.units, self.attributes, self.words)
 
     @classmethod
     def load(cls, path: Any) -> "Table":

@@ -27,6 +27,11 @@ def shown(value: Any) -> str:
     return repr(array.item()) if array.ndim == 0 and array.dtype != object else repr(value)
 
 
+def _first(numbers: np.ndarray, holds: np.ndarray) -> str:
+    """The first number for which the condition does not hold."""
+    return shown(numbers[~holds].ravel()[0]) if numbers.ndim else shown(numbers)
+
+
 def require(
     value: Any,
     name: str,
@@ -56,8 +61,11 @@ def require(
     except (TypeError, ValueError):
         raise ValueError(f"{name} = {value!r} is not a number") from None
     remark = f" ({why})" if why else ""
-    if not np.all(np.isfinite(numbers)):
-        raise ValueError(f"{name} = {shown(value)} must be finite{remark}")
+    if value is None:
+        raise ValueError(f"{name} = None is not a number")
+    finite = np.isfinite(numbers)
+    if not np.all(finite):
+        raise ValueError(f"{name} = {_first(numbers, finite)} must be finite{remark}")
     bounds = (
         (above, np.greater, "greater than"),
         (at_least, np.greater_equal, "at least"),
@@ -67,5 +75,8 @@ def require(
     for bound, holds, words in bounds:
         if bound is None or is_traced(bound):
             continue
-        if not np.all(holds(numbers, np.asarray(bound, dtype=float))):
-            raise ValueError(f"{name} = {shown(value)} must be {words} {shown(bound)}{remark}")
+        numbers, limits = np.broadcast_arrays(numbers, np.asarray(bound, dtype=float))
+        allowed = holds(numbers, limits)
+        if not np.all(allowed):
+            told = f"{name} = {_first(numbers, allowed)} must be {words} {_first(limits, allowed)}"
+            raise ValueError(told + remark)

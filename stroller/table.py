@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic import sweep as grids
-from nonholonomic.ensemble import lanes_for, traced_march
+from nonholonomic.ensemble import compiled_march, lanes_for
 from nonholonomic.lockstep import CROSSED, FAILED, GUARD_LOST, AbstractProblem
 from nonholonomic.paths import description, with_numbers
 from nonholonomic.runge_kutta import explicit_tableau
@@ -135,8 +135,7 @@ def sweep(
     def march(cells: dict[str, Any], size: int, count: int, watched: bool) -> tuple[RideProblem, Any]:
         problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", input), size, watched)
         numbers = (as_number(t1), jnp.asarray(count), as_number(tolerance), as_number(0.1 * tolerance))
-        # Not `compiled_march`: XLA (jaxlib 0.10.2) aborts when it puts some of these loops into one kernel.
-        return problem, traced_march(problem, *numbers, solver=solver, lanes=lanes_for(size))[0]
+        return problem, compiled_march(problem, *numbers, solver=solver, lanes=lanes_for(size))[0]
 
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
         cells = replaced(roots, columns)

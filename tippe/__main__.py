@@ -54,12 +54,19 @@ def parser() -> argparse.ArgumentParser:
     )
     launch.add_argument("--eta", type=float, nargs="+", default=[0.0, math.pi / 2.0], help="places eta(0) [rad]")
     launch.add_argument("--beta1", type=float, default=paper.BETA1, help="I3 w3 at the start [kg m^2/s]")
-    launch.add_argument("--spin", type=float, help="spin w3 at the start [rad/s], instead of --beta1")
+    launch.add_argument(
+        "--spin", type=float, help="spin w3 at the start [rad/s] instead of --beta1; --spin=-100 if negative"
+    )
     run = told.add_argument_group("the run")
     run.add_argument("--t1", type=float, default=60.0, help="horizon [s]")
     run.add_argument("--angle", type=float, default=0.95 * math.pi, help="angle that counts as inverted [rad]")
     run.add_argument("--tolerance", type=float, default=1e-9, help="relative tolerance of the integration")
-    run.add_argument("--out", type=Path, default=Path("tippe-out"), help="folder for the tables and the picture")
+    run.add_argument(
+        "--out",
+        type=Path,
+        default=Path("tippe-out"),
+        help="folder for the tables and the picture; another run needs another",
+    )
     return told
 
 
@@ -83,9 +90,9 @@ def spin_of(options: argparse.Namespace, scene: Scene) -> float:
 
 def tables(options: argparse.Namespace) -> dict[tuple[str, str], Table]:
     """The table of each arena for the first and for the last crossing of the angle, each written to its file."""
+    arenas, found = scenes(options), {}
     options.out.mkdir(parents=True, exist_ok=True)
-    found = {}
-    for name, scene in scenes(options).items():
+    for name, scene in arenas.items():
         for crossing in ("first", "last"):
             found[name, crossing] = inversion_table(
                 scene,

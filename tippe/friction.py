@@ -1,7 +1,7 @@
 """Friction at the contact point, per unit normal force. A new law is one new class."""
 
 import abc
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,7 +25,9 @@ class ContactLoad(NamedTuple):
 
 
 class AbstractFriction(eqx.Module):
-    """A friction law whose force is proportional to the normal force."""
+    """A friction law whose force is proportional to the normal force; `units` has the units of its numbers."""
+
+    units: ClassVar[dict[str, str]] = {}
 
     @abc.abstractmethod
     def per_normal_force(self, slip: Slip) -> ContactLoad:
@@ -54,6 +56,8 @@ class Viscous(AbstractFriction):
     - `mu`: coefficient [s/m], at least 0.
     """
 
+    units: ClassVar[dict[str, str]] = {"mu": "s m-1"}
+
     mu: Float[Array, "..."] = eqx.field(converter=as_number)
 
     def __check_init__(self):
@@ -75,6 +79,8 @@ class Coulomb(AbstractFriction):
     - `mu`: coefficient of friction [1], at least 0.
     - `slip_speed`: speed [m/s] at which the force reaches 71 % of its limit, positive.
     """
+
+    units: ClassVar[dict[str, str]] = {"mu": "1", "slip_speed": "m s-1"}
 
     mu: Float[Array, "..."] = eqx.field(converter=as_number)
     slip_speed: Float[Array, "..."] = eqx.field(converter=as_number)

@@ -8,10 +8,12 @@ from typing import Any, NamedTuple
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from nonholonomic.ensemble import Outcome, lanes_for, traced_march
 from nonholonomic.lockstep import CROSSED, REACHED_END, AbstractProblem
+from nonholonomic.paths import numbers
 from nonholonomic.runge_kutta import explicit_tableau
 from nonholonomic.validation import as_number, require
 
@@ -85,11 +87,7 @@ def inversion_time(
     check_run(scene, launch, t1, tolerance)
     check_event(angle, crossing)
     explicit_tableau(solver)
-    inputs = (scene, launch, as_number(angle), as_number(t1), as_number(tolerance))
-    leaves, structure = jax.tree.flatten(inputs)
-    for leaf in leaves:
-        if jnp.ndim(leaf) != 0:
-            raise ValueError(f"inversion_time takes one number for each argument, not an array of shape {leaf.shape}")
+    leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
     return _differentiable(_Run(structure, solver, crossing == "last"), len(leaves))(*leaves)
 
 
@@ -214,10 +212,16 @@ def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any) -> None:
         raise ValueError(f"launch = {launch!r} must be a Launch")
     require(t1, "t1", above=0.0)
     require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+    values = numbers("scene", scene) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
+    for name, value in values.items():
+        if value is not None and np.ndim(value) != 0:
+            raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; inversion_table takes lists")
 
 
 def check_event(angle: Any, crossing: Any) -> None:
     """Raise `ValueError` unless the angle is in (0, pi] and the crossing a known word."""
     require(angle, "angle", above=0.0, at_most=math.pi)
+    if np.ndim(angle) != 0:
+        raise ValueError(f"angle must be one number, not of shape {np.shape(angle)}")
     if crossing not in ("first", "last"):
         raise ValueError(f"crossing = {crossing!r} must be 'first' or 'last'")

@@ -44,5 +44,6 @@ def draw_launches(panels: list[Panel], angle: float) -> Any:
         drawing.set_xlabel("time [s]")
         drawing.set_yticks([0.0, np.pi / 2.0, np.pi], ["0", "π/2", "π"])
     drawings[0].set_ylabel("θ, angle from the normal to the stem [rad]")
+    figure.suptitle("Dots: above the dashed angle for good", fontsize=9, color="0.4")
     drawings[-1].legend(title="θ(0) [rad]", loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure

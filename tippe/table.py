@@ -25,6 +25,9 @@ from .scene import Scene
 #: Arenas, laws and solvers whose loops XLA is known to compile into one kernel; a test goes through them all.
 SINGLE_KERNEL = (Plane, Cylinder, Sphere, Viscous, Coulomb, diffrax.Dopri8, diffrax.Dopri5, diffrax.Tsit5)
 
+#: Cells that are checked together, to bound the memory it takes.
+CHECKED_AT_ONCE = 1 << 20
+
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed")
 
 VARIABLES = {
@@ -37,7 +40,7 @@ VARIABLES = {
 }
 
 UNITS = {"mass": "kg", "radius": "m", "offset": "m", "I1": "kg m2", "I3": "kg m2", "gravity": "m s-2"}
-UNITS |= {"theta": "rad", "eta": "rad", "azimuth": "rad", "spin": "rad s-1", "slip_speed": "m s-1"}
+UNITS |= {"theta": "rad", "eta": "rad", "azimuth": "rad", "spin": "rad s-1"}
 
 
 def inversion_table(
@@ -90,16 +93,27 @@ def inversion_table(
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
+    if axes is not None and not isinstance(axes, dict):
+        raise ValueError(f"axes = {axes!r} must be a dictionary, path of a number -> values")
     given = {"launch.theta": theta, "launch.eta": eta, "scene.friction.mu": mu, "launch.spin": spin}
-    given |= {"launch.azimuth": azimuth} | (axes or {})
-    given = {number: values for number, values in given.items() if values is not None}
+    given |= {"launch.azimuth": azimuth}
+    if mu is None:
+        del given["scene.friction.mu"]
+    for number in given:
+        if number in (axes or {}):
+            raise ValueError(f"axes: {number!r} is an argument of its own")
+    given |= axes or {}
     fixed = {number: value for number, value in given.items() if np.ndim(value) == 0}
-    grid = [_axis(number, values) for number, values in given.items() if number not in fixed]
+    names = [number.rsplit(".", 1)[-1] for number in given]
+    units = UNITS | scene.friction.units
+    grid = []
+    for number, name in zip(given, names, strict=True):
+        if number not in fixed:
+            unit = units.get(name, "1")
+            grid.append(axis(name if names.count(name) == 1 else number, number, unit, given[number]))
     roots = with_numbers({"scene": scene, "launch": Launch(theta=0.0, spin=0.0)}, fixed)
     check_run(roots["scene"], roots["launch"], t1, tolerance)
-    # The modules check every value of every axis here, before anything compiles.
-    for one in grid:
-        with_numbers(roots, {one.path: one.values})
+    _check_cells(roots, grid)
     last = crossing == "last"
     tried = all(type(part) in SINGLE_KERNEL for part in (scene.surface, scene.friction, solver))
     march = single_kernel_march if tried else compiled_march
@@ -110,6 +124,7 @@ def inversion_table(
         problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
         horizon, rtol = jnp.asarray(t1, float), jnp.asarray(tolerance, float)
         if method == "diffrax":
+            # The reference has no use for a call that only compiles.
             outcome = march_by_diffrax(problem, horizon, rtol, ABSOLUTE * rtol, solver=solver)
         else:
             outcome, _ = march(
@@ -141,7 +156,10 @@ def inversion_table(
     return sweep(run, grid, VARIABLES, request, path=path)
 
 
-def _axis(path: str, values: Any) -> Axis:
-    """The axis of a number, under its last name and with its unit."""
-    name = path.rsplit(".", 1)[-1]
-    return axis(name, path, UNITS.get(name, "1"), values)
+def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:
+    """Have the modules check every cell, before anything compiles: numbers may be impossible only together."""
+    shape = tuple(len(one.values) for one in grid)
+    cells = int(np.prod(shape, dtype=int))
+    for first in range(0, cells, CHECKED_AT_ONCE):
+        places = np.unravel_index(np.arange(first, min(first + CHECKED_AT_ONCE, cells)), shape) if grid else ()
+        with_numbers(roots, {one.path: one.values[place] for one, place in zip(grid, places, strict=True)})

@@ -164,6 +164,7 @@ class Trajectory(eqx.Module):
             raise ValueError("a run made inside jit, vmap or grad has no dense output: hand `times` to simulate")
         times = np.asarray(times, dtype=float)
         require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
+        _check_increasing(times)
         return _cut(self, times, self.dense.at(times))
 
     def _fixed(self, vector: tuple[Array, Array, Array]) -> Float[Array, "times 3"]:
@@ -211,7 +212,7 @@ def simulate(
     - `scene`, `launch`: every number a scalar.
     - `t1`: horizon [s].
     - `times`: times of the result [s], increasing, within [0, t1]; by default those of the accepted steps. Outside of
-      transformations `Trajectory.at` gives others afterwards.
+      transformations those after the end of the run are left out, and `Trajectory.at` gives others.
     - `tolerance`: relative tolerance; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
     - `solver`: any solver of Diffrax, `Dopri8()` by default.
     - `adjoint`: how Diffrax differentiates, `RecursiveCheckpointAdjoint()` by default (reverse mode; use `ForwardMode()`
@@ -228,10 +229,7 @@ def simulate(
     if times is not None:
         times = as_number(times)
         require(times, "times", at_least=0.0, at_most=t1)
-        if jnp.ndim(times) != 1 or times.shape[0] == 0:
-            raise ValueError(f"times must be a non-empty list, not of shape {jnp.shape(times)}")
-        if not is_traced(times) and np.any(np.diff(times) <= 0.0):
-            raise ValueError("times must increase")
+        _check_increasing(times)
     run = Run.of(scene, launch)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((run, times, t1))):
         return _traced(scene, run, times, t1, tolerance, solver, adjoint)
@@ -240,6 +238,13 @@ def simulate(
     if times is None:
         return trajectory
     return trajectory.at(np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)])
+
+
+def _check_increasing(times: Any) -> None:
+    if np.ndim(times) != 1 or np.shape(times)[0] == 0:
+        raise ValueError(f"times must be a non-empty list, not of shape {np.shape(times)}")
+    if not is_traced(times) and np.any(np.diff(times) <= 0.0):
+        raise ValueError("times must increase")
 
 
 def _traced(

@@ -123,5 +123,62 @@ def test_bad_arguments_are_named(rutstam_scene, arguments, message):
 
 
 def test_arrays_are_refused_with_a_hint(rutstam_scene):
-    with pytest.raises(ValueError, match=r"one number for each argument, not an array of shape \(2,\)"):
+    with pytest.raises(
+        ValueError, match=r"launch.theta must be one number, not of shape \(2,\); inversion_table takes"
+    ):
         tippe.inversion_time(rutstam_scene, tippe.Launch([0.1, 0.2], 155.0), 10.0)
+
+
+def test_a_batch_keeps_every_horizon():
+    """vmap over t1: each cell has its own, for the first crossing and for the last."""
+    horizons = jnp.array([3.0, 20.0])
+    for crossing in ("first", "last"):
+        times = jax.vmap(lambda t1, word=crossing: time_of(t1=t1, crossing=word))(horizons)
+        assert np.isinf(times[0])
+        assert_close(times[1], time_of(), rtol=1e-9)
+
+
+def test_a_launch_exactly_on_the_angle():
+    """It has reached the angle; for the last crossing the way onwards counts."""
+    scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
+    launch = tippe.Launch(2.5, 100.0)
+    assert tippe.inversion_time(scene, launch, 1.0, angle=2.5) == 0.0
+    last = tippe.inversion_time(scene, launch, 1.0, angle=2.5, crossing="last")
+    assert np.isinf(last) or 0.0 <= last < 1.0
+
+
+def test_a_field_that_is_no_number_fails_at_once():
+    table = tippe.inversion_table(
+        tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3)), theta=0.1, spin=[1e200, 100.0], t1=0.1
+    )
+    assert table.status.tolist() == ["failed", "not_inverted"]
+    assert table.steps[0] < 100
+
+
+FLOAT32 = """
+import numpy as np, tippe
+mass, radius = 0.02, 0.02
+top = tippe.Top(mass, radius, 0.006, 131 / 350 * mass * radius**2, 0.4 * mass * radius**2)
+scene = tippe.Scene(top, tippe.Plane(), tippe.Viscous(0.3))
+table = tippe.inversion_table(scene, theta=[0.3, 0.4], spin=[155.0, 160.0], t1=8.0, tolerance=1e-5)
+print(",".join(str(time) for time in table.time.ravel()))
+"""
+
+
+def test_float32_works_at_its_own_tolerance():
+    """JAX_ENABLE_X64=0: the same times to a hundredth, which is what the tolerance leaves."""
+    import os
+    import subprocess
+    import sys
+
+    told = subprocess.run(
+        [sys.executable, "-c", FLOAT32],
+        env=os.environ | {"JAX_ENABLE_X64": "0"},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
+    expected = tippe.inversion_table(scene, theta=[0.3, 0.4], spin=[155.0, 160.0], t1=8.0)
+    assert_close([float(time) for time in told.stdout.split(",")], expected.time.ravel(), rtol=2e-2)

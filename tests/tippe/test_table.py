@@ -158,6 +158,10 @@ def test_save_and_load_return_the_same(table, tmp_path):
     np.testing.assert_array_equal(loaded.time, table.time)
     np.testing.assert_array_equal(loaded.status, table.status)
     assert loaded.units == table.units
+    assert loaded.words == table.words
+    # The numbers that stand for the words are the same in every file.
+    with h5py.File(tmp_path / "saved.h5", "r") as file:
+        assert file["status"].attrs["flag_meanings"].split()[:3] == ["inverted", "not_inverted", "contact_lost"]
     assert json.loads(loaded.attributes["request"]) == json.loads(table.attributes["request"])
 
 
@@ -271,9 +275,54 @@ def test_unwritable_corrupt_and_foreign_files_are_named(rutstam_scene_module, tm
         tippe.Table.load(tmp_path / "missing.h5")
 
 
+def test_a_file_has_one_writer(rutstam_scene_module, tmp_path):
+    """While one sweep fills a file in, another is refused; a file that vanishes meanwhile costs no result."""
+    path, arguments = tmp_path / "table.h5", {"theta": THETA, "spin": SPIN, "t1": 0.1}
+    once = sweeping.BlockFile.write
+
+    def and_try_again(self, block, first, values):
+        with pytest.raises(OSError, match="another process is writing it"):
+            tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
+        once(self, block, first, values)
+        path.unlink()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweeping.BlockFile, "write", and_try_again)
+        table = tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
+    assert (table.status == "not_inverted").all()
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_unit_of_mu_is_that_of_the_law(tmp_path):
+    for law, unit in ((tippe.Viscous(0.3), "s m-1"), (tippe.Coulomb(0.3, 0.1), "1")):
+        scene = tippe.Scene(rutstam_top(), tippe.Plane(), law)
+        assert tippe.inversion_table(scene, theta=0.1, spin=100.0, mu=[0.1, 0.2], t1=0.01).units["mu"] == unit
+
+
+@pytest.mark.parametrize("law", [tippe.Frictionless(), tippe.Viscous(0.3), tippe.Coulomb(0.3, 0.05)])
+@pytest.mark.parametrize("arena", [tippe.Plane(), tippe.Cylinder(0.3), tippe.Sphere(0.3)])
+def test_every_scene_compiles(arena, law):
+    """XLA aborts on some loops in a single kernel: every arena and law goes through it here, scalars and axes."""
+    scene = tippe.Scene(rutstam_top(), arena, law)
+    for crossing in ("first", "last"):
+        table = tippe.inversion_table(scene, theta=[0.1, 0.2], spin=[90.0, 95.0], t1=0.02, crossing=crossing)
+        assert (table.status == "not_inverted").all()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"theta": None}, "theta = None is not a number"),
+        ({"spin": None}, "spin = None is not a number"),
+        ({"axes": {"launch.theta": [0.1]}}, "'launch.theta' is an argument of its own"),
+        ({"axes": [0.1]}, "axes = .* must be a dictionary"),
+        ({"t1": [1.0, 2.0]}, r"t1 must be one number, not of shape \(2,\)"),
+        ({"angle": [1.0, 2.0]}, r"angle must be one number, not of shape \(2,\)"),
+        ({"path": 5}, "path = 5 must be the path of a file"),
+        (
+            {"axes": {"scene.body.radius": [0.01, 0.02], "scene.body.offset": [0.005, 0.015]}},
+            "offset = 0.015 must be less than 0.01",
+        ),
         ({"theta": []}, "theta must be a number or a non-empty list"),
         ({"theta": [0.1, math.nan]}, "theta = .* must be finite"),
         ({"theta": [0.1, 3.2]}, "theta = .* must be at most 3.14159"),
