@@ -8,12 +8,20 @@ README = (Path(__file__).parents[1] / "README.md").read_text()
 
 def test_the_ten_lines_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    code = re.search(r"```python\n(.*?)```", README, re.DOTALL).group(1)
+    code, _ = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     # A coarser grid of the same shape: the example's own takes longer than a test should.
     exec(code.replace("36", "4").replace("51", "10"), {})
     assert (tmp_path / "table.h5").exists()
     assert (tmp_path / "table.png").exists()
     assert "5.96" in capsys.readouterr().out
+
+
+def test_the_ride_runs(capsys):
+    _, code = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    names = {}
+    exec(code, names)
+    assert names["table"].shape == (3, 2)
+    assert names["ride"].position.shape[1] == 3
 
 
 def test_every_file_it_names_exists():
