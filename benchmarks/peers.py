@@ -215,7 +215,7 @@ def cyrk(task: Task) -> Callable[[float], Any]:
         answers = []
         for start in task.starts.T:
             found = pysolve_ivp(
-                rate, (0.0, task.t1), start, method="DOP853", rtol=tolerance, atol=0.1 * tolerance * task.scales
+                rate, (0.0, task.t1), start.copy(), method="DOP853", rtol=tolerance, atol=0.1 * tolerance * task.scales
             )
             answers.append(found.y[2:5, -1])
         return np.array(answers)
