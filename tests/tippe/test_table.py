@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 
+import diffrax
 import h5py
 import jax
 import numpy as np
@@ -306,6 +307,9 @@ def test_every_scene_compiles(arena, law):
     scene = tippe.Scene(rutstam_top(), arena, law)
     for crossing in ("first", "last"):
         table = tippe.inversion_table(scene, theta=[0.1, 0.2], spin=[90.0, 95.0], t1=0.02, crossing=crossing)
+        assert (table.status == "not_inverted").all()
+    for solver in (diffrax.Dopri5(), diffrax.Tsit5()):
+        table = tippe.inversion_table(scene, theta=[0.1, 0.2], spin=[90.0, 95.0], t1=0.02, solver=solver)
         assert (table.status == "not_inverted").all()
 
 
