@@ -38,7 +38,15 @@ def draw_launches(panels: list[Panel], angle: float) -> Any:
         for theta, start, end, colour in zip(panel.theta, panel.starts, panel.ends, colours, strict=True):
             drawing.plot(panel.times, theta, color=colour, linewidth=0.9, label=f"{start:.4g}")
             if np.isfinite(end):
-                drawing.plot(end, np.interp(end, panel.times, theta), "o", color=colour, markersize=5)
+                drawing.plot(
+                    end,
+                    np.interp(end, panel.times, theta),
+                    "o",
+                    color=colour,
+                    markersize=5,
+                    markeredgecolor="white",
+                    zorder=3,
+                )
         drawing.axhline(angle, color="0.5", linewidth=0.8, linestyle="--")
         drawing.set_title(panel.title)
         drawing.set_xlabel("time [s]")
