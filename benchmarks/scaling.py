@@ -20,7 +20,7 @@ from work_precision import TOP
 
 import tippe
 from nonholonomic import sweep
-from nonholonomic.ensemble import lanes_for, single_kernel_march
+from nonholonomic.ensemble import compiled_march, lanes_for
 from tippe.inversion import ABSOLUTE, InversionProblem
 
 TOLERANCE = 1e-9
@@ -57,7 +57,7 @@ def useful_share(scene: tippe.Scene) -> float:
     """The part of all lane-steps on a 64 x 64 grid of theta x spin that advanced a lane that was still running."""
     theta, spin = np.meshgrid(np.linspace(0.05, 1.5, 64), np.linspace(20.0, 200.0, 64), indexing="ij")
     problem = InversionProblem.of(scene, tippe.Launch(theta.ravel(), spin.ravel()), 0.95 * np.pi, 4096)
-    outcome, iterations = single_kernel_march(
+    outcome, iterations = compiled_march(
         problem,
         jnp.asarray(30.0),
         jnp.asarray(4096),
@@ -76,7 +76,7 @@ def lanes_table(scene: tippe.Scene) -> list[dict[str, str]]:
     for lanes in (8, 16, 32, 64, 128, 256):
 
         def run(lanes: int = lanes) -> Any:
-            return single_kernel_march(
+            return compiled_march(
                 problem,
                 jnp.asarray(30.0),
                 jnp.asarray(4096),

@@ -22,7 +22,7 @@ from measure import machine, one_core, table, timed, write_csv
 from peers import PEERS, Task, available, heyoka_scalar, scipy_with
 
 import tippe
-from nonholonomic.ensemble import lanes_for, single_kernel_march
+from nonholonomic.ensemble import compiled_march, lanes_for
 from tippe.inversion import ABSOLUTE, InversionProblem
 
 ANGLE = 0.95 * math.pi
@@ -71,7 +71,7 @@ def ours(scene: tippe.Scene, launch: tippe.Launch, t1: float, angle: float | Non
         problem = InversionProblem(problem.dynamics, jnp.asarray(-2.0), problem.states, problem.scales)
 
     def run(tolerance: float) -> Any:
-        outcome, _ = single_kernel_march(
+        outcome, _ = compiled_march(
             problem,
             jnp.asarray(t1),
             jnp.asarray(cells),

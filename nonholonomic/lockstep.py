@@ -55,7 +55,8 @@ class Control(NamedTuple):
     """How steps are taken.
 
     `tableau` and `order` are the method's; `rtol` the relative tolerance; `t1` the horizon [s], one for all or one per lane;
-    a lane that needs more than `max_steps` has failed; `passes` says whether a run goes on through its event.
+    a lane that needs more than `max_steps` has failed; `passes` says whether a run goes on through its event; the error of
+    the first `controlled` components (all, if `None`) is what a step is judged by.
     """
 
     tableau: diffrax.ButcherTableau
@@ -64,6 +65,7 @@ class Control(NamedTuple):
     t1: Float[Array, "..."]
     max_steps: int
     passes: bool
+    controlled: int | None
 
 
 class Search(NamedTuple):
@@ -132,10 +134,11 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
         return least_margin(problem, block.side, time, state)
 
     here = (block.time, block.state, block.rate, block.length)
-    tried = explicit_step(control.tableau, problem.field, watch, *here)
+    tried = explicit_step(control.tableau, problem.field, watch, *here, control.controlled)
     running = block.status == RUNNING
     free = running & ~block.searching
-    error = scaled_error(*stop_gradient((tried.error, block.state, tried.state)), control.rtol, atol)
+    before, after, atol = (part[: control.controlled] for part in (block.state, tried.state, atol))
+    error = scaled_error(*stop_gradient((tried.error, before, after)), control.rtol, atol)
     margin = stop_gradient(tried.watched)
     # A step into nonsense counts as one with a huge error.
     error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)

@@ -41,6 +41,7 @@ def explicit_step(
     state: States,
     rate: States,
     length: Lanes,
+    controlled: int | None = None,
 ) -> Step:
     """Try one step in every lane.
 
@@ -56,6 +57,7 @@ def explicit_step(
       What is negative for less than a quarter of a step may pass unseen.
     - `time`, `state`, `rate`: where the step starts, and the field there.
     - `length`: length of the step [s], one per lane.
+    - `controlled`: of how many leading components the error is estimated; of all by default.
 
     **Returns:** a `Step`. `watched` is the watched number at the end; `first_negative` the fraction of the step of the
     first stage at which it was negative, 2 if it never was.
@@ -65,7 +67,7 @@ def explicit_step(
     first_negative = jnp.full_like(length, 2.0)
     looks = _places_to_look(tableau.c)
     for stage, (fraction, row) in enumerate(zip(tableau.c, tableau.a_lower, strict=True)):
-        end = _moved(state, length, row, rates)
+        end = moved_state(state, length, row, rates)
         at = time + float(fraction) * length
         if stage in looks:
             stage_rate, seen = jax.lax.optimization_barrier((field(at, end), watch(at, end)))
@@ -76,9 +78,9 @@ def explicit_step(
     if tableau.fsal:
         last_rate = rates[-1]
     else:
-        end = _moved(state, length, tableau.b_sol, rates)
+        end = moved_state(state, length, tableau.b_sol, rates)
         last_rate = jax.lax.optimization_barrier(field(time + length, end))
-    error = length * _weighted(tableau.b_error, rates)
+    error = length * weighted_sum(tableau.b_error, [rate[:controlled] for rate in rates])
     return Step(end, last_rate, error, watch(time + length, end), first_negative)
 
 
@@ -88,7 +90,7 @@ def _places_to_look(fractions: Float[Array, " stages"]) -> set[int]:
     return {min(between, key=lambda stage: abs(fractions[stage] - part)) for part in (0.25, 0.5, 0.75) if between}
 
 
-def _moved(state: States, length: Lanes, weights: Array, rates: list[States]) -> States:
+def moved_state(state: States, length: Lanes, weights: Array, rates: list[States]) -> States:
     """The state moved along the weighted sum of the rates, joined from two halves.
 
     Joining, with a barrier behind it, makes the compiler store the result. It would otherwise evaluate the sum anew for
@@ -96,13 +98,13 @@ def _moved(state: States, length: Lanes, weights: Array, rates: list[States]) ->
     """
     half = state.shape[0] // 2
     parts = [
-        state[rows] + length * _weighted(weights, [rate[rows] for rate in rates])
+        state[rows] + length * weighted_sum(weights, [rate[rows] for rate in rates])
         for rows in (slice(half), slice(half, None))
     ]
     return jax.lax.optimization_barrier(jnp.concatenate(parts))
 
 
-def _weighted(weights: Float[Array, " stages"], rates: list[States]) -> States:
+def weighted_sum(weights: Float[Array, " stages"], rates: list[States]) -> States:
     """Sum of the rates with the given weights, leaving out those of weight 0."""
     total = None
     for weight, rate in zip(weights, rates, strict=True):
@@ -136,12 +138,13 @@ def first_length(
     order: int,
     rtol: float,
     atol: States,
+    controlled: int | None,
 ) -> Lanes:
     """Length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section II.4), as Diffrax selects it."""
     scale = atol + jnp.abs(state) * rtol
 
     def size(vector: States) -> Lanes:
-        return jnp.sqrt(jnp.mean((vector / scale) ** 2, axis=0))
+        return jnp.sqrt(jnp.mean((vector / scale)[:controlled] ** 2, axis=0))
 
     magnitude, slope = size(state), size(rate)
     flat = (magnitude < 1e-5) | (slope < 1e-5)

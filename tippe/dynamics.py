@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.surface import AbstractSurface, Tangent, carried
-from nonholonomic.vector import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors
+from nonholonomic.vector import Component, Vector, add, cross, dot, multiply, scale, stored, subtract, sum_vectors
 
 from .friction import AbstractFriction, Slip
 from .top import Top
@@ -93,7 +93,7 @@ class Dynamics(eqx.Module):
         along_axis = self.axial_excess * spin_momentum
         w1 = self.per_transverse * L[0] + along_axis * e[0]
         w2 = self.per_transverse * L[1] + along_axis * e[1]
-        slip = Slip(V[0] - R * w2, V[1] + R * w1)
+        slip = Slip(*stored(V[0] - R * w2, V[1] + R * w1))
         f1, f2 = self.friction.per_normal_force(slip).force
 
         # Moment per unit normal force of (f1, f2, 1) at the contact r = a e - R n.

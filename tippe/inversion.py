@@ -16,6 +16,7 @@ from nonholonomic.lockstep import CROSSED, REACHED_END, AbstractProblem
 from nonholonomic.paths import numbers
 from nonholonomic.runge_kutta import explicit_tableau
 from nonholonomic.validation import as_number, require
+from nonholonomic.variation import directions_of, march_with_slopes
 
 from .dynamics import COS_THETA, Dynamics
 from .launch import Launch
@@ -180,20 +181,34 @@ def _event_slopes(
     Cells do not influence one another, so moving a number in all of them at once gives every cell its own derivative.
     """
 
-    def times(*moving):
+    def build(*moving):
         moved = list(leaves)
         for i, leaf in zip(active, moving, strict=True):
             moved[i] = leaf
-        time = _event_times(run, cells, *moved)
-        # The derivative of the infinite result is that of a constant.
-        return jnp.where(jnp.isfinite(time), time, 0.0)
+        scene, launch, angle, *_ = jax.tree.unflatten(run.structure, moved)
+        return InversionProblem.of(scene, launch, angle, cells)
 
     point = tuple(leaves[i] for i in active)
-    if len(active) == 1:
-        return [jax.jvp(times, point, (jnp.ones_like(point[0]),))[1]]
-    directions = tuple(jnp.zeros((len(active), *leaf.shape), leaf.dtype).at[k].set(1.0) for k, leaf in enumerate(point))
-    slopes = jax.vmap(lambda *direction: jax.jvp(times, point, direction)[1])(*directions)
-    return list(slopes)
+    tangents = [
+        tuple(jnp.ones_like(leaf) if i == k else jnp.zeros_like(leaf) for i, leaf in enumerate(point))
+        for k in range(len(point))
+    ]
+    problem = build(*point)
+    t1, tolerance = jax.tree.unflatten(run.structure, leaves)[-2:]
+    tolerance = jnp.min(tolerance)
+    outcome, slopes = march_with_slopes(
+        problem,
+        directions_of(build, point, tangents),
+        t1,
+        jnp.asarray(cells),
+        tolerance,
+        ABSOLUTE * tolerance,
+        solver=run.solver,
+        lanes=lanes_for(cells),
+        passes=run.last,
+    )
+    inverted = is_inverted(outcome, problem, run.last)
+    return [jnp.where(inverted, slope, 0.0) for slope in slopes]
 
 
 def is_inverted(outcome: Outcome, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:

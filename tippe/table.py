@@ -8,22 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nonholonomic.ensemble import compiled_march, lanes_for, single_kernel_march
+from nonholonomic.ensemble import compiled_march, lanes_for
 from nonholonomic.lockstep import FAILED, GUARD_LOST
 from nonholonomic.paths import description, with_numbers
 from nonholonomic.reference import march_by_diffrax
 from nonholonomic.runge_kutta import explicit_tableau
-from nonholonomic.surface import Cylinder, Plane, Sphere
 from nonholonomic.sweep import Axis, Variable, axis, sweep
 from nonholonomic.table import Table
 
-from .friction import Coulomb, Viscous
 from .inversion import ABSOLUTE, InversionProblem, check_event, check_run, is_inverted
 from .launch import Launch
 from .scene import Scene
-
-#: Arenas, laws and solvers whose loops XLA is known to compile into one kernel; a test goes through them all.
-SINGLE_KERNEL = (Plane, Cylinder, Sphere, Viscous, Coulomb, diffrax.Dopri8, diffrax.Dopri5, diffrax.Tsit5)
 
 #: Cells that are checked together, to bound the memory it takes.
 CHECKED_AT_ONCE = 1 << 20
@@ -115,8 +110,6 @@ def inversion_table(
     check_run(roots["scene"], roots["launch"], t1, tolerance)
     _check_cells(roots, grid)
     last = crossing == "last"
-    tried = all(type(part) in SINGLE_KERNEL for part in (scene.surface, scene.friction, solver))
-    march = single_kernel_march if tried else compiled_march
 
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
         if method == "diffrax" and count == 0:
@@ -129,7 +122,7 @@ def inversion_table(
         if method == "diffrax":
             outcome = march_by_diffrax(problem, horizon, rtol, ABSOLUTE * rtol, solver=solver)
         else:
-            outcome, _ = march(
+            outcome, _ = compiled_march(
                 problem,
                 horizon,
                 jnp.asarray(count),

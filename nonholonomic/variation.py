@@ -1,0 +1,147 @@
+"""First derivatives of event times: the variations of the state run along with it.
+
+A problem and its variations are one problem with a longer state, so that they run through the same loop as the problem
+alone; differentiating the loop as a whole costs several times as much.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Literal
+from jaxtyping import Array, Float, Int
+
+from .ensemble import alone, march
+from .lockstep import CROSSED, AbstractProblem, crossing_time
+from .queue import Outcome
+
+
+class VariationalProblem(AbstractProblem):
+    """A problem and its first variation in each of some directions, the variations stacked behind the state.
+
+    A direction is a tangent of the problem: the same tree, with the rate at which each number moves, `None` where none of
+    the directions moves it.
+    """
+
+    problem: AbstractProblem
+    directions: tuple[Any, ...]
+    ends_on_event: bool = eqx.field(static=True)
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        states, scales = self.problem.start()
+
+        def variation(direction: Any) -> Float[Array, "components cells"]:
+            moved = eqx.filter_jvp(lambda problem: problem.start()[0], (self.problem,), (direction,))[1]
+            return jnp.zeros_like(states) if moved is None else moved
+
+        variations = [variation(direction) for direction in self.directions]
+        return jnp.concatenate([states, *variations]), jnp.concatenate([scales] * (1 + len(variations)))
+
+    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        at, *variations = self.parts(state)
+        rate = self.problem.field(time, at)
+        changes = [
+            eqx.filter_jvp(lambda problem, at: problem.field(time, at), (self.problem, at), moved)[1]
+            for moved in zip(self.directions, variations, strict=True)
+        ]
+        return jnp.concatenate([rate, *changes])
+
+    def crossing(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"] | None:
+        return self.problem.crossing(self.parts(state)[0]) if self.ends_on_event else None
+
+    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.problem.guard(time, self.parts(state)[0])
+
+    def parts(self, state: Float[Array, "components ..."]) -> list[Float[Array, "components ..."]]:
+        """The state and its variations."""
+        return jnp.split(state, 1 + len(self.directions))
+
+
+def march_with_slopes(
+    problem: AbstractProblem,
+    directions: tuple[Any, ...],
+    t1: Float[Array, "..."],
+    cells: Int[Array, ""],
+    rtol: Float[Array, ""],
+    atol: Float[Array, ""],
+    *,
+    solver: diffrax.AbstractERK,
+    lanes: int,
+    passes: bool = False,
+    one_kernel: bool = False,
+) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+    """Run every cell, and differentiate the time of its event in some directions.
+
+    **Arguments:** as for `ensemble.march`, and
+
+    - `directions`: tangents of the problem, as for `VariationalProblem`.
+
+    **Returns:** the `Outcome`, and for each direction the derivative of `crossing_time`, 0 where that is infinite. Source:
+    implicit function theorem at the event; step lengths are held fixed.
+    """
+    states, _ = problem.start()
+    varied = VariationalProblem(problem, directions, not passes)
+    options = {"solver": solver, "lanes": lanes, "one_kernel": one_kernel, "controlled": states.shape[0]}
+    if passes:
+        del options["controlled"]
+        outcome, _ = march(problem, t1, cells, rtol, atol, passes=True, **options)
+        # The variations run to the event alone, whose time is known by now.
+        horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
+        options["controlled"] = states.shape[0]
+        there, _ = march(varied, horizon, cells, rtol, atol, **options)
+        happened = jnp.isfinite(outcome.crossing_time)
+    else:
+        there, _ = march(varied, t1, cells, rtol, atol, **options)
+        happened = there.status == CROSSED
+        outcome = there._replace(state=varied.parts(there.state)[0])
+    state, *variations = varied.parts(there.state)
+    # At the very start the event is there at once, whatever moves.
+    happened &= there.end_time > 0.0
+
+    def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+        return crossing_time(problem, there.end_time, state)
+
+    slopes = []
+    for moved in zip(directions, variations, strict=True):
+        time, slope = eqx.filter_jvp(event_time, (problem, state), moved)
+        slopes.append(jnp.where(happened, slope, 0.0))
+    if not passes:
+        time = jnp.where(happened, time, 0.0)
+        outcome = outcome._replace(crossing_time=jnp.where(outcome.status == CROSSED, time, jnp.inf))
+    return outcome, slopes
+
+
+#: `march_with_slopes`, compiled on its own, for use outside of other transformed functions.
+compiled_march_with_slopes = alone(eqx.Partial(march_with_slopes, one_kernel=True))
+
+
+def directions_of(
+    build: Callable[..., AbstractProblem], numbers: tuple[Any, ...], tangents: list[tuple[Any, ...]]
+) -> tuple[Any, ...]:
+    """The tangents of a problem that is built from numbers.
+
+    **Arguments:**
+
+    - `build`: numbers -> problem.
+    - `numbers`: what it is built from, arrays.
+    - `tangents`: for each direction the rate at which each number moves.
+
+    **Returns:** for each direction the tangent of the problem, `None` for what depends on no number.
+    """
+    reached = _reached(jax.make_jaxpr(build)(*numbers))
+    structure = jax.tree.structure(jax.eval_shape(build, *numbers))
+    moving = jax.tree.unflatten(structure, reached)
+    found = [jax.jvp(build, numbers, tangent)[1] for tangent in tangents]
+    return tuple(eqx.filter(one, moving) for one in found)
+
+
+def _reached(closed: Any) -> list[bool]:
+    """Which outputs of a traced function depend on an input."""
+    depends = set(closed.jaxpr.invars)
+    for equation in closed.jaxpr.eqns:
+        if any(not isinstance(variable, Literal) and variable in depends for variable in equation.invars):
+            depends |= set(equation.outvars)
+    return [not isinstance(variable, Literal) and variable in depends for variable in closed.jaxpr.outvars]
