@@ -21,6 +21,7 @@ from .friction import Coulomb, Viscous
 from .inversion import ABSOLUTE, InversionProblem, check_event, check_run, is_inverted
 from .launch import Launch
 from .scene import Scene
+from .time_error import COARSER, time_error
 
 #: Arenas, laws and solvers whose loops XLA is known to compile into one kernel; a test goes through them all.
 SINGLE_KERNEL = (Plane, Cylinder, Sphere, Viscous, Coulomb, diffrax.Dopri8, diffrax.Dopri5, diffrax.Tsit5)
@@ -59,6 +60,7 @@ def inversion_table(
     axes: dict[str, Any] | None = None,
     solver: diffrax.AbstractERK | None = None,
     method: str = "ensemble",
+    errors: bool = False,
 ) -> Table:
     """Inversion times over a grid of launches and scenes, in one batched call on all cores.
 
@@ -77,10 +79,12 @@ def inversion_table(
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
     - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which knows first
       crossings only.
+    - `errors`: whether to run every cell again at ten times the tolerance, for an estimate of the error of its time.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
     "contact_lost", "failed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was lost, when
-    and at what angle), `steps` and `rejected`.
+    and at what angle), `steps` and `rejected`. With `errors` also `time_error` [s], infinite where the two runs disagree on
+    the status or failed, 0 where they agree that there is no time; `Table.digits("time")` shows the digits it leaves.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
     """
@@ -118,13 +122,7 @@ def inversion_table(
     tried = all(type(part) in SINGLE_KERNEL for part in (scene.surface, scene.friction, solver))
     march = single_kernel_march if tried else compiled_march
 
-    def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
-        if method == "diffrax" and count == 0:
-            # The reference runs whole blocks: a call that is there to compile would compute the first one twice.
-            return {}
-        cells = with_numbers(roots, columns)
-        size = next((len(values) for values in columns.values()), 1)
-        problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
+    def outcome_at(problem: InversionProblem, tolerance: float, count: int, size: int) -> dict[str, Any]:
         horizon, rtol = jnp.asarray(t1, float), jnp.asarray(tolerance, float)
         if method == "diffrax":
             outcome = march_by_diffrax(problem, horizon, rtol, ABSOLUTE * rtol, solver=solver)
@@ -151,11 +149,29 @@ def inversion_table(
             "rejected": np.asarray(outcome.rejected),
         }
 
+    def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
+        if method == "diffrax" and count == 0:
+            # The reference runs whole blocks: a call that is there to compile would compute the first one twice.
+            return {}
+        cells = with_numbers(roots, columns)
+        size = next((len(values) for values in columns.values()), 1)
+        problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
+        found = outcome_at(problem, tolerance, count, size)
+        if errors:
+            coarse = outcome_at(problem, COARSER * tolerance, count, size)
+            agreed = (found["status"] == coarse["status"]) & (found["status"] != WORDS.index("failed"))
+            found["time_error"] = time_error(found["time"], coarse["time"], agreed)
+        return found
+
     request = description("scene", roots["scene"]) | description("launch", roots["launch"])
     request |= {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
     request |= {"solver": type(solver).__name__, "method": method}
     request |= {one.path: "an axis" for one in grid}
-    return sweep(run, grid, VARIABLES, request, path=path)
+    variables = VARIABLES
+    if errors:
+        request |= {"errors": True}
+        variables = VARIABLES | {"time_error": Variable("s", np.float64)}
+    return sweep(run, grid, variables, request, path=path)
 
 
 def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:
