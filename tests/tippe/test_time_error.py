@@ -203,8 +203,8 @@ def test_the_estimate_over_random_scenes(crossing):
     """Of about 500 times, against 1e-13: how many errors exceed the estimate, and how many are below a hundredth of it.
 
     Measured: 0.4 % and 1.4 % at 1e-10, 0.9 % and 1.9 % at 1e-9, 2.6 % and 5.1 % at 1e-8, 1.9 % and 19 % at 1e-7 (first
-    crossings; the last ones do better). Half of the first kind at 1e-9 are short excursions past the angle over which both
-    runs step: then the error is that of a whole nutation.
+    crossings; the last ones do better). Two in five of the first kind at 1e-9 are short excursions past the angle over which
+    both runs step: then the error is that of a whole nutation.
     """
     found = {}
     for number, (surface, law) in enumerate(KINDS):
