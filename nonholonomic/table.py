@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Shaped
 
+from .digits import concise_texts
 from .hdf5 import read_grid, write_grid
 
 Values = Shaped[np.ndarray, "..."]
@@ -56,6 +57,24 @@ class Table(eqx.Module):
         **Raises:** `OSError` that names the path if it cannot be read or holds no table.
         """
         return cls(*read_grid(path))
+
+    def digits(self, variable: str = "time") -> Values:
+        """A variable with the digits that its error leaves: "5.01142(3)" is 5.01142 with an error of 0.00003.
+
+        **Arguments:** `variable`: name of a numeric variable, such as "time", whose error the table holds as "time_error".
+
+        **Returns:** an array of texts over the grid. Where there is no number the text is the cell's status; where even that
+        is in doubt, the status with a question mark.
+
+        **Raises:** `ValueError` if the table does not hold the variable and its error.
+        """
+        for name in (variable, f"{variable}_error"):
+            if name not in self.variables:
+                raise ValueError(
+                    f"variable = {variable!r}: the table has no {name!r}; it has {', '.join(self.variables)}"
+                )
+        values, errors = self.variables[variable], self.variables[f"{variable}_error"]
+        return concise_texts(values, errors, self.variables.get("status", values))
 
     def plot(self, variable: str = "time") -> Any:
         """Draw a variable over the grid (needs matplotlib): lines over the first axis, or a map of the first two.

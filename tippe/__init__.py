@@ -11,6 +11,8 @@ from .friction import Frictionless as Frictionless
 from .friction import Viscous as Viscous
 from .inversion import inversion_time as inversion_time
 from .launch import Launch as Launch
+from .lyapunov import LyapunovExponent as LyapunovExponent
+from .lyapunov import lyapunov_exponent as lyapunov_exponent
 from .scene import Scene as Scene
 from .table import inversion_table as inversion_table
 from .top import Top as Top

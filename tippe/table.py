@@ -19,6 +19,7 @@ from nonholonomic.table import Table
 from .inversion import ABSOLUTE, InversionProblem, check_event, check_run, is_inverted
 from .launch import Launch
 from .scene import Scene
+from .time_error import COARSER, time_error
 
 #: Cells that are checked together, to bound the memory it takes.
 CHECKED_AT_ONCE = 1 << 20
@@ -54,6 +55,7 @@ def inversion_table(
     axes: dict[str, Any] | None = None,
     solver: diffrax.AbstractERK | None = None,
     method: str = "ensemble",
+    errors: bool = False,
 ) -> Table:
     """Inversion times over a grid of launches and scenes, in one batched call on all cores.
 
@@ -72,10 +74,12 @@ def inversion_table(
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
     - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which knows first
       crossings only.
+    - `errors`: whether to run every cell again at ten times the tolerance, for an estimate of the error of its time.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
     "contact_lost", "failed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was lost, when
-    and at what angle), `steps` and `rejected`.
+    and at what angle), `steps` and `rejected`. With `errors` also `time_error` [s], infinite where the two runs disagree on
+    the status or failed, 0 where they agree that there is no time; `Table.digits("time")` shows the digits it leaves.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
     """
@@ -111,13 +115,7 @@ def inversion_table(
     _check_cells(roots, grid)
     last = crossing == "last"
 
-    def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
-        if method == "diffrax" and count == 0:
-            # The reference runs whole blocks: a call that is there to compile would compute the first one twice.
-            return {}
-        cells = with_numbers(roots, columns)
-        size = next((len(values) for values in columns.values()), 1)
-        problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
+    def outcome_at(problem: InversionProblem, tolerance: float, count: int, size: int) -> dict[str, Any]:
         horizon, rtol = jnp.asarray(t1, float), jnp.asarray(tolerance, float)
         if method == "diffrax":
             outcome = march_by_diffrax(problem, horizon, rtol, ABSOLUTE * rtol, solver=solver)
@@ -144,11 +142,29 @@ def inversion_table(
             "rejected": np.asarray(outcome.rejected),
         }
 
+    def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
+        if method == "diffrax" and count == 0:
+            # The reference runs whole blocks: a call that is there to compile would compute the first one twice.
+            return {}
+        cells = with_numbers(roots, columns)
+        size = next((len(values) for values in columns.values()), 1)
+        problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
+        found = outcome_at(problem, tolerance, count, size)
+        if errors:
+            coarse = outcome_at(problem, COARSER * tolerance, count, size)
+            agreed = (found["status"] == coarse["status"]) & (found["status"] != WORDS.index("failed"))
+            found["time_error"] = time_error(found["time"], coarse["time"], agreed)
+        return found
+
     request = description("scene", roots["scene"]) | description("launch", roots["launch"])
     request |= {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
     request |= {"solver": type(solver).__name__, "method": method}
     request |= {one.path: "an axis" for one in grid}
-    return sweep(run, grid, VARIABLES, request, path=path)
+    variables = VARIABLES
+    if errors:
+        request |= {"errors": True}
+        variables = VARIABLES | {"time_error": Variable("s", np.float64)}
+    return sweep(run, grid, variables, request, path=path)
 
 
 def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:

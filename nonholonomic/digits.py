@@ -1,0 +1,46 @@
+"""Numbers with the digits that their errors leave, in the concise notation: 5.01142(3) is 5.01142 with an error of 0.00003."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+
+def concise(value: float, error: float) -> str:
+    """A number with the digits that its error leaves and, in parentheses, the error of the last of them, rounded up.
+
+    **Arguments:** `value`, `error`: finite numbers, the error at least 0; without one the number is written in full.
+    """
+    if error == 0.0:
+        return repr(float(value))
+    place = math.floor(math.log10(error))
+    # The quotient may exceed a whole number by its rounding alone.
+    digit = math.ceil(error / 10.0**place * (1.0 - 1e-12))
+    if digit == 10:
+        place, digit = place + 1, 1
+    if place > 0:
+        return f"{round(value, -place):.0f}({digit * 10**place})"
+    return f"{value:.{-place}f}({digit})"
+
+
+def concise_texts(
+    values: Float[np.ndarray, "..."], errors: Float[np.ndarray, "..."], words: Shaped[np.ndarray, "..."]
+) -> Shaped[np.ndarray, "..."]:
+    """Concise notation for every number of an array, and a word where there is none.
+
+    **Arguments:**
+
+    - `values`: numbers; not finite where there is none.
+    - `errors`: their errors; infinite where it is doubtful whether there is a number at all.
+    - `words`: what to say where there is no number; with a question mark where that is doubtful.
+
+    **Returns:** an array of texts.
+    """
+
+    def text(value, error, word):
+        if np.isinf(error):
+            return f"{word}?"
+        return concise(value, error) if np.isfinite(value) else str(word)
+
+    texts = [text(*one) for one in zip(values.ravel(), errors.ravel(), words.ravel(), strict=True)]
+    return np.array(texts, dtype=str).reshape(values.shape)

@@ -1,0 +1,108 @@
+"""The Lyapunov exponent of a launch: whether nearby launches part exponentially, and how fast."""
+
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Shaped
+
+from nonholonomic.lockstep import GUARD_LOST, REACHED_END
+from nonholonomic.lyapunov import exponent_of, growth
+from nonholonomic.runge_kutta import explicit_tableau
+from nonholonomic.validation import require
+from nonholonomic.vector import cross
+
+from .inversion import ABSOLUTE, InversionProblem
+from .launch import Launch
+from .scene import Scene
+
+#: Stretches of time in which growth is counted; half of them give the exponent and its scatter.
+STRETCHES = 32
+
+
+class LyapunovExponent(NamedTuple):
+    """The largest Lyapunov exponent of a run, or of each of several.
+
+    - `exponent`: mean rate [1/s] of exponential parting in the second half of the run; not a number if the run ended early.
+    - `error`: of the exponent [1/s]; an exponent below twice its error is no sign of chaos.
+    - `status`: "reached_end", "contact_lost" or "failed".
+    - `end_time`: when the run ended [s]; `steps`: accepted and rejected ones.
+    - `times`: [s], (32,), and `running`: the mean rate of parting [1/s] from the start to each of them, (32, ...).
+    """
+
+    exponent: Float[np.ndarray, "..."]
+    error: Float[np.ndarray, "..."]
+    status: Shaped[np.ndarray, "..."]
+    end_time: Float[np.ndarray, "..."]
+    steps: Int[np.ndarray, "..."]
+    times: Float[np.ndarray, " stretches"]
+    running: Float[np.ndarray, "stretches ..."]
+
+
+def lyapunov_exponent(
+    scene: Scene,
+    launch: Launch,
+    t1: float,
+    tolerance: float = 1e-9,
+    solver: diffrax.AbstractERK | None = None,
+) -> LyapunovExponent:
+    """The largest Lyapunov exponent of one launch or of many at once, by the variational equation.
+
+    Positive if nearby launches part exponentially. While a top rises, it is the rate of the rise; chaos is what stays
+    positive as `t1` grows. Source: Benettin et al., Meccanica 15 (1980) 9; see `nonholonomic/lyapunov.py`.
+
+    **Arguments:**
+
+    - `scene`, `launch`: every number a scalar or one per launch, of shape (n,).
+    - `t1`: time [s] to follow the motion, positive.
+    - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
+
+    **Returns:** a `LyapunovExponent`, its arrays of shape () or (n,).
+
+    **Raises:** `ValueError` for arguments outside these ranges.
+    """
+    solver = diffrax.Dopri8() if solver is None else solver
+    explicit_tableau(solver)
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene = {scene!r} must be a Scene")
+    if not isinstance(launch, Launch):
+        raise ValueError(f"launch = {launch!r} must be a Launch")
+    require(t1, "t1", above=0.0)
+    require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+    shapes = {np.shape(leaf) for leaf in jax.tree.leaves((scene, launch))} - {()}
+    if len(shapes) > 1 or any(len(shape) > 1 for shape in shapes):
+        raise ValueError(f"scene and launch must hold scalars or one number per launch, not arrays of shapes {shapes}")
+    shape = shapes.pop() if shapes else ()
+    cells = int(np.prod(shape, dtype=int))
+    # The angle is that of an event, and the exponent has none.
+    problem = InversionProblem.of(scene, launch, jnp.pi, cells)
+    found = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, tolerance, ABSOLUTE, solver)
+    exponent, error = exponent_of(found.logarithm, float(t1))
+    whole = found.status == REACHED_END
+    words = np.select([whole, found.status == GUARD_LOST], ["reached_end", "contact_lost"], "failed")
+    times = t1 * np.arange(1, STRETCHES + 1) / STRETCHES
+    passed = np.minimum(times[:, None], found.end_time)
+    # A run that ends where it starts has not parted from anything.
+    running = np.cumsum(found.logarithm, axis=0) / np.where(passed > 0.0, passed, 1.0)
+    return LyapunovExponent(
+        exponent=np.where(whole, exponent, np.nan).reshape(shape),
+        error=np.where(whole, error, np.nan).reshape(shape),
+        status=words.reshape(shape),
+        end_time=found.end_time.reshape(shape),
+        steps=found.steps.reshape(shape),
+        times=times,
+        running=running.reshape(STRETCHES, *shape),
+    )
+
+
+def _direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, "components cells"]:
+    """A direction with nothing special about it, tangent to the states there are: axis and vertical stay of length 1."""
+    magnitudes = scene.scales(launch)
+    u1, u2, r1, r2, r3, *L = (magnitudes[i] * jnp.cos(1.0 + i) for i in range(8))
+    e = tuple(scene.state(launch)[2:5])
+    _, place = jax.jvp(scene.surface.place, (launch.eta,), (jnp.ones_like(launch.eta),))
+    parts = (u1, u2, *cross((r1, r2, r3), e), *L, *place)
+    return jnp.stack([jnp.broadcast_to(part, (cells,)) for part in parts])
