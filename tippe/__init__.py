@@ -4,11 +4,15 @@ from nonholonomic.surface import Cylinder as Cylinder
 from nonholonomic.surface import Plane as Plane
 from nonholonomic.surface import Sphere as Sphere
 from nonholonomic.table import Table as Table
+from nonholonomic.unknown import Free as Free
 
 from .friction import AbstractFriction as AbstractFriction
 from .friction import Coulomb as Coulomb
 from .friction import Frictionless as Frictionless
 from .friction import Viscous as Viscous
+from .identify import InversionTimes as InversionTimes
+from .identify import Recording as Recording
+from .identify import identify as identify
 from .inversion import inversion_time as inversion_time
 from .launch import Launch as Launch
 from .lyapunov import LyapunovExponent as LyapunovExponent

@@ -1,0 +1,282 @@
+"""What a fit found: estimates, their errors, what the data cannot see, and how it went from every start."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from .levenberg_marquardt import Linearised, Problem, minimise
+from .likelihood import Measurements
+
+#: Singular values below this part of the largest are those of a direction that the data do not see at all.
+NO_SLOPE = 1e-7
+
+#: A combination of numbers counts as unseen where its relative error exceeds this.
+UNSEEN = 1.0
+
+#: Rows of the residual table and unknowns of a combination that a summary shows.
+MOST_ROWS, LEAST_SHARE = 24, 0.02
+
+
+class Profile(NamedTuple):
+    """The profile likelihood of one number.
+
+    - `values`: (points,), at which it was held.
+    - `deviance`: (points,), -2 log likelihood, all other numbers fitted again, above its least value.
+    - `estimates`: name -> (points,), the other numbers there.
+    - `converged`: (points,), whether these fits did.
+    """
+
+    values: Float[np.ndarray, " points"]
+    deviance: Float[np.ndarray, " points"]
+    estimates: dict[str, Float[np.ndarray, " points"]]
+    converged: np.ndarray
+
+
+class Identifiability(NamedTuple):
+    """What data fix, and what not, to first order: singular values of the slopes of the residuals, priors left out.
+
+    A slope is that by a relative change: of 1 in the logarithm of a number that cannot be negative, of `Free.unit` else.
+
+    - `singular_values`: (unknowns,), falling; the inverse of one is the relative error of its combination of numbers.
+    - `directions`: (unknowns, unknowns), the combinations, one a row.
+    - `words`: the combinations as text: what moves together, and by how much.
+    """
+
+    singular_values: Float[np.ndarray, " unknowns"]
+    directions: Float[np.ndarray, "unknowns unknowns"]
+    words: tuple[str, ...]
+
+    @property
+    def unseen(self) -> tuple[str, ...]:
+        """The combinations that the data leave open by more than their own size."""
+        least = max(1.0 / UNSEEN, NO_SLOPE * self.singular_values[0])
+        return tuple(word for value, word in zip(self.singular_values, self.words, strict=True) if value < least)
+
+
+class ResidualRow(NamedTuple):
+    """One measurement: what was measured, its error, what the fit predicts, and its residual in units of the error."""
+
+    label: str
+    value: float
+    error: float
+    prediction: float
+    residual: float
+    censored: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Identification:
+    """Numbers identified from measurements.
+
+    - `estimates`, `standard_errors`: name -> number. The errors are those of the Gauss-Newton matrix, of data and priors
+      together; infinite for a number that a direction without slope contains.
+    - `covariance`: (unknowns, unknowns), in the order of `estimates`. Numbers with infinite error have covariance 0.
+    - `deviance`: -2 log likelihood of data and priors at the estimate, up to a constant: the sum of squared residuals.
+    - `degrees`: measurements and priors less unknowns.
+    - `identifiability`: an `Identifiability`, `residuals`: a `ResidualRow` for every measurement.
+    - `status`: "converged" or why not; `starts`, `ends`: name -> (starts,), from where to where each fit went;
+      `end_deviances`: (starts,); `statuses`: one of "converged", "not_converged", "failed" for each start.
+    - `coordinates`, `coordinate_covariance`: the same in the coordinates in which the fit was done.
+    """
+
+    estimates: dict[str, float]
+    standard_errors: dict[str, float]
+    covariance: Float[np.ndarray, "unknowns unknowns"]
+    deviance: float
+    degrees: int
+    identifiability: Identifiability
+    residuals: tuple[ResidualRow, ...]
+    status: str
+    starts: dict[str, Float[np.ndarray, " starts"]]
+    ends: dict[str, Float[np.ndarray, " starts"]]
+    end_deviances: Float[np.ndarray, " starts"]
+    statuses: tuple[str, ...]
+    coordinates: Float[np.ndarray, " unknowns"]
+    coordinate_covariance: Float[np.ndarray, "unknowns unknowns"]
+    problem: Problem = dataclasses.field(repr=False)
+    measurements: Measurements = dataclasses.field(repr=False)
+
+    def interval(self, name: str, deviations: float = 1.96) -> tuple[float, float]:
+        """The interval of a number, symmetric in its coordinate and so within its bounds.
+
+        **Arguments:** `name`: of the number; `deviations`: half its width in standard errors, 1.96 for 95 %.
+
+        **Raises:** `ValueError` for a name that was not free.
+        """
+        k = self._place(name)
+        free = self.problem.free[k][1]
+        reach = deviations * np.sqrt(self.coordinate_covariance[k, k])
+        with np.errstate(over="ignore"):
+            return tuple(float(free.value(np.asarray(self.coordinates[k] + side * reach))) for side in (-1.0, 1.0))
+
+    def profile(self, name: str, values: Any = None) -> Profile:
+        """The profile likelihood of a number: all others are fitted again, for all its values at once.
+
+        **Arguments:**
+
+        - `name`: of the number.
+        - `values`: at which to hold it, by default 13 within three standard errors.
+
+        **Returns:** a `Profile`.
+
+        **Raises:** `ValueError` for a name that was not free, or without `values` for a number of infinite error.
+        """
+        k = self._place(name)
+        free = self.problem.free[k][1]
+        if len(self.problem.free) == 1:
+            raise ValueError(f"name = {name!r} is the only free number: there is nothing to fit again")
+        if values is None:
+            if not np.isfinite(self.standard_errors[name]):
+                raise ValueError(f"values must be given for {name!r}, whose standard error is infinite")
+            reach = 3.0 * np.sqrt(self.coordinate_covariance[k, k])
+            values = np.asarray(free.value(jnp.asarray(self.coordinates[k] + np.linspace(-reach, reach, 13))))
+        values = np.atleast_1d(np.asarray(values, float))
+        if not np.all((values > free.lower) & (values < free.upper)):
+            raise ValueError(f"values = {values!r} must lie within the bounds ({free.lower}, {free.upper}) of {name!r}")
+        starts = np.tile(self.coordinates, (len(values), 1))
+        starts[:, k] = np.asarray(free.coordinate(values))
+        ends = minimise(self.problem, jnp.asarray(starts), self.measurements, held=k)
+        found = np.asarray(self.problem.values(ends.coordinates))
+        deviance = deviance_of(self.problem, ends.coordinates, self.measurements) - self.deviance
+        others = {other: found[:, i] for i, (other, _) in enumerate(self.problem.free) if i != k}
+        return Profile(values, deviance, others, np.asarray(ends.converged))
+
+    def _place(self, name: str) -> int:
+        if name not in self.estimates:
+            raise ValueError(f"name = {name!r} must be one of {', '.join(self.estimates)}")
+        return list(self.estimates).index(name)
+
+    def __str__(self) -> str:
+        here = np.sum(self.end_deviances < self.deviance + 0.1)
+        lines = [
+            f"Identification of {len(self.estimates)} numbers from {len(self.residuals)} measurements: {self.status}",
+            f"  {self.statuses.count('converged')} of {len(self.statuses)} starts converged, {here} ended here",
+            f"  -2 log likelihood {self.deviance:.4g} at {self.degrees} degrees of freedom",
+            "estimates, standard errors and 95 % intervals",
+        ]
+        width = max(map(len, self.estimates))
+        for name, value in self.estimates.items():
+            low, high = self.interval(name)
+            lines.append(f"  {name:{width}}  {value:.6g} +- {self.standard_errors[name]:.2g}  ({low:.6g}, {high:.6g})")
+        lines.append("what the data fix, by the relative error of what moves together")
+        for value, words in zip(self.identifiability.singular_values, self.identifiability.words, strict=True):
+            mark = "  NOT SEEN" if words in self.identifiability.unseen else ""
+            lines.append(f"  {1.0 / max(value, 1e-300):8.2g}  {words}{mark}")
+        lines.append("measured, predicted, residual in units of the error")
+        width = max(len(row.label) for row in self.residuals)
+        for row in self.residuals[:MOST_ROWS]:
+            sign = ">" if row.censored else " "
+            measured = f"{sign}{row.value:.6g} +- {row.error:.2g}"
+            lines.append(f"  {row.label:{width}}  {measured:20}  {row.prediction:.6g}  {row.residual:+.2f}")
+        if len(self.residuals) > MOST_ROWS:
+            worst = max(self.residuals, key=lambda row: abs(row.residual))
+            lines.append(f"  and {len(self.residuals) - MOST_ROWS} more; largest {worst.label} {worst.residual:+.2f}")
+        return "\n".join(lines)
+
+
+def deviance_of(problem: Problem, coordinates: Any, measurements: Measurements) -> Float[np.ndarray, " rows"]:
+    """-2 log likelihood of every row; infinite where it is not a number."""
+    prediction = problem.predict(jnp.asarray(coordinates))
+    data = jnp.sum(measurements.residuals(prediction) ** 2, axis=-1)
+    prior = jnp.array([jnp.sum(problem.prior(one) ** 2) for one in jnp.asarray(coordinates)])
+    return np.asarray(jnp.where(jnp.isfinite(data + prior), data + prior, jnp.inf))
+
+
+def coordinate_covariance(jacobian: Float[np.ndarray, "residuals unknowns"]) -> Float[np.ndarray, "unknowns unknowns"]:
+    """The inverse of the Gauss-Newton matrix J^T J; of unknowns that a direction without slope contains, infinite.
+
+    Directions are judged with every unknown in units of its own error, the others held.
+    """
+    norms = np.linalg.norm(jacobian, axis=0)
+    norms = np.where(norms > 0.0, norms, 1.0)
+    values, directions = _singular(jacobian / norms)
+    seen = values > NO_SLOPE * max(values[0], 1e-300)
+    covariance = (directions[seen].T / values[seen] ** 2) @ directions[seen] / np.outer(norms, norms)
+    open_ = np.any(np.abs(directions[~seen]) > 1e-6, axis=0)
+    covariance[open_, :] = covariance[:, open_] = 0.0
+    covariance[open_, open_] = np.inf
+    return covariance
+
+
+def _singular(slopes: Float[np.ndarray, "n unknowns"]) -> tuple[np.ndarray, np.ndarray]:
+    """As many singular values and right singular vectors (a row each) as there are unknowns."""
+    unknowns = slopes.shape[1]
+    _, values, directions = np.linalg.svd(slopes, full_matrices=len(slopes) < unknowns)
+    return np.concatenate([values, np.zeros(unknowns - len(values))]), directions
+
+
+def identifiability(problem: Problem, estimates: Any, slopes: Any, jacobian: Any) -> Identifiability:
+    """Singular values of the slopes of the residuals by relative changes of the numbers, with their directions in words.
+
+    **Arguments:** `estimates`: (unknowns,); `slopes`: (unknowns,), of the numbers by their coordinates; `jacobian`: (n,
+    unknowns), of the residuals by the coordinates.
+    """
+    units = np.array(
+        [abs(x) if one.positive else one.unit for x, (_, one) in zip(estimates, problem.free, strict=True)]
+    )
+    scaled = np.asarray(jacobian) * units / np.where(slopes == 0.0, 1.0, slopes)
+    values, directions = _singular(scaled)
+    words = tuple(_in_words(problem, direction) for direction in directions)
+    return Identifiability(values, directions, words)
+
+
+def _in_words(problem: Problem, direction: Float[np.ndarray, " unknowns"]) -> str:
+    """What moves together: per cent of a number that cannot be negative, hundredths of its unit of another."""
+    most = np.argmax(np.abs(direction))
+    parts = []
+    for share, (name, free) in zip(direction / direction[most], problem.free, strict=True):
+        if abs(share) >= LEAST_SHARE:
+            parts.append(f"{name} {share:+.2g} %" if free.positive else f"{name} {0.01 * share * free.unit:+.2g}")
+    return ", ".join(parts)
+
+
+def summarise(
+    problem: Problem,
+    measurements: Measurements,
+    labels: tuple[str, ...],
+    starts: Float[np.ndarray, "starts unknowns"],
+    ends: Float[np.ndarray, "starts unknowns"],
+    converged: np.ndarray,
+    at_ends: Linearised,
+) -> Identification:
+    """The result of fits from several starts: that of the best of them, with the others on record."""
+    deviances = np.asarray(at_ends.deviance)
+    deviances = np.where(np.isfinite(deviances) & np.all(np.isfinite(ends), axis=1), deviances, np.inf)
+    statuses = tuple(
+        "failed" if np.isinf(deviance) else "converged" if there else "not_converged"
+        for deviance, there in zip(deviances, converged, strict=True)
+    )
+    best = int(np.argmin(deviances))
+    here, names = ends[best], [name for name, _ in problem.free]
+    values = np.asarray(problem.values(jnp.asarray(ends)))
+    slopes = np.array([float(jax.grad(one.value)(at)) for at, (_, one) in zip(here, problem.free, strict=True)])
+    jacobian = np.asarray(at_ends.jacobian[best])
+    covariance = coordinate_covariance(np.asarray(at_ends.whole_jacobian[best]))
+    with np.errstate(invalid="ignore"):
+        by_value = np.where(covariance == 0.0, 0.0, covariance * np.outer(slopes, slopes))
+    begins = np.asarray(problem.values(jnp.asarray(starts)))
+    numbers = (measurements.value, measurements.error, at_ends.prediction[best], at_ends.residual[best])
+    table = zip(labels, *(np.asarray(part).tolist() for part in numbers), strict=True)
+    flags = np.asarray(measurements.censored).tolist()
+    return Identification(
+        estimates=dict(zip(names, values[best].tolist(), strict=True)),
+        standard_errors=dict(zip(names, np.sqrt(np.diag(by_value)).tolist(), strict=True)),
+        covariance=by_value,
+        deviance=float(deviances[best]),
+        degrees=len(labels) + at_ends.prior.shape[-1] - len(names),
+        identifiability=identifiability(problem, values[best], slopes, jacobian),
+        residuals=tuple(ResidualRow(*row, flag) for row, flag in zip(table, flags, strict=True)),
+        status=statuses[best],
+        starts=dict(zip(names, begins.T, strict=True)),
+        ends=dict(zip(names, values.T, strict=True)),
+        end_deviances=deviances,
+        statuses=statuses,
+        coordinates=here,
+        coordinate_covariance=covariance,
+        problem=problem,
+        measurements=measurements,
+    )

@@ -1,0 +1,253 @@
+"""Nonlinear least squares from many starts, or of many data, at once: Optimistix's Levenberg-Marquardt on rows.
+
+A row is one fit. All rows advance together, and the model is evaluated for all of them, with its slopes, in one call; a
+model that runs its own cases as lanes of one block therefore runs those of every row in it.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from tqdm import tqdm
+
+from .likelihood import Measurements
+from .unknown import Free
+
+#: Damping of the first step, as a part of the largest squared slope (Madsen, Nielsen and Tingleff, "Methods for
+#: non-linear least squares problems", 2nd edition (2004), section 3.2).
+FIRST_DAMPING = 1e-2
+
+#: A fit has converged once a step changes no coordinate and no residual by more than this, relatively or absolutely.
+CONVERGED = 1e-6
+
+
+class Problem(eqx.Module):
+    """A model and what is free in it.
+
+    - `model`: parameters, name -> (rows,), to predictions (rows, n).
+    - `free`: name -> `Free`, as pairs.
+    """
+
+    model: Callable[[dict[str, Float[Array, " rows"]]], Float[Array, "rows n"]]
+    free: tuple[tuple[str, Free], ...] = eqx.field(static=True)
+
+    def values(self, coordinates: Float[Array, "... unknowns"]) -> Float[Array, "... unknowns"]:
+        """The numbers at their coordinates."""
+        return jnp.stack([one.value(coordinates[..., k]) for k, (_, one) in enumerate(self.free)], axis=-1)
+
+    def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
+        """What the model predicts in every row."""
+        values = self.values(coordinates)
+        return self.model({name: values[:, k] for k, (name, _) in enumerate(self.free)})
+
+    def prior(self, coordinates: Float[Array, " unknowns"]) -> Float[Array, " priors"]:
+        """Residuals of the priors, in one row."""
+        priors = [(k, *one.prior) for k, (_, one) in enumerate(self.free) if one.prior is not None]
+        values = self.values(coordinates)
+        return jnp.array([(values[k] - mean) / deviation for k, mean, deviation in priors])
+
+
+class Linearised(NamedTuple):
+    """A model and its likelihood at a point of every row.
+
+    - `prediction`: (rows, n); `residual`: (rows, n), those of the data;
+    - `jacobian`: (rows, n, unknowns), their slopes along the coordinates;
+    - `prior`, `prior_jacobian`: (rows, priors), (rows, priors, unknowns), those of the priors.
+    """
+
+    prediction: Float[Array, "rows n"]
+    residual: Float[Array, "rows n"]
+    jacobian: Float[Array, "rows n unknowns"]
+    prior: Float[Array, "rows priors"]
+    prior_jacobian: Float[Array, "rows priors unknowns"]
+
+    @property
+    def deviance(self) -> Float[Array, " rows"]:
+        """-2 log posterior of every row, up to a constant."""
+        return jnp.sum(self.residual**2, axis=-1) + jnp.sum(self.prior**2, axis=-1)
+
+    @property
+    def whole_jacobian(self) -> Float[Array, "rows residuals unknowns"]:
+        """The slopes of data and priors."""
+        return jnp.concatenate([self.jacobian, self.prior_jacobian], axis=1)
+
+
+class Ends(NamedTuple):
+    """Where the rows ended: coordinates (rows, unknowns), whether each converged, and in how many steps."""
+
+    coordinates: Float[Array, "rows unknowns"]
+    converged: Bool[Array, " rows"]
+    steps: Int[Array, " rows"]
+
+
+def _slopes(problem: Problem, coordinates: Float[Array, "rows unknowns"]) -> tuple[Array, Array]:
+    """Predictions and their slopes; rows do not influence one another, so a coordinate is moved in all of them at once."""
+
+    def along(direction):
+        return jax.jvp(problem.predict, (coordinates,), (jnp.broadcast_to(direction, coordinates.shape),))
+
+    values, slopes = jax.vmap(along, out_axes=(0, -1))(jnp.eye(coordinates.shape[-1]))
+    return values[0], jnp.where(jnp.isfinite(slopes), slopes, 0.0)
+
+
+@eqx.filter_jit
+def linearise(problem: Problem, coordinates: Float[Array, "rows unknowns"], measurements: Measurements) -> Linearised:
+    """Predictions, residuals and their slopes.
+
+    **Arguments:**
+
+    - `problem`: the `Problem`.
+    - `coordinates`: (rows, unknowns).
+    - `measurements`: `Measurements` of shape (n,) or (rows, n).
+
+    **Returns:** a `Linearised`.
+    """
+    prediction, slopes = _slopes(problem, coordinates)
+    residual, by_prediction = jax.jvp(measurements.residuals, (prediction,), (jnp.ones_like(prediction),))
+    prior = jax.vmap(problem.prior)(coordinates)
+    prior_jacobian = jax.vmap(jax.jacfwd(problem.prior))(coordinates)
+    return Linearised(prediction, residual, by_prediction[..., None] * slopes, prior, prior_jacobian)
+
+
+class _Row(NamedTuple):
+    """What a row minimises: its data, the part of the coordinates that is held, and the unit of its residuals."""
+
+    measurements: Measurements
+    held: Float[Array, " unknowns"]
+    unit: Float[Array, ""]
+
+
+def _residuals(moving: Float[Array, " moving"], given: tuple[Problem, Float[Array, "unknowns moving"], _Row]) -> Any:
+    """All residuals of one row, as Optimistix wants them."""
+    problem, embedding, row = given
+    coordinates = row.held + embedding @ moving
+    data = row.measurements.residuals(_prediction(problem, coordinates))
+    return jnp.concatenate([data, problem.prior(coordinates)]) / row.unit, None
+
+
+def _prediction(problem: Problem, coordinates: Float[Array, " unknowns"]) -> Float[Array, " n"]:
+    """The prediction of one row, whose batching keeps the rows together and whose derivative costs no second run."""
+    numbers, structure = eqx.partition(problem, eqx.is_array)
+
+    def rows(numbers, coordinates):
+        return _slopes(eqx.combine(numbers, structure), coordinates)
+
+    @jax.custom_batching.custom_vmap
+    def both(numbers, coordinates):
+        return jax.tree.map(lambda result: result[0], rows(numbers, coordinates[None]))
+
+    @both.def_vmap
+    def both_of_rows(size, batched, numbers, coordinates):
+        # The problem itself is the same in all rows.
+        return rows(numbers, coordinates), (True, True)
+
+    @jax.custom_jvp
+    def prediction(numbers, coordinates):
+        return both(numbers, coordinates)[0]
+
+    @prediction.defjvp
+    def variation(point, tangents):
+        value, slopes = both(*point)
+        return value, slopes @ tangents[1]
+
+    return prediction(numbers, coordinates)
+
+
+def minimise(
+    problem: Problem,
+    starts: Float[Array, "rows unknowns"],
+    measurements: Measurements,
+    *,
+    held: int | None = None,
+    max_steps: int = 60,
+    progress: bool = False,
+) -> Ends:
+    """Fit every row.
+
+    **Arguments:**
+
+    - `problem`: the `Problem`.
+    - `starts`: coordinates, (rows, unknowns).
+    - `measurements`: (n,), the same for all rows, or (rows, n).
+    - `held`: number of an unknown that keeps its start, or `None`.
+    - `max_steps`: a row that needs more has not converged.
+    - `progress`: whether to show on a terminal how many rows are done.
+
+    **Returns:** the `Ends`.
+
+    **Raises:** `ImportError` if Optimistix is not installed.
+    """
+    optimistix = required()
+    starts = jnp.asarray(starts, float)
+    rows, unknowns = starts.shape
+    measurements = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (rows, leaf.shape[-1])), measurements)
+    embedding = jnp.eye(unknowns) if held is None else jnp.delete(jnp.eye(unknowns), held, axis=1)
+    begin = linearise(problem, starts, measurements)
+    largest = jnp.max(jnp.sum(begin.whole_jacobian**2, axis=1), axis=-1)
+    unit = jnp.sqrt(FIRST_DAMPING * jnp.where(largest > 0.0, largest, 1.0 / FIRST_DAMPING))
+    moving = starts @ embedding
+    row = _Row(measurements, starts - moving @ embedding.T, unit)
+    solver = optimistix.LevenbergMarquardt(rtol=CONVERGED, atol=CONVERGED)
+    moving, state = _begin(solver, problem, embedding, row, moving)
+    done = np.zeros(rows, bool)
+    steps = np.zeros(rows, int)
+    with tqdm(total=rows, desc="fits", unit="fit", disable=None if progress else True) as bar:
+        for step in range(max_steps):
+            moving, state, ended = _step(solver, problem, embedding, row, moving, state, jnp.asarray(done))
+            ended = np.asarray(ended)
+            steps[~done] = step + 1
+            bar.update(int(np.sum(ended & ~done)))
+            bar.set_postfix(steps=step + 1)
+            done |= ended
+            if done.all():
+                break
+    return Ends(row.held + moving @ embedding.T, jnp.asarray(done), jnp.asarray(steps))
+
+
+def required() -> Any:
+    """Optimistix.
+
+    **Raises:** `ImportError` that says how to install it.
+    """
+    try:
+        import optimistix
+    except ImportError:
+        raise ImportError("identification needs Optimistix: pip install 'nonholonomic[fit]'") from None
+    return optimistix
+
+
+@eqx.filter_jit
+def _begin(solver: Any, problem: Problem, embedding: Array, row: _Row, moving: Array) -> tuple[Array, Any]:
+    """The solver's state before the first step, in every row."""
+
+    def begin(moving, row):
+        given = (problem, embedding, row)
+        shape = eqx.filter_eval_shape(_residuals, moving, given)[0]
+        return solver.init(_residuals, moving, given, {"jac": "fwd"}, shape, None, frozenset())
+
+    return moving, eqx.filter_vmap(begin)(moving, row)
+
+
+@eqx.filter_jit
+def _step(
+    solver: Any, problem: Problem, embedding: Array, row: _Row, moving: Array, state: Any, done: Array
+) -> tuple[Array, Any, Array]:
+    """One step of every row that is not done; the new points and states, and which rows are done now."""
+
+    def step(moving, state, row):
+        given = (problem, embedding, row)
+        options = {"jac": "fwd"}
+        moving, state, _ = solver.step(_residuals, moving, given, options, state, frozenset())
+        ended, _ = solver.terminate(_residuals, moving, given, options, state, frozenset())
+        return moving, state, ended
+
+    new_moving, new_state, ended = eqx.filter_vmap(step)(moving, state, row)
+
+    def keep(new, old):
+        return jnp.where(done.reshape(-1, *(1,) * (new.ndim - 1)), old, new) if eqx.is_array(new) else new
+
+    return keep(new_moving, moving), jax.tree.map(keep, new_state, state), done | ended

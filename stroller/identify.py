@@ -1,0 +1,154 @@
+"""Numbers of a stroller, its ground and its launch from a recorded ride."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic import identify as generic
+from nonholonomic.identify_result import Identification
+from nonholonomic.likelihood import Measurements
+from nonholonomic.paths import numbers
+from nonholonomic.validation import as_number, require
+
+from .input import Input
+from .launch import Launch
+from .scene import Scene
+from .simulate import simulate
+from .table import PLACES, replaced
+
+#: Columns of a sample of each quantity.
+QUANTITIES = {"position": ("x", "y", "z"), "heading": ("heading",), "speed": ("speed",), "steering": ("steering",)}
+
+
+class Recording(eqx.Module):
+    """A recorded ride: one quantity at some times.
+
+    **Arguments:**
+
+    - `launch`: a `Launch`, every number a scalar.
+    - `times`: (times,) [s], increasing from 0 or later.
+    - `value`: (times, 3) [m] for "position" (in the fixed frame), (times,) for "heading" [rad], "speed" [m/s] and
+      "steering" [rad], all as in `Trajectory`.
+    - `error`: standard errors, one for all or of the shape of `value`.
+    - `quantity`: one of these words.
+    - `input`: what drove the stroller, as for `simulate`.
+
+    **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
+    """
+
+    launch: Launch
+    times: Float[Array, " times"] = eqx.field(converter=as_number)
+    value: Float[Array, "..."] = eqx.field(converter=as_number)
+    error: Float[Array, "..."] = eqx.field(converter=as_number)
+    quantity: str = eqx.field(static=True, default="position")
+    input: Input | None = None
+
+    def __check_init__(self):
+        if self.quantity not in QUANTITIES:
+            raise ValueError(f"quantity = {self.quantity!r} must be one of {', '.join(map(repr, QUANTITIES))}")
+        require(self.times, "times", at_least=0.0)
+        if np.ndim(self.times) != 1 or np.any(np.diff(np.asarray(self.times)) <= 0.0) or not self.times[-1] > 0.0:
+            raise ValueError(f"times = {self.times!r} must be an increasing list with a positive end")
+        shape = (len(self.times), *((3,) if self.quantity == "position" else ()))
+        if np.shape(self.value) != shape:
+            raise ValueError(f"value must be of shape {shape} for {self.quantity!r}, not {np.shape(self.value)}")
+
+    @property
+    def measurements(self) -> Measurements:
+        """The samples as a likelihood takes them."""
+        error = jnp.broadcast_to(self.error, jnp.shape(self.value))
+        return Measurements(self.value.reshape(-1), error.reshape(-1))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What to call each sample."""
+        return tuple(f"{name}({time:.4g} s)" for time in np.asarray(self.times) for name in QUANTITIES[self.quantity])
+
+    def predict(self, scene: Scene, values: dict[str, Array], tolerance: float) -> Float[Array, "rows n"]:
+        """The samples in every row."""
+
+        def one(values):
+            roots = replaced({"scene": scene, "launch": self.launch}, values)
+            run = simulate(
+                roots["scene"],
+                roots["launch"],
+                self.times[-1],
+                self.input,
+                self.times,
+                tolerance,
+                adjoint=diffrax.ForwardMode(),
+            )
+            return getattr(run, self.quantity).reshape(-1)
+
+        return jax.vmap(one)(values)
+
+
+class SceneModel(eqx.Module):
+    """Predictions of all recordings of a scene, as `nonholonomic.identify` wants them."""
+
+    scene: Scene
+    data: tuple[Recording, ...]
+    tolerance: float = eqx.field(static=True)
+
+    def __call__(self, parameters: dict[str, Float[Array, " rows"]]) -> Float[Array, "rows n"]:
+        return jnp.concatenate([one.predict(self.scene, parameters, self.tolerance) for one in self.data], axis=1)
+
+
+def identify(
+    scene: Scene,
+    data: Any,
+    free: dict[str, Any],
+    *,
+    starts: int = 1,
+    spread: float = 2.0,
+    seed: int = 0,
+    tolerance: float = 1e-8,
+    max_steps: int = 60,
+    progress: bool = True,
+) -> Identification:
+    """Numbers of a scene and its launch from recorded rides, with their errors and with what is left open.
+
+    **Arguments:**
+
+    - `scene`: a `Scene`; what is not free is taken from it.
+    - `data`: a `Recording`, or a list of several to be fitted together.
+    - `free`: path of a number -> a `Free` or only the value from which to start: `"scene.friction.rolling"`, or
+      `"rolling"` where nothing else ends so; `"launch.place[0]"` and `"launch.place[1]"` are parts of the place. A number
+      of the launch is the same in all recordings. Numbers that cannot be negative are fitted in their logarithms.
+    - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identify.identify`.
+    - `tolerance`: relative tolerance of the integration.
+
+    **Returns:** an `Identification`.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown path; `ImportError` if Optimistix is not installed.
+    """
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene = {scene!r} must be a Scene")
+    data = tuple(data) if isinstance(data, list | tuple) else (data,)
+    if not data or not all(isinstance(one, Recording) for one in data):
+        raise ValueError(f"data = {data!r} must be a Recording, or a list of them")
+    require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+    for one in data:
+        scene.check(one.launch)
+    roots = {"scene": scene, "launch": data[0].launch}
+    known = [path for root, tree in roots.items() for path in numbers(root, tree)] + list(PLACES)
+    unknowns = generic.free_numbers(free, roots, known, replaced)
+    labels = tuple(
+        f"{i + 1}: {label}" if len(data) > 1 else label for i, one in enumerate(data) for label in one.labels
+    )
+    return generic.identify(
+        SceneModel(scene, data, tolerance),
+        jax.tree.map(lambda *parts: jnp.concatenate(parts), *[one.measurements for one in data]),
+        unknowns,
+        starts=starts,
+        spread=spread,
+        seed=seed,
+        max_steps=max_steps,
+        labels=labels,
+        progress=progress,
+    )

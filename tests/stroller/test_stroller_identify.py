@@ -1,0 +1,38 @@
+"""Numbers of a stroller from a recorded ride."""
+
+import numpy as np
+import pytest
+from conftest import assert_close
+
+import stroller
+
+LAUNCH = stroller.Launch(place=(0.0, 0.0), heading=0.0, speed=1.5, steering=0.3)
+TIMES = np.array([0.5, 1.0, 1.5])
+
+
+def scene(rolling=2.0, wheelbase=0.7):
+    body = stroller.Stroller(mass=12.0, wheelbase=wheelbase, inertia=1.5, steering_inertia=0.05)
+    return stroller.Scene(body, friction=stroller.Damping(rolling))
+
+
+def test_damping_and_wheelbase_from_an_exact_path():
+    path = stroller.simulate(scene(), LAUNCH, 1.5, times=TIMES).position
+    data = stroller.Recording(LAUNCH, TIMES, path, 0.01)
+    free = {"rolling": 1.0, "scene.body.wheelbase": 1.2}
+    found = stroller.identify(scene(), data, free, tolerance=1e-7)
+    assert found.status == "converged"
+    assert_close(list(found.estimates.values()), [2.0, 0.7], rtol=1e-4)
+    assert found.residuals[0].label == "x(0.5 s)"
+
+
+def test_what_cannot_be_fitted_is_refused():
+    data = stroller.Recording(LAUNCH, TIMES, np.zeros((3, 3)), 0.01)
+    for free, told in (({"drag": 1.0}, "must be one of"), ({"wheelbase": -1.0}, "wheelbase")):
+        with pytest.raises(ValueError, match=told):
+            stroller.identify(scene(), data, free)
+    with pytest.raises(ValueError, match="must be a Recording"):
+        stroller.identify(scene(), 1.0, {"wheelbase": 1.0})
+    with pytest.raises(ValueError, match="quantity = 'theta'"):
+        stroller.Recording(LAUNCH, TIMES, np.zeros(3), 0.01, quantity="theta")
+    with pytest.raises(ValueError, match="value must be of shape"):
+        stroller.Recording(LAUNCH, TIMES, np.zeros(3), 0.01)

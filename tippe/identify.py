@@ -1,0 +1,265 @@
+"""Numbers of a top, its arena and its launches from inversion times and from recorded motion."""
+
+import math
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic import identify as generic
+from nonholonomic.ensemble import lanes_for, traced_march
+from nonholonomic.identify_result import Identification
+from nonholonomic.likelihood import Measurements
+from nonholonomic.lockstep import CROSSED, FAILED
+from nonholonomic.paths import numbers, with_numbers
+from nonholonomic.validation import as_number, require
+
+from .inversion import ABSOLUTE, InversionProblem, check_event, check_run
+from .launch import Launch
+from .scene import Scene
+from .trajectory import simulate
+
+#: A cell that needs more steps than this has failed: numbers tried on the way may be far off.
+MOST_STEPS = 100_000
+
+#: The least angle [rad] that is told from 0 in the penalty for a top that does not invert.
+LEAST_ANGLE = 1e-6
+
+
+class InversionTimes(eqx.Module):
+    """Measured inversion times of some launches.
+
+    Over a nutation period the time is a staircase in every number, so its slope differs from its trend; where theta grows
+    without falling back it is smooth. Small angles at the launch, angles to be reached of 0.6 to 0.8 pi, and several
+    launches keep the steps below the errors.
+
+    **Arguments:**
+
+    - `launch`: a `Launch` whose numbers are one for all or (launches,).
+    - `time`: (launches,) [s], infinite for a launch that was not seen to invert.
+    - `error`: standard errors [s], one for all or (launches,).
+    - `t1`: until when the model follows a launch [s]: some times the longest time measured, as a start may be far off.
+    - `until`: until when a launch that did not invert was watched [s], one for all or (launches,); `t1` by default. Its
+      likelihood is one-sided: the probability of a time beyond `until`.
+    - `angle`: angle [rad] that counted as inverted.
+
+    **Raises:** `ValueError` for numbers out of range or shapes that do not fit.
+    """
+
+    launch: Launch
+    time: Float[Array, " launches"] = eqx.field(converter=as_number)
+    error: Float[Array, "..."] = eqx.field(converter=as_number)
+    t1: Float[Array, ""] = eqx.field(converter=as_number)
+    until: Any = None
+    angle: Float[Array, ""] = eqx.field(converter=as_number, default=0.95 * math.pi)
+
+    def __check_init__(self):
+        if np.ndim(self.time) != 1 or np.size(self.time) == 0:
+            raise ValueError(f"time must be a non-empty list, not of shape {np.shape(self.time)}")
+        require(self.t1, "t1", above=0.0)
+        check_event(self.angle, "first")
+        seen = np.isfinite(np.asarray(self.time))
+        if np.any(np.isnan(np.asarray(self.time))):
+            raise ValueError("time must be numbers, infinite where a launch did not invert")
+        require(np.asarray(self.time)[seen], "time", above=0.0, below=self.t1, why="t1")
+        if self.until is not None:
+            require(self.until, "until", above=0.0, at_most=self.t1, why="t1")
+        alike = numbers("launch", self.launch) | {"error": self.error, "until": self.until}
+        for name, value in alike.items():
+            if value is not None and np.shape(value) not in ((), np.shape(self.time)):
+                raise ValueError(f"{name} must be one number or one for each launch, not of shape {np.shape(value)}")
+
+    @property
+    def measurements(self) -> Measurements:
+        """The times as a likelihood takes them."""
+        censored = ~np.isfinite(np.asarray(self.time))
+        until = self.t1 if self.until is None else self.until
+        return Measurements(np.where(censored, np.asarray(until), np.asarray(self.time)), self.error, censored)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What to call each launch."""
+        columns = np.broadcast_arrays(np.asarray(self.launch.theta), np.asarray(self.launch.spin), self.time)
+        return tuple(f"theta {theta:.4g}, spin {spin:.4g}" for theta, spin in zip(*columns[:2], strict=True))
+
+    def predict(
+        self, scene: Scene, values: dict[str, Array], rows: int, tolerance: float
+    ) -> Float[Array, "rows launches"]:
+        """Times of all launches in every row, all of them lanes of one block."""
+        launches = len(self.time)
+        spread = {path: jnp.repeat(value, launches) for path, value in values.items()}
+        launch = jax.tree.map(lambda leaf: jnp.tile(jnp.broadcast_to(leaf, (launches,)), rows), self.launch)
+        roots = with_numbers({"scene": scene, "launch": launch}, spread)
+        times = extended_inversion_times(
+            roots["scene"], roots["launch"], self.t1, self.angle, tolerance, lanes=rows * launches
+        )
+        return times.reshape(rows, launches)
+
+
+class Recording(eqx.Module):
+    """A recorded run: theta, or the position of the sphere's centre, at some times.
+
+    **Arguments:**
+
+    - `launch`: a `Launch`, every number a scalar.
+    - `times`: (times,) [s], increasing from 0 or later.
+    - `value`: (times,) [rad] for "theta", (times, 3) [m] for "position" (in the fixed frame, as of `simulate`).
+    - `error`: standard errors, one for all or of the shape of `value`.
+    - `quantity`: "theta" or "position".
+
+    **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
+    """
+
+    launch: Launch
+    times: Float[Array, " times"] = eqx.field(converter=as_number)
+    value: Float[Array, "..."] = eqx.field(converter=as_number)
+    error: Float[Array, "..."] = eqx.field(converter=as_number)
+    quantity: str = eqx.field(static=True, default="theta")
+
+    def __check_init__(self):
+        if self.quantity not in ("theta", "position"):
+            raise ValueError(f"quantity = {self.quantity!r} must be 'theta' or 'position'")
+        require(self.times, "times", at_least=0.0)
+        if np.ndim(self.times) != 1 or np.any(np.diff(np.asarray(self.times)) <= 0.0) or not self.times[-1] > 0.0:
+            raise ValueError(f"times = {self.times!r} must be an increasing list with a positive end")
+        shape = (len(self.times), *((3,) if self.quantity == "position" else ()))
+        if np.shape(self.value) != shape:
+            raise ValueError(f"value must be of shape {shape} for {self.quantity!r}, not {np.shape(self.value)}")
+
+    @property
+    def measurements(self) -> Measurements:
+        """The samples as a likelihood takes them."""
+        error = jnp.broadcast_to(self.error, jnp.shape(self.value))
+        return Measurements(self.value.reshape(-1), error.reshape(-1))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What to call each sample."""
+        names = ("theta",) if self.quantity == "theta" else ("x", "y", "z")
+        return tuple(f"{name}({time:.4g} s)" for time in np.asarray(self.times) for name in names)
+
+    def predict(self, scene: Scene, values: dict[str, Array], rows: int, tolerance: float) -> Float[Array, "rows n"]:
+        """The samples in every row; not a number after a run's end."""
+
+        def one(values):
+            roots = with_numbers({"scene": scene, "launch": self.launch}, values)
+            run = simulate(
+                roots["scene"],
+                roots["launch"],
+                jnp.asarray(float(self.times[-1])),
+                self.times,
+                tolerance,
+                adjoint=diffrax.ForwardMode(),
+            )
+            return getattr(run, self.quantity).reshape(-1)
+
+        return jax.vmap(one)(values)
+
+
+class SceneModel(eqx.Module):
+    """Predictions of all data of a scene, as `nonholonomic.identify` wants them."""
+
+    scene: Scene
+    data: tuple[Any, ...]
+    tolerance: float = eqx.field(static=True)
+
+    def __call__(self, parameters: dict[str, Float[Array, " rows"]]) -> Float[Array, "rows n"]:
+        rows = len(next(iter(parameters.values())))
+        parts = [one.predict(self.scene, parameters, rows, self.tolerance) for one in self.data]
+        return jnp.concatenate(parts, axis=1)
+
+
+def extended_inversion_times(
+    scene: Scene,
+    launch: Launch,
+    t1: Float[Array, ""],
+    angle: Float[Array, ""],
+    tolerance: float,
+    lanes: int,
+) -> Float[Array, " lanes"]:
+    """Inversion times, continued beyond the horizon so that a fit finds a way back.
+
+    A top that has not inverted by `t1`, or has lost contact, and is then at theta counts as inverting at
+    t1 (1 + log(angle / theta)): continuous where a time passes the horizon, and linear in the rate at which theta grows
+    where it grows exponentially, as it does from a small one. It is a penalty, no prediction.
+
+    **Arguments:**
+
+    - `scene`, `launch`: every number a scalar or (lanes,).
+    - `t1`, `angle`, `tolerance`: as for `inversion_time`.
+    - `lanes`: how many.
+
+    **Returns:** (lanes,) [s]; not a number where the integration failed.
+    """
+    problem = InversionProblem.of(scene, launch, angle, lanes)
+    outcome, _ = traced_march(
+        problem,
+        as_number(t1),
+        jnp.asarray(lanes),
+        as_number(tolerance),
+        as_number(ABSOLUTE * tolerance),
+        solver=diffrax.Dopri8(),
+        lanes=lanes_for(lanes),
+        max_steps=MOST_STEPS,
+    )
+    missing = jnp.log(angle / jnp.clip(jax.vmap(scene.theta, 1)(outcome.state), LEAST_ANGLE, angle))
+    times = jnp.where(outcome.status == CROSSED, outcome.crossing_time, t1 * (1.0 + missing))
+    return jnp.where(outcome.status == FAILED, jnp.nan, times)
+
+
+def identify(
+    scene: Scene,
+    data: Any,
+    free: dict[str, Any],
+    *,
+    starts: int = 1,
+    spread: float = 2.0,
+    seed: int = 0,
+    tolerance: float = 1e-8,
+    max_steps: int = 60,
+    progress: bool = True,
+) -> Identification:
+    """Numbers of a scene and its launches from measurements, with their errors and with what is left open.
+
+    **Arguments:**
+
+    - `scene`: a `Scene`; what is not free is taken from it.
+    - `data`: an `InversionTimes` or a `Recording`, or a list of several to be fitted together.
+    - `free`: path of a number -> a `Free` or only the value from which to start: `"scene.friction.mu"`, or `"friction.mu"`
+      where nothing else ends so; a number of the launch is the same in all launches of all data. Numbers that cannot be
+      negative are fitted in their logarithms.
+    - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identify.identify`.
+    - `tolerance`: relative tolerance of the integration.
+
+    **Returns:** an `Identification`.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown path; `ImportError` if Optimistix is not installed.
+    """
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene = {scene!r} must be a Scene")
+    data = tuple(data) if isinstance(data, list | tuple) else (data,)
+    if not data or not all(isinstance(one, InversionTimes | Recording) for one in data):
+        raise ValueError(f"data = {data!r} must be an InversionTimes or a Recording, or a list of them")
+    roots = {"scene": scene, "launch": data[0].launch}
+    check_run(scene, Launch(0.0, 0.0), 1.0, tolerance)
+    known = [path for root, tree in roots.items() for path in numbers(root, tree)]
+    unknowns = generic.free_numbers(free, roots, known, with_numbers)
+    measurements = [one.measurements for one in data]
+    labels = tuple(
+        f"{i + 1}: {label}" if len(data) > 1 else label for i, one in enumerate(data) for label in one.labels
+    )
+    return generic.identify(
+        SceneModel(scene, data, tolerance),
+        jax.tree.map(lambda *parts: jnp.concatenate(parts), *measurements),
+        unknowns,
+        starts=starts,
+        spread=spread,
+        seed=seed,
+        max_steps=max_steps,
+        labels=labels,
+        progress=progress,
+    )
