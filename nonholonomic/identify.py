@@ -93,7 +93,7 @@ def free_numbers(
     """
     given = {}
     for name, one in as_free(free).items():
-        path = full_path(name, known)
+        path = full_path("free", name, known)
         if path in given:
             raise ValueError(f"free: {path!r} is named twice")
         given[path] = one

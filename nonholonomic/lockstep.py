@@ -24,6 +24,9 @@ SAFETY, SHRINK, GROW = 0.9, 0.2, 10.0
 #: An event is located once the next trial would differ by less than this part of the step in which it lies.
 LOCATED = 1e-10
 
+#: A dip of the crossing function within a step is looked at if its estimate is below this part of the values at both ends.
+DIP = 0.2
+
 #: Trials after which the far end of what is left of the step is taken for the event.
 MOST_TRIALS = 64
 
@@ -143,8 +146,9 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     # A step into nonsense counts as one with a huge error.
     error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
     good = error <= 1.0
-    # Negative at a stage: end the step there and look again, so that the first event of several is found.
-    between = good & (tried.first_negative < 1.0)
+    # Negative in between: end the step there and look again, so that the first event of several is found.
+    negative = jnp.minimum(tried.first_negative, stop_gradient(_dip(problem, block, tried)))
+    between = good & (negative < 1.0)
     beyond = good & ~between & (margin <= 0.0)
     forward = free & good & ~between & ~beyond
 
@@ -155,7 +159,7 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     time = jnp.where(moved, block.time + block.length, block.time)
 
     length = block.length * _factor(error, good, control.order)
-    length = jnp.where(between, block.length * tried.first_negative, length)
+    length = jnp.where(between, block.length * negative, length)
     length = jnp.where(searching, guess, jnp.where(hit, search.stride, length))
     status, side, latest = _fate(problem, control, block, tried, time, hit)
     ended = running & (status == RUNNING) & moved & (time >= control.t1)
@@ -185,6 +189,26 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
         steps=steps,
         rejected=block.rejected + (free & ~forward & ~beyond),
     )
+
+
+def _dip(problem: AbstractProblem, block: Block, tried: Step) -> Lanes:
+    """Where in the step the crossing function may dip below zero and come back, as a fraction of the step; 2 if nowhere.
+
+    It is where the cubic through its values and slopes at both ends is least, if that is low against both ends.
+    """
+    if problem.crossing(block.state) is None:
+        return jnp.full_like(block.length, 2.0)
+    low, fall = jax.jvp(problem.crossing, (block.state,), (block.rate,))
+    high, rise = jax.jvp(problem.crossing, (tried.state,), (tried.rate,))
+    low, high = block.side * low, block.side * high
+    fall, rise = block.side * fall * block.length, block.side * rise * block.length
+    cubic = 3.0 * (fall + rise - 2.0 * (high - low))
+    square = 3.0 * (high - low) - 2.0 * fall - rise
+    root = square + jnp.sqrt(jnp.maximum(square * square - cubic * fall, 0.0))
+    at = -fall / jnp.where(root == 0.0, 1.0, root)
+    least = low + at * (fall + at * (square + at * cubic / 3.0))
+    dips = (fall < 0.0) & (rise > 0.0) & (least < DIP * jnp.minimum(low, high)) & (at > 0.02) & (at < 0.98)
+    return jnp.where(dips, at, 2.0)
 
 
 def _factor(error: Lanes, good: Bool[Array, " lanes"], order: int) -> Lanes:

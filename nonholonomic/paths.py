@@ -47,17 +47,18 @@ def with_numbers(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any
     return {root: _replaced(root, tree, values) for root, tree in roots.items()}
 
 
-def full_path(name: str, known: list[str]) -> str:
+def full_path(argument: str, name: str, known: list[str]) -> str:
     """The path that a name means: the name itself, or the one path that ends in it.
 
-    **Arguments:** `name`: such as `"scene.friction.mu"` or `"friction.mu"`; `known`: the paths to choose from.
+    **Arguments:** `argument`: what the name was given for; `name`: such as `"scene.friction.mu"` or `"friction.mu"`; `known`:
+    the paths to choose from.
 
     **Raises:** `ValueError` for a name that means none of the paths, or several.
     """
     meant = [name] if name in known else [path for path in known if path.endswith("." + str(name))]
     if len(meant) != 1:
         what = f"could be {' or '.join(meant)}" if meant else f"must be one of {', '.join(known)}"
-        raise ValueError(f"free: {name!r} {what}")
+        raise ValueError(f"{argument}: {name!r} {what}")
     return meant[0]
 
 

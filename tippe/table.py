@@ -1,6 +1,7 @@
 """Tables of inversion times over the grid of launches and friction."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import diffrax
@@ -8,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nonholonomic.ensemble import compiled_march, lanes_for
+from nonholonomic.ensemble import Outcome, compiled_march, lanes_for
 from nonholonomic.lockstep import FAILED, GUARD_LOST
 from nonholonomic.paths import description, with_numbers
 from nonholonomic.reference import march_by_diffrax
@@ -19,6 +20,7 @@ from nonholonomic.table import Table
 from .inversion import ABSOLUTE, InversionProblem, check_event, check_run, is_inverted
 from .launch import Launch
 from .scene import Scene
+from .sensitivities import sensitivity_paths, slope_variables, slopes_of_cells
 from .time_error import COARSER, time_error
 
 #: Cells that are checked together, to bound the memory it takes.
@@ -56,6 +58,7 @@ def inversion_table(
     solver: diffrax.AbstractERK | None = None,
     method: str = "ensemble",
     errors: bool = False,
+    sensitivities: Sequence[str] = (),
 ) -> Table:
     """Inversion times over a grid of launches and scenes, in one batched call on all cores.
 
@@ -75,11 +78,15 @@ def inversion_table(
     - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which knows first
       crossings only.
     - `errors`: whether to run every cell again at ten times the tolerance, for an estimate of the error of its time.
+    - `sensitivities`: paths of numbers to differentiate the times by, such as `["scene.friction.mu", "launch.theta"]`; the end
+      of a path will do where it fits one number only.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
     "contact_lost", "failed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was lost, when
     and at what angle), `steps` and `rejected`. With `errors` also `time_error` [s], infinite where the two runs disagree on
-    the status or failed, 0 where they agree that there is no time; `Table.digits("time")` shows the digits it leaves.
+    the status or failed, 0 where they agree that there is no time; `Table.digits("time")` shows the digits it leaves. With
+    `sensitivities` also the derivative of `time` by each number, `time_by_mu` for `"scene.friction.mu"`, 0 where the top did
+    not invert.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
     """
@@ -88,6 +95,8 @@ def inversion_table(
     explicit_tableau(solver)
     if method not in ("ensemble", "diffrax"):
         raise ValueError(f"method = {method!r} must be 'ensemble' or 'diffrax'")
+    if method == "diffrax" and sensitivities:
+        raise ValueError("method = 'diffrax' must be 'ensemble' for sensitivities")
     if method == "diffrax" and crossing != "first":
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     if not isinstance(scene, Scene):
@@ -113,34 +122,15 @@ def inversion_table(
     roots = with_numbers({"scene": scene, "launch": Launch(theta=0.0, spin=0.0)}, fixed)
     check_run(roots["scene"], roots["launch"], t1, tolerance)
     _check_cells(roots, grid)
+    paths = sensitivity_paths(roots, sensitivities)
     last = crossing == "last"
 
-    def outcome_at(problem: InversionProblem, tolerance: float, count: int, size: int) -> dict[str, Any]:
+    def outcome_at(problem: InversionProblem, tolerance: float, count: int, size: int) -> Outcome:
         horizon, rtol = jnp.asarray(t1, float), jnp.asarray(tolerance, float)
         if method == "diffrax":
-            outcome = march_by_diffrax(problem, horizon, rtol, ABSOLUTE * rtol, solver=solver)
-        else:
-            outcome, _ = compiled_march(
-                problem,
-                horizon,
-                jnp.asarray(count),
-                rtol,
-                ABSOLUTE * rtol,
-                solver=solver,
-                lanes=lanes_for(size),
-                passes=last,
-            )
-        inverted = is_inverted(outcome, problem, last)
-        return {
-            "time": np.where(inverted, outcome.crossing_time, np.inf),
-            "status": np.select(
-                [inverted, outcome.status == GUARD_LOST, outcome.status == FAILED], [0, 2, 3], 1
-            ).astype(np.int8),
-            "end_time": np.asarray(outcome.end_time),
-            "end_theta": np.asarray(jax.vmap(scene.theta, 1)(outcome.state)),
-            "steps": np.asarray(outcome.steps),
-            "rejected": np.asarray(outcome.rejected),
-        }
+            return march_by_diffrax(problem, horizon, rtol, ABSOLUTE * rtol, solver=solver)
+        options = {"solver": solver, "lanes": lanes_for(size), "passes": last}
+        return compiled_march(problem, horizon, jnp.asarray(count), rtol, ABSOLUTE * rtol, **options)[0]
 
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
         if method == "diffrax" and count == 0:
@@ -149,9 +139,16 @@ def inversion_table(
         cells = with_numbers(roots, columns)
         size = next((len(values) for values in columns.values()), 1)
         problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
-        found = outcome_at(problem, tolerance, count, size)
+        slopes = {}
+        if paths:
+            options = {"count": count, "size": size, "solver": solver, "last": last}
+            outcome, slopes = slopes_of_cells(roots, columns, paths, angle, t1, tolerance, **options)
+        else:
+            outcome = outcome_at(problem, tolerance, count, size)
+        found = _results(scene, outcome, is_inverted(outcome, problem, last)) | slopes
         if errors:
-            coarse = outcome_at(problem, COARSER * tolerance, count, size)
+            again = outcome_at(problem, COARSER * tolerance, count, size)
+            coarse = _results(scene, again, is_inverted(again, problem, last))
             agreed = (found["status"] == coarse["status"]) & (found["status"] != WORDS.index("failed"))
             found["time_error"] = time_error(found["time"], coarse["time"], agreed)
         return found
@@ -163,8 +160,24 @@ def inversion_table(
     variables = VARIABLES
     if errors:
         request |= {"errors": True}
-        variables = VARIABLES | {"time_error": Variable("s", np.float64)}
+        variables = variables | {"time_error": Variable("s", np.float64)}
+    if paths:
+        request |= {"sensitivities": paths}
+        variables = variables | slope_variables(paths, units)
     return sweep(run, grid, variables, request, path=path)
+
+
+def _results(scene: Scene, outcome: Outcome, inverted: Any) -> dict[str, Any]:
+    """The variables of a table without options."""
+    code = np.select([inverted, outcome.status == GUARD_LOST, outcome.status == FAILED], [0, 2, 3], 1)
+    return {
+        "time": np.where(inverted, outcome.crossing_time, np.inf),
+        "status": code.astype(np.int8),
+        "end_time": np.asarray(outcome.end_time),
+        "end_theta": np.asarray(jax.vmap(scene.theta, 1)(outcome.state)),
+        "steps": np.asarray(outcome.steps),
+        "rejected": np.asarray(outcome.rejected),
+    }
 
 
 def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:

@@ -106,6 +106,15 @@ def test_padding_is_not_run():
     assert iterations > 0
 
 
+def test_a_dip_between_the_stages_of_a_step_is_found():
+    """x = cos t is below -0.9999 for 0.028 s, within a step twenty times as long that sees nothing of it at its stages."""
+    level = -0.9999
+    outcome, _ = run([1.0], level=level, t1=8.0, tolerance=1e-6)
+    assert int(outcome.status[0]) == CROSSED
+    assert int(outcome.steps[0]) < 60
+    assert_close(outcome.crossing_time, [math.acos(level)], atol=1e-3)
+
+
 def test_too_many_steps_and_nonsense_are_failures():
     outcome, _ = run([1.0], level=-2.0, t1=1e3, max_steps=20)
     assert outcome.status[0] == FAILED

@@ -166,12 +166,12 @@ def test_bad_measurements_are_refused(given):
 
 def test_names_are_paths_or_their_ends():
     known = ["scene.body.offset", "scene.friction.mu", "launch.spin", "launch.mu"]
-    assert full_path("offset", known) == "scene.body.offset"
-    assert full_path("friction.mu", known) == "scene.friction.mu"
+    assert full_path("free", "offset", known) == "scene.body.offset"
+    assert full_path("free", "friction.mu", known) == "scene.friction.mu"
     with pytest.raises(ValueError, match=r"scene.friction.mu or launch.mu"):
-        full_path("mu", known)
+        full_path("free", "mu", known)
     with pytest.raises(ValueError, match="must be one of"):
-        full_path("fset", known)
+        full_path("free", "fset", known)
 
 
 def test_without_optimistix_it_says_what_to_install(monkeypatch):

@@ -1,0 +1,85 @@
+"""Derivatives of inversion times against extrapolated central differences (`make_gradient_reference.py`)."""
+
+import csv
+import math
+from pathlib import Path
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import rutstam_top
+from make_gradient_reference import ANGLE, MOVED, columns_of, extrapolated, roots_of
+
+import tippe
+from tippe.sensitivities import slopes_of_cells
+
+ROWS = list(csv.DictReader(Path(__file__).with_name("gradient_reference.csv").read_text().splitlines()))
+
+
+def relative_errors(family: str, tolerance: float) -> np.ndarray:
+    """Of the derivatives by mu, theta, spin and offset in every scene of a family."""
+    rows = [row for row in ROWS if row["family"] == family]
+    names = list(MOVED.values())
+    options = {"count": len(rows), "size": len(rows), "solver": diffrax.Dopri8(), "last": False}
+    _, found = slopes_of_cells(roots_of(rows[0]), columns_of(rows), names, ANGLE, 8.0, tolerance, **options)
+    expected = np.array([[float(row[f"by_{name}"]) for row in rows] for name in MOVED])
+    return np.abs(np.stack(list(found.values())) / expected - 1.0)
+
+
+@pytest.mark.parametrize(
+    "family",
+    [
+        "plane-viscous",
+        "cylinder-Coulomb",
+        *(pytest.param(one, marks=pytest.mark.slow) for one in ("plane-Coulomb", "cylinder-viscous", "sphere-viscous")),
+    ],
+)
+def test_derivatives_agree_with_extrapolated_differences(family):
+    """By mu, theta, spin and offset, relative error below 1e-5 at tolerance 1e-11."""
+    assert relative_errors(family, 1e-11).max() < 1e-5
+
+
+def test_the_reference_is_better_than_what_it_is_used_for():
+    assert len(ROWS) == 28
+    assert max(float(row[f"error_{name}"]) for row in ROWS for name in MOVED) < 2e-6
+
+
+@pytest.fixture(scope="module")
+def threshold_scan():
+    """Rutstam's top, launched with 0.99 to 1.05 times the spin of the threshold: times to pi - 0.1, and their slopes."""
+    top = rutstam_top(235.0 / 625.0)
+    scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    alpha, gamma = float(top.offset / top.radius), float(top.I1 / top.I3)
+    threshold = float(top.radius) * math.sqrt(float(top.mass * 9.81 * top.offset * top.I3) / (1 + alpha - gamma))
+    spin = threshold * (1 + alpha) ** 2 / float(top.I3 * top.radius) / (math.cos(0.1) - alpha)
+    factors = np.array([0.9, 0.97, 0.99, 1.001, 1.003, 1.01, 1.05])
+    steps = 1e-4 * (factors - 0.985) / 1.6 ** np.arange(8)[:, None]
+    spins = spin * np.concatenate([[factors], factors + steps, factors - steps])
+    table = tippe.inversion_table(
+        scene, theta=0.1, spin=spins.ravel(), t1=40.0, angle=math.pi - 0.1, tolerance=1e-12, sensitivities=["spin"]
+    )
+    return factors, steps * spin, table.time.reshape(17, -1), table.time_by_spin[: len(factors)], table.status
+
+
+def test_across_the_threshold_the_derivative_is_right_or_flagged(threshold_scan):
+    """Above, it agrees with differences as the time grows without bound; below, the cell says so and the slope is 0."""
+    factors, steps, times, slopes, status = threshold_scan
+    below = factors < 0.995
+    assert (status[: len(factors)] == np.where(below, "not_inverted", "inverted")).all()
+    assert (slopes[below] == 0.0).all()
+    for cell in np.flatnonzero(~below):
+        expected, error = extrapolated((times[1:9, cell] - times[9:, cell]) / (2.0 * steps[:, cell]))
+        assert abs(slopes[cell] - expected) < 1e-5 * abs(expected) + 10.0 * error
+
+
+def test_the_slope_of_a_cell_that_ends_otherwise_is_zero():
+    """Not inverted by t1, and contact lost: derivative 0 and a status, never NaN, in a table and by `grad`."""
+    scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
+    table = tippe.inversion_table(scene, theta=0.1, spin=[60.0, 250.0], t1=6.0, sensitivities=["friction.mu", "theta"])
+    assert list(table.status) == ["not_inverted", "contact_lost"]
+    assert (table.time_by_mu == 0.0).all()
+    assert (table.time_by_theta == 0.0).all()
+    time = jax.vmap(lambda spin: tippe.inversion_time(scene, tippe.Launch(0.1, spin), 6.0))
+    assert (jax.jacfwd(time)(jnp.array([60.0, 250.0])) == 0.0).all()

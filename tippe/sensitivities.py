@@ -1,0 +1,105 @@
+"""Derivatives of the inversion times of a table's cells with respect to numbers of the scene and the launch."""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+
+from nonholonomic.ensemble import Outcome
+from nonholonomic.paths import full_path, numbers, with_numbers
+from nonholonomic.sweep import Variable
+from nonholonomic.variation import compiled_march_with_slopes, directions_of
+
+from .inversion import ABSOLUTE, InversionProblem, is_inverted
+
+#: Directions that run along together: more of them cost less time in all, but more to compile.
+TOGETHER = 2
+
+
+def sensitivity_paths(roots: dict[str, Any], names: Any) -> list[str]:
+    """The paths of the numbers to differentiate by.
+
+    **Arguments:** `roots`: the table's scene and launch; `names`: paths, or the ends of paths that fit one only.
+
+    **Raises:** `ValueError` for something else than a list of such names.
+    """
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"sensitivities = {names!r} must be a list of paths, such as ['scene.friction.mu']")
+    known = [path for root, tree in roots.items() for path, value in numbers(root, tree).items() if value is not None]
+    paths = [full_path("sensitivities", name, known) for name in names]
+    if len(set(paths)) < len(paths):
+        raise ValueError(f"sensitivities = {names!r} must name every number once")
+    return paths
+
+
+def slope_names(paths: list[str]) -> list[str]:
+    """The table's variables: `time_by_mu` for `scene.friction.mu`, the whole path where two numbers share a name."""
+    last = [path.rsplit(".", 1)[-1] for path in paths]
+    return [
+        "time_by_" + (name if last.count(name) == 1 else path.replace(".", "_"))
+        for path, name in zip(paths, last, strict=True)
+    ]
+
+
+def slope_variables(paths: list[str], units: dict[str, str]) -> dict[str, Variable]:
+    """The table's variables, with their units."""
+
+    def unit(path: str) -> str:
+        of_number = units.get(path.rsplit(".", 1)[-1], "1")
+        return "s" if of_number == "1" else f"s ({of_number})-1"
+
+    return {name: Variable(unit(path), np.float64) for name, path in zip(slope_names(paths), paths, strict=True)}
+
+
+def slopes_of_cells(
+    roots: dict[str, Any],
+    columns: dict[str, Any],
+    paths: list[str],
+    angle: float,
+    t1: float,
+    tolerance: float,
+    *,
+    count: int,
+    size: int,
+    solver: diffrax.AbstractERK,
+    last: bool,
+) -> tuple[Outcome, dict[str, Any]]:
+    """How every cell ended, and the derivative of its inversion time by every number, 0 where the top did not invert.
+
+    **Arguments:** as for `inversion_table`, and
+
+    - `columns`: path of a number -> its value in every cell; `count` of the `size` cells are to be run.
+    - `paths`: of the numbers to differentiate by.
+
+    **Returns:** the `Outcome`, and name of the variable -> derivatives (size,). Source: implicit function theorem at the event.
+    """
+
+    def build(*moving: Any) -> InversionProblem:
+        cells = with_numbers(roots, columns | dict(zip(paths, moving, strict=True)))
+        return InversionProblem.of(cells["scene"], cells["launch"], angle, size)
+
+    cells = with_numbers(roots, columns)
+    values = {path: value for root, tree in cells.items() for path, value in numbers(root, tree).items()}
+    point = tuple(jnp.asarray(values[path], float) for path in paths)
+    # Groups of one size, padded with directions that lead nowhere, share a program.
+    together = min(TOGETHER, len(paths))
+    rows = len(paths) + -len(paths) % together
+    tangents = [tuple(jnp.full_like(value, row == k) for k, value in enumerate(point)) for row in range(rows)]
+    problem, directions = build(*point), directions_of(build, point, tangents)
+    found = []
+    for first in range(0, rows, together):
+        outcome, slopes = compiled_march_with_slopes(
+            problem,
+            directions[first : first + together],
+            jnp.asarray(t1, float),
+            jnp.asarray(count),
+            jnp.asarray(tolerance, float),
+            jnp.asarray(ABSOLUTE * tolerance, float),
+            solver=solver,
+            lanes=max(8, 3 * lanes_for(size) // (2 + 2 * together)),
+            passes=last,
+        )
+        inverted = is_inverted(outcome, problem, last)
+        found += [np.where(inverted, slope, 0.0) for slope in slopes]
+    return outcome, dict(zip(slope_names(paths), found[: len(paths)], strict=True))
