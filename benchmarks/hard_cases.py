@@ -17,10 +17,10 @@ import sys
 import time
 from pathlib import Path
 
-from hard import limits
+from hard import friction, limits
 from measure import machine, table, write_csv
 
-SUBJECTS = (limits,)
+SUBJECTS = (limits, friction)
 
 
 def main() -> int:

@@ -6,8 +6,10 @@ from nonholonomic.surface import Sphere as Sphere
 from nonholonomic.table import Table as Table
 
 from .friction import AbstractFriction as AbstractFriction
+from .friction import Contensou as Contensou
 from .friction import Coulomb as Coulomb
 from .friction import Frictionless as Frictionless
+from .friction import Rolling as Rolling
 from .friction import Viscous as Viscous
 from .inversion import inversion_time as inversion_time
 from .launch import Launch as Launch

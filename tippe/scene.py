@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.surface import AbstractSurface, Plane
 from nonholonomic.validation import as_number, require
-from nonholonomic.vector import dot, multiply
+from nonholonomic.vector import dot
 
 from .dynamics import COS_THETA, Dynamics
 from .friction import AbstractFriction, Frictionless
@@ -23,7 +23,8 @@ class Scene(eqx.Module):
 
     - `body`: a `Top`.
     - `surface`: the arena: `Plane()`, `Cylinder(radius)` or `Sphere(radius)`; the top runs inside the last two.
-    - `friction`: `Frictionless()`, `Viscous(mu)` or `Coulomb(mu, slip_speed)`.
+    - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
+      or `Rolling(resistance, turning_speed, sliding)` with one of them.
     - `gravity`: acceleration of free fall [m/s^2], positive.
 
     **Raises:** `ValueError` if a part is of the wrong kind, if the top does not fit into the arena, or if gravity is not
@@ -88,12 +89,13 @@ class Scene(eqx.Module):
 
     def slip_velocity(self, state: Float[Array, "components ..."]) -> Float[Array, "2 ..."]:
         """Velocity of the material contact point in the moving frame [m/s]."""
-        return jnp.stack(self.dynamics.motion(state).slip)
+        slip = self.dynamics.motion(state).slip
+        return jnp.stack([slip.x, slip.y])
 
     def friction_power(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Power of friction N f.v_s [W], at most 0 (`tippe.md`, section 2)."""
+        """Power of friction N (f.v_s + tau.w) [W], at most 0 (`tippe.md`, section 2)."""
         motion = self.dynamics.motion(state)
-        power = multiply(motion.normal_force, dot(motion.friction, motion.slip))
+        power = motion.friction_power
         return jnp.zeros_like(motion.normal_force) if power is None else power
 
     def energy(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
@@ -112,7 +114,8 @@ class Scene(eqx.Module):
     def jellett(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Jellett's quantity L.(R n - a e) [kg m^3/s]: constant on the plane for every friction at the contact point.
 
-        On a curved arena it changes at the rate R L.n' (`tippe.md`, section 2).
+        On a curved arena it changes at the rate R L.n', and a contact torque N tau changes it at the rate
+        N tau.(R n - a e) (`tippe.md`, section 2).
         """
         return self.body.radius * state[7] - self.body.offset * dot(tuple(state[2:5]), tuple(state[5:8]))
 

@@ -10,20 +10,24 @@ import numpy as np
 
 from nonholonomic.ensemble import compiled_march, lanes_for, single_kernel_march
 from nonholonomic.lockstep import FAILED, GUARD_LOST
-from nonholonomic.paths import description, with_numbers
+from nonholonomic.paths import description, numbers, with_numbers
 from nonholonomic.reference import march_by_diffrax
 from nonholonomic.runge_kutta import explicit_tableau
 from nonholonomic.surface import Cylinder, Plane, Sphere
 from nonholonomic.sweep import Axis, Variable, axis, sweep
 from nonholonomic.table import Table
 
-from .friction import Coulomb, Viscous
+from .friction import Contensou, Coulomb, Rolling, Viscous
 from .inversion import ABSOLUTE, InversionProblem, check_event, check_run, is_inverted
 from .launch import Launch
 from .scene import Scene
 
 #: Arenas, laws and solvers whose loops XLA is known to compile into one kernel; a test goes through them all.
-SINGLE_KERNEL = (Plane, Cylinder, Sphere, Viscous, Coulomb, diffrax.Dopri8, diffrax.Dopri5, diffrax.Tsit5)
+SINGLE_KERNEL = (
+    *(Plane, Cylinder, Sphere),
+    *(Viscous, Coulomb, Contensou, Rolling),
+    *(diffrax.Dopri8, diffrax.Dopri5, diffrax.Tsit5),
+)
 
 #: Cells that are checked together, to bound the memory it takes.
 CHECKED_AT_ONCE = 1 << 20
@@ -65,8 +69,9 @@ def inversion_table(
     **Arguments:**
 
     - `scene`: the scene, every number a scalar.
-    - `theta`, `spin`, `eta`, `azimuth`: of the launch, as for `Launch`; `mu`: of the scene's friction, its own by default.
-      A list or array becomes an axis of the table, in the order (theta, eta, mu, spin, azimuth); a number does not.
+    - `theta`, `spin`, `eta`, `azimuth`: of the launch, as for `Launch`; `mu`: of the scene's friction, or of the
+      law of sliding in it, its own by default. A list or array becomes an axis of the table, in the order (theta, eta, mu,
+      spin, azimuth); a number does not.
     - `t1`: horizon [s].
     - `angle`: angle [rad] that counts as inverted.
     - `tolerance`: relative tolerance of the integration.
@@ -95,10 +100,11 @@ def inversion_table(
         raise ValueError(f"scene = {scene!r} must be a Scene")
     if axes is not None and not isinstance(axes, dict):
         raise ValueError(f"axes = {axes!r} must be a dictionary, path of a number -> values")
-    given = {"launch.theta": theta, "launch.eta": eta, "scene.friction.mu": mu, "launch.spin": spin}
-    given |= {"launch.azimuth": azimuth}
+    known = numbers("scene.friction", scene.friction)
+    of_mu = next((number for number in known if number.endswith(".mu")), "scene.friction.mu")
+    given = {"launch.theta": theta, "launch.eta": eta, of_mu: mu, "launch.spin": spin, "launch.azimuth": azimuth}
     if mu is None:
-        del given["scene.friction.mu"]
+        del given[of_mu]
     for number in given:
         if number in (axes or {}):
             raise ValueError(f"axes: {number!r} is an argument of its own")
@@ -115,7 +121,7 @@ def inversion_table(
     check_run(roots["scene"], roots["launch"], t1, tolerance)
     _check_cells(roots, grid)
     last = crossing == "last"
-    tried = all(type(part) in SINGLE_KERNEL for part in (scene.surface, scene.friction, solver))
+    tried = all(type(part) in SINGLE_KERNEL for part in (scene.surface, *scene.friction.laws, solver))
     march = single_kernel_march if tried else compiled_march
 
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
