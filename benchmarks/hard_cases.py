@@ -32,7 +32,10 @@ def main() -> int:
     options = told.parse_args()
     started = time.perf_counter()
     print(machine())
-    found = {name: functions[name]() for name in options.only or functions}
+    found = {}
+    for name in options.only or functions:
+        print(f"{time.perf_counter() - started:6.0f} s: {name}", file=sys.stderr, flush=True)
+        found[name] = functions[name]()
     cells = [row.cells(name) for name, row in found.items()]
     print(table(cells))
     write_csv(options.csv, cells)

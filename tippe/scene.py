@@ -13,6 +13,9 @@ from .friction import AbstractFriction, Frictionless
 from .launch import Launch
 from .top import Top
 
+#: Tilt [rad] of a launch below which errors across the normal are measured in proportion to it.
+NEARLY_UPRIGHT = 1e-2
+
 
 class Scene(eqx.Module):
     """A tippe top on an arena.
@@ -68,7 +71,8 @@ class Scene(eqx.Module):
         """Magnitudes by which absolute errors of the state are measured, component by component.
 
         Velocities count in units of sqrt(g R), directions in units of 1, angular momenta in units of the launch's own,
-        or of I1 sqrt(g / R) where that is more.
+        or of I1 sqrt(g / R) where that is more. For a launch within `NEARLY_UPRIGHT` of the normal, what vanishes with
+        the tilt counts in proportion to it: its growth, which decides when the top turns over, would drown in the errors.
 
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
@@ -77,7 +81,11 @@ class Scene(eqx.Module):
         velocity = rate * self.body.radius
         momentum = jnp.maximum(self.body.I3 * jnp.abs(launch.spin), self.body.I1 * rate)
         place = [one for _ in self.surface.place(launch.eta)]
-        return jnp.stack(jnp.broadcast_arrays(velocity, velocity, one, one, one, *([momentum] * 3), *place))
+        tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
+        # A top that stands exactly has no growth to resolve.
+        tilt = jnp.where(tilt > 0.0, jnp.clip(tilt, 1e-280, 1.0), 1.0)
+        across = [velocity * tilt, velocity * tilt, tilt, tilt, one, momentum * tilt, momentum * tilt, momentum]
+        return jnp.stack(jnp.broadcast_arrays(*across, *place))
 
     def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """Rate of change of the state: (m/s^2, 1/s, N m, 1/s) for (velocity, axis, angular momentum, place)."""

@@ -6,8 +6,11 @@ import hard_cases
 import pytest
 from hard.row import Row
 
-#: Rows that take long.
-SLOW: tuple[str, ...] = ()
+#: Rows that take long to compile or to run.
+SLOW = (
+    *("no_offset", "no_friction_at_all", "huge_cylinder", "spins_of_all_sizes", "extreme_inertias", "tight_cylinder"),
+    *("inverted_exactly", "ball_that_drills", "ball_that_rolls", "energy_under_torque", "torques_by_lagrange"),
+)
 
 ROWS = [
     pytest.param(row, id=row.__name__, marks=[pytest.mark.slow] if row.__name__ in SLOW else [])
