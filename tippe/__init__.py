@@ -7,8 +7,10 @@ from nonholonomic.table import Table as Table
 from nonholonomic.unknown import Free as Free
 
 from .friction import AbstractFriction as AbstractFriction
+from .friction import Contensou as Contensou
 from .friction import Coulomb as Coulomb
 from .friction import Frictionless as Frictionless
+from .friction import Rolling as Rolling
 from .friction import Viscous as Viscous
 from .identify import InversionTimes as InversionTimes
 from .identify import Recording as Recording

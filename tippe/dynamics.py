@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from nonholonomic.surface import AbstractSurface, Tangent, carried
 from nonholonomic.vector import Component, Vector, add, cross, dot, multiply, scale, stored, subtract, sum_vectors
 
-from .friction import AbstractFriction, Slip
+from .friction import AbstractFriction, ContactLoad, Slip
 from .top import Top
 
 #: Where the axis' component along n stands in the state: cos(theta).
@@ -26,11 +26,16 @@ class Motion(NamedTuple):
 
     rate: tuple[Component, ...]
     normal_force: Float[Array, "..."]
-    friction: tuple[Component, Component]
+    friction: ContactLoad
     slip: Slip
     velocity: Tangent
     turning: Tangent
     spin_momentum: Float[Array, "..."]
+
+    @property
+    def friction_power(self) -> Component:
+        """Power of friction N (f.v_s + tau.w) [W], at most 0; `None` without friction."""
+        return multiply(self.normal_force, self.friction.power(self.slip))
 
 
 class Dynamics(eqx.Module):
@@ -93,14 +98,17 @@ class Dynamics(eqx.Module):
         along_axis = self.axial_excess * spin_momentum
         w1 = self.per_transverse * L[0] + along_axis * e[0]
         w2 = self.per_transverse * L[1] + along_axis * e[1]
-        slip = Slip(*stored(V[0] - R * w2, V[1] + R * w1))
-        f1, f2 = self.friction.per_normal_force(slip).force
+        w3 = self.per_transverse * L[2] + along_axis * e[2] if self.friction.drills else None
+        slip = Slip(*stored(V[0] - R * w2, V[1] + R * w1), (w1, w2, w3))
+        friction = self.friction.per_normal_force(slip)
+        f1, f2 = friction.force
 
-        # Moment per unit normal force of (f1, f2, 1) at the contact r = a e - R n.
+        # Moment per unit normal force: of (f1, f2, 1) at the contact r = a e - R n, and of the torque at the contact.
         r1, r2, r3 = a * e[0], a * e[1], a * e[2] - R
         M1 = subtract(r2, multiply(r3, f2))
         M2 = subtract(multiply(r3, f1), r1)
         M3 = subtract(multiply(r1, f2), multiply(r2, f1))
+        M1, M2, M3 = sum_vectors((M1, M2, M3), friction.torque)
 
         # n . acceleration of the centre = centripetal; N is on both sides through M.
         centripetal = dot(V, o)
@@ -115,7 +123,7 @@ class Dynamics(eqx.Module):
         e_dot = sum_vectors(e_dot, carried(e, o))
         L_dot = sum_vectors(scale(N, (M1, M2, M3)), carried(L, o))
         rate = (u1_dot, u2_dot, *e_dot, *L_dot, *self.parallel.place_rate(place, o))
-        return Motion(rate, N, (f1, f2), slip, V, o, spin_momentum)
+        return Motion(rate, N, friction, slip, V, o, spin_momentum)
 
     def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """Rate of change of the state, (components, ...)."""

@@ -137,22 +137,41 @@ def contact_motion(
 
 def slip_velocity(scene: Scene, q: Float[Array, " 6"], q_dot: Float[Array, " 6"]) -> Float[Array, " 2"]:
     """Velocity of the material contact point along the arena, V - R w x n [m/s]; arguments as above."""
-    velocity, _, rates = contact_motion(scene, q, q_dot)
-    w = rates @ axes(q[2], q[3])
+    velocity = contact_motion(scene, q, q_dot)[0]
+    w = angular_velocity(scene, q, q_dot)
     return jnp.stack([velocity[0] - scene.body.radius * w[1], velocity[1] + scene.body.radius * w[0]])
 
 
-def friction_per_normal_force(scene: Scene, slip: Float[Array, " 2"]) -> Float[Array, " 2"]:
-    """Tangential force per unit normal force [1], zeros where there is none."""
-    force = scene.friction.per_normal_force(Slip(slip[0], slip[1])).force
-    return jnp.stack([jnp.zeros_like(slip[0]) if part is None else part for part in force])
+def angular_velocity(scene: Scene, q: Float[Array, " 6"], q_dot: Float[Array, " 6"]) -> Float[Array, " 3"]:
+    """Angular velocity of the body in the frame (t1, t2, n) [rad/s]; arguments as above."""
+    return contact_motion(scene, q, q_dot)[2] @ axes(q[2], q[3])
+
+
+def friction_per_normal_force(
+    scene: Scene, slip: Float[Array, " 2"], turning: Float[Array, " 3"]
+) -> tuple[Float[Array, " 2"], Float[Array, " 3"]]:
+    """Tangential force [1] and torque [m] per unit normal force, zeros where there is none.
+
+    **Arguments:**
+
+    - `slip`: velocity of the contact point along the arena [m/s].
+    - `turning`: angular velocity of the body in the frame (t1, t2, n) [rad/s].
+    """
+    load = scene.friction.per_normal_force(Slip(slip[0], slip[1], tuple(turning)))
+    zero = jnp.zeros_like(slip[0])
+    force, torque = (jnp.stack([zero if part is None else part for part in vector]) for vector in load)
+    return force, torque
 
 
 def per_normal_force(scene: Scene, q: Float[Array, " 6"], q_dot: Float[Array, " 6"]) -> Float[Array, " 6"]:
-    """Generalised forces of the contact per unit normal force, d gap/dq + f . dv/dq'; arguments as above."""
-    friction = friction_per_normal_force(scene, slip_velocity(scene, q, q_dot))
-    reach = jax.jacfwd(lambda rate: slip_velocity(scene, q, rate))(q_dot)
-    return friction @ reach + jnp.zeros_like(q).at[5].set(1.0)
+    """Generalised forces of the contact per unit normal force, d gap/dq + f . dv/dq' + tau . dw/dq'; arguments as above."""
+
+    def moving(rate):
+        return slip_velocity(scene, q, rate), angular_velocity(scene, q, rate)
+
+    force, torque = friction_per_normal_force(scene, *moving(q_dot))
+    reach, turn = jax.jacfwd(moving)(q_dot)
+    return force @ reach + torque @ turn + jnp.zeros_like(q).at[5].set(1.0)
 
 
 def spread(state: Float[Array, " 8"]) -> tuple[Float[Array, " 6"], Float[Array, " 6"]]:
@@ -172,7 +191,7 @@ class Accelerations(NamedTuple):
 def by_lagrange(scene: Scene, state: Float[Array, " 8"]) -> Accelerations:
     """Lagrange's equations, by automatic differentiation of the energies, the contact kept by a multiplier.
 
-    d/dt dT/dq' - dT/dq + dU/dq = N (d gap/dq + f . dv/dq'), gap'' = 0: six equations, linear in q'' and in N.
+    d/dt dT/dq' - dT/dq + dU/dq = N (d gap/dq + f . dv/dq' + tau . dw/dq'), gap'' = 0: six equations, linear in q'' and in N.
 
     **Arguments:**
 
@@ -201,7 +220,7 @@ def equations(scene: Scene, state: Float[Array, " 8"]) -> tuple[Float[Array, "6 
         m s'' = N (f1, f2, 1) - m g z,   s'' = O'' - a e''
         I1 p' + I3 omega3 q - I1 q sigma = N M.e1,   I1 q' + I1 p sigma - I3 omega3 p = N M.e2,   I3 omega3' = N M.e
 
-    with M = r x (f1, f2, 1), r = a e - R n, p = -(phi' sin(theta) + eta' cos(theta) sin(phi)),
+    with M = r x (f1, f2, 1) + tau, r = a e - R n, p = -(phi' sin(theta) + eta' cos(theta) sin(phi)),
     q = theta' - eta' cos(phi), sigma = phi' cos(theta) - eta' sin(theta) sin(phi), omega3 = psi' + sigma.
 
     **Arguments:** as for `by_lagrange`.
@@ -224,9 +243,9 @@ def equations(scene: Scene, state: Float[Array, " 8"]) -> tuple[Float[Array, "6 
     bend = bend + 2.0 * turning * jnp.stack([-seen[2], zero, seen[0]]) - turning**2 * jnp.stack([e[0], zero, e[2]])
     swing = turns * jnp.stack([-e[2], zero, e[0]])
 
-    f = friction_per_normal_force(scene, slip_velocity(scene, q, q_dot))
+    f, torque = friction_per_normal_force(scene, slip_velocity(scene, q, q_dot), angular_velocity(scene, q, q_dot))
     push = jnp.append(f, one)
-    moment = jnp.cross(body.offset * e - body.radius * jnp.stack([zero, zero, one]), push)
+    moment = jnp.cross(body.offset * e - body.radius * jnp.stack([zero, zero, one]), push) + torque
 
     p, q2 = -(phi_dot * s + turning * c * sp), theta_dot - turning * cp
     sigma = phi_dot * c - turning * s * sp

@@ -1,6 +1,7 @@
-"""Friction at the contact point, per unit normal force. A new law is one new class."""
+"""Friction at the contact, per unit normal force. A new law is one new class."""
 
 import abc
+import math
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -8,26 +9,54 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.validation import as_number, require
-from nonholonomic.vector import Component
+from nonholonomic.vector import Component, Vector, add, dot, sum_vectors
 
 
 class Slip(NamedTuple):
-    """Velocity of the material contact point along the arena, in the moving frame [m/s]."""
+    """How the body moves on the arena at the contact, in the moving frame (t1, t2, n).
+
+    - `x`, `y`: velocity of the material contact point along the arena [m/s].
+    - `turning`: angular velocity of the body [rad/s]; its component along n, the drilling, is `None` unless the law
+      `drills`.
+    """
 
     x: Float[Array, "..."]
     y: Float[Array, "..."]
+    turning: Vector = (None, None, None)
 
 
 class ContactLoad(NamedTuple):
-    """What friction does at the contact per unit normal force: the tangential force [1] in the moving frame."""
+    """What friction does at the contact per unit normal force, in the moving frame.
+
+    - `force`: the tangential force [1].
+    - `torque`: the torque about the contact point [m].
+
+    A component is `None` where it vanishes identically.
+    """
 
     force: tuple[Component, Component]
+    torque: Vector = (None, None, None)
+
+    def power(self, slip: Slip) -> Component:
+        """Power per unit normal force, f.v_s + tau.w [m/s] (`tippe.md`, section 2)."""
+        return add(dot(self.force, (slip.x, slip.y)), dot(self.torque, slip.turning))
 
 
 class AbstractFriction(eqx.Module):
-    """A friction law whose force is proportional to the normal force; `units` has the units of its numbers."""
+    """A friction law whose force and torque are proportional to the normal force."""
 
+    #: The units of the law's numbers, by name.
     units: ClassVar[dict[str, str]] = {}
+
+    @property
+    def laws(self) -> "tuple[AbstractFriction, ...]":
+        """The law itself and those it is made of."""
+        return (self,)
+
+    @property
+    def drills(self) -> bool:
+        """Whether the law depends on the body's angular velocity about the normal."""
+        return False
 
     @abc.abstractmethod
     def per_normal_force(self, slip: Slip) -> ContactLoad:
@@ -35,9 +64,9 @@ class AbstractFriction(eqx.Module):
 
         **Arguments:**
 
-        - `slip`: slip velocity [m/s].
+        - `slip`: velocity of the contact point [m/s] and angular velocity [rad/s].
 
-        **Returns:** a `ContactLoad`; a component is `None` where it vanishes identically.
+        **Returns:** a `ContactLoad`.
         """
 
 
@@ -93,3 +122,86 @@ class Coulomb(AbstractFriction):
         speed = jnp.sqrt(slip.x * slip.x + slip.y * slip.y + self.slip_speed * self.slip_speed)
         factor = -self.mu / speed
         return ContactLoad(force=(factor * slip.x, factor * slip.y))
+
+
+class Contensou(AbstractFriction):
+    """Coulomb friction on a small contact disc: sliding and drilling share its limit (`tippe.md`, section 3).
+
+    F = -mu N v_s / Q and the torque -mu N Rb^2 w_n n / Q with Q = sqrt(v_s^2 + Rb^2 w_n^2 + slip_speed^2) and
+    Rb = 3 pi / 16 contact_radius. The load is the gradient of the potential mu N Q, an ellipsoid that has the limits of
+    the disc under Hertz' pressure for pure sliding and for pure drilling. In between it departs from the disc's exact
+    force by at most 0.12 mu N and from its torque by at most 0.09 mu N contact_radius. As the radius tends to 0 it is
+    `Coulomb`.
+
+    **Arguments:**
+
+    - `mu`: coefficient of friction [1], at least 0.
+    - `contact_radius`: radius [m] of the disc of contact, at least 0.
+    - `slip_speed`: speed [m/s] at which the force without drilling reaches 71 % of its limit, positive.
+    """
+
+    units: ClassVar[dict[str, str]] = {"mu": "1", "contact_radius": "m", "slip_speed": "m s-1"}
+
+    mu: Float[Array, "..."] = eqx.field(converter=as_number)
+    contact_radius: Float[Array, "..."] = eqx.field(converter=as_number)
+    slip_speed: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def __check_init__(self):
+        require(self.mu, "mu", at_least=0.0)
+        require(self.contact_radius, "contact_radius", at_least=0.0)
+        require(self.slip_speed, "slip_speed", above=0.0)
+
+    @property
+    def drills(self) -> bool:
+        return True
+
+    def per_normal_force(self, slip: Slip) -> ContactLoad:
+        lever = 3.0 * math.pi / 16.0 * self.contact_radius
+        drilling = lever * slip.turning[2]
+        speed = jnp.sqrt(slip.x * slip.x + slip.y * slip.y + drilling * drilling + self.slip_speed * self.slip_speed)
+        factor = -self.mu / speed
+        return ContactLoad((factor * slip.x, factor * slip.y), (None, None, factor * lever * drilling))
+
+
+class Rolling(AbstractFriction):
+    """Rolling resistance on top of a sliding law: a torque N resistance against the rolling (`tippe.md`, section 3).
+
+    The torque is -N resistance w_t / sqrt(w_t^2 + turning_speed^2), with w_t the angular velocity without its component
+    along n: the normal force acts ahead of the contact point by the lever `resistance`.
+
+    **Arguments:**
+
+    - `resistance`: lever [m] of the normal force, at least 0.
+    - `turning_speed`: angular velocity [rad/s] at which the torque reaches 71 % of its limit, positive.
+    - `sliding`: the law of the force, such as `Coulomb(mu, slip_speed)`.
+    """
+
+    resistance: Float[Array, "..."] = eqx.field(converter=as_number)
+    turning_speed: Float[Array, "..."] = eqx.field(converter=as_number)
+    sliding: AbstractFriction
+
+    def __check_init__(self):
+        require(self.resistance, "resistance", at_least=0.0)
+        require(self.turning_speed, "turning_speed", above=0.0)
+        if not isinstance(self.sliding, AbstractFriction):
+            raise ValueError(f"sliding = {self.sliding!r} must be a Friction, such as Coulomb(mu, slip_speed)")
+        if isinstance(self.sliding, Rolling):
+            raise ValueError(f"sliding = {self.sliding!r} must be a law of sliding, not a second rolling resistance")
+
+    @property
+    def units(self) -> dict[str, str]:
+        return {"resistance": "m", "turning_speed": "rad s-1"} | self.sliding.units
+
+    @property
+    def laws(self) -> tuple[AbstractFriction, ...]:
+        return (self, *self.sliding.laws)
+
+    @property
+    def drills(self) -> bool:
+        return self.sliding.drills
+
+    def per_normal_force(self, slip: Slip) -> ContactLoad:
+        w1, w2, _ = slip.turning
+        factor = -self.resistance / jnp.sqrt(w1 * w1 + w2 * w2 + self.turning_speed * self.turning_speed)
+        load = self.sliding.per_normal_force(slip)
+        return ContactLoad(load.force, sum_vectors(load.torque, (factor * w1, factor * w2, None)))

@@ -1,7 +1,8 @@
 """Two reduced forms of the tippe top on the plane: Rutstam's equations, and the paper's reduction by Routh and Jellett.
 
-Both use the nodal frame (tx, ty, z): tx along the horizontal projection of the axis e, ty = z x tx. They are singular
-where sin(theta) = 0 and stand as witnesses beside the vector form, which is not.
+Both are for friction at a point: with a contact torque Jellett's quantity is no constant. Both use the nodal frame
+(tx, ty, z): tx along the horizontal projection of the axis e, ty = z x tx. They are singular where sin(theta) = 0 and
+stand as witnesses beside the vector form, which is not.
 """
 
 from typing import NamedTuple
@@ -11,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .euler_angles import friction_per_normal_force, from_vector_state
+from .euler_angles import from_vector_state
+from .friction import Slip
 from .scene import Scene
 
 
@@ -20,6 +22,20 @@ def nodal(state: Float[Array, " 8"], vector: Float[Array, " 2"]) -> Float[Array,
     level = jnp.hypot(state[2], state[3])
     c, s = state[2] / level, state[3] / level
     return jnp.stack([c * vector[0] + s * vector[1], c * vector[1] - s * vector[0]])
+
+
+def point_friction(scene: Scene, slip: Float[Array, " 2"]) -> Float[Array, " 2"]:
+    """Tangential force per unit normal force [1] along (tx, ty), zeros where there is none.
+
+    **Arguments:** `slip`: velocity of the contact point along (tx, ty) [m/s].
+
+    **Raises:** `ValueError` for a law that has a torque.
+    """
+    zero = jnp.zeros_like(slip[0])
+    force, torque = scene.friction.per_normal_force(Slip(slip[0], slip[1], (zero, zero, zero)))
+    if torque != (None, None, None):
+        raise ValueError(f"friction = {scene.friction!r} must act at a point, without a torque, for the reduced forms")
+    return jnp.stack([zero if part is None else part for part in force])
 
 
 # Rutstam's equations
@@ -36,7 +52,7 @@ def rutstam_normal_force(scene: Scene, state: Float[Array, " 6"]) -> Float[Array
     """Normal force g_n [N] of Rutstam (2012), with friction f per unit normal force in place of -mu nu."""
     body = scene.body
     theta, theta_dot, phi_dot, omega, *slip = state
-    force_x, _ = friction_per_normal_force(scene, jnp.stack(slip))
+    force_x, _ = point_friction(scene, jnp.stack(slip))
     m, R, I1, I3, al = body.mass, body.radius, body.I1, body.I3, body.offset / body.radius
     s, c = jnp.sin(theta), jnp.cos(theta)
     swing = c * (I1 * phi_dot**2 * s**2 + I1 * theta_dot**2) - I3 * phi_dot * omega * s**2
@@ -60,7 +76,7 @@ def rutstam_rate(scene: Scene, state: Float[Array, " 6"]) -> Float[Array, " 6"]:
     m, R, I1, I3, al = body.mass, body.radius, body.I1, body.I3, body.offset / body.radius
     s, c = jnp.sin(theta), jnp.cos(theta)
     N = rutstam_normal_force(scene, state)
-    F_x, F_y = N * friction_per_normal_force(scene, jnp.stack([slip_x, slip_y]))
+    F_x, F_y = N * point_friction(scene, jnp.stack([slip_x, slip_y]))
     theta_2 = s / I1 * (I1 * phi_dot**2 * c - I3 * omega * phi_dot - R * al * N) - R * F_x / I1 * (1.0 - al * c)
     phi_2 = (I3 * theta_dot * omega - 2.0 * I1 * theta_dot * phi_dot * c + F_y * R * (al - c)) / (I1 * s)
     omega_1 = F_y * R * s / I3
@@ -214,7 +230,7 @@ def jellett_rate(scene: Scene, state: JellettState, jellett: Float[Array, ""]) -
     push = jax.grad(of_rate, argnums=1)(theta_dot, theta) - drift
 
     slip = jnp.stack([v_x + (a * c - R) * theta_dot, v_y + a * phi_dot * s + R * psi_dot * s])
-    f_x, f_y = friction_per_normal_force(scene, slip)
+    f_x, f_y = point_friction(scene, slip)
     lever = f_x * (a * c - R)
     # inertia theta'' = push + N lever, and N is linear in theta''.
     bare = body.mass * (scene.gravity + a * theta_dot**2 * c)

@@ -6,12 +6,15 @@ from jaxtyping import Array, Float
 
 from nonholonomic.surface import AbstractSurface, Plane
 from nonholonomic.validation import as_number, require
-from nonholonomic.vector import dot, multiply
+from nonholonomic.vector import dot
 
 from .dynamics import COS_THETA, Dynamics
 from .friction import AbstractFriction, Frictionless
 from .launch import Launch
 from .top import Top
+
+#: Tilt [rad] of a launch below which errors across the normal are measured in proportion to it.
+NEARLY_UPRIGHT = 1e-2
 
 
 class Scene(eqx.Module):
@@ -23,7 +26,8 @@ class Scene(eqx.Module):
 
     - `body`: a `Top`.
     - `surface`: the arena: `Plane()`, `Cylinder(radius)` or `Sphere(radius)`; the top runs inside the last two.
-    - `friction`: `Frictionless()`, `Viscous(mu)` or `Coulomb(mu, slip_speed)`.
+    - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
+      or `Rolling(resistance, turning_speed, sliding)` with one of them.
     - `gravity`: acceleration of free fall [m/s^2], positive.
 
     **Raises:** `ValueError` if a part is of the wrong kind, if the top does not fit into the arena, or if gravity is not
@@ -67,7 +71,8 @@ class Scene(eqx.Module):
         """Magnitudes by which absolute errors of the state are measured, component by component.
 
         Velocities count in units of sqrt(g R), directions in units of 1, angular momenta in units of the launch's own,
-        or of I1 sqrt(g / R) where that is more.
+        or of I1 sqrt(g / R) where that is more. For a launch within `NEARLY_UPRIGHT` of the normal, what vanishes with
+        the tilt counts in proportion to it: its growth, which decides when the top turns over, would drown in the errors.
 
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
@@ -76,7 +81,11 @@ class Scene(eqx.Module):
         velocity = rate * self.body.radius
         momentum = jnp.maximum(self.body.I3 * jnp.abs(launch.spin), self.body.I1 * rate)
         place = [one for _ in self.surface.place(launch.eta)]
-        return jnp.stack(jnp.broadcast_arrays(velocity, velocity, one, one, one, *([momentum] * 3), *place))
+        tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
+        # A top that stands exactly has no growth to resolve.
+        tilt = jnp.where(tilt > 0.0, jnp.clip(tilt, 1e-280, 1.0), 1.0)
+        across = [velocity * tilt, velocity * tilt, tilt, tilt, one, momentum * tilt, momentum * tilt, momentum]
+        return jnp.stack(jnp.broadcast_arrays(*across, *place))
 
     def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """Rate of change of the state: (m/s^2, 1/s, N m, 1/s) for (velocity, axis, angular momentum, place)."""
@@ -88,12 +97,13 @@ class Scene(eqx.Module):
 
     def slip_velocity(self, state: Float[Array, "components ..."]) -> Float[Array, "2 ..."]:
         """Velocity of the material contact point in the moving frame [m/s]."""
-        return jnp.stack(self.dynamics.motion(state).slip)
+        slip = self.dynamics.motion(state).slip
+        return jnp.stack([slip.x, slip.y])
 
     def friction_power(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Power of friction N f.v_s [W], at most 0 (`tippe.md`, section 2)."""
+        """Power of friction N (f.v_s + tau.w) [W], at most 0 (`tippe.md`, section 2)."""
         motion = self.dynamics.motion(state)
-        power = multiply(motion.normal_force, dot(motion.friction, motion.slip))
+        power = motion.friction_power
         return jnp.zeros_like(motion.normal_force) if power is None else power
 
     def energy(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
@@ -112,7 +122,8 @@ class Scene(eqx.Module):
     def jellett(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Jellett's quantity L.(R n - a e) [kg m^3/s]: constant on the plane for every friction at the contact point.
 
-        On a curved arena it changes at the rate R L.n' (`tippe.md`, section 2).
+        On a curved arena it changes at the rate R L.n', and a contact torque N tau changes it at the rate
+        N tau.(R n - a e) (`tippe.md`, section 2).
         """
         return self.body.radius * state[7] - self.body.offset * dot(tuple(state[2:5]), tuple(state[5:8]))
 

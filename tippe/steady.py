@@ -2,8 +2,8 @@
 
 A standing top spins with its axis along the normal: upright (stem out, theta = 0) or inverted (stem in, theta = pi). On
 the plane there are tumbling tops between: the axis precesses at a fixed inclination, the centre of mass at rest,
-without slip. The formulas hold for every friction law that vanishes with the slip only; alpha = a / R and gamma = I1 /
-I3.
+without slip. The formulas hold for every friction law that vanishes with the slip only, not for `Contensou` and
+`Rolling`, under which every spin runs down; alpha = a / R and gamma = I1 / I3.
 
 The stability matrices are Jacobians of the scene's own field, less the directions that are neutral by symmetry or by
 conservation, so that an eigenvalue with positive real part is an instability and nothing else.

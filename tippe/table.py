@@ -11,7 +11,7 @@ import numpy as np
 
 from nonholonomic.ensemble import Outcome, compiled_march, lanes_for
 from nonholonomic.lockstep import FAILED, GUARD_LOST
-from nonholonomic.paths import description, with_numbers
+from nonholonomic.paths import description, numbers, with_numbers
 from nonholonomic.reference import march_by_diffrax
 from nonholonomic.runge_kutta import explicit_tableau
 from nonholonomic.sweep import Axis, Variable, axis, sweep
@@ -65,8 +65,9 @@ def inversion_table(
     **Arguments:**
 
     - `scene`: the scene, every number a scalar.
-    - `theta`, `spin`, `eta`, `azimuth`: of the launch, as for `Launch`; `mu`: of the scene's friction, its own by default.
-      A list or array becomes an axis of the table, in the order (theta, eta, mu, spin, azimuth); a number does not.
+    - `theta`, `spin`, `eta`, `azimuth`: of the launch, as for `Launch`; `mu`: of the scene's friction, or of the
+      law of sliding in it, its own by default. A list or array becomes an axis of the table, in the order (theta, eta, mu,
+      spin, azimuth); a number does not.
     - `t1`: horizon [s].
     - `angle`: angle [rad] that counts as inverted.
     - `tolerance`: relative tolerance of the integration.
@@ -103,10 +104,11 @@ def inversion_table(
         raise ValueError(f"scene = {scene!r} must be a Scene")
     if axes is not None and not isinstance(axes, dict):
         raise ValueError(f"axes = {axes!r} must be a dictionary, path of a number -> values")
-    given = {"launch.theta": theta, "launch.eta": eta, "scene.friction.mu": mu, "launch.spin": spin}
-    given |= {"launch.azimuth": azimuth}
+    known = numbers("scene.friction", scene.friction)
+    of_mu = next((number for number in known if number.endswith(".mu")), "scene.friction.mu")
+    given = {"launch.theta": theta, "launch.eta": eta, of_mu: mu, "launch.spin": spin, "launch.azimuth": azimuth}
     if mu is None:
-        del given["scene.friction.mu"]
+        del given[of_mu]
     for number in given:
         if number in (axes or {}):
             raise ValueError(f"axes: {number!r} is an argument of its own")

@@ -45,9 +45,7 @@ class Run(AbstractProblem):
         lean, path = state[: len(self.state)], tuple(state[len(self.state) : -2])
         motion = self.dynamics.motion(lean)
         path_rate = self.dynamics.parallel.path_rate(path, motion.velocity, motion.turning)
-        force = dot(motion.friction, motion.slip)
-        power = None if force is None else motion.normal_force * force
-        return stacked((*motion.rate, *path_rate, motion.spin_momentum / self.axial, power), state)
+        return stacked((*motion.rate, *path_rate, motion.spin_momentum / self.axial, motion.friction_power), state)
 
     def crossing(self, state: Float[Array, " components"]) -> None:
         return None
@@ -140,7 +138,7 @@ class Trajectory(eqx.Module):
 
     @_of_each_run
     def jellett(self) -> Float[Array, " times"]:
-        """Jellett's quantity [kg m^3/s]; constant on the plane."""
+        """Jellett's quantity [kg m^3/s]; constant on the plane where friction acts at a point."""
         return self.scene.jellett(self.states)
 
     @_of_each_run

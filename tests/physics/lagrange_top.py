@@ -15,8 +15,12 @@ Centre of mass  s = O - a e.  Lagrangian  L = T - U,
   T = m |s'|^2 / 2 + I1 (theta'^2 + phi'^2 sin^2 theta) / 2 + I3 (psi' + phi' cos theta)^2 / 2,
   U = m g s_z.
 Contact: the constraint d = 0 has the multiplier N (normal force). The friction force N f acts at the
-contact point, whose velocity in the arena's tangent plane is v; its generalised force is N f . dv/dq'.
+contact point, whose velocity in the arena's tangent plane is v, and the friction torque N tau on the body, whose
+angular velocity is w; their generalised force is N (f . dv/dq' + tau . dw/dq').
   viscous f = -mu v (mu in s/m);  Coulomb f = -mu v / sqrt(v^2 + slip_speed^2);  frictionless f = 0.
+  On a disc of contact_radius > 0, with b = 3 pi/16 contact_radius and w_n = w.n:
+  f = -mu v / Q, tau = -mu b^2 w_n n / Q, Q = sqrt(v^2 + b^2 w_n^2 + slip_speed^2).
+  Rolling resistance adds -resistance w_t / sqrt(w_t^2 + turning_speed^2) to tau, w_t = w - w_n n.
 Lagrange's equations with d'' = 0 are six linear equations in (u'', y'', theta'', phi'', psi'', N).
 u, theta, phi and the five rates are integrated; x, y and psi are cyclic and matter to nothing else.
 """
@@ -52,6 +56,9 @@ class Scene:
     slip_speed: float | None = None  # m/s; None: viscous
     surface_radius: float | None = None  # m; None: the plane
     gravity: float = 9.81
+    contact_radius: float = 0.0  # m
+    resistance: float = 0.0  # m
+    turning_speed: float = 1.0  # rad/s
 
 
 def dot(a, b):
@@ -77,10 +84,13 @@ def axis(theta, phi):
     return (st * cp, st * sp, ct), (ct * cp, ct * sp, -st), (-st * sp, st * cp, 0.0), (-ct * sp, ct * cp, 0.0)
 
 
-def friction(scene, vt, vy):
-    """Tangential force per unit normal force."""
-    size = 1.0 if scene.slip_speed is None else sqrt(vt * vt + vy * vy + scene.slip_speed**2)
-    return -scene.mu * vt / size, -scene.mu * vy / size
+def friction(scene, vt, vy, wt, wy, wn):
+    """Force (along t, y) and torque (about t, y, n) per unit normal force."""
+    lever, size = 3 * pi / 16 * scene.contact_radius, 1.0
+    if scene.slip_speed is not None:
+        size = sqrt(vt * vt + vy * vy + (lever * wn) ** 2 + scene.slip_speed**2)
+    drag = scene.resistance / sqrt(wt * wt + wy * wy + scene.turning_speed**2)
+    return -scene.mu * vt / size, -scene.mu * vy / size, -drag * wt, -drag * wy, -scene.mu * lever**2 * wn / size
 
 
 def accelerations(scene, state, pole="z"):
@@ -103,15 +113,19 @@ def accelerations(scene, state, pole="z"):
     # velocity of the contact point v = O' - R w x n along t and y; its derivatives by the rates
     t3, t4, t5 = -R * dot(kth, y), -R * y[2], -R * dot(e, y)
     y3, y4, y5 = R * dot(kth, t), R * t[2], R * dot(e, t)
-    ft, fy = friction(scene, rho * du + t3 * dth + t4 * dph + t5 * dps, dy + y3 * dth + y4 * dph + y5 * dps)
+    turn = [(dot(kth, along), along[2], dot(e, along)) for along in (t, y, n)]  # dw/dq' along t, y and n
+    w = [dot(row, (dth, dph, dps)) for row in turn]
+    v = rho * du + t3 * dth + t4 * dph + t5 * dps, dy + y3 * dth + y4 * dph + y5 * dps
+    ft, fy, *torque = friction(scene, *v, *w)
+    tau = [dot(torque, column) for column in zip(*turn, strict=True)]
     matrix = np.array(
         (
             (m * rho * rho, 0.0, -ma * rho * te1, -ma * rho * te2, 0.0, -ft * rho),
             (0.0, m, -ma * ye1, -ma * ye2, 0.0, -fy),
             (0.0, 0.0, -ma * ne1, -ma * ne2, 0.0, -1.0),
-            (-ma * rho * te1, -ma * ye1, J, 0.0, 0.0, -ft * t3 - fy * y3),
-            (-ma * rho * te2, -ma * ye2, 0.0, J * st * st + I3 * ct * ct, I3 * ct, -ft * t4 - fy * y4),
-            (0.0, 0.0, 0.0, I3 * ct, I3, -ft * t5 - fy * y5),
+            (-ma * rho * te1, -ma * ye1, J, 0.0, 0.0, -ft * t3 - fy * y3 - tau[0]),
+            (-ma * rho * te2, -ma * ye2, 0.0, J * st * st + I3 * ct * ct, I3 * ct, -ft * t4 - fy * y4 - tau[1]),
+            (0.0, 0.0, 0.0, I3 * ct, I3, -ft * t5 - fy * y5 - tau[2]),
         )
     )
     bias = np.array(

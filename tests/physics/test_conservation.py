@@ -13,6 +13,11 @@ LAWS = {
     "viscous": tippe.Viscous(0.3),
     "coulomb": tippe.Coulomb(0.3, 0.05),
 }
+TORQUES = {
+    "contensou": tippe.Contensou(0.3, 2e-3, 0.05),
+    "rolling": tippe.Rolling(1e-3, 2.0, tippe.Viscous(0.3)),
+    "both": tippe.Rolling(1e-3, 2.0, tippe.Contensou(0.3, 2e-3, 0.05)),
+}
 ARENAS = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3), "sphere": tippe.Sphere(0.3)}
 
 
@@ -46,10 +51,10 @@ def test_energy_changes_by_the_work_of_friction(arena, law):
 
 
 @pytest.mark.parametrize("arena", ARENAS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", LAWS | TORQUES)
 def test_rates_of_energy_and_jellett_at_random_states(arena, law):
-    """dE/dt = N f.v_s and dlambda/dt = R L.n' (0 on the plane), term by term, at 200 random states."""
-    scene = tippe.Scene(rutstam_top(), ARENAS[arena], LAWS[law])
+    """dE/dt = N (f.v_s + tau.w) <= 0 and dlambda/dt = R L.n' + N tau.(R n - a e), at 200 random states."""
+    scene = tippe.Scene(rutstam_top(), ARENAS[arena], (LAWS | TORQUES)[law])
     states = random_states(scene, 200)
     rates = scene.field(states)
     _, energy_rate = jax.jvp(scene.energy, (states,), (rates,))
@@ -60,6 +65,10 @@ def test_rates_of_energy_and_jellett_at_random_states(arena, law):
     motion = scene.dynamics.motion(states)
     turning = [jnp.zeros(200) if part is None else part for part in motion.turning]
     expected = -scene.body.radius * (turning[0] * states[5] + turning[1] * states[6])
+    torque = jnp.stack([jnp.zeros(200) if part is None else part for part in motion.friction.torque])
+    arm = jnp.asarray([[0.0], [0.0], [1.0]]) * scene.body.radius - scene.body.offset * states[2:5]
+    expected = expected + motion.normal_force * jnp.sum(torque * arm, axis=0)
+    assert (law in TORQUES) == bool(jnp.any(torque != 0.0))
     size = float(scene.body.radius) * float(scene.body.I3) * 100.0 * 100.0
     assert_close(jellett_rate / size, expected / size, atol=1e-13)
 

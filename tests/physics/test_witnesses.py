@@ -13,7 +13,9 @@ from tippe import euler_angles, poincare, quadrature, reduced
 
 STATES = 1000
 ARENAS = ["plane", "cylinder"]
-FRICTIONS = ["frictionless", "viscous", "coulomb"]
+#: Friction at a point, then friction with a torque about the normal and along the arena.
+POINT = ["frictionless", "viscous", "coulomb"]
+FRICTIONS = [*POINT, "torques"]
 
 
 def random_scenes(rng, count, arena, friction):
@@ -30,6 +32,11 @@ def random_scenes(rng, count, arena, friction):
         "frictionless": tippe.Frictionless(),
         "viscous": tippe.Viscous(between(0.05, 0.5)),
         "coulomb": tippe.Coulomb(between(0.05, 0.5), between(0.005, 0.2)),
+        "torques": tippe.Rolling(
+            between(0.0, 0.1) * radius,
+            between(0.1, 10.0),
+            tippe.Contensou(between(0.05, 0.5), between(0.0, 0.3) * radius, between(0.005, 0.2)),
+        ),
     }
     return tippe.Scene(body, surfaces[arena], frictions[friction], between(5.0, 15.0))
 
@@ -75,7 +82,9 @@ def relative_error(found, expected, lengths):
     return jnp.max(jnp.abs(found - expected) * units, axis=1) / jnp.max(jnp.abs(expected) * units, axis=1)
 
 
-@pytest.mark.parametrize("friction", FRICTIONS)
+@pytest.mark.parametrize(
+    "friction", ["frictionless", "viscous", pytest.param("coulomb", marks=pytest.mark.slow), "torques"]
+)
 @pytest.mark.parametrize("arena", ARENAS)
 def test_lagrange_poincare_and_the_corrected_paper_give_the_accelerations_of_the_vector_form(arena, friction):
     """Four derivations, 1000 random tops, arenas and states each: q'' to 1e-10, and N to 1e-10 of the weight."""
@@ -88,7 +97,7 @@ def test_lagrange_poincare_and_the_corrected_paper_give_the_accelerations_of_the
         assert jnp.max(jnp.abs(found.normal_force - normal_force) / (weight + normal_force)) < 1e-10
 
 
-@pytest.mark.parametrize("friction", FRICTIONS)
+@pytest.mark.parametrize("friction", POINT)
 def test_rutstam_and_the_jellett_reduction_give_the_accelerations_of_the_vector_form(friction):
     """Rutstam's six equations and the reduction by beta1 and Jellett's constant, 1000 random states on the plane."""
     scenes, states = legal_cases("plane", friction)

@@ -38,6 +38,16 @@ def test_impossible_tops_are_refused(change, message):
         (lambda: tippe.Viscous(-0.1), "mu = -0.1 must be at least 0.0"),
         (lambda: tippe.Coulomb(0.3, 0.0), "slip_speed = 0.0 must be greater than 0.0"),
         (lambda: tippe.Coulomb(math.nan, 0.1), "mu = nan must be finite"),
+        (lambda: tippe.Contensou(-0.1, 1e-3, 0.1), "mu = -0.1 must be at least 0.0"),
+        (lambda: tippe.Contensou(0.3, -1e-3, 0.1), "contact_radius = -0.001 must be at least 0.0"),
+        (lambda: tippe.Contensou(0.3, 1e-3, 0.0), "slip_speed = 0.0 must be greater than 0.0"),
+        (lambda: tippe.Rolling(-1e-4, 1.0, tippe.Viscous(0.3)), "resistance = -0.0001 must be at least 0.0"),
+        (lambda: tippe.Rolling(1e-4, 0.0, tippe.Viscous(0.3)), "turning_speed = 0.0 must be greater than 0.0"),
+        (lambda: tippe.Rolling(1e-4, 1.0, 0.3), "sliding = 0.3 must be a Friction"),
+        (
+            lambda: tippe.Rolling(0.0, 1.0, tippe.Rolling(0.0, 1.0, tippe.Viscous(0.3))),
+            "not a second rolling resistance",
+        ),
         (lambda: tippe.Cylinder(0.0), "surface radius = 0.0 must be greater than 0.0"),
         (lambda: tippe.Scene(rutstam_top(), tippe.Cylinder(0.02)), "surface radius = 0.02 must be greater than 0.02"),
         (lambda: tippe.Scene(rutstam_top(), tippe.Sphere(0.01)), "surface radius = 0.01 must be greater than 0.02"),
@@ -67,6 +77,7 @@ YARDSTICK = {
     ("plane", "frictionless"): 53,
     ("plane", "viscous"): 63,
     ("plane", "coulomb"): 69,
+    ("plane", "contensou"): 77,
     ("cylinder", "viscous"): 83,
     ("cylinder", "coulomb"): 89,
     ("sphere", "viscous"): 101,
@@ -79,6 +90,7 @@ def test_the_field_costs_what_the_lean_one_does(arena, law):
     """A scene evaluates only the terms it has: within 2 operations of the yardstick, no trigonometry, no power."""
     surface = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3), "sphere": tippe.Sphere(0.3)}[arena]
     friction = {"frictionless": tippe.Frictionless(), "viscous": tippe.Viscous(0.3), "coulomb": tippe.Coulomb(0.3, 0.1)}
+    friction["contensou"] = tippe.Contensou(0.3, 5e-4, 0.1)
     scene = tippe.Scene(rutstam_top(), surface, friction[law])
     dynamics, states = scene.dynamics, random_states(scene, 7)
     equations = jax.make_jaxpr(lambda state: dynamics.motion(state).rate)(states).jaxpr.eqns

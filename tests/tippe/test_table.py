@@ -300,7 +300,29 @@ def test_the_unit_of_mu_is_that_of_the_law(tmp_path):
         assert tippe.inversion_table(scene, theta=0.1, spin=100.0, mu=[0.1, 0.2], t1=0.01).units["mu"] == unit
 
 
-@pytest.mark.parametrize("law", [tippe.Frictionless(), tippe.Viscous(0.3), tippe.Coulomb(0.3, 0.05)])
+def test_mu_under_rolling_resistance_is_that_of_the_sliding_law():
+    """So is its unit, and a table over the lever is one over any other number."""
+    scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Rolling(1e-4, 1.0, tippe.Viscous(0.3)))
+    arguments = {"theta": 0.1, "spin": 100.0, "t1": 0.01}
+    table = tippe.inversion_table(scene, mu=[0.1, 0.2], axes={"scene.friction.resistance": [0.0, 1e-4]}, **arguments)
+    assert table.coords.keys() == {"mu", "resistance"}
+    assert (table.units["mu"], table.units["resistance"]) == ("s m-1", "m")
+
+
+LAWS = [
+    *(tippe.Frictionless(), tippe.Viscous(0.3), tippe.Coulomb(0.3, 0.05)),
+    pytest.param(tippe.Contensou(0.3, 5e-4, 0.05), marks=pytest.mark.slow),
+    *(
+        pytest.param(tippe.Rolling(1e-4, 1.0, law), marks=pytest.mark.slow)
+        for law in (
+            *(tippe.Frictionless(), tippe.Viscous(0.3), tippe.Coulomb(0.3, 0.05)),
+            tippe.Contensou(0.3, 5e-4, 0.05),
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("arena", [tippe.Plane(), tippe.Cylinder(0.3), tippe.Sphere(0.3)])
 def test_every_scene_compiles(arena, law):
     """XLA aborts on some loops in a single kernel: every arena and law goes through it here, scalars and axes."""

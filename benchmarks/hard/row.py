@@ -1,0 +1,47 @@
+"""One hard case: what happened, how wrong it was, against what, and what it cost."""
+
+import math
+from typing import NamedTuple
+
+
+class Row(NamedTuple):
+    """A line of the table of hard cases.
+
+    - `case`: what is hard about it, with its numbers.
+    - `happens`: what the simulator does.
+    - `error`: the measured error, or the distance of a measured order from the one it should be.
+    - `bound`: what the error must not exceed, about ten times what was measured when the row was written.
+    - `against`: the independent reference of the error, and its unit.
+    - `steps`: accepted and rejected steps of one run.
+    - `cpu`: CPU time of one run [s], compilation apart.
+    - `status`: how the run ended, in the words of the result.
+    """
+
+    case: str
+    happens: str
+    error: float
+    bound: float
+    against: str
+    steps: int
+    cpu: float
+    status: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether the error is a number within its bound."""
+        return math.isfinite(self.error) and self.error <= self.bound
+
+    def cells(self, name: str) -> dict[str, str]:
+        """The row as text, for the table and the CSV."""
+        return {
+            "row": name,
+            "case": self.case,
+            "what happens": self.happens,
+            "error": f"{self.error:.1e}",
+            "bound": f"{self.bound:.1e}",
+            "against": self.against,
+            "steps": str(self.steps),
+            "cpu ms": f"{1e3 * self.cpu:.3g}",
+            "status": self.status,
+            "ok": "yes" if self.ok else "NO",
+        }

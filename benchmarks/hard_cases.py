@@ -1,0 +1,48 @@
+"""What the simulator does where others break: one table of hard cases, each with its error against a reference.
+
+    python benchmarks/hard_cases.py [--only upright_exactly ...] [--csv hard_cases.csv]
+
+A row says what is hard, what happens, how large the error is against something independent (a closed form, another
+formulation, an eigenvalue), the bound the error must keep, the steps, the CPU time and the status. The script exits with 1
+if a row breaks its bound, after printing all of them.
+
+To add a row: write a function without arguments in a file of `benchmarks/hard/` that returns a `hard.row.Row`, and name it in
+that file's `rows()`. Its name is what `--only` takes. A new file goes into `SUBJECTS` below. Measure the error, then set the
+bound to about ten times of it; an order of convergence counts as its distance from the order that is due. A result that is
+not a number breaks every bound. Keep a row under a minute: `tests/physics/test_hard_cases.py` runs them all.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from hard import friction, limits
+from measure import machine, table, write_csv
+
+SUBJECTS = (limits, friction)
+
+
+def main() -> int:
+    """Run the rows, print the table, and return the exit status."""
+    told = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    functions = {function.__name__: function for subject in SUBJECTS for function in subject.rows()}
+    told.add_argument("--only", nargs="+", choices=list(functions), metavar="name", help=", ".join(functions))
+    told.add_argument("--csv", type=Path, default=Path("hard_cases.csv"), help="file for the same table")
+    options = told.parse_args()
+    started = time.perf_counter()
+    print(machine())
+    found = {}
+    for name in options.only or functions:
+        print(f"{time.perf_counter() - started:6.0f} s: {name}", file=sys.stderr, flush=True)
+        found[name] = functions[name]()
+    cells = [row.cells(name) for name, row in found.items()]
+    print(table(cells))
+    write_csv(options.csv, cells)
+    broken = [name for name, row in found.items() if not row.ok]
+    print(f"\n{time.perf_counter() - started:.0f} s in all; {', '.join(broken) or 'no row'} broke its bound")
+    return 1 if broken else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,105 @@
+"""Friction with a torque: the disc it stands for, its potential, its limits, and what the laws refuse."""
+
+import jax
+import jax.numpy as jnp
+import lagrange_top
+import numpy as np
+import pytest
+from conftest import assert_close, random_states, rutstam_top
+from hard.friction import hertz_disc
+
+import tippe
+from tippe import reduced
+from tippe.friction import Slip
+
+ARENAS = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3), "sphere": tippe.Sphere(0.3)}
+BOTH = tippe.Rolling(2e-3, 3.0, tippe.Contensou(0.4, 4e-3, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("ratio", "exact", "ellipsoid"),
+    [
+        (0.3, (0.3455, 0.5378), (0.4538, 0.5249)),
+        (1.0, (0.8836, 0.2209), (0.8616, 0.2990)),
+        (3.0, (0.9888, 0.0672), (0.9813, 0.1135)),
+    ],
+)
+def test_contensou_has_the_values_of_the_disc_and_of_the_ellipsoid(ratio, exact, ellipsoid):
+    """Force and torque at three ratios of sliding to drilling, to the printed digits (`tippe.md`, section 3)."""
+    radius = 1e-3
+    load = tippe.Contensou(1.0, radius, 1e-12).per_normal_force(Slip(ratio * radius, 0.0, (0.0, 0.0, 1.0)))
+    assert_close([-load.force[0], -load.torque[2] / radius], ellipsoid, atol=5e-5)
+    assert_close(hertz_disc(ratio), exact, atol=1e-4)
+
+
+def test_the_load_is_the_gradient_of_the_dissipation_potential():
+    """f = -d/dv and tau = -d/dw of mu Q and of resistance sqrt(w_t^2 + turning_speed^2), at 50 random slips."""
+    law, lever = BOTH.sliding, 3.0 * np.pi / 16.0 * 4e-3
+
+    def potential(motion):
+        v1, v2, w1, w2, w3 = motion
+        sliding = law.mu * jnp.sqrt(v1**2 + v2**2 + (lever * w3) ** 2 + law.slip_speed**2)
+        return sliding + BOTH.resistance * jnp.sqrt(w1**2 + w2**2 + BOTH.turning_speed**2)
+
+    motions = np.random.default_rng(5).normal(size=(50, 5)) * np.array([0.3, 0.3, 30.0, 30.0, 100.0])
+    expected = -jax.vmap(jax.grad(potential))(jnp.asarray(motions))
+    load = BOTH.per_normal_force(Slip(motions[:, 0], motions[:, 1], tuple(motions[:, 2:].T)))
+    assert_close(jnp.stack([*load.force, *load.torque], axis=1), expected, rtol=1e-12, atol=1e-16)
+
+
+@pytest.mark.parametrize("arena", ARENAS)
+def test_without_disc_or_lever_the_laws_are_those_of_sliding(arena):
+    """contact_radius = 0 is Coulomb and resistance = 0 the sliding law, to the last bit; small ones come close."""
+    coulomb = tippe.Coulomb(0.3, 0.05)
+    scene = tippe.Scene(rutstam_top(), ARENAS[arena], coulomb)
+    states = random_states(scene, 20)
+    expected = np.asarray(scene.field(states))
+
+    def field(law):
+        return np.asarray(tippe.Scene(rutstam_top(), ARENAS[arena], law).field(states))
+
+    np.testing.assert_array_equal(field(tippe.Contensou(0.3, 0.0, 0.05)), expected)
+    np.testing.assert_array_equal(field(tippe.Rolling(0.0, 1.0, coulomb)), expected)
+    # The ellipsoid departs from Coulomb with the square of the radius, but for its torque, and the lever in proportion.
+    for near, order in (
+        (lambda h: tippe.Contensou(0.3, h, 0.05), 2.0),
+        (lambda h: tippe.Rolling(h, 1.0, coulomb), 1.0),
+    ):
+        gaps = [np.abs(field(near(h)) - expected).max() for h in (2e-7, 1e-7)]
+        assert_close(np.log2(gaps[0] / gaps[1]), order, atol=0.02)
+
+
+@pytest.mark.parametrize("arena", [None, 0.2])
+def test_forces_and_torques_agree_with_lagranges_equations_in_plain_numpy(arena):
+    """Accelerations of the centre and of the spin, and N, at 20 random states by `lagrange_top.py`, to 1e-11."""
+    top = rutstam_top()
+    scene = tippe.Scene(top, tippe.Plane() if arena is None else tippe.Cylinder(arena), BOTH)
+    numbers = {name: float(getattr(top, name)) for name in ("mass", "radius", "offset", "I1", "I3")}
+    law = {"mu": 0.4, "slip_speed": 0.1, "contact_radius": 4e-3, "resistance": 2e-3, "turning_speed": 3.0}
+    reference = lagrange_top.Scene(**numbers, **law, theta=0.0, spin=0.0, surface_radius=arena)
+    path_radius = 1.0 if arena is None else arena - 0.02
+
+    def rates(state):
+        return jnp.stack([*scene.dynamics.motion(state).velocity, scene.spin(state)])
+
+    states = random_states(scene, 20, seed=3)
+    expected = jax.jvp(rates, (states,), (scene.field(states),))[1] / np.array([[path_radius], [1.0], [1.0]])
+    for k, state in enumerate(np.array(states).T):
+        eta = 0.0 if arena is None else float(np.arctan2(state[8], state[9]))
+        frame = np.array(tippe.Cylinder(1.0).frame((np.sin(eta), np.cos(eta)), ()))
+        axis, turning = state[2:5] @ frame, np.cross(state[5:8], state[2:5]) / numbers["I1"] @ frame
+        velocity = state[:2] + numbers["offset"] * np.cross(state[5:8], state[2:5])[:2] / numbers["I1"]
+        spin = state[2:5] @ state[5:8] / numbers["I3"]
+        angles, rate = lagrange_top.in_angles(axis, turning, spin)
+        chart = [eta if arena else 0.0, *angles, velocity[0] / path_radius, velocity[1], *rate]
+        found = lagrange_top.accelerations(reference, [float(number) for number in chart], "z")
+        spin_rate = found[4] + found[3] * np.cos(chart[1]) - chart[6] * chart[5] * np.sin(chart[1])
+        assert_close([*found[:2], spin_rate, found[5]], [*expected[:, k], scene.normal_force(state)], rtol=1e-11)
+
+
+def test_the_reduced_forms_refuse_a_torque():
+    """Jellett's quantity is no constant then, and Rutstam's equations have no place for one."""
+    scene = tippe.Scene(rutstam_top(), tippe.Plane(), BOTH)
+    state = scene.state(tippe.Launch(0.3, 100.0))
+    with pytest.raises(ValueError, match="must act at a point, without a torque"):
+        reduced.rutstam_rate(scene, reduced.rutstam_state(scene, state))
