@@ -13,6 +13,7 @@ from .inversion import inversion_time as inversion_time
 from .launch import Launch as Launch
 from .scene import Scene as Scene
 from .table import inversion_table as inversion_table
+from .top import Stem as Stem
 from .top import Top as Top
 from .trajectory import Trajectory as Trajectory
 from .trajectory import simulate as simulate

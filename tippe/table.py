@@ -18,6 +18,7 @@ from nonholonomic.sweep import Axis, Variable, axis, sweep
 from nonholonomic.table import Table
 
 from .friction import Coulomb, Viscous
+from .hybrid.cells import hybrid_cells
 from .inversion import ABSOLUTE, InversionProblem, check_event, check_run, is_inverted
 from .launch import Launch
 from .scene import Scene
@@ -29,6 +30,7 @@ SINGLE_KERNEL = (Plane, Cylinder, Sphere, Viscous, Coulomb, diffrax.Dopri8, diff
 CHECKED_AT_ONCE = 1 << 20
 
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed")
+HYBRID_WORDS = (*WORDS, "unresolved", "both_contacts")
 
 VARIABLES = {
     "time": Variable("s", np.float64),
@@ -38,6 +40,7 @@ VARIABLES = {
     "steps": Variable("1", np.int64),
     "rejected": Variable("1", np.int64),
 }
+HYBRID_VARIABLES = VARIABLES | {"status": Variable("1", np.int8, HYBRID_WORDS), "hops": Variable("1", np.int64)}
 
 UNITS = {"mass": "kg", "radius": "m", "offset": "m", "I1": "kg m2", "I3": "kg m2", "gravity": "m s-2"}
 UNITS |= {"theta": "rad", "eta": "rad", "azimuth": "rad", "spin": "rad s-1"}
@@ -80,7 +83,9 @@ def inversion_table(
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
     "contact_lost", "failed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was lost, when
-    and at what angle), `steps` and `rejected`.
+    and at what angle), `steps` and `rejected`. A scene with `contact="hybrid"` flies on where contact is lost, and the angle
+    counts in flight too; `hops` is the number of flights, and `status` may be "unresolved" (too many of them) or
+    "both_contacts" (sphere and stem stayed on the plane together, which is not modelled).
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
     """
@@ -93,6 +98,9 @@ def inversion_table(
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
+    hybrid = scene.contact == "hybrid"
+    if method == "diffrax" and hybrid:
+        raise ValueError("method = 'diffrax' must be 'ensemble' for a scene with contact = 'hybrid'")
     if axes is not None and not isinstance(axes, dict):
         raise ValueError(f"axes = {axes!r} must be a dictionary, path of a number -> values")
     given = {"launch.theta": theta, "launch.eta": eta, "scene.friction.mu": mu, "launch.spin": spin}
@@ -124,6 +132,8 @@ def inversion_table(
             return {}
         cells = with_numbers(roots, columns)
         size = next((len(values) for values in columns.values()), 1)
+        if hybrid:
+            return hybrid_cells(cells["scene"], cells["launch"], t1, angle, tolerance, last, solver, size, count)
         problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
         horizon, rtol = jnp.asarray(t1, float), jnp.asarray(tolerance, float)
         if method == "diffrax":
@@ -155,7 +165,10 @@ def inversion_table(
     request |= {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
     request |= {"solver": type(solver).__name__, "method": method}
     request |= {one.path: "an axis" for one in grid}
-    return sweep(run, grid, VARIABLES, request, path=path)
+    if not hybrid:
+        # As in files from before there was a choice.
+        del request["scene.contact"]
+    return sweep(run, grid, HYBRID_VARIABLES if hybrid else VARIABLES, request, path=path)
 
 
 def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:
