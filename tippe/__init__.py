@@ -9,6 +9,7 @@ from .friction import AbstractFriction as AbstractFriction
 from .friction import Coulomb as Coulomb
 from .friction import Frictionless as Frictionless
 from .friction import Viscous as Viscous
+from .hybrid.trajectory import HybridTrajectory as HybridTrajectory
 from .inversion import inversion_time as inversion_time
 from .launch import Launch as Launch
 from .scene import Scene as Scene

@@ -3,7 +3,6 @@
 from typing import Any
 
 import diffrax
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,7 +14,7 @@ from ..inversion import ABSOLUTE
 from ..launch import Launch
 from ..scene import Scene
 from .free_body import balls
-from .sliding import BOTH_CONTACTS, Slide, clearance
+from .sliding import BOTH_CONTACTS, Slide, first_ball
 
 
 def hybrid_cells(
@@ -72,13 +71,11 @@ def ride(
 
     state, scales = per_cell(scene.state(launch)), per_cell(scene.scales(launch))
     spheres = balls(scene.body)
-    # The launch is on the sphere that is lower.
-    on_stem = jnp.zeros(size, int) if len(spheres) == 1 else (clearance(*spheres, state) < 0.0).astype(int)
     cos_angle = jnp.cos(angle)
     phases = tuple(Slide(scene, scales, cos_angle, jnp.asarray(number), last) for number in range(len(spheres)))
     return travel(
         phases,
-        np.asarray(on_stem),
+        np.asarray(first_ball(spheres, state)),
         np.asarray(state),
         t1,
         count,

@@ -130,7 +130,7 @@ def strike(
         jnp.asarray(cells),
         jnp.asarray(TOLERANCE),
         jnp.asarray(TOLERANCE),
-        solver=diffrax.Dopri8(),
+        solver=diffrax.Dopri5(),
         lanes=lanes_for(cells),
         max_steps=MOST_STEPS,
     )

@@ -1,6 +1,6 @@
 """Sliding on one sphere as a phase of the motion, and what follows it: a flight, the other sphere, or the end."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,7 +18,9 @@ from .impact import strike
 
 Cells = Float[Array, " cells"]
 
-#: Both spheres stay on the plane: a double contact, which is not modelled. A further code of `Passage.status`.
+#: Both spheres stay on the plane: a double contact, which is not modelled. A slow top ends so, leaning on its stem: it rocks
+#: from one sphere to the other, ever less, until the one parts from the plane more slowly than `CLOSING_SPEED`. A further
+#: code of `Passage.status`.
 BOTH_CONTACTS = 6
 
 #: A rebound slower than this part of sqrt(g R) is none: the contact closes. Its height would be half the square of it, in R.
@@ -84,32 +86,15 @@ class Slide(AbstractPhase):
 
         Counted are the flights.
         """
-        spheres = balls(self.scene.body)
-        own, other = _own_and_other(spheres, self.number)
-        here = jnp.broadcast_to(self.number, left.shape)
-        touches = jnp.zeros(left.shape, bool)
-        if other is not None:
-            touches = clearance(own, other, state) <= standing_on(self.scene.dynamics, own).contact_margin(state)
-        start = Air(
-            free=freed(self.scene.body, own, state),
-            elapsed=jnp.zeros_like(left),
-            ball=jnp.where(touches, 1 - here, here),
-            rising=jnp.zeros(left.shape, bool),
-            status=jnp.full(left.shape, RUNNING),
-            crossing_time=jnp.full_like(left, jnp.inf),
-            flights=jnp.zeros(left.shape, int),
-            open=jnp.ones(left.shape, bool),
-        )
-        if other is not None:
-            struck = land(self.scene, start)
-            start = jax.tree.map(lambda new, old: jnp.where(touches, new, old), struck, start)
+        touches, start = lost_contact(self.scene, self.number, state)
 
         def hop(carry: tuple[Air, Array]) -> tuple[Air, Array]:
             air, count = carry
-            landed, sphere_landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
-            landed = jax.tree.map(lambda new, old: jnp.where(sphere_landed, new, old), land(self.scene, landed), landed)
-            flying = air.open
-            return jax.tree.map(lambda new, old: jnp.where(flying, new, old), landed, air), count + 1
+            arrives = touches & (count == 0)
+            after, landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
+            after = _where(arrives, air, after)
+            after = _where(arrives | landed, land(self.scene, after), after)
+            return _where(air.open, after, air), count + 1
 
         def under_way(carry: tuple[Air, Array]) -> Array:
             return jnp.any(carry[0].open) & (carry[1] < MOST_BOUNCES)
@@ -136,6 +121,34 @@ class Air(NamedTuple):
     crossing_time: Cells
     flights: Int[Array, " cells"]
     open: Bool[Array, " cells"]
+
+
+def first_ball(spheres: tuple[Ball, ...], state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+    """The number of the sphere on which a launch stands: the lower one."""
+    none = jnp.zeros(state.shape[1:], int)
+    return none if len(spheres) == 1 else (clearance(*spheres, state) < 0.0).astype(int)
+
+
+def lost_contact(
+    scene: Scene, number: Int[Array, ""], state: Float[Array, "components cells"]
+) -> tuple[Bool[Array, " cells"], Air]:
+    """What has ended sliding on the sphere with a number: whether the other sphere touches the plane; and the top then."""
+    own, other = _own_and_other(balls(scene.body), number)
+    zero = jnp.zeros_like(state[0])
+    touches = jnp.zeros(zero.shape, bool)
+    if other is not None:
+        touches = clearance(own, other, state) <= standing_on(scene.dynamics, own).contact_margin(state)
+    start = Air(
+        free=freed(scene.body, own, state),
+        elapsed=zero,
+        ball=jnp.where(touches, 1 - number, number),
+        rising=jnp.zeros(zero.shape, bool),
+        status=jnp.full(zero.shape, RUNNING),
+        crossing_time=jnp.full_like(zero, jnp.inf),
+        flights=jnp.zeros(zero.shape, int),
+        open=jnp.ones(zero.shape, bool),
+    )
+    return touches, start
 
 
 def take_flight(
@@ -173,13 +186,19 @@ def land(scene: Scene, air: Air) -> Air:
     restitution = (
         jnp.zeros_like(speed) if scene.restitution is None else jnp.broadcast_to(scene.restitution, speed.shape)
     )
-    rebounds = restitution * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * body.radius)
+    closing = CLOSING_SPEED * jnp.sqrt(scene.gravity * body.radius)
+    rebounds = restitution * speed > closing
     free, jams = strike(body, scene.friction, own, air.free, jnp.where(rebounds, restitution, 0.0))
     status = jnp.where(jams, FAILED, air.status)
     if other is not None:
-        both = (gap(other, free) < TOUCHING * body.radius) & (gap_rate(body, other, free) <= 0.0)
+        both = (gap(other, free) < TOUCHING * body.radius) & (gap_rate(body, other, free) <= closing)
         status = jnp.where(both & ~rebounds & ~jams, BOTH_CONTACTS, status)
     return air._replace(free=free, rising=rebounds, status=status, open=rebounds & ~jams)
+
+
+def _where(condition: Bool[Array, " cells"], this: Any, that: Any) -> Any:
+    """Each leaf of one tree where a condition holds, of the other elsewhere."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), this, that)
 
 
 def _own_and_other(spheres: tuple[Ball, ...], number: Int[Array, "..."]) -> tuple[Ball, Ball | None]:
@@ -187,8 +206,4 @@ def _own_and_other(spheres: tuple[Ball, ...], number: Int[Array, "..."]) -> tupl
     if len(spheres) == 1:
         return spheres[0], None
     main, stem = spheres
-    first = number == 0
-    return (
-        jax.tree.map(lambda a, b: jnp.where(first, a, b), main, stem),
-        jax.tree.map(lambda a, b: jnp.where(first, b, a), main, stem),
-    )
+    return _where(number == 0, main, stem), _where(number == 0, stem, main)
