@@ -9,9 +9,12 @@ from nonholonomic.validation import as_number, require
 from nonholonomic.vector import dot, multiply
 
 from .dynamics import COS_THETA, Dynamics
-from .friction import AbstractFriction, Frictionless
+from .friction import AbstractFriction, Coulomb, Frictionless, Viscous
 from .launch import Launch
 from .top import Top
+
+#: Laws for impacts: those that depend on the slip velocity alone and exert no torque about the contact point.
+POINT_FRICTION = (Frictionless, Viscous, Coulomb)
 
 
 class Scene(eqx.Module):
@@ -51,6 +54,8 @@ class Scene(eqx.Module):
             raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
         if self.contact == "hybrid" and not isinstance(self.surface, Plane):
             raise ValueError(f"contact = 'hybrid' must be on a Plane(), not on {self.surface!r}")
+        if self.contact == "hybrid" and not isinstance(self.friction, POINT_FRICTION):
+            raise ValueError(f"contact = 'hybrid' must be with friction at a point, not with {self.friction!r}")
         if self.contact == "stop" and self.body.stem is not None:
             raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
         if self.restitution is not None:

@@ -179,7 +179,7 @@ def watched(function, direction):
     return event
 
 
-def follow(case, rtol=1e-12, flight_step=2e-4, contact_step=2e-3):
+def follow(case, rtol=1e-12, flight_step=2e-4, contact_step=2.5e-4):
     """Run until theta reaches the angle, or t1.
 
     Returns (status, time [s] of the angle, end state, flights, list of (time, ball) at which a ball came to the plane,
@@ -267,7 +267,7 @@ def main():
         table = csv.DictWriter(file, [*names, *RESULTS, "reference_error"], lineterminator="\n")
         table.writeheader()
         for case in CASES:
-            fine, check = row(case), row(case, rtol=3e-11, flight_step=1e-4, contact_step=1e-3)
+            fine, check = row(case), row(case, rtol=3e-11, flight_step=1e-4, contact_step=2e-3)
             error = max(
                 abs(fine[name] / check[name] - 1)
                 for name in ("time", "end_theta", "end_energy")

@@ -5,7 +5,8 @@ unit normal force: with the normal impulse p in place of time, d(tangential impu
 the impulses (Routh, Dynamics of a System of Rigid Bodies, 1905, art. 198; Stronge, Impact Mechanics, ch. 4). It is the
 limit of a stiff contact with the same law, and so needs no law of its own: a stop of the slip, a reversal, and friction
 that depends on the speed come out by themselves. The clock is the velocity gained along the normal, of which Newton's
-restitution e_N gives the end, (1 + e_N) times the speed of approach.
+restitution e_N gives the end, (1 + e_N) times the speed of approach. With friction Newton's rule may ask for more energy than
+there was (Stronge, section 3.3); the impact then ends earlier, where the kinetic energy is what it was before.
 """
 
 from typing import NamedTuple
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.ensemble import lanes_for, traced_march
-from nonholonomic.lockstep import REACHED_END, AbstractProblem
+from nonholonomic.lockstep import FAILED, GUARD_LOST, AbstractProblem
 from nonholonomic.vector import Vector, cross, dot, scale, sum_vectors
 
 from ..friction import AbstractFriction, Slip
@@ -26,6 +27,9 @@ Cells = Float[Array, " cells"]
 
 #: Relative tolerance of an impact's integration: impacts are rare, so they may cost.
 TOLERANCE = 1e-12
+
+#: A contact less stiff than this part of the frictionless one is jammed.
+JAMMED = 1e-6
 
 #: Steps after which an impact has failed.
 MOST_STEPS = 100_000
@@ -81,7 +85,15 @@ class Impact(AbstractProblem):
 
     def guard(self, time: Cells, state: Float[Array, "2 cells"]) -> Cells:
         # Where friction pulls the sphere into the plane faster than the impulse pushes it out, rigid bodies jam.
-        return self.stiffness(self.load(time, state)) / self.approach.response[2][2]
+        stiffness = self.stiffness(self.load(time, state)) / self.approach.response[2][2]
+        # In compression the sphere still approaches; in restitution the energy that was lost is not to come back in full.
+        speed = self.approach.velocity[2]
+        impulse = (*state, self.normal_impulse(time, state))
+        change = tuple(dot(column, impulse) for column in self.approach.response)
+        gain = dot(impulse, self.approach.velocity) + 0.5 * dot(impulse, change)
+        allowed = -gain * self.approach.response[2][2] / jnp.maximum(speed**2, 1e-24) + 1e-12
+        approaches = -(speed + time) / jnp.maximum(jnp.abs(speed), 1e-12)
+        return jnp.minimum(stiffness, jnp.maximum(approaches, allowed))
 
 
 def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
@@ -116,7 +128,7 @@ def strike(
 
     - `friction`: the scene's law.
     - `free`: the body before the impact.
-    - `restitution`: Newton's coefficient e_N [1].
+    - `restitution`: Newton's coefficient e_N [1]; the rebound is slower where it would take energy from nowhere.
 
     **Returns:** the body after it; and where the impact has no solution.
     """
@@ -135,7 +147,9 @@ def strike(
         max_steps=MOST_STEPS,
     )
     tangential = outcome.state
-    impulse = (tangential[0], tangential[1], problem.normal_impulse(gained, tangential))
+    impulse = (tangential[0], tangential[1], problem.normal_impulse(outcome.end_time, tangential))
     velocity = sum_vectors(free.velocity, scale(1.0 / body.mass, impulse))
     momentum = sum_vectors(free.momentum, cross(meets.arm, impulse))
-    return FreeBody(velocity, free.height, free.axis, momentum), outcome.status != REACHED_END
+    soft = problem.stiffness(problem.load(outcome.end_time, tangential)) < JAMMED * meets.response[2][2]
+    jams = (outcome.status == FAILED) | ((outcome.status == GUARD_LOST) & soft)
+    return FreeBody(velocity, free.height, free.axis, momentum), jams
