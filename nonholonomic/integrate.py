@@ -57,6 +57,12 @@ def _guard(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array,
     return guard
 
 
+@eqx.filter_jit
+def _guard_on(problem: AbstractProblem, solution: diffrax.Solution, time: Float[Array, ""]) -> Float[Array, ""]:
+    """The guard on the dense output."""
+    return _guard(problem, time, solution.evaluate(time))
+
+
 def _control(rtol: float | Float[Array, ""], atol: Float[Array, " components"]) -> diffrax.PIDController:
     # The greatest error counts, not the mean: cyclic coordinates that ride along must not dilute the others' errors.
     return diffrax.PIDController(rtol, atol, norm=optimistix.max_norm)
@@ -160,11 +166,10 @@ def follow(
 
 def _loss(problem: AbstractProblem, solution: diffrax.Solution, begin: float, end: float) -> float:
     """The first time in a step at which the guard is zero, by bisection on the dense output."""
-    evaluate = eqx.filter_jit(lambda s, t: _guard(problem, t, s.evaluate(t)))
     previous = begin
     for fraction in (*LOOKS, 1.0):
         at = begin + (end - begin) * fraction
-        if float(evaluate(solution, jnp.asarray(at))) < 0.0:
+        if float(_guard_on(problem, solution, jnp.asarray(at))) < 0.0:
             break
         previous = at
     low, high = previous, at
@@ -172,7 +177,7 @@ def _loss(problem: AbstractProblem, solution: diffrax.Solution, begin: float, en
         middle = 0.5 * (low + high)
         if not low < middle < high:
             break
-        negative = float(evaluate(solution, jnp.asarray(middle))) < 0.0
+        negative = float(_guard_on(problem, solution, jnp.asarray(middle))) < 0.0
         low, high = (low, middle) if negative else (middle, high)
     return low
 

@@ -12,6 +12,7 @@ from .friction import Coulomb as Coulomb
 from .friction import Frictionless as Frictionless
 from .friction import Rolling as Rolling
 from .friction import Viscous as Viscous
+from .hybrid.trajectory import HybridTrajectory as HybridTrajectory
 from .identify import InversionTimes as InversionTimes
 from .identify import Recording as Recording
 from .identify import identify as identify
@@ -21,6 +22,7 @@ from .lyapunov import LyapunovExponent as LyapunovExponent
 from .lyapunov import lyapunov_exponent as lyapunov_exponent
 from .scene import Scene as Scene
 from .table import inversion_table as inversion_table
+from .top import Stem as Stem
 from .top import Top as Top
 from .trajectory import Trajectory as Trajectory
 from .trajectory import simulate as simulate

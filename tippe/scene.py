@@ -4,17 +4,20 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.surface import AbstractSurface, Plane
+from nonholonomic.surface import AbstractSurface, Plane, none_if_zero
 from nonholonomic.validation import as_number, require
 from nonholonomic.vector import dot
 
 from .dynamics import COS_THETA, Dynamics
-from .friction import AbstractFriction, Frictionless
+from .friction import AbstractFriction, Coulomb, Frictionless, Viscous
 from .launch import Launch
 from .top import Top
 
 #: Tilt [rad] of a launch below which errors across the normal are measured in proportion to it.
 NEARLY_UPRIGHT = 1e-2
+
+#: Laws for impacts: those that depend on the slip velocity alone and exert no torque about the contact point.
+POINT_FRICTION = (Frictionless, Viscous, Coulomb)
 
 
 class Scene(eqx.Module):
@@ -29,15 +32,20 @@ class Scene(eqx.Module):
     - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
       or `Rolling(resistance, turning_speed, sliding)` with one of them.
     - `gravity`: acceleration of free fall [m/s^2], positive.
+    - `contact`: "stop": a run ends where the contact is lost; "hybrid", on the plane: it goes on through flights, impacts
+      and changes to the stem and back (`hybrid/`). A top with a stem needs the latter.
+    - `restitution`: Newton's coefficient e_N of impacts [1], in [0, 1], for "hybrid" only; `None` is 0.
 
-    **Raises:** `ValueError` if a part is of the wrong kind, if the top does not fit into the arena, or if gravity is not
-    positive.
+    **Raises:** `ValueError` if a part is of the wrong kind, if the top does not fit into the arena, if gravity is not
+    positive, or if the contact asks for what the arena or the body does not allow.
     """
 
     body: Top
     surface: AbstractSurface = Plane()
     friction: AbstractFriction = Frictionless()
     gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81)
+    contact: str = eqx.field(static=True, default="stop")
+    restitution: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
 
     def __check_init__(self):
         parts = (("body", self.body, Top), ("surface", self.surface, AbstractSurface))
@@ -46,6 +54,18 @@ class Scene(eqx.Module):
                 raise ValueError(f"{name} = {part!r} must be a {kind.__name__.removeprefix('Abstract')}")
         require(self.gravity, "gravity", above=0.0)
         self.surface.parallel(self.body.radius)
+        if self.contact not in ("stop", "hybrid"):
+            raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
+        if self.contact == "hybrid" and not isinstance(self.surface, Plane):
+            raise ValueError(f"contact = 'hybrid' must be on a Plane(), not on {self.surface!r}")
+        if self.contact == "hybrid" and not isinstance(self.friction, POINT_FRICTION):
+            raise ValueError(f"contact = 'hybrid' must be with friction at a point, not with {self.friction!r}")
+        if self.contact == "stop" and self.body.stem is not None:
+            raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
+        if self.restitution is not None:
+            if self.contact == "stop":
+                raise ValueError(f"restitution = {self.restitution!r} must be left out where contact = 'stop'")
+            require(self.restitution, "restitution", at_least=0.0, at_most=1.0)
 
     @property
     def dynamics(self) -> Dynamics:

@@ -5,37 +5,22 @@ from collections.abc import Sequence
 from typing import Any
 
 import diffrax
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from nonholonomic.ensemble import Outcome, compiled_march, lanes_for
-from nonholonomic.lockstep import FAILED, GUARD_LOST
 from nonholonomic.paths import description, numbers, with_numbers
-from nonholonomic.reference import march_by_diffrax
 from nonholonomic.runge_kutta import explicit_tableau
 from nonholonomic.sweep import Axis, Variable, axis, sweep
 from nonholonomic.table import Table
 
-from .inversion import ABSOLUTE, InversionProblem, check_event, check_run, is_inverted
+from .cells import Runs, kind_of
+from .inversion import check_event, check_run
 from .launch import Launch
 from .scene import Scene
-from .sensitivities import sensitivity_paths, slope_variables, slopes_of_cells
+from .sensitivities import sensitivity_paths, slope_variables
 from .time_error import COARSER, time_error
 
 #: Cells that are checked together, to bound the memory it takes.
 CHECKED_AT_ONCE = 1 << 20
-
-WORDS = ("inverted", "not_inverted", "contact_lost", "failed")
-
-VARIABLES = {
-    "time": Variable("s", np.float64),
-    "status": Variable("1", np.int8, WORDS),
-    "end_time": Variable("s", np.float64),
-    "end_theta": Variable("rad", np.float64),
-    "steps": Variable("1", np.int64),
-    "rejected": Variable("1", np.int64),
-}
 
 UNITS = {"mass": "kg", "radius": "m", "offset": "m", "I1": "kg m2", "I3": "kg m2", "gravity": "m s-2"}
 UNITS |= {"theta": "rad", "eta": "rad", "azimuth": "rad", "spin": "rad s-1"}
@@ -87,7 +72,9 @@ def inversion_table(
     and at what angle), `steps` and `rejected`. With `errors` also `time_error` [s], infinite where the two runs disagree on
     the status or failed, 0 where they agree that there is no time; `Table.digits("time")` shows the digits it leaves. With
     `sensitivities` also the derivative of `time` by each number, `time_by_mu` for `"scene.friction.mu"`, 0 where the top did
-    not invert.
+    not invert. A scene with `contact="hybrid"` flies on where contact is lost, and the angle counts in flight too; `hops` is
+    the number of flights, and `status` may be "unresolved" (too many of them) or "both_contacts" (sphere and stem stayed on
+    the plane together, which is not modelled).
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
     """
@@ -125,33 +112,20 @@ def inversion_table(
     check_run(roots["scene"], roots["launch"], t1, tolerance)
     _check_cells(roots, grid)
     paths = sensitivity_paths(roots, sensitivities)
-    last = crossing == "last"
-
-    def outcome_at(problem: InversionProblem, tolerance: float, count: int, size: int) -> Outcome:
-        horizon, rtol = jnp.asarray(t1, float), jnp.asarray(tolerance, float)
-        if method == "diffrax":
-            return march_by_diffrax(problem, horizon, rtol, ABSOLUTE * rtol, solver=solver)
-        options = {"solver": solver, "lanes": lanes_for(size), "passes": last}
-        return compiled_march(problem, horizon, jnp.asarray(count), rtol, ABSOLUTE * rtol, **options)[0]
+    kind = kind_of(scene)
+    if not kind.smooth and (method == "diffrax" or paths):
+        what = "method = 'diffrax'" if method == "diffrax" else f"sensitivities = {sensitivities!r}"
+        raise ValueError(f"{what} is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
+    runs = Runs(kind, float(t1), float(angle), crossing == "last", solver, method, paths)
 
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
         if method == "diffrax" and count == 0:
             # The reference runs whole blocks: a call that is there to compile would compute the first one twice.
             return {}
-        cells = with_numbers(roots, columns)
-        size = next((len(values) for values in columns.values()), 1)
-        problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
-        slopes = {}
-        if paths:
-            options = {"count": count, "size": size, "solver": solver, "last": last}
-            outcome, slopes = slopes_of_cells(roots, columns, paths, angle, t1, tolerance, **options)
-        else:
-            outcome = outcome_at(problem, tolerance, count, size)
-        found = _results(scene, outcome, is_inverted(outcome, problem, last)) | slopes
+        found = runs.results(roots, columns, tolerance, count)
         if errors:
-            again = outcome_at(problem, COARSER * tolerance, count, size)
-            coarse = _results(scene, again, is_inverted(again, problem, last))
-            agreed = (found["status"] == coarse["status"]) & (found["status"] != WORDS.index("failed"))
+            coarse = runs._replace(paths=[]).results(roots, columns, COARSER * tolerance, count)
+            agreed = (found["status"] == coarse["status"]) & (found["status"] != kind.words.index("failed"))
             found["time_error"] = time_error(found["time"], coarse["time"], agreed)
         return found
 
@@ -159,7 +133,7 @@ def inversion_table(
     request |= {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
     request |= {"solver": type(solver).__name__, "method": method}
     request |= {one.path: "an axis" for one in grid}
-    variables = VARIABLES
+    variables = kind.variables
     if errors:
         request |= {"errors": True}
         variables = variables | {"time_error": Variable("s", np.float64)}
@@ -167,19 +141,6 @@ def inversion_table(
         request |= {"sensitivities": paths}
         variables = variables | slope_variables(paths, units)
     return sweep(run, grid, variables, request, path=path)
-
-
-def _results(scene: Scene, outcome: Outcome, inverted: Any) -> dict[str, Any]:
-    """The variables of a table without options."""
-    code = np.select([inverted, outcome.status == GUARD_LOST, outcome.status == FAILED], [0, 2, 3], 1)
-    return {
-        "time": np.where(inverted, outcome.crossing_time, np.inf),
-        "status": code.astype(np.int8),
-        "end_time": np.asarray(outcome.end_time),
-        "end_theta": np.asarray(jax.vmap(scene.theta, 1)(outcome.state)),
-        "steps": np.asarray(outcome.steps),
-        "rejected": np.asarray(outcome.rejected),
-    }
 
 
 def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:

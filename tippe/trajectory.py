@@ -16,6 +16,7 @@ from nonholonomic.validation import as_number, is_traced, require
 from nonholonomic.vector import dot
 
 from .dynamics import Dynamics, stacked
+from .hybrid.trajectory import HybridTrajectory, simulate_hybrid
 from .inversion import ABSOLUTE, check_run
 from .launch import Launch
 from .scene import Scene
@@ -199,8 +200,8 @@ def simulate(
     tolerance: float = 1e-9,
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
-) -> Trajectory:
-    """Run one launch until `t1` or until contact is lost.
+) -> Trajectory | HybridTrajectory:
+    """Run one launch until `t1` or until contact is lost; through flights and impacts if the scene's contact is "hybrid".
 
     Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run are then not a
     number, and `status` and `end_time` say so.
@@ -216,9 +217,9 @@ def simulate(
     - `adjoint`: how Diffrax differentiates, `RecursiveCheckpointAdjoint()` by default (reverse mode; use `ForwardMode()`
       for `jvp` and `jacfwd`).
 
-    **Returns:** a `Trajectory`.
+    **Returns:** a `Trajectory`, for a hybrid scene a `HybridTrajectory`.
 
-    **Raises:** `ValueError` for arguments out of range.
+    **Raises:** `ValueError` for arguments out of range, and for a hybrid scene inside a transformation.
     """
     check_run(scene, launch, t1, tolerance)
     solver = diffrax.Dopri8() if solver is None else solver
@@ -228,6 +229,10 @@ def simulate(
         times = as_number(times)
         require(times, "times", at_least=0.0, at_most=t1)
         _check_increasing(times)
+    if scene.contact == "hybrid":
+        if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1))):
+            raise ValueError("contact = 'hybrid' must be 'stop' inside jit, vmap and grad")
+        return simulate_hybrid(scene, launch, float(t1), times, tolerance, solver)
     run = Run.of(scene, launch)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((run, times, t1))):
         return _traced(scene, run, times, t1, tolerance, solver, adjoint)

@@ -1,0 +1,112 @@
+"""Contact loss, flight, landing and the stem, against an event-driven reference in NumPy and SciPy and closed forms.
+
+The reference is tests/physics/hop_reference.py: other equations, flight integrated, impacts by a matrix exponential.
+"""
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from hard.limits import rutstam_top
+from hard.row import Row
+from measure import timed
+
+import tippe
+from tippe.hybrid.stem import first_contact
+
+#: The reference's results, by number of its cases.
+REFERENCE = list(csv.DictReader((Path(__file__).parents[2] / "tests/physics/hop_reference.csv").open()))
+
+
+def leine_glocker_top() -> tippe.Top:
+    """The top of Leine and Glocker (2003), with its stem."""
+    return tippe.Top(6e-3, 0.015, 3e-3, 8e-7, 7e-7, stem=tippe.Stem(radius=5e-3, offset=0.016))
+
+
+def _against_reference(number: int, case: str, happens: str, bound: float) -> Row:
+    """A case of the reference, run at a tolerance of 1e-11; a wrong number of flights breaks the bound."""
+    expected = {name: float(value) for name, value in REFERENCE[number].items() if name != "status"}
+    friction = tippe.Viscous(expected["mu"])
+    if expected["slip_speed"]:
+        friction = tippe.Coulomb(expected["mu"], expected["slip_speed"])
+    top = leine_glocker_top() if expected["stem_radius"] else rutstam_top()
+    scene = tippe.Scene(top, friction=friction, contact="hybrid", restitution=expected["restitution"])
+    arguments = {"theta": expected["theta"], "spin": expected["spin"], "t1": expected["t1"], "tolerance": 1e-11}
+    run = timed(lambda: tippe.inversion_table(scene, **arguments), 1)
+    table = run.result
+    flights = int(table.hops)
+    error = abs(float(table.time) - expected["time"]) if flights == int(expected["flights"]) else np.inf
+    told = f"{happens} ({flights} flights)" if flights else happens
+    return Row(case, told, error, bound, "SciPy, time [s]", int(table.steps), run.cpu, str(table.status))
+
+
+def hops() -> Row:
+    """Rutstam's top at 2.6 times the threshold of Jellett: contact is lost, again and again."""
+    return _against_reference(1, "viscous 0.3, 200 rad/s: N reaches 0", "lands, inverts", 1e-7)
+
+
+def bounces() -> Row:
+    """The same with restitution: every landing is a series of bounces that ends."""
+    return _against_reference(4, "the same, e_N = 0.5", "bounces out, inverts", 1e-7)
+
+
+def coulomb_hops() -> Row:
+    """Regularised Coulomb friction loses contact at half that spin."""
+    return _against_reference(5, "Coulomb 0.3, 0.05 m/s, 155 rad/s", "lands, inverts", 1e-7)
+
+
+def over_to_the_stem() -> Row:
+    """Leine and Glocker's top: from the sphere to the stem, back, and over for good."""
+    return _against_reference(7, "two spheres, Coulomb, 180 rad/s", "goes over to its stem", 1e-7)
+
+
+def jellett_through_hops() -> Row:
+    """Forces act at the contact point only, impacts too: Jellett's quantity of a top without stem is constant."""
+    scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), contact="hybrid", restitution=0.3)
+    run = timed(lambda: tippe.simulate(scene, tippe.Launch(0.1, 250.0), 7.0, tolerance=1e-11), 1)
+    ride = run.result
+    error = float(np.max(np.abs(ride.jellett / ride.jellett[0] - 1.0)))
+    happens = f"Jellett's quantity stays ({len(ride.hops)} flights)"
+    steps = ride.stats["accepted"] + ride.stats["rejected"]
+    return Row("250 rad/s, e_N = 0.3, 7 s", happens, error, 1e-9, "exact, relative", steps, run.cpu, ride.status)
+
+
+def energy_through_hops() -> Row:
+    """Energy never grows, through flights, impacts and changes of sphere."""
+    scene = tippe.Scene(leine_glocker_top(), friction=tippe.Coulomb(0.3, 0.05), contact="hybrid")
+    run = timed(lambda: tippe.simulate(scene, tippe.Launch(0.1, 250.0), 4.0, tolerance=1e-10), 1)
+    ride = run.result
+    error = float(np.max(np.diff(ride.energy))) / float(ride.energy[0])
+    happens = f"energy falls only ({len(ride.hops)} flights)"
+    steps = ride.stats["accepted"] + ride.stats["rejected"]
+    return Row(
+        "two spheres, 250 rad/s, 4 s", happens, error, 1e-8, "greatest rise, relative", steps, run.cpu, ride.status
+    )
+
+
+def leaning_on_the_stem() -> Row:
+    """Too slow to rise: it rocks between sphere and stem, ever less, and ends on both."""
+    scene = tippe.Scene(leine_glocker_top(), friction=tippe.Coulomb(0.3, 0.05), contact="hybrid")
+    run = timed(lambda: tippe.inversion_table(scene, theta=0.1, spin=120.0, t1=8.0), 1)
+    table = run.result
+    error = abs(float(table.end_theta) - float(first_contact(scene.body)))
+    happens = "rocks, rests on both: said so"
+    status = str(table.status)
+    error = error if status == "both_contacts" else np.inf
+    return Row(
+        "two spheres, 120 rad/s", happens, error, 1e-7, "closed form, theta [rad]", int(table.steps), run.cpu, status
+    )
+
+
+def rows() -> list[Callable[[], Row]]:
+    """The rows of this file, in the order of the table."""
+    return [
+        hops,
+        bounces,
+        coulomb_hops,
+        over_to_the_stem,
+        jellett_through_hops,
+        energy_through_hops,
+        leaning_on_the_stem,
+    ]

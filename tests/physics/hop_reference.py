@@ -1,0 +1,285 @@
+"""A top that hops, slides and changes to its stem: a reference in plain NumPy and SciPy, SI units.
+
+The body is a rigid body in space: place s and velocity u of the centre of mass, axis e, angular velocity w, all in the fixed
+frame, with Euler's equations J w' = M - w x J w, J = I1 + (I3 - I1) e e^T, and e' = w x e. A ball of the body has its centre
+at s + a e and radius R. In contact the normal force N is the one that keeps the ball's height where it is: its acceleration is
+affine in N, so two evaluations give N. Flight is the same equations without the force, integrated like everything else.
+Impact: d(velocities)/dp = the response to the force (f(v), 1), p the normal impulse, until the ball's normal velocity is
+-restitution times what it was; for viscous friction that is a linear equation, solved by the matrix exponential, for
+Coulomb's regularised law it is integrated. A rebound slower than 1e-5 sqrt(g R) closes the contact.
+
+Run: python hop_reference.py   writes hop_reference.csv (some minutes). Nothing here is shared with the simulator.
+"""
+
+import csv
+from dataclasses import asdict, dataclass, fields
+from math import cos, inf, pi, sin, sqrt
+from pathlib import Path
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.optimize import brentq
+
+CLOSING = 1e-5
+UP = np.array((0.0, 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class Case:
+    """Top, friction, restitution and launch; `stem_radius` 0 is a top without stem, `slip_speed` 0 viscous friction."""
+
+    mass: float
+    radius: float
+    offset: float
+    I1: float
+    I3: float
+    mu: float
+    theta: float
+    spin: float
+    restitution: float = 0.0
+    slip_speed: float = 0.0
+    stem_radius: float = 0.0
+    stem_offset: float = 0.0
+    gravity: float = 9.81
+    t1: float = 20.0
+    angle: float = 0.95 * pi
+
+    @property
+    def balls(self):
+        """(offset, radius) of the spheres that can touch."""
+        stem = [(self.stem_offset, self.stem_radius)] if self.stem_radius else []
+        return [(self.offset, self.radius), *stem]
+
+
+def cross(x, y):
+    return np.array((x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]))
+
+
+def split(state):
+    """s, u, e, w."""
+    return state[:3], state[3:6], state[6:9], state[9:12]
+
+
+def friction(case, slip):
+    """Tangential force per unit normal force."""
+    size = sqrt(slip @ slip + case.slip_speed**2) if case.slip_speed else 1.0
+    return -case.mu / size * slip
+
+
+def solve_inertia(case, e, torque):
+    """J^-1 torque."""
+    along = (torque @ e) * e
+    return (torque - along) / case.I1 + along / case.I3
+
+
+def arm(ball, e):
+    """From the centre of mass to the contact point."""
+    return ball[0] * e - ball[1] * UP
+
+
+def accelerations(case, state, ball, force):
+    """u', w' and the acceleration of the ball's centre along the normal, for a force at its contact point."""
+    _, _, e, w = split(state)
+    spin_momentum = case.I1 * w + (case.I3 - case.I1) * (w @ e) * e
+    torque = cross(arm(ball, e), force)
+    w_dot = solve_inertia(case, e, torque - cross(w, spin_momentum))
+    u_dot = force / case.mass - case.gravity * UP
+    e_dot = cross(w, e)
+    return u_dot, w_dot, u_dot[2] + ball[0] * (cross(w_dot, e) + cross(w, e_dot))[2]
+
+
+def contact_force(case, state, ball):
+    """N [N] of a ball that stays on the plane, and the accelerations without force and for N = 1."""
+    _, u, e, w = split(state)
+    slip = u + cross(w, arm(ball, e))
+    slip[2] = 0.0
+    free = accelerations(case, state, ball, 0.0 * UP)
+    unit = accelerations(case, state, ball, friction(case, slip) + UP)
+    return free[2] / (free[2] - unit[2]), free, unit
+
+
+def rate(case, state, ball):
+    """Rate of the state; `ball` is the one on the plane, or None in flight."""
+    _, u, e, w = split(state)
+    if ball is None:
+        u_dot, w_dot, _ = accelerations(case, state, (0.0, 0.0), 0.0 * UP)
+    else:
+        N, free, unit = contact_force(case, state, ball)
+        u_dot, w_dot = (x + N * (y - x) for x, y in zip(free[:2], unit[:2], strict=True))
+    return np.concatenate((u, u_dot, cross(w, e), w_dot))
+
+
+def gap(ball, state):
+    return state[2] + ball[0] * state[8] - ball[1]
+
+
+def gap_rate(ball, state):
+    _, u, e, w = split(state)
+    return u[2] + ball[0] * cross(w, e)[2]
+
+
+def energy(case, state):
+    s, u, e, w = split(state)
+    rotation = case.I1 * (w @ w) + (case.I3 - case.I1) * (w @ e) ** 2
+    return (case.mass * (u @ u) + rotation) / 2 + case.mass * case.gravity * s[2]
+
+
+def strike(case, state, ball):
+    """The state after the impact of a ball, and whether it bounces."""
+    s, u, e, w = split(state)
+    r = arm(ball, e)
+    before = u + cross(w, r)
+    response = np.array([d / case.mass + cross(solve_inertia(case, e, cross(r, d)), r) for d in np.eye(3)]).T
+    bounces = -case.restitution * before[2] > CLOSING * sqrt(case.gravity * case.radius)
+    wanted = -case.restitution * before[2] if bounces else 0.0
+    if case.slip_speed:
+
+        def change(_, P):
+            velocity = before + response @ P
+            velocity[2] = 0.0
+            return friction(case, velocity) + UP
+
+        def reaches(_, P):
+            return (before + response @ P)[2] - wanted
+
+        reaches.terminal = True
+        most = 3.0 * (wanted - before[2]) / response[2, 2]
+        run = solve_ivp(change, (0.0, most), np.zeros(3), method="DOP853", rtol=1e-12, atol=1e-18, events=reaches)
+        impulse = run.y_events[0][0]
+    else:
+        # P' = -mu (before + response P) along the plane, 1 along the normal: P(p) from one exponential.
+        matrix = np.zeros((4, 4))
+        matrix[:2, :3], matrix[:2, 3], matrix[2, 3] = -case.mu * response[:2], -case.mu * before[:2], 1.0
+
+        def after(p):
+            return expm(p * matrix)[:3, 3]
+
+        most = 3.0 * (wanted - before[2]) / response[2, 2]
+        p = brentq(lambda p: (before + response @ after(p))[2] - wanted, 0.0, most, xtol=1e-20, rtol=1e-15)
+        impulse = after(p)
+    return np.concatenate((s, u + impulse / case.mass, e, w + solve_inertia(case, e, cross(r, impulse)))), bounces
+
+
+def launch(case):
+    """State at the start, on the ball that is lower, and that ball's number."""
+    e = np.array((sin(case.theta), 0.0, cos(case.theta)))
+    heights = [radius - offset * e[2] for offset, radius in case.balls]
+    number = int(np.argmax(heights))
+    return np.concatenate((heights[number] * UP, np.zeros(3), e, case.spin * e)), number
+
+
+def watched(function, direction):
+    """An event of solve_ivp that ends the run."""
+
+    def event(_, state):
+        return function(state)
+
+    event.terminal, event.direction = True, direction
+    return event
+
+
+def follow(case, rtol=1e-12, flight_step=2e-4, contact_step=2.5e-4):
+    """Run until theta reaches the angle, or t1.
+
+    Returns (status, time [s] of the angle, end state, flights, list of (time, ball) at which a ball came to the plane,
+    energies at the ends of all pieces)."""
+    state, number = launch(case)
+    time, flying, flights, contacts, energies = 0.0, False, 0, [], [energy(case, state)]
+    swing = sqrt(case.gravity / case.radius)
+    absolute = rtol * np.repeat((case.radius, swing * case.radius, 1.0, swing), 3)
+    inverts = watched(lambda y: y[8] - cos(case.angle), -1.0)
+    while True:
+        ball = None if flying else case.balls[number]
+        if flying:
+            ends = [watched(lambda y, ball=ball: gap(ball, y), -1.0) for ball in case.balls]
+        else:
+            ends = [watched(lambda y, ball=ball: contact_force(case, y, ball)[0], -1.0)]
+            ends += [watched(lambda y, b=b: gap(b, y), -1.0) for k, b in enumerate(case.balls) if k != number]
+        # A short bounce must not hide within the first step.
+        speed = gap_rate(case.balls[number], state) if flying else 0.0
+        first = min(0.2 * speed / case.gravity, flight_step) if speed > 1e-9 else None
+        run = solve_ivp(
+            lambda _, y, ball=ball: rate(case, y, ball),
+            (time, case.t1),
+            state,
+            method="DOP853",
+            rtol=rtol,
+            atol=absolute,
+            first_step=first if first is None else min(first, case.t1 - time),
+            max_step=flight_step if flying else contact_step,
+            events=[inverts, *ends],
+        )
+        time, state = run.t[-1], run.y[:, -1]
+        state[6:9] /= np.linalg.norm(state[6:9])
+        energies.append(energy(case, state))
+        if run.status == 0:
+            return "not_inverted", inf, state, flights, contacts, energies
+        which = next(k for k, times in enumerate(run.t_events) if len(times))
+        if which == 0:
+            return "inverted", time, state, flights, contacts, energies
+        if not flying and which == 1:
+            flying, flights = True, flights + 1
+            continue
+        number = which - 1 if flying else 1 - number
+        ball = case.balls[number]
+        # The ball is on the plane exactly; what the event left is round-off.
+        state[2] = ball[1] - ball[0] * state[8]
+        state, flying = strike(case, state, ball)
+        contacts.append((time, number))
+        if not flying:
+            state[5] -= gap_rate(ball, state)
+            flying = contact_force(case, state, ball)[0] <= 0.0
+        flights += flying
+
+
+MR2 = 0.02 * 0.02**2
+RUTSTAM = dict(mass=0.02, radius=0.02, offset=0.006, I1=131 / 350 * MR2, I3=0.4 * MR2, mu=0.3, theta=0.1)
+LEINE_GLOCKER = dict(mass=6e-3, radius=0.015, offset=3e-3, I1=8e-7, I3=7e-7, stem_radius=5e-3, stem_offset=0.016)
+
+CASES = (
+    Case(**RUTSTAM, spin=180.0),
+    Case(**RUTSTAM, spin=200.0),
+    Case(**RUTSTAM, spin=250.0),
+    Case(**RUTSTAM, spin=280.0),
+    Case(**RUTSTAM, spin=200.0, restitution=0.5),
+    Case(**RUTSTAM, spin=155.0, slip_speed=0.05),
+    Case(**RUTSTAM, spin=180.0, slip_speed=0.1, restitution=0.3),
+    Case(**LEINE_GLOCKER, mu=0.3, slip_speed=0.05, theta=0.1, spin=180.0, t1=8.0),
+    Case(**LEINE_GLOCKER, mu=0.3, theta=0.1, spin=200.0, t1=20.0),
+)
+
+RESULTS = ("status", "time", "end_theta", "flights", "landings", "last_landing", "end_energy")
+
+
+def row(case, **accuracy):
+    """What the table holds of a case."""
+    status, time, state, flights, contacts, energies = follow(case, **accuracy)
+    last = contacts[-1][0] if contacts else inf
+    theta = np.arctan2(np.hypot(state[6], state[7]), state[8])
+    return dict(zip(RESULTS, (status, time, theta, flights, len(contacts), last, energies[-1]), strict=True))
+
+
+def main():
+    """Write the file next to this script."""
+    with open(Path(__file__).with_name("hop_reference.csv"), "w", newline="") as file:
+        names = [field.name for field in fields(Case)]
+        table = csv.DictWriter(file, [*names, *RESULTS, "reference_error"], lineterminator="\n")
+        table.writeheader()
+        for case in CASES:
+            fine, check = row(case), row(case, rtol=3e-11, flight_step=1e-4, contact_step=2e-3)
+            error = max(
+                abs(fine[name] / check[name] - 1)
+                for name in ("time", "end_theta", "end_energy")
+                if np.isfinite(fine[name])
+            )
+            same = fine["flights"] == check["flights"] and fine["status"] == check["status"]
+            print(case, fine, error, same, sep="\n  ", flush=True)
+            table.writerow(
+                {k: v if isinstance(v, str) else float(v) for k, v in (asdict(case) | fine).items()}
+                | {"reference_error": float(error)}
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,397 @@
+"""Flights, impacts and the stem: an independent event-driven reference, closed forms, conservation, brute force."""
+
+import csv
+import math
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close, rutstam_top
+from hop_reference import CASES, Case, row
+from hop_reference import strike as reference_strike
+
+import tippe
+from tippe.hybrid.flight import Descent, angle_reached, cone, flown, landing
+from tippe.hybrid.free_body import FreeBody, angular_velocity, balls, energy, gap_rate, jellett, standing_on
+from tippe.hybrid.impact import strike
+from tippe.hybrid.stem import first_contact, standing_spin
+
+with open(Path(__file__).with_name("hop_reference.csv")) as file:
+    REFERENCE = list(csv.DictReader(file))
+
+
+def leine_glocker_top() -> tippe.Top:
+    """The top of Leine and Glocker (2003), with its stem."""
+    return tippe.Top(6e-3, 0.015, 3e-3, 8e-7, 7e-7, stem=tippe.Stem(radius=5e-3, offset=0.016))
+
+
+def scene_of(case: Case, restitution: float | None = None) -> tippe.Scene:
+    """The scene of a reference case."""
+    stem = tippe.Stem(case.stem_radius, case.stem_offset) if case.stem_radius else None
+    friction = tippe.Coulomb(case.mu, case.slip_speed) if case.slip_speed else tippe.Viscous(case.mu)
+    top = tippe.Top(case.mass, case.radius, case.offset, case.I1, case.I3, stem)
+    given = case.restitution if restitution is None else restitution
+    return tippe.Scene(top, tippe.Plane(), friction, case.gravity, contact="hybrid", restitution=given)
+
+
+def check_against_reference(table: tippe.Table, place: tuple[int, ...], expected: dict[str, str]) -> None:
+    """A cell that inverts at the reference's time, after as many flights; the errors seen are below 2e-9."""
+    assert table.status[place] == expected["status"]
+    assert_close(table.time[place], float(expected["time"]), rtol=1e-8)
+    assert table.hops[place] == int(float(expected["flights"]))
+    assert_close(table.end_theta[place], float(expected["end_theta"]), atol=1e-8)
+
+
+SPINS, RESTITUTIONS = [180.0, 200.0, 250.0, 280.0], [0.0, 0.5]
+
+
+@pytest.fixture(scope="module")
+def hopping_table() -> tippe.Table:
+    """Rutstam's top at spins at which it hops, with and without restitution."""
+    axes = {"scene.restitution": RESTITUTIONS}
+    return tippe.inversion_table(scene_of(CASES[0], 0.1), theta=0.1, spin=SPINS, axes=axes, t1=20.0, tolerance=1e-11)
+
+
+def test_inversion_times_through_hops(hopping_table):
+    """The top lands and inverts after all, after 7 to 333 flights; NumPy and SciPy by other equations see the same."""
+    for case, expected in zip(CASES[:5], REFERENCE[:5], strict=True):
+        place = (SPINS.index(case.spin), RESTITUTIONS.index(case.restitution))
+        check_against_reference(hopping_table, place, expected)
+    assert (hopping_table.status == "inverted").all()
+
+
+def test_a_cell_does_not_depend_on_its_neighbours(hopping_table):
+    axes = {"scene.restitution": [0.5, 0.0]}
+    spins = [280.0, 150.0, 200.0]
+    other = tippe.inversion_table(scene_of(CASES[0], 0.1), theta=0.1, spin=spins, axes=axes, t1=20.0, tolerance=1e-11)
+    for spin in (200.0, 280.0):
+        # The order of the axes' values is turned round.
+        assert_close(other.time[spins.index(spin), ::-1], hopping_table.time[SPINS.index(spin)], rtol=1e-12)
+        np.testing.assert_array_equal(other.hops[spins.index(spin), ::-1], hopping_table.hops[SPINS.index(spin)])
+    # Where contact is never lost restitution makes no difference.
+    assert other.hops[1].tolist() == [0, 0]
+    assert other.time[1, 0] == other.time[1, 1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(5, len(CASES)))
+def test_coulomb_hops_and_the_stem(number):
+    case = CASES[number]
+    table = tippe.inversion_table(scene_of(case), theta=case.theta, spin=[case.spin], t1=case.t1, tolerance=1e-11)
+    check_against_reference(table, (0,), REFERENCE[number])
+
+
+@pytest.mark.slow
+def test_the_reference_is_what_its_program_writes():
+    for number in (5, 7):
+        found = row(CASES[number])
+        assert_close(found["time"], float(REFERENCE[number]["time"]), rtol=1e-9)
+        assert found["flights"] == float(REFERENCE[number]["flights"])
+
+
+@pytest.mark.slow
+def test_time_converges_through_events():
+    """The error falls with the tolerance through 23 flights and impacts, in proportion."""
+    scene, exact = scene_of(CASES[1]), float(REFERENCE[1]["time"])
+    times = [
+        tippe.inversion_table(scene, theta=0.1, spin=[200.0], t1=20.0, tolerance=tol).time[0] for tol in (1e-7, 1e-9)
+    ]
+    errors = np.abs(np.array(times) - exact)
+    assert 30.0 < errors[0] / errors[1] < 300.0
+
+
+@pytest.mark.slow
+def test_last_crossing_through_flights():
+    """The last crossing is the one after which theta stays above, whether it is passed on the plane or in the air."""
+    scene = scene_of(CASES[1])
+    angle = 1.9
+    arguments = {"theta": 0.1, "spin": [200.0], "t1": 6.3, "tolerance": 1e-10, "angle": angle}
+    last = tippe.inversion_table(scene, crossing="last", **arguments)
+    first = tippe.inversion_table(scene, **arguments)
+    run = tippe.simulate(scene, tippe.Launch(0.1, 200.0), 6.3, times=np.linspace(0.0, 6.3, 200_001), tolerance=1e-10)
+    above = run.theta >= angle
+    crossings = run.t[1:][above[1:] & ~above[:-1]]
+    assert last.status[0] == first.status[0] == "inverted"
+    assert len(crossings) > 1
+    assert_close(last.time[0], crossings[-1], atol=4e-5)
+    assert_close(first.time[0], crossings[0], atol=4e-5)
+
+
+# The stem
+
+
+@pytest.fixture(scope="module")
+def ride() -> tippe.HybridTrajectory:
+    """Leine and Glocker's top: it hops, goes over to its stem and spins on it."""
+    scene = tippe.Scene(leine_glocker_top(), friction=tippe.Coulomb(0.3, 0.05), contact="hybrid")
+    return tippe.simulate(scene, tippe.Launch(0.1, 250.0), 4.0, tolerance=1e-10)
+
+
+def test_the_top_goes_over_to_its_stem(ride):
+    assert ride.status == "reached t1"
+    assert set(ride.contact) == {-1, 0, 1}
+    assert ride.contact[-1] == 1
+    assert len(ride.hops) > 10
+    assert ride.theta[-1] > 3.0
+    # It stands on its stem, faster than it must.
+    assert abs(ride.spin[-1]) > standing_spin(ride.scene.body)
+    changes = np.flatnonzero((ride.contact[1:] == 1) & (ride.contact[:-1] == 0))
+    assert_close(ride.theta[changes], float(first_contact(ride.scene.body)), atol=2e-7)
+
+
+def test_nothing_enters_the_plane_and_nothing_pulls(ride):
+    height, lean = ride.position[:, 2], np.cos(ride.theta)
+    assert np.min(height - 0.015) > -1e-10
+    assert np.min(height + 0.013 * lean - 0.005) > -1e-10
+    assert np.min(ride.normal_force) > -1e-8 * 6e-3 * 9.81
+    assert np.all(ride.normal_force[ride.contact == -1] == 0.0)
+
+
+def test_energy_falls_and_jellett_stays_through_hops(ride):
+    """Energy never grows; Jellett's quantity is that of the sphere that touches, in flights and impacts too."""
+    assert np.max(np.diff(ride.energy)) < 1e-8 * ride.energy[0]
+    assert ride.stats["energy_residual"] < 1e-9 * ride.energy[0]
+    assert ride.stats["impact_loss"] > 0.0
+    on_stem = np.flatnonzero(ride.contact == 1)
+    before = ride.jellett[: on_stem[0]]
+    assert np.sum(ride.contact[: on_stem[0]] == -1) > 10
+    assert_close(before, before[0], rtol=1e-9)
+    # From the last time that the sphere touches, that of the stem.
+    last = np.flatnonzero(ride.contact == 0)[-1] + 1
+    stem = jellett(balls(ride.scene.body)[1], ride._free)[last:]
+    assert_close(stem, stem[0], rtol=1e-9)
+    assert abs(ride.jellett[-1] / before[0] - 1.0) > 1e-3
+
+
+def test_a_ride_at_other_times_is_the_same(ride):
+    ends = np.sort(ride.hops.ravel())
+    some, middles = ride.t[::7], ride.hops.mean(axis=1)
+    times = np.unique(np.concatenate([some, middles, ends, ends + 1e-9]))
+    again = ride.at(times)
+
+    def places(of):
+        return np.searchsorted(times, of)
+
+    for name in ("theta", "energy", "spin_angle"):
+        assert_close(getattr(again, name)[places(some)], getattr(ride, name)[::7], rtol=1e-12, atol=1e-12)
+    assert np.all(again.contact[places(middles)] == -1)
+    # Positions are continuous, also where velocities are not.
+    assert_close(again.position[places(ends + 1e-9)], again.position[places(ends)], atol=1e-8)
+    assert "flights" in str(ride)
+    with pytest.raises(ValueError, match=r"must be at most .* \(the run ends there\)"):
+        ride.at([4.5])
+
+
+def test_closed_forms_of_the_stem():
+    """The literature's 2.448 rad, and 88.11 rad/s as the spin at which an eigenvalue changes sign."""
+    top = leine_glocker_top()
+    assert_close(first_contact(top), 2.44843, atol=5e-6)
+    assert_close(standing_spin(top), 88.11, atol=5e-3)
+    scene = tippe.Scene(top, friction=tippe.Viscous(0.3), contact="hybrid")
+    dynamics = standing_on(scene.dynamics, balls(top)[1])
+    jacobian = jax.jit(jax.jacfwd(dynamics.field))
+
+    def growth(spin):
+        state = jnp.array([0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, -7e-7 * spin])
+        # |e| and the spin are neutral.
+        kept = np.array([0, 1, 2, 3, 5, 6])
+        return np.max(np.linalg.eigvals(np.asarray(jacobian(state))[np.ix_(kept, kept)]).real)
+
+    assert growth(0.97 * 88.11) > 1e-3
+    # Two more are neutral: a circular slide of the tilted, slipless top does not exist above the threshold.
+    assert growth(1.03 * 88.11) < 1e-9
+
+
+# Flight
+
+
+search = eqx.filter_jit(landing)
+
+
+def random_descents(count: int, seed: int) -> Descent:
+    """Distances of every kind: high and low, fast and slow, with many waves and with less than one."""
+    random = np.random.default_rng(seed)
+    rate = 10.0 ** random.uniform(0.0, 3.0, count)
+    amplitude, phase = 10.0 ** random.uniform(-4.0, -2.0, count), random.uniform(0.0, 2.0 * np.pi, count)
+    start = np.where(random.random(count) < 0.5, 0.0, 10.0 ** random.uniform(-6.0, -2.0, count))
+    speed = 1e-3 + random.uniform(0.0, 1.0, count) ** 3 - np.where(start > 0.0, 0.3, 0.0)
+    cosine, sine = amplitude * np.cos(phase), amplitude * np.sin(phase)
+    return Descent(*map(jnp.asarray, (start, speed, np.full(count, 9.81), rate, cosine, sine)))
+
+
+def test_landings_by_brute_force():
+    """No root is missed: the first sign change on 100 000 samples, refined, for 300 random flights."""
+    descent = random_descents(300, 1)
+    time, lost = search(descent, jnp.full(300, 10.0))
+    assert not np.asarray(lost).any()
+    assert np.isfinite(time).all()
+    values = np.asarray(jax.jit(lambda d, t: d.value(t))(descent, time))
+    assert np.max(np.abs(values)) < 1e-15
+    for i in range(300):
+        one = [float(number[i]) for number in descent]
+
+        def value(t, one=one):
+            start, speed, gravity, rate, cosine, sine = one
+            swing = cosine * (1.0 - np.cos(rate * t)) + sine * (rate * t - np.sin(rate * t))
+            return start + speed * t - gravity * t * t / 2.0 - swing
+
+        samples = np.linspace(1e-9, 1.01 * float(time[i]), 100_000)
+        negative = np.flatnonzero(value(samples) < -1e-16)
+        assert negative.size
+        assert abs(samples[negative[0]] - float(time[i])) <= 2.0 * (samples[1] - samples[0]) + 1e-9
+
+
+def test_a_flight_that_begins_with_the_third_power_of_time():
+    """From N = 0 the distance is c (W t)^3 / 6 - g t^2 (W t)^2 / 24 at first: a graze of 1e-9 m and its landing are seen."""
+    rate, gravity = 200.0, 9.81
+    slopes = -(10.0 ** np.linspace(-7.0, -5.0, 300))
+    one = np.ones(300)
+    descent = Descent(
+        *map(jnp.asarray, (0 * one, 0 * one, gravity * one, rate * one, -gravity / rate**2 * one, slopes))
+    )
+    time, lost = search(descent, jnp.asarray(one))
+    assert not np.asarray(lost).any()
+    first_order = 4.0 * -slopes * rate / gravity
+    assert_close(time, first_order, rtol=2e-2)
+
+
+def test_flight_is_the_free_motion():
+    """Closed form against Euler's equations, differentiated: e' = L x e / I1, and the angle's time is when it is reached."""
+    body = rutstam_top()
+    free = free_bodies(6, 2)
+    time = jnp.linspace(0.01, 0.05, 6)
+    later, rate = jax.jvp(lambda t: flown(body, 9.81, free, t), (time,), (jnp.ones(6),))
+    e, L = np.stack(later.axis), np.stack(free.momentum)
+    assert_close(np.stack(rate.axis), np.cross(L, e, axis=0) / float(body.I1), atol=1e-9)
+    assert_close(np.linalg.norm(e, axis=0), 1.0, atol=1e-14)
+    assert_close(energy(body, 9.81, later), energy(body, 9.81, free), rtol=1e-13)
+    for last in (False, True):
+        cos_angle = cone(body, free).along[2] + 0.01
+        reached = angle_reached(body, free, cos_angle, 0.5 * jnp.ones(6), last)
+        assert np.isfinite(reached).all()
+        there, onwards = jax.jvp(lambda t: flown(body, 9.81, free, t).axis[2], (reached,), (jnp.ones(6),))
+        assert_close(there, cos_angle, atol=1e-12)
+        assert np.all(onwards < 0.0)
+
+
+# Impact
+
+
+def free_bodies(count: int, seed: int) -> FreeBody:
+    """Bodies that fall on the plane, with any axis and turning fast."""
+    random = np.random.default_rng(seed)
+    axis = random.normal(size=(3, count))
+    axis /= np.linalg.norm(axis, axis=0)
+    momentum = 3.2e-6 * 100.0 * random.normal(size=(3, count))
+    velocity = np.concatenate([random.normal(scale=0.3, size=(2, count)), -3.0 * np.ones((1, count))])
+    return FreeBody(
+        tuple(jnp.asarray(velocity)), jnp.full(count, 0.02), tuple(jnp.asarray(axis)), tuple(jnp.asarray(momentum))
+    )
+
+
+@pytest.mark.parametrize("slip_speed", [0.0, pytest.param(0.05, marks=pytest.mark.slow)])
+def test_impacts(slip_speed):
+    """Against a matrix exponential or SciPy; Newton's restitution; Jellett's quantity to round-off; energy never grows."""
+    case = Case(0.02, 0.02, 0.006, 131 / 350 * 8e-6, 3.2e-6, 0.3, 0.1, 0.0, slip_speed=slip_speed)
+    body, friction = rutstam_top(), scene_of(case).friction
+    ball, free = balls(body)[0], free_bodies(60, 3)
+    restitution = jnp.asarray(np.repeat([0.0, 0.5, 1.0], 20))
+    after, jams = eqx.filter_jit(strike)(body, friction, ball, free, restitution)
+    assert not np.asarray(jams).any()
+    assert_close(jellett(ball, after), jellett(ball, free), atol=1e-20)
+    lost = energy(body, 9.81, free) - energy(body, 9.81, after)
+    assert np.min(lost) > -1e-12
+    # Newton's restitution, unless it would take energy from nowhere.
+    approach, rebound = -gap_rate(body, ball, free), gap_rate(body, ball, after)
+    full = np.abs(rebound - restitution * approach) < 1e-12
+    assert full[:40].all()
+    assert full.sum() > 50
+    assert np.all((rebound <= restitution * approach + 1e-12) & (full | (np.abs(lost) < 1e-9)))
+    before, found = state_of(body, free), state_of(body, after)
+    for i in np.flatnonzero(full)[::6]:
+        one = Case(**{**case.__dict__, "restitution": float(restitution[i])})
+        expected, _ = reference_strike(one, before[:, i], (0.006, 0.02))
+        assert_close(found[:, i], expected, rtol=1e-9, atol=1e-9)
+
+
+def state_of(body: tippe.Top, free: FreeBody) -> np.ndarray:
+    """Place, velocity, axis and angular velocity, as the reference has them."""
+    turning = angular_velocity(body, free.axis, free.momentum)
+    zero = jnp.zeros_like(free.height)
+    return np.stack([zero, zero, free.height, *free.velocity, *free.axis, *turning])
+
+
+# In a cylinder, from its wall
+
+
+def test_a_start_on_the_wall_has_contact():
+    """At eta = pi/2 the normal force starts from 0 as 3/2 m g^2 t^2 / (rho (1 + m a A)) (tippe.md, section 8)."""
+    top = rutstam_top()
+    scene = tippe.Scene(top, tippe.Cylinder(0.3), tippe.Viscous(0.3))
+    launch = tippe.Launch(np.array([0.1, 0.5, 1.2]), 78.125 * np.ones(3), math.pi / 2.0 * np.ones(3), np.zeros(3))
+    state, dynamics = scene.state(launch), scene.dynamics
+    # The friction is that of the slip at the start; 1 + m a A is the slope of the equation for N.
+    weight, rho, a, R = 0.02 * 9.81, 0.28, 0.006, 0.02
+    field = eqx.filter_jit(dynamics.field)
+    h, steps = 2e-5, 100
+    for _ in range(steps):
+        k1 = field(state)
+        k2 = field(state + h / 2 * k1)
+        k3 = field(state + h / 2 * k2)
+        state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + field(state + h * k3))
+    motion = dynamics.motion(scene.state(launch))
+    e = np.asarray(scene.state(launch)[2:5])
+    along = motion.friction[0] * e[0] + motion.friction[1] * e[1]
+    A = (a * (1.0 - e[2] ** 2) + (R - a * e[2]) * along) / float(top.I1)
+    expected = 1.5 * weight * 9.81 * (h * steps) ** 2 / (rho * (1.0 + 0.02 * a * A))
+    assert_close(scene.normal_force(state) / expected, 1.0, atol=6e-3)
+
+
+def test_a_table_starts_on_the_wall():
+    scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Viscous(0.3))
+    etas = [math.pi / 2.0 - 1e-9, math.pi / 2.0]
+    table = tippe.inversion_table(scene, theta=[0.1, 0.5, 1.2], spin=78.125, eta=etas, t1=2e-3)
+    assert (table.status == "not_inverted").all()
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda top: tippe.Scene(top, contact="fly"), "contact = 'fly' must be 'stop' or 'hybrid'"),
+        (lambda top: tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), contact="hybrid"), r"must be on a Plane\(\)"),
+        (lambda top: tippe.Scene(top), "contact = 'stop' must be 'hybrid' for a top with a stem"),
+        (lambda top: tippe.Scene(rutstam_top(), restitution=0.5), "restitution = .* must be left out where contact"),
+        (lambda top: tippe.Scene(top, contact="hybrid", restitution=1.5), "restitution = 1.5 must be at most 1.0"),
+        (lambda top: tippe.Stem(0.0, 0.02), "stem radius = 0.0 must be greater than 0.0"),
+        (lambda top: tippe.Top(6e-3, 0.015, 3e-3, 8e-7, 7e-7, tippe.Stem(5e-3, 0.01)), "neither sphere lies within"),
+        (lambda top: tippe.Top(6e-3, 0.015, 3e-3, 8e-7, 7e-7, 0.3), "stem = 0.3 must be a Stem"),
+        (lambda top: first_contact(rutstam_top()), "stem = None must be a Stem"),
+        (
+            lambda top: tippe.inversion_time(tippe.Scene(top, contact="hybrid"), tippe.Launch(0.1, 100.0), 1.0),
+            "contact = 'hybrid' must be 'stop' for inversion_time",
+        ),
+        (
+            lambda top: tippe.inversion_table(
+                tippe.Scene(top, contact="hybrid"), theta=0.1, spin=100.0, t1=1.0, method="diffrax"
+            ),
+            "method = 'diffrax' must be 'ensemble'",
+        ),
+        (
+            lambda top: jax.jit(
+                lambda spin: (
+                    tippe.simulate(tippe.Scene(top, contact="hybrid"), tippe.Launch(0.1, spin), 1.0, times=[1.0]).t
+                )
+            )(100.0),
+            "contact = 'hybrid' must be 'stop' inside jit",
+        ),
+    ],
+)
+def test_what_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make(leine_glocker_top())

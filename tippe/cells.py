@@ -1,0 +1,104 @@
+"""How the cells of a table are run: the kinds of runs that scenes have, and what each finds."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nonholonomic.ensemble import Outcome, compiled_march, lanes_for
+from nonholonomic.lockstep import FAILED, GUARD_LOST
+from nonholonomic.paths import with_numbers
+from nonholonomic.reference import march_by_diffrax
+from nonholonomic.sweep import Variable
+
+from .hybrid.cells import hybrid_cells
+from .inversion import ABSOLUTE, InversionProblem, is_inverted
+from .scene import Scene
+from .sensitivities import slopes_of_cells
+
+
+class Kind(NamedTuple):
+    """A kind of runs: the words of its status, the variables it has besides, and how they are found.
+
+    `in_phases` takes (scene, launch, t1, angle, tolerance, last, solver, size, count); `None` for runs of one smooth motion.
+    """
+
+    words: tuple[str, ...]
+    counts: tuple[str, ...]
+    in_phases: Callable[..., dict[str, Any]] | None
+
+    @property
+    def smooth(self) -> bool:
+        """Whether a run is one smooth motion."""
+        return self.in_phases is None
+
+    @property
+    def variables(self) -> dict[str, Variable]:
+        """The table's variables."""
+        found = {"time": Variable("s", np.float64), "status": Variable("1", np.int8, self.words)}
+        found |= {"end_time": Variable("s", np.float64), "end_theta": Variable("rad", np.float64)}
+        return found | {name: Variable("1", np.int64) for name in ("steps", "rejected", *self.counts)}
+
+
+WORDS = ("inverted", "not_inverted", "contact_lost", "failed")
+SMOOTH = Kind(WORDS, (), None)
+HYBRID = Kind((*WORDS, "unresolved", "both_contacts"), ("hops",), hybrid_cells)
+
+
+def kind_of(scene: Scene) -> Kind:
+    """The kind of a scene's runs."""
+    return HYBRID if scene.contact == "hybrid" else SMOOTH
+
+
+class Runs(NamedTuple):
+    """What is asked of every cell of a table; see `inversion_table`."""
+
+    kind: Kind
+    t1: float
+    angle: float
+    last: bool
+    solver: diffrax.AbstractERK
+    method: str
+    paths: list[str]
+
+    def results(self, roots: dict[str, Any], columns: dict[str, Any], tolerance: float, count: int) -> dict[str, Any]:
+        """The variables of some cells.
+
+        **Arguments:** `roots`: scene and launch; `columns`: path of a number -> its value in every cell, the first `count`
+        of which are to be run; `tolerance`: relative tolerance.
+        """
+        cells = with_numbers(roots, columns)
+        scene, launch = cells["scene"], cells["launch"]
+        size = next((len(values) for values in columns.values()), 1)
+        if self.kind.in_phases is not None:
+            return self.kind.in_phases(
+                scene, launch, self.t1, self.angle, tolerance, self.last, self.solver, size, count
+            )
+        problem = InversionProblem.of(scene, launch, self.angle, size)
+        if not self.paths:
+            return self._named(scene, problem, self._outcome(problem, tolerance, count, size))
+        options = {"count": count, "size": size, "solver": self.solver, "last": self.last}
+        outcome, slopes = slopes_of_cells(roots, columns, self.paths, self.angle, self.t1, tolerance, **options)
+        return self._named(scene, problem, outcome) | slopes
+
+    def _outcome(self, problem: InversionProblem, tolerance: float, count: int, size: int) -> Outcome:
+        horizon, rtol = jnp.asarray(self.t1), jnp.asarray(tolerance, float)
+        if self.method == "diffrax":
+            return march_by_diffrax(problem, horizon, rtol, ABSOLUTE * rtol, solver=self.solver)
+        options = {"solver": self.solver, "lanes": lanes_for(size), "passes": self.last}
+        return compiled_march(problem, horizon, jnp.asarray(count), rtol, ABSOLUTE * rtol, **options)[0]
+
+    def _named(self, scene: Scene, problem: InversionProblem, outcome: Outcome) -> dict[str, Any]:
+        inverted = is_inverted(outcome, problem, self.last)
+        code = np.select([inverted, outcome.status == GUARD_LOST, outcome.status == FAILED], [0, 2, 3], 1)
+        return {
+            "time": np.where(inverted, outcome.crossing_time, np.inf),
+            "status": code.astype(np.int8),
+            "end_time": np.asarray(outcome.end_time),
+            "end_theta": np.asarray(jax.vmap(scene.theta, 1)(outcome.state)),
+            "steps": np.asarray(outcome.steps),
+            "rejected": np.asarray(outcome.rejected),
+        }

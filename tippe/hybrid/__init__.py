@@ -1,0 +1,1 @@
+"""Contact loss, flight, landing and the stem: scenes with `contact="hybrid"`."""
