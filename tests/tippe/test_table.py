@@ -162,7 +162,7 @@ def test_save_and_load_return_the_same(table, tmp_path):
     assert loaded.words == table.words
     # The numbers that stand for the words are the same in every file.
     with h5py.File(tmp_path / "saved.h5", "r") as file:
-        assert file["status"].attrs["flag_meanings"].split()[:3] == ["inverted", "not_inverted", "contact_lost"]
+        assert file["status"].attrs["flag_meanings"].decode().split()[:3] == ["inverted", "not_inverted", "contact_lost"]
     assert json.loads(loaded.attributes["request"]) == json.loads(table.attributes["request"])
 
 
