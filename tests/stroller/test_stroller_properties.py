@@ -153,11 +153,11 @@ def departure(scene, launch, states, others):
     return np.max(np.abs(states - others) / (np.asarray(scene.scales(launch)) + np.abs(states)), axis=0)
 
 
-def sensitivity(scene, launch, states, tolerance):
+def sensitivity(scene, launch, states, tolerance, horizon=HORIZON):
     """By how much a small change of the state at the start grows until the end of a ride."""
     random = np.random.default_rng(0)
     nudge = 1e-7 * (np.asarray(scene.scales(launch)) + np.abs(states)) * random.choice([-1.0, 1.0], np.shape(states))
-    ends = [ride(scene, launch, tolerance, at).state for at in (states, states + nudge)]
+    ends = [ride(scene, launch, tolerance, at, horizon=horizon).state for at in (states, states + nudge)]
     return departure(scene, launch, *ends) / 1e-7
 
 
@@ -213,7 +213,8 @@ def check_units(scene: Scene, launch: Launch, exponents: tuple[int, int, int]):
 def check_reversal(scene: Scene, launch: Launch):
     """Without friction the ride with all speeds reversed leads back to the start.
 
-    A free fork that turns with the frame is drawn straight as e^(v t / l), and on the way back pushed away as fast.
+    A free fork that turns with the frame is drawn straight as e^(v t / l), and on the way back pushed away as fast. Where
+    the speed changes its sign the two may cancel over a whole ride, so growth is looked at on the way as well.
 
     **Returns:** by how much it misses, in tolerances for each step and for each unit of a small change's growth, and
     for which rides that can be told.
@@ -228,6 +229,10 @@ def check_reversal(scene: Scene, launch: Launch):
     stays = (np.asarray(there.status) == REACHED_END) & (np.asarray(back.status) == REACHED_END)
     missed = departure(smooth, launch, signs * back.state, smooth.state(launch))
     growth = 1.0 + sensitivity(smooth, launch, signs * there.state, tolerance)
+    for part in (0.25, 0.5, 0.75):
+        on_the_way = ride(smooth, launch, tolerance, signs * there.state, horizon=part * HORIZON).state
+        rest = sensitivity(smooth, launch, on_the_way, tolerance, (1.0 - part) * HORIZON)
+        growth = np.maximum(growth, 1.0 + rest)
     stays &= growth < MOST_GROWTH
     return np.where(stays, missed / (tolerance * growth * np.asarray(there.steps)), 0.0), stays
 
