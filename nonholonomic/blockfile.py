@@ -1,5 +1,8 @@
 """A table's file while a sweep fills it in, block by block; a sweep that was killed resumes from it."""
 
+import json
+import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +15,22 @@ import h5py
 import numpy as np
 from jaxtyping import Shaped
 
-from .hdf5 import BLOCKS, PENDING, read_grid, stored_array, write_grid
+from .checksum import block_checksum
+from .hdf5 import CHECKSUMS, FINISHED, Grid, blank, read_stored, stored_array, write_grid
 from .table import same_request
 
 Values = Shaped[np.ndarray, "..."]
 
 
 class BlockFile:
-    """The arrays of a file under construction, mapped into memory.
+    """The arrays of a file under construction.
 
-    A block's numbers are written first and its mark after them, both into space the file already has: whenever the process
-    dies, the blocks that are marked are complete.
+    A block's numbers and their checksum are handed to the disk first and the block's mark after them, all into space the
+    file already has. So the blocks that are marked are complete, whenever the process dies; and whenever the machine does,
+    as far as its disk keeps what it confirms. It writes rather than maps the file into memory, where a full disk or a file
+    cut short by someone else would end the process.
+
+    `attributes` are those in the file.
     """
 
     def __init__(self, path: Any, layout: "Layout"):
@@ -34,13 +42,14 @@ class BlockFile:
         - `layout`: what the file holds.
 
         **Raises:** `OSError` that names the path if it cannot be read or written; `ValueError` that names the first
-        difference if it holds the result of another request.
+        difference if it holds the result of another request or of another version of this package.
         """
         try:
             self.path = Path(path)
         except TypeError:
             raise ValueError(f"path = {path!r} must be the path of a file") from None
-        self._lock, self._maps = self._locked(), {}
+        self._lock: Any = self._locked()
+        self._stream: Any = None
         try:
             self._open(layout)
         except BaseException:
@@ -48,80 +57,129 @@ class BlockFile:
             raise
 
     def _open(self, layout: "Layout") -> None:
-        if self.path.exists():
-            self._check(layout)
-        else:
+        if not self.path.exists():
             layout.write(self.path)
-        self.cells = layout.cells
+        grid = read_stored(self.path)
+        self._check(grid, layout)
+        self.attributes, self._header, self._finished = grid.attributes, grid.header, grid.finished
+        self._values = {name: values.reshape(-1) for name, values in grid.variables.items()}
         with h5py.File(self.path, "r") as file:
-            arrays = {name: stored_array(file, name) for name in (*layout.kinds, BLOCKS)}
-            places = {name: (array.id.get_offset(), array.dtype) for name, array in arrays.items()}
-            blocks = len(arrays[BLOCKS])
+            arrays = {name: stored_array(file, name) for name in (*layout.kinds, FINISHED, CHECKSUMS)}
+            self._places = {name: (array.id.get_offset(), array.dtype) for name, array in arrays.items()}
         try:
-            self._maps = {
-                name: np.memmap(self.path, dtype, "r+", offset, (blocks if name == BLOCKS else self.cells,))
-                for name, (offset, dtype) in places.items()
-            }
+            # Unbuffered, so that what could not be written is not tried again on closing.
+            self._stream = self.path.open("r+b", buffering=0)
         except OSError as error:
-            raise OSError(f"cannot write {self.path}: {error.strerror}") from None
+            raise self._unwritable(error) from None
+        for block in np.flatnonzero(grid.damaged):
+            self._put(FINISHED, block, 0)
 
     def _locked(self) -> Any:
         """Keep other processes from filling in the same file; the system lets go of it when the process ends."""
         if fcntl is None:
             return None
         beside = self.path.with_name(self.path.name + ".lock")
-        try:
-            lock = beside.open("w")
-        except OSError as error:
-            raise OSError(f"cannot write {self.path}: {error.strerror}") from None
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        while True:
+            try:
+                lock = beside.open("w")
+            except OSError as error:
+                raise self._unwritable(error) from None
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                lock.close()
+                raise OSError(f"cannot write {self.path}: another process is writing it") from None
+            # One that has just closed the file has removed its lock, perhaps after we opened it.
+            try:
+                if os.path.samestat(os.fstat(lock.fileno()), beside.stat()):
+                    return lock
+            except FileNotFoundError:
+                pass
             lock.close()
-            raise OSError(f"cannot write {self.path}: another process is writing it") from None
-        return lock
 
     def close(self) -> None:
         """Let other processes have the file."""
-        self._maps.clear()
+        if self._stream is not None:
+            self._stream.close()
         if self._lock is not None:
             self.path.with_name(self.path.name + ".lock").unlink(missing_ok=True)
             self._lock.close()
 
     def values(self) -> dict[str, Values]:
-        """The numbers in the file, variable by variable, cells in a row."""
-        return {name: np.array(values) for name, values in self._maps.items() if name != BLOCKS}
+        """The numbers that the file held when it was opened, variable by variable, cells in a row."""
+        return self._values
 
-    def _check(self, layout: "Layout") -> None:
-        coords, _, _, attributes, _ = read_grid(self.path)
-        difference = same_request(str(attributes["request"]), layout.attributes["request"])
+    def _check(self, grid: Grid, layout: "Layout") -> None:
+        ours, theirs = (
+            json.loads(str(attributes.get("versions", "{}"))) for attributes in (layout.attributes, grid.attributes)
+        )
+        difference = same_request(str(grid.attributes["request"]), layout.attributes["request"])
         if difference is None:
             for name, values in layout.coords.items():
-                if name not in coords or not np.array_equal(coords[name], values):
+                if name not in grid.coords or not np.array_equal(grid.coords[name], values):
                     difference = f"the axis {name} differs"
-        if difference is None and list(coords) != list(layout.coords):
-            difference = f"its axes are {', '.join(coords)}"
+        if difference is None and list(grid.coords) != list(layout.coords):
+            difference = f"its axes are {', '.join(grid.coords)}"
+        if difference is None and theirs.get("nonholonomic") != ours.get("nonholonomic"):
+            difference = f"nonholonomic is {theirs.get('nonholonomic')} there and {ours.get('nonholonomic')} here"
         if difference is not None:
             raise ValueError(
                 f"{self.path} holds the result of another run: {difference}; give another path or remove the file"
             )
-        with h5py.File(self.path, "r") as file:
-            if BLOCKS not in file or len(stored_array(file, BLOCKS)) != layout.blocks:
-                raise ValueError(f"{self.path} was not written by a sweep in {layout.blocks} blocks; give another path")
+        kinds = {name: values.dtype for name, values in grid.variables.items()}
+        if not np.array_equal(grid.firsts, layout.firsts) or kinds != layout.kinds:
+            raise ValueError(
+                f"{self.path} was not written by a sweep in {len(layout.firsts)} blocks; give another path"
+            )
+        if grid.damaged.any():
+            warnings.warn(
+                f"{self.path} is damaged: {grid.damaged.sum()} finished blocks do not match their checksums and are "
+                "computed again",
+                RuntimeWarning,
+                stacklevel=6,
+            )
+        others = [name for name in ours if name not in ("nonholonomic", "python") and theirs.get(name) != ours[name]]
+        if others and not grid.finished.all():
+            told = ", ".join(f"{name} {theirs.get(name)}, now {ours[name]}" for name in others)
+            warnings.warn(f"{self.path} was begun with {told}: digits may differ", RuntimeWarning, stacklevel=6)
 
     @property
     def finished(self) -> set[int]:
         """The blocks that need not be computed."""
-        return set(np.flatnonzero(self._maps[BLOCKS]).tolist())
+        return set(np.flatnonzero(self._finished).tolist())
 
     def write(self, block: int, first: int, values: dict[str, Values]) -> None:
-        """Write a block's values, for the cells from `first` on, and mark it finished."""
-        for name, some in values.items():
-            target = self._maps[name]
-            target[first : first + len(some)] = some
-            target.flush()
-        self._maps[BLOCKS][block] = 1
-        self._maps[BLOCKS].flush()
+        """Write a block's values, for the cells from `first` on, and mark it finished.
+
+        **Raises:** `OSError` that names the path if that fails; the block is then not finished, and those that are stay so.
+        """
+        stored = {name: np.asarray(some, self._places[name][1]) for name, some in values.items()}
+        for name, some in stored.items():
+            self._put(name, first, some)
+        self._put(CHECKSUMS, block, block_checksum(self._header, stored))
+        self._sync()
+        self._put(FINISHED, block, 1)
+        self._sync()
+
+    def _put(self, name: str, index: int, values: Any) -> None:
+        """Write numbers into an array of the file, from an index on."""
+        offset, kind = self._places[name]
+        numbers = memoryview(np.asarray(values, kind).tobytes())
+        try:
+            self._stream.seek(offset + int(index) * kind.itemsize)
+            while numbers:
+                numbers = numbers[self._stream.write(numbers) :]
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def _sync(self) -> None:
+        try:
+            os.fsync(self._stream.fileno())
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def _unwritable(self, error: OSError) -> OSError:
+        return OSError(f"cannot write {self.path}: {error.strerror}")
 
 
 class Layout:
@@ -134,30 +192,23 @@ class Layout:
         units: dict[str, str],
         words: dict[str, tuple[str, ...]],
         attributes: dict[str, Any],
-        blocks: int,
+        firsts: Any,
     ):
         """State the grid.
 
-        **Arguments:** as for `write_grid`, with `kinds`: variable -> dtype.
+        **Arguments:** as for `write_grid`, with `kinds`: variable -> dtype, and `firsts`: the first cell of each block.
         """
         self.coords, self.kinds, self.units, self.words = coords, kinds, units, words
-        self.attributes, self.blocks = attributes, blocks
+        self.attributes, self.firsts = attributes, firsts
 
     @property
     def shape(self) -> tuple[int, ...]:
         return tuple(len(values) for values in self.coords.values())
 
-    @property
-    def cells(self) -> int:
-        return int(np.prod(self.shape, dtype=int))
-
     def empty(self) -> dict[str, Values]:
         """The variables before anything is computed: not a number, or pending."""
-        return {
-            name: np.full(self.shape, np.nan if np.dtype(kind).kind == "f" else PENDING, kind)
-            for name, kind in self.kinds.items()
-        }
+        return {name: np.full(self.shape, blank(kind), kind) for name, kind in self.kinds.items()}
 
     def write(self, path: Path) -> None:
         """Make the file."""
-        write_grid(path, self.coords, self.empty(), self.units, self.attributes, self.words, self.blocks)
+        write_grid(path, self.coords, self.empty(), self.units, self.attributes, self.words, self.firsts)

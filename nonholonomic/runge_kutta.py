@@ -140,20 +140,23 @@ def first_length(
     atol: States,
     controlled: int | None,
 ) -> Lanes:
-    """Length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section II.4), as Diffrax selects it."""
+    """Length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section II.4), in the motion's own unit.
+
+    They compare |y'| with |y''|, which depends on the unit of time, and Diffrax does so in seconds. Here the unit is |y|/|y'|,
+    so that motions that differ in their scale only are integrated alike.
+    """
     scale = atol + jnp.abs(state) * rtol
 
     def size(vector: States) -> Lanes:
         return jnp.sqrt(jnp.mean((vector / scale)[:controlled] ** 2, axis=0))
 
     magnitude, slope = size(state), size(rate)
-    flat = (magnitude < 1e-5) | (slope < 1e-5)
-    trial = jnp.where(flat, 1e-6, 0.01 * magnitude / jnp.where(flat, 1.0, slope))
+    unit = magnitude / slope
+    # Something that stands still has no unit of its own; longer ones would overflow below.
+    still = (magnitude < 1e-5) | ~(unit < 1e15)
+    unit = jnp.where(still, 1e-4, unit)
+    trial = 0.01 * unit
     bend = size(field(time + trial, state + trial * rate) - rate) / trial
-    steepest = jnp.maximum(slope, bend)
-    length = jnp.where(
-        steepest <= 1e-15,
-        jnp.maximum(1e-6, trial * 1e-3),
-        inverse_root(jnp.maximum(steepest, 1e-15) * 100.0, order),
-    )
-    return jnp.minimum(100.0 * trial, length)
+    steepest = unit * jnp.maximum(slope, unit * bend)
+    fraction = jnp.where(steepest <= 1e-15, 0.01, inverse_root(jnp.maximum(steepest, 1e-15) * 100.0, order))
+    return unit * jnp.minimum(1.0, fraction)

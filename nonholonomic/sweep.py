@@ -90,7 +90,7 @@ def sweep(
     }
     words = {name: one.words for name, one in variables.items() if one.words is not None}
     kinds = {name: one.kind for name, one in variables.items()}
-    layout = Layout(coords, kinds, units, words, attributes, len(firsts))
+    layout = Layout(coords, kinds, units, words, attributes, firsts)
 
     def columns(index: int) -> dict[str, Values]:
         cell = np.minimum(np.arange(firsts[index], firsts[index] + block), cells - 1)
@@ -121,7 +121,7 @@ def sweep(
             file.close()
     shaped = {name: values.reshape(layout.shape) for name, values in found.items()}
     shaped |= {name: np.array([*words[name], UNREACHED])[shaped[name]] for name in words}
-    return Table(coords, shaped, units, attributes, words)
+    return Table(coords, shaped, units, attributes if file is None else file.attributes, words)
 
 
 def _as_they_finish(work: Callable[[int], Any], todo: list[int]) -> Iterator[tuple[int, Any]]:

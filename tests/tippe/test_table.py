@@ -162,7 +162,8 @@ def test_save_and_load_return_the_same(table, tmp_path):
     assert loaded.words == table.words
     # The numbers that stand for the words are the same in every file.
     with h5py.File(tmp_path / "saved.h5", "r") as file:
-        assert file["status"].attrs["flag_meanings"].split()[:3] == ["inverted", "not_inverted", "contact_lost"]
+        words = file["status"].attrs["flag_meanings"].decode().split()
+        assert words[:3] == ["inverted", "not_inverted", "contact_lost"]
     assert json.loads(loaded.attributes["request"]) == json.loads(table.attributes["request"])
 
 
@@ -241,6 +242,36 @@ def test_a_killed_sweep_leaves_a_file_that_opens_and_resumes(tmp_path):
     known = part.status != "pending"
     np.testing.assert_array_equal(part.status[known], fresh.status[known])
     assert_close(part.end_theta[known], fresh.end_theta[known], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_table_killed_again_and_again_is_the_one_that_was_not(tmp_path, monkeypatch):
+    """Five times SIGKILL, each after some more blocks; the table that is resumed at last is the same to the last bit."""
+    path, random, finished = tmp_path / "table.h5", np.random.default_rng(0), set()
+    for _ in range(5):
+        process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.DEVNULL)
+        enough, found = len(finished) + int(random.integers(1, 30)), finished
+        while len(found) < enough and process.poll() is None:
+            time.sleep(random.uniform(0.0, 0.02))
+            if path.exists():
+                with h5py.File(path, "r") as file:
+                    found = set(np.flatnonzero(file["block_finished"]).tolist())
+        os.kill(process.pid, signal.SIGKILL)
+        process.communicate()
+        cells = tippe.Table.load(path).status.reshape(200, 4)
+        after = set(np.flatnonzero((cells != "pending").all(axis=1)).tolist())
+        assert finished <= after
+        assert enough <= len(after) < 200
+        assert (cells[[block not in after for block in range(200)]] == "pending").all()
+        finished = after
+    monkeypatch.setattr(sweeping, "block_for", lambda cells: 4)
+    top = tippe.Top(0.02, 0.02, 0.006, 131 / 350 * 0.02 * 0.02**2, 0.4 * 0.02 * 0.02**2)
+    scene = tippe.Scene(top, tippe.Plane(), tippe.Viscous(0.3))
+    arguments = {"theta": np.linspace(0.05, 0.3, 400), "spin": [80.0, 100.0], "t1": 5.0}
+    resumed = tippe.inversion_table(scene, path=path, **arguments)
+    fresh = tippe.inversion_table(scene, **arguments)
+    for name, values in fresh.variables.items():
+        np.testing.assert_array_equal(resumed.variables[name], values)
 
 
 def test_a_file_of_another_scene_is_refused_by_name(rutstam_scene_module, tmp_path):
