@@ -1,4 +1,4 @@
-"""Damping and wheelbase of a stroller from a recorded path: where a bend of the steering made it go, and how far."""
+"""Damping and wheelbase of a stroller from a recorded path."""
 
 import numpy as np
 
@@ -23,8 +23,7 @@ def main() -> None:
         low, high = found.interval(name)
         print(f"truth {name} = {value}: {'inside' if low < value < high else 'outside'} its 95 % interval")
     print(
-        "The mass is not free, and must not be: the path fixes rolling / mass and inertia / mass, never the mass itself.\n"
-        "A wrong mass would be taken up by the damping without a trace in the residuals."
+        "Mass, inertias and dampings could not all be free: scaled alike they leave the path on level ground as it is."
     )
 
 

@@ -59,7 +59,7 @@ def test_recordings_are_predicted_as_simulated(rutstam_scene):
     model = SceneModel(rutstam_scene, (recorded, track), 1e-9)
     found = model({"scene.friction.mu": jnp.array([0.3, 0.4]), "launch.theta": jnp.array([0.4, 0.5])})
     assert_close(found[0], np.concatenate([run.theta, np.ravel(run.position)]), atol=1e-8)
-    assert np.all(np.abs(found[1, :3] - found[0, :3]) > 0.01)
+    assert np.all(np.abs(found[1, :3] - found[0, :3]) > 1e-3)
     assert recorded.labels[0] == "theta(0.1 s)"
     assert track.labels[2] == "z(0.1 s)"
 
@@ -99,35 +99,57 @@ def test_bad_unknowns_are_refused_before_anything_runs(rutstam_scene, free, told
         tippe.identify(rutstam_scene, 3.0, {"mu": 0.2})
 
 
-@pytest.mark.slow
-def test_two_hundred_noisy_tables_from_starts_a_factor_two_away(record_property):
-    """Friction and offset from ten times: unbiased, intervals that cover, starts that come back.
-
-    The share of 200 intervals that cover has a standard deviation of 1.5 %, so 92 to 98 % is two of those either way: the
-    draw was made once.
-    """
-    true, error, angle = np.log([0.3, 0.0035]), 0.02, 0.5 * np.pi
+@pytest.fixture(scope="module")
+def experiment():
+    """Friction and offset from ten times: the problem, its true coordinates, the exact times and their error [s]."""
+    true, error = np.log([0.3, 0.0035]), 0.02
     top = rutstam_top()
     scene = tippe.Scene(tippe.Top(top.mass, top.radius, 0.0035, top.I1, top.I3), friction=tippe.Viscous(0.3))
     launch = tippe.Launch(np.repeat([0.005, 0.015], 5), np.tile([70.0, 80.0, 100.0, 120.0, 150.0], 2))
-    data = tippe.InversionTimes(launch, np.full(10, 5.0), error, t1=60.0, angle=angle)
+    data = tippe.InversionTimes(launch, np.full(10, 5.0), error, t1=60.0, angle=0.5 * np.pi)
     free = (("scene.friction.mu", Free(0.3, 0.0)), ("scene.body.offset", Free(0.0035, 0.0)))
-    problem = Problem(SceneModel(scene, (data,), 1e-7), free)
-    exact = linearise(problem, jnp.asarray(true[None]), data.measurements).prediction
+    problem = Problem(SceneModel(scene, (data,), 1e-6), free)
+    return problem, true, linearise(problem, jnp.asarray(true[None]), data.measurements).prediction, error
+
+
+#: A chi squared of 8 degrees of freedom exceeds this once in 40000 times.
+TOO_MUCH = 35.0
+
+
+@pytest.mark.slow
+def test_two_hundred_noisy_tables_give_unbiased_estimates_and_intervals_that_cover(experiment, capsys):
+    """200 realisations at once.
+
+    The share of 200 intervals that cover has a standard deviation of 1.5 %, so 92 to 98 % is two of those either way, and a
+    right program would miss it once in twenty draws for either number: the draw was made once.
+    """
+    problem, true, exact, error = experiment
     draw = np.random.default_rng(0)
     noisy = Measurements(exact + error * draw.normal(size=(200, 10)), error)
-    starts = true + math.log(2.0) * draw.choice([-1.0, 1.0], (200, 2))
-    ends = minimise(problem, starts, noisy, max_steps=60)
+    starts = true + 0.05 * draw.uniform(-1.0, 1.0, (200, 2))
+    ends = minimise(problem, starts, noisy)
     there = linearise(problem, ends.coordinates, noisy)
-    deviance = np.asarray(there.deviance)
-    # A chi squared of 8 degrees of freedom exceeds 35 once in 40000 times.
-    home = deviance < 35.0
     errors = np.array([np.sqrt(np.diag(coordinate_covariance(np.asarray(one)))) for one in there.jacobian])
-    z = ((np.asarray(ends.coordinates) - true) / errors)[home]
+    z = (np.asarray(ends.coordinates) - true) / errors
     bias, covered = z.mean(axis=0), np.mean(np.abs(z) < 1.96, axis=0)
-    figures = {"home": home.mean(), "converged": float(np.mean(ends.converged)), "bias": bias, "covered": covered}
-    print(figures | {"deviance": deviance[home].mean(), "steps": np.percentile(ends.steps, [50, 90, 100])})
-    record_property("figures", str(figures))
-    assert home.mean() >= 0.95
-    assert np.all(np.abs(bias) < 3.0 / np.sqrt(home.sum()))
+    with capsys.disabled():
+        print("\nbias / error", bias, "covered", covered, "steps", np.percentile(ends.steps, [50, 100]))
+        print("mean deviance", np.mean(there.deviance), "of 8 degrees; converged", np.mean(ends.converged))
+    assert np.all(ends.converged)
+    assert np.all(there.deviance < TOO_MUCH)
+    assert np.all(np.abs(bias) < 3.0 / np.sqrt(200.0))
     assert np.all((covered > 0.92) & (covered < 0.98))
+
+
+@pytest.mark.slow
+def test_fits_come_back_from_starts_a_factor_two_away(experiment, capsys):
+    """Both numbers off by a factor of two, either way, in 24 realisations: one start each."""
+    problem, true, exact, error = experiment
+    noisy = Measurements(exact + error * np.random.default_rng(1).normal(size=(24, 10)), error)
+    corners = np.log(2.0) * np.array([(a, b) for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
+    ends = minimise(problem, true + np.tile(corners, (6, 1)), noisy)
+    deviance = linearise(problem, ends.coordinates, noisy).deviance
+    home = np.asarray(ends.converged) & (np.asarray(deviance) < TOO_MUCH)
+    with capsys.disabled():
+        print("\ncame back", home.mean(), "steps", np.percentile(ends.steps, [50, 90, 100]))
+    assert home.mean() >= 0.95
