@@ -6,7 +6,7 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 
-from nonholonomic.ensemble import Outcome
+from nonholonomic.ensemble import Outcome, lanes_for
 from nonholonomic.paths import full_path, numbers, with_numbers
 from nonholonomic.sweep import Variable
 from nonholonomic.variation import compiled_march_with_slopes, directions_of
