@@ -125,8 +125,10 @@ class Air(NamedTuple):
 
 def first_ball(spheres: tuple[Ball, ...], state: Float[Array, "components ..."]) -> Int[Array, "..."]:
     """The number of the sphere on which a launch stands: the lower one."""
-    none = jnp.zeros(state.shape[1:], int)
-    return none if len(spheres) == 1 else (clearance(*spheres, state) < 0.0).astype(int)
+    if len(spheres) == 1:
+        return jnp.zeros(state.shape[1:], int)
+    main, stem = spheres
+    return (clearance(main, stem, state) < 0.0).astype(int)
 
 
 def lost_contact(

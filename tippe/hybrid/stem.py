@@ -1,7 +1,7 @@
 """Closed forms of a top with a stem on the plane (`tippe.md`, section 4; Leine and Glocker 2003)."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from ..top import Stem, Top
 
@@ -25,7 +25,7 @@ def first_contact(body: Top) -> Float[Array, "..."]:
     return jnp.arccos((stem.radius - body.radius) / (stem.offset - body.offset))
 
 
-def standing_spin(body: Top, gravity: Float[Array, "..."] = 9.81) -> Float[Array, "..."]:
+def standing_spin(body: Top, gravity: Float[ArrayLike, "..."] = 9.81) -> Float[Array, "..."]:
     """Spin [rad/s] above which a top stands stably on its stem at theta = pi.
 
     With alpha2 = a2 / r2 and gamma = I1 / I3: omega^2 = m g a2 (1 + alpha2)^2 / (I3 (1 + alpha2 - gamma)); infinite if

@@ -170,7 +170,7 @@ class HybridTrajectory(eqx.Module):
         """The sphere that touches, the top's own in flight."""
         spheres = balls(self.scene.body)
         return Ball(
-            *(np.where(self.contact == 1, stem, own) for own, stem in zip(spheres[0], spheres[-1], strict=True))
+            *(jnp.where(self.contact == 1, stem, own) for own, stem in zip(spheres[0], spheres[-1], strict=True))
         )
 
     @property
