@@ -53,9 +53,7 @@ def main() -> None:
     print(
         f"simulated: inverts at {run.t[before]:.3f} s, least normal force on the way {least:.4f} of the weight, {LEAST} asked"
     )
-    print(
-        "The fastest of four starts, not proved the fastest of all. At 0.5 the limit does not bind; 0.95 none of them met."
-    )
+    print("The fastest of four starts, no proof. At 0.5 the limit does not bind; 0.95 none of them met.")
 
 
 if __name__ == "__main__":
