@@ -8,6 +8,7 @@ from nonholonomic.table import Table as Table
 from .friction import AbstractFriction as AbstractFriction
 from .friction import Coulomb as Coulomb
 from .friction import Frictionless as Frictionless
+from .friction import SetValuedCoulomb as SetValuedCoulomb
 from .friction import Viscous as Viscous
 from .inversion import inversion_time as inversion_time
 from .launch import Launch as Launch

@@ -29,6 +29,9 @@ class AbstractFriction(eqx.Module):
 
     units: ClassVar[dict[str, str]] = {}
 
+    #: Whether the force of a contact at rest is whatever keeps it there, within limits.
+    set_valued: ClassVar[bool] = False
+
     @abc.abstractmethod
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         """The load per unit normal force.
@@ -93,3 +96,38 @@ class Coulomb(AbstractFriction):
         speed = jnp.sqrt(slip.x * slip.x + slip.y * slip.y + self.slip_speed * self.slip_speed)
         factor = -self.mu / speed
         return ContactLoad(force=(factor * slip.x, factor * slip.y))
+
+
+class SetValuedCoulomb(AbstractFriction):
+    """Coulomb friction as it stands, without a slip speed: F = -mu N v_s / |v_s| while the contact slips, and any force
+    along the arena up to mu N while it does not (`tippe.md`, section 3).
+
+    The run is made of phases. In a slip the force has its full size; a slip that stops turns into rolling, with the
+    equations of `rolling.py`, if the force which that takes is within the friction cone; and the top slips again as soon
+    as it is not. While it rolls the energy is constant.
+
+    **Arguments:**
+
+    - `mu`: coefficient of friction [1], at least 0.
+    """
+
+    units: ClassVar[dict[str, str]] = {"mu": "1"}
+    set_valued: ClassVar[bool] = True
+
+    mu: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def __check_init__(self):
+        require(self.mu, "mu", at_least=0.0)
+
+    def per_normal_force(self, slip: Slip) -> ContactLoad:
+        """The load of a contact that slips; where it does not, the law alone says nothing, and the load is 0."""
+        speed = length(slip.x, slip.y)
+        factor = -self.mu / jnp.where(speed > 0.0, speed, 1.0)
+        return ContactLoad(force=(factor * slip.x, factor * slip.y))
+
+
+def length(x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Length of a vector of two components, its derivative 0 where it vanishes."""
+    square = x * x + y * y
+    moving = square > 0.0
+    return jnp.where(moving, jnp.sqrt(jnp.where(moving, square, 1.0)), 0.0)

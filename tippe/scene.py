@@ -11,6 +11,7 @@ from nonholonomic.vector import dot, multiply
 from .dynamics import COS_THETA, Dynamics
 from .friction import AbstractFriction, Frictionless
 from .launch import Launch
+from .stick_slip.motion import StickSlip
 from .top import Top
 
 
@@ -23,7 +24,8 @@ class Scene(eqx.Module):
 
     - `body`: a `Top`.
     - `surface`: the arena: `Plane()`, `Cylinder(radius)` or `Sphere(radius)`; the top runs inside the last two.
-    - `friction`: `Frictionless()`, `Viscous(mu)` or `Coulomb(mu, slip_speed)`.
+    - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)` or, with `contact="stop"`,
+      `SetValuedCoulomb(mu)`.
     - `gravity`: acceleration of free fall [m/s^2], positive.
     - `contact`: "stop": a run ends where the contact is lost; "hybrid", on the plane: it goes on through flights, impacts
       and changes to the stem and back (`hybrid/`). A top with a stem needs the latter.
@@ -51,6 +53,8 @@ class Scene(eqx.Module):
             raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
         if self.contact == "hybrid" and not isinstance(self.surface, Plane):
             raise ValueError(f"contact = 'hybrid' must be on a Plane(), not on {self.surface!r}")
+        if self.contact == "hybrid" and self.friction.set_valued:
+            raise ValueError(f"contact = 'hybrid' must be 'stop' with {type(self.friction).__name__}")
         if self.contact == "stop" and self.body.stem is not None:
             raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
         if self.restitution is not None:
@@ -59,9 +63,10 @@ class Scene(eqx.Module):
             require(self.restitution, "restitution", at_least=0.0, at_most=1.0)
 
     @property
-    def dynamics(self) -> Dynamics:
+    def dynamics(self) -> Dynamics | StickSlip:
         """The equations of motion, with the combinations of the scene's numbers that they need."""
-        return Dynamics.of(self.body, self.surface, self.friction, self.gravity)
+        equations = StickSlip if self.friction.set_valued else Dynamics
+        return equations.of(self.body, self.surface, self.friction, self.gravity)
 
     def state(self, launch: Launch) -> Float[Array, "components ..."]:
         """The state at the start of a run (see `dynamics.py` for its components).

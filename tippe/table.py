@@ -22,6 +22,7 @@ from .hybrid.cells import hybrid_cells
 from .inversion import ABSOLUTE, InversionProblem, check_event, check_run, is_inverted
 from .launch import Launch
 from .scene import Scene
+from .stick_slip.cells import stick_slip_cells
 
 #: Arenas, laws and solvers whose loops XLA is known to compile into one kernel; a test goes through them all.
 SINGLE_KERNEL = (Plane, Cylinder, Sphere, Viscous, Coulomb, diffrax.Dopri8, diffrax.Dopri5, diffrax.Tsit5)
@@ -41,6 +42,12 @@ VARIABLES = {
     "rejected": Variable("1", np.int64),
 }
 HYBRID_VARIABLES = VARIABLES | {"status": Variable("1", np.int8, HYBRID_WORDS), "hops": Variable("1", np.int64)}
+
+STICK_SLIP_WORDS = (*WORDS, "unresolved")
+STICK_SLIP_VARIABLES = VARIABLES | {
+    "status": Variable("1", np.int8, STICK_SLIP_WORDS),
+    "sticks": Variable("1", np.int64),
+}
 
 UNITS = {"mass": "kg", "radius": "m", "offset": "m", "I1": "kg m2", "I3": "kg m2", "gravity": "m s-2"}
 UNITS |= {"theta": "rad", "eta": "rad", "azimuth": "rad", "spin": "rad s-1"}
@@ -85,7 +92,8 @@ def inversion_table(
     "contact_lost", "failed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was lost, when
     and at what angle), `steps` and `rejected`. A scene with `contact="hybrid"` flies on where contact is lost, and the angle
     counts in flight too; `hops` is the number of flights, and `status` may be "unresolved" (too many of them) or
-    "both_contacts" (sphere and stem stayed on the plane together, which is not modelled).
+    "both_contacts" (sphere and stem stayed on the plane together, which is not modelled). With `SetValuedCoulomb`, `sticks`
+    is how often a slip has turned into rolling, and `status` may be "unresolved" (too many changes).
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
     """
@@ -101,6 +109,9 @@ def inversion_table(
     hybrid = scene.contact == "hybrid"
     if method == "diffrax" and hybrid:
         raise ValueError("method = 'diffrax' must be 'ensemble' for a scene with contact = 'hybrid'")
+    sticking = scene.friction.set_valued
+    if method == "diffrax" and sticking:
+        raise ValueError(f"method = 'diffrax' must be 'ensemble' with {type(scene.friction).__name__}")
     if axes is not None and not isinstance(axes, dict):
         raise ValueError(f"axes = {axes!r} must be a dictionary, path of a number -> values")
     given = {"launch.theta": theta, "launch.eta": eta, "scene.friction.mu": mu, "launch.spin": spin}
@@ -134,6 +145,8 @@ def inversion_table(
         size = next((len(values) for values in columns.values()), 1)
         if hybrid:
             return hybrid_cells(cells["scene"], cells["launch"], t1, angle, tolerance, last, solver, size, count)
+        if sticking:
+            return stick_slip_cells(cells["scene"], cells["launch"], t1, angle, tolerance, last, solver, size, count)
         problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
         horizon, rtol = jnp.asarray(t1, float), jnp.asarray(tolerance, float)
         if method == "diffrax":
@@ -168,7 +181,8 @@ def inversion_table(
     if not hybrid:
         # As in files from before there was a choice.
         del request["scene.contact"]
-    return sweep(run, grid, HYBRID_VARIABLES if hybrid else VARIABLES, request, path=path)
+    variables = HYBRID_VARIABLES if hybrid else STICK_SLIP_VARIABLES if sticking else VARIABLES
+    return sweep(run, grid, variables, request, path=path)
 
 
 def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:
