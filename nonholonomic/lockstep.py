@@ -195,8 +195,9 @@ def _fate(
 ) -> tuple[Int[Array, " lanes"], Lanes, Lanes]:
     """Status, side and latest crossing time of the lanes, where `hit` says that an event was located."""
     crossing, guard = problem.crossing(tried.state), problem.guard(time, tried.state)
-    by_guard = hit if crossing is None else hit & (False if guard is None else guard <= 0.0)
-    crossed = jnp.zeros_like(hit) if crossing is None else hit & (block.side * crossing <= 0.0)
+    # The lesser of the two is what was located; by its sign it may be round-off.
+    by_guard = hit if crossing is None else hit & (False if guard is None else guard <= block.side * crossing)
+    crossed = hit & ~by_guard
     if not control.passes:
         status = jnp.where(hit, jnp.where(by_guard, GUARD_LOST, CROSSED), block.status)
         return status, block.side, block.crossing_time

@@ -14,7 +14,7 @@ from ..dynamics import COS_THETA
 from ..inversion import ABSOLUTE, InversionProblem
 from ..launch import Launch
 from ..scene import Scene
-from .motion import Kind, started
+from .motion import COARSEST, Kind, started
 
 #: The numbers of the two phases.
 SLIPPING, ROLLING = range(2)
@@ -96,14 +96,15 @@ def ride(
     both = problem.dynamics
     phases = tuple(StickSlipPhase(Kind(both, rolls), problem.cos_angle, problem.scales) for rolls in (False, True))
     states, rolls = started(both, problem.states)
+    rtol = min(tolerance, COARSEST)
     return travel(
         phases,
         np.where(np.asarray(rolls), ROLLING, SLIPPING),
         np.asarray(states),
         t1,
         count,
-        tolerance,
-        ABSOLUTE * tolerance,
+        rtol,
+        ABSOLUTE * rtol,
         kinds=1,
         solver=solver,
         passes=last,

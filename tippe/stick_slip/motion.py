@@ -29,6 +29,9 @@ EXCESS = 1e-4
 #: By how much the least slip that begins is faster than one that is over.
 FASTER = 10.0
 
+#: Coarser relative tolerances are taken for this one: with them steps would leap over the end of a slip, to and fro.
+COARSEST = 1e-7
+
 #: What a slip has gathered is trusted up to this age, in units of sqrt(R / g).
 OLDEST = 0.1
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from nonholonomic.integrate import Path, follow
 from nonholonomic.lockstep import AbstractProblem
 
-from .motion import Kind, StickSlip, started
+from .motion import COARSEST, Kind, StickSlip, started
 
 #: Phases after which a run is given up.
 MOST_PHASES = 2000
@@ -118,10 +118,11 @@ def follow_stick_slip(run: Any, t1: float, *, solver: diffrax.AbstractSolver, rt
     state, rolls = started(both, run.state)
     whole = jnp.concatenate([state, run.start()[0][size:]])
     path = StickSlipPath(both, size, [], [], False, False)
+    finer = min(1.0, COARSEST / rtol)
     while True:
         kind = Kind(both, bool(rolls))
         stretch = Stretch(eqx.tree_at(lambda one: one.dynamics, run, kind), whole)
-        part = follow(stretch, t1, t0=time, solver=solver, rtol=rtol, atol=atol)
+        part = follow(stretch, t1, t0=time, solver=solver, rtol=finer * rtol, atol=finer * atol)
         path.parts.append(part)
         path.rolls.append(kind.rolls)
         if not part.guard_lost:
