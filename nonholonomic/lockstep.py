@@ -136,7 +136,9 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     running = block.status == RUNNING
     free = running & ~block.searching
     error = scaled_error(*stop_gradient((tried.error, block.state, tried.state)), control.rtol, atol)
-    margin = stop_gradient(tried.watched)
+    # An event is located where the margin is round-off. Joined, with a barrier behind it, it is computed once; the compiler
+    # would else fuse it into several kernels of different round-off, in one of which the event is found and in another not.
+    error, margin = jax.lax.optimization_barrier(jnp.stack([error, stop_gradient(tried.watched)]))
     # A step into nonsense counts as one with a huge error.
     error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
     good = error <= 1.0

@@ -163,4 +163,3 @@ class RollingDynamics(eqx.Module):
         rx = ((self.I3 + m * r2) * tr - excess * er * te) / determinant
         rest = sum_vectors(torque, scale(subtract(None, excess * ex), e), scale(m * rx, r))
         return scale(1.0 / A, rest)
-

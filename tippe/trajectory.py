@@ -259,7 +259,9 @@ def _traced(
     adjoint: diffrax.AbstractAdjoint | None,
 ) -> Trajectory:
     if scene.friction.set_valued:
-        raise ValueError(f"friction = {type(scene.friction).__name__} must be a law without phases inside jit, vmap and grad")
+        raise ValueError(
+            f"friction = {type(scene.friction).__name__} must be a law without phases inside jit, vmap and grad"
+        )
     if times is None:
         raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
     adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint

@@ -108,9 +108,9 @@ def test_three_constants_and_the_quadrature_on_the_plane():
     routh = scene.spin(states) * jnp.sqrt(quadrature.routh_factor(scene, states[4]))
     assert_close(routh, routh[0], rtol=1e-9)
 
-    angular_velocity = start[5:8] / scene.body.I1 + (1 / scene.body.I3 - 1 / scene.body.I1) * (
-        start[2:5] @ start[5:8]
-    ) * (start[2:5])
+    angular_velocity = (
+        start[5:8] / scene.body.I1 + (1 / scene.body.I3 - 1 / scene.body.I1) * (start[2:5] @ start[5:8]) * (start[2:5])
+    )
     nutation = quadrature.RollingNutation.of(scene, start[2:5], angular_velocity)
     swing = quadrature.swing(nutation, start[4], rolling.field(start)[4])
     assert np.ptp(np.asarray(scene.theta(states))) > 0.05

@@ -1,5 +1,6 @@
 """Coulomb friction as it stands: Cohen's top, repeated stick and slip, the limit of the regularised law (tippe.md, section 7)."""
 
+import coulomb_top
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -7,7 +8,6 @@ import numpy as np
 import pytest
 from conftest import assert_close, homogeneous_ball, rutstam_top
 
-import coulomb_top
 import tippe
 from tippe.stick_slip.path import follow_stick_slip
 from tippe.trajectory import Run
@@ -107,15 +107,16 @@ def test_a_ball_on_a_slope_rolls_where_friction_is_two_sevenths_of_the_slope():
 
 
 def test_a_table_is_what_its_runs_are():
-    scene = scene_of(rutstam_top(), 0.2)
-    table = tippe.inversion_table(scene, theta=[1.5, 2.0], spin=[30.0, 100.0, 300.0], t1=0.9)
-    assert table.status.tolist() == [["not_inverted"] * 3, ["not_inverted", "inverted", "contact_lost"]]
-    for place, theta, spin in [((0, 0), 1.5, 30.0), ((1, 2), 2.0, 300.0)]:
-        run = tippe.simulate(scene, tippe.Launch(theta, spin), 0.9)
+    """Also a regression: in this very grid an event at round-off once was found in one kernel and not in another."""
+    scene, theta, spin = scene_of(rutstam_top(), 0.2), [0.5, 1.0, 1.5, 2.0], [30.0, 100.0, 200.0, 300.0]
+    table = tippe.inversion_table(scene, theta=theta, spin=spin, t1=0.9)
+    assert table.sticks.tolist() == [[1, 1, 1, 1], [1, 1, 1, 0], [2, 1, 0, 0], [1, 1, 0, 0]]
+    assert table.status[3].tolist() == ["not_inverted", "inverted", "contact_lost", "contact_lost"]
+    for place in [(0, 1), (2, 0), (3, 3)]:
+        run = tippe.simulate(scene, tippe.Launch(theta[place[0]], spin[place[1]]), 0.9)
         assert_close(table.end_time[place], run.end_time, rtol=1e-8)
         assert_close(table.end_theta[place], run.theta[-1], atol=1e-7)
         assert table.sticks[place] == run.stats["sticks"]
-    assert table.sticks.tolist() == [[2, 0, 0], [1, 1, 0]]
 
 
 @pytest.mark.parametrize(
@@ -130,7 +131,10 @@ def test_a_table_is_what_its_runs_are():
             lambda s: tippe.inversion_table(s, theta=0.1, spin=100.0, t1=1.0, method="diffrax"),
             "method = 'diffrax' must be 'ensemble' with SetValuedCoulomb",
         ),
-        (lambda s: tippe.Scene(s.body, friction=s.friction, contact="hybrid"), "contact = 'hybrid' must be 'stop' with"),
+        (
+            lambda s: tippe.Scene(s.body, friction=s.friction, contact="hybrid"),
+            "contact = 'hybrid' must be 'stop' with",
+        ),
         (lambda s: tippe.SetValuedCoulomb(-0.1), "mu = -0.1 must be at least 0"),
     ],
 )
@@ -143,9 +147,9 @@ def test_what_is_not_supported_is_refused(call, message):
     ("slip_speed", "theta"),
     [
         (1e-1, 0.449),
-        (3e-2, 0.496),
+        pytest.param(3e-2, 0.496, marks=pytest.mark.slow),
         (1e-2, 0.156),
-        (3e-3, 0.089),
+        pytest.param(3e-3, 0.089, marks=pytest.mark.slow),
         (1e-3, 0.0785),
         pytest.param(1e-4, 0.0744, marks=pytest.mark.slow),
         pytest.param(1e-5, 0.0740, marks=pytest.mark.slow),

@@ -104,7 +104,9 @@ def _next(kind: Kind, state: Float[Array, " components"], size: int) -> tuple[Ar
     return jnp.concatenate([after, state[size:]]), rolls, lost
 
 
-def follow_stick_slip(run: Any, t1: float, *, solver: diffrax.AbstractSolver, rtol: float, atol: float) -> StickSlipPath:
+def follow_stick_slip(
+    run: Any, t1: float, *, solver: diffrax.AbstractSolver, rtol: float, atol: float
+) -> StickSlipPath:
     """One run, phase by phase, until `t1` or until contact is lost.
 
     **Arguments:**
