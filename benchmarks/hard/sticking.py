@@ -65,22 +65,22 @@ def regularised(slip_speed: float, solver: diffrax.AbstractSolver, tolerance: fl
 
 def explicit_at_a_tenth() -> Row:
     """Slip speed 0.1 m/s, Dopri8."""
-    return regularised(1e-1, diffrax.Dopri8(), 1e-7, 1e-5)
+    return regularised(1e-1, diffrax.Dopri8(), 1e-7, 1e-6)
 
 
 def explicit_at_a_hundredth() -> Row:
     """Slip speed 0.01 m/s, Dopri8."""
-    return regularised(1e-2, diffrax.Dopri8(), 1e-7, 1e-5)
+    return regularised(1e-2, diffrax.Dopri8(), 1e-7, 3e-7)
 
 
 def explicit_at_a_thousandth() -> Row:
     """Slip speed 1e-3 m/s, Dopri8."""
-    return regularised(1e-3, diffrax.Dopri8(), 1e-7, 1e-6)
+    return regularised(1e-3, diffrax.Dopri8(), 1e-7, 1e-7)
 
 
 def explicit_at_a_ten_thousandth() -> Row:
     """Slip speed 1e-4 m/s, Dopri8."""
-    return regularised(1e-4, diffrax.Dopri8(), 1e-7, 1e-6)
+    return regularised(1e-4, diffrax.Dopri8(), 1e-7, 1e-7)
 
 
 def implicit_at_a_tenth() -> Row:

@@ -1,4 +1,4 @@
-"""Coulomb friction as it stands: Cohen's top, repeated stick and slip, the limit of the regularised law (tippe.md, section 7)."""
+"""Coulomb friction as it stands: Cohen's top, stick and slip, the limit of the regularised law (tippe.md, section 7)."""
 
 import coulomb_top
 import diffrax
