@@ -115,6 +115,7 @@ def follow(
     rtol: float,
     atol: float,
     first: float | None = None,
+    t0: float = 0.0,
 ) -> Path:
     """Integrate one run step by step until `t1` or until the model ceases to hold.
 
@@ -125,13 +126,14 @@ def follow(
     - `solver`: any solver of Diffrax.
     - `rtol`, `atol`: relative tolerance, and absolute tolerance in units of the problem's magnitudes.
     - `first`: length of the first step [s], by default selected as Diffrax does.
+    - `t0`: when the run starts [s].
 
     **Returns:** a `Path` with the accepted steps; it ends where the guard reaches zero, found on the dense output.
     """
     state, scales = problem.start()
     state, scales = jnp.asarray(state), jnp.asarray(scales)
-    time = jnp.zeros((), state.dtype)
-    times, states, pieces = [np.zeros(1)], [np.asarray(state)[:, None]], []
+    time = jnp.asarray(t0, state.dtype)
+    times, states, pieces = [np.full(1, t0)], [np.asarray(state)[:, None]], []
     accepted = rejected = 0
     end, lost, failed = jnp.asarray(t1, state.dtype), False, False
     length = None if first is None else jnp.asarray(first, state.dtype)

@@ -142,7 +142,9 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     free = running & ~block.searching
     before, after, atol = (part[: control.controlled] for part in (block.state, tried.state, atol))
     error = scaled_error(*stop_gradient((tried.error, before, after)), control.rtol, atol)
-    margin = stop_gradient(tried.watched)
+    # An event is located where the margin is round-off. Joined, with a barrier behind it, it is computed once; the compiler
+    # would else fuse it into several kernels of different round-off, in one of which the event is found and in another not.
+    error, margin = jax.lax.optimization_barrier(jnp.stack([error, stop_gradient(tried.watched)]))
     # A step into nonsense counts as one with a huge error.
     error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
     good = error <= 1.0
@@ -222,8 +224,9 @@ def _fate(
 ) -> tuple[Int[Array, " lanes"], Lanes, Lanes]:
     """Status, side and latest crossing time of the lanes, where `hit` says that an event was located."""
     crossing, guard = problem.crossing(tried.state), problem.guard(time, tried.state)
-    by_guard = hit if crossing is None else hit & (False if guard is None else guard <= 0.0)
-    crossed = jnp.zeros_like(hit) if crossing is None else hit & (block.side * crossing <= 0.0)
+    # The lesser of the two is what was located; by its sign it may be round-off.
+    by_guard = hit if crossing is None else hit & (False if guard is None else guard <= block.side * crossing)
+    crossed = hit & ~by_guard
     if not control.passes:
         status = jnp.where(hit, jnp.where(by_guard, GUARD_LOST, CROSSED), block.status)
         return status, block.side, block.crossing_time

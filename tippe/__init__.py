@@ -11,6 +11,7 @@ from .friction import Contensou as Contensou
 from .friction import Coulomb as Coulomb
 from .friction import Frictionless as Frictionless
 from .friction import Rolling as Rolling
+from .friction import SetValuedCoulomb as SetValuedCoulomb
 from .friction import Viscous as Viscous
 from .hybrid.trajectory import HybridTrajectory as HybridTrajectory
 from .identify import InversionTimes as InversionTimes

@@ -18,6 +18,7 @@ from .hybrid.cells import hybrid_cells
 from .inversion import ABSOLUTE, InversionProblem, is_inverted
 from .scene import Scene
 from .sensitivities import slopes_of_cells
+from .stick_slip.cells import stick_slip_cells
 
 
 class Kind(NamedTuple):
@@ -45,11 +46,14 @@ class Kind(NamedTuple):
 
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed")
 SMOOTH = Kind(WORDS, (), None)
+STICK_SLIP = Kind((*WORDS, "unresolved"), ("sticks",), stick_slip_cells)
 HYBRID = Kind((*WORDS, "unresolved", "both_contacts"), ("hops",), hybrid_cells)
 
 
 def kind_of(scene: Scene) -> Kind:
     """The kind of a scene's runs."""
+    if scene.friction.set_valued:
+        return STICK_SLIP
     return HYBRID if scene.contact == "hybrid" else SMOOTH
 
 

@@ -48,6 +48,9 @@ class AbstractFriction(eqx.Module):
     #: The units of the law's numbers, by name.
     units: ClassVar[dict[str, str]] = {}
 
+    #: Whether the force of a contact at rest is whatever keeps it there, within limits.
+    set_valued: ClassVar[bool] = False
+
     @property
     def laws(self) -> "tuple[AbstractFriction, ...]":
         """The law itself and those it is made of."""
@@ -101,7 +104,9 @@ class Coulomb(AbstractFriction):
 
     The regularisation creeps: below the slip speed the law is viscous with the coefficient mu / slip_speed, and a top
     that would stick and roll under exact Coulomb friction may still turn over, in a time that grows as 1 / slip_speed.
-    Quote a result only together with its slip speed.
+    Cohen's top (Am. J. Phys. 45 (1977) 12) takes 1.8, 5.9 and 50 s at 0.1, 0.01 and 0.001 m/s, and never turns over under
+    `SetValuedCoulomb`, the limit. Quote a result only together with its slip speed. The number of explicit steps grows as
+    1 / slip_speed too; from 1e-4 m/s down an implicit solver is cheaper (`benchmarks/hard/sticking.py`).
 
     **Arguments:**
 
@@ -185,8 +190,10 @@ class Rolling(AbstractFriction):
         require(self.turning_speed, "turning_speed", above=0.0)
         if not isinstance(self.sliding, AbstractFriction):
             raise ValueError(f"sliding = {self.sliding!r} must be a Friction, such as Coulomb(mu, slip_speed)")
-        if isinstance(self.sliding, Rolling):
-            raise ValueError(f"sliding = {self.sliding!r} must be a law of sliding, not a second rolling resistance")
+        if isinstance(self.sliding, Rolling) or self.sliding.set_valued:
+            raise ValueError(
+                f"sliding = {self.sliding!r} must be a law of sliding that has a force at every slip velocity"
+            )
 
     @property
     def units(self) -> dict[str, str]:
@@ -205,3 +212,38 @@ class Rolling(AbstractFriction):
         factor = -self.resistance / jnp.sqrt(w1 * w1 + w2 * w2 + self.turning_speed * self.turning_speed)
         load = self.sliding.per_normal_force(slip)
         return ContactLoad(load.force, sum_vectors(load.torque, (factor * w1, factor * w2, None)))
+
+
+class SetValuedCoulomb(AbstractFriction):
+    """Coulomb friction as it stands, without a slip speed: F = -mu N v_s / |v_s| while the contact slips, and any force
+    along the arena up to mu N while it does not (`tippe.md`, section 3).
+
+    The run is made of phases. In a slip the force has its full size; a slip that stops turns into rolling, with the
+    equations of `rolling.py`, if the force which that takes is within the friction cone; and the top slips again as soon
+    as it is not. While it rolls the energy is constant.
+
+    **Arguments:**
+
+    - `mu`: coefficient of friction [1], at least 0.
+    """
+
+    units: ClassVar[dict[str, str]] = {"mu": "1"}
+    set_valued: ClassVar[bool] = True
+
+    mu: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def __check_init__(self):
+        require(self.mu, "mu", at_least=0.0)
+
+    def per_normal_force(self, slip: Slip) -> ContactLoad:
+        """The load of a contact that slips; where it does not, the law alone says nothing, and the load is 0."""
+        speed = length(slip.x, slip.y)
+        factor = -self.mu / jnp.where(speed > 0.0, speed, 1.0)
+        return ContactLoad(force=(factor * slip.x, factor * slip.y))
+
+
+def length(x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Length of a vector of two components, its derivative 0 where it vanishes."""
+    square = x * x + y * y
+    moving = square > 0.0
+    return jnp.where(moving, jnp.sqrt(jnp.where(moving, square, 1.0)), 0.0)

@@ -82,14 +82,18 @@ def inversion_time(
 
     **Returns:** the time [s]; infinite if the top has not inverted by `t1` or has lost contact before.
 
-    **Raises:** `ValueError` for arguments outside these ranges, and for a scene with `contact="hybrid"`: the derivative does
-    not go through impacts. `inversion_table` gives the time.
+    **Raises:** `ValueError` for arguments outside these ranges, and for a scene with `contact="hybrid"` or
+    `SetValuedCoulomb`: the derivative does not go through impacts, nor through stick and slip. `inversion_table` gives the
+    time.
     """
     solver = diffrax.Dopri8() if solver is None else solver
     check_run(scene, launch, t1, tolerance)
     check_event(angle, crossing)
     if scene.contact == "hybrid":
         raise ValueError("contact = 'hybrid' must be 'stop' for inversion_time; inversion_table goes through flights")
+    if scene.friction.set_valued:
+        kind = type(scene.friction).__name__
+        raise ValueError(f"friction = {kind} must be a law without phases for inversion_time; inversion_table has them")
     explicit_tableau(solver)
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
     return _differentiable(_Run(structure, solver, crossing == "last"), len(leaves))(*leaves)

@@ -11,6 +11,7 @@ from nonholonomic.vector import dot
 from .dynamics import COS_THETA, Dynamics
 from .friction import AbstractFriction, Coulomb, Frictionless, Viscous
 from .launch import Launch
+from .stick_slip.motion import StickSlip
 from .top import Top
 
 #: Tilt [rad] of a launch below which errors across the normal are measured in proportion to it.
@@ -30,7 +31,8 @@ class Scene(eqx.Module):
     - `body`: a `Top`.
     - `surface`: the arena: `Plane()`, `Cylinder(radius)` or `Sphere(radius)`; the top runs inside the last two.
     - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
-      or `Rolling(resistance, turning_speed, sliding)` with one of them.
+      or `Rolling(resistance, turning_speed, sliding)` with one of them, or, with `contact="stop"`,
+      `SetValuedCoulomb(mu)`.
     - `gravity`: acceleration of free fall [m/s^2], positive.
     - `contact`: "stop": a run ends where the contact is lost; "hybrid", on the plane: it goes on through flights, impacts
       and changes to the stem and back (`hybrid/`). A top with a stem needs the latter.
@@ -68,9 +70,10 @@ class Scene(eqx.Module):
             require(self.restitution, "restitution", at_least=0.0, at_most=1.0)
 
     @property
-    def dynamics(self) -> Dynamics:
+    def dynamics(self) -> Dynamics | StickSlip:
         """The equations of motion, with the combinations of the scene's numbers that they need."""
-        return Dynamics.of(self.body, self.surface, self.friction, self.gravity)
+        equations = StickSlip if self.friction.set_valued else Dynamics
+        return equations.of(self.body, self.surface, self.friction, self.gravity)
 
     def state(self, launch: Launch) -> Float[Array, "components ..."]:
         """The state at the start of a run (see `dynamics.py` for its components).

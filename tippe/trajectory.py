@@ -20,6 +20,7 @@ from .hybrid.trajectory import HybridTrajectory, simulate_hybrid
 from .inversion import ABSOLUTE, check_run
 from .launch import Launch
 from .scene import Scene
+from .stick_slip.path import follow_stick_slip
 
 
 class Run(AbstractProblem):
@@ -75,7 +76,7 @@ class Trajectory(eqx.Module):
 
     `status` is "reached t1", "contact_lost" or "failed" (a code 0, 1, 2 inside a transformation); the run ends at
     `end_time`. `stats` holds accepted and rejected steps, the greatest drift of |e| and the greatest energy residual
-    |E - E(0) - work of friction| [J].
+    |E - E(0) - work of friction| [J]; with `SetValuedCoulomb` also `sticks`, how often a slip has turned into rolling.
     """
 
     t: Float[Array, " times"]
@@ -236,7 +237,8 @@ def simulate(
     run = Run.of(scene, launch)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((run, times, t1))):
         return _traced(scene, run, times, t1, tolerance, solver, adjoint)
-    path = follow(run, float(t1), solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
+    through = follow_stick_slip if scene.friction.set_valued else follow
+    path = through(run, float(t1), solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
     trajectory = _as_trajectory(scene, run, path)
     if times is None:
         return trajectory
@@ -259,6 +261,10 @@ def _traced(
     solver: diffrax.AbstractSolver,
     adjoint: diffrax.AbstractAdjoint | None,
 ) -> Trajectory:
+    if scene.friction.set_valued:
+        raise ValueError(
+            f"friction = {type(scene.friction).__name__} must be a law without phases inside jit, vmap and grad"
+        )
     if times is None:
         raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
     adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
@@ -285,6 +291,8 @@ def _as_trajectory(scene: Scene, run: Run, path: Any) -> Trajectory:
         "axis_drift": float(jnp.max(jnp.abs(jnp.sqrt(jnp.sum(lean[2:5] ** 2, axis=0)) - 1.0))),
         "energy_residual": float(jnp.max(jnp.abs(energy - energy[0] - work))),
     }
+    if scene.friction.set_valued:
+        stats["sticks"] = path.sticks
     times = jnp.asarray(path.times)
     return Trajectory(times, scene, lean, cyclic, spin_angle, work, status, times[-1], stats, path)
 

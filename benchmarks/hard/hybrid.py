@@ -8,11 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from hard.limits import rutstam_top
-from hard.row import Row
 from measure import timed
 
 import tippe
+from hard.limits import rutstam_top
+from hard.row import Row
 from tippe.hybrid.stem import first_contact
 
 #: The reference's results, by number of its cases.

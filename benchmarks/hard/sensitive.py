@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from hard.row import Row
 from measure import timed
 
 import tippe
+from hard.row import Row
 from tippe import steady
 
 sys.path.append(str(Path(__file__).parents[2] / "tests" / "physics"))

@@ -46,7 +46,7 @@ def test_impossible_tops_are_refused(change, message):
         (lambda: tippe.Rolling(1e-4, 1.0, 0.3), "sliding = 0.3 must be a Friction"),
         (
             lambda: tippe.Rolling(0.0, 1.0, tippe.Rolling(0.0, 1.0, tippe.Viscous(0.3))),
-            "not a second rolling resistance",
+            "must be a law of sliding that has a force",
         ),
         (lambda: tippe.Cylinder(0.0), "surface radius = 0.0 must be greater than 0.0"),
         (lambda: tippe.Scene(rutstam_top(), tippe.Cylinder(0.02)), "surface radius = 0.02 must be greater than 0.02"),

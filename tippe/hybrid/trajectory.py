@@ -56,9 +56,8 @@ class Contact(AbstractProblem):
 
     def field(self, time: Float[Array, ""], state: Float[Array, "12"]) -> Float[Array, "12"]:
         motion = self.dynamics.motion(state[:8])
-        force = dot(motion.friction, motion.slip)
-        power = None if force is None else motion.normal_force * force
-        return stacked((*motion.rate, state[0], state[1], motion.spin_momentum / self.axial, power), state)
+        rates = (*motion.rate, state[0], state[1], motion.spin_momentum / self.axial, motion.friction_power)
+        return stacked(rates, state)
 
     def crossing(self, state: Float[Array, "12"]) -> None:
         return None

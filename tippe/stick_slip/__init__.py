@@ -1,0 +1,1 @@
+"""Stick and slip under `SetValuedCoulomb`: slipping and rolling in turn."""

@@ -1,0 +1,137 @@
+"""One run through stick and slip, with its path."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from nonholonomic.integrate import Path, follow
+from nonholonomic.lockstep import AbstractProblem
+
+from .motion import COARSEST, Kind, StickSlip, started
+
+#: Phases after which a run is given up.
+MOST_PHASES = 2000
+
+
+class StickSlipPath(NamedTuple):
+    """A run: the paths of its phases, whether each rolls, and how it ended, as in `integrate.Path`.
+
+    `sticks` counts how often a slip has turned into rolling; `size` is that of the state without the rest that rides along.
+    """
+
+    both: StickSlip
+    size: int
+    parts: list[Path]
+    rolls: list[bool]
+    guard_lost: bool
+    failed: bool
+
+    @property
+    def times(self) -> Float[np.ndarray, " times"]:
+        """The times of the steps [s]; those of the changes stand for the phase that begins."""
+        whole = [part.times[:-1] for part in self.parts[:-1]]
+        return np.concatenate([*whole, self.parts[-1].times])
+
+    @property
+    def states(self) -> Float[np.ndarray, "components times"]:
+        """The states at these times."""
+        whole = [part.states[:, :-1] for part in self.parts[:-1]]
+        whole = [*whole, self.parts[-1].states]
+        return np.concatenate(
+            [self._carried(states, rolls) for states, rolls in zip(whole, self.rolls, strict=True)], axis=1
+        )
+
+    @property
+    def accepted(self) -> int:
+        """Steps that were accepted."""
+        return sum(part.accepted for part in self.parts)
+
+    @property
+    def rejected(self) -> int:
+        """Steps that were rejected."""
+        return sum(part.rejected for part in self.parts)
+
+    @property
+    def sticks(self) -> int:
+        """How often a slip has turned into rolling."""
+        return sum(after and not before for before, after in zip(self.rolls[:-1], self.rolls[1:], strict=True))
+
+    def at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "components times"]:
+        """States at the given times, by the dense output; times must lie within the run."""
+        states = np.zeros((len(self.parts[0].states), len(times)))
+        for part, rolls in zip(self.parts, self.rolls, strict=True):
+            # What a later phase has to say about its own times is written over this.
+            here = times >= part.times[0]
+            if here.any():
+                states[:, here] = self._carried(part.at(times[here]), rolls)
+        return states
+
+    def _carried(self, states: Float[np.ndarray, "components times"], rolls: bool) -> Float[np.ndarray, "..."]:
+        """The velocity of a rolling top follows from the rest of its state."""
+        if not rolls:
+            return states
+        own = self.both.rolling.carried_along(jnp.asarray(states[: self.size]))
+        return np.concatenate([np.asarray(own), states[self.size :]])
+
+
+class Stretch(AbstractProblem):
+    """A run in one of its phases, from the given state of all that is integrated."""
+
+    run: AbstractProblem
+    whole: Float[Array, " components"]
+
+    def start(self) -> tuple[Float[Array, " components"], Float[Array, " components"]]:
+        return self.whole, self.run.start()[1]
+
+    def field(self, time: Float[Array, ""], state: Float[Array, " components"]) -> Float[Array, " components"]:
+        return self.run.field(time, state)
+
+    def crossing(self, state: Float[Array, " components"]) -> None:
+        return None
+
+    def guard(self, time: Float[Array, ""], state: Float[Array, " components"]) -> Float[Array, ""] | None:
+        return self.run.guard(time, state)
+
+
+@eqx.filter_jit
+def _next(kind: Kind, state: Float[Array, " components"], size: int) -> tuple[Array, Bool[Array, ""], Bool[Array, ""]]:
+    """After a phase: the state, whether it rolls, and whether the contact is lost."""
+    after, rolls, lost = kind.ended(state[:size])
+    return jnp.concatenate([after, state[size:]]), rolls, lost
+
+
+def follow_stick_slip(
+    run: Any, t1: float, *, solver: diffrax.AbstractSolver, rtol: float, atol: float
+) -> StickSlipPath:
+    """One run, phase by phase, until `t1` or until contact is lost.
+
+    **Arguments:**
+
+    - `run`: a `trajectory.Run` of a scene with `SetValuedCoulomb`.
+    - `t1`, `solver`, `rtol`, `atol`: as for `integrate.follow`.
+
+    **Returns:** a `StickSlipPath`.
+    """
+    both, size, time = run.dynamics, len(run.state), 0.0
+    state, rolls = started(both, run.state)
+    whole = jnp.concatenate([state, run.start()[0][size:]])
+    path = StickSlipPath(both, size, [], [], False, False)
+    finer = min(1.0, COARSEST / rtol)
+    while True:
+        kind = Kind(both, bool(rolls))
+        stretch = Stretch(eqx.tree_at(lambda one: one.dynamics, run, kind), whole)
+        part = follow(stretch, t1, t0=time, solver=solver, rtol=finer * rtol, atol=finer * atol)
+        path.parts.append(part)
+        path.rolls.append(kind.rolls)
+        if not part.guard_lost:
+            return path._replace(failed=part.failed)
+        whole, rolls, lost = _next(kind, jnp.asarray(part.states[:, -1]), size)
+        if bool(lost):
+            return path._replace(guard_lost=True)
+        if len(path.parts) == MOST_PHASES or not bool(jnp.all(jnp.isfinite(whole))):
+            return path._replace(failed=True)
+        time = float(part.times[-1])
