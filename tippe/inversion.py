@@ -21,6 +21,7 @@ from nonholonomic.variation import directions_of, march_with_slopes
 from .dynamics import COS_THETA, Dynamics
 from .launch import Launch
 from .scene import Scene
+from .stick_slip.motion import Kind, StickSlip
 
 #: The absolute tolerance is this part of the relative one, in units of the state's own magnitudes.
 ABSOLUTE = 0.1
@@ -29,7 +30,7 @@ ABSOLUTE = 0.1
 class InversionProblem(AbstractProblem):
     """Launches that end when theta reaches an angle or the contact is lost."""
 
-    dynamics: Dynamics
+    dynamics: Dynamics | StickSlip | Kind
     cos_angle: Float[Array, "..."]
     states: Float[Array, "components cells"]
     scales: Float[Array, "components cells"]

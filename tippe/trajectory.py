@@ -20,13 +20,14 @@ from .hybrid.trajectory import HybridTrajectory, simulate_hybrid
 from .inversion import ABSOLUTE, check_run
 from .launch import Launch
 from .scene import Scene
+from .stick_slip.motion import Kind, StickSlip
 from .stick_slip.path import follow_stick_slip
 
 
 class Run(AbstractProblem):
     """A launch with its cyclic coordinates: the state, the arena's path, the spin angle and the work of friction."""
 
-    dynamics: Dynamics
+    dynamics: Dynamics | StickSlip | Kind
     axial: Float[Array, ""]
     state: Float[Array, " components"]
     path: Float[Array, " components"]

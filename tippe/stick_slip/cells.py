@@ -14,7 +14,7 @@ from ..dynamics import COS_THETA
 from ..inversion import ABSOLUTE, InversionProblem
 from ..launch import Launch
 from ..scene import Scene
-from .motion import COARSEST, Kind, started
+from .motion import COARSEST, Kind, StickSlip, started
 
 #: The numbers of the two phases.
 SLIPPING, ROLLING = range(2)
@@ -94,6 +94,7 @@ def ride(
     """Run every cell through its phases. **Arguments:** as for `stick_slip_cells`. **Returns:** a `Journey`."""
     problem = InversionProblem.of(scene, launch, angle, size)
     both = problem.dynamics
+    assert isinstance(both, StickSlip)
     phases = tuple(StickSlipPhase(Kind(both, rolls), problem.cos_angle, problem.scales) for rolls in (False, True))
     states, rolls = started(both, problem.states)
     rtol = min(tolerance, COARSEST)

@@ -88,6 +88,10 @@ class StickSlip(eqx.Module):
         """Rate of change of the state, (components, ...)."""
         return stacked(self.motion(state).rate, state)
 
+    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Normal force as a fraction of the weight, plus the round-off that a start with N = 0 exactly is allowed."""
+        return self.motion(state).normal_force / (self.slipping.mass * self.slipping.gravity) + 1e-12
+
     def slip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Slip speed above that at which a slip is over, in units of sqrt(g R)."""
         slip = self.slipping.motion(state).slip
