@@ -9,7 +9,7 @@ from lagrange_top import inversion
 
 import tippe
 from nonholonomic.digits import concise
-from nonholonomic.ensemble import lanes_for, single_kernel_march
+from nonholonomic.ensemble import lanes_for, compiled_march
 from tippe import steady
 from tippe.inversion import ABSOLUTE, InversionProblem, is_inverted
 from tippe.time_error import COARSER, time_error
@@ -181,7 +181,7 @@ def times(scene, launch, tolerance, crossing, t1=12.0):
     cells = launch.theta.size
     problem = InversionProblem.of(scene, launch, 0.95 * np.pi, cells)
     numbers = (jnp.asarray(value) for value in (t1, cells, tolerance, ABSOLUTE * tolerance))
-    outcome, _ = single_kernel_march(
+    outcome, _ = compiled_march(
         problem, *numbers, solver=diffrax.Dopri8(), lanes=lanes_for(cells), passes=crossing == "last"
     )
     inverted = np.asarray(is_inverted(outcome, problem, crossing == "last"))
