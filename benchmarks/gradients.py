@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from measure import machine, one_core, table, timed, write_csv
-from work_precision import TOP
+from scenes import TOP
 
 import tippe
 from nonholonomic import sweep

@@ -1,4 +1,4 @@
-"""Other programs on the same scenes: each takes a task and a tolerance and returns the answer of every launch.
+"""Other programs on the same scenes: each takes a task and a tolerance and returns how every launch ended.
 
 A peer that is not installed is named and skipped. None of them is installed by the benchmark.
 """
@@ -9,33 +9,54 @@ from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import numpy as np
-from fields import Numbers, cylinder, plane
+from fields import Functions
 
-#: Where the axis' component along the normal stands in the state.
+#: Where the axis' component along the normal stands in a top's state.
 E3 = 4
+
+#: The functions of a field on numbers.
+NUMPY = Functions(np.sqrt, np.sin, np.cos)
 
 
 class Task(NamedTuple):
-    """What is computed: the time at which theta reaches an angle (`angle`), or the axis at `t1` (`angle` None)."""
+    """What is computed: the time at which theta reaches an angle (`angle`), or `t1` (`angle` None), and the state there.
 
-    name: str
-    numbers: Numbers
+    `field` and `numbers` are those of `fields.py`; `starts` and `scales`, the magnitudes of the components, are
+    (components, launches); `compared` says which components of the end state are.
+    """
+
+    field: Callable[..., Any]
+    numbers: Any
     starts: Any
+    scales: Any
     t1: float
     angle: float | None
+    compared: slice
 
     @property
-    def field(self) -> Callable[..., Any]:
-        return cylinder if self.numbers.rho else plane
+    def launches(self) -> int:
+        return self.starts.shape[1]
 
-    @property
-    def scales(self) -> Any:
-        """Magnitudes of the components, as `tippe.Scene.scales` has them."""
-        p = self.numbers
-        rate = math.sqrt(p.gravity / p.radius)
-        momentum = max(float(np.max(np.linalg.norm(self.starts[5:8], axis=0))), p.I1 * rate)
-        place = [1.0] * (self.starts.shape[0] - 8)
-        return np.array([rate * p.radius] * 2 + [1.0] * 3 + [momentum] * 3 + place)
+    def of(self, which: Any) -> "Task":
+        """The same for some of the launches."""
+        return self._replace(starts=self.starts[:, which], scales=self.scales[:, which])
+
+
+class Ends(NamedTuple):
+    """When every launch ended [s], at its angle or at `t1`, and the components of its state there that are compared."""
+
+    time: Any
+    state: Any
+
+    @classmethod
+    def from_pairs(cls, task: Task, ends: Any) -> "Ends":
+        """From a pair of time and state for each launch."""
+        times, states = zip(*ends, strict=True)
+        return cls(np.array(times), np.array(states)[:, task.compared])
+
+    def of(self, which: Any) -> "Ends":
+        """The same for some of the launches."""
+        return Ends(self.time[which], self.state[which])
 
 
 def available(name: str) -> bool:
@@ -63,8 +84,8 @@ def heyoka_scalar(task: Task) -> Callable[[float], Any]:
                 integrator.reset_cooldowns()
             integrator.time, integrator.state[:] = 0.0, start
             integrator.propagate_until(task.t1)
-            answers.append(integrator.state[2:5].copy() if task.angle is None else integrator.time)
-        return np.array(answers)
+            answers.append((integrator.time, integrator.state.copy()))
+        return Ends.from_pairs(task, answers)
 
     return run
 
@@ -74,10 +95,13 @@ def heyoka_batch(task: Task) -> Callable[[float], Any]:
     import heyoka
 
     system, variables = _heyoka_system(heyoka, task)
-    width, made, times = heyoka.recommended_simd_size(), {}, {}
+    # The callback keeps what is outside of it, not what is in the integrator's copy of it.
+    width, made, ends = heyoka.recommended_simd_size(), {}, {}
 
     def found(integrator, time, sign, lane):
-        times.setdefault(lane, time)
+        if lane not in ends:
+            integrator.update_d_output(np.full(width, time))
+            ends[lane] = (time, integrator.d_output[:, lane].copy())
 
     def run(tolerance: float) -> Any:
         if tolerance not in made:
@@ -88,30 +112,26 @@ def heyoka_batch(task: Task) -> Callable[[float], Any]:
             blank = np.ones((len(variables), width))
             made[tolerance] = heyoka.taylor_adaptive_batch(system, blank, tol=tolerance, nt_events=events)
         integrator, answers = made[tolerance], []
-        for first in range(0, task.starts.shape[1], width):
-            lanes = np.minimum(np.arange(first, first + width), task.starts.shape[1] - 1)
-            times.clear()
+        for first in range(0, task.launches, width):
+            lanes = np.minimum(np.arange(first, first + width), task.launches - 1)
+            ends.clear()
             integrator.set_time(0.0)
             integrator.state[:] = task.starts[:, lanes]
             end = task.t1 if task.angle is None else 0.0
-            while task.angle is not None and len(times) < width and end < task.t1:
+            while task.angle is not None and len(ends) < width and end < task.t1:
                 end += 0.25
                 integrator.propagate_until(end)
             if task.angle is None:
                 integrator.propagate_until(end)
-                answers += list(integrator.state[2:5].T.copy())
-            else:
-                # The callback keeps the state of its closure, not of the integrator's copy of it.
-                answers += [times.get(lane, np.inf) for lane in range(width)]
-        return np.array(answers)[: task.starts.shape[1]]
+            answers += [ends.get(lane, (end, integrator.state[:, lane].copy())) for lane in range(width)]
+        return Ends.from_pairs(task, answers[: task.launches])
 
     return run
 
 
 def _heyoka_system(heyoka: Any, task: Task) -> tuple[Any, Any]:
-    names = ("u1", "u2", "e1", "e2", "e3", "L1", "L2", "L3", "sn", "cn")[: task.starts.shape[0]]
-    variables = heyoka.make_vars(*names)
-    rates = task.field(variables, task.numbers, heyoka.sqrt)
+    variables = heyoka.make_vars(*(f"y{i}" for i in range(len(task.starts))))
+    rates = task.field(variables, task.numbers, Functions(heyoka.sqrt, heyoka.sin, heyoka.cos))
     return [(one, rate + 0.0 * one) for one, rate in zip(variables, rates, strict=True)], variables
 
 
@@ -130,30 +150,26 @@ def scipy_with(method: str, compiled: bool) -> Callable[[Task], Callable[[float]
 
         def run(tolerance: float) -> Any:
             answers = []
-            for start in task.starts.T:
+            for start, scales in zip(task.starts.T, task.scales.T, strict=True):
                 found = solve_ivp(
                     rate,
                     (0.0, task.t1),
                     start,
                     method=method,
                     rtol=tolerance,
-                    atol=0.1 * tolerance * task.scales,
+                    atol=0.1 * tolerance * scales,
                     events=None if task.angle is None else reached,
                 )
-                answers.append(found.y[2:5, -1] if task.angle is None else _first(found.t_events[0]))
-            return np.array(answers)
+                answers.append((found.t[-1], found.y[:, -1]))
+            return Ends.from_pairs(task, answers)
 
         return run
 
     return make
 
 
-def _first(times: Any) -> float:
-    return times[0] if len(times) else math.inf
-
-
 def _python_field(task: Task) -> Callable[..., Any]:
-    return lambda t, y: np.array(task.field(y, task.numbers, np.sqrt))
+    return lambda t, y: np.array(task.field(y, task.numbers, NUMPY))
 
 
 def _numba_field(task: Task) -> Callable[..., Any]:
@@ -161,13 +177,15 @@ def _numba_field(task: Task) -> Callable[..., Any]:
 
     field, numbers = numba.njit(task.field), task.numbers
 
-    @numba.njit
-    def root(value):
-        return np.sqrt(value)
+    functions = Functions(
+        numba.njit(lambda value: np.sqrt(value)),
+        numba.njit(lambda value: np.sin(value)),
+        numba.njit(lambda value: np.cos(value)),
+    )
 
     @numba.njit
     def rate(t, y):
-        return np.array(field(y, numbers, root))
+        return np.array(field(y, numbers, functions))
 
     rate(0.0, task.starts[:, 0].copy())
     return rate
@@ -188,17 +206,15 @@ def cvode(task: Task) -> Callable[[float], Any]:
     reached.terminal, reached.direction = [True], [-1]
 
     def run(tolerance: float) -> Any:
-        options = {"method": "Adams", "rtol": tolerance, "atol": 0.1 * tolerance * task.scales, "max_num_steps": 10**7}
+        options = {"method": "Adams", "rtol": tolerance, "max_num_steps": 10**7}
         if task.angle is not None:
             options |= {"eventsfn": reached, "num_events": 1}
         answers = []
-        for start in task.starts.T:
-            found = CVODE(right_side, **options).solve(np.array([0.0, task.t1]), start)
-            if task.angle is None:
-                answers.append(found.y[-1, 2:5])
-            else:
-                answers.append(found.t_events[0] if found.t_events is not None else math.inf)
-        return np.array(answers)
+        for start, scales in zip(task.starts.T, task.scales.T, strict=True):
+            solver = CVODE(right_side, atol=0.1 * tolerance * scales, **options)
+            found = solver.solve(np.array([0.0, task.t1]), start)
+            answers.append((found.t[-1], found.y[-1]))
+        return Ends.from_pairs(task, answers)
 
     return run
 
@@ -213,23 +229,66 @@ def cyrk(task: Task) -> Callable[[float], Any]:
 
     def run(tolerance: float) -> Any:
         answers = []
-        for start in task.starts.T:
+        for start, scales in zip(task.starts.T, task.scales.T, strict=True):
             found = pysolve_ivp(
-                rate, (0.0, task.t1), start.copy(), method="DOP853", rtol=tolerance, atol=0.1 * tolerance * task.scales
+                rate, (0.0, task.t1), start.copy(), method="DOP853", rtol=tolerance, atol=0.1 * tolerance * scales
             )
-            answers.append(found.y[2:5, -1])
-        return np.array(answers)
+            answers.append((task.t1, found.y[:, -1]))
+        return Ends.from_pairs(task, answers)
 
     return run
 
 
-#: Name -> (package, how to make it, how many launches it can bear in a benchmark).
+def vmapped_diffrax(task: Task) -> Callable[[float], Any]:
+    """Diffrax's Dopri8 under `vmap`, with an event that Newton's method locates on its interpolant."""
+    import diffrax
+    import jax
+    import jax.numpy as jnp
+    import optimistix
+
+    functions = Functions(jnp.sqrt, jnp.sin, jnp.cos)
+    term = diffrax.ODETerm(lambda t, y, args: jnp.stack(task.field(y, task.numbers, functions)))
+    event = None
+    if task.angle is not None:
+        cosine = math.cos(task.angle)
+        newton = optimistix.Newton(1e-13, 1e-13)
+        event = diffrax.Event(lambda t, y, args, **_: y[E3] - cosine, newton, direction=False)
+
+    def one(start, scales, tolerance):
+        control = diffrax.PIDController(tolerance, 0.1 * tolerance * scales)
+        found = diffrax.diffeqsolve(
+            term,
+            diffrax.Dopri8(),
+            0.0,
+            task.t1,
+            None,
+            start,
+            stepsize_controller=control,
+            event=event,
+            max_steps=100_000,
+            throw=False,
+        )
+        return found.ts[0], found.ys[0]
+
+    batched = jax.jit(jax.vmap(one, (1, 1, None)))
+    starts, scales = jnp.asarray(task.starts), jnp.asarray(task.scales)
+
+    def run(tolerance: float) -> Any:
+        times, states = batched(starts, scales, tolerance)
+        return Ends(np.asarray(times), np.asarray(states)[:, task.compared])
+
+    return run
+
+
+#: Name -> (packages, how to make it, how many launches it can bear in a benchmark).
 PEERS = {
-    "heyoka scalar": ("heyoka", heyoka_scalar, 64),
-    "heyoka batch": ("heyoka", heyoka_batch, 64),
-    "SciPy DOP853, numba": ("numba", scipy_with("DOP853", True), 2),
-    "SciPy LSODA, numba": ("numba", scipy_with("LSODA", True), 2),
-    "SciPy DOP853, NumPy": ("scipy", scipy_with("DOP853", False), 1),
-    "CVODE Adams, numba": ("sksundae", cvode, 2),
-    "CyRK DOP853, numba": ("CyRK", cyrk, 4),
+    "heyoka scalar": (("heyoka",), heyoka_scalar, 64),
+    "heyoka batch": (("heyoka",), heyoka_batch, 64),
+    "SciPy DOP853, numba": (("scipy", "numba"), scipy_with("DOP853", True), 2),
+    "SciPy LSODA, numba": (("scipy", "numba"), scipy_with("LSODA", True), 2),
+    "SciPy DOP853, NumPy": (("scipy",), scipy_with("DOP853", False), 1),
+    "SciPy LSODA, NumPy": (("scipy",), scipy_with("LSODA", False), 1),
+    "CVODE Adams, numba": (("sksundae", "numba"), cvode, 2),
+    "CyRK DOP853, numba": (("CyRK", "numba"), cyrk, 4),
+    "vmapped Diffrax Dopri8": (("diffrax",), vmapped_diffrax, 1024),
 }

@@ -16,7 +16,7 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 from measure import machine, table, timed
-from work_precision import TOP
+from scenes import TOP
 
 import tippe
 from nonholonomic import sweep

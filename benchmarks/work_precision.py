@@ -1,11 +1,12 @@
 """Speed against error: this package beside its peers on the same launches, one core each.
 
-    python benchmarks/work_precision.py [--out FOLDER] [--quick]
+    python benchmarks/work_precision.py [--out FOLDER] [--quick] [--scenes NAME ...]
 
-For each scene and tolerance: the error is the greatest over the launches, of the inversion time or of the axis at the end,
-against heyoka at 1e-16 (SciPy's DOP853 at 1e-13 where heyoka is missing); the time is the least CPU time of three runs
-after a warm-up, per launch. Compilation is given apart. Peers that are not installed are named and skipped. It writes a
-CSV, a picture and the README's table.
+For each scene and tolerance: the error is the greatest over the launches, against heyoka at 1e-16 (SciPy's DOP853 at 1e-13
+where heyoka is missing): of the inversion time [s] where the scene has one, otherwise of the end, which has a column of its
+own (a top's axis, a stroller's position [m]). The time is the least CPU time of three runs after a warm-up (one run of the
+slow peers), per launch. Compilation is given apart. Peers that are not installed are named and skipped. It writes a CSV, a
+picture and the README's table.
 """
 
 import argparse
@@ -17,70 +18,29 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from fields import Numbers
 from measure import machine, one_core, table, timed, write_csv
-from peers import PEERS, Task, available, heyoka_scalar, scipy_with
+from peers import PEERS, Ends, Task, available, heyoka_scalar, scipy_with
+from scenes import Case, misprint, scenes
 
-import tippe
 from nonholonomic.ensemble import compiled_march, lanes_for
-from tippe.inversion import ABSOLUTE, InversionProblem
+from nonholonomic.lockstep import CROSSED
 
-ANGLE = 0.95 * math.pi
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
-
-#: The reference top of all scenes.
-MASS, RADIUS = 0.02, 0.02
-INERTIA = MASS * RADIUS**2
-TOP = (MASS, RADIUS, 0.006, 131.0 / 350.0 * INERTIA, 0.4 * INERTIA)
 
 SOLVERS = {"Dopri8": diffrax.Dopri8(), "Tsit5": diffrax.Tsit5(), "Dopri5": diffrax.Dopri5()}
 
 
-def scenes(launches: int) -> dict[str, tuple[tippe.Scene, tippe.Launch, float, float | None]]:
-    """Scene, launches, horizon and angle (`None`: the axis at the horizon is compared) of every benchmark."""
-    top, theta = tippe.Top(*TOP), np.linspace(0.05, 0.15, launches)
-    flat = tippe.Launch(theta, 100.0)
-    slope = tippe.Launch(theta, 100.0, eta=0.3)
-    drum = tippe.Cylinder(0.3)
-    return {
-        "plane, viscous": (tippe.Scene(top, tippe.Plane(), tippe.Viscous(0.3)), flat, 30.0, ANGLE),
-        # First crossings jump by whole oscillations in a cylinder, so the axis is compared there.
-        "cylinder, viscous": (tippe.Scene(top, drum, tippe.Viscous(0.3)), slope, 3.0, None),
-        "cylinder, Coulomb 1e-2": (tippe.Scene(top, drum, tippe.Coulomb(0.3, 1e-2)), slope, 0.5, None),
-        "cylinder, Coulomb 1e-3": (tippe.Scene(top, drum, tippe.Coulomb(0.3, 1e-3)), slope, 0.5, None),
-    }
-
-
-def task_of(name: str, scene: tippe.Scene, launch: tippe.Launch, t1: float, angle: float | None) -> Task:
-    """The same scene as plain numbers, for the peers."""
-    body, law = scene.body, scene.friction
-    numbers = Numbers(
-        *(float(value) for value in (body.mass, body.radius, body.offset, body.I1, body.I3, law.mu, scene.gravity)),
-        slip_speed=float(getattr(law, "slip_speed", 0.0)),
-        rho=float(scene.surface.radius - body.radius) if isinstance(scene.surface, tippe.Cylinder) else 0.0,
-    )
-    return Task(name, numbers, np.asarray(scene.state(launch)), t1, angle)
-
-
-def ours(scene: tippe.Scene, launch: tippe.Launch, t1: float, angle: float | None, solver: Any) -> Any:
+def ours(case: Case, solver: Any) -> Any:
     """This package's block driver, with the answer that the peers give."""
-    cells = launch.theta.shape[0]
-    # No angle has a cosine of 2: every run goes on to the horizon.
-    problem = InversionProblem.of(scene, launch, ANGLE if angle is None else angle, cells)
-    if angle is None:
-        problem = InversionProblem(problem.dynamics, jnp.asarray(-2.0), problem.states, problem.scales)
+    task, cells = case.task, case.task.launches
 
-    def run(tolerance: float) -> Any:
-        outcome, _ = compiled_march(
-            problem,
-            jnp.asarray(t1),
-            jnp.asarray(cells),
-            jnp.asarray(tolerance),
-            jnp.asarray(ABSOLUTE * tolerance),
-            solver=solver,
-            lanes=lanes_for(cells),
-        )
-        return outcome.crossing_time if angle is not None else outcome.state[2:5].T
+    def run(tolerance: float) -> Ends:
+        # Relative and absolute tolerance as `inversion_table` and `stroller.sweep` have them.
+        numbers = (jnp.asarray(number) for number in (task.t1, cells, tolerance, 0.1 * tolerance))
+        outcome, _ = compiled_march(case.problem, *numbers, solver=solver, lanes=lanes_for(cells))
+        ends = jax.tree.map(np.asarray, outcome)
+        time = np.where(ends.status == CROSSED, ends.crossing_time, ends.end_time)
+        return Ends(time, ends.state[task.compared].T)
 
     return run
 
@@ -118,7 +78,7 @@ def obvious_diffrax(task: Task, launches: int) -> Any:
         )
         return found.ts[0]
 
-    starts = task.starts[:, np.arange(launches) % task.starts.shape[1]]
+    starts = task.starts[:, np.arange(launches) % task.launches]
     y0 = (
         jnp.asarray(np.vstack([starts[:2], 0.0 * starts[:1]]).T),
         jnp.asarray(starts[2:5].T),
@@ -128,43 +88,56 @@ def obvious_diffrax(task: Task, launches: int) -> Any:
     return lambda: batched(y0)
 
 
-def row(scene: str, program: str, tolerance: float, error: float, milliseconds: float, first: float) -> dict[str, str]:
+def spread(launches: int, most: int) -> Any:
+    """Which launches stand for all of them with a program that bears only so many: as cheap and as dear as the rest."""
+    count = min(launches, most)
+    return ((np.arange(count) + 0.5) * launches / count).astype(int)
+
+
+def errors(task: Task, found: Ends, reference: Ends) -> tuple[float, float]:
+    """The greatest errors over the launches: of the time [s], or of the end where the horizon ends a run; of the end."""
+    time, end = (float(np.max(np.abs(one - other))) for one, other in zip(found, reference, strict=True))
+    return (end if task.angle is None else time), end
+
+
+def row(scene: str, program: str, tolerance: float, task: Task, measured: Any, reference: Ends) -> dict[str, str]:
     """One row of the CSV."""
+    error, end_error = errors(task, measured.result, reference)
     return {
         "scene": scene,
         "program": program,
         "tolerance": f"{tolerance:.0e}",
         "error": f"{error:.1e}",
-        "cpu ms per launch": f"{milliseconds:.4f}",
-        "first call [s]": f"{first:.1f}",
+        "end error": f"{end_error:.1e}",
+        "cpu ms per launch": f"{measured.cpu / task.launches * 1e3:.4f}",
+        "first call [s]": f"{measured.first:.1f}",
     }
 
 
-def measure(name: str, described: Any, quick: bool) -> list[dict[str, str]]:
+def measure(name: str, case: Case, quick: bool) -> list[dict[str, str]]:
     """All programs on one scene."""
-    scene, launch, t1, angle = described
-    task = task_of(name, *described)
-    reference = heyoka_scalar(task)(1e-16) if available("heyoka") else scipy_with("DOP853", True)(task)(1e-13)
+    task, difference = case.task, misprint(case)
+    if not difference < 1e-12:
+        raise RuntimeError(f"{name}: the peers' field differs from the scene's own by {difference:.1e}")
+    by_scipy = scipy_with("DOP853", compiled=available("numba"))
+    reference = heyoka_scalar(task)(1e-16) if available("heyoka") else by_scipy(task)(1e-13)
     rows = []
     tolerances = TOLERANCES[2::3] if quick else TOLERANCES
     for solver_name, solver in SOLVERS.items():
-        run, launches = ours(scene, launch, t1, angle, solver), launch.theta.shape[0]
+        run = ours(case, solver)
         for tolerance in tolerances:
             if solver_name != "Dopri8" and tolerance < 1e-10:
                 continue
             measured = timed(lambda run=run, tolerance=tolerance: run(tolerance), 3)
-            error = float(np.max(np.abs(np.asarray(measured.result) - reference)))
-            rows.append(
-                row(
-                    name, f"nonholonomic {solver_name}", tolerance, error, measured.cpu / launches * 1e3, measured.first
-                )
-            )
+            rows.append(row(name, f"nonholonomic {solver_name}", tolerance, task, measured, reference))
             print(rows[-1], flush=True)
-    for peer, (package, make, bears) in PEERS.items():
-        if not available(package):
-            print(f"{peer}: {package} is not installed, skipped")
+    for peer, (packages, make, bears) in PEERS.items():
+        missing = [package for package in packages if not available(package)]
+        if missing:
+            print(f"{peer}: {' and '.join(missing)} not installed, skipped")
             continue
-        few = task._replace(starts=task.starts[:, :bears])
+        which = spread(task.launches, bears)
+        few, right = task.of(which), reference.of(which)
         try:
             run = make(few)
         except NotImplementedError as reason:
@@ -172,8 +145,7 @@ def measure(name: str, described: Any, quick: bool) -> list[dict[str, str]]:
             continue
         for tolerance in tolerances if "heyoka" in peer else tolerances[::2]:
             measured = timed(lambda run=run, tolerance=tolerance: run(tolerance), 3 if "heyoka" in peer else 1)
-            error = float(np.max(np.abs(measured.result - reference[:bears])))
-            rows.append(row(name, peer, tolerance, error, measured.cpu / bears * 1e3, measured.first))
+            rows.append(row(name, peer, tolerance, few, measured, right))
             print(rows[-1], flush=True)
     return rows
 
@@ -222,7 +194,7 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
                 style = "-" if program.startswith("nonholonomic") else "--"
                 drawing.loglog(*zip(*points, strict=True), "o" + style, markersize=3, label=program)
         drawing.set_title(name)
-        drawing.set_xlabel("error [s], or of the axis")
+        drawing.set_xlabel("error [s], of the axis, or [m]")
         drawing.set_ylabel("CPU ms per launch, one core")
         drawing.grid(alpha=0.3)
     drawings[0].legend(fontsize=7)
@@ -235,18 +207,19 @@ def main() -> None:
     told.add_argument("--out", type=Path, default=Path("benchmark-out"))
     told.add_argument("--launches", type=int, default=512)
     told.add_argument("--quick", action="store_true", help="three tolerances, no vmapped Diffrax in large batches")
+    told.add_argument("--scenes", nargs="+", choices=list(scenes(1)), help="these scenes only")
     options = told.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     one_core()
     print(machine())
     rows = []
     described = scenes(options.launches)
-    for name, scene in described.items():
-        rows += measure(name, scene, options.quick)
+    for name in options.scenes or described:
+        rows += measure(name, described[name], options.quick)
     write_csv(options.out / "work_precision.csv", rows)
     print(table(summary(rows)))
-    if not options.quick:
-        task = task_of("plane, viscous", *described["plane, viscous"])
+    if not options.quick and "plane, viscous" in (options.scenes or described):
+        task = described["plane, viscous"].task
         mine = next(
             float(one["cpu ms per launch"])
             for one in rows
