@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from .lockstep import CROSSED, AbstractProblem, crossing_time
 from .queue import Outcome as Outcome
-from .queue import Progress, Queue
+from .queue import Queue
 
 
 def march(
@@ -32,7 +32,6 @@ def march(
     passes: bool = False,
     max_steps: int = 2_000_000,
     one_kernel: bool = False,
-    controlled: int | None = None,
 ) -> tuple[Outcome, Int[Array, ""]]:
     """Run every cell of a problem from t = 0 to its event, to the end of the model's validity, or to `t1`.
 
@@ -49,7 +48,6 @@ def march(
     - `max_steps`: a cell that needs more has failed.
     - `one_kernel`: whether to have the loop compiled into a single kernel on a CPU, which halves its cost; not for
       programs that are differentiated again.
-    - `controlled`: how many of the leading components steer the steps' lengths; all of them by default.
 
     **Returns:** the `Outcome`, and the number of lockstep iterations, each of which advanced `lanes` lanes.
     """
@@ -64,18 +62,9 @@ def march(
         passes=passes,
         max_steps=max_steps,
         one_kernel=one_kernel,
-        controlled=controlled,
     )
-
-    def period(carry: tuple[Progress, Outcome]) -> tuple[Progress, Outcome]:
-        progress, outcome = carry
-        progress = queue.run(progress)
-        return queue.refill(progress), queue.store(outcome, progress.block)
-
-    carry = (queue.start(), queue.empty())
-    progress, outcome = jax.lax.while_loop(lambda carry: queue.unfinished(carry[0]), period, carry)
-    outcome = queue.store(outcome, progress.block)
-    return (outcome if passes else with_crossing_times(problem, outcome)), progress.iterations
+    outcome, iterations = queue.outcome()
+    return (outcome if passes else with_crossing_times(problem, outcome)), iterations
 
 
 def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:

@@ -86,7 +86,11 @@ class Queue(eqx.Module):
         one_kernel: bool = False,
         controlled: int | None = None,
     ) -> "Queue":
-        """The queue of a problem; arguments as for `ensemble.march`."""
+        """The queue of a problem.
+
+        **Arguments:** as for `ensemble.march`, and `controlled`: how many of the leading components steer the steps' lengths;
+        all of them by default.
+        """
         control = Control(explicit_tableau(solver), solver.order(None), rtol, t1, max_steps, passes, controlled)
         starts, scales = problem.start()
         zero = jnp.zeros_like(starts[0])
@@ -109,6 +113,21 @@ class Queue(eqx.Module):
         """Problem, control and absolute tolerances of the cells in a block."""
         control = self.control._replace(t1=self.pick(self.control.t1, block.cell))
         return self.pick(self.problem, block.cell), control, self.pick(self.atols, block.cell)
+
+    def outcome(self) -> tuple[Outcome, Int[Array, ""]]:
+        """Run every cell.
+
+        **Returns:** the `Outcome`, its crossing times those of events that were passed, and the number of iterations.
+        """
+
+        def period(carry: tuple[Progress, Outcome]) -> tuple[Progress, Outcome]:
+            progress, outcome = carry
+            progress = self.run(progress)
+            return self.refill(progress), self.store(outcome, progress.block)
+
+        carry = (self.start(), self.empty())
+        progress, outcome = jax.lax.while_loop(lambda carry: self.unfinished(carry[0]), period, carry)
+        return self.store(outcome, progress.block), progress.iterations
 
     def start(self) -> Progress:
         """The first cells, one in each lane."""
@@ -147,10 +166,6 @@ class Queue(eqx.Module):
         block = jax.tree.map(lambda new, old: jnp.where(idle, new, old), loaded, block)
         return Progress(block, jnp.minimum(queued + jnp.sum(idle), self.cells), iterations)
 
-    def ended(self, block: Block) -> Bool[Array, " lanes"]:
-        """Which lanes hold a cell whose run has ended."""
-        return (block.status != RUNNING) & (block.cell < self.cells)
-
     def empty(self) -> Outcome:
         """An outcome of the right shapes, to be filled."""
         fresh = self.fresh
@@ -159,12 +174,8 @@ class Queue(eqx.Module):
     def store(self, outcome: Outcome, block: Block) -> Outcome:
         """The outcome with the cells of a block that have ended."""
         found = Outcome(block.status, block.crossing_time, block.time, block.state, block.steps, block.rejected)
-        return self.put(outcome, found, block.cell, self.ended(block))
-
-    def put(self, all: Any, some: Any, cell: Int[Array, " lanes"], which: Bool[Array, " lanes"]) -> Any:
-        """Results per cell, with those of some lanes written to their cells."""
-        to = jnp.where(which, cell, self.capacity)
-        return jax.tree.map(lambda into, values: into.at[..., to].set(values, mode="drop"), all, some)
+        to = jnp.where((block.status != RUNNING) & (block.cell < self.cells), block.cell, self.capacity)
+        return jax.tree.map(lambda all, some: all.at[..., to].set(some, mode="drop"), outcome, found)
 
     def _load(self, cell: Int[Array, " lanes"]) -> Block:
         block = self.pick(self.fresh, cell)

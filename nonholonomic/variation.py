@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jax.extend.core import Literal
 from jaxtyping import Array, Float, Int
 
-from .ensemble import alone, march
+from .ensemble import alone, with_crossing_times
 from .lockstep import CROSSED, AbstractProblem, crossing_time
-from .queue import Outcome
+from .queue import Outcome, Queue
 
 
 class VariationalProblem(AbstractProblem):
@@ -82,21 +82,22 @@ def march_with_slopes(
     **Returns:** the `Outcome`, and for each direction the derivative of `crossing_time`, 0 where that is infinite. Source:
     implicit function theorem at the event; step lengths are held fixed.
     """
-    states, _ = problem.start()
     varied = VariationalProblem(problem, directions, not passes)
-    options = {"solver": solver, "lanes": lanes, "one_kernel": one_kernel, "controlled": states.shape[0]}
+    size = problem.start()[0].shape[0]
+
+    def run(one: AbstractProblem, horizon: Float[Array, "..."], **options: Any) -> Outcome:
+        options |= {"solver": solver, "lanes": lanes, "one_kernel": one_kernel}
+        return Queue.of(one, horizon, cells, rtol, atol, **options).outcome()[0]
+
     if passes:
-        del options["controlled"]
-        outcome, _ = march(problem, t1, cells, rtol, atol, passes=True, **options)
-        # The variations run to the event alone, whose time is known by now.
-        horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
-        options["controlled"] = states.shape[0]
-        there, _ = march(varied, horizon, cells, rtol, atol, **options)
+        outcome = run(problem, t1, passes=True)
         happened = jnp.isfinite(outcome.crossing_time)
+        # The variations run to the event alone, whose time is known by now.
+        there = run(varied, jnp.where(happened, outcome.crossing_time, 0.0), controlled=size)
     else:
-        there, _ = march(varied, t1, cells, rtol, atol, **options)
+        there = run(varied, t1, controlled=size)
         happened = there.status == CROSSED
-        outcome = there._replace(state=varied.parts(there.state)[0])
+        outcome = with_crossing_times(problem, there._replace(state=varied.parts(there.state)[0]))
     state, *variations = varied.parts(there.state)
     # At the very start the event is there at once, whatever moves.
     happened &= there.end_time > 0.0
@@ -104,14 +105,10 @@ def march_with_slopes(
     def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         return crossing_time(problem, there.end_time, state)
 
-    slopes = []
-    for moved in zip(directions, variations, strict=True):
-        time, slope = eqx.filter_jvp(event_time, (problem, state), moved)
-        slopes.append(jnp.where(happened, slope, 0.0))
-    if not passes:
-        time = jnp.where(happened, time, 0.0)
-        outcome = outcome._replace(crossing_time=jnp.where(outcome.status == CROSSED, time, jnp.inf))
-    return outcome, slopes
+    slopes = [
+        eqx.filter_jvp(event_time, (problem, state), moved)[1] for moved in zip(directions, variations, strict=True)
+    ]
+    return outcome, [jnp.where(happened, slope, 0.0) for slope in slopes]
 
 
 #: `march_with_slopes`, compiled on its own, for use outside of other transformed functions.

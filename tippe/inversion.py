@@ -132,16 +132,16 @@ def _differentiable(run: _Run, count: int) -> Callable[..., Float[Array, ""]]:
 
 def _slopes(run: _Run, active: list[int]) -> Callable[..., list[Float[Array, ""]]]:
     """The derivatives of the event's time with respect to the active numbers, as a function of the call's numbers."""
-    function = functools.partial(_event_slopes, run, active)
 
     @jax.custom_jvp
     def slopes(*leaves):
-        return _batched(function)(*leaves)
+        return _batched(functools.partial(_event_slopes, run, active, True))(*leaves)
 
     @slopes.defjvp
     def second_variation(leaves, tangents):
         # `_batched` would mark the value as batched where only the variation is, so it is left out here.
-        return jax.jvp(lambda *numbers: [result[0] for result in function(1, *numbers)], leaves, tangents)
+        once = functools.partial(_event_slopes, run, active, False, 1)
+        return jax.jvp(lambda *numbers: [result[0] for result in once(*numbers)], leaves, tangents)
 
     return slopes
 
@@ -176,13 +176,14 @@ def _event_times(run: _Run, cells: int, *leaves: Float[Array, "..."]) -> Float[A
         solver=run.solver,
         lanes=lanes_for(cells),
         passes=run.last,
+        one_kernel=True,
     )
     inverted = is_inverted(outcome, problem, run.last)
     return jnp.where(inverted, outcome.crossing_time, jnp.inf)
 
 
 def _event_slopes(
-    run: _Run, active: list[int], cells: int, *leaves: Float[Array, "..."]
+    run: _Run, active: list[int], one_kernel: bool, cells: int, *leaves: Float[Array, "..."]
 ) -> list[Float[Array, " cells"]]:
     """Derivatives of the event's time with respect to the active numbers, 0 where there is no event.
 
@@ -214,6 +215,7 @@ def _event_slopes(
         solver=run.solver,
         lanes=lanes_for(cells),
         passes=run.last,
+        one_kernel=one_kernel,
     )
     inverted = is_inverted(outcome, problem, run.last)
     return [jnp.where(inverted, slope, 0.0) for slope in slopes]

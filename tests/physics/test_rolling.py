@@ -55,7 +55,7 @@ def test_the_reaction_is_the_force_that_keeps_the_contact_at_rest(arena):
     states = rolling_states(scene, rolling, 20)
     assert jnp.max(jnp.abs(scene.slip_velocity(states))) < 1e-14
     motion = rolling.motion(states)
-    forced = tippe.Scene(scene.body, arena, Prescribed(motion.friction))
+    forced = tippe.Scene(scene.body, arena, Prescribed(motion.friction.force))
     assert_close(forced.normal_force(states), motion.normal_force, rtol=1e-12)
     rates = rolling.field(states)
     assert_close(forced.field(states), rates, atol=1e-13 * float(jnp.max(jnp.abs(rates))))

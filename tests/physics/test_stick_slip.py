@@ -129,11 +129,11 @@ def test_a_table_is_what_its_runs_are():
         ),
         (
             lambda s: tippe.inversion_table(s, theta=0.1, spin=100.0, t1=1.0, method="diffrax"),
-            "method = 'diffrax' must be 'ensemble' with SetValuedCoulomb",
+            "method = 'diffrax' is not for runs of several phases",
         ),
         (
             lambda s: tippe.Scene(s.body, friction=s.friction, contact="hybrid"),
-            "contact = 'hybrid' must be 'stop' with",
+            "contact = 'hybrid' must be with friction at a point, not with SetValuedCoulomb",
         ),
         (lambda s: tippe.SetValuedCoulomb(-0.1), "mu = -0.1 must be at least 0"),
     ],
