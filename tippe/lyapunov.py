@@ -1,5 +1,6 @@
 """The Lyapunov exponent of a launch: whether nearby launches part exponentially, and how fast."""
 
+import dataclasses
 from typing import NamedTuple
 
 import diffrax
@@ -62,7 +63,7 @@ def lyapunov_exponent(
 
     **Returns:** a `LyapunovExponent`, its arrays of shape () or (n,).
 
-    **Raises:** `ValueError` for arguments outside these ranges.
+    **Raises:** `ValueError` for arguments outside these ranges, and for a scene with `contact="hybrid"` or `SetValuedCoulomb`.
     """
     solver = diffrax.Dopri8() if solver is None else solver
     explicit_tableau(solver)
@@ -70,6 +71,10 @@ def lyapunov_exponent(
         raise ValueError(f"scene = {scene!r} must be a Scene")
     if not isinstance(launch, Launch):
         raise ValueError(f"launch = {launch!r} must be a Launch")
+    if scene.contact == "hybrid" or scene.friction.set_valued:
+        raise ValueError(
+            "contact = 'hybrid' and SetValuedCoulomb have no exponents: variations end at a change of phase"
+        )
     require(t1, "t1", above=0.0)
     require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
     shapes = {np.shape(leaf) for leaf in jax.tree.leaves((scene, launch))} - {()}
@@ -77,8 +82,8 @@ def lyapunov_exponent(
         raise ValueError(f"scene and launch must hold scalars or one number per launch, not arrays of shapes {shapes}")
     shape = shapes.pop() if shapes else ()
     cells = int(np.prod(shape, dtype=int))
-    # The angle is that of an event, and the exponent has none.
-    problem = InversionProblem.of(scene, launch, jnp.pi, cells)
+    # No angle has a cosine of 2: nothing but the loss of contact ends a run before the horizon.
+    problem = dataclasses.replace(InversionProblem.of(scene, launch, jnp.pi, cells), cos_angle=jnp.asarray(-2.0))
     found = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, tolerance, ABSOLUTE, solver)
     exponent, error = exponent_of(found.logarithm, float(t1))
     whole = found.status == REACHED_END
