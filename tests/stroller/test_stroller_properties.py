@@ -1,4 +1,7 @@
-"""Properties over the whole legal range of strollers, grounds and launches (hypothesis)."""
+"""Properties over the whole legal range of strollers, grounds and launches (hypothesis).
+
+One measure judges them all: every step may err by its tolerance, and the linear map of the rest of the ride carries that on.
+"""
 
 import dataclasses
 import math
@@ -21,8 +24,14 @@ from stroller.table import RideProblem
 LANES = 16
 HORIZON = 0.25
 
-#: A small change that grows by more than this tells nothing about the rest of a ride.
-MOST_GROWTH = 1e5
+#: Small changes are followed over this many parts of a ride, one after the other.
+STRETCHES = 8
+
+#: A small change, relative to the magnitudes of a state.
+NUDGE = 1e-7
+
+#: Changes up to this are taken for small.
+SMALL = 1e-3
 
 #: Ground, side, fork, heading, friction: what a scene is made of, apart from its numbers.
 KINDS = [
@@ -44,11 +53,10 @@ MORE_KINDS = [
 ]
 
 
-@st.composite
-def batches(draw, kind):
+def batch_of(kind, seed: int):
     """A scene and a launch with `LANES` numbers in every place; every eighth lane at a pole, every eighth nearly across."""
     ground, side, fork, heading, friction = kind
-    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    random = np.random.default_rng(seed)
 
     def between(low, high, log=False):
         return np.exp(random.uniform(np.log(low), np.log(high), LANES)) if log else random.uniform(low, high, LANES)
@@ -98,67 +106,137 @@ def batches(draw, kind):
 
 
 def ride(scene: Scene, launch: Launch, tolerance: float = 1e-9, states=None, scales=None, horizon: float = HORIZON):
-    """How the rides end; from the given states rather than the launch's."""
-    problem = RideProblem.of(scene, launch, None, LANES, watched=False)
-    if states is not None:
-        problem = eqx.tree_at(lambda problem: problem.states, problem, jnp.asarray(states))
+    """How the rides end; from the given states rather than the launch's.
+
+    **Arguments:** `states`: (components, `LANES`), or those and as many others for each component. Room for all of them is
+    in every call, so that one program is compiled.
+    """
+    start = np.asarray(scene.state(launch) if states is None else states)
+    copies, count = start.shape[0] + 1, start.shape[1]
+
+    def repeated(tree):
+        return jax.tree.map(lambda leaf: np.tile(leaf, copies) if np.ndim(leaf) else leaf, tree)
+
+    cells = copies * LANES
+    problem = RideProblem.of(repeated(scene), repeated(launch), None, cells, watched=False)
+    problem = eqx.tree_at(lambda problem: problem.states, problem, jnp.asarray(np.tile(start, cells // count)))
     if scales is not None:
-        problem = eqx.tree_at(lambda problem: problem.scales, problem, jnp.asarray(scales))
-    numbers = (jnp.asarray(horizon), jnp.asarray(LANES), jnp.asarray(tolerance), jnp.asarray(0.1 * tolerance))
-    return compiled_march(problem, *numbers, solver=diffrax.Dopri8(), lanes=LANES, max_steps=200_000)[0]
+        problem = eqx.tree_at(lambda problem: problem.scales, problem, jnp.asarray(np.tile(scales, copies)))
+    numbers = (jnp.asarray(horizon), jnp.asarray(count), jnp.asarray(tolerance), jnp.asarray(0.1 * tolerance))
+    outcome = compiled_march(problem, *numbers, solver=diffrax.Dopri8(), lanes=LANES, max_steps=200_000)[0]
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[..., :count], outcome)
 
 
-@eqx.filter_jit
-def readings(scene: Scene, states):
-    """Energy, kinetic energy and work [J], and what should vanish: |e| - 1, e.n, and how far the position is off."""
-    dynamics = scene.dynamics
-    position, heading, (_, momentum, fork_rate, work) = dynamics.unpack(states)
-    kinetic = 0.5 * (momentum**2 + scene.body.steering_inertia * fork_rate**2)
+def knots_of(scene: Scene, launch: Launch, count: int):
+    """The states at `count` + 1 times of the rides, (times, components, lanes)."""
+    knots = [np.asarray(scene.state(launch))]
+    for _ in range(count):
+        knots.append(ride(scene, launch, 1e-11, knots[-1], horizon=HORIZON / count).state)
+    return np.stack(knots)
+
+
+def meets_a_kink(scene: Scene, launch: Launch):
+    """Which rides come where rolling resistance is cut off: the load changes its sign.
+
+    At a kink of the field a step's error estimate may be too small by any factor: with the kink evenly spread over a step
+    of Dopri8, by more than 10 in 1.5 % of the cases, by more than 100 in 0.1 %.
+    """
+    if isinstance(scene.surface, Plane) or not isinstance(scene.friction, RollingResistance):
+        return np.zeros(LANES, bool)
+    loads = [np.asarray(scene.contact(jnp.asarray(knot))) for knot in knots_of(scene, launch, 8 * STRETCHES)]
+    return (np.max(loads, axis=0) > 0.0) & (np.min(loads, axis=0) < 0.0)
+
+
+def weights_of(scene: Scene, launch: Launch, states):
+    """The magnitudes by which errors are measured: an error of the tolerance times these passes the step control."""
+    return np.asarray(scene.scales(launch)) + np.abs(states)
+
+
+def row_norms(matrices):
+    """The most that each row makes of an error whose root mean square over the components is 1, as a step's may be."""
+    return np.sqrt(matrices.shape[-1] * np.sum(matrices**2, axis=-1))
+
+
+def map_of(scene: Scene, launch: Launch, start, end):
+    """The linear map of small changes of states over a stretch of time, (lanes, components, components).
+
+    **Arguments:** `start`, `end`: states (components, lanes) and where the stretch brings them; changes are in units of the
+    magnitudes of each.
+    """
+    components, lanes = start.shape
+    nudges = NUDGE * np.concatenate([np.zeros((1, components)), np.eye(components)])
+    nudged = start + nudges[:, :, None] * weights_of(scene, launch, start)
+    starts = np.swapaxes(nudged, 0, 1).reshape(components, -1)
+    ends = ride(scene, launch, 1e-11, starts, horizon=HORIZON / STRETCHES).state.reshape(components, -1, lanes)
+    return np.transpose((ends[:, 1:] - ends[:, :1]) / (NUDGE * weights_of(scene, launch, end)[:, None]), (2, 0, 1))
+
+
+def growth_of(maps):
+    """By how much errors of one tolerance in a step, made anywhere on the way, have grown at most at the end of it.
+
+    **Arguments:** `maps`: of the stretches, each (lanes, components, components), the last one first.
+
+    **Returns:** the growth, infinite where the changes that were followed did not stay small.
+    """
+    total = np.broadcast_to(np.eye(maps[0].shape[-1]), maps[0].shape)
+    most = row_norms(total).max(axis=-1)
+    for one in maps:
+        total = total @ one
+        most = np.maximum(most, row_norms(total).max(axis=-1))
+    followed = np.max([row_norms(one).max(axis=-1) for one in maps], axis=0)
+    return np.where(NUDGE * followed < SMALL, most, np.inf)
+
+
+def first_integrals(scene: Scene, states):
+    """What stays zero: |e| - 1, e.n, how far the position is off the ground [m]; and what stays: energy less work [J]."""
+    position, heading, (_, _, _, work) = scene.dynamics.unpack(states)
     length = jnp.sqrt(sum(part * part for part in heading if part is not None))
     along, off = jnp.zeros_like(length), jnp.zeros_like(length)
     if not isinstance(scene.surface, Plane):
         off = scene.surface.departure(position)
         if scene.heading == "intrinsic":
             along = sum(a * b for a, b in zip(heading, scene.surface.outward(position), strict=True))
-    return scene.energy(states), kinetic, work, jnp.stack([length - 1.0, along, off])
+    return jnp.stack([length - 1.0, along, off, scene.energy(states) - work])
 
 
-def check_a_batch(scene: Scene, launch: Launch):
+@eqx.filter_jit
+def integrals_and_slopes(scene: Scene, states):
+    """The first integrals (integrals, lanes), and their derivatives by the state (integrals, components, lanes)."""
+    values, pull_back = jax.vjp(lambda states: first_integrals(scene, states), states)
+    rows = jnp.broadcast_to(jnp.eye(len(values))[:, :, None], (len(values), *values.shape))
+    return values, jax.vmap(lambda row: pull_back(row)[0])(rows)
+
+
+def check_a_batch(scene: Scene, launch: Launch, knots, kink):
     """Finite or flagged; on the ground, the heading a unit vector along it; energy is lost to friction, and to it only.
 
-    **Returns:** the errors, in tolerances for each step.
+    All these are first integrals of the equations, off the ground as well, so an error in them neither grows nor shrinks.
+
+    **Arguments:** `knots`: as above; `kink`: the rides whose errors are not judged.
+
+    **Returns:** the errors, in those of one tolerance in each step.
     """
     tolerance = 1e-9
-    outcome, start = ride(scene, launch, tolerance), scene.state(launch)
+    outcome = ride(scene, launch, tolerance)
     assert np.isfinite(outcome.state).all()
     assert np.isin(outcome.status, [REACHED_END, GUARD_LOST] if scene.heading == "projected" else [REACHED_END]).all()
-    (before, kinetic, _, _), (after, _, work, errors) = readings(scene, start), readings(scene, outcome.state)
-    places = scene.surface.axes
-    far = np.max(np.linalg.norm([start[:places], outcome.state[:places]], axis=1), axis=0)
-    size = kinetic + np.abs(work) + scene.body.mass * scene.gravity * (far + scene.body.wheelbase)
-    size = size + scene.scales(launch)[-1]
-    errors = np.abs([*errors, (after - before - work) / size, np.maximum(work, 0.0) / size])
-    return np.max(errors, axis=0) / (tolerance * np.asarray(outcome.steps))
+    most = 0.0
+    for knot in knots:
+        slopes = np.asarray(integrals_and_slopes(scene, jnp.asarray(knot))[1]) * weights_of(scene, launch, knot)
+        most = np.maximum(most, row_norms(np.swapaxes(slopes, 1, 2)))
+    before, after = (np.asarray(integrals_and_slopes(scene, at)[0]) for at in (scene.state(launch), outcome.state))
+    steps = np.asarray(outcome.steps)
+    # What vanishes identically, as on a plane, has no slope.
+    errors = np.abs(after - before) / np.where(most > 0.0, tolerance * steps * most, np.finfo(float).tiny)
+    work, weight = np.asarray(outcome.state[-1]), weights_of(scene, launch, knots[-1])[-1]
+    gained = np.maximum(work, 0.0) / (math.sqrt(len(knots[0])) * tolerance * steps * weight)
+    return np.where(kink, 0.0, np.max([*errors, gained], axis=0))
 
 
 def signs_of(scene: Scene, place, heading, rest):
     """A column of signs for the components of a state."""
     turned = scene.dynamics.heading.axes(scene.surface)
     return np.array([*place[: scene.surface.axes], *heading[:turned], *rest])[:, None]
-
-
-def departure(scene, launch, states, others):
-    """Greatest difference of two states in each lane, in units of the state's own magnitudes."""
-    states, others = np.asarray(states), np.asarray(others)
-    return np.max(np.abs(states - others) / (np.asarray(scene.scales(launch)) + np.abs(states)), axis=0)
-
-
-def sensitivity(scene, launch, states, tolerance, horizon=HORIZON):
-    """By how much a small change of the state at the start grows until the end of a ride."""
-    random = np.random.default_rng(0)
-    nudge = 1e-7 * (np.asarray(scene.scales(launch)) + np.abs(states)) * random.choice([-1.0, 1.0], np.shape(states))
-    ends = [ride(scene, launch, tolerance, at, horizon=horizon).state for at in (states, states + nudge)]
-    return departure(scene, launch, *ends) / 1e-7
 
 
 def check_mirror(scene: Scene, launch: Launch):
@@ -210,14 +288,30 @@ def check_units(scene: Scene, launch: Launch, exponents: tuple[int, int, int]):
     np.testing.assert_array_equal(far.state / sizes, near.state)
 
 
+def missed_by(scene, launch, states, others, tolerance, steps, growth):
+    """By how much two states of each lane differ, in what errors of one tolerance in each step make of it.
+
+    **Returns:** that, and whether it can be told: errors must stay small for their growth to be that of small changes.
+    """
+    states, others, allowed = np.asarray(states), np.asarray(others), tolerance * np.asarray(steps) * growth
+    difference = np.max(np.abs(states - others) / weights_of(scene, launch, states), axis=0)
+    told = allowed < SMALL
+    return np.where(told, difference / allowed, 0.0), told
+
+
+def reached(*outcomes):
+    """Which lanes came to the horizon."""
+    return np.all([np.asarray(outcome.status) == REACHED_END for outcome in outcomes], axis=0)
+
+
 def check_reversal(scene: Scene, launch: Launch):
     """Without friction the ride with all speeds reversed leads back to the start.
 
-    A free fork that turns with the frame is drawn straight as e^(v t / l), and on the way back pushed away as fast. Where
-    the speed changes its sign the two may cancel over a whole ride, so growth is looked at on the way as well.
+    Errors made there and back are carried to the start by the linear maps along the ride there. The growth from end to end
+    of the ride back is no measure: with a free fork that turns with the frame the ride there settles in a steady motion
+    (`stroller.md`, section 8, row 13), which repels on the way back; once lost, that way settles elsewhere, with all others.
 
-    **Returns:** by how much it misses, in tolerances for each step and for each unit of a small change's growth, and
-    for which rides that can be told.
+    **Returns:** by how much it misses, and for which rides that can be told.
     """
     tolerance = 1e-11
     smooth = eqx.tree_at(lambda scene: scene.friction, scene, jax.tree.map(jnp.zeros_like, scene.friction))
@@ -226,21 +320,18 @@ def check_reversal(scene: Scene, launch: Launch):
     signs = signs_of(scene, (1, 1, 1), (1, 1, 1), (1, -1, -1, 1))
     there = ride(smooth, launch, tolerance)
     back = ride(smooth, launch, tolerance, signs * there.state)
-    stays = (np.asarray(there.status) == REACHED_END) & (np.asarray(back.status) == REACHED_END)
-    missed = departure(smooth, launch, signs * back.state, smooth.state(launch))
-    growth = 1.0 + sensitivity(smooth, launch, signs * there.state, tolerance)
-    for part in (0.25, 0.5, 0.75):
-        on_the_way = ride(smooth, launch, tolerance, signs * there.state, horizon=part * HORIZON).state
-        rest = sensitivity(smooth, launch, on_the_way, tolerance, (1.0 - part) * HORIZON)
-        growth = np.maximum(growth, 1.0 + rest)
-    stays &= growth < MOST_GROWTH
-    return np.where(stays, missed / (tolerance * growth * np.asarray(there.steps)), 0.0), stays
+    knots = signs * knots_of(smooth, launch, STRETCHES)
+    growth = growth_of([map_of(smooth, launch, a, b) for a, b in zip(knots[1:], knots[:-1], strict=True)])
+    steps = there.steps + back.steps
+    missed, told = missed_by(smooth, launch, smooth.state(launch), signs * back.state, tolerance, steps, growth)
+    stays = told & reached(there, back)
+    return np.where(stays, missed, 0.0), stays
 
 
-def check_moving(scene: Scene, launch: Launch, angle: float):
+def check_moving(scene: Scene, launch: Launch, angle: float, knots, kink):
     """A ride that starts elsewhere is the same, moved: turned about the vertical axis, or shifted along a plane.
 
-    **Returns:** by how much it misses, as above.
+    **Returns:** by how much it misses, and for which rides that can be told.
     """
     tolerance, flat = 1e-11, isinstance(scene.surface, Plane)
     cosine, sine = math.cos(angle), math.sin(angle)
@@ -257,27 +348,30 @@ def check_moving(scene: Scene, launch: Launch, angle: float):
 
     states = scene.state(launch)
     here, there = ride(scene, launch, tolerance, states), ride(scene, launch, tolerance, moved(states))
-    stays = (np.asarray(here.status) == REACHED_END) & (np.asarray(there.status) == REACHED_END)
-    missed = departure(scene, launch, moved(here.state), there.state)
-    growth = 1.0 + sensitivity(scene, launch, states, tolerance)
-    stays &= growth < MOST_GROWTH
-    return np.where(stays, missed / (tolerance * growth * np.asarray(here.steps)), 0.0)
+    growth = growth_of([map_of(scene, launch, a, b) for a, b in zip(knots[:-1], knots[1:], strict=True)][::-1])
+    steps = here.steps + there.steps
+    missed, told = missed_by(scene, launch, moved(here.state), there.state, tolerance, steps, growth)
+    stays = told & reached(here, there) & ~kink
+    return np.where(stays, missed, 0.0), stays
 
 
 def check_everything(batch, angle, exponents):
-    """All properties of one batch."""
-    # Rolling resistance turns round within a small speed and is cut off where the load is zero: kinks, or nearly so, at
-    # which no method has its order.
-    rough = 25.0 if isinstance(batch[0].friction, RollingResistance) else 1.0
-    errors = check_a_batch(*batch)
-    assert np.all(errors < 0.3 * rough), errors
-    check_mirror(*batch)
-    check_units(*batch, exponents)
-    missed, stays = check_reversal(*batch)
-    assert np.all(missed < 0.2), missed
-    assert stays.mean() > 0.4
-    missed = check_moving(*batch, angle)
-    assert np.all(missed < 0.2 * rough), missed
+    """All properties of one batch; a miss of 1 is what an error of one tolerance in every step can make."""
+    scene, launch = batch
+    knots, kink = knots_of(scene, launch, STRETCHES), meets_a_kink(scene, launch)
+    errors = check_a_batch(scene, launch, knots, kink)
+    assert np.all(errors < 1.0), errors
+    check_mirror(scene, launch)
+    check_units(scene, launch, exponents)
+    for missed, stays in (check_reversal(scene, launch), check_moving(scene, launch, angle, knots, kink)):
+        assert np.all(missed < 1.0), missed
+        # A quarter of a batch at least, or little would be tested.
+        assert stays.mean() >= 0.25
+
+
+def batches(kind):
+    """Batches of a kind, each from a seed."""
+    return st.integers(0, 2**32 - 1).map(lambda seed: batch_of(kind, seed))
 
 
 ANGLES = st.floats(-math.pi, math.pi)
