@@ -16,7 +16,9 @@ from hard.row import Row
 from tippe.hybrid.stem import first_contact
 
 #: The reference's results, by number of its cases.
-REFERENCE = list(csv.DictReader((Path(__file__).parents[2] / "tests/physics/hop_reference.csv").open()))
+REFERENCE = list(
+    csv.DictReader((Path(__file__).parents[2] / "tests/physics/hop_reference.csv").read_text().splitlines())
+)
 
 
 def leine_glocker_top() -> tippe.Top:

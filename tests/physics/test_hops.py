@@ -19,8 +19,7 @@ from tippe.hybrid.free_body import FreeBody, angular_velocity, balls, energy, ga
 from tippe.hybrid.impact import strike
 from tippe.hybrid.stem import first_contact, standing_spin
 
-with open(Path(__file__).with_name("hop_reference.csv")) as file:
-    REFERENCE = list(csv.DictReader(file))
+REFERENCE = list(csv.DictReader(Path(__file__).with_name("hop_reference.csv").read_text().splitlines()))
 
 
 def leine_glocker_top() -> tippe.Top:
