@@ -9,7 +9,7 @@ from lagrange_top import inversion
 
 import tippe
 from nonholonomic.digits import concise
-from nonholonomic.ensemble import lanes_for, compiled_march
+from nonholonomic.ensemble import compiled_march, lanes_for
 from tippe import steady
 from tippe.inversion import ABSOLUTE, InversionProblem, is_inverted
 from tippe.time_error import COARSER, time_error
