@@ -121,40 +121,24 @@ class _Row(NamedTuple):
     unit: Float[Array, ""]
 
 
-def _residuals(moving: Float[Array, " moving"], given: tuple[Problem, Float[Array, "unknowns moving"], _Row]) -> Any:
-    """All residuals of one row, as Optimistix wants them."""
-    problem, embedding, row = given
+class _Tangent(NamedTuple):
+    """The model at a point of a row: the point's coordinates, the prediction there, and its slopes."""
+
+    coordinates: Float[Array, " unknowns"]
+    prediction: Float[Array, " n"]
+    slopes: Float[Array, "n unknowns"]
+
+
+def _residuals(moving: Float[Array, " moving"], given: tuple[Problem, Array, _Row, _Tangent]) -> Any:
+    """All residuals of one row, as Optimistix wants them, the model in its linear approximation.
+
+    A step of Levenberg-Marquardt asks for residuals and slopes at one point only, where the approximation is exact.
+    """
+    problem, embedding, row, tangent = given
     coordinates = row.held + embedding @ moving
-    data = row.measurements.residuals(_prediction(problem, coordinates))
+    prediction = tangent.prediction + tangent.slopes @ (coordinates - tangent.coordinates)
+    data = row.measurements.residuals(prediction)
     return jnp.concatenate([data, problem.prior(coordinates)]) / row.unit, None
-
-
-def _prediction(problem: Problem, coordinates: Float[Array, " unknowns"]) -> Float[Array, " n"]:
-    """The prediction of one row, whose batching keeps the rows together and whose derivative costs no second run."""
-    numbers, structure = eqx.partition(problem, eqx.is_array)
-
-    def rows(numbers, coordinates):
-        return _slopes(eqx.combine(numbers, structure), coordinates)
-
-    @jax.custom_batching.custom_vmap
-    def both(numbers, coordinates):
-        return jax.tree.map(lambda result: result[0], rows(numbers, coordinates[None]))
-
-    @both.def_vmap
-    def both_of_rows(size, batched, numbers, coordinates):
-        # The problem itself is the same in all rows.
-        return rows(numbers, coordinates), (True, True)
-
-    @jax.custom_jvp
-    def prediction(numbers, coordinates):
-        return both(numbers, coordinates)[0]
-
-    @prediction.defjvp
-    def variation(point, tangents):
-        value, slopes = both(*point)
-        return value, slopes @ tangents[1]
-
-    return prediction(numbers, coordinates)
 
 
 def minimise(
@@ -225,7 +209,9 @@ def _begin(solver: Any, problem: Problem, embedding: Array, row: _Row, moving: A
     """The solver's state before the first step, in every row."""
 
     def begin(moving, row):
-        given = (problem, embedding, row)
+        unknowns, n = embedding.shape[0], row.measurements.value.shape[0]
+        tangent = _Tangent(jnp.zeros(unknowns), jnp.zeros(n), jnp.zeros((n, unknowns)))
+        given = (problem, embedding, row, tangent)
         shape = eqx.filter_eval_shape(_residuals, moving, given)[0]
         return solver.init(_residuals, moving, given, {"jac": "fwd"}, shape, None, frozenset())
 
@@ -238,14 +224,18 @@ def _step(
 ) -> tuple[Array, Any, Array]:
     """One step of every row that is not done; the new points and states, and which rows are done now."""
 
-    def step(moving, state, row):
-        given = (problem, embedding, row)
+    # One run of the model with its slopes, for all rows together.
+    coordinates = row.held + state.y_eval @ embedding.T
+    tangents = _Tangent(coordinates, *_slopes(problem, coordinates))
+
+    def step(moving, state, row, tangent):
+        given = (problem, embedding, row, tangent)
         options = {"jac": "fwd"}
         moving, state, _ = solver.step(_residuals, moving, given, options, state, frozenset())
         ended, _ = solver.terminate(_residuals, moving, given, options, state, frozenset())
         return moving, state, ended
 
-    new_moving, new_state, ended = eqx.filter_vmap(step)(moving, state, row)
+    new_moving, new_state, ended = eqx.filter_vmap(step)(moving, state, row, tangents)
 
     def keep(new, old):
         return jnp.where(done.reshape(-1, *(1,) * (new.ndim - 1)), old, new) if eqx.is_array(new) else new

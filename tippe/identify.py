@@ -11,23 +11,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic import identify as generic
-from nonholonomic.ensemble import lanes_for, traced_march
 from nonholonomic.identify_result import Identification
 from nonholonomic.likelihood import Measurements
-from nonholonomic.lockstep import CROSSED, FAILED
 from nonholonomic.paths import numbers, with_numbers
 from nonholonomic.validation import as_number, require
 
-from .inversion import ABSOLUTE, InversionProblem, check_event, check_run
+from .extended_times import extended_inversion_times
+from .inversion import check_event, check_run, check_smooth
 from .launch import Launch
 from .scene import Scene
 from .trajectory import simulate
-
-#: A cell that needs more steps than this has failed: numbers tried on the way may be far off.
-MOST_STEPS = 100_000
-
-#: The least angle [rad] that is told from 0 in the penalty for a top that does not invert.
-LEAST_ANGLE = 1e-6
 
 
 class InversionTimes(eqx.Module):
@@ -173,44 +166,6 @@ class SceneModel(eqx.Module):
         return jnp.concatenate(parts, axis=1)
 
 
-def extended_inversion_times(
-    scene: Scene,
-    launch: Launch,
-    t1: Float[Array, ""],
-    angle: Float[Array, ""],
-    tolerance: float,
-    lanes: int,
-) -> Float[Array, " lanes"]:
-    """Inversion times, continued beyond the horizon so that a fit finds a way back.
-
-    A top that has not inverted by `t1`, or has lost contact, and is then at theta counts as inverting at
-    t1 (1 + log(angle / theta)): continuous where a time passes the horizon, and linear in the rate at which theta grows
-    where it grows exponentially, as it does from a small one. It is a penalty, no prediction.
-
-    **Arguments:**
-
-    - `scene`, `launch`: every number a scalar or (lanes,).
-    - `t1`, `angle`, `tolerance`: as for `inversion_time`.
-    - `lanes`: how many.
-
-    **Returns:** (lanes,) [s]; not a number where the integration failed.
-    """
-    problem = InversionProblem.of(scene, launch, angle, lanes)
-    outcome, _ = traced_march(
-        problem,
-        as_number(t1),
-        jnp.asarray(lanes),
-        as_number(tolerance),
-        as_number(ABSOLUTE * tolerance),
-        solver=diffrax.Dopri8(),
-        lanes=lanes_for(lanes),
-        max_steps=MOST_STEPS,
-    )
-    missing = jnp.log(angle / jnp.clip(jax.vmap(scene.theta, 1)(outcome.state), LEAST_ANGLE, angle))
-    times = jnp.where(outcome.status == CROSSED, outcome.crossing_time, t1 * (1.0 + missing))
-    return jnp.where(outcome.status == FAILED, jnp.nan, times)
-
-
 def identify(
     scene: Scene,
     data: Any,
@@ -237,10 +192,12 @@ def identify(
 
     **Returns:** an `Identification`.
 
-    **Raises:** `ValueError` for arguments out of range or an unknown path; `ImportError` if Optimistix is not installed.
+    **Raises:** `ValueError` for arguments out of range, an unknown path, and a scene with `contact="hybrid"` or
+    `SetValuedCoulomb`, through whose phases the derivative does not go; `ImportError` if Optimistix is not installed.
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
+    check_smooth(scene, "identify")
     data = tuple(data) if isinstance(data, list | tuple) else (data,)
     if not data or not all(isinstance(one, InversionTimes | Recording) for one in data):
         raise ValueError(f"data = {data!r} must be an InversionTimes or a Recording, or a list of them")

@@ -90,11 +90,7 @@ def inversion_time(
     solver = diffrax.Dopri8() if solver is None else solver
     check_run(scene, launch, t1, tolerance)
     check_event(angle, crossing)
-    if scene.contact == "hybrid":
-        raise ValueError("contact = 'hybrid' must be 'stop' for inversion_time; inversion_table goes through flights")
-    if scene.friction.set_valued:
-        kind = type(scene.friction).__name__
-        raise ValueError(f"friction = {kind} must be a law without phases for inversion_time; inversion_table has them")
+    check_smooth(scene, "inversion_time")
     explicit_tableau(solver)
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
     return _differentiable(_Run(structure, solver, crossing == "last"), len(leaves))(*leaves)
@@ -241,6 +237,15 @@ def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any) -> None:
     for name, value in values.items():
         if value is not None and np.ndim(value) != 0:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; inversion_table takes lists")
+
+
+def check_smooth(scene: Scene, caller: str) -> None:
+    """Raise `ValueError` for a scene whose runs have phases, which derivatives do not go through."""
+    if scene.contact == "hybrid":
+        raise ValueError(f"contact = 'hybrid' must be 'stop' for {caller}; inversion_table goes through flights")
+    if scene.friction.set_valued:
+        kind = type(scene.friction).__name__
+        raise ValueError(f"friction = {kind} must be a law without phases for {caller}; inversion_table has them")
 
 
 def check_event(angle: Any, crossing: Any) -> None:

@@ -15,6 +15,7 @@ def scene(rolling=2.0, wheelbase=0.7):
     return stroller.Scene(body, friction=stroller.Damping(rolling))
 
 
+@pytest.mark.slow
 def test_damping_and_wheelbase_from_an_exact_path():
     path = stroller.simulate(scene(), LAUNCH, 1.5, times=TIMES).position
     data = stroller.Recording(LAUNCH, TIMES, path, 0.01)

@@ -1,7 +1,9 @@
 """Numbers of tops from inversion times and recordings: recovered, censored, refused; and 200 noisy tables at once."""
 
+import dataclasses
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,8 +13,9 @@ import tippe
 from nonholonomic.identify_result import coordinate_covariance
 from nonholonomic.levenberg_marquardt import Problem, linearise, minimise
 from nonholonomic.likelihood import Measurements
-from nonholonomic.unknown import Free
-from tippe.identify import SceneModel, extended_inversion_times
+from nonholonomic.unknown import Free, draw_starts
+from tippe.extended_times import extended_inversion_times
+from tippe.identify import SceneModel
 
 LAUNCH = tippe.Launch(theta=[0.2, 0.2, 0.3, 0.2], spin=[110.0, 140.0, 110.0, 60.0])
 LAUNCHES = list(zip(np.asarray(LAUNCH.theta).tolist(), np.asarray(LAUNCH.spin).tolist(), strict=True))
@@ -51,6 +54,27 @@ def test_beyond_the_horizon_times_go_on_without_a_jump(rutstam_scene):
     assert before[0] < before[3]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("tables", [1, 100])
+def test_slopes_of_the_times_are_those_of_central_differences(rutstam_scene, tables):
+    """Along three directions, which are run in groups of two; with many lanes, in one kernel; and beyond the horizon."""
+    data = tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, np.inf], 0.05, t1=6.0)
+    free = tuple((name, Free(at, 0.0)) for name, at in (("scene.friction.mu", 0.3), ("scene.body.offset", 0.006)))
+    problem = Problem(SceneModel(rutstam_scene, (data,), 1e-11), (*free, ("scene.gravity", Free(9.81, 0.0))))
+    at = jnp.log(jnp.array([[0.3, 0.006, 9.81]])) + jnp.zeros((tables, 1))
+    slopes = linearise(problem, at, Measurements(np.full(4, 2.0), 1.0)).jacobian
+    predict = jax.jit(problem.predict)
+    for k in range(3):
+
+        def difference(step):
+            return (predict(at.at[:, k].add(step)) - predict(at.at[:, k].add(-step))) / (2.0 * step)  # noqa: B023
+
+        extrapolated = (4.0 * difference(1e-5) - difference(2e-5)) / 3.0
+        assert_close(slopes[..., k], extrapolated, rtol=1e-5, atol=1e-6)
+    assert np.all(np.abs(slopes[0, :, :2]) > 1e-3)
+
+
+@pytest.mark.slow
 def test_recordings_are_predicted_as_simulated(rutstam_scene):
     launch, times = tippe.Launch(0.4, 100.0), np.array([0.1, 0.2, 0.3])
     run = tippe.simulate(rutstam_scene, launch, 0.3, times=times)
@@ -99,6 +123,22 @@ def test_bad_unknowns_are_refused_before_anything_runs(rutstam_scene, free, told
         tippe.identify(rutstam_scene, 3.0, {"mu": 0.2})
 
 
+@pytest.mark.parametrize(
+    ("phases", "told"),
+    [
+        ({"contact": "hybrid"}, "contact = 'hybrid' must be 'stop' for"),
+        ({"friction": tippe.SetValuedCoulomb(0.3)}, "friction = SetValuedCoulomb must be a law without phases for"),
+    ],
+)
+def test_scenes_with_phases_are_refused(rutstam_scene, phases, told):
+    scene = dataclasses.replace(rutstam_scene, **phases)
+    data = tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, 4.0], 0.1, t1=5.0)
+    with pytest.raises(ValueError, match=told + " identify"):
+        tippe.identify(scene, data, {"mu": 0.2})
+    with pytest.raises(ValueError, match=told + " extended_inversion_times"):
+        extended_inversion_times(scene, LAUNCH, 5.0, 3.0, 1e-8, 4)
+
+
 @pytest.fixture(scope="module")
 def experiment():
     """Friction and offset from ten times: the problem, its true coordinates, the exact times and their error [s]."""
@@ -143,14 +183,32 @@ def test_two_hundred_noisy_tables_give_unbiased_estimates_and_intervals_that_cov
 
 
 @pytest.mark.slow
-def test_fits_come_back_from_starts_a_factor_two_away(experiment, capsys):
-    """Both numbers off by a factor of two, either way, in 24 realisations: one start each."""
+def test_eight_starts_about_a_guess_a_factor_two_off_find_the_truth(experiment, capsys):
+    """Both numbers guessed wrong by a factor of two, either way: what `identify(..., starts=8)` does, for 25 noisy tables.
+
+    A single start may stick on a step of the time's staircase. The truth counts as found where the best of the eight fits
+    explains the table at least as well as the true numbers do, and these lie within five of its standard errors.
+    """
     problem, true, exact, error = experiment
-    noisy = Measurements(exact + error * np.random.default_rng(1).normal(size=(24, 10)), error)
-    corners = np.log(2.0) * np.array([(a, b) for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
-    ends = minimise(problem, true + np.tile(corners, (6, 1)), noisy)
-    deviance = linearise(problem, ends.coordinates, noisy).deviance
-    home = np.asarray(ends.converged) & (np.asarray(deviance) < TOO_MUCH)
+    tables, starts = 25, 8
+    noisy = exact + error * np.random.default_rng(1).normal(size=(tables, 10))
+    corners = [2.0 ** np.array([a, b]) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
+    begins = []
+    for i in range(tables):
+        guess = np.exp(true) * corners[i % 4]
+        about = {name: Free(at, 0.0) for name, at in zip(("mu", "offset"), guess.tolist(), strict=True)}
+        begins.append(draw_starts(about, starts, 2.0, seed=i))
+    each = Measurements(np.repeat(noisy, starts, axis=0), error)
+    ends = minimise(problem, np.concatenate(begins), each)
+    there = linearise(problem, ends.coordinates, each)
+    deviance = np.asarray(there.deviance).reshape(tables, starts)
+    best = np.arange(tables) * starts + np.argmin(deviance, axis=1)
+    of_truth = np.sum(((noisy - exact) / error) ** 2, axis=1)
+    off = np.asarray(ends.coordinates)[best] - true
+    errors = np.array([np.sqrt(np.diag(coordinate_covariance(np.asarray(one)))) for one in there.jacobian[best]])
+    found = (deviance.min(axis=1) <= of_truth) & np.all(np.abs(off) < 5.0 * errors, axis=1)
     with capsys.disabled():
-        print("\ncame back", home.mean(), "steps", np.percentile(ends.steps, [50, 90, 100]))
-    assert home.mean() >= 0.95
+        alone = np.mean(deviance <= of_truth[:, None] + 0.1)
+        print("\nfound", found.mean(), "of single starts", alone, "converged", np.mean(ends.converged))
+        print("steps", np.percentile(ends.steps, [50, 90, 100]), "off / error", np.max(np.abs(off / errors)))
+    assert found.mean() >= 0.95

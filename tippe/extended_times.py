@@ -1,0 +1,145 @@
+"""Inversion times that a fit can follow beyond its horizon, with their derivatives along several directions at once."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nonholonomic.ensemble import lanes_for, traced_march
+from nonholonomic.lockstep import CROSSED, FAILED, crossing_time
+from nonholonomic.validation import as_number
+from nonholonomic.variation import VariationalProblem
+
+from .inversion import ABSOLUTE, InversionProblem, check_smooth
+from .launch import Launch
+from .scene import Scene
+
+#: A cell that needs more steps than this has failed: numbers tried on the way may be far off.
+MOST_STEPS = 100_000
+
+#: The least angle [rad] that is told from 0 in the penalty for a top that does not invert.
+LEAST_ANGLE = 1e-6
+
+#: Directions that run along together: more of them cost less time in all, but more to compile.
+TOGETHER = 2
+
+#: From how many cells on it pays to compile for twice as long what then runs in a third of the time.
+MANY = 64
+
+
+def extended_inversion_times(
+    scene: Scene,
+    launch: Launch,
+    t1: Float[Array, ""],
+    angle: Float[Array, ""],
+    tolerance: float,
+    lanes: int,
+) -> Float[Array, " lanes"]:
+    """Inversion times, continued beyond the horizon so that a fit finds a way back.
+
+    A top that has not inverted by `t1`, or has lost contact, and is then at theta counts as inverting at
+    t1 (1 + log(angle / theta)): continuous where a time passes the horizon, and linear in the rate at which theta grows
+    where it grows exponentially, as it does from a small one. It is a penalty, no prediction. First derivatives, forward
+    mode, are those of the event's time (implicit function theorem) and of the penalty.
+
+    **Arguments:**
+
+    - `scene`, `launch`: every number a scalar or (lanes,).
+    - `t1`, `angle`, `tolerance`: as for `inversion_time`.
+    - `lanes`: how many.
+
+    **Returns:** (lanes,) [s]; not a number where the integration failed.
+
+    **Raises:** `ValueError` for a scene with `contact="hybrid"` or `SetValuedCoulomb`.
+    """
+    check_smooth(scene, "extended_inversion_times")
+    leaves, structure = jax.tree.flatten(InversionProblem.of(scene, launch, angle, lanes))
+    return _differentiable(structure, as_number(t1), as_number(tolerance))(*leaves)
+
+
+def _differentiable(structure: Any, t1: Float[Array, ""], tolerance: Float[Array, ""]) -> Callable[..., Array]:
+    """The extended times as a function of a problem's numbers; directions that `jax.vmap` stacks run along together."""
+
+    def run(leaves: tuple[Array, ...], moving: list[list[Array | None]]) -> tuple[Array, Array]:
+        directions = tuple(jax.tree.unflatten(structure, one) for one in moving)
+        return _times_and_slopes(jax.tree.unflatten(structure, leaves), directions, t1, tolerance)
+
+    @jax.custom_batching.custom_vmap
+    def along(leaves, moving):
+        times, slopes = run(leaves, [moving])
+        return times, slopes[0]
+
+    @along.def_vmap
+    def along_several(size, batched, leaves, moving):
+        if any(batched[0]):
+            axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
+            results = jax.vmap(lambda *given: run(given[0], [given[1]]), axes)(leaves, moving)
+            return (results[0], results[1][:, 0]), (True, True)
+        # Groups of one size, padded with directions that lead nowhere, share a program.
+        groups = -(-size // TOGETHER)
+
+        def grouped(tangent, is_batched):
+            stacked = tangent if is_batched else jnp.broadcast_to(tangent, (size, *tangent.shape))
+            padding = jnp.zeros((groups * TOGETHER - size, *stacked.shape[1:]))
+            return jnp.concatenate([stacked, padding]).reshape(groups, TOGETHER, *stacked.shape[1:])
+
+        def group(tangents):
+            stacked, empty = jax.tree.flatten(tangents)
+            return run(leaves, [jax.tree.unflatten(empty, [one[k] for one in stacked]) for k in range(TOGETHER)])
+
+        times, slopes = jax.lax.map(group, jax.tree.map(grouped, moving, batched[1]))
+        return (times[0], slopes.reshape(groups * TOGETHER, -1)[:size]), (False, True)
+
+    @jax.custom_jvp
+    def times(*leaves):
+        return run(leaves, [])[0]
+
+    @functools.partial(times.defjvp, symbolic_zeros=True)
+    def variation(leaves, tangents):
+        zero = jax.custom_derivatives.SymbolicZero
+        return along(leaves, [None if isinstance(tangent, zero) else tangent for tangent in tangents])
+
+    return times
+
+
+def _times_and_slopes(
+    problem: InversionProblem, directions: tuple[Any, ...], t1: Float[Array, ""], tolerance: Float[Array, ""]
+) -> tuple[Float[Array, " cells"], Float[Array, "directions cells"]]:
+    """The extended times of every cell, and their derivatives along directions (as of `VariationalProblem`)."""
+    components, cells = problem.states.shape
+    varied = VariationalProblem(problem, directions, True)
+    outcome, _ = traced_march(
+        varied,
+        t1,
+        jnp.asarray(cells),
+        tolerance,
+        ABSOLUTE * tolerance,
+        solver=diffrax.Dopri8(),
+        lanes=max(8, 3 * lanes_for(cells) // (2 + 2 * len(directions))) if directions else lanes_for(cells),
+        max_steps=MOST_STEPS,
+        one_kernel=cells >= MANY,
+        controlled=components,
+    )
+    state, *variations = varied.parts(outcome.state)
+    crossed = outcome.status == CROSSED
+
+    def extended(problem: InversionProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+        # A cell that starts beyond the angle is there at once.
+        time = jnp.where(outcome.end_time > 0.0, crossing_time(problem, outcome.end_time, state), 0.0)
+        angle = jnp.arccos(problem.cos_angle)
+        theta = jnp.arctan2(jnp.hypot(state[2], state[3]), state[4])
+        missing = jnp.log(angle / jnp.clip(theta, LEAST_ANGLE, angle))
+        return jnp.where(crossed, time, t1 * (1.0 + missing))
+
+    failed = outcome.status == FAILED
+    times = jnp.where(failed, jnp.nan, extended(problem, state))
+    slopes = [
+        jnp.where(failed, 0.0, eqx.filter_jvp(extended, (problem, state), moved)[1])
+        for moved in zip(directions, variations, strict=True)
+    ]
+    return times, jnp.stack(slopes) if slopes else jnp.zeros((0, cells))
