@@ -38,14 +38,12 @@ def times(scene: tippe.Scene, theta: np.ndarray, tolerance: float, paths: list[s
     return tippe.inversion_table(scene, theta=theta, spin=100.0, t1=30.0, tolerance=tolerance, sensitivities=paths)
 
 
-def loss_of(
-    scene: tippe.Scene, theta: np.ndarray, tolerance: float, paths: list[str]
-) -> tuple[Callable[[Any], Any], list[Any]]:
-    """Mean square of the launches' times, as a function of some numbers of scene and launch, and the numbers."""
+def loss_of(scene: tippe.Scene, theta: np.ndarray, paths: list[str]) -> tuple[Callable[..., Any], list[Any]]:
+    """Mean square of the launches' times, as a function of some numbers and the tolerance, and the numbers."""
     known = {"scene.friction.mu": scene.friction.mu, "launch.spin": 100.0, "launch.theta": theta}
     known |= {f"scene.body.{name}": getattr(scene.body, name) for name in ("offset", "I1", "I3")}
 
-    def loss(values: list[Any]) -> Any:
+    def loss(values: list[Any], tolerance: Any) -> Any:
         def time(one: Any) -> Any:
             given = dict(zip(paths, values, strict=True)) | ({"launch.theta": one} if "launch.theta" in paths else {})
             roots = with_numbers({"scene": scene, "launch": tippe.Launch(one, 100.0)}, given)
@@ -54,7 +52,7 @@ def loss_of(
         angles = values[paths.index("launch.theta")] if "launch.theta" in paths else jnp.asarray(theta)
         return jnp.mean(jax.vmap(time)(angles) ** 2)
 
-    return jax.jit(loss), [jnp.asarray(known[path], float) for path in paths]
+    return loss, [jnp.asarray(known[path], float) for path in paths]
 
 
 def differences(scene: tippe.Scene, theta: float) -> tuple[float, float]:
@@ -72,13 +70,24 @@ def rows_of(name: str, scene: tippe.Scene, launches: int) -> list[dict[str, str]
     theta = np.linspace(0.05, 0.15, launches)
     exact = times(scene, theta, 1e-13, ONE).time_by_mu
     slope, doubt = differences(scene, theta[0])
-    rows = [row_of(name, scene, theta, tolerance, exact, (slope, doubt)) for tolerance in (1e-6, 1e-8, 1e-10, 1e-12)]
+    losses = {}
+    for label, paths in (("two", [*ONE, SIX[1]]), ("all", SIX)):
+        loss, values = loss_of(scene, theta, paths)
+        losses[label] = (values, jax.jit(loss), jax.jit(jax.grad(loss)))
+    given = (losses, exact, (slope, doubt))
+    rows = [row_of(name, scene, theta, tolerance, *given) for tolerance in (1e-6, 1e-8, 1e-10, 1e-12)]
     print(table(rows), flush=True)
     return rows
 
 
 def row_of(
-    name: str, scene: tippe.Scene, theta: np.ndarray, tolerance: float, exact: Any, difference: tuple[float, float]
+    name: str,
+    scene: tippe.Scene,
+    theta: np.ndarray,
+    tolerance: float,
+    losses: dict[str, Any],
+    exact: Any,
+    difference: tuple[float, float],
 ) -> dict[str, str]:
     """Costs and errors at one tolerance."""
     runs = {
@@ -86,11 +95,9 @@ def row_of(
         "one": timed(lambda: times(scene, theta, tolerance, ONE), 3),
         "six": timed(lambda: times(scene, theta, tolerance, SIX), 2),
     }
-    for label, paths in (("two", [*ONE, SIX[1]]), ("all", SIX)):
-        loss, values = loss_of(scene, theta, tolerance, paths)
-        runs[f"loss of {label}"] = timed(lambda loss=loss, values=values: loss(values), 3)
-        gradient = jax.jit(jax.grad(loss))
-        runs[f"gradient of {label}"] = timed(lambda gradient=gradient, values=values: gradient(values), 2)
+    for label, (values, *functions) in losses.items():
+        for what, function in zip(("loss", "gradient"), functions, strict=True):
+            runs[f"{what} of {label}"] = timed(lambda run=function, at=values: run(at, jnp.asarray(tolerance)), 2)
     base, slopes = runs["table"].cpu, runs["one"].result.time_by_mu
     slope, doubt = difference
     return {

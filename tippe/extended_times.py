@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.ensemble import lanes_for, traced_march
+from nonholonomic.ensemble import lanes_for
 from nonholonomic.lockstep import CROSSED, FAILED, crossing_time
+from nonholonomic.queue import Queue
 from nonholonomic.validation import as_number
 from nonholonomic.variation import VariationalProblem
 
@@ -113,7 +114,7 @@ def _times_and_slopes(
     """The extended times of every cell, and their derivatives along directions (as of `VariationalProblem`)."""
     components, cells = problem.states.shape
     varied = VariationalProblem(problem, directions, True)
-    outcome, _ = traced_march(
+    outcome, _ = Queue.of(
         varied,
         t1,
         jnp.asarray(cells),
@@ -124,7 +125,7 @@ def _times_and_slopes(
         max_steps=MOST_STEPS,
         one_kernel=cells >= MANY,
         controlled=components,
-    )
+    ).outcome()
     state, *variations = varied.parts(outcome.state)
     crossed = outcome.status == CROSSED
 

@@ -59,7 +59,7 @@ def test_transformations_agree():
 
 def test_second_derivative():
     """jax.hessian against differences of the gradient."""
-    slope = jax.grad(time_of)
+    slope = jax.jit(jax.grad(time_of))
     expected = central_difference(slope, 0.3, [2e-5, 1e-5, 5e-6, 2.5e-6])
     assert_close(jax.hessian(time_of)(0.3), expected, rtol=1e-4)
 
