@@ -110,6 +110,8 @@ class Dynamics(eqx.Module):
         M3 = subtract(multiply(r1, f2), multiply(r2, f1))
         M1, M2, M3 = sum_vectors((M1, M2, M3), friction.torque)
 
+        M1, M2, M3 = stored(M1, M2, M3)
+
         # n . acceleration of the centre = centripetal; N is on both sides through M.
         centripetal = dot(V, o)
         pull = add(multiply(self.gravity, up[2]), centripetal)
