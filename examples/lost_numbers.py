@@ -49,9 +49,7 @@ def main() -> None:
     print(found)
     misfit = max(1.0, (found.deviance / found.degrees) ** 0.5)
     if found.deviance > 2.0 * found.degrees:
-        print(
-            "This top does not reproduce the tables: what follows says how sharply they would fix one near it, no more."
-        )
+        print("This top does not reproduce the tables: what follows is how sharply they would fix one near it.")
     print(f"Residuals are {misfit:.2g} times the errors of 1 s. With errors so large the tables fix, near this point,")
     for value, words in zip(found.identifiability.singular_values, found.identifiability.words, strict=True):
         error = misfit / max(value, 1e-300)
