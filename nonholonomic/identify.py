@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -74,6 +75,15 @@ def identify(
     return summarise(
         problem, measurements, labels, begins, np.asarray(ends.coordinates), np.asarray(ends.converged), there
     )
+
+
+def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...]]:
+    """The measurements of several data sets, each with `measurements` and `labels`, one after the other, and their labels."""
+    measurements = [one.measurements for one in data]
+    labels = tuple(
+        f"{i + 1}: {label}" if len(data) > 1 else label for i, one in enumerate(data) for label in one.labels
+    )
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *measurements), labels
 
 
 def free_numbers(

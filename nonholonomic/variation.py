@@ -14,9 +14,17 @@ import jax.numpy as jnp
 from jax.extend.core import Literal
 from jaxtyping import Array, Float, Int
 
-from .ensemble import alone, with_crossing_times
+from .ensemble import alone, lanes_for, with_crossing_times
 from .lockstep import CROSSED, AbstractProblem, crossing_time
 from .queue import Outcome, Queue
+
+#: Directions that run along together: more of them cost less time in all, but more to compile.
+TOGETHER = 2
+
+
+def lanes_along(cells: int, directions: int) -> int:
+    """How many cells should advance together with their variations in some directions: the whole state fits the caches."""
+    return max(8, 3 * lanes_for(cells) // (2 + 2 * directions)) if directions else lanes_for(cells)
 
 
 class VariationalProblem(AbstractProblem):

@@ -6,13 +6,13 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic import identify as generic
 from nonholonomic.identify_result import Identification
 from nonholonomic.likelihood import Measurements
 from nonholonomic.paths import numbers
+from nonholonomic.recording import check_recording, sample_labels, samples
 from nonholonomic.validation import as_number, require
 
 from .input import Input
@@ -49,25 +49,17 @@ class Recording(eqx.Module):
     input: Input | None = None
 
     def __check_init__(self):
-        if self.quantity not in QUANTITIES:
-            raise ValueError(f"quantity = {self.quantity!r} must be one of {', '.join(map(repr, QUANTITIES))}")
-        require(self.times, "times", at_least=0.0)
-        if np.ndim(self.times) != 1 or np.any(np.diff(np.asarray(self.times)) <= 0.0) or not self.times[-1] > 0.0:
-            raise ValueError(f"times = {self.times!r} must be an increasing list with a positive end")
-        shape = (len(self.times), *((3,) if self.quantity == "position" else ()))
-        if np.shape(self.value) != shape:
-            raise ValueError(f"value must be of shape {shape} for {self.quantity!r}, not {np.shape(self.value)}")
+        check_recording(self.times, self.value, self.quantity, QUANTITIES)
 
     @property
     def measurements(self) -> Measurements:
         """The samples as a likelihood takes them."""
-        error = jnp.broadcast_to(self.error, jnp.shape(self.value))
-        return Measurements(self.value.reshape(-1), error.reshape(-1))
+        return samples(self.value, self.error)
 
     @property
     def labels(self) -> tuple[str, ...]:
         """What to call each sample."""
-        return tuple(f"{name}({time:.4g} s)" for time in np.asarray(self.times) for name in QUANTITIES[self.quantity])
+        return sample_labels(self.times, QUANTITIES[self.quantity])
 
     def predict(self, scene: Scene, values: dict[str, Array], tolerance: float) -> Float[Array, "rows n"]:
         """The samples in every row."""
@@ -138,12 +130,10 @@ def identify(
     roots = {"scene": scene, "launch": data[0].launch}
     known = [path for root, tree in roots.items() for path in numbers(root, tree)] + list(PLACES)
     unknowns = generic.free_numbers(free, roots, known, replaced)
-    labels = tuple(
-        f"{i + 1}: {label}" if len(data) > 1 else label for i, one in enumerate(data) for label in one.labels
-    )
+    measurements, labels = generic.joined(data)
     return generic.identify(
         SceneModel(scene, data, tolerance),
-        jax.tree.map(lambda *parts: jnp.concatenate(parts), *[one.measurements for one in data]),
+        measurements,
         unknowns,
         starts=starts,
         spread=spread,

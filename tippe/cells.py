@@ -11,30 +11,32 @@ import numpy as np
 from nonholonomic.ensemble import Outcome, compiled_march, lanes_for
 from nonholonomic.lockstep import FAILED, GUARD_LOST
 from nonholonomic.paths import with_numbers
+from nonholonomic.phases import UNRESOLVED, Journey
 from nonholonomic.reference import march_by_diffrax
 from nonholonomic.sweep import Variable
 
-from .hybrid.cells import hybrid_cells
+from .hybrid.cells import ride as ride_with_flights
+from .hybrid.sliding import BOTH_CONTACTS
 from .inversion import ABSOLUTE, InversionProblem, is_inverted
 from .scene import Scene
 from .sensitivities import slopes_of_cells
-from .stick_slip.cells import stick_slip_cells
+from .stick_slip.cells import ride as ride_with_sticking
 
 
 class Kind(NamedTuple):
-    """A kind of runs: the words of its status, the variables it has besides, and how they are found.
+    """A kind of runs: the words of its status, what is counted besides steps, and how the runs go.
 
-    `in_phases` takes (scene, launch, t1, angle, tolerance, last, solver, size, count); `None` for runs of one smooth motion.
+    `ride` takes (scene, problem, t1, tolerance, last, solver, count); `None` for runs of one smooth motion.
     """
 
     words: tuple[str, ...]
     counts: tuple[str, ...]
-    in_phases: Callable[..., dict[str, Any]] | None
+    ride: Callable[..., Journey] | None
 
     @property
     def smooth(self) -> bool:
         """Whether a run is one smooth motion."""
-        return self.in_phases is None
+        return self.ride is None
 
     @property
     def variables(self) -> dict[str, Variable]:
@@ -46,8 +48,11 @@ class Kind(NamedTuple):
 
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed")
 SMOOTH = Kind(WORDS, (), None)
-STICK_SLIP = Kind((*WORDS, "unresolved"), ("sticks",), stick_slip_cells)
-HYBRID = Kind((*WORDS, "unresolved", "both_contacts"), ("hops",), hybrid_cells)
+STICK_SLIP = Kind((*WORDS, "unresolved"), ("sticks",), ride_with_sticking)
+HYBRID = Kind((*WORDS, "unresolved", "both_contacts"), ("hops",), ride_with_flights)
+
+#: Which word a run's status is, where it has not inverted; `not_inverted` for all others.
+WORD_OF_STATUS = {GUARD_LOST: 2, FAILED: 3, UNRESOLVED: 4, BOTH_CONTACTS: 5}
 
 
 def kind_of(scene: Scene) -> Kind:
@@ -77,11 +82,10 @@ class Runs(NamedTuple):
         cells = with_numbers(roots, columns)
         scene, launch = cells["scene"], cells["launch"]
         size = next((len(values) for values in columns.values()), 1)
-        if self.kind.in_phases is not None:
-            return self.kind.in_phases(
-                scene, launch, self.t1, self.angle, tolerance, self.last, self.solver, size, count
-            )
         problem = InversionProblem.of(scene, launch, self.angle, size)
+        if self.kind.ride is not None:
+            journey = self.kind.ride(scene, problem, self.t1, tolerance, self.last, self.solver, count)
+            return self._named(scene, problem, journey) | dict(zip(self.kind.counts, journey.counts, strict=True))
         if not self.paths:
             return self._named(scene, problem, self._outcome(problem, tolerance, count, size))
         options = {"count": count, "size": size, "solver": self.solver, "last": self.last}
@@ -95,14 +99,15 @@ class Runs(NamedTuple):
         options = {"solver": self.solver, "lanes": lanes_for(size), "passes": self.last}
         return compiled_march(problem, horizon, jnp.asarray(count), rtol, ABSOLUTE * rtol, **options)[0]
 
-    def _named(self, scene: Scene, problem: InversionProblem, outcome: Outcome) -> dict[str, Any]:
-        inverted = is_inverted(outcome, problem, self.last)
-        code = np.select([inverted, outcome.status == GUARD_LOST, outcome.status == FAILED], [0, 2, 3], 1)
+    def _named(self, scene: Scene, problem: InversionProblem, ended: Outcome | Journey) -> dict[str, Any]:
+        inverted = is_inverted(ended, problem, self.last)
+        others = [np.asarray(ended.status == status) for status in WORD_OF_STATUS]
+        code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
         return {
-            "time": np.where(inverted, outcome.crossing_time, np.inf),
+            "time": np.where(inverted, ended.crossing_time, np.inf),
             "status": code.astype(np.int8),
-            "end_time": np.asarray(outcome.end_time),
-            "end_theta": np.asarray(jax.vmap(scene.theta, 1)(outcome.state)),
-            "steps": np.asarray(outcome.steps),
-            "rejected": np.asarray(outcome.rejected),
+            "end_time": np.asarray(ended.end_time),
+            "end_theta": np.asarray(jax.vmap(scene.theta, 1)(jnp.asarray(ended.state))),
+            "steps": np.asarray(ended.steps),
+            "rejected": np.asarray(ended.rejected),
         }

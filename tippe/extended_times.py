@@ -10,11 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.ensemble import lanes_for
 from nonholonomic.lockstep import CROSSED, FAILED, crossing_time
 from nonholonomic.queue import Queue
 from nonholonomic.validation import as_number
-from nonholonomic.variation import VariationalProblem
+from nonholonomic.variation import TOGETHER, VariationalProblem, lanes_along
 
 from .inversion import ABSOLUTE, InversionProblem, check_smooth
 from .launch import Launch
@@ -25,9 +24,6 @@ MOST_STEPS = 100_000
 
 #: The least angle [rad] that is told from 0 in the penalty for a top that does not invert.
 LEAST_ANGLE = 1e-6
-
-#: Directions that run along together: more of them cost less time in all, but more to compile.
-TOGETHER = 2
 
 #: From how many cells on it pays to compile for twice as long what then runs in a third of the time.
 MANY = 64
@@ -121,7 +117,7 @@ def _times_and_slopes(
         tolerance,
         ABSOLUTE * tolerance,
         solver=diffrax.Dopri8(),
-        lanes=max(8, 3 * lanes_for(cells) // (2 + 2 * len(directions))) if directions else lanes_for(cells),
+        lanes=lanes_along(cells, len(directions)),
         max_steps=MOST_STEPS,
         one_kernel=cells >= MANY,
         controlled=components,

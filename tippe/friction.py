@@ -52,11 +52,6 @@ class AbstractFriction(eqx.Module):
     set_valued: ClassVar[bool] = False
 
     @property
-    def laws(self) -> "tuple[AbstractFriction, ...]":
-        """The law itself and those it is made of."""
-        return (self,)
-
-    @property
     def drills(self) -> bool:
         """Whether the law depends on the body's angular velocity about the normal."""
         return False
@@ -198,10 +193,6 @@ class Rolling(AbstractFriction):
     @property
     def units(self) -> dict[str, str]:
         return {"resistance": "m", "turning_speed": "rad s-1"} | self.sliding.units
-
-    @property
-    def laws(self) -> tuple[AbstractFriction, ...]:
-        return (self, *self.sliding.laws)
 
     @property
     def drills(self) -> bool:

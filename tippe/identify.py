@@ -14,6 +14,7 @@ from nonholonomic import identify as generic
 from nonholonomic.identify_result import Identification
 from nonholonomic.likelihood import Measurements
 from nonholonomic.paths import numbers, with_numbers
+from nonholonomic.recording import check_recording, sample_labels, samples
 from nonholonomic.validation import as_number, require
 
 from .extended_times import extended_inversion_times
@@ -21,6 +22,9 @@ from .inversion import check_event, check_run, check_smooth
 from .launch import Launch
 from .scene import Scene
 from .trajectory import simulate
+
+#: Columns of a sample of each quantity that is recorded.
+QUANTITIES = {"theta": ("theta",), "position": ("x", "y", "z")}
 
 
 class InversionTimes(eqx.Module):
@@ -114,26 +118,17 @@ class Recording(eqx.Module):
     quantity: str = eqx.field(static=True, default="theta")
 
     def __check_init__(self):
-        if self.quantity not in ("theta", "position"):
-            raise ValueError(f"quantity = {self.quantity!r} must be 'theta' or 'position'")
-        require(self.times, "times", at_least=0.0)
-        if np.ndim(self.times) != 1 or np.any(np.diff(np.asarray(self.times)) <= 0.0) or not self.times[-1] > 0.0:
-            raise ValueError(f"times = {self.times!r} must be an increasing list with a positive end")
-        shape = (len(self.times), *((3,) if self.quantity == "position" else ()))
-        if np.shape(self.value) != shape:
-            raise ValueError(f"value must be of shape {shape} for {self.quantity!r}, not {np.shape(self.value)}")
+        check_recording(self.times, self.value, self.quantity, QUANTITIES)
 
     @property
     def measurements(self) -> Measurements:
         """The samples as a likelihood takes them."""
-        error = jnp.broadcast_to(self.error, jnp.shape(self.value))
-        return Measurements(self.value.reshape(-1), error.reshape(-1))
+        return samples(self.value, self.error)
 
     @property
     def labels(self) -> tuple[str, ...]:
         """What to call each sample."""
-        names = ("theta",) if self.quantity == "theta" else ("x", "y", "z")
-        return tuple(f"{name}({time:.4g} s)" for time in np.asarray(self.times) for name in names)
+        return sample_labels(self.times, QUANTITIES[self.quantity])
 
     def predict(self, scene: Scene, values: dict[str, Array], rows: int, tolerance: float) -> Float[Array, "rows n"]:
         """The samples in every row; not a number after a run's end."""
@@ -205,13 +200,10 @@ def identify(
     check_run(scene, Launch(0.0, 0.0), 1.0, tolerance)
     known = [path for root, tree in roots.items() for path in numbers(root, tree)]
     unknowns = generic.free_numbers(free, roots, known, with_numbers)
-    measurements = [one.measurements for one in data]
-    labels = tuple(
-        f"{i + 1}: {label}" if len(data) > 1 else label for i, one in enumerate(data) for label in one.labels
-    )
+    measurements, labels = generic.joined(data)
     return generic.identify(
         SceneModel(scene, data, tolerance),
-        jax.tree.map(lambda *parts: jnp.concatenate(parts), *measurements),
+        measurements,
         unknowns,
         starts=starts,
         spread=spread,

@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from nonholonomic.ensemble import Outcome, lanes_for, traced_march
 from nonholonomic.lockstep import CROSSED, REACHED_END, AbstractProblem
 from nonholonomic.paths import numbers
+from nonholonomic.phases import Journey
 from nonholonomic.runge_kutta import explicit_tableau
 from nonholonomic.validation import as_number, require
 from nonholonomic.variation import directions_of, march_with_slopes
@@ -217,7 +218,7 @@ def _event_slopes(
     return [jnp.where(inverted, slope, 0.0) for slope in slopes]
 
 
-def is_inverted(outcome: Outcome, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:
+def is_inverted(outcome: Outcome | Journey, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:
     """Which cells count as inverted: those that reached the angle, or that end above it where the last crossing counts."""
     if not last:
         return outcome.status == CROSSED

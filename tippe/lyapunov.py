@@ -15,6 +15,7 @@ from nonholonomic.runge_kutta import explicit_tableau
 from nonholonomic.validation import require
 from nonholonomic.vector import cross
 
+from .cells import kind_of
 from .inversion import ABSOLUTE, InversionProblem
 from .launch import Launch
 from .scene import Scene
@@ -71,7 +72,7 @@ def lyapunov_exponent(
         raise ValueError(f"scene = {scene!r} must be a Scene")
     if not isinstance(launch, Launch):
         raise ValueError(f"launch = {launch!r} must be a Launch")
-    if scene.contact == "hybrid" or scene.friction.set_valued:
+    if not kind_of(scene).smooth:
         raise ValueError(
             "contact = 'hybrid' and SetValuedCoulomb have no exponents: variations end at a change of phase"
         )

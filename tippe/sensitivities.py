@@ -6,15 +6,12 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 
-from nonholonomic.ensemble import Outcome, lanes_for
+from nonholonomic.ensemble import Outcome
 from nonholonomic.paths import full_path, numbers, with_numbers
 from nonholonomic.sweep import Variable
-from nonholonomic.variation import compiled_march_with_slopes, directions_of
+from nonholonomic.variation import TOGETHER, compiled_march_with_slopes, directions_of, lanes_along
 
 from .inversion import ABSOLUTE, InversionProblem, is_inverted
-
-#: Directions that run along together: more of them cost less time in all, but more to compile.
-TOGETHER = 2
 
 
 def sensitivity_paths(roots: dict[str, Any], names: Any) -> list[str]:
@@ -97,7 +94,7 @@ def slopes_of_cells(
             jnp.asarray(tolerance, float),
             jnp.asarray(ABSOLUTE * tolerance, float),
             solver=solver,
-            lanes=max(8, 3 * lanes_for(size) // (2 + 2 * together)),
+            lanes=lanes_along(size, together),
             passes=last,
         )
         inverted = is_inverted(outcome, problem, last)

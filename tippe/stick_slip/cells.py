@@ -1,18 +1,14 @@
-"""Inversion times through stick and slip, for a block of cells of a table."""
-
-from typing import Any
+"""The rides of a block of cells of a table through stick and slip."""
 
 import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.lockstep import CROSSED, FAILED, GUARD_LOST, REACHED_END, RUNNING
-from nonholonomic.phases import UNRESOLVED, AbstractPhase, Journey, Passage, travel
+from nonholonomic.lockstep import GUARD_LOST, RUNNING
+from nonholonomic.phases import AbstractPhase, Journey, Passage, travel
 
-from ..dynamics import COS_THETA
 from ..inversion import ABSOLUTE, InversionProblem
-from ..launch import Launch
 from ..scene import Scene
 from .motion import COARSEST, Kind, StickSlip, started
 
@@ -44,56 +40,26 @@ class StickSlipPhase(AbstractPhase):
         )
 
 
-def stick_slip_cells(
-    scene: Scene,
-    launch: Launch,
-    t1: float,
-    angle: float,
-    tolerance: float,
-    last: bool,
-    solver: diffrax.AbstractERK,
-    size: int,
-    count: int,
-) -> dict[str, Any]:
-    """The variables of an inversion table of scenes with `SetValuedCoulomb`.
-
-    **Arguments:** as for `inversion_table`; `scene` and `launch` hold scalars or one number per cell, `last` is whether the
-    last crossing counts, `size` the number of cells, of which the first `count` are to be run.
-
-    **Returns:** name -> values, one for each cell; `status` numbers the words of `STICK_SLIP_WORDS`.
-    """
-    journey = ride(scene, launch, t1, angle, tolerance, last, solver, size, count)
-    crossed = journey.status == CROSSED
-    if last:
-        above = journey.state[COS_THETA] <= np.cos(angle)
-        crossed = (journey.status == REACHED_END) & above & np.isfinite(journey.crossing_time)
-    others = {GUARD_LOST: 2, FAILED: 3, UNRESOLVED: 4}
-    status = np.select([crossed, *(journey.status == code for code in others)], [0, *others.values()], 1)
-    return {
-        "time": np.where(crossed, journey.crossing_time, np.inf),
-        "status": status.astype(np.int8),
-        "end_time": journey.end_time,
-        "end_theta": np.asarray(scene.theta(jnp.asarray(journey.state))),
-        "steps": journey.steps,
-        "rejected": journey.rejected,
-        "sticks": journey.counts[0],
-    }
-
-
 def ride(
     scene: Scene,
-    launch: Launch,
+    problem: InversionProblem,
     t1: float,
-    angle: float,
     tolerance: float,
     last: bool,
     solver: diffrax.AbstractERK,
-    size: int,
     count: int,
 ) -> Journey:
-    """Run every cell through its phases. **Arguments:** as for `stick_slip_cells`. **Returns:** a `Journey`."""
-    problem = InversionProblem.of(scene, launch, angle, size)
-    both = problem.dynamics
+    """Run cells through their phases.
+
+    **Arguments:**
+
+    - `scene`: with `SetValuedCoulomb`, its numbers scalars or one per cell.
+    - `problem`: of the scene and its launches, all of them, of which the first `count` are to be run.
+    - `t1`, `tolerance`, `solver`: as for `inversion_table`; `last` is whether the last crossing counts.
+
+    **Returns:** a `Journey`, whose counts tell how often slipping has turned into rolling.
+    """
+    both = scene.dynamics
     assert isinstance(both, StickSlip)
     phases = tuple(StickSlipPhase(Kind(both, rolls), problem.cos_angle, problem.scales) for rolls in (False, True))
     states, rolls = started(both, problem.states)
