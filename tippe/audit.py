@@ -294,7 +294,8 @@ column after 25 (Coulomb 15) rounds in which the best sets were varied.
   changes in its fourth digit, so minima are many and a better one may exist. No set within the error of 1 s was found.
 
 That a largest inclination exists follows from Jellett's threshold, and from loss of contact, for many tops. So the two
-tables can be had, but do not fix Table 1: with the law of friction unknown, they leave even the offset open.
+tables can be had, but do not fix Table 1, the less so as the law of friction is unknown: the Coulomb law was searched too
+briefly for both tables to say what it would give.
 """
 
 
