@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .levenberg_marquardt import Linearised, Problem, minimise
+from .levenberg_marquardt import Linearised, Problem, linearise, minimise
 from .likelihood import Measurements
 
 #: Singular values below this part of the largest are those of a direction that the data do not see at all.
@@ -180,10 +180,8 @@ class Identification:
 
 def deviance_of(problem: Problem, coordinates: Any, measurements: Measurements) -> Float[np.ndarray, " rows"]:
     """-2 log likelihood of every row; infinite where it is not a number."""
-    prediction = problem.predict(jnp.asarray(coordinates))
-    data = jnp.sum(measurements.residuals(prediction) ** 2, axis=-1)
-    prior = jnp.array([jnp.sum(problem.prior(one) ** 2) for one in jnp.asarray(coordinates)])
-    return np.asarray(jnp.where(jnp.isfinite(data + prior), data + prior, jnp.inf))
+    deviance = linearise(problem, jnp.asarray(coordinates), measurements).deviance
+    return np.asarray(jnp.where(jnp.isfinite(deviance), deviance, jnp.inf))
 
 
 def coordinate_covariance(jacobian: Float[np.ndarray, "residuals unknowns"]) -> Float[np.ndarray, "unknowns unknowns"]:

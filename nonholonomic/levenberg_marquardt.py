@@ -21,8 +21,19 @@ from .unknown import Free
 #: non-linear least squares problems", 2nd edition (2004), section 3.2).
 FIRST_DAMPING = 1e-2
 
+#: A step that gains more than this part of what it promised is followed by one with less damping, by the factor `EASED`;
+#: one that gains next to nothing is taken back, and tried again with more damping, by the factor `HARDENED`.
+GOOD, EASED, HARDENED = 0.5, 10.0, 4.0
+
 #: A fit has converged once a step changes no coordinate and no residual by more than this, relatively or absolutely.
 CONVERGED = 1e-6
+
+#: It has converged too where a step gains nothing, and an undamped one would lower -2 log likelihood by no more than this:
+#: it is as far as the errors of the integration allow, within a thirtieth of a standard error of the minimum.
+NEGLIGIBLE = 1e-3
+
+#: Singular values of a row's slopes below this part of the largest are round-off.
+ROUND_OFF = 1e-7
 
 
 class Problem(eqx.Module):
@@ -84,8 +95,14 @@ class Ends(NamedTuple):
     steps: Int[Array, " rows"]
 
 
-def _slopes(problem: Problem, coordinates: Float[Array, "rows unknowns"]) -> tuple[Array, Array]:
-    """Predictions and their slopes; rows do not influence one another, so a coordinate is moved in all of them at once."""
+@eqx.filter_jit
+def predictions_and_slopes(
+    problem: Problem, coordinates: Float[Array, "rows unknowns"]
+) -> tuple[Float[Array, "rows n"], Float[Array, "rows n unknowns"]]:
+    """Predictions and their slopes; rows do not influence one another, so a coordinate is moved in all of them at once.
+
+    Everything that asks for a model does so here, so that it is compiled once for every number of rows.
+    """
 
     def along(direction):
         return jax.jvp(problem.predict, (coordinates,), (jnp.broadcast_to(direction, coordinates.shape),))
@@ -94,7 +111,6 @@ def _slopes(problem: Problem, coordinates: Float[Array, "rows unknowns"]) -> tup
     return values[0], jnp.where(jnp.isfinite(slopes), slopes, 0.0)
 
 
-@eqx.filter_jit
 def linearise(problem: Problem, coordinates: Float[Array, "rows unknowns"], measurements: Measurements) -> Linearised:
     """Predictions, residuals and their slopes.
 
@@ -106,7 +122,13 @@ def linearise(problem: Problem, coordinates: Float[Array, "rows unknowns"], meas
 
     **Returns:** a `Linearised`.
     """
-    prediction, slopes = _slopes(problem, coordinates)
+    return _linearised(problem, coordinates, measurements, *predictions_and_slopes(problem, coordinates))
+
+
+@eqx.filter_jit
+def _linearised(
+    problem: Problem, coordinates: Array, measurements: Measurements, prediction: Array, slopes: Array
+) -> Linearised:
     residual, by_prediction = jax.jvp(measurements.residuals, (prediction,), (jnp.ones_like(prediction),))
     prior = jax.vmap(problem.prior)(coordinates)
     prior_jacobian = jax.vmap(jax.jacfwd(problem.prior))(coordinates)
@@ -175,13 +197,15 @@ def minimise(
     unit = jnp.sqrt(FIRST_DAMPING * jnp.where(largest > 0.0, largest, 1.0 / FIRST_DAMPING))
     moving = starts @ embedding
     row = _Row(measurements, starts - moving @ embedding.T, unit)
-    solver = optimistix.LevenbergMarquardt(rtol=CONVERGED, atol=CONVERGED)
+    solver = _solver(optimistix)
     moving, state = _begin(solver, problem, embedding, row, moving)
     done = np.zeros(rows, bool)
     steps = np.zeros(rows, int)
     with tqdm(total=rows, desc="fits", unit="fit", disable=None if progress else True) as bar:
         for step in range(max_steps):
-            moving, state, ended = _step(solver, problem, embedding, row, moving, state, jnp.asarray(done))
+            coordinates = row.held + state.y_eval @ embedding.T
+            tangents = _Tangent(coordinates, *predictions_and_slopes(problem, coordinates))
+            moving, state, ended = _step(solver, problem, embedding, row, tangents, moving, state, jnp.asarray(done))
             ended = np.asarray(ended)
             steps[~done] = step + 1
             bar.update(int(np.sum(ended & ~done)))
@@ -204,6 +228,13 @@ def required() -> Any:
     return optimistix
 
 
+def _solver(optimistix: Any) -> Any:
+    """Levenberg-Marquardt, with a damping that is eased sooner than Optimistix does it."""
+    search = optimistix.ClassicalTrustRegion(high_cutoff=GOOD, high_constant=EASED, low_constant=1.0 / HARDENED)
+    solver = optimistix.LevenbergMarquardt(rtol=CONVERGED, atol=CONVERGED)
+    return eqx.tree_at(lambda solver: solver.search, solver, search)
+
+
 @eqx.filter_jit
 def _begin(solver: Any, problem: Problem, embedding: Array, row: _Row, moving: Array) -> tuple[Array, Any]:
     """The solver's state before the first step, in every row."""
@@ -220,20 +251,24 @@ def _begin(solver: Any, problem: Problem, embedding: Array, row: _Row, moving: A
 
 @eqx.filter_jit
 def _step(
-    solver: Any, problem: Problem, embedding: Array, row: _Row, moving: Array, state: Any, done: Array
+    solver: Any,
+    problem: Problem,
+    embedding: Array,
+    row: _Row,
+    tangents: _Tangent,
+    moving: Array,
+    state: Any,
+    done: Array,
 ) -> tuple[Array, Any, Array]:
     """One step of every row that is not done; the new points and states, and which rows are done now."""
-
-    # One run of the model with its slopes, for all rows together.
-    coordinates = row.held + state.y_eval @ embedding.T
-    tangents = _Tangent(coordinates, *_slopes(problem, coordinates))
 
     def step(moving, state, row, tangent):
         given = (problem, embedding, row, tangent)
         options = {"jac": "fwd"}
         moving, state, _ = solver.step(_residuals, moving, given, options, state, frozenset())
         ended, _ = solver.terminate(_residuals, moving, given, options, state, frozenset())
-        return moving, state, ended
+        stays = state.num_steps_since_acceptance > 0
+        return moving, state, ended | (stays & (_promise(state.f_info, row.unit) < NEGLIGIBLE))
 
     new_moving, new_state, ended = eqx.filter_vmap(step)(moving, state, row, tangents)
 
@@ -241,3 +276,10 @@ def _step(
         return jnp.where(done.reshape(-1, *(1,) * (new.ndim - 1)), old, new) if eqx.is_array(new) else new
 
     return keep(new_moving, moving), jax.tree.map(keep, new_state, state), done | ended
+
+
+def _promise(info: Any, unit: Float[Array, ""]) -> Float[Array, ""]:
+    """By how much an undamped step from the last good point would lower -2 log likelihood, to first order in the model."""
+    sides, values, _ = jnp.linalg.svd(info.jac.as_matrix(), full_matrices=False)
+    seen = values > ROUND_OFF * jnp.max(values)
+    return jnp.sum(jnp.where(seen, sides.T @ info.residual, 0.0) ** 2) * unit**2

@@ -40,9 +40,10 @@ def extended_inversion_times(
     """Inversion times, continued beyond the horizon so that a fit finds a way back.
 
     A top that has not inverted by `t1`, or has lost contact, and is then at theta counts as inverting at
-    t1 (1 + log(angle / theta)): continuous where a time passes the horizon, and linear in the rate at which theta grows
-    where it grows exponentially, as it does from a small one. It is a penalty, no prediction. First derivatives, forward
-    mode, are those of the event's time (implicit function theorem) and of the penalty.
+    t1 (1 + log(angle / theta) / C), C = log(angle / theta at the launch), 1 at least. Where theta grows as exp(s t), as it
+    does from a small one, that is the tangent, at the rate with which it would arrive at `t1`, of the time C / s: continuous
+    with its slope where a time passes the horizon, and linear in the rate beyond. It is a penalty, no prediction. First
+    derivatives, forward mode, are those of the event's time (implicit function theorem) and of the penalty.
 
     **Arguments:**
 
@@ -129,9 +130,9 @@ def _times_and_slopes(
         # A cell that starts beyond the angle is there at once.
         time = jnp.where(outcome.end_time > 0.0, crossing_time(problem, outcome.end_time, state), 0.0)
         angle = jnp.arccos(problem.cos_angle)
-        theta = jnp.arctan2(jnp.hypot(state[2], state[3]), state[4])
-        missing = jnp.log(angle / jnp.clip(theta, LEAST_ANGLE, angle))
-        return jnp.where(crossed, time, t1 * (1.0 + missing))
+        missing = _e_folds(state, angle)
+        whole = jnp.maximum(_e_folds(problem.states, angle), 1.0)
+        return jnp.where(crossed, time, t1 * (1.0 + missing / whole))
 
     failed = outcome.status == FAILED
     times = jnp.where(failed, jnp.nan, extended(problem, state))
@@ -140,3 +141,9 @@ def _times_and_slopes(
         for moved in zip(directions, variations, strict=True)
     ]
     return times, jnp.stack(slopes) if slopes else jnp.zeros((0, cells))
+
+
+def _e_folds(state: Float[Array, "components cells"], angle: Float[Array, "..."]) -> Float[Array, " cells"]:
+    """How many times theta must still grow e-fold to reach an angle."""
+    theta = jnp.arctan2(jnp.hypot(state[2], state[3]), state[4])
+    return jnp.log(angle / jnp.clip(theta, LEAST_ANGLE, angle))

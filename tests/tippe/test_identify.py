@@ -3,7 +3,7 @@
 import dataclasses
 import math
 
-import jax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ import tippe
 from nonholonomic.identify_result import coordinate_covariance
 from nonholonomic.levenberg_marquardt import Problem, linearise, minimise
 from nonholonomic.likelihood import Measurements
-from nonholonomic.unknown import Free, draw_starts
+from nonholonomic.unknown import Free
 from tippe.extended_times import extended_inversion_times
 from tippe.identify import SceneModel
 
@@ -54,6 +54,19 @@ def test_beyond_the_horizon_times_go_on_without_a_jump(rutstam_scene):
     assert before[0] < before[3]
 
 
+def test_beyond_the_horizon_times_follow_the_rate_of_growth(rutstam_scene):
+    """A theta that grows as exp(s t) arrives at T = C / s; seen from t1 < T, the tangent of that at t1 is t1 (2 - t1 / T).
+
+    The first tenths of a second, in which theta dips, make an eighth of difference.
+    """
+    launch, angle = tippe.Launch(jnp.full(4, 0.002), jnp.array([60.0, 80.0, 100.0, 150.0])), 0.3
+    times = extended_inversion_times(rutstam_scene, launch, 60.0, angle, 1e-8, 4)
+    assert np.all(times < 60.0)
+    t1 = 0.8 * times.min()
+    beyond = extended_inversion_times(rutstam_scene, launch, t1, angle, 1e-8, 4)
+    assert_close(beyond, t1 * (2.0 - t1 / times), rtol=0.15)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("tables", [1, 100])
 def test_slopes_of_the_times_are_those_of_central_differences(rutstam_scene, tables):
@@ -63,7 +76,7 @@ def test_slopes_of_the_times_are_those_of_central_differences(rutstam_scene, tab
     problem = Problem(SceneModel(rutstam_scene, (data,), 1e-11), (*free, ("scene.gravity", Free(9.81, 0.0))))
     at = jnp.log(jnp.array([[0.3, 0.006, 9.81]])) + jnp.zeros((tables, 1))
     slopes = linearise(problem, at, Measurements(np.full(4, 2.0), 1.0)).jacobian
-    predict = jax.jit(problem.predict)
+    predict = eqx.filter_jit(problem.predict)
     for k in range(3):
 
         def difference(step):
@@ -183,32 +196,25 @@ def test_two_hundred_noisy_tables_give_unbiased_estimates_and_intervals_that_cov
 
 
 @pytest.mark.slow
-def test_eight_starts_about_a_guess_a_factor_two_off_find_the_truth(experiment, capsys):
-    """Both numbers guessed wrong by a factor of two, either way: what `identify(..., starts=8)` does, for 25 noisy tables.
+def test_single_starts_a_factor_two_off_find_the_truth(experiment, capsys):
+    """Either number or both wrong by a factor of two, either way: eight starts for each of 25 noisy tables.
 
-    A single start may stick on a step of the time's staircase. The truth counts as found where the best of the eight fits
-    explains the table at least as well as the true numbers do, and these lie within five of its standard errors.
+    At some of them, up to seven of the ten tops have not inverted by the horizon. The truth counts as found where a fit
+    explains its table at least as well as the true numbers do, and these lie within five of its standard errors.
     """
     problem, true, exact, error = experiment
-    tables, starts = 25, 8
-    noisy = exact + error * np.random.default_rng(1).normal(size=(tables, 10))
-    corners = [2.0 ** np.array([a, b]) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
-    begins = []
-    for i in range(tables):
-        guess = np.exp(true) * corners[i % 4]
-        about = {name: Free(at, 0.0) for name, at in zip(("mu", "offset"), guess.tolist(), strict=True)}
-        begins.append(draw_starts(about, starts, 2.0, seed=i))
-    each = Measurements(np.repeat(noisy, starts, axis=0), error)
-    ends = minimise(problem, np.concatenate(begins), each)
+    tables = 25
+    off = np.log(2.0) * np.array([[a, b] for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)])
+    noisy = np.repeat(exact + error * np.random.default_rng(1).normal(size=(tables, 10)), len(off), axis=0)
+    each = Measurements(noisy, error)
+    ends = minimise(problem, np.tile(true + off, (tables, 1)), each)
     there = linearise(problem, ends.coordinates, each)
-    deviance = np.asarray(there.deviance).reshape(tables, starts)
-    best = np.arange(tables) * starts + np.argmin(deviance, axis=1)
+    errors = np.array([np.sqrt(np.diag(coordinate_covariance(np.asarray(one)))) for one in there.jacobian])
+    deviations = np.abs(np.asarray(ends.coordinates) - true) / errors
     of_truth = np.sum(((noisy - exact) / error) ** 2, axis=1)
-    off = np.asarray(ends.coordinates)[best] - true
-    errors = np.array([np.sqrt(np.diag(coordinate_covariance(np.asarray(one)))) for one in there.jacobian[best]])
-    found = (deviance.min(axis=1) <= of_truth) & np.all(np.abs(off) < 5.0 * errors, axis=1)
+    found = (np.asarray(there.deviance) <= of_truth) & np.all(deviations < 5.0, axis=1)
     with capsys.disabled():
-        alone = np.mean(deviance <= of_truth[:, None] + 0.1)
-        print("\nfound", found.mean(), "of single starts", alone, "converged", np.mean(ends.converged))
-        print("steps", np.percentile(ends.steps, [50, 90, 100]), "off / error", np.max(np.abs(off / errors)))
+        print("\nfound by", np.sum(found), "of", len(found), "starts; converged", np.mean(ends.converged))
+        print("steps", np.percentile(ends.steps, [50, 90, 100]), "off / error", np.max(deviations))
     assert found.mean() >= 0.95
+    assert np.mean(ends.converged) >= 0.95

@@ -216,6 +216,24 @@ def test_one_top_gives_the_pattern_of_table_2_and_its_times_to_a_second_and_a_ha
     assert list(result.status[2:]) == ["not_inverted"] * 7
 
 
+def test_one_top_gives_table_3_to_half_a_second_and_table_2_nearly():
+    """The best of `benchmarks/paper_tables_joint.py`: its pattern is that of both tables but for 0.3 rad in Table 2."""
+    mass, radius = 0.011573, 0.027474
+    I3 = 0.4075 * mass * radius**2
+    top = tippe.Top(mass, radius, 0.086495 * radius, 1.0533 * I3, I3)
+    scene = tippe.Scene(top, tippe.Cylinder(84.428 * radius), tippe.Viscous(0.32573))
+    found = []
+    for table in (paper.TABLE_2, paper.TABLE_3):
+        theta = [row.theta for row in table.rows]
+        start = {"spin": float(paper.BETA1 / I3), "eta": min(table.eta, np.pi / 2.0 - 1e-6), "azimuth": 1.7971}
+        found.append(tippe.inversion_table(scene, theta=theta, **start, t1=30.0, tolerance=1e-9))
+    np.testing.assert_allclose(found[0].time[:3], [26.3, 26.3, 28.2], atol=0.05)
+    assert list(found[0].status[3:]) == ["not_inverted"] * 6
+    printed = [row.time for row in paper.TABLE_3.rows[:4]]
+    np.testing.assert_allclose(found[1].time[:4], printed, atol=0.5)
+    assert list(found[1].status[4:]) == ["contact_lost"] * 5
+
+
 # The page
 
 
