@@ -1,10 +1,16 @@
-"""Cost per launch for 1 to 10^5 launches, the memory, one core and all of them.
+"""Cost per launch for 1 to 10^5 launches and more, the memory, and how much of the machine's arithmetic is used.
 
     python benchmarks/scaling.py [--most 100000]
+    JAX_ENABLE_X64=0 python benchmarks/scaling.py        the same in single precision, at tolerance 1e-5
 
-The reference problem: Rutstam's top on the plane, viscous friction, 100 rad/s, theta(0) from 0.05 to 0.15, tolerance 1e-9. Then
-the 64 x 64 grid of theta x spin whose cells differ in cost by a factor of ten: how many of the steps that the lockstep
-took were useful. Compilation is given apart. Run it alone: other work on the machine shows in every number.
+The reference problem: Rutstam's top on the plane, viscous friction, 100 rad/s, theta(0) from 0.05 to 0.15, tolerance 1e-9. On a
+CPU with one core and with all; on an accelerator, where there is one, as it is (`--most 10000000` goes up to 10^7 launches).
+Then the 64 x 64 grid of theta x spin whose cells differ in cost by a factor of ten: how many of the steps that the lockstep
+took were useful; and the lanes of a block. Compilation is given apart. Run it alone: other work on the machine shows in
+every number.
+
+Operations are counted in the program of a step, multiply and add as two; the peak is that of multiply-adds on registers,
+measured in the same run. Steps of idle lanes count as wasted.
 """
 
 import argparse
@@ -13,9 +19,11 @@ import time
 from typing import Any
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 from measure import machine, table, timed
+from peak import operations_per_step, peak
 from scenes import TOP
 
 import tippe
@@ -23,7 +31,9 @@ from nonholonomic import sweep
 from nonholonomic.ensemble import compiled_march, lanes_for
 from tippe.inversion import ABSOLUTE, InversionProblem
 
-TOLERANCE = 1e-9
+ON_CPU = jax.default_backend() == "cpu"
+DOUBLE = jnp.result_type(float) == jnp.float64
+TOLERANCE = 1e-9 if DOUBLE else 1e-5
 
 
 def with_workers(count: int) -> None:
@@ -31,25 +41,43 @@ def with_workers(count: int) -> None:
     sweep.workers = lambda: count
 
 
-def launches_row(scene: tippe.Scene, launches: int, cores: int) -> dict[str, str]:
-    """Cost of one table of inversion times."""
+def times_of(scene: tippe.Scene, launches: int) -> tippe.Table:
+    """The table of inversion times."""
     theta = np.linspace(0.05, 0.15, launches)
+    return tippe.inversion_table(scene, theta=theta, spin=100.0, t1=30.0, tolerance=TOLERANCE)
+
+
+def cpu_row(scene: tippe.Scene, launches: int, cores: int, operations: float, most: float) -> dict[str, str]:
+    """Cost of one table on a CPU, where a step makes so many operations and a core at most so many a second."""
     times = {}
     for workers in sorted({1, cores}):
         with_workers(workers)
-        times[workers] = timed(
-            lambda: tippe.inversion_table(scene, theta=theta, spin=100.0, t1=30.0, tolerance=TOLERANCE).time, 2
-        )
+        times[workers] = timed(lambda: times_of(scene, launches), 2 if launches <= 100_000 else 1)
     one, all_ = times[1], times[cores]
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return {
         "launches": str(launches),
         "cpu ms per launch, one core": f"{one.cpu / launches * 1e3:.3f}",
+        "of peak": f"{100.0 * operations * one.result.steps.sum() / one.cpu / most:.0f} %",
         "wall s, one core": f"{one.wall:.2f}",
         f"wall s, {cores} cores": f"{all_.wall:.2f}",
         "ratio": f"{one.wall / all_.wall:.2f}",
         "first call s": f"{one.first:.1f}",
-        "peak memory GiB": f"{peak:.2f}",
+        "peak memory GiB": f"{memory:.2f}",
+    }
+
+
+def device_row(scene: tippe.Scene, launches: int, operations: float, most: float) -> dict[str, str]:
+    """Cost of one table on an accelerator, which makes at most so many operations a second."""
+    run = timed(lambda: times_of(scene, launches), 2)
+    memory = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", 0) / 2**30
+    return {
+        "launches": str(launches),
+        "us per launch": f"{run.wall / launches * 1e6:.2f}",
+        "of peak": f"{100.0 * operations * run.result.steps.sum() / run.wall / most:.1f} %",
+        "wall s": f"{run.wall:.2f}",
+        "first call s": f"{run.first:.1f}",
+        "device memory GiB": f"{memory:.2f}",
     }
 
 
@@ -71,15 +99,16 @@ def useful_share(scene: tippe.Scene) -> float:
 
 def lanes_table(scene: tippe.Scene) -> list[dict[str, str]]:
     """What the number of lanes in a block does to the cost: it decides which cache the stages fit."""
-    problem = InversionProblem.of(scene, tippe.Launch(np.linspace(0.05, 0.15, 4096), 100.0), 0.95 * np.pi, 4096)
+    cells = 4096 if ON_CPU else 262144
+    problem = InversionProblem.of(scene, tippe.Launch(np.linspace(0.05, 0.15, cells), 100.0), 0.95 * np.pi, cells)
     rows = []
-    for lanes in (8, 16, 32, 64, 128, 256):
+    for lanes in (8, 16, 32, 64, 128, 256) if ON_CPU else (256, 1024, 4096, 16384, 65536):
 
         def run(lanes: int = lanes) -> Any:
             return compiled_march(
                 problem,
                 jnp.asarray(30.0),
-                jnp.asarray(4096),
+                jnp.asarray(cells),
                 jnp.asarray(TOLERANCE),
                 jnp.asarray(ABSOLUTE * TOLERANCE),
                 solver=diffrax.Dopri8(),
@@ -87,12 +116,13 @@ def lanes_table(scene: tippe.Scene) -> list[dict[str, str]]:
             )
 
         measured = timed(run, 1)
+        spent = measured.cpu if ON_CPU else measured.wall
         steps = float(measured.result[1]) * lanes
         rows.append(
             {
                 "lanes": str(lanes),
-                "cpu ms per launch": f"{measured.cpu / 4096 * 1e3:.3f}",
-                "ns per lane-step": f"{measured.cpu / steps * 1e9:.0f}",
+                "ms per launch": f"{spent / cells * 1e3:.3f}",
+                "ns per lane-step": f"{spent / steps * 1e9:.3g}",
             }
         )
     return rows
@@ -105,10 +135,20 @@ def main() -> None:
     options = told.parse_args()
     print(machine())
     scene = tippe.Scene(tippe.Top(*TOP), tippe.Plane(), tippe.Viscous(0.3))
-    cores = sweep.workers()
     started = time.perf_counter()
-    counts = [count for count in (1, 10, 100, 1000, 10_000, 100_000, 1_000_000) if count <= options.most]
-    print(table([launches_row(scene, count, cores) for count in counts]))
+    problem = InversionProblem.of(scene, tippe.Launch(np.linspace(0.05, 0.15, 64), 100.0), 0.95 * np.pi, 64)
+    operations, most = operations_per_step(problem, TOLERANCE), peak()
+    device = f"{jax.devices()[0].device_kind}, {'double' if DOUBLE else 'single'} precision"
+    print(
+        f"{device}: {operations:.0f} operations a step, at most {most:.3g} a second{' on one core' if ON_CPU else ''}"
+    )
+    cores = sweep.workers()
+    counts = [10**power for power in range(8) if 10**power <= options.most]
+    rows = [
+        cpu_row(scene, count, cores, operations, most) if ON_CPU else device_row(scene, count, operations, most)
+        for count in counts
+    ]
+    print(table(rows))
     print(f"\nuseful lane-steps on the 64 x 64 grid of theta x spin: {100.0 * useful_share(scene):.0f} %\n")
     print(table(lanes_table(scene)))
     print(f"\n{time.perf_counter() - started:.0f} s in all")

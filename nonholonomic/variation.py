@@ -50,12 +50,16 @@ class VariationalProblem(AbstractProblem):
 
     def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
         at, *variations = self.parts(state)
-        rate = self.problem.field(time, at)
-        changes = [
-            eqx.filter_jvp(lambda problem, at: problem.field(time, at), (self.problem, at), moved)[1]
-            for moved in zip(self.directions, variations, strict=True)
-        ]
-        return jnp.concatenate([rate, *changes])
+        if not variations:
+            return self.problem.field(time, at)
+        moving = _where_moved(self.problem, self.directions[0])
+
+        def rate(moving: Any, at: Float[Array, "components lanes"]) -> Float[Array, "components lanes"]:
+            return eqx.combine(moving, self.problem).field(time, at)
+
+        # Linearised once: the rate is computed once, and the directions share what their changes have in common.
+        here, change = jax.linearize(rate, moving, at)
+        return jnp.concatenate([here, *(change(*moved) for moved in zip(self.directions, variations, strict=True))])
 
     def crossing(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"] | None:
         return self.problem.crossing(self.parts(state)[0]) if self.ends_on_event else None
@@ -119,8 +123,38 @@ def march_with_slopes(
     return outcome, [jnp.where(happened, slope, 0.0) for slope in slopes]
 
 
+def in_groups(run: Callable[..., tuple[Any, list[Any]]], directions: tuple[Any, ...]) -> tuple[Any, list[Any]]:
+    """What `run` finds along many directions, a few at a time by one program.
+
+    **Arguments:**
+
+    - `run`: a tuple of `TOGETHER` directions -> a result that does not depend on them, and a slope for each.
+    - `directions`: any number of them.
+
+    **Returns:** the result, and the slopes.
+    """
+    if len(directions) <= TOGETHER:
+        return run(directions)
+    # The last group is filled with directions that lead nowhere.
+    empty = -len(directions) % TOGETHER
+    padded = [*directions, *[jax.tree.map(jnp.zeros_like, directions[0])] * empty]
+    stacked = [jax.tree.map(lambda *rates: jnp.stack(rates), *padded[k::TOGETHER]) for k in range(TOGETHER)]
+    results, slopes = jax.lax.map(lambda group: run(tuple(group)), stacked)
+    each = [slopes[i % TOGETHER][i // TOGETHER] for i in range(len(directions))]
+    return jax.tree.map(lambda leaf: leaf[0], results), each
+
+
 #: `march_with_slopes`, compiled on its own, for use outside of other transformed functions.
 compiled_march_with_slopes = alone(eqx.Partial(march_with_slopes, one_kernel=True))
+
+
+def _where_moved(problem: Any, direction: Any) -> Any:
+    """The numbers of a problem that a direction moves, `None` for the others."""
+
+    def moved(rate: Any, number: Any) -> Any:
+        return None if rate is None else number
+
+    return jax.tree.map(moved, direction, problem, is_leaf=lambda rate: rate is None)
 
 
 def directions_of(

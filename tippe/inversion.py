@@ -17,7 +17,7 @@ from nonholonomic.paths import numbers
 from nonholonomic.phases import Journey
 from nonholonomic.runge_kutta import explicit_tableau
 from nonholonomic.validation import as_number, require
-from nonholonomic.variation import directions_of, march_with_slopes
+from nonholonomic.variation import directions_of, in_groups, lanes_along, march_with_slopes
 
 from .dynamics import COS_THETA, Dynamics
 from .launch import Launch
@@ -202,18 +202,22 @@ def _event_slopes(
     problem = build(*point)
     t1, tolerance = jax.tree.unflatten(run.structure, leaves)[-2:]
     tolerance = jnp.min(tolerance)
-    outcome, slopes = march_with_slopes(
-        problem,
-        directions_of(build, point, tangents),
-        t1,
-        jnp.asarray(cells),
-        tolerance,
-        ABSOLUTE * tolerance,
-        solver=run.solver,
-        lanes=lanes_for(cells),
-        passes=run.last,
-        one_kernel=one_kernel,
-    )
+
+    def march(some: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+        return march_with_slopes(
+            problem,
+            some,
+            t1,
+            jnp.asarray(cells),
+            tolerance,
+            ABSOLUTE * tolerance,
+            solver=run.solver,
+            lanes=lanes_along(cells, len(some)),
+            passes=run.last,
+            one_kernel=one_kernel,
+        )
+
+    outcome, slopes = in_groups(march, directions_of(build, point, tangents))
     inverted = is_inverted(outcome, problem, run.last)
     return [jnp.where(inverted, slope, 0.0) for slope in slopes]
 
