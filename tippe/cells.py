@@ -47,7 +47,7 @@ class Kind(NamedTuple):
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed")
 SMOOTH = Kind(WORDS, (), None)
 STICK_SLIP = Kind((*WORDS, "unresolved"), ("sticks",), stick_slip_cells)
-HYBRID = Kind((*WORDS, "unresolved", "both_contacts"), ("hops",), hybrid_cells)
+HYBRID = Kind((*WORDS, "unresolved"), ("hops",), hybrid_cells)
 
 
 def kind_of(scene: Scene) -> Kind:

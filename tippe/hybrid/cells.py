@@ -14,7 +14,7 @@ from ..inversion import ABSOLUTE
 from ..launch import Launch
 from ..scene import Scene
 from .free_body import balls
-from .sliding import BOTH_CONTACTS, Slide, first_ball
+from .sliding import first_ball, phases
 
 
 def hybrid_cells(
@@ -40,7 +40,7 @@ def hybrid_cells(
     if last:
         above = journey.state[COS_THETA] <= np.cos(angle)
         crossed = (journey.status == REACHED_END) & above & np.isfinite(journey.crossing_time)
-    others = {FAILED: 3, UNRESOLVED: 4, BOTH_CONTACTS: 5}
+    others = {FAILED: 3, UNRESOLVED: 4}
     status = np.select([crossed, *(journey.status == code for code in others)], [0, *others.values()], 1)
     return {
         "time": np.where(crossed, journey.crossing_time, np.inf),
@@ -72,9 +72,8 @@ def ride(
     state, scales = per_cell(scene.state(launch)), per_cell(scene.scales(launch))
     spheres = balls(scene.body)
     cos_angle = jnp.cos(angle)
-    phases = tuple(Slide(scene, scales, cos_angle, jnp.asarray(number), last) for number in range(len(spheres)))
     return travel(
-        phases,
+        phases(scene, scales, cos_angle, last),
         np.asarray(first_ball(spheres, state)),
         np.asarray(state),
         t1,
