@@ -66,7 +66,6 @@ def ends(scene: tippe.Scene, launch: tippe.Launch, tolerance: float = 1e-9, stat
         jnp.asarray(0.1 * tolerance),
         solver=diffrax.Dopri8(),
         lanes=LANES,
-        max_steps=200_000,
     )
     return outcome
 
