@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from .ensemble import compiled_march, lanes_for
 from .lockstep import FAILED, GUARD_LOST, REACHED_END, RUNNING, AbstractProblem
 
-#: A cell that is still under way after so many rounds is given up. Further codes, from 6 on, are a model's own.
+#: A cell that is still under way after so many rounds is given up.
 UNRESOLVED = 5
 
 #: Rounds after which what is still under way is given up.

@@ -16,7 +16,6 @@ from nonholonomic.reference import march_by_diffrax
 from nonholonomic.sweep import Variable
 
 from .hybrid.cells import ride as ride_with_flights
-from .hybrid.sliding import BOTH_CONTACTS
 from .inversion import ABSOLUTE, InversionProblem, is_inverted
 from .scene import Scene
 from .sensitivities import slopes_of_cells
@@ -49,10 +48,10 @@ class Kind(NamedTuple):
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed")
 SMOOTH = Kind(WORDS, (), None)
 STICK_SLIP = Kind((*WORDS, "unresolved"), ("sticks",), ride_with_sticking)
-HYBRID = Kind((*WORDS, "unresolved", "both_contacts"), ("hops",), ride_with_flights)
+HYBRID = Kind((*WORDS, "unresolved"), ("hops",), ride_with_flights)
 
 #: Which word a run's status is, where it has not inverted; `not_inverted` for all others.
-WORD_OF_STATUS = {GUARD_LOST: 2, FAILED: 3, UNRESOLVED: 4, BOTH_CONTACTS: 5}
+WORD_OF_STATUS = {GUARD_LOST: 2, FAILED: 3, UNRESOLVED: 4}
 
 
 def kind_of(scene: Scene) -> Kind:

@@ -2,11 +2,14 @@
 
 The body is a rigid body in space: place s and velocity u of the centre of mass, axis e, angular velocity w, all in the fixed
 frame, with Euler's equations J w' = M - w x J w, J = I1 + (I3 - I1) e e^T, and e' = w x e. A ball of the body has its centre
-at s + a e and radius R. In contact the normal force N is the one that keeps the ball's height where it is: its acceleration is
-affine in N, so two evaluations give N. Flight is the same equations without the force, integrated like everything else.
+at s + a e and radius R. In contact the normal forces are those that keep the heights of the balls that touch where they are:
+the accelerations are affine in the forces, so one evaluation without them and one for each give a linear system. It has
+two unknowns where the top leans, on ball and stem at once. Flight is the same equations without the force, integrated like
+everything else.
 Impact: d(velocities)/dp = the response to the force (f(v), 1), p the normal impulse, until the ball's normal velocity is
 -restitution times what it was; for viscous friction that is a linear equation, solved by the matrix exponential, for
-Coulomb's regularised law it is integrated. A rebound slower than 1e-5 sqrt(g R) closes the contact.
+Coulomb's regularised law it is integrated. A rebound slower than 1e-5 sqrt(g R) closes the contact; if the other ball is at the
+plane and no faster, both balls are put to rest along the normal, u_z = 0 and e_z' = 0, and stay if both forces are positive.
 
 Run: python hop_reference.py   writes hop_reference.csv (some minutes). Nothing here is shared with the simulator.
 """
@@ -78,35 +81,45 @@ def arm(ball, e):
     return ball[0] * e - ball[1] * UP
 
 
-def accelerations(case, state, ball, force):
-    """u', w' and the acceleration of the ball's centre along the normal, for a force at its contact point."""
+def accelerations(case, state, loads=()):
+    """u' and w' under forces at the contact points of balls, (ball, force)."""
     _, _, e, w = split(state)
     spin_momentum = case.I1 * w + (case.I3 - case.I1) * (w @ e) * e
-    torque = cross(arm(ball, e), force)
-    w_dot = solve_inertia(case, e, torque - cross(w, spin_momentum))
-    u_dot = force / case.mass - case.gravity * UP
-    e_dot = cross(w, e)
-    return u_dot, w_dot, u_dot[2] + ball[0] * (cross(w_dot, e) + cross(w, e_dot))[2]
+    torque = -cross(w, spin_momentum)
+    for ball, force in loads:
+        torque = torque + cross(arm(ball, e), force)
+    return sum((force for _, force in loads), 0.0) / case.mass - case.gravity * UP, solve_inertia(case, e, torque)
 
 
-def contact_force(case, state, ball):
-    """N [N] of a ball that stays on the plane, and the accelerations without force and for N = 1."""
+def centre_acceleration(state, ball, u_dot, w_dot):
+    """Acceleration of a ball's centre along the normal."""
+    _, _, e, w = split(state)
+    return u_dot[2] + ball[0] * (cross(w_dot, e) + cross(w, cross(w, e)))[2]
+
+
+def contact(case, state, balls):
+    """The normal forces [N] of the balls that stay on the plane, and u' and w' under them."""
     _, u, e, w = split(state)
-    slip = u + cross(w, arm(ball, e))
-    slip[2] = 0.0
-    free = accelerations(case, state, ball, 0.0 * UP)
-    unit = accelerations(case, state, ball, friction(case, slip) + UP)
-    return free[2] / (free[2] - unit[2]), free, unit
+    units = []
+    for ball in balls:
+        slip = u + cross(w, arm(ball, e))
+        slip[2] = 0.0
+        units.append((ball, friction(case, slip) + UP))
+    free = accelerations(case, state)
+    rises = np.array([centre_acceleration(state, ball, *free) for ball in balls])
+    pushed = [accelerations(case, state, [unit]) for unit in units]
+    matrix = [
+        [centre_acceleration(state, ball, *one) - rise for one in pushed]
+        for ball, rise in zip(balls, rises, strict=True)
+    ]
+    forces = np.linalg.solve(matrix, -rises) if balls else rises
+    return forces, *accelerations(case, state, [(b, N * f) for N, (b, f) in zip(forces, units, strict=True)])
 
 
-def rate(case, state, ball):
-    """Rate of the state; `ball` is the one on the plane, or None in flight."""
+def rate(case, state, balls):
+    """Rate of the state; `balls` are those on the plane, none in flight."""
     _, u, e, w = split(state)
-    if ball is None:
-        u_dot, w_dot, _ = accelerations(case, state, (0.0, 0.0), 0.0 * UP)
-    else:
-        N, free, unit = contact_force(case, state, ball)
-        u_dot, w_dot = (x + N * (y - x) for x, y in zip(free[:2], unit[:2], strict=True))
+    _, u_dot, w_dot = contact(case, state, balls)
     return np.concatenate((u, u_dot, cross(w, e), w_dot))
 
 
@@ -161,6 +174,13 @@ def strike(case, state, ball):
     return np.concatenate((s, u + impulse / case.mass, e, w + solve_inertia(case, e, cross(r, impulse)))), bounces
 
 
+def at_rest(state):
+    """The state without u_z and without the turning of e towards the normal."""
+    s, u, e, w = split(state)
+    across = cross(UP, e)
+    return np.concatenate((s, u * (1.0 - UP), e, w - (w @ across) / (across @ across) * across))
+
+
 def launch(case):
     """State at the start, on the ball that is lower, and that ball's number."""
     e = np.array((sin(case.theta), 0.0, cos(case.theta)))
@@ -182,55 +202,67 @@ def watched(function, direction):
 def follow(case, rtol=1e-12, flight_step=2e-4, contact_step=2.5e-4):
     """Run until theta reaches the angle, or t1.
 
-    Returns (status, time [s] of the angle, end state, flights, list of (time, ball) at which a ball came to the plane,
-    energies at the ends of all pieces)."""
+    Returns (status, time [s] of the angle, end state, flights, list of (time, ball) at which a ball came to the plane, 2 where
+    both came to rest there, energies at the ends of all pieces, when first one of two balls parted)."""
     state, number = launch(case)
-    time, flying, flights, contacts, energies = 0.0, False, 0, [], [energy(case, state)]
+    # `touching`: the numbers of the balls on the plane.
+    time, touching, flights, contacts, energies, parted = 0.0, [number], 0, [], [energy(case, state)], inf
     swing = sqrt(case.gravity / case.radius)
+    closing, numbers = CLOSING * swing * case.radius, range(len(case.balls))
     absolute = rtol * np.repeat((case.radius, swing * case.radius, 1.0, swing), 3)
     inverts = watched(lambda y: y[8] - cos(case.angle), -1.0)
     while True:
-        ball = None if flying else case.balls[number]
-        if flying:
-            ends = [watched(lambda y, ball=ball: gap(ball, y), -1.0) for ball in case.balls]
-        else:
-            ends = [watched(lambda y, ball=ball: contact_force(case, y, ball)[0], -1.0)]
-            ends += [watched(lambda y, b=b: gap(b, y), -1.0) for k, b in enumerate(case.balls) if k != number]
+        balls, others = [case.balls[k] for k in touching], [k for k in numbers if k not in touching]
+        ends = [watched(lambda y, k=k: contact(case, y, balls)[0][k], -1.0) for k in range(len(balls))]  # noqa: B023
+        ends += [watched(lambda y, k=k: gap(case.balls[k], y), -1.0) for k in others]
         # A short bounce must not hide within the first step.
-        speed = gap_rate(case.balls[number], state) if flying else 0.0
-        first = min(0.2 * speed / case.gravity, flight_step) if speed > 1e-9 else None
+        speed, most = (
+            max((gap_rate(case.balls[k], state) for k in others), default=0.0),
+            [contact_step, flight_step][not balls],
+        )
+        first = min(0.2 * speed / case.gravity, most, case.t1 - time) if speed > 1e-9 else None
         run = solve_ivp(
-            lambda _, y, ball=ball: rate(case, y, ball),
+            lambda _, y: rate(case, y, balls),  # noqa: B023
             (time, case.t1),
             state,
             method="DOP853",
             rtol=rtol,
             atol=absolute,
-            first_step=first if first is None else min(first, case.t1 - time),
-            max_step=flight_step if flying else contact_step,
+            first_step=first,
+            max_step=most,
             events=[inverts, *ends],
         )
         time, state = run.t[-1], run.y[:, -1]
         state[6:9] /= np.linalg.norm(state[6:9])
         energies.append(energy(case, state))
         if run.status == 0:
-            return "not_inverted", inf, state, flights, contacts, energies
+            return "not_inverted", inf, state, flights, contacts, energies, parted
         which = next(k for k, times in enumerate(run.t_events) if len(times))
         if which == 0:
-            return "inverted", time, state, flights, contacts, energies
-        if not flying and which == 1:
-            flying, flights = True, flights + 1
+            return "inverted", time, state, flights, contacts, energies, parted
+        if which <= len(balls):
+            parted = min(parted, time) if len(balls) == 2 else parted
+            touching = [k for k in touching if k != touching[which - 1]]
+            flights += not touching
             continue
-        number = which - 1 if flying else 1 - number
+        number = others[which - 1 - len(balls)]
         ball = case.balls[number]
         # The ball is on the plane exactly; what the event left is round-off.
         state[2] = ball[1] - ball[0] * state[8]
         state, flying = strike(case, state, ball)
         contacts.append((time, number))
+        touching = [] if flying else [number]
         if not flying:
             state[5] -= gap_rate(ball, state)
-            flying = contact_force(case, state, ball)[0] <= 0.0
-        flights += flying
+            both = [(k, b) for k, b in enumerate(case.balls) if abs(gap(b, state)) < 1e-9 * case.radius]
+            if len(both) == 2 and max(abs(gap_rate(b, state)) for _, b in both) <= closing:
+                state = at_rest(state)
+                forces = contact(case, state, case.balls)[0]
+                touching = [k for k in numbers if forces[k] > 0.0]
+                contacts += [(time, 2)] if len(touching) == 2 else []
+            elif contact(case, state, [ball])[0][0] <= 0.0:
+                touching = []
+        flights += not touching
 
 
 MR2 = 0.02 * 0.02**2
@@ -247,17 +279,22 @@ CASES = (
     Case(**RUTSTAM, spin=180.0, slip_speed=0.1, restitution=0.3),
     Case(**LEINE_GLOCKER, mu=0.3, slip_speed=0.05, theta=0.1, spin=180.0, t1=8.0),
     Case(**LEINE_GLOCKER, mu=0.3, theta=0.1, spin=200.0, t1=20.0),
+    Case(**LEINE_GLOCKER, mu=0.3, slip_speed=0.05, theta=0.1, spin=140.0, t1=3.0),
+    Case(**LEINE_GLOCKER, mu=0.3, theta=2.4, spin=90.0, t1=3.0),
+    Case(**LEINE_GLOCKER, mu=0.3, theta=0.1, spin=140.0, t1=8.0),
 )
 
-RESULTS = ("status", "time", "end_theta", "flights", "landings", "last_landing", "end_energy")
+RESULTS = ("status", "time", "end_theta", "flights", "landings", "last_landing", "end_energy", "leans", "parted")
 
 
 def row(case, **accuracy):
     """What the table holds of a case."""
-    status, time, state, flights, contacts, energies = follow(case, **accuracy)
+    status, time, state, flights, contacts, energies, parted = follow(case, **accuracy)
     last = contacts[-1][0] if contacts else inf
     theta = np.arctan2(np.hypot(state[6], state[7]), state[8])
-    return dict(zip(RESULTS, (status, time, theta, flights, len(contacts), last, energies[-1]), strict=True))
+    leans = next((when for when, ball in contacts if ball == 2), inf)
+    values = (status, time, theta, flights, len(contacts), last, energies[-1], leans, parted)
+    return dict(zip(RESULTS, values, strict=True))
 
 
 def main():

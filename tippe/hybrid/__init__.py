@@ -1,1 +1,1 @@
-"""Contact loss, flight, landing and the stem: scenes with `contact="hybrid"`."""
+"""Contact loss, flight, landing, the stem and leaning on it: scenes with `contact="hybrid"`."""

@@ -1,7 +1,6 @@
 """The rides of a block of cells of a table through flights and impacts."""
 
 import diffrax
-import jax.numpy as jnp
 import numpy as np
 
 from nonholonomic.phases import Journey, travel
@@ -9,7 +8,7 @@ from nonholonomic.phases import Journey, travel
 from ..inversion import ABSOLUTE, InversionProblem
 from ..scene import Scene
 from .free_body import balls
-from .sliding import Slide, first_ball
+from .sliding import first_ball, phases
 
 
 def ride(
@@ -31,13 +30,9 @@ def ride(
 
     **Returns:** a `Journey`, whose counts are the flights.
     """
-    spheres = balls(scene.body)
-    phases = tuple(
-        Slide(scene, problem.scales, problem.cos_angle, jnp.asarray(number), last) for number in range(len(spheres))
-    )
     return travel(
-        phases,
-        np.asarray(first_ball(spheres, problem.states)),
+        phases(scene, problem.scales, problem.cos_angle, last),
+        np.asarray(first_ball(balls(scene.body), problem.states)),
         np.asarray(problem.states),
         t1,
         count,

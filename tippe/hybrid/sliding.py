@@ -1,4 +1,4 @@
-"""Sliding on one sphere as a phase of the motion, and what follows it: a flight, the other sphere, or the end."""
+"""Sliding as a phase of the motion, on one sphere or on both, and what follows it: a flight, the other sphere, or the end."""
 
 from typing import Any, NamedTuple
 
@@ -15,15 +15,12 @@ from ..scene import Scene
 from .flight import angle_reached, flown, fly
 from .free_body import Ball, FreeBody, balls, freed, gap, gap_rate, grounded, standing_on
 from .impact import strike
+from .leaning import LeaningDynamics, at_rest
 
 Cells = Float[Array, " cells"]
 
-#: Both spheres stay on the plane: a double contact, which is not modelled. A slow top ends so, leaning on its stem: it rocks
-#: from one sphere to the other, ever less, until the one parts from the plane more slowly than `CLOSING_SPEED`. A further
-#: code of `Passage.status`.
-BOTH_CONTACTS = 6
-
 #: A rebound slower than this part of sqrt(g R) is none: the contact closes. Its height would be half the square of it, in R.
+#: A top that rocks from one sphere to the other, ever less, comes so to lean on both.
 CLOSING_SPEED = 1e-5
 
 #: Two spheres are at the plane together if neither is farther from it than this part of R.
@@ -34,10 +31,13 @@ MOST_BOUNCES = 1000
 
 
 class Sliding(AbstractProblem):
-    """Sliding on one sphere until theta reaches an angle, the contact is lost or the other sphere touches the plane."""
+    """Sliding until theta reaches an angle, a contact is lost or a sphere that does not touch the plane does.
 
-    dynamics: Dynamics
-    own: Ball
+    `own` is the sphere that slides and `other` the one that does not; `None` if there is none.
+    """
+
+    dynamics: Dynamics | LeaningDynamics
+    own: Ball | None
     other: Ball | None
     cos_angle: Float[Array, "..."]
     states: Float[Array, "components cells"]
@@ -54,7 +54,7 @@ class Sliding(AbstractProblem):
 
     def guard(self, time: Cells, state: Float[Array, "components cells"]) -> Cells:
         margin = self.dynamics.contact_margin(state)
-        if self.other is None:
+        if self.own is None or self.other is None:
             return margin
         return jnp.minimum(margin, clearance(self.own, self.other, state))
 
@@ -86,29 +86,70 @@ class Slide(AbstractPhase):
 
         Counted are the flights.
         """
-        touches, start = lost_contact(self.scene, self.number, state)
 
         def hop(carry: tuple[Air, Array]) -> tuple[Air, Array]:
             air, count = carry
-            arrives = touches & (count == 0)
             after, landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
-            after = _where(arrives, air, after)
-            after = _where(arrives | landed, land(self.scene, after), after)
+            if air.falls is not None:
+                after, landed = _where(air.falls, air, after), air.falls | landed
+            after = _where(landed, land(self.scene, after), after)
             return _where(air.open, after, air), count + 1
 
         def under_way(carry: tuple[Air, Array]) -> Array:
             return jnp.any(carry[0].open) & (carry[1] < MOST_BOUNCES)
 
+        start = lost_contact(self.scene, self.number, state)
         air, _ = jax.lax.while_loop(under_way, hop, (start, jnp.zeros((), int)))
         status = jnp.where(air.open, UNRESOLVED, air.status)
         return Passage(air.ball, grounded(air.free), air.elapsed, status, air.crossing_time, air.flights[None])
+
+
+class Lean(AbstractPhase):
+    """Sliding on both spheres; the phase after those of the spheres."""
+
+    scene: Scene
+    scales: Float[Array, "components cells"]
+    cos_angle: Float[Array, "..."]
+
+    def problem(self, state: Float[Array, "components cells"]) -> Sliding:
+        return Sliding(leaning(self.scene), None, None, self.cos_angle, state, self.scales)
+
+    def leave(self, state: Float[Array, "components cells"], left: Cells) -> Passage:
+        """Slide on the sphere whose normal force has not vanished."""
+        number, state = lifted(self.scene, state)
+        zero = jnp.zeros_like(state[0])
+        running, none = jnp.full(zero.shape, RUNNING), jnp.zeros((1, *zero.shape), int)
+        return Passage(number, state, zero, running, jnp.full_like(zero, jnp.inf), none)
+
+
+def phases(
+    scene: Scene, scales: Float[Array, "components cells"], cos_angle: Float[Array, "..."], last: bool
+) -> tuple[AbstractPhase, ...]:
+    """The phases of a scene: sliding on each of its spheres, and on both if there are two."""
+    spheres = len(balls(scene.body))
+    single = tuple(Slide(scene, scales, cos_angle, jnp.asarray(number), last) for number in range(spheres))
+    return single if spheres == 1 else (*single, Lean(scene, scales, cos_angle))
+
+
+def leaning(scene: Scene) -> LeaningDynamics:
+    """The equations of motion of a scene's top on both of its spheres."""
+    return LeaningDynamics(scene.body, scene.friction, scene.gravity)
+
+
+def lifted(
+    scene: Scene, state: Float[Array, "components cells"]
+) -> tuple[Int[Array, " cells"], Float[Array, "components cells"]]:
+    """The number of the sphere that stays when the other's normal force has vanished, and the state then."""
+    number = leaning(scene).heavier(state)
+    return number, grounded(at_rest(scene.body, freed(scene.body, balls(scene.body)[0], state)))
 
 
 class Air(NamedTuple):
     """A top that may be in the air.
 
     - `free`, `elapsed` [s]: the body and the time since the contact was lost.
-    - `ball`: the sphere that touched last; `rising`: whether it left with a speed.
+    - `ball`: the sphere that touched last; `rising`: whether it left with a speed; `falls`: whether, without a flight, it is
+      about to strike the plane, `None` for a top without stem. Once the contact is closed, the number of the phase.
     - `status`: `RUNNING`, or how the run ended; `crossing_time` [s] of the event, infinite if there was none.
     - `flights`: so far; `open`: whether there is no contact and the run goes on.
     """
@@ -117,6 +158,7 @@ class Air(NamedTuple):
     elapsed: Cells
     ball: Int[Array, " cells"]
     rising: Bool[Array, " cells"]
+    falls: Bool[Array, " cells"] | None
     status: Int[Array, " cells"]
     crossing_time: Cells
     flights: Int[Array, " cells"]
@@ -131,26 +173,25 @@ def first_ball(spheres: tuple[Ball, ...], state: Float[Array, "components ..."])
     return (clearance(main, stem, state) < 0.0).astype(int)
 
 
-def lost_contact(
-    scene: Scene, number: Int[Array, ""], state: Float[Array, "components cells"]
-) -> tuple[Bool[Array, " cells"], Air]:
-    """What has ended sliding on the sphere with a number: whether the other sphere touches the plane; and the top then."""
+def lost_contact(scene: Scene, number: Int[Array, ""], state: Float[Array, "components cells"]) -> Air:
+    """The top at the end of sliding on the sphere with a number: its contact is lost, or the other sphere is at the plane."""
     own, other = _own_and_other(balls(scene.body), number)
     zero = jnp.zeros_like(state[0])
-    touches = jnp.zeros(zero.shape, bool)
+    falls, ball = None, jnp.broadcast_to(number, zero.shape)
     if other is not None:
-        touches = clearance(own, other, state) <= standing_on(scene.dynamics, own).contact_margin(state)
-    start = Air(
+        falls = clearance(own, other, state) <= standing_on(scene.dynamics, own).contact_margin(state)
+        ball = jnp.where(falls, 1 - number, number)
+    return Air(
         free=freed(scene.body, own, state),
         elapsed=zero,
-        ball=jnp.where(touches, 1 - number, number),
+        ball=ball,
         rising=jnp.zeros(zero.shape, bool),
+        falls=falls,
         status=jnp.full(zero.shape, RUNNING),
         crossing_time=jnp.full_like(zero, jnp.inf),
         flights=jnp.zeros(zero.shape, int),
         open=jnp.ones(zero.shape, bool),
     )
-    return touches, start
 
 
 def take_flight(
@@ -172,6 +213,7 @@ def take_flight(
         elapsed=air.elapsed + duration,
         ball=jnp.where(landed, flight.ball, air.ball),
         rising=air.rising,
+        falls=air.falls,
         status=jnp.where(flight.lost, FAILED, status),
         crossing_time=jnp.where(jnp.isfinite(reached), air.elapsed + reached, air.crossing_time),
         flights=air.flights + 1,
@@ -191,11 +233,25 @@ def land(scene: Scene, air: Air) -> Air:
     closing = CLOSING_SPEED * jnp.sqrt(scene.gravity * body.radius)
     rebounds = restitution * speed > closing
     free, jams = strike(body, scene.friction, own, air.free, jnp.where(rebounds, restitution, 0.0))
-    status = jnp.where(jams, FAILED, air.status)
+    struck = air._replace(free=free, rising=rebounds, open=rebounds, status=jnp.where(jams, FAILED, air.status))
     if other is not None:
-        both = (gap(other, free) < TOUCHING * body.radius) & (gap_rate(body, other, free) <= closing)
-        status = jnp.where(both & ~rebounds & ~jams, BOTH_CONTACTS, status)
-    return air._replace(free=free, rising=rebounds, status=status, open=rebounds & ~jams)
+        struck = _with_other(scene, struck, other, closing)
+    return struck._replace(open=struck.open & ~jams)
+
+
+def _with_other(scene: Scene, air: Air, other: Ball, closing: Cells) -> Air:
+    """What an impact means to the other sphere if that is at the plane: it strikes too, or the top comes to rest on both."""
+    speed = gap_rate(scene.body, other, air.free)
+    touches = gap(other, air.free) < TOUCHING * scene.body.radius
+    falls, rests = touches & (speed < -closing), touches & (jnp.abs(speed) <= closing) & ~air.rising
+    free, number, definite = leaning(scene).settled(air.free)
+    return air._replace(
+        free=_where(rests, free, air.free),
+        ball=jnp.where(rests, number, jnp.where(falls, 1 - air.ball, air.ball)),
+        falls=falls,
+        status=jnp.where(rests & ~definite & (air.status == RUNNING), UNRESOLVED, air.status),
+        open=air.open | falls,
+    )
 
 
 def _where(condition: Bool[Array, " cells"], this: Any, that: Any) -> Any:

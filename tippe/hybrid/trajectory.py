@@ -22,7 +22,8 @@ from ..scene import Scene
 from .flight import cone, flown
 from .free_body import Ball, FreeBody, axis_rate, balls, energy, freed, grounded, jellett, standing_on
 from .impact import approach
-from .sliding import BOTH_CONTACTS, clearance, first_ball, land, lost_contact, take_flight
+from .leaning import BOTH, LeaningDynamics
+from .sliding import clearance, first_ball, land, leaning, lifted, lost_contact, take_flight
 
 #: Pieces, that is contacts and flights, after which a run is given up.
 MOST_PIECES = 4000
@@ -33,7 +34,7 @@ SHOWN = 0.4
 #: No angle has this cosine: a trajectory goes on through all of them.
 NEVER = -2.0
 
-STATUS = {REACHED_END: "reached t1", FAILED: "failed", UNRESOLVED: "unresolved", BOTH_CONTACTS: "both_contacts"}
+STATUS = {REACHED_END: "reached t1", FAILED: "failed", UNRESOLVED: "unresolved"}
 
 #: Rows of what is shown of a run: state, velocity and height of the centre of mass, its place, spin angle, work.
 ROWS = 14
@@ -42,9 +43,9 @@ Rows: TypeAlias = Float[np.ndarray, "14 times"]
 
 
 class Contact(AbstractProblem):
-    """Sliding on one sphere, with the place of the centre of mass, the spin angle and the work of friction."""
+    """Sliding, with the place of the centre of mass, the spin angle and the work of friction; see `Sliding`."""
 
-    dynamics: Dynamics
+    dynamics: Dynamics | LeaningDynamics
     own: Ball
     other: Ball | None
     axial: Float[Array, ""]
@@ -119,6 +120,7 @@ _take_flight = eqx.filter_jit(take_flight)
 _energy = eqx.filter_jit(lambda scene, free: energy(scene.body, scene.gravity, free))
 _land = eqx.filter_jit(land)
 _lost_contact = eqx.filter_jit(lost_contact)
+_lifted = eqx.filter_jit(lifted)
 
 
 def _rows_in_contact(scene: Scene, states: Float[np.ndarray, "12 times"], ball: Ball) -> Rows:
@@ -142,11 +144,12 @@ def _rows_in_flight(
 class HybridTrajectory(eqx.Module):
     """A run through contacts, flights and impacts; vectors are arrays (times, 3) in the fixed frame (x, y, z).
 
-    `status` is "reached t1", "failed", "unresolved" (too many pieces) or "both_contacts" (sphere and stem stayed on the
-    plane together); the run ends at `end_time`. `contact` says at each time which sphere touches: 0 the top's, 1 its
-    stem's, -1 none. At the time of an impact the values are those before it. `hops` has a row for each flight, its begin and
-    its end [s]. `work` is that of friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest
-    drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J].
+    `status` is "reached t1", "failed" or "unresolved" (too many pieces, or sphere and stem on the plane together with so
+    much friction that the forces are not determined); the run ends at `end_time`. `contact` says at each time which sphere
+    touches: 0 the top's, 1 its stem's, 2 both, -1 none. At the time of an impact the values are those before it. `hops` has
+    a row for each flight, its begin and its end [s]. `work` is that of friction and of the impacts [J]. `stats` holds
+    accepted and rejected steps, the greatest drift of |e|, the greatest energy residual |E - E(0) - work| and the energy
+    lost in impacts [J].
     """
 
     t: Float[np.ndarray, " times"]
@@ -166,7 +169,7 @@ class HybridTrajectory(eqx.Module):
 
     @property
     def _ball(self) -> Ball:
-        """The sphere that touches, the top's own in flight."""
+        """The sphere that touches, the top's own in flight and where both do."""
         spheres = balls(self.scene.body)
         return Ball(
             *(jnp.where(self.contact == 1, stem, own) for own, stem in zip(spheres[0], spheres[-1], strict=True))
@@ -237,13 +240,15 @@ class HybridTrajectory(eqx.Module):
 
     @property
     def normal_force(self) -> Float[np.ndarray, " times"]:
-        """Normal force [N]; 0 in flight."""
+        """Normal force [N]; 0 in flight. Where both spheres touch it is their sum, the weight."""
         motion = standing_on(self.scene.dynamics, self._ball).motion(jnp.asarray(self.rows[:8]))
-        return np.where(self.contact < 0, 0.0, motion.normal_force)
+        both = np.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, motion.normal_force)
+        return np.where(self.contact < 0, 0.0, both)
 
     @property
     def slip(self) -> Float[np.ndarray, "times 2"]:
-        """Velocity along the plane of the lowest point of the sphere that touches, of the top's own in flight [m/s]."""
+        """Velocity along the plane of the lowest point of the sphere that touches [m/s]: of the top's own in flight too, and
+        where both touch."""
         return np.stack(approach(self.scene.body, self._ball, self._free).velocity[:2], axis=-1)
 
     def at(self, times: Any) -> "HybridTrajectory":
@@ -325,19 +330,23 @@ def _pieces(
 
     while len(pieces) < MOST_PIECES:
         number = int(number)
-        own, other = spheres[number], spheres[1 - number] if len(spheres) == 2 else None
+        own, other = _own_and_other(spheres, number)
         start = jnp.concatenate([jnp.asarray(state), jnp.asarray(rest)])
-        problem = Contact(standing_on(scene.dynamics, own), own, other, scene.body.I3, start, scales)
+        dynamics = leaning(scene) if number == BOTH else standing_on(scene.dynamics, own)
+        problem = Contact(dynamics, own, other, scene.body.I3, start, scales)
         path = follow(problem, t1 - time, solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
         pieces.append(Sojourn(time, path, scene, own, number))
         time, accepted, rejected = pieces[-1].end, accepted + path.accepted, rejected + path.rejected
         if path.failed or not path.guard_lost:
             return ended(FAILED if path.failed else REACHED_END)
         state, rest = path.states[:8, -1], path.states[8:, -1]
-        touches, air = _lost_contact(scene, jnp.asarray(number), jnp.asarray(state)[:, None])
-        arrived = bool(touches[0])
+        if number == BOTH:
+            numbers, states = _lifted(scene, jnp.asarray(state)[:, None])
+            number, state = numbers[0], states[:, 0]
+            continue
+        air = _lost_contact(scene, jnp.asarray(number), jnp.asarray(state)[:, None])
         while bool(air.open[0]):
-            if not arrived:
+            if air.falls is None or not bool(air.falls[0]):
                 before = air
                 air, landed = _take_flight(
                     scene, before._replace(elapsed=jnp.zeros(1)), never, jnp.asarray([t1 - time]), False
@@ -347,7 +356,6 @@ def _pieces(
                 time, rest = arc.end, arc.at(np.array([arc.end]))[10:, 0]
                 if not bool(landed[0]):
                     return ended(int(air.status[0]))
-            arrived = False
             struck = _land(scene, air)
             lost = float(_energy(scene, air.free)[0] - _energy(scene, struck.free)[0])
             loss, rest, air = loss + lost, rest - np.array([0.0, 0.0, 0.0, lost]), struck
@@ -357,6 +365,13 @@ def _pieces(
                 return ended(UNRESOLVED)
         number, state = air.ball[0], np.asarray(grounded(_single(air.free)))
     return ended(UNRESOLVED)
+
+
+def _own_and_other(spheres: tuple[Ball, ...], number: int) -> tuple[Ball, Ball | None]:
+    """The sphere that touches, the top's own if both do, and the one that does not if there is one."""
+    if number == BOTH or len(spheres) == 1:
+        return spheres[0], None
+    return spheres[number], spheres[1 - number]
 
 
 def _single(free: FreeBody) -> FreeBody:
