@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 import tippe
 from hard.lagrange import theta_by_lagrange
 from hard.limits import rutstam_top
-from hard.row import Row
+from hard.row import Row, of_runs
 from nonholonomic.integrate import Path, follow
 from tippe.trajectory import Run
 
@@ -101,15 +101,13 @@ def ball_that_drills() -> Row:
     run = timed(lambda: tippe.simulate(scene, tippe.Launch(0.0, 100.0), end, tolerance=1e-12), 1)
     spins = np.asarray(run.result.spin)
     expected = [brentq(lambda w, t=t: clock(w) - clock(100.0) + t, 1e-12, 100.0, xtol=1e-13) for t in run.result.t]
-    return Row(
+    return of_runs(
         "ball drilling on the spot to rest under Contensou friction",
         f"w falls linearly to {spins[-1]:.2f} rad/s, then fades",
         float(np.max(np.abs(spins - expected))),
         1e-11,
         "closed form [rad/s of 100]",
-        run.result.stats["accepted"] + run.result.stats["rejected"],
-        run.cpu,
-        run.result.status,
+        run,
     )
 
 
@@ -166,15 +164,13 @@ def jellett_under_torque() -> Row:
     )
     run = timed(lambda: tippe.simulate(scene, launch, 2.0, times, tolerance=1e-12), 1)
     share = np.asarray(run.result.jellett) / size
-    return Row(
+    return of_runs(
         "Jellett's quantity under drilling and rolling resistance, 2 s",
         f"loses {100.0 * (1.0 - share[-1]):.1f} %",
         float(np.max(np.abs(share - audit.y[8]))) if share[-1] < 0.99 else math.nan,
         2e-11,
         "integral of N tau.(R n - a e) [lambda(0)]",
-        run.result.stats["accepted"] + run.result.stats["rejected"],
-        run.cpu,
-        run.result.status,
+        run,
     )
 
 
@@ -183,15 +179,13 @@ def energy_under_torque() -> Row:
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), DISC_AND_LEVER)
     run = timed(lambda: tippe.simulate(scene, tippe.Launch(0.3, 100.0, eta=0.4), 2.0, tolerance=1e-12), 1)
     energy = np.asarray(run.result.energy)
-    return Row(
+    return of_runs(
         "energy in the cylinder under drilling and rolling resistance, 2 s",
         f"loses {100.0 * (1.0 - energy[-1] / energy[0]):.0f} %",
         run.result.stats["energy_residual"] / energy[0] if np.all(np.diff(energy) <= 0.0) else math.nan,
         5e-13,
         "work of force and torque [E(0)]",
-        run.result.stats["accepted"] + run.result.stats["rejected"],
-        run.cpu,
-        run.result.status,
+        run,
     )
 
 
@@ -200,15 +194,13 @@ def torques_by_lagrange() -> Row:
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.2), DISC_AND_LEVER)
     launch, times = tippe.Launch(0.4, 80.0, eta=0.5, azimuth=1.0), np.linspace(0.1, 2.0, 20)
     run = timed(lambda: tippe.simulate(scene, launch, 2.0, times, tolerance=1e-12), 1)
-    return Row(
+    return of_runs(
         "theta(t) in the cylinder under drilling and rolling resistance, 2 s",
         f"theta comes to {float(run.result.theta[-1]):.3f} rad",
         float(np.max(np.abs(np.asarray(run.result.theta) - theta_by_lagrange(scene, launch, times)))),
         3e-10,
         "Lagrange in Euler angles [rad]",
-        run.result.stats["accepted"] + run.result.stats["rejected"],
-        run.cpu,
-        run.result.status,
+        run,
     )
 
 

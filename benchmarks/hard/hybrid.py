@@ -12,7 +12,7 @@ from measure import timed
 
 import tippe
 from hard.limits import rutstam_top
-from hard.row import Row
+from hard.row import Row, of_runs, of_table
 from tippe.hybrid.stem import first_contact
 
 #: The reference's results, by number of its cases.
@@ -40,7 +40,7 @@ def _against_reference(number: int, case: str, happens: str, bound: float) -> Ro
     flights = int(table.hops)
     error = abs(float(table.time) - expected["time"]) if flights == int(expected["flights"]) else np.inf
     told = f"{happens} ({flights} flights)" if flights else happens
-    return Row(case, told, error, bound, "SciPy, time [s]", int(table.steps), run.cpu, str(table.status))
+    return of_table(case, told, error, bound, "SciPy, time [s]", run)
 
 
 def hops() -> Row:
@@ -70,8 +70,7 @@ def jellett_through_hops() -> Row:
     ride = run.result
     error = float(np.max(np.abs(ride.jellett / ride.jellett[0] - 1.0)))
     happens = f"Jellett's quantity stays ({len(ride.hops)} flights)"
-    steps = ride.stats["accepted"] + ride.stats["rejected"]
-    return Row("250 rad/s, e_N = 0.3, 7 s", happens, error, 1e-9, "exact, relative", steps, run.cpu, ride.status)
+    return of_runs("250 rad/s, e_N = 0.3, 7 s", happens, error, 1e-9, "exact, relative", run)
 
 
 def energy_through_hops() -> Row:
@@ -81,10 +80,7 @@ def energy_through_hops() -> Row:
     ride = run.result
     error = float(np.max(np.diff(ride.energy))) / float(ride.energy[0])
     happens = f"energy falls only ({len(ride.hops)} flights)"
-    steps = ride.stats["accepted"] + ride.stats["rejected"]
-    return Row(
-        "two spheres, 250 rad/s, 4 s", happens, error, 1e-8, "greatest rise, relative", steps, run.cpu, ride.status
-    )
+    return of_runs("two spheres, 250 rad/s, 4 s", happens, error, 1e-8, "greatest rise, relative", run)
 
 
 def leaning_on_the_stem() -> Row:
@@ -96,10 +92,7 @@ def leaning_on_the_stem() -> Row:
     table = run.result
     error = abs(float(table.end_theta) - expected["end_theta"])
     happens = f"leans from {expected['leans']:.3f} to {expected['parted']:.3f} s, falls back"
-    status = str(table.status)
-    return Row(
-        "two spheres, 140 rad/s, 3 s", happens, error, 5e-7, "SciPy, theta [rad]", int(table.steps), run.cpu, status
-    )
+    return of_table("two spheres, 140 rad/s, 3 s", happens, error, 5e-7, "SciPy, theta [rad]", run)
 
 
 def leaning_for_ever() -> Row:
@@ -108,9 +101,8 @@ def leaning_for_ever() -> Row:
     run = timed(lambda: tippe.inversion_table(scene, theta=0.1, spin=120.0, t1=30.0), 1)
     table = run.result
     error = abs(float(table.end_theta) - float(first_contact(scene.body)))
-    return Row(
-        *("two spheres, 120 rad/s, 30 s", "rocks, leans for ever", error, 1e-7, "closed form, theta [rad]"),
-        *(int(table.steps), run.cpu, str(table.status)),
+    return of_table(
+        "two spheres, 120 rad/s, 30 s", "rocks, leans for ever", error, 1e-7, "closed form, theta [rad]", run
     )
 
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from measure import Timed, timed
+from measure import timed
 
 import tippe
 from hard.lagrange import theta_by_lagrange
-from hard.row import Row
+from hard.row import Row, of_runs, of_table
 from tippe.quadrature import FrictionlessNutation, swing
 from tippe.steady import growth_rate, standing_matrix, tumbling_angles
 
@@ -20,20 +20,6 @@ VISCOUS = tippe.Viscous(0.3)
 def rutstam_top(I1: float = 131.0 / 350.0, I3: float = 0.4) -> tippe.Top:
     """Rutstam's top (SIGMA 8 (2012) 019), its moments of inertia in units of m R^2."""
     return tippe.Top(0.02, 0.02, 0.006, I1 * 8e-6, I3 * 8e-6)
-
-
-def of_table(case: str, happens: str, error: Any, bound: float, against: str, run: Timed) -> Row:
-    """The row of a table of one or more cells: the steps of all of them, the status of the first."""
-    table = run.result
-    steps, status = int(np.sum(table.steps)), str(np.ravel(table.status)[0])
-    return Row(case, happens, float(error), bound, against, steps, run.cpu, status)
-
-
-def of_runs(case: str, happens: str, error: Any, bound: float, against: str, run: Timed) -> Row:
-    """The row of one or more trajectories: the steps of all of them, the status of the first."""
-    runs = run.result if isinstance(run.result, list) else [run.result]
-    steps = sum(one.stats["accepted"] + one.stats["rejected"] for one in runs)
-    return Row(case, happens, float(error), bound, against, steps, run.cpu, runs[0].status)
 
 
 def upright_exactly() -> Row:

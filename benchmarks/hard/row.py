@@ -1,7 +1,10 @@
 """One hard case: what happened, how wrong it was, against what, and what it cost."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
+from measure import Timed
 
 
 class Row(NamedTuple):
@@ -45,3 +48,17 @@ class Row(NamedTuple):
             "status": self.status,
             "ok": "yes" if self.ok else "NO",
         }
+
+
+def of_table(case: str, happens: str, error: Any, bound: float, against: str, run: Timed) -> Row:
+    """The row of a table of one or more cells: the steps of all of them, the status of the first."""
+    table = run.result
+    steps, status = int(np.sum(table.steps)), str(np.ravel(table.status)[0])
+    return Row(case, happens, float(error), bound, against, steps, run.cpu, status)
+
+
+def of_runs(case: str, happens: str, error: Any, bound: float, against: str, run: Timed) -> Row:
+    """The row of one or more trajectories: the steps of all of them, the status of the first."""
+    runs = run.result if isinstance(run.result, list) else [run.result]
+    steps = sum(one.stats["accepted"] + one.stats["rejected"] for one in runs)
+    return Row(case, happens, float(error), bound, against, steps, run.cpu, runs[0].status)

@@ -16,7 +16,7 @@ import optimistix
 from measure import timed
 
 import tippe
-from hard.row import Row
+from hard.row import Row, of_runs
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "physics"))
 
@@ -49,17 +49,14 @@ def regularised(slip_speed: float, solver: diffrax.AbstractSolver, tolerance: fl
     explicit = isinstance(solver, diffrax.Dopri8)
     other = final_theta(friction, implicit() if explicit else diffrax.Dopri8(), 1e-9)
     run = timed(lambda: final_theta(friction, solver, tolerance), 1)
-    steps = run.result.stats["accepted"] + run.result.stats["rejected"]
     found = float(run.result.theta[-1])
-    return Row(
+    return of_runs(
         f"Cohen's top, Coulomb regularised by {slip_speed:g} m/s, {'explicit' if explicit else 'implicit'}",
         f"theta(0.5 s) = {found:.6f} rad",
         abs(found - float(other.theta[-1])),
         bound,
         f"{'Kvaerno5' if explicit else 'Dopri8'} at 1e-9 [rad]",
-        steps,
-        run.cpu,
-        run.result.status,
+        run,
     )
 
 
@@ -97,15 +94,13 @@ def implicit_at_the_limit() -> Row:
     """Slip speed 1e-5 m/s, Kvaerno5, against the law itself: the regularisation is the error."""
     run = timed(lambda: final_theta(tippe.Coulomb(0.3, 1e-5), implicit(), 1e-7), 1)
     found = float(run.result.theta[-1])
-    return Row(
+    return of_runs(
         "Cohen's top, Coulomb regularised by 1e-05 m/s, implicit",
         f"theta(0.5 s) = {found:.6f} rad",
         abs(found - by_events()),
         4e-4,
         "SciPy by events, without a slip speed [rad]",
-        run.result.stats["accepted"] + run.result.stats["rejected"],
-        run.cpu,
-        run.result.status,
+        run,
     )
 
 
@@ -122,15 +117,13 @@ def the_law_itself() -> Row:
     run = timed(lambda: final_theta(tippe.SetValuedCoulomb(0.3), diffrax.Dopri8(), 1e-9), 1)
     found = float(run.result.theta[-1])
     slip = run.result.dense.parts[0]
-    return Row(
+    return of_runs(
         "Cohen's top under Coulomb's law itself",
         f"slips to {slip.times[-1]:.5f} s, then rolls; theta(0.5 s) = {found:.6f} rad",
         abs(found - by_events()),
         1e-8,
         "SciPy by events [rad]",
-        run.result.stats["accepted"] + run.result.stats["rejected"],
-        run.cpu,
-        run.result.status,
+        run,
     )
 
 
@@ -142,15 +135,13 @@ def stick_and_slip_again() -> Row:
     run = timed(lambda: tippe.simulate(scene, tippe.Launch(1.5, 30.0), 0.9, tolerance=1e-9), 1)
     body = coulomb_top.Body(*numbers, 0.2)
     last = coulomb_top.follow(body, coulomb_top.start(body, 1.5, 30.0), 0.9)[-1]
-    return Row(
+    return of_runs(
         "Rutstam's top under Coulomb's law itself, mu = 0.2",
         f"sticks {run.result.stats['sticks']} times and slips again",
         float(np.max(np.abs(np.asarray(run.result.axis[-1]) - last.states[:3, -1]))),
         1e-7,
         "SciPy by events, axis [1]",
-        run.result.stats["accepted"] + run.result.stats["rejected"],
-        run.cpu,
-        run.result.status,
+        run,
     )
 
 
