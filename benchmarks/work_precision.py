@@ -177,28 +177,38 @@ def summary(rows: list[dict[str, str]]) -> list[dict[str, str]]:
 
 
 def draw(rows: list[dict[str, str]], path: Path) -> None:
-    """CPU time against error, a panel for each scene."""
+    """CPU time against error, a panel for each scene, and one for the names of the programs."""
+    from matplotlib import colormaps
     from matplotlib.figure import Figure
 
     names = list(dict.fromkeys(one["scene"] for one in rows))
-    figure = Figure(figsize=(5.0 * len(names), 4.6), layout="constrained")
-    drawings = figure.subplots(1, len(names), squeeze=False)[0]
+    programs = list(dict.fromkeys(one["program"] for one in rows))
+    columns = min(len(names) + 1, 3)
+    lines = -(-(len(names) + 1) // columns)
+    figure = Figure(figsize=(4.6 * columns, 3.9 * lines), layout="constrained")
+    *drawings, legend = figure.subplots(lines, columns, squeeze=False).flat[: len(names) + 1]
     for drawing, name in zip(drawings, names, strict=True):
-        for program in dict.fromkeys(one["program"] for one in rows):
+        for number, program in enumerate(programs):
             points = [
                 (float(one["error"]), float(one["cpu ms per launch"]))
                 for one in rows
                 if one["scene"] == name and one["program"] == program and math.isfinite(float(one["error"]))
             ]
-            if points:
-                style = "-" if program.startswith("nonholonomic") else "--"
-                drawing.loglog(*zip(*points, strict=True), "o" + style, markersize=3, label=program)
+            style = "-" if program.startswith("nonholonomic") else "--"
+            drawing.loglog(
+                *(zip(*points, strict=True) if points else ([], [])),
+                "o" + style,
+                color=colormaps["tab20"](number),
+                markersize=3,
+                label=program,
+            )
         drawing.set_title(name)
         drawing.set_xlabel("error [s], of the axis, or [m]")
         drawing.set_ylabel("CPU ms per launch, one core")
         drawing.grid(alpha=0.3)
-    drawings[0].legend(fontsize=7)
-    figure.savefig(path, dpi=130)
+    legend.axis("off")
+    legend.legend(*drawings[0].get_legend_handles_labels(), loc="center", frameon=False)
+    figure.savefig(path, dpi=90)
 
 
 def main() -> None:
