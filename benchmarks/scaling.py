@@ -5,9 +5,12 @@
 
 The reference problem: Rutstam's top on the plane, viscous friction, 100 rad/s, theta(0) from 0.05 to 0.15, tolerance 1e-9. On a
 CPU with one core and with all; on an accelerator, where there is one, as it is (`--most 10000000` goes up to 10^7 launches).
-Then the 64 x 64 grid of theta x spin whose cells differ in cost by a factor of ten: how many of the steps that the lockstep
-took were useful; and the lanes of a block. Compilation is given apart. Run it alone: other work on the machine shows in
-every number.
+Then, whatever `--most` says, the 64 x 64 grid of theta x spin whose cells differ in cost by a factor of ten: how many of the
+steps that the lockstep took were useful; and what the number of lanes in a block does, for which six programs are compiled.
+Run it alone: other work on the machine shows in every number.
+
+A first call compiles and runs; it is not in the other columns. "ratio" is the wall time with one core over that with all. Peak
+memory is the most that the process has held so far, compilers included.
 
 Operations are counted in the program of a step, multiply and add as two; the peak is that of multiply-adds on registers,
 measured in the same run. Steps of idle lanes count as wasted.

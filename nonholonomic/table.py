@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from .digits import concise_texts
-from .hdf5 import read_grid, write_grid
+from .hdf5 import UNREACHED, read_grid, write_grid
 
 Values = Shaped[np.ndarray, "..."]
 
@@ -90,7 +90,9 @@ class Table(eqx.Module):
         lines = [f"Table over {axes or 'one cell'}"]
         for name, values in self.variables.items():
             unit = f" [{self.units[name]}]" if self.units.get(name, "1") not in ("1", "") else ""
-            lines.append(f"  {name}{unit}: {_summary(values)}")
+            # What has not been computed is told by the status alone.
+            known = values[self.status != UNREACHED] if "status" in self.variables else values
+            lines.append(f"  {name}{unit}: {_summary(values if name == 'status' else known)}")
         return "\n".join(lines)
 
     def __repr__(self) -> str:

@@ -9,7 +9,9 @@ from jaxtyping import Array, Float
 
 
 def as_number(value: Any) -> Float[Array, "..."]:
-    """Convert to a floating-point array of the default precision; what cannot be converted is left for `require`."""
+    """Convert to a floating-point array of the default precision; what is no number is left for `require`."""
+    if isinstance(value, str):
+        return value
     try:
         return jnp.asarray(value, dtype=float)
     except (TypeError, ValueError):
@@ -57,12 +59,13 @@ def require(
         return
     # A pytree rebuilt by a JAX transformation may hold placeholders; they never reach here through a constructor.
     try:
-        numbers = np.asarray(value, dtype=float)
+        # NumPy would read a number out of a text.
+        numbers = np.asarray(None if isinstance(value, str) else value, dtype=float)
     except (TypeError, ValueError):
         raise ValueError(f"{name} = {value!r} is not a number") from None
     remark = f" ({why})" if why else ""
-    if value is None:
-        raise ValueError(f"{name} = None is not a number")
+    if value is None or isinstance(value, str):
+        raise ValueError(f"{name} = {value!r} is not a number")
     finite = np.isfinite(numbers)
     if not np.all(finite):
         raise ValueError(f"{name} = {_first(numbers, finite)} must be finite{remark}")

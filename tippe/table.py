@@ -73,15 +73,17 @@ def inversion_table(
     the status or failed, 0 where they agree that there is no time; `Table.digits("time")` shows the digits it leaves. With
     `sensitivities` also the derivative of `time` by each number, `time_by_mu` for `"scene.friction.mu"`, 0 where the top did
     not invert. A scene with `contact="hybrid"` flies on where contact is lost, and the angle counts in flight too; `hops` is
-    the number of flights, and `status` may be "unresolved" (too many of them, or sphere and stem on the plane together with
-    so much friction that the forces are not determined). With `SetValuedCoulomb`, `sticks` is how often a slip has turned
-    into rolling, and `status` may be "unresolved" (too many changes).
+    the number of flights until the run ended, and `status` may be "unresolved" (10 000 of them in a row, or sphere and stem
+    on the plane together with so much friction that the forces are not determined). With `SetValuedCoulomb`, `sticks` is how
+    often a slip has turned into rolling, and `status` may be "unresolved" (too many changes).
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
     """
     solver = diffrax.Dopri8() if solver is None else solver
     check_event(angle, crossing)
     explicit_tableau(solver)
+    if not isinstance(errors, bool):
+        raise ValueError(f"errors = {errors!r} must be True or False")
     if method not in ("ensemble", "diffrax"):
         raise ValueError(f"method = {method!r} must be 'ensemble' or 'diffrax'")
     if method == "diffrax" and sensitivities:

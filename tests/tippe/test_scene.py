@@ -20,6 +20,7 @@ GOOD = {"mass": 0.02, "radius": 0.02, "offset": 0.006, "I1": 3e-6, "I3": 3.2e-6}
         ({"mass": 0.0}, "mass = 0.0 must be greater than 0.0"),
         ({"mass": math.nan}, "mass = nan must be finite"),
         ({"mass": "heavy"}, "mass = 'heavy' is not a number"),
+        ({"mass": "1"}, "mass = '1' is not a number"),
         ({"radius": math.inf}, "radius = inf must be finite"),
         ({"offset": 0.02}, "offset = 0.02 must be less than 0.02"),
         ({"offset": -0.001}, "offset = -0.001 must be at least 0.0"),

@@ -386,6 +386,8 @@ def test_every_scene_compiles(arena, law):
         ({"method": "magic"}, "method = 'magic' must be"),
         ({"crossing": "last", "method": "diffrax"}, "crossing = 'last' must be 'first'"),
         ({"t1": 0.0}, "t1 = 0.0 must be greater than 0.0"),
+        ({"t1": "8"}, "t1 = '8' is not a number"),
+        ({"errors": "no"}, "errors = 'no' must be True or False"),
     ],
 )
 def test_bad_tables_are_refused_before_anything_compiles(rutstam_scene_module, change, message):

@@ -59,7 +59,7 @@ class Descent(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """How a flight ended: its length [s], whether a sphere landed and which, the body then.
+    """How a flight ended: its length [s], whether a sphere landed and which.
 
     `lost` says where the search for the landing gave up.
     """
@@ -67,7 +67,6 @@ class Flight(NamedTuple):
     duration: Cells
     landed: Bool[Array, " cells"]
     ball: Int[Array, " cells"]
-    free: FreeBody
     lost: Bool[Array, " cells"]
 
 
@@ -105,7 +104,7 @@ def fly(
     gravity: Float[Array, "..."],
     spheres: tuple[Ball, ...],
     free: FreeBody,
-    left: Int[Array, " cells"],
+    parted: Int[Array, " cells"],
     rising: Bool[Array, " cells"],
     most: Cells,
 ) -> Flight:
@@ -115,7 +114,7 @@ def fly(
 
     - `spheres`: those that can land.
     - `free`: the body at the start.
-    - `left`: the number of the sphere that has just left the plane.
+    - `parted`: the number of the sphere that has just left the plane.
     - `rising`: where that sphere leaves with a speed, as after an impact; elsewhere it is at rest and its normal force has
       vanished, so that its distance grows with the third power of time.
     - `most`: the flight is cut off there [s].
@@ -124,7 +123,7 @@ def fly(
     """
     times, lost = [], jnp.zeros(most.shape, bool)
     for number, ball in enumerate(spheres):
-        descent = _descent(body, gravity, ball, free, (left == number) & ~rising, left == number)
+        descent = _descent(body, gravity, ball, free, (parted == number) & ~rising, parted == number)
         time, given_up = landing(descent, most)
         times.append(time)
         lost |= given_up
@@ -132,7 +131,7 @@ def fly(
     time = jnp.min(jnp.stack(times), axis=0)
     landed = time <= most
     duration = jnp.where(landed, time, most)
-    return Flight(duration, landed, first, flown(body, gravity, free, duration), lost)
+    return Flight(duration, landed, first, lost)
 
 
 def _descent(
@@ -200,8 +199,8 @@ def landing(descent: Descent, most: Cells) -> tuple[Cells, Bool[Array, " cells"]
 
     zero, no = jnp.zeros_like(end), jnp.zeros(end.shape, bool)
     low, high, found, over, _ = jax.lax.while_loop(searching, search, (zero, zero, no, no, 0))
-    time = _bisect(lambda t: descent.value(t) >= 0.0, low, high)
     # At the very start the distance is zero: what counts is that it has been above since.
+    time = _bisect(lambda t: descent.value(t) >= 0.0, low, high)
     return jnp.where(found, time, jnp.inf), ~found & ~over
 
 

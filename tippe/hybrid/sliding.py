@@ -26,8 +26,8 @@ CLOSING_SPEED = 1e-5
 #: Two spheres are at the plane together if neither is farther from it than this part of R.
 TOUCHING = 1e-9
 
-#: Bounces in a row after which a cell is given up.
-MOST_BOUNCES = 1000
+#: Bounces in a row after which a run is given up.
+MOST_BOUNCES = 10_000
 
 
 class Sliding(AbstractProblem):

@@ -23,10 +23,10 @@ from .flight import cone, flown
 from .free_body import Ball, FreeBody, axis_rate, balls, energy, freed, grounded, jellett, standing_on
 from .impact import approach
 from .leaning import BOTH, LeaningDynamics
-from .sliding import clearance, first_ball, land, leaning, lifted, lost_contact, take_flight
+from .sliding import MOST_BOUNCES, clearance, first_ball, land, leaning, lifted, lost_contact, take_flight
 
-#: Pieces, that is contacts and flights, after which a run is given up.
-MOST_PIECES = 4000
+#: Pieces, that is contacts and flights, after which a run is given up: as many as a table allows bounces in a row.
+MOST_PIECES = MOST_BOUNCES
 
 #: Angle by which the axis turns between the times at which a flight is shown by default [rad].
 SHOWN = 0.4
@@ -144,12 +144,12 @@ def _rows_in_flight(
 class HybridTrajectory(eqx.Module):
     """A run through contacts, flights and impacts; vectors are arrays (times, 3) in the fixed frame (x, y, z).
 
-    `status` is "reached t1", "failed" or "unresolved" (too many pieces, or sphere and stem on the plane together with so
-    much friction that the forces are not determined); the run ends at `end_time`. `contact` says at each time which sphere
-    touches: 0 the top's, 1 its stem's, 2 both, -1 none. At the time of an impact the values are those before it. `hops` has
-    a row for each flight, its begin and its end [s]. `work` is that of friction and of the impacts [J]. `stats` holds
-    accepted and rejected steps, the greatest drift of |e|, the greatest energy residual |E - E(0) - work| and the energy
-    lost in impacts [J].
+    `status` is "reached t1", "failed" or "unresolved" (more than 10 000 contacts and flights, or sphere and stem on the
+    plane together with so much friction that the forces are not determined); the run ends at `end_time`. `contact` says at
+    each time which sphere touches: 0 the top's, 1 its stem's, 2 both, -1 none. At the time of an impact the values are those
+    before it. `hops` has a row for each flight until `end_time`, its begin and its end [s]; a table counts those before the
+    inversion. `work` is that of friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest
+    drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J].
     """
 
     t: Float[np.ndarray, " times"]
