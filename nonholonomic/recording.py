@@ -20,7 +20,8 @@ def check_recording(times: Any, value: Any, quantity: str, quantities: dict[str,
     if quantity not in quantities:
         raise ValueError(f"quantity = {quantity!r} must be one of {', '.join(map(repr, quantities))}")
     require(times, "times", at_least=0.0)
-    if np.ndim(times) != 1 or np.any(np.diff(np.asarray(times)) <= 0.0) or not times[-1] > 0.0:
+    moments = np.asarray(times, dtype=float)
+    if moments.ndim != 1 or np.any(np.diff(moments) <= 0.0) or not moments[-1] > 0.0:
         raise ValueError(f"times = {times!r} must be an increasing list with a positive end")
     columns = len(quantities[quantity])
     shape = (len(times), *((columns,) if columns > 1 else ()))

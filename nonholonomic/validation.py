@@ -10,9 +10,9 @@ from jaxtyping import Array, Float
 
 def as_number(value: Any) -> Float[Array, "..."]:
     """Convert to a floating-point array of the default precision; what is no number is left for `require`."""
-    if isinstance(value, str):
-        return value
     try:
+        if isinstance(value, str):
+            raise TypeError
         return jnp.asarray(value, dtype=float)
     except (TypeError, ValueError):
         return value

@@ -226,7 +226,7 @@ def is_inverted(outcome: Outcome | Journey, problem: InversionProblem, last: boo
     """Which cells count as inverted: those that reached the angle, or that end above it where the last crossing counts."""
     if not last:
         return outcome.status == CROSSED
-    above = problem.crossing(outcome.state) <= 0.0
+    above = problem.crossing(jnp.asarray(outcome.state)) <= 0.0
     return (outcome.status == REACHED_END) & above & jnp.isfinite(outcome.crossing_time)
 
 
