@@ -88,11 +88,11 @@ class Table(eqx.Module):
     def __str__(self) -> str:
         axes = ", ".join(f"{name} ({len(values)})" for name, values in self.coords.items())
         lines = [f"Table over {axes or 'one cell'}"]
+        # What has not been computed is told by the status alone.
+        computed = self.variables["status"] != UNREACHED if "status" in self.variables else ...
         for name, values in self.variables.items():
             unit = f" [{self.units[name]}]" if self.units.get(name, "1") not in ("1", "") else ""
-            # What has not been computed is told by the status alone.
-            known = values[self.status != UNREACHED] if "status" in self.variables else values
-            lines.append(f"  {name}{unit}: {_summary(values if name == 'status' else known)}")
+            lines.append(f"  {name}{unit}: {_summary(values if name == 'status' else values[computed])}")
         return "\n".join(lines)
 
     def __repr__(self) -> str:

@@ -57,15 +57,15 @@ def require(
     """
     if is_traced(value):
         return
+    # NumPy would make a number of these.
+    if value is None or isinstance(value, str):
+        raise ValueError(f"{name} = {value!r} is not a number")
     # A pytree rebuilt by a JAX transformation may hold placeholders; they never reach here through a constructor.
     try:
-        # NumPy would read a number out of a text.
-        numbers = np.asarray(None if isinstance(value, str) else value, dtype=float)
+        numbers = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         raise ValueError(f"{name} = {value!r} is not a number") from None
     remark = f" ({why})" if why else ""
-    if value is None or isinstance(value, str):
-        raise ValueError(f"{name} = {value!r} is not a number")
     finite = np.isfinite(numbers)
     if not np.all(finite):
         raise ValueError(f"{name} = {_first(numbers, finite)} must be finite{remark}")

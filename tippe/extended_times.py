@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from nonholonomic.lockstep import CROSSED, FAILED, crossing_time
 from nonholonomic.queue import Queue
 from nonholonomic.validation import as_number
-from nonholonomic.variation import TOGETHER, VariationalProblem, lanes_along
+from nonholonomic.variation import VariationalProblem, in_groups, lanes_along
 
 from .inversion import ABSOLUTE, InversionProblem, check_smooth
 from .launch import Launch
@@ -78,20 +78,16 @@ def _differentiable(structure: Any, t1: Float[Array, ""], tolerance: Float[Array
             axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
             results = jax.vmap(lambda *given: run(given[0], [given[1]]), axes)(leaves, moving)
             return (results[0], results[1][:, 0]), (True, True)
-        # Groups of one size, padded with directions that lead nowhere, share a program.
-        groups = -(-size // TOGETHER)
 
-        def grouped(tangent, is_batched):
-            stacked = tangent if is_batched else jnp.broadcast_to(tangent, (size, *tangent.shape))
-            padding = jnp.zeros((groups * TOGETHER - size, *stacked.shape[1:]))
-            return jnp.concatenate([stacked, padding]).reshape(groups, TOGETHER, *stacked.shape[1:])
+        def direction(k):
+            return jax.tree.map(lambda tangent, is_batched: tangent[k] if is_batched else tangent, moving, batched[1])
 
-        def group(tangents):
-            stacked, empty = jax.tree.flatten(tangents)
-            return run(leaves, [jax.tree.unflatten(empty, [one[k] for one in stacked]) for k in range(TOGETHER)])
+        def together(some):
+            times, slopes = run(leaves, some)
+            return times, list(slopes)
 
-        times, slopes = jax.lax.map(group, jax.tree.map(grouped, moving, batched[1]))
-        return (times[0], slopes.reshape(groups * TOGETHER, -1)[:size]), (False, True)
+        times, slopes = in_groups(together, tuple(direction(k) for k in range(size)))
+        return (times, jnp.stack(slopes)), (False, True)
 
     @jax.custom_jvp
     def times(*leaves):
