@@ -12,10 +12,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.extend.core import Literal
+from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
+from .adjoint import march_with_gradient
 from .ensemble import alone, lanes_for, with_crossing_times
-from .lockstep import CROSSED, AbstractProblem, crossing_time
+from .lockstep import AbstractProblem, Block, crossing_time
 from .queue import Outcome, Queue
 
 #: Directions that run along together: more of them cost less time in all, but more to compile.
@@ -24,7 +26,8 @@ TOGETHER = 2
 
 def lanes_along(cells: int, directions: int) -> int:
     """How many cells should advance together with their variations in some directions: the whole state fits the caches."""
-    return max(8, 3 * lanes_for(cells) // (2 + 2 * directions)) if directions else lanes_for(cells)
+    together = 0 < directions <= TOGETHER
+    return max(8, 3 * lanes_for(cells) // (2 + 2 * directions)) if together else lanes_for(cells)
 
 
 class VariationalProblem(AbstractProblem):
@@ -69,7 +72,7 @@ class VariationalProblem(AbstractProblem):
 
     def parts(self, state: Float[Array, "components ..."]) -> list[Float[Array, "components ..."]]:
         """The state and its variations."""
-        return jnp.split(state, 1 + len(self.directions))
+        return jnp.split(state, 1 + len(self.directions)) if self.directions else [state]
 
 
 def march_with_slopes(
@@ -94,25 +97,28 @@ def march_with_slopes(
     **Returns:** the `Outcome`, and for each direction the derivative of `crossing_time`, 0 where that is infinite. Source:
     implicit function theorem at the event; step lengths are held fixed.
     """
-    varied = VariationalProblem(problem, directions, not passes)
-    size = problem.start()[0].shape[0]
-
-    def run(one: AbstractProblem, horizon: Float[Array, "..."], **options: Any) -> Outcome:
-        options |= {"solver": solver, "lanes": lanes, "one_kernel": one_kernel}
-        return Queue.of(one, horizon, cells, rtol, atol, **options).outcome()[0]
-
+    options = {"solver": solver, "lanes": lanes, "one_kernel": one_kernel}
+    horizon = t1
     if passes:
-        outcome = run(problem, t1, passes=True)
-        happened = jnp.isfinite(outcome.crossing_time)
-        # The variations run to the event alone, whose time is known by now.
-        there = run(varied, jnp.where(happened, outcome.crossing_time, 0.0), controlled=size)
-    else:
-        there = run(varied, t1, controlled=size)
-        happened = there.status == CROSSED
-        outcome = with_crossing_times(problem, there._replace(state=varied.parts(there.state)[0]))
-    state, *variations = varied.parts(there.state)
+        outcome = Queue.of(problem, t1, cells, rtol, atol, passes=True, **options).outcome()[0]
+        # The slopes need the run up to the event alone, whose time is known by now.
+        horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
+    along = _slopes_by_adjoint if len(directions) > TOGETHER else _slopes_by_variations
+    there, slopes = along(problem, directions, not passes, horizon, cells, rtol, atol, **options)
+    if not passes:
+        outcome = with_crossing_times(problem, there)
     # At the very start the event is there at once, whatever moves.
-    happened &= there.end_time > 0.0
+    happened = jnp.isfinite(outcome.crossing_time) & (there.end_time > 0.0)
+    return outcome, [jnp.where(happened, slope, 0.0) for slope in slopes]
+
+
+def _slopes_by_variations(
+    problem: AbstractProblem, directions: tuple[Any, ...], ends_on_event: bool, *given: Any, **options: Any
+) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+    """Run every cell with its variations, and let them move the event at its end; what is `given` is as for `Queue.of`."""
+    varied = VariationalProblem(problem, directions, ends_on_event)
+    there, _ = Queue.of(varied, *given, controlled=problem.start()[0].shape[0], **options).outcome()
+    state, *variations = varied.parts(there.state)
 
     def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         return crossing_time(problem, there.end_time, state)
@@ -120,7 +126,57 @@ def march_with_slopes(
     slopes = [
         eqx.filter_jvp(event_time, (problem, state), moved)[1] for moved in zip(directions, variations, strict=True)
     ]
-    return outcome, [jnp.where(happened, slope, 0.0) for slope in slopes]
+    return there._replace(state=state), slopes
+
+
+def _slopes_by_adjoint(
+    problem: AbstractProblem, directions: tuple[Any, ...], ends_on_event: bool, *given: Any, **options: Any
+) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+    """The same by taking every run back, at a cost that does not depend on the number of directions."""
+    moving = _moving(problem, directions[0])
+    there, by_start, by_number = march_with_gradient(
+        VariationalProblem(problem, (), ends_on_event),
+        VariationalProblem(moving, (), ends_on_event),
+        *given,
+        measured=_event_time,
+        **options,
+    )
+
+    def slope(direction: Any) -> Float[Array, " cells"]:
+        start = eqx.filter_jvp(lambda problem: problem.start()[0], (problem,), (direction,))[1]
+        rates = eqx.filter(direction, moving)
+        shares = [
+            gradient * rate
+            for gradient, rate in zip(jax.tree.leaves(by_number), jax.tree.leaves(rates), strict=True)
+        ]
+        return sum(shares, jnp.zeros(by_start.shape[1]) if start is None else jnp.sum(by_start * start, axis=0))
+
+    return there, [slope(direction) for direction in directions]
+
+
+def _event_time(varied: VariationalProblem, block: Block) -> Float[Array, " lanes"]:
+    """When the crossing function vanishes, for a block that has ended on the event, to first order (implicit function theorem)."""
+    crossing, rate = varied.problem.crossing, varied.problem.field(block.time, block.state)
+    fall = stop_gradient(jax.jvp(crossing, (stop_gradient(block.state),), (rate,))[1])
+    return block.time - crossing(block.state) / jnp.where(fall == 0.0, 1.0, fall)
+
+
+def _moving(problem: AbstractProblem, direction: Any) -> Any:
+    """Which numbers of a problem a direction moves, of those that its field or its event depends on."""
+    leaves, structure = jax.tree.flatten(problem)
+    states = problem.start()[0]
+
+    def seen(*leaves: Any) -> Any:
+        one = jax.tree.unflatten(structure, leaves)
+        return one.field(jnp.zeros_like(states[0]), states), one.crossing(states)
+
+    closed = jax.make_jaxpr(seen)(*leaves)
+    needed = set(closed.jaxpr.outvars)
+    for equation in reversed(closed.jaxpr.eqns):
+        if not needed.isdisjoint(equation.outvars):
+            needed |= {variable for variable in equation.invars if not isinstance(variable, Literal)}
+    used = jax.tree.unflatten(structure, [variable in needed for variable in closed.jaxpr.invars])
+    return jax.tree.map(lambda rate, one: one and rate is not None, direction, used, is_leaf=lambda rate: rate is None)
 
 
 def in_groups(run: Callable[..., tuple[Any, list[Any]]], directions: tuple[Any, ...]) -> tuple[Any, list[Any]]:

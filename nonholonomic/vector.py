@@ -75,5 +75,5 @@ def stored(*components: Component) -> tuple[Component, ...]:
     present = [component for component in components if component is not None]
     if not present:
         return components
-    joined = iter(jax.lax.optimization_barrier(jnp.stack(jnp.broadcast_arrays(*present))))
+    joined = iter(jnp.unstack(jax.lax.optimization_barrier(jnp.stack(jnp.broadcast_arrays(*present)))))
     return tuple(None if component is None else next(joined) for component in components)

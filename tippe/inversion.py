@@ -217,7 +217,8 @@ def _event_slopes(
             one_kernel=one_kernel,
         )
 
-    outcome, slopes = in_groups(march, directions_of(build, point, tangents))
+    directions = directions_of(build, point, tangents)
+    outcome, slopes = march(directions) if one_kernel else in_groups(march, directions)
     inverted = is_inverted(outcome, problem, run.last)
     return [jnp.where(inverted, slope, 0.0) for slope in slopes]
 

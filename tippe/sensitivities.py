@@ -3,13 +3,14 @@
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from nonholonomic.ensemble import Outcome
 from nonholonomic.paths import full_path, numbers, with_numbers
 from nonholonomic.sweep import Variable
-from nonholonomic.variation import TOGETHER, compiled_march_with_slopes, directions_of, lanes_along
+from nonholonomic.variation import compiled_march_with_slopes, directions_of, lanes_along
 
 from .inversion import ABSOLUTE, InversionProblem, is_inverted
 
@@ -72,6 +73,29 @@ def slopes_of_cells(
     **Returns:** the `Outcome`, and name of the variable -> derivatives (size,). Source: implicit function theorem at the event.
     """
 
+    problem, directions = _directions(roots, columns, paths, angle, size)
+    outcome, slopes = compiled_march_with_slopes(
+        problem,
+        directions,
+        jnp.asarray(t1, float),
+        jnp.asarray(count),
+        jnp.asarray(tolerance, float),
+        jnp.asarray(ABSOLUTE * tolerance, float),
+        solver=solver,
+        lanes=lanes_along(size, len(paths)),
+        passes=last,
+    )
+    inverted = is_inverted(outcome, problem, last)
+    found = [np.where(inverted, slope, 0.0) for slope in slopes]
+    return outcome, dict(zip(slope_names(paths), found, strict=True))
+
+
+@eqx.filter_jit
+def _directions(
+    roots: dict[str, Any], columns: dict[str, Any], paths: list[str], angle: float, size: int
+) -> tuple[InversionProblem, tuple[Any, ...]]:
+    """The problem of the cells, and its tangents along the numbers to differentiate by."""
+
     def build(*moving: Any) -> InversionProblem:
         cells = with_numbers(roots, columns | dict(zip(paths, moving, strict=True)))
         return InversionProblem.of(cells["scene"], cells["launch"], angle, size)
@@ -79,24 +103,5 @@ def slopes_of_cells(
     cells = with_numbers(roots, columns)
     values = {path: value for root, tree in cells.items() for path, value in numbers(root, tree).items()}
     point = tuple(jnp.asarray(values[path], float) for path in paths)
-    # Groups of one size, padded with directions that lead nowhere, share a program.
-    together = min(TOGETHER, len(paths))
-    rows = len(paths) + -len(paths) % together
-    tangents = [tuple(jnp.full_like(value, row == k) for k, value in enumerate(point)) for row in range(rows)]
-    problem, directions = build(*point), directions_of(build, point, tangents)
-    found = []
-    for first in range(0, rows, together):
-        outcome, slopes = compiled_march_with_slopes(
-            problem,
-            directions[first : first + together],
-            jnp.asarray(t1, float),
-            jnp.asarray(count),
-            jnp.asarray(tolerance, float),
-            jnp.asarray(ABSOLUTE * tolerance, float),
-            solver=solver,
-            lanes=lanes_along(size, together),
-            passes=last,
-        )
-        inverted = is_inverted(outcome, problem, last)
-        found += [np.where(inverted, slope, 0.0) for slope in slopes]
-    return outcome, dict(zip(slope_names(paths), found[: len(paths)], strict=True))
+    tangents = [tuple(jnp.full_like(value, row == k) for k, value in enumerate(point)) for row in range(len(paths))]
+    return build(*point), directions_of(build, point, tangents)
