@@ -16,8 +16,9 @@ from nonholonomic.lockstep import CROSSED, REACHED_END, AbstractProblem
 from nonholonomic.paths import numbers
 from nonholonomic.phases import Journey
 from nonholonomic.runge_kutta import explicit_tableau
+from nonholonomic.slopes import directions_of, march_with_slopes
 from nonholonomic.validation import as_number, require
-from nonholonomic.variation import directions_of, in_groups, lanes_along, march_with_slopes
+from nonholonomic.variation import in_groups
 
 from .dynamics import COS_THETA, Dynamics
 from .launch import Launch
@@ -212,7 +213,6 @@ def _event_slopes(
             tolerance,
             ABSOLUTE * tolerance,
             solver=run.solver,
-            lanes=lanes_along(cells, len(some)),
             passes=run.last,
             one_kernel=one_kernel,
         )

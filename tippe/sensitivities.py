@@ -9,8 +9,8 @@ import numpy as np
 
 from nonholonomic.ensemble import Outcome
 from nonholonomic.paths import full_path, numbers, with_numbers
+from nonholonomic.slopes import compiled_march_with_slopes, directions_of
 from nonholonomic.sweep import Variable
-from nonholonomic.variation import compiled_march_with_slopes, directions_of, lanes_along
 
 from .inversion import ABSOLUTE, InversionProblem, is_inverted
 
@@ -82,7 +82,6 @@ def slopes_of_cells(
         jnp.asarray(tolerance, float),
         jnp.asarray(ABSOLUTE * tolerance, float),
         solver=solver,
-        lanes=lanes_along(size, len(paths)),
         passes=last,
     )
     inverted = is_inverted(outcome, problem, last)
