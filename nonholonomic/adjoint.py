@@ -196,9 +196,10 @@ def _taken_back(
     """Carry the derivatives from the end of a period to its start; those of the lanes that have ended begin there."""
     weights = Weights.of(queue.control.tableau)
 
+    problem = queue.here(block)[0]
+
     def loop(carry: Any) -> Any:
         block, record, count, adjoint = carry
-        problem = queue.here(block)[0]
         ended = block.status != RUNNING
         adjoint = jnp.where(ended, _at_the_end(problem, moving, measured, block), adjoint)
 

@@ -71,7 +71,8 @@ def inversion_time(
     """Time at which theta reaches an angle; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
     The derivative is that of the event's time by the implicit function theorem; it is 0 where the result is infinite.
-    Differentiating costs one forward-mode pass for each number that is differentiated.
+    Differentiating by one number costs about as much again as the time itself, by any number of them four to six times as
+    much (`nonholonomic/slopes.py`); second derivatives take forward-mode passes.
 
     **Arguments:**
 
@@ -119,29 +120,29 @@ def _differentiable(run: _Run, count: int) -> Callable[..., Float[Array, ""]]:
         # Horizon and tolerance, the last two numbers, do not move the event.
         zero = jax.custom_derivatives.SymbolicZero
         active = [i for i in range(count - 2) if not isinstance(tangents[i], zero)]
-        time = event_time(*leaves)
         if not active:
+            time = event_time(*leaves)
             return time, jnp.zeros_like(time)
-        slopes = _slopes(run, active)(*leaves)
+        time, *slopes = _time_and_slopes(run, active)(*leaves)
         return time, sum(slope * tangents[i] for slope, i in zip(slopes, active, strict=True))
 
     return event_time
 
 
-def _slopes(run: _Run, active: list[int]) -> Callable[..., list[Float[Array, ""]]]:
-    """The derivatives of the event's time with respect to the active numbers, as a function of the call's numbers."""
+def _time_and_slopes(run: _Run, active: list[int]) -> Callable[..., list[Float[Array, ""]]]:
+    """The event's time and its derivatives by the active numbers, as a function of the call's numbers."""
 
     @jax.custom_jvp
-    def slopes(*leaves):
-        return _batched(functools.partial(_event_slopes, run, active, True))(*leaves)
+    def found(*leaves):
+        return _batched(functools.partial(_times_and_slopes, run, active, True))(*leaves)
 
-    @slopes.defjvp
+    @found.defjvp
     def second_variation(leaves, tangents):
         # `_batched` would mark the value as batched where only the variation is, so it is left out here.
-        once = functools.partial(_event_slopes, run, active, False, 1)
+        once = functools.partial(_times_and_slopes, run, active, False, 1)
         return jax.jvp(lambda *numbers: [result[0] for result in once(*numbers)], leaves, tangents)
 
-    return slopes
+    return found
 
 
 def _batched(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -180,10 +181,10 @@ def _event_times(run: _Run, cells: int, *leaves: Float[Array, "..."]) -> Float[A
     return jnp.where(inverted, outcome.crossing_time, jnp.inf)
 
 
-def _event_slopes(
+def _times_and_slopes(
     run: _Run, active: list[int], one_kernel: bool, cells: int, *leaves: Float[Array, "..."]
 ) -> list[Float[Array, " cells"]]:
-    """Derivatives of the event's time with respect to the active numbers, 0 where there is no event.
+    """The event's time in every cell, infinite where there is none, and its derivatives by the active numbers, 0 there.
 
     Cells do not influence one another, so moving a number in all of them at once gives every cell its own derivative.
     """
@@ -220,7 +221,8 @@ def _event_slopes(
     directions = directions_of(build, point, tangents)
     outcome, slopes = march(directions) if one_kernel else in_groups(march, directions)
     inverted = is_inverted(outcome, problem, run.last)
-    return [jnp.where(inverted, slope, 0.0) for slope in slopes]
+    times = jnp.where(inverted, outcome.crossing_time, jnp.inf)
+    return [times, *(jnp.where(inverted, slope, 0.0) for slope in slopes)]
 
 
 def is_inverted(outcome: Outcome | Journey, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:
