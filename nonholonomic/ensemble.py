@@ -3,8 +3,8 @@
 A block of lanes advances in lockstep, every lane with its own step length; cells wait in a queue for a lane (`queue.py`).
 The state is one array (components, lanes); the numbers of the problem are scalars or one per cell.
 
-Derivatives (forward mode) flow through the states alone; step lengths are held fixed. `variation.py` has the fast way to
-first derivatives.
+Derivatives (forward mode) flow through the states alone; step lengths are held fixed. `slopes.py` has the fast ways to first
+derivatives.
 """
 
 import functools

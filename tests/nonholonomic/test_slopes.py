@@ -19,7 +19,7 @@ RATES = np.geomspace(3.0, 0.2, 100)
 
 
 class Decays(AbstractProblem):
-    """y' = -rate (1 + growth t) y from y = height, with a clock beside it; the event is y = 1/2, the guard ends by the clock."""
+    """y' = -rate (1 + growth t) y from y = height, and a clock; the event is y = 1/2, the guard is up when patience is."""
 
     rate: jax.Array
     height: jax.Array
@@ -47,7 +47,7 @@ def time_of_decay(rate, height, growth):
 def found_and_expected(names=MOVED, patience=1e3, **options):
     """Outcome, slopes by the named numbers, and what they should be; rate and height differ from cell to cell."""
     point = (jnp.asarray(RATES), jnp.asarray(HEIGHTS), jnp.asarray(0.7))
-    tangents = [tuple(jnp.full_like(one, name == moved) for one, moved in zip(point, MOVED)) for name in names]
+    tangents = [tuple(jnp.full_like(one, name == moved) for one, moved in zip(point, MOVED, strict=True)) for name in names]
 
     @eqx.filter_jit
     def run(point, tangents):
