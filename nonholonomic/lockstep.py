@@ -43,7 +43,7 @@ class AbstractProblem(eqx.Module):
 
     @abc.abstractmethod
     def field(self, time: Lanes, state: States) -> States:
-        """Rate of change of the state."""
+        """Rate of change of the state, lane by lane; the state may come as a tuple of its components."""
 
     @abc.abstractmethod
     def crossing(self, state: States) -> Lanes | None:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 Lanes = Float[Array, " lanes"]
@@ -84,13 +85,13 @@ def explicit_step(
     return Step(end, last_rate, error, watch(time + length, end), first_negative)
 
 
-def _places_to_look(fractions: Float[Array, " stages"]) -> set[int]:
+def _places_to_look(fractions: Float[np.ndarray, " stages"]) -> set[int]:
     """The stages nearest to 1/4, 1/2 and 3/4 of the step: what happens between its ends is looked for there."""
     between = [stage for stage, fraction in enumerate(fractions) if 0.0 < fraction < 1.0]
     return {min(between, key=lambda stage: abs(fractions[stage] - part)) for part in (0.25, 0.5, 0.75) if between}
 
 
-def moved_state(state: States, length: Lanes, weights: Array, rates: list[States]) -> States:
+def moved_state(state: States, length: Lanes, weights: Float[np.ndarray, " stages"], rates: list[States]) -> States:
     """The state moved along the weighted sum of the rates, joined from two halves.
 
     Joining, with a barrier behind it, makes the compiler store the result. It would otherwise evaluate the sum anew for
@@ -104,7 +105,7 @@ def moved_state(state: States, length: Lanes, weights: Array, rates: list[States
     return jax.lax.optimization_barrier(jnp.concatenate(parts))
 
 
-def weighted_sum(weights: Float[Array, " stages"], rates: list[States]) -> States:
+def weighted_sum(weights: Float[np.ndarray, " stages"], rates: list[States]) -> States:
     """Sum of the rates with the given weights, leaving out those of weight 0."""
     total = None
     for weight, rate in zip(weights, rates, strict=True):

@@ -46,20 +46,20 @@ class Listing:
 
     - `operations`: in an order in which they can be done.
     - `given`: number of a value -> the array, for what is no operation's result.
-    - `shapes`: of every value.
+    - `kinds`: shape and dtype of every value.
     """
 
     def __init__(self) -> None:
         self.operations: list[Operation] = []
         self.given: dict[int, Any] = {}
-        self.shapes: list[tuple[int, ...]] = []
+        self.kinds: list[Any] = []
         self._known: dict[Any, Any] = {}
 
     def enter(self, value: Any, key: Any = None) -> int:
         """The number of a value that is given; one with the same key is the same."""
         key = ("given", id(value)) if key is None else key
         if key not in self._known:
-            self._known[key] = self._new(jnp.shape(value))
+            self._known[key] = self._new(jnp.shape(value), jnp.result_type(value))
             self.given[self._known[key]] = value
         return self._known[key]
 
@@ -84,7 +84,7 @@ class Listing:
                 outputs = inputs
             elif name == "stack" and equation.params["axis"] == 0:
                 outputs = [Stack(inputs, equation)]
-            elif name == "unstack" and isinstance(inputs[0], Stack):
+            elif name == "unstack" and equation.params["axis"] == 0 and isinstance(inputs[0], Stack):
                 outputs = inputs[0].parts
             else:
                 outputs = self._listed(equation, [self.joined(one) for one in inputs])
@@ -93,21 +93,23 @@ class Listing:
 
     def joined(self, value: Any) -> int:
         """The number of a value, a stack put together if it is one."""
-        return self._listed(value.equation, value.parts)[0] if isinstance(value, Stack) else value
+        if not isinstance(value, Stack):
+            return value
+        return self._listed(value.equation, [self.joined(part) for part in value.parts])[0]
 
     def _listed(self, equation: Any, inputs: list[int]) -> list[int]:
         name = equation.primitive.name
         commutes = name in ("add", "add_any", "mul")
         key = (name, *(sorted(inputs) if commutes else inputs), str(equation.params))
         if key not in self._known:
-            outputs = tuple(self._new(one.aval.shape) for one in equation.outvars)
+            outputs = tuple(self._new(one.aval.shape, one.aval.dtype) for one in equation.outvars)
             self.operations.append(Operation(equation, tuple(inputs), outputs))
             self._known[key] = outputs
         return list(self._known[key])
 
-    def _new(self, shape: tuple[int, ...]) -> int:
-        self.shapes.append(shape)
-        return len(self.shapes) - 1
+    def _new(self, shape: tuple[int, ...], dtype: Any) -> int:
+        self.kinds.append((shape, dtype))
+        return len(self.kinds) - 1
 
 
 def sharing_values(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -143,7 +145,7 @@ def _evaluated(listing: Listing, results: list[int]) -> list[Any]:
         levels += [([], []) for _ in range(depth + 1 - len(levels))]
         levels[depth][0].append(operation)
         for value in operation.outputs:
-            if len(listing.shapes[value]) == 1 and cost * (uses[value] - 1) >= WORTH_STORING:
+            if len(listing.kinds[value][0]) == 1 and cost * (uses[value] - 1) >= WORTH_STORING:
                 levels[depth][1].append(value)
                 depths[value] = depth + 1
             else:
@@ -154,7 +156,10 @@ def _evaluated(listing: Listing, results: list[int]) -> list[Any]:
             primitive = operation.equation.primitive
             found = primitive.bind(*(values[value] for value in operation.inputs), **operation.equation.params)
             values.update(zip(operation.outputs, found if primitive.multiple_results else [found], strict=True))
-        values.update(zip(kept, stored(*(values[value] for value in kept)), strict=True))
+        # Only what is alike can be joined.
+        for kind in dict.fromkeys(listing.kinds[value] for value in kept):
+            alike = [value for value in kept if listing.kinds[value] == kind]
+            values.update(zip(alike, stored(*(values[value] for value in alike)), strict=True))
     return [values[number] for number in results]
 
 

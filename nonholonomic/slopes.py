@@ -35,11 +35,11 @@ def march_with_slopes(
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """Run every cell, and differentiate the time of its event in some directions.
 
-    **Arguments:** as for `ensemble.march`, but `lanes`, and
+    **Arguments:** as for `ensemble.march`, but `lanes` and `max_steps`, and
 
     - `directions`: tangents of the problem, as for `VariationalProblem`.
-    - `one_kernel`: as there; without it, for programs that are differentiated again, variations run along any number of
-      directions.
+    - `one_kernel`: as there, not for programs that are differentiated again; nor is the way back, so that without it
+      variations run along any number of directions.
 
     **Returns:** the `Outcome`, and for each direction the derivative of `crossing_time`, 0 where that is infinite. Source:
     implicit function theorem at the event; step lengths are held fixed.
@@ -68,6 +68,7 @@ def _slopes_by_adjoint(
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """What `slopes_by_variations` gives, at a cost that does not depend on the number of directions."""
     moving = _moving(problem, directions[0])
+    # Without directions it is the problem itself, which can be told not to end on its event.
     there, by_start, by_number = march_with_gradient(
         VariationalProblem(problem, (), ends_on_event),
         VariationalProblem(moving, (), ends_on_event),
@@ -88,7 +89,10 @@ def _slopes_by_adjoint(
 
 
 def _event_time(varied: VariationalProblem, block: Block) -> Float[Array, " lanes"]:
-    """When the crossing function vanishes, to first order, for a block that has ended there (implicit function theorem)."""
+    """When the crossing function vanishes, for a block that has ended there (implicit function theorem).
+
+    To first order, unlike `crossing_time`: the event is located to 1e-10 of a step, and its time is not differentiated again.
+    """
     crossing, rate = varied.problem.crossing, varied.problem.field(block.time, block.state)
     fall = stop_gradient(jax.jvp(crossing, (stop_gradient(block.state),), (rate,))[1])
     return block.time - crossing(block.state) / jnp.where(fall == 0.0, 1.0, fall)
@@ -114,6 +118,9 @@ def _moving(problem: AbstractProblem, direction: Any) -> Any:
 
 #: `march_with_slopes`, compiled on its own, for use outside of other transformed functions.
 compiled_march_with_slopes = alone(eqx.Partial(march_with_slopes, one_kernel=True))
+
+#: `march_with_slopes`, for use inside other transformed functions.
+traced_march_with_slopes = eqx.filter_jit(march_with_slopes)
 
 
 def directions_of(

@@ -16,7 +16,7 @@ from nonholonomic.lockstep import CROSSED, REACHED_END, AbstractProblem
 from nonholonomic.paths import numbers
 from nonholonomic.phases import Journey
 from nonholonomic.runge_kutta import explicit_tableau
-from nonholonomic.slopes import directions_of, march_with_slopes
+from nonholonomic.slopes import directions_of, traced_march_with_slopes
 from nonholonomic.validation import as_number, require
 from nonholonomic.variation import in_groups
 
@@ -206,7 +206,7 @@ def _times_and_slopes(
     tolerance = jnp.min(tolerance)
 
     def march(some: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
-        return march_with_slopes(
+        return traced_march_with_slopes(
             problem,
             some,
             t1,
@@ -219,6 +219,7 @@ def _times_and_slopes(
         )
 
     directions = directions_of(build, point, tangents)
+    # Variations run along in groups; the way back, which a single kernel comes with, takes all directions at once.
     outcome, slopes = march(directions) if one_kernel else in_groups(march, directions)
     inverted = is_inverted(outcome, problem, run.last)
     times = jnp.where(inverted, outcome.crossing_time, jnp.inf)

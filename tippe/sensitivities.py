@@ -6,6 +6,7 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from nonholonomic.ensemble import Outcome
 from nonholonomic.paths import full_path, numbers, with_numbers
@@ -73,7 +74,7 @@ def slopes_of_cells(
     **Returns:** the `Outcome`, and name of the variable -> derivatives (size,). Source: implicit function theorem at the event.
     """
 
-    problem, directions = _directions(roots, columns, paths, angle, size)
+    problem, directions = _directions(roots, columns, paths, jnp.asarray(angle, float), size)
     outcome, slopes = compiled_march_with_slopes(
         problem,
         directions,
@@ -91,7 +92,7 @@ def slopes_of_cells(
 
 @eqx.filter_jit
 def _directions(
-    roots: dict[str, Any], columns: dict[str, Any], paths: list[str], angle: float, size: int
+    roots: dict[str, Any], columns: dict[str, Any], paths: list[str], angle: Float[Array, ""], size: int
 ) -> tuple[InversionProblem, tuple[Any, ...]]:
     """The problem of the cells, and its tangents along the numbers to differentiate by."""
 

@@ -44,17 +44,19 @@ def time_of_decay(rate, height, growth):
     return (jnp.sqrt(1.0 + 2.0 * growth * jnp.log(2.0 * height) / rate) - 1.0) / growth
 
 
-def found_and_expected(names=MOVED, patience=1e3, **options):
+def found_and_expected(names=MOVED, patience=1e3, heights=HEIGHTS, cells=100, **options):
     """Outcome, slopes by the named numbers, and what they should be; rate and height differ from cell to cell."""
-    point = (jnp.asarray(RATES), jnp.asarray(HEIGHTS), jnp.asarray(0.7))
-    tangents = [tuple(jnp.full_like(one, name == moved) for one, moved in zip(point, MOVED, strict=True)) for name in names]
+    point = (jnp.asarray(RATES), jnp.asarray(heights), jnp.asarray(0.7))
+    tangents = [
+        tuple(jnp.full_like(one, name == moved) for one, moved in zip(point, MOVED, strict=True)) for name in names
+    ]
 
     @eqx.filter_jit
     def run(point, tangents):
         def build(*numbers):
             return Decays(*numbers, jnp.asarray(patience))
 
-        given = (jnp.asarray(50.0), jnp.asarray(len(RATES)), jnp.asarray(1e-11), jnp.asarray(1e-12))
+        given = (jnp.asarray(50.0), jnp.asarray(cells), jnp.asarray(1e-11), jnp.asarray(1e-12))
         directions = directions_of(build, point, tangents)
         return march_with_slopes(build(*point), directions, *given, **({"one_kernel": True} | options))
 
@@ -63,9 +65,17 @@ def found_and_expected(names=MOVED, patience=1e3, **options):
     return outcome, slopes, [every[MOVED.index(name)] for name in names]
 
 
-@pytest.mark.parametrize("solver", [diffrax.Dopri8(), diffrax.Tsit5()])
-@pytest.mark.parametrize("passes", [False, True])
-@pytest.mark.parametrize("names", [MOVED, ("growth",), ("height", "rate")])
+@pytest.mark.parametrize(
+    ("names", "passes", "solver"),
+    [
+        (MOVED, False, diffrax.Dopri8()),
+        (MOVED, True, diffrax.Tsit5()),
+        (("height", "rate"), True, diffrax.Dopri8()),
+        (("height", "height"), False, diffrax.Tsit5()),
+        (("growth",), False, diffrax.Dopri8()),
+        (("growth",), True, diffrax.Tsit5()),
+    ],
+)
 def test_the_slopes_are_those_of_the_closed_form(names, passes, solver):
     """For a field that depends on time, more cells than lanes, methods whose last stage is and is not their end."""
     outcome, slopes, expected = found_and_expected(names, solver=solver, passes=passes)
@@ -81,6 +91,17 @@ def test_a_cell_that_ends_otherwise_has_no_slope_and_leaves_the_others_theirs():
     assert (np.asarray(outcome.status) == np.where(late, GUARD_LOST, CROSSED)).all()
     for one, other in zip(slopes, expected, strict=True):
         assert_close(one, np.where(late, 0.0, other), rtol=1e-7)
+
+
+@pytest.mark.parametrize("cells", [0, 1, 70])
+def test_padding_and_cells_beyond_the_event_have_no_slope(cells):
+    """Some cells start beyond the event, and of the cells only some are run: fewer than lanes, and none."""
+    heights = np.where(np.arange(100) % 3 == 0, 0.4, HEIGHTS)
+    outcome, slopes, expected = found_and_expected(heights=heights, cells=cells, solver=diffrax.Dopri8())
+    run = np.arange(100) < cells
+    assert (np.asarray(outcome.status)[run] == CROSSED).all()
+    for one, other in zip(slopes, expected, strict=True):
+        assert_close(one, np.where(run & (heights > 0.5), other, 0.0), rtol=1e-7)
 
 
 @pytest.mark.parametrize("kept", [2, 5])
@@ -121,3 +142,19 @@ def test_a_shared_value_is_computed_once():
     text = str(jax.make_jaxpr(sharing_values(function))(x, scale))
     assert text.count("sqrt") == 1
     assert text.count("optimization_barrier") == 1
+
+
+def test_values_of_several_kinds_are_shared():
+    """Truth values beside numbers, stacks of stacks, and a stack taken apart along its other axis."""
+
+    def function(x, y):
+        above = jnp.sqrt(x) * y > 1.0
+        table = jnp.stack([x, y, x + y])
+        deep = jnp.stack([table, 2.0 * table])
+        along = jnp.unstack(table, axis=1)
+        return jnp.where(above, x, y), jnp.where(above, y, x), jnp.where(above, x * y, 0.0), deep + 1.0, along
+
+    x, y = jnp.linspace(0.5, 2.0, 3), jnp.linspace(2.0, 0.1, 3)
+    jax.tree.map(
+        lambda one, other: assert_close(one, other, rtol=1e-15), function(x, y), sharing_values(function)(x, y)
+    )
