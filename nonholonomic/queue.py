@@ -203,10 +203,10 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
                 look = sum(jnp.ravel(leaf)[0].astype(float) for leaf in arguments)
                 return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))(*leaves), look
 
-            # XLA 0.10.2 aborts on a call with an argument that it does not use. So each is looked at.
-            results, _ = jax.lax.optimization_barrier(
-                jax.jit(looking_at_all)(*closed.consts, *jax.tree.leaves(argument))
-            )
+            # XLA 0.10.2 aborts on a call with an argument that it does not use. So each is looked at, from behind a
+            # barrier, for what is known to be constant would not be.
+            given = jax.lax.optimization_barrier([*closed.consts, *jax.tree.leaves(argument)])
+            results, _ = jax.lax.optimization_barrier(jax.jit(looking_at_all)(*given))
         return jax.tree.unflatten(jax.tree.structure(shape), results)
 
     return called
