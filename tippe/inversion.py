@@ -71,8 +71,8 @@ def inversion_time(
     """Time at which theta reaches an angle; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
     The derivative is that of the event's time by the implicit function theorem; it is 0 where the result is infinite.
-    Differentiating by one number costs about as much again as the time itself, by any number of them four to six times as
-    much (`nonholonomic/slopes.py`); second derivatives take forward-mode passes.
+    Differentiating by one number costs about as much again as the time itself, by any number of them four to seven times
+    as much (`nonholonomic/slopes.py`); second derivatives take forward-mode passes.
 
     **Arguments:**
 
