@@ -148,11 +148,12 @@ def test_values_of_several_kinds_are_shared():
     """Truth values beside numbers, stacks of stacks, and a stack taken apart along its other axis."""
 
     def function(x, y):
-        above = jnp.sqrt(x) * y > 1.0
+        root = jnp.sqrt(x) * y
+        above, below = root * root > 1.0, jnp.sqrt(root + 1.0)
         table = jnp.stack([x, y, x + y])
         deep = jnp.stack([table, 2.0 * table])
         along = jnp.unstack(table, axis=1)
-        return jnp.where(above, x, y), jnp.where(above, y, x), jnp.where(above, x * y, 0.0), deep + 1.0, along
+        return jnp.where(above, x, y), jnp.where(above, y, below), jnp.where(above, x * y, below), deep + root, along
 
     x, y = jnp.linspace(0.5, 2.0, 3), jnp.linspace(2.0, 0.1, 3)
     jax.tree.map(
