@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .lockstep import RUNNING, AbstractProblem, Block, attempt
-from .queue import Outcome, Progress, Queue, in_one_kernel
+from .queue import Outcome, Progress, Queue
 from .runge_kutta import Lanes, States, moved_state
 from .shared_values import sharing_values
 
@@ -186,7 +186,7 @@ def _recorded(queue: Queue, progress: Progress) -> tuple[Progress, Record, Int[A
         )
         return jax.lax.while_loop(going, step, (start, empty, jnp.zeros((), int)))
 
-    block, record, count = (in_one_kernel(loop) if queue.one_kernel else loop)(progress.block)
+    block, record, count = queue.in_kernel(loop)(progress.block)
     return Progress(block, progress.queued, progress.iterations + count), record, count
 
 
@@ -217,7 +217,7 @@ def _taken_back(
         room = jnp.zeros((len(weights.fractions), *block.state.shape), adjoint.dtype)
         return jax.lax.while_loop(lambda carry: carry[0] > 0, step, (count, adjoint, room))[1]
 
-    return (in_one_kernel(loop) if queue.one_kernel else loop)((block, record, count, adjoint))
+    return queue.in_kernel(loop)((block, record, count, adjoint))
 
 
 def _at_the_end(problem: AbstractProblem, moving: Any, measured: Measured, block: Block) -> Float[Array, "rows lanes"]:

@@ -154,9 +154,12 @@ class Queue(eqx.Module):
                 carry,
             )
 
-        loop = in_one_kernel(loop) if self.one_kernel else loop
-        block, iterations = loop((progress.block, progress.iterations))
+        block, iterations = self.in_kernel(loop)((progress.block, progress.iterations))
         return Progress(block, progress.queued, iterations)
+
+    def in_kernel(self, loop: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """A loop over steps, compiled into a single kernel if the queue's are."""
+        return in_one_kernel(loop) if self.one_kernel else loop
 
     def refill(self, progress: Progress) -> Progress:
         """Give every idle lane the next cell that waits."""

@@ -18,7 +18,7 @@ from .adjoint import march_with_gradient
 from .ensemble import alone, lanes_for, with_crossing_times
 from .lockstep import AbstractProblem, Block
 from .queue import Outcome, Queue
-from .variation import VariationalProblem, lanes_along, slopes_by_variations
+from .variation import VariationalProblem, in_groups, lanes_along, slopes_by_variations
 
 
 def march_with_slopes(
@@ -52,10 +52,15 @@ def march_with_slopes(
         outcome = whole.outcome()[0]
         # The slopes need the run up to the event alone, whose time is known by now.
         horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
-    backward = one_kernel and len(directions) > 1
-    along = _slopes_by_adjoint if backward else slopes_by_variations
-    options["lanes"] = lanes_for(size) if backward else lanes_along(size, len(directions))
-    there, slopes = along(problem, directions, not passes, horizon, cells, rtol, atol, **options)
+    given = (not passes, horizon, cells, rtol, atol)
+
+    def along(some: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+        return slopes_by_variations(problem, some, *given, lanes=lanes_along(size, len(some)), **options)
+
+    if one_kernel and len(directions) > 1:
+        there, slopes = _slopes_by_adjoint(problem, directions, *given, lanes=lanes_for(size), **options)
+    else:
+        there, slopes = in_groups(along, directions)
     if not passes:
         outcome = with_crossing_times(problem, there)
     # At the very start the event is there at once, whatever moves.

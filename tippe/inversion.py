@@ -18,7 +18,6 @@ from nonholonomic.phases import Journey
 from nonholonomic.runge_kutta import explicit_tableau
 from nonholonomic.slopes import directions_of, traced_march_with_slopes
 from nonholonomic.validation import as_number, require
-from nonholonomic.variation import in_groups
 
 from .dynamics import COS_THETA, Dynamics
 from .launch import Launch
@@ -205,22 +204,17 @@ def _times_and_slopes(
     t1, tolerance = jax.tree.unflatten(run.structure, leaves)[-2:]
     tolerance = jnp.min(tolerance)
 
-    def march(some: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
-        return traced_march_with_slopes(
-            problem,
-            some,
-            t1,
-            jnp.asarray(cells),
-            tolerance,
-            ABSOLUTE * tolerance,
-            solver=run.solver,
-            passes=run.last,
-            one_kernel=one_kernel,
-        )
-
-    directions = directions_of(build, point, tangents)
-    # Variations run along in groups; the way back, which a single kernel comes with, takes all directions at once.
-    outcome, slopes = march(directions) if one_kernel else in_groups(march, directions)
+    outcome, slopes = traced_march_with_slopes(
+        problem,
+        directions_of(build, point, tangents),
+        t1,
+        jnp.asarray(cells),
+        tolerance,
+        ABSOLUTE * tolerance,
+        solver=run.solver,
+        passes=run.last,
+        one_kernel=one_kernel,
+    )
     inverted = is_inverted(outcome, problem, run.last)
     times = jnp.where(inverted, outcome.crossing_time, jnp.inf)
     return [times, *(jnp.where(inverted, slope, 0.0) for slope in slopes)]

@@ -73,8 +73,7 @@ def slopes_of_cells(
 
     **Returns:** the `Outcome`, and name of the variable -> derivatives (size,). Source: implicit function theorem at the event.
     """
-
-    problem, directions = _directions(roots, columns, paths, jnp.asarray(angle, float), size)
+    problem, directions = _problem_and_directions(roots, columns, paths, jnp.asarray(angle, float), size)
     outcome, slopes = compiled_march_with_slopes(
         problem,
         directions,
@@ -91,7 +90,7 @@ def slopes_of_cells(
 
 
 @eqx.filter_jit
-def _directions(
+def _problem_and_directions(
     roots: dict[str, Any], columns: dict[str, Any], paths: list[str], angle: Float[Array, ""], size: int
 ) -> tuple[InversionProblem, tuple[Any, ...]]:
     """The problem of the cells, and its tangents along the numbers to differentiate by."""
