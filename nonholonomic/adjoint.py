@@ -6,6 +6,7 @@ the latest progress that was kept before it. The cost does not depend on how man
 long the runs are. Step lengths are held fixed, as they are by the variations (`variation.py`).
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,10 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .lockstep import RUNNING, AbstractProblem, Block, attempt
+from .lockstep import RUNNING, AbstractProblem, Block, attempt, length_to_try
 from .queue import Outcome, Progress, Queue
 from .runge_kutta import Lanes, States, moved_state
 from .shared_values import sharing_values
+from .variation import VariationalProblem
 
 #: Iterations of a period: as many as have a record that fits the caches.
 PERIOD = 128
@@ -100,8 +102,9 @@ class Backward(NamedTuple):
 
 
 def march_with_gradient(
-    problem: AbstractProblem,
+    problem: VariationalProblem,
     moving: Any,
+    probe: Any,
     t1: Float[Array, "..."],
     cells: Int[Array, ""],
     rtol: Float[Array, ""],
@@ -116,7 +119,10 @@ def march_with_gradient(
 
     **Arguments:** as for `ensemble.march`, but `passes` and `max_steps`, and
 
+    - `problem`: without directions.
     - `moving`: a tree like the problem of booleans: which of its numbers to differentiate by, scalars or (cells,).
+    - `probe`: a direction of the inner problem. Its variation runs along and takes part in step control, so that the steps
+      bear tangents also where the state is at rest.
     - `measured`: what is measured.
 
     **Returns:** the `Outcome`, with crossing times left out; the derivatives of every cell by its state at the start; and
@@ -132,7 +138,15 @@ def march_with_gradient(
             raise ValueError(f"moving: a number must be a scalar or ({size},), not of shape {jnp.shape(leaf)}")
     numbers = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (size,)), numbers)
     problem = eqx.combine(numbers, rest)
-    queue = Queue.of(problem, t1, cells, rtol, atol, solver=solver, lanes=lanes, one_kernel=one_kernel)
+    # Numbers that move have one value for each cell by now, and so have their rates.
+    probe = jax.tree.map(
+        lambda rate, number: None if rate is None else jnp.broadcast_to(rate, jnp.shape(number)),
+        probe,
+        problem.problem,
+        is_leaf=lambda rate: rate is None,
+    )
+    probed = dataclasses.replace(problem, directions=(probe,))
+    queue = Queue.of(probed, t1, cells, rtol, atol, solver=solver, lanes=lanes, one_kernel=one_kernel, parts=2)
     rows = components + len(jax.tree.leaves(numbers))
 
     def period(run: Backward) -> Backward:
@@ -162,7 +176,7 @@ def march_with_gradient(
     )
     run = jax.lax.while_loop(lambda run: run.needed > 0, period, run)
     by_number = jax.tree.unflatten(jax.tree.structure(numbers), list(run.gradient[components:]))
-    return run.outcome, run.gradient[:components], by_number
+    return run.outcome._replace(state=run.outcome.state[:components]), run.gradient[:components], by_number
 
 
 def _recorded(queue: Queue, progress: Progress) -> tuple[Progress, Record, Int[Array, ""]]:
@@ -176,18 +190,27 @@ def _recorded(queue: Queue, progress: Progress) -> tuple[Progress, Record, Int[A
     def step(carry: Any) -> Any:
         block, record, count = carry
         after = attempt(*here, block)
-        made = Record(block.time, block.state, jnp.where(after.time > block.time, block.length, 0.0))
+        length = jnp.where(after.time > block.time, length_to_try(here[1], block), 0.0)
+        made = Record(block.time, _without_probe(block).state, length)
         record = jax.tree.map(functools.partial(_written, at=count), record, made)
         return after, record, count + 1
 
     def loop(start: Block) -> Any:
         empty = Record(
-            *(jnp.zeros((PERIOD, *leaf.shape), leaf.dtype) for leaf in (start.time, start.state, start.length))
+            *(
+                jnp.zeros((PERIOD, *leaf.shape), leaf.dtype)
+                for leaf in (start.time, _without_probe(start).state, start.length)
+            )
         )
         return jax.lax.while_loop(going, step, (start, empty, jnp.zeros((), int)))
 
     block, record, count = queue.in_kernel(loop)(progress.block)
     return Progress(block, progress.queued, progress.iterations + count), record, count
+
+
+def _without_probe(block: Block) -> Block:
+    """A block with the states alone, of the states and the variations that run along with them."""
+    return block._replace(state=block.state[: block.state.shape[0] // 2])
 
 
 def _taken_back(
@@ -202,7 +225,8 @@ def _taken_back(
     """Carry the derivatives from the end of a period to its start; those of the lanes that have ended begin there."""
     weights = Weights.of(queue.control.tableau)
     # Picked out here: XLA 0.10.2 aborts on a kernel that is handed all the cells' starts where these are known constants.
-    problem = queue.here(block)[0]
+    problem = dataclasses.replace(queue.here(block)[0], directions=())
+    block = _without_probe(block)
 
     def loop(carry: Any) -> Any:
         block, record, count, adjoint = carry

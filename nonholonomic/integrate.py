@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .lockstep import AbstractProblem
 
@@ -184,33 +184,46 @@ def _loss(problem: AbstractProblem, solution: diffrax.Solution, begin: float, en
     return low
 
 
+class Sampled(NamedTuple):
+    """A run at given times: its states, not a number after its end; when, where and whether by the guard it ended."""
+
+    states: Float[Array, "components times"]
+    end_time: Float[Array, ""]
+    end_state: Float[Array, " components"]
+    lost: Bool[Array, ""]
+    accepted: Int[Array, ""]
+    rejected: Int[Array, ""]
+
+
 def sample(
     problem: AbstractProblem,
     times: Float[Array, " times"],
     t1: Float[Array, ""],
     *,
     solver: diffrax.AbstractSolver,
-    rtol: float,
-    atol: float,
-    adjoint: diffrax.AbstractAdjoint,
+    rtol: float | Float[Array, ""],
+    atol: float | Float[Array, ""],
+    adjoint: diffrax.AbstractAdjoint | None = None,
     max_steps: int = 1_000_000,
-) -> tuple[Float[Array, "components times"], Float[Array, ""], Array, dict[str, Any]]:
+) -> Sampled:
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 
-    The guard is looked at where steps end, and the run ends before the step at whose end it is negative.
+    The guard is looked at where steps end, and the run ends where it is zero on the dense output.
 
-    **Arguments:** as for `follow`; `times`: growing, in [0, t1]; `adjoint`: how Diffrax differentiates; `max_steps`: bound
-    on the steps.
+    **Arguments:** as for `follow`; `times`: growing, in [0, t1]; `adjoint`: how Diffrax differentiates, by default forwards;
+    `max_steps`: bound on the steps.
 
-    **Returns:** the states, not a number after the end of the run; the time at which the run ended; whether the guard ended it;
-    Diffrax's statistics.
+    **Returns:** a `Sampled`.
     """
     state, scales = problem.start()
     watched = problem.guard(jnp.zeros_like(t1), state) is not None
+    event = diffrax.Event(
+        lambda t, y, args, **_: args.guard(t, y), optimistix.Newton(1e-13, 1e-13) if watched else None
+    )
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
         solver,
-        0.0,
+        jnp.zeros_like(t1),
         t1,
         None,
         state,
@@ -218,13 +231,14 @@ def sample(
         stepsize_controller=_control(rtol, jax.lax.stop_gradient(atol * scales)),
         saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=times), diffrax.SubSaveAt(t1=True)]),
         max_steps=max_steps,
-        event=diffrax.Event(lambda t, y, args, **_: args.guard(t, y) < 0.0) if watched else None,
-        adjoint=adjoint,
+        event=event if watched else None,
+        adjoint=diffrax.ForwardMode() if adjoint is None else adjoint,
         throw=False,
     )
     lost = jnp.zeros((), bool) if solution.event_mask is None else solution.event_mask
-    (_, ends), (states, _) = saved(solution)
+    (_, ends), (states, ends_at) = saved(solution)
     end = ends[0]
     # Not a number, rather than infinite: an angle of infinite components would look like an angle.
     states = jnp.where(times <= end, states.T, jnp.nan)
-    return states, end, lost, solution.stats
+    counts = solution.stats
+    return Sampled(states, end, ends_at[0], lost, counts["num_accepted_steps"], counts["num_rejected_steps"])

@@ -5,6 +5,7 @@ other lengths, its start kept, until the step ends on the event. So the event ha
 """
 
 import abc
+from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax
@@ -58,8 +59,8 @@ class Control(NamedTuple):
     """How steps are taken.
 
     `tableau` and `order` are the method's; `rtol` the relative tolerance; `t1` the horizon [s], one for all or one per lane;
-    a lane that needs more than `max_steps` has failed; `passes` says whether a run goes on through its event; the error of
-    the first `controlled` components (all, if `None`) is what a step is judged by.
+    a lane that needs more than `max_steps` has failed; `passes` says whether a run goes on through its event; `parts` is of how
+    many equal parts the state is made, such as a state and its variations: a step is judged by the part that errs most.
     """
 
     tableau: diffrax.ButcherTableau
@@ -68,7 +69,7 @@ class Control(NamedTuple):
     t1: Float[Array, "..."]
     max_steps: int
     passes: bool
-    controlled: int | None
+    parts: int
 
 
 class Search(NamedTuple):
@@ -90,7 +91,7 @@ class Block(NamedTuple):
 
     - `cell`: which cell of the problem a lane runs; `status`: one of the codes above.
     - `time` [s], `state`, `rate`: where the lane is, and the field there.
-    - `length`: of the step to be tried [s].
+    - `length`: of the step to be tried [s], if the horizon is not nearer.
     - `side`: 1 before the event, -1 beyond it; `margin`: the least of `side` times the crossing function and the guard.
     - `crossing_time`: of the last event that was passed [s], infinite if there was none.
     - `searching`: whether the lane looks for an event, `search`: where.
@@ -120,6 +121,12 @@ def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: Stat
     return side * crossing if guard is None else jnp.minimum(side * crossing, guard)
 
 
+def length_to_try(control: Control, block: Block) -> Lanes:
+    """Length of each lane's next step [s]: the last one ends on the horizon exactly, also where round-off would miss it."""
+    left = control.t1 - block.time
+    return jnp.where(~block.searching & (block.length >= left * (1.0 - 1e-12)), left, block.length)
+
+
 def attempt(problem: AbstractProblem, control: Control, atol: States, block: Block) -> Block:
     """Try a step in every lane of a block and decide what becomes of it.
 
@@ -136,12 +143,11 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     def watch(time: Lanes, state: States) -> Lanes:
         return least_margin(problem, block.side, time, state)
 
-    here = (block.time, block.state, block.rate, block.length)
-    tried = explicit_step(control.tableau, problem.field, watch, *here, control.controlled)
+    tried_length = length_to_try(control, block)
+    tried = explicit_step(control.tableau, problem.field, watch, block.time, block.state, block.rate, tried_length)
     running = block.status == RUNNING
     free = running & ~block.searching
-    before, after, atol = (part[: control.controlled] for part in (block.state, tried.state, atol))
-    error = scaled_error(*stop_gradient((tried.error, before, after)), control.rtol, atol)
+    error = scaled_error(*stop_gradient((tried.error, block.state, tried.state)), control.rtol, atol, control.parts)
     # An event is located where the margin is round-off. Joined, with a barrier behind it, it is computed once; the compiler
     # would else fuse it into several kernels of different round-off, in one of which the event is found and in another not.
     error, margin = jax.lax.optimization_barrier(jnp.stack([error, stop_gradient(tried.watched)]))
@@ -149,19 +155,19 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
     good = error <= 1.0
     # Negative in between: end the step there and look again, so that the first event of several is found.
-    negative = jnp.minimum(tried.first_negative, stop_gradient(_dip(problem, block, tried)))
+    negative = jnp.minimum(tried.first_negative, stop_gradient(_dip(problem, block, tried, tried_length)))
     between = good & (negative < 1.0)
     beyond = good & ~between & (margin <= 0.0)
     forward = free & good & ~between & ~beyond
 
-    search, guess, found = _narrow(block, margin)
+    search, guess, found = _narrow(block, margin, tried_length)
     hit = running & found
     searching = (block.searching | (free & beyond)) & ~hit
     moved = forward | hit
-    time = jnp.where(moved, block.time + block.length, block.time)
+    time = jnp.where(moved, block.time + tried_length, block.time)
 
-    length = block.length * _factor(error, good, control.order)
-    length = jnp.where(between, block.length * negative, length)
+    length = tried_length * _factor(error, good, control.order)
+    length = jnp.where(between, tried_length * negative, length)
     length = jnp.where(searching, guess, jnp.where(hit, search.stride, length))
     status, side, latest = _fate(problem, control, block, tried, time, hit)
     ended = running & (status == RUNNING) & moved & (time >= control.t1)
@@ -169,19 +175,16 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     # Written so that a length that is not a number counts as stuck.
     tiny = 8.0 * jnp.finfo(time.dtype).eps * jnp.maximum(time, 1e-3)
     stuck = free & ~forward & ~searching & ~(length > tiny)
-    stuck |= forward & (time == block.time) & (block.length > 0.0)
+    stuck |= forward & (time == block.time) & (tried_length > 0.0)
     failed = running & (status == RUNNING) & ~ended & (stuck | (steps >= control.max_steps))
     status = jnp.where(failed, FAILED, jnp.where(ended, REACHED_END, status))
-    # The last step ends on the horizon exactly: what is left of it may differ from the length by round-off.
-    left = control.t1 - time
-    length = jnp.where(~searching & (length >= left * (1.0 - 1e-12)), left, length)
     return Block(
         cell=block.cell,
         status=status,
         time=jnp.where(ended, control.t1, time),
         state=jnp.where(moved, tried.state, block.state),
         rate=jnp.where(moved, tried.rate, block.rate),
-        length=jnp.where(status == RUNNING, length, 0.0),
+        length=length,
         side=side,
         # Just past a crossing the margin is round-off of either sign.
         margin=jnp.where(hit, jnp.abs(margin), jnp.where(forward, margin, block.margin)),
@@ -193,17 +196,17 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     )
 
 
-def _dip(problem: AbstractProblem, block: Block, tried: Step) -> Lanes:
+def _dip(problem: AbstractProblem, block: Block, tried: Step, length: Lanes) -> Lanes:
     """Where in the step the crossing function may dip below zero and come back, as a fraction of the step; 2 if nowhere.
 
     It is where the cubic through its values and slopes at both ends is least, if that is low against both ends.
     """
     if problem.crossing(block.state) is None:
-        return jnp.full_like(block.length, 2.0)
+        return jnp.full_like(length, 2.0)
     low, fall = jax.jvp(problem.crossing, (block.state,), (block.rate,))
     high, rise = jax.jvp(problem.crossing, (tried.state,), (tried.rate,))
     low, high = block.side * low, block.side * high
-    fall, rise = block.side * fall * block.length, block.side * rise * block.length
+    fall, rise = block.side * fall * length, block.side * rise * length
     cubic = 3.0 * (fall + rise - 2.0 * (high - low))
     square = 3.0 * (high - low) - 2.0 * fall - rise
     root = square + jnp.sqrt(jnp.maximum(square * square - cubic * fall, 0.0))
@@ -236,7 +239,7 @@ def _fate(
     return jnp.where(by_guard, GUARD_LOST, block.status), jnp.where(crossed, -block.side, block.side), latest
 
 
-def _narrow(block: Block, margin: Lanes) -> tuple[Search, Lanes, Bool[Array, " lanes"]]:
+def _narrow(block: Block, margin: Lanes, length: Lanes) -> tuple[Search, Lanes, Bool[Array, " lanes"]]:
     """Narrow the bracket by what the attempt found (Anderson and Bjorck, BIT 13 (1973) 253).
 
     A lane that is not searching yet opens its bracket with the step it just took.
@@ -251,11 +254,11 @@ def _narrow(block: Block, margin: Lanes) -> tuple[Search, Lanes, Bool[Array, " l
     weighted_low = was.margin_low * _fade(margin, was.margin_high)
     weighted_high = was.margin_high * _fade(margin, was.margin_low)
     search = Search(
-        low=jnp.where(opens, 0.0, jnp.where(replaces_high, was.low, block.length)),
-        high=jnp.where(opens | replaces_high, block.length, was.high),
+        low=jnp.where(opens, 0.0, jnp.where(replaces_high, was.low, length)),
+        high=jnp.where(opens | replaces_high, length, was.high),
         margin_low=jnp.where(opens, start, jnp.where(replaces_high, weighted_low, margin)),
         margin_high=jnp.where(opens | replaces_high, margin, weighted_high),
-        stride=jnp.where(opens, block.length, was.stride),
+        stride=jnp.where(opens, length, was.stride),
         trials=jnp.where(opens, 0, was.trials + 1),
     )
     rise = search.margin_high - search.margin_low
@@ -263,10 +266,10 @@ def _narrow(block: Block, margin: Lanes) -> tuple[Search, Lanes, Bool[Array, " l
     guess = jnp.where(jnp.isfinite(guess), jnp.clip(guess, search.low, search.high), search.high)
     located = max(LOCATED, 8.0 * float(jnp.finfo(margin.dtype).eps)) * search.stride
     tired = search.trials >= MOST_TRIALS
-    close = block.searching & ((jnp.abs(guess - block.length) <= 2.0 * located) | tired)
+    close = block.searching & ((jnp.abs(guess - length) <= 2.0 * located) | tired)
     # A run that goes on must start beyond the event, or it would find the same one again.
     found = close & replaces_high
-    beyond = jnp.where(tired, search.high, jnp.minimum(block.length + located, search.high))
+    beyond = jnp.where(tired, search.high, jnp.minimum(length + located, search.high))
     return search, jnp.where(close & ~found, beyond, guess), found
 
 
@@ -276,16 +279,21 @@ def _fade(margin: Lanes, replaced: Lanes) -> Lanes:
 
 
 def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes:
-    """When the crossing function vanishes, for a state close to that, to third order in the distance.
+    """When the crossing function vanishes, for a state close to that (`event_time`)."""
+    return event_time(problem, problem.crossing, time, state)
+
+
+def event_time(problem: AbstractProblem, function: Callable[[States], Lanes], time: Lanes, state: States) -> Lanes:
+    """When a function of the state vanishes along a motion, for a state close to that, to third order in the distance.
 
     It gives the time of a located event its derivatives: `time` is held fixed, the state varies with the parameters, and
     the series t - g/g' - g'' g^2 / (2 g'^3) turns its variation into that of the time (implicit function theorem).
     """
 
     def slope(at: States) -> Lanes:
-        return jax.jvp(problem.crossing, (at,), (problem.field(time, at),))[1]
+        return jax.jvp(function, (at,), (problem.field(time, at),))[1]
 
     first, second = jax.jvp(slope, (state,), (problem.field(time, state),))
     first = jnp.where(first == 0.0, 1.0, first)
-    shift = problem.crossing(state) / first
+    shift = function(state) / first
     return time - shift - 0.5 * second / first * shift * shift

@@ -34,7 +34,7 @@ class VariedProblem(AbstractProblem):
     magnitudes: Float[Array, "components cells"]
 
     def start(self) -> tuple[Float[Array, "all cells"], Float[Array, "all cells"]]:
-        ones = jnp.ones((self.states.shape[0] - len(self.magnitudes), self.states.shape[1]))
+        ones = jnp.ones((self.states.shape[0] - len(self.magnitudes), *self.states.shape[1:]))
         return self.states, jnp.concatenate([self.magnitudes, ones])
 
     def field(self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]) -> Float[Array, "all lanes"]:
@@ -50,6 +50,20 @@ class VariedProblem(AbstractProblem):
 
     def guard(self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]) -> Float[Array, " lanes"] | None:
         return self.problem.guard(time, state[: len(self.magnitudes)])
+
+
+def probed(problem: AbstractProblem) -> VariedProblem:
+    """A run and a direction with nothing special about it, for a derivative that takes no part in step control itself.
+
+    The direction follows the linearised motion and takes part in step control, so that the steps bear tangents also where
+    the state is at rest.
+    """
+    start, magnitudes = problem.start()
+    direction = jnp.cos(1.0 + jnp.arange(len(start)))
+    direction = jnp.broadcast_to(direction.reshape(-1, *(1,) * (start.ndim - 1)), start.shape)
+    unit = direction / jnp.linalg.norm(direction, axis=0)
+    states = jnp.concatenate([start, unit, jnp.zeros((1, *start.shape[1:]))])
+    return VariedProblem(problem, states, magnitudes)
 
 
 class Growth(NamedTuple):

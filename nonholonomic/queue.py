@@ -84,18 +84,17 @@ class Queue(eqx.Module):
         passes: bool = False,
         max_steps: int = 2_000_000,
         one_kernel: bool = False,
-        controlled: int | None = None,
+        parts: int = 1,
     ) -> "Queue":
         """The queue of a problem.
 
-        **Arguments:** as for `ensemble.march`, and `controlled`: how many of the leading components steer the steps' lengths;
-        all of them by default.
+        **Arguments:** as for `ensemble.march`, and `parts`: of how many equal parts the state is made, as for `Control`.
         """
-        control = Control(explicit_tableau(solver), solver.order(None), rtol, t1, max_steps, passes, controlled)
+        control = Control(explicit_tableau(solver), solver.order(None), rtol, t1, max_steps, passes, parts)
         starts, scales = problem.start()
         zero = jnp.zeros_like(starts[0])
         rates, atols = problem.field(zero, starts), atol * scales
-        lengths = first_length(problem.field, zero, starts, rates, control.order, rtol, atols, controlled)
+        lengths = first_length(problem.field, zero, starts, rates, control.order, rtol, atols, parts)
         fresh = _fresh_block(problem, control, starts, rates, jnp.minimum(stop_gradient(lengths), t1))
         return cls(problem, control, atols, fresh, cells, lanes, one_kernel)
 

@@ -1,5 +1,6 @@
 """One explicit Runge-Kutta step of many lanes, from a Diffrax solver's tableau, with the stages written out."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -42,7 +43,6 @@ def explicit_step(
     state: States,
     rate: States,
     length: Lanes,
-    controlled: int | None = None,
 ) -> Step:
     """Try one step in every lane.
 
@@ -58,7 +58,6 @@ def explicit_step(
       What is negative for less than a quarter of a step may pass unseen.
     - `time`, `state`, `rate`: where the step starts, and the field there.
     - `length`: length of the step [s], one per lane.
-    - `controlled`: of how many leading components the error is estimated; of all by default.
 
     **Returns:** a `Step`. `watched` is the watched number at the end; `first_negative` the fraction of the step of the
     first stage at which it was negative, 2 if it never was.
@@ -81,7 +80,7 @@ def explicit_step(
     else:
         end = moved_state(state, length, tableau.b_sol, rates)
         last_rate = jax.lax.optimization_barrier(field(time + length, end))
-    error = length * weighted_sum(tableau.b_error, [rate[:controlled] for rate in rates])
+    error = length * weighted_sum(tableau.b_error, rates)
     return Step(end, last_rate, error, watch(time + length, end), first_negative)
 
 
@@ -115,11 +114,12 @@ def weighted_sum(weights: Float[np.ndarray, " stages"], rates: list[States]) -> 
     return jnp.zeros_like(rates[0]) if total is None else total
 
 
-def scaled_error(error: States, before: States, after: States, rtol: float, atol: States) -> Lanes:
-    """Root mean square over the components of the error in units of the tolerance (Diffrax's norm and scale)."""
-    scale = atol + rtol * jnp.maximum(jnp.abs(before), jnp.abs(after))
-    ratio = error / scale
-    return jnp.sqrt(jnp.mean(ratio * ratio, axis=0))
+def scaled_error(error: States, before: States, after: States, rtol: float, atol: States, parts: int) -> Lanes:
+    """Error in units of the tolerance: of the parts of the state, the greatest root mean square (Diffrax's norm and scale)."""
+    ratio = error / (atol + rtol * jnp.maximum(jnp.abs(before), jnp.abs(after)))
+    size = ratio.shape[0] // parts
+    squares = [jnp.mean(ratio[k * size : (k + 1) * size] ** 2, axis=0) for k in range(parts)]
+    return jnp.sqrt(functools.reduce(jnp.maximum, squares))
 
 
 def inverse_root(value: Lanes, order: int) -> Lanes:
@@ -139,25 +139,26 @@ def first_length(
     order: int,
     rtol: float,
     atol: States,
-    controlled: int | None,
+    parts: int,
 ) -> Lanes:
     """Length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section II.4), in the motion's own unit.
 
     They compare |y'| with |y''|, which depends on the unit of time, and Diffrax does so in seconds. Here the unit is |y|/|y'|,
-    so that motions that differ in their scale only are integrated alike.
+    so that motions that differ in their scale only are integrated alike. Of a state of several `parts` the first one counts.
     """
     scale = atol + jnp.abs(state) * rtol
+    size = state.shape[0] // parts
 
-    def size(vector: States) -> Lanes:
-        return jnp.sqrt(jnp.mean((vector / scale)[:controlled] ** 2, axis=0))
+    def measure(vector: States) -> Lanes:
+        return jnp.sqrt(jnp.mean((vector / scale)[:size] ** 2, axis=0))
 
-    magnitude, slope = size(state), size(rate)
+    magnitude, slope = measure(state), measure(rate)
     unit = magnitude / slope
     # Something that stands still has no unit of its own; longer ones would overflow below.
     still = (magnitude < 1e-5) | ~(unit < 1e15)
     unit = jnp.where(still, 1e-4, unit)
     trial = 0.01 * unit
-    bend = size(field(time + trial, state + trial * rate) - rate) / trial
+    bend = measure(field(time + trial, state + trial * rate) - rate) / trial
     steepest = unit * jnp.maximum(slope, unit * bend)
     fraction = jnp.where(steepest <= 1e-15, 0.01, inverse_root(jnp.maximum(steepest, 1e-15) * 100.0, order))
     return unit * jnp.minimum(1.0, fraction)

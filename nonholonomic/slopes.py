@@ -3,6 +3,7 @@
 Along one direction its variation runs along (`variation.py`); along several every run is taken back once (`adjoint.py`).
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -37,7 +38,8 @@ def march_with_slopes(
 
     **Arguments:** as for `ensemble.march`, but `lanes` and `max_steps`, and
 
-    - `directions`: tangents of the problem, as for `VariationalProblem`.
+    - `directions`: tangents of the problem, as for `VariationalProblem`. Their variations, or a mixture of them, take part in
+      step control.
     - `one_kernel`: as there, not for programs that are differentiated again; nor is the way back, so that without it
       variations run along any number of directions.
 
@@ -77,6 +79,7 @@ def _slopes_by_adjoint(
     there, by_start, by_number = march_with_gradient(
         VariationalProblem(problem, (), ends_on_event),
         VariationalProblem(moving, (), ends_on_event),
+        _mixed(directions),
         *given,
         measured=_event_time,
         **options,
@@ -91,6 +94,12 @@ def _slopes_by_adjoint(
         return sum(shares, jnp.zeros(by_start.shape[1]) if start is None else jnp.sum(by_start * start, axis=0))
 
     return there, [slope(direction) for direction in directions]
+
+
+def _mixed(directions: tuple[Any, ...]) -> Any:
+    """A direction in which all of some directions have a share, by shares that are not likely to cancel."""
+    shares = [0.5 + math.modf(0.618 * k)[0] for k in range(len(directions))]
+    return jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *directions)
 
 
 def _event_time(varied: VariationalProblem, block: Block) -> Float[Array, " lanes"]:
@@ -141,10 +150,15 @@ def directions_of(
 
     **Returns:** for each direction the tangent of the problem, `None` for what depends on no number.
     """
-    reached = _reached(jax.make_jaxpr(build)(*numbers))
-    structure = jax.tree.structure(jax.eval_shape(build, *numbers))
+
+    def built(*numbers: Any) -> Any:
+        # A problem may hold functions too.
+        return eqx.filter(build(*numbers), eqx.is_inexact_array)
+
+    reached = _reached(jax.make_jaxpr(built)(*numbers))
+    structure = jax.tree.structure(jax.eval_shape(built, *numbers))
     moving = jax.tree.unflatten(structure, reached)
-    found = [jax.jvp(build, numbers, tangent)[1] for tangent in tangents]
+    found = [jax.jvp(built, numbers, tangent)[1] for tangent in tangents]
     return tuple(eqx.filter(one, moving) for one in found)
 
 

@@ -4,6 +4,7 @@ A problem and its variations are one problem with a longer state, so that they r
 alone; differentiating the loop as a whole costs several times as much. For many directions see `adjoint.py`.
 """
 
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +21,11 @@ from .queue import Outcome, Queue
 TOGETHER = 2
 
 
+def natural_size(number: Float[Array, "..."]) -> Float[Array, "..."]:
+    """By how much to move a number: by its own size, or by 1 where it is zero."""
+    return jax.lax.stop_gradient(jnp.where(number == 0.0, 1.0, jnp.abs(number)))
+
+
 def lanes_along(cells: int, directions: int) -> int:
     """How many cells should advance together with their variations in some directions: the whole state fits the caches."""
     return max(8, 3 * lanes_for(cells) // (2 + 2 * directions)) if directions else lanes_for(cells)
@@ -29,7 +35,8 @@ class VariationalProblem(AbstractProblem):
     """A problem and its first variation in each of some directions, the variations stacked behind the state.
 
     A direction is a tangent of the problem: the same tree, with the rate at which each number moves, `None` where none of
-    the directions moves it.
+    the directions moves it. A variation's absolute tolerance is that of the state, so a direction should move a number by
+    about its own size (`natural_size`).
     """
 
     problem: AbstractProblem
@@ -84,7 +91,9 @@ def slopes_by_variations(
     **Returns:** the `Outcome`, with crossing times left out, and for each direction the derivative of the event's time.
     """
     varied = VariationalProblem(problem, directions, ends_on_event)
-    there, _ = Queue.of(varied, *given, controlled=problem.start()[0].shape[0], **options).outcome()
+    # The variations take part in step control: the state alone may be at rest where its tangent is not, and steps would
+    # outgrow what the tangent can bear.
+    there, _ = Queue.of(varied, *given, parts=1 + len(directions), **options).outcome()
     state, *variations = varied.parts(there.state)
 
     def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
@@ -96,25 +105,30 @@ def slopes_by_variations(
     return there._replace(state=state), slopes
 
 
-def in_groups(run: Callable[..., tuple[Any, list[Any]]], directions: tuple[Any, ...]) -> tuple[Any, list[Any]]:
+def in_groups(
+    run: Callable[..., tuple[Any, list[Any]]], directions: tuple[Any, ...], together: int = TOGETHER
+) -> tuple[Any, list[Any]]:
     """What `run` finds along many directions, a few at a time by one program.
 
     **Arguments:**
 
-    - `run`: a tuple of `TOGETHER` directions -> a result that does not depend on them, and a slope for each.
+    - `run`: a tuple of `together` directions, or of fewer if there are no more -> a result that does not depend on them, and
+      a slope for each.
     - `directions`: any number of them.
+    - `together`: how many run along at a time.
 
     **Returns:** the result, and the slopes.
     """
-    if len(directions) <= TOGETHER:
+    if len(directions) <= together:
         return run(directions)
     # The last group is filled with directions that lead nowhere.
-    empty = -len(directions) % TOGETHER
+    empty = -len(directions) % together
     padded = [*directions, *[jax.tree.map(jnp.zeros_like, directions[0])] * empty]
-    stacked = [jax.tree.map(lambda *rates: jnp.stack(rates), *padded[k::TOGETHER]) for k in range(TOGETHER)]
+    stacked = [jax.tree.map(lambda *rates: jnp.stack(rates), *padded[k::together]) for k in range(together)]
     results, slopes = jax.lax.map(lambda group: run(tuple(group)), stacked)
-    each = [slopes[i % TOGETHER][i // TOGETHER] for i in range(len(directions))]
-    return jax.tree.map(lambda leaf: leaf[0], results), each
+    groups = range(len(padded) // together)
+    each = [jax.tree.map(operator.itemgetter(group), slope) for group in groups for slope in slopes]
+    return jax.tree.map(lambda leaf: leaf[0], results), each[: len(directions)]
 
 
 def _where_moved(problem: Any, direction: Any) -> Any:

@@ -1,9 +1,6 @@
 """Run the stroller from a launch."""
 
-from typing import Any
-
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,11 +9,11 @@ from jaxtyping import Array, ArrayLike, Float
 from nonholonomic.midpoint import ImplicitMidpoint
 from nonholonomic.validation import as_number, is_traced, require
 
-from .dynamics import State
 from .input import Input
 from .launch import Launch
+from .ride import Settings, differentiable_ride, is_closed, opened, ride
 from .scene import Scene
-from .trajectory import Stats, Trajectory, Watch, read_off, watched
+from .trajectory import Trajectory, read_off
 
 #: How many times are saved where none are asked for.
 DEFAULT_TIMES = 201
@@ -45,7 +42,9 @@ def simulate(
     - `tolerance`: relative tolerance, and absolute tolerance in units of the scene's magnitudes, of an adaptive solver.
     - `solver`: any Diffrax solver, by default `diffrax.Dopri8()`, or an `ImplicitMidpoint`.
     - `max_steps`: a run that needs more has failed.
-    - `adjoint`: how Diffrax differentiates, by default for `jax.grad`; `diffrax.ForwardMode()` for `jax.jacfwd`.
+    - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
+      number; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax differentiates, which pays where a loss is
+      differentiated by many numbers, as by the weights of an input.
 
     **Returns:** a `Trajectory`; its `status` tells whether the run came to its end and what it met on the way.
 
@@ -63,15 +62,17 @@ def simulate(
     if not is_traced(times) and np.any(np.diff(np.asarray(times)) <= 0.0):
         raise ValueError(f"times = {times!r} must be increasing")
     solver = diffrax.Dopri8() if solver is None else solver
-    end = as_number(t1)
-    adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-    grid = None
+    end, grid = as_number(t1), None
     if isinstance(solver, ImplicitMidpoint):
         grid = even_steps(times, end, solver.step_length)
         max_steps = grid.size
-    states, watch, stats = solve(
-        scene, launch, input, end, times, grid, as_number(tolerance), solver, max_steps, adjoint
-    )
+    steering = input if is_closed(input, scene, launch) else opened(input, scene, launch)
+    settings = Settings(solver, max_steps, adjoint)
+    given = (scene, launch, steering)
+    if adjoint is None and any(is_traced(leaf) for leaf in jax.tree.leaves((given, times, end))):
+        states, watch, stats = differentiable_ride(given, times, end, grid, as_number(tolerance), settings)
+    else:
+        states, watch, stats = ride(given, times, end, grid, as_number(tolerance), settings)
     return read_off(scene, input, times, states, watch, stats)
 
 
@@ -83,38 +84,3 @@ def even_steps(
     counts = np.ceil(np.diff(knots) / float(longest) * (1.0 - 1e-12)).astype(int)
     pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots, knots[1:], counts, strict=False)]
     return jnp.asarray(np.concatenate([*pieces, knots[-1:]]))
-
-
-@eqx.filter_jit
-def solve(scene, launch, input, t1, times, grid, tolerance, solver, max_steps, adjoint) -> tuple[State, Watch, Stats]:
-    """Integrate; the states at `times`, what a `Watch` follows at every step, and statistics."""
-    start = scene.state(launch, input is not None)
-    if grid is None:
-        scales = scene.scales(launch, input is not None)
-        controller = diffrax.PIDController(rtol=tolerance, atol=tolerance * jax.lax.stop_gradient(scales))
-        # Steps end on the times of output, where interpolation would lose a digit or two.
-        controller = diffrax.ClipStepSizeController(controller, step_ts=times)
-    else:
-        controller = diffrax.StepTo(grid)
-    dynamics = scene.dynamics
-    subs = (
-        diffrax.SubSaveAt(ts=times),
-        diffrax.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: watched(scene, y)),
-    )
-    solution: Any = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, y, args: dynamics.field(t, y, input)),
-        solver,
-        t0=jnp.zeros_like(t1),
-        t1=t1,
-        dt0=None,
-        y0=start,
-        saveat=diffrax.SaveAt(subs=subs),
-        stepsize_controller=controller,
-        max_steps=max_steps,
-        adjoint=adjoint,
-        throw=False,
-    )
-    counts, finished = solution.stats, solution.result == diffrax.RESULTS.successful
-    stats = Stats(counts["num_accepted_steps"], counts["num_rejected_steps"], finished)
-    states, followed = solution.ys
-    return states.T, Watch(solution.ts[1], *followed), stats

@@ -65,14 +65,20 @@ class RideProblem(AbstractProblem):
     @classmethod
     def of(cls, scene: Scene, launch: Launch, input: Input | None, cells: int, watched: bool) -> "RideProblem":
         """The problem of the given number of cells; every number is a scalar or one per cell."""
-        driven = input is not None
 
         def spread(states):
             return jnp.broadcast_to(states.reshape(states.shape[0], -1), (states.shape[0], cells))
 
+        one = cls.single(scene, launch, input)
+        watched = watched and not isinstance(scene.surface, Plane)
+        return dataclasses.replace(one, states=spread(one.states), scales=spread(one.scales), watched=watched)
+
+    @classmethod
+    def single(cls, scene: Scene, launch: Launch, input: Input | None) -> "RideProblem":
+        """The problem of one ride, which goes on where contact is lost."""
+        driven = input is not None
         press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
-        states, scales = spread(scene.state(launch, driven)), spread(scene.scales(launch, driven))
-        return cls(scene, input, states, scales, press, watched and not isinstance(scene.surface, Plane))
+        return cls(scene, input, scene.state(launch, driven), scene.scales(launch, driven), press, False)
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales

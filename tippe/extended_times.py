@@ -105,7 +105,7 @@ def _times_and_slopes(
     problem: InversionProblem, directions: tuple[Any, ...], t1: Float[Array, ""], tolerance: Float[Array, ""]
 ) -> tuple[Float[Array, " cells"], Float[Array, "directions cells"]]:
     """The extended times of every cell, and their derivatives along directions (as of `VariationalProblem`)."""
-    components, cells = problem.states.shape
+    cells = problem.states.shape[1]
     varied = VariationalProblem(problem, directions, True)
     outcome, _ = Queue.of(
         varied,
@@ -117,7 +117,7 @@ def _times_and_slopes(
         lanes=lanes_along(cells, len(directions)),
         max_steps=MOST_STEPS,
         one_kernel=cells >= MANY,
-        controlled=components,
+        parts=1 + len(directions),
     ).outcome()
     state, *variations = varied.parts(outcome.state)
     crossed = outcome.status == CROSSED

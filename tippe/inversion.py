@@ -18,6 +18,7 @@ from nonholonomic.phases import Journey
 from nonholonomic.runge_kutta import explicit_tableau
 from nonholonomic.slopes import directions_of, traced_march_with_slopes
 from nonholonomic.validation import as_number, require
+from nonholonomic.variation import natural_size
 
 from .dynamics import COS_THETA, Dynamics
 from .launch import Launch
@@ -196,9 +197,9 @@ def _times_and_slopes(
         return InversionProblem.of(scene, launch, angle, cells)
 
     point = tuple(leaves[i] for i in active)
+    sizes = [natural_size(leaf) for leaf in point]
     tangents = [
-        tuple(jnp.ones_like(leaf) if i == k else jnp.zeros_like(leaf) for i, leaf in enumerate(point))
-        for k in range(len(point))
+        tuple(size if i == k else jnp.zeros_like(size) for i, size in enumerate(sizes)) for k in range(len(point))
     ]
     problem = build(*point)
     t1, tolerance = jax.tree.unflatten(run.structure, leaves)[-2:]
@@ -217,7 +218,7 @@ def _times_and_slopes(
     )
     inverted = is_inverted(outcome, problem, run.last)
     times = jnp.where(inverted, outcome.crossing_time, jnp.inf)
-    return [times, *(jnp.where(inverted, slope, 0.0) for slope in slopes)]
+    return [times, *(jnp.where(inverted, slope / size, 0.0) for slope, size in zip(slopes, sizes, strict=True))]
 
 
 def is_inverted(outcome: Outcome | Journey, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:

@@ -12,6 +12,7 @@ from nonholonomic.ensemble import Outcome
 from nonholonomic.paths import full_path, numbers, with_numbers
 from nonholonomic.slopes import compiled_march_with_slopes, directions_of
 from nonholonomic.sweep import Variable
+from nonholonomic.variation import natural_size
 
 from .inversion import ABSOLUTE, InversionProblem, is_inverted
 
@@ -73,7 +74,7 @@ def slopes_of_cells(
 
     **Returns:** the `Outcome`, and name of the variable -> derivatives (size,). Source: implicit function theorem at the event.
     """
-    problem, directions = _problem_and_directions(roots, columns, paths, jnp.asarray(angle, float), size)
+    problem, directions, sizes = _problem_and_directions(roots, columns, paths, jnp.asarray(angle, float), size)
     outcome, slopes = compiled_march_with_slopes(
         problem,
         directions,
@@ -85,15 +86,15 @@ def slopes_of_cells(
         passes=last,
     )
     inverted = is_inverted(outcome, problem, last)
-    found = [np.where(inverted, slope, 0.0) for slope in slopes]
+    found = [np.where(inverted, slope / size, 0.0) for slope, size in zip(slopes, sizes, strict=True)]
     return outcome, dict(zip(slope_names(paths), found, strict=True))
 
 
 @eqx.filter_jit
 def _problem_and_directions(
     roots: dict[str, Any], columns: dict[str, Any], paths: list[str], angle: Float[Array, ""], size: int
-) -> tuple[InversionProblem, tuple[Any, ...]]:
-    """The problem of the cells, and its tangents along the numbers to differentiate by."""
+) -> tuple[InversionProblem, tuple[Any, ...], list[Float[Array, "..."]]]:
+    """The problem of the cells, its tangents along the numbers to differentiate by, and by how much these move each."""
 
     def build(*moving: Any) -> InversionProblem:
         cells = with_numbers(roots, columns | dict(zip(paths, moving, strict=True)))
@@ -102,5 +103,8 @@ def _problem_and_directions(
     cells = with_numbers(roots, columns)
     values = {path: value for root, tree in cells.items() for path, value in numbers(root, tree).items()}
     point = tuple(jnp.asarray(values[path], float) for path in paths)
-    tangents = [tuple(jnp.full_like(value, row == k) for k, value in enumerate(point)) for row in range(len(paths))]
-    return build(*point), directions_of(build, point, tangents)
+    sizes = [natural_size(value) for value in point]
+    tangents = [
+        tuple(size if row == k else jnp.zeros_like(size) for k, size in enumerate(sizes)) for row in range(len(paths))
+    ]
+    return build(*point), directions_of(build, point, tangents), sizes

@@ -10,51 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.integrate import follow, sample
-from nonholonomic.lockstep import AbstractProblem
+from nonholonomic.integrate import follow
 from nonholonomic.validation import as_number, is_traced, require
 from nonholonomic.vector import dot
 
-from .dynamics import Dynamics, stacked
 from .hybrid.trajectory import HybridTrajectory, simulate_hybrid
 from .inversion import ABSOLUTE, check_run
 from .launch import Launch
+from .sampled import Run, sampled, sampled_by_diffrax
 from .scene import Scene
-from .stick_slip.motion import Kind, StickSlip
 from .stick_slip.path import follow_stick_slip
-
-
-class Run(AbstractProblem):
-    """A launch with its cyclic coordinates: the state, the arena's path, the spin angle and the work of friction."""
-
-    dynamics: Dynamics | StickSlip | Kind
-    axial: Float[Array, ""]
-    state: Float[Array, " components"]
-    path: Float[Array, " components"]
-    scales: Float[Array, " components"]
-
-    @classmethod
-    def of(cls, scene: Scene, launch: Launch) -> "Run":
-        """The run of one launch."""
-        state, path = scene.state(launch), jnp.stack(scene.surface.path(launch.eta))
-        radius, weight = scene.body.radius, scene.body.mass * scene.gravity
-        extra = jnp.stack([*([radius] * len(path)), jnp.ones(()), weight * radius])
-        return cls(scene.dynamics, scene.body.I3, state, path, jnp.concatenate([scene.scales(launch), extra]))
-
-    def start(self) -> tuple[Float[Array, " components"], Float[Array, " components"]]:
-        return jnp.concatenate([self.state, self.path, jnp.zeros(2)]), self.scales
-
-    def field(self, time: Float[Array, ""], state: Float[Array, " components"]) -> Float[Array, " components"]:
-        lean, path = state[: len(self.state)], tuple(state[len(self.state) : -2])
-        motion = self.dynamics.motion(lean)
-        path_rate = self.dynamics.parallel.path_rate(path, motion.velocity, motion.turning)
-        return stacked((*motion.rate, *path_rate, motion.spin_momentum / self.axial, motion.friction_power), state)
-
-    def crossing(self, state: Float[Array, " components"]) -> None:
-        return None
-
-    def guard(self, time: Float[Array, ""], state: Float[Array, " components"]) -> Float[Array, ""]:
-        return self.dynamics.contact_margin(state[: len(self.state)])
 
 
 def _of_each_run(function: Callable[["Trajectory"], Array]) -> property:
@@ -206,7 +171,7 @@ def simulate(
     """Run one launch until `t1` or until contact is lost; through flights and impacts if the scene's contact is "hybrid".
 
     Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run are then not a
-    number, and `status` and `end_time` say so.
+    number, and `status` and `end_time` say so. A batch, as `vmap` makes it, runs as the cells of one block, as tables do.
 
     **Arguments:**
 
@@ -216,8 +181,9 @@ def simulate(
       transformations those after the end of the run are left out, and `Trajectory.at` gives others.
     - `tolerance`: relative tolerance; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
     - `solver`: any solver of Diffrax, `Dopri8()` by default.
-    - `adjoint`: how Diffrax differentiates, `RecursiveCheckpointAdjoint()` by default (reverse mode; use `ForwardMode()`
-      for `jvp` and `jacfwd`).
+    - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
+      number; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, a traced run goes by Diffrax, which pays where a
+      loss is differentiated by many numbers.
 
     **Returns:** a `Trajectory`, for a hybrid scene a `HybridTrajectory`.
 
@@ -235,9 +201,9 @@ def simulate(
         if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1))):
             raise ValueError("contact = 'hybrid' must be 'stop' inside jit, vmap and grad")
         return simulate_hybrid(scene, launch, float(t1), times, tolerance, solver)
+    if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1))):
+        return _traced(scene, launch, times, t1, tolerance, solver, adjoint)
     run = Run.of(scene, launch)
-    if any(is_traced(leaf) for leaf in jax.tree.leaves((run, times, t1))):
-        return _traced(scene, run, times, t1, tolerance, solver, adjoint)
     through = follow_stick_slip if scene.friction.set_valued else follow
     path = through(run, float(t1), solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
     trajectory = _as_trajectory(scene, run, path)
@@ -255,10 +221,10 @@ def _check_increasing(times: Any) -> None:
 
 def _traced(
     scene: Scene,
-    run: Run,
+    launch: Launch,
     times: Any,
     t1: Any,
-    tolerance: Any,
+    tolerance: float,
     solver: diffrax.AbstractSolver,
     adjoint: diffrax.AbstractAdjoint | None,
 ) -> Trajectory:
@@ -268,12 +234,14 @@ def _traced(
         )
     if times is None:
         raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
-    adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-    states, end, lost, stats = sample(
-        run, times, as_number(t1), solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance, adjoint=adjoint
-    )
-    status = jnp.where(lost, 1, jnp.where(end < t1, 2, 0))
-    return Trajectory(times, scene, *_parts(run, states), status, end, stats, None)
+    run = Run.of(scene, launch)
+    if adjoint is None:
+        found = sampled(scene, launch, times, t1, tolerance, solver)
+    else:
+        found = sampled_by_diffrax(run, times, as_number(t1), tolerance, solver, adjoint)
+    status = jnp.where(found.lost > 0.0, 1, jnp.where(found.failed > 0.0, 2, 0))
+    stats = {"accepted": found.steps.astype(int), "rejected": found.rejected.astype(int)}
+    return Trajectory(times, scene, *_parts(run, found.states.T), status, found.end_time, stats, None)
 
 
 def _parts(run: Run, states: Float[Array, "components times"]) -> tuple[Any, Any, Any, Any]:

@@ -1,0 +1,186 @@
+"""Answers with derivatives of their own: functions of scalars for `jit`, `vmap`, `grad`, `jvp` and their compositions.
+
+A run is not differentiated operation by operation. A question knows how to find its answer together with the answer's
+slopes by some of the numbers (variations that run along, or the way back), and what JAX asks for is put together from these.
+A batch of answers, as `vmap` asks for, is found as the cells of one block.
+"""
+
+import abc
+import functools
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .slopes import directions_of
+from .variation import natural_size
+
+#: What a question finds: arrays of floats, the cells along the first axis.
+Answer = Any
+
+
+class AbstractQuestion(eqx.Module):
+    """What is asked of a run, as a function of numbers: `leaves`, of which the first `movable` may move the answer."""
+
+    #: Whether a batch is run as the cells of one block; else each run is one of its own, and the number of cells is 1.
+    in_blocks: ClassVar[bool] = True
+
+    movable: eqx.AbstractVar[int]
+
+    @abc.abstractmethod
+    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Answer:
+        """The answer in every cell; a number is a scalar or one per cell."""
+
+    @abc.abstractmethod
+    def with_slopes(
+        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[Answer, list[Answer]]:
+        """The answer, and its slope by each active leaf: shaped like the answer, with the leaf's own axes behind; a part of
+        the answer that is not to be differentiated has `None` for its slope.
+
+        **Arguments:** `active`: which leaves; `again`: whether what is found will be differentiated once more, forwards;
+        `cells`, `leaves`: as for `answer`.
+        """
+
+
+def ask(question: AbstractQuestion, *leaves: Float[Array, "..."]) -> Answer:
+    """The answer for one run. Where it is not finite its derivative is 0, whatever becomes of it afterwards.
+
+    **Arguments:** `leaves`: the numbers, as the question takes them for a single cell.
+
+    **Returns:** the answer, without the axis of cells.
+    """
+
+    @jax.custom_jvp
+    def found(*leaves):
+        return _in_block(question, question.answer)(*leaves)
+
+    @functools.partial(found.defjvp, symbolic_zeros=True)
+    def variation(leaves, tangents):
+        zero = jax.custom_derivatives.SymbolicZero
+        active = tuple(i for i in range(question.movable) if not isinstance(tangents[i], zero))
+        if not active:
+            answer = found(*leaves)
+            return answer, jax.tree.map(jnp.zeros_like, answer)
+        answer, slopes = _with_slopes(question, active)(*leaves)
+        moved = [tangents[i] for i in active]
+        return answer, jax.tree.map(lambda value, *by: _change(value, by, moved), answer, *slopes)
+
+    return found(*leaves)
+
+
+def _change(value: Array, slopes: tuple[Any, ...], tangents: list[Array]) -> Any:
+    if slopes[0] is None:
+        return jax.custom_derivatives.zero_from_primal(value, symbolic_zeros=True)
+    change = sum(
+        jnp.tensordot(slope, tangent, axes=jnp.ndim(tangent)) for slope, tangent in zip(slopes, tangents, strict=True)
+    )
+    # Chosen last, so that on the way back an infinite cotangent of a value that is not finite is dropped, not multiplied.
+    return jnp.where(jnp.isfinite(value), change, 0.0)
+
+
+def _with_slopes(question: AbstractQuestion, active: tuple[int, ...]) -> Callable[..., tuple[Answer, list[Answer]]]:
+    """Answer and slopes of one run, which can be differentiated once more."""
+
+    @jax.custom_jvp
+    def found(*leaves):
+        return _in_block(question, functools.partial(question.with_slopes, active, False))(*leaves)
+
+    @found.defjvp
+    def second_variation(leaves, tangents):
+        # `_in_block` would mark the value as batched where only the variation is, so it is left out here.
+        once = functools.partial(question.with_slopes, active, True, 1)
+        return jax.jvp(lambda *numbers: _only(once(*numbers)), leaves, tangents)
+
+    return found
+
+
+def _in_block(question: AbstractQuestion, function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of a number of cells and their numbers as one of a single cell's, batched as the cells of one block."""
+
+    def single(*leaves):
+        return _only(function(1, *leaves))
+
+    if not question.in_blocks:
+        return single
+    one = jax.custom_batching.custom_vmap(single)
+
+    @one.def_vmap
+    def many(size, batched, *leaves):
+        results = function(size, *leaves)
+        return results, jax.tree.map(lambda _: True, results)
+
+    return one
+
+
+def _only(results: Any) -> Any:
+    return jax.tree.map(lambda result: result[0], results)
+
+
+def directions_by(
+    build: Callable[[tuple[Array, ...], int | None], Any],
+    active: tuple[int, ...],
+    leaves: tuple[Array, ...],
+    cells: int | None,
+) -> tuple[Any, tuple[Any, ...], Callable[[list[Answer]], list[Answer]]]:
+    """A problem and its directions along leaves, each of which moves a number by its own size.
+
+    **Arguments:**
+
+    - `build`: (leaves, cells) -> problem.
+    - `active`, `leaves`: along which of the leaves. With `cells` they are scalars or one per cell; without, arrays of any
+      shape, each of whose entries has a direction of its own.
+
+    **Returns:** the problem; its directions; and a function that makes of the slopes along the directions, trees of arrays,
+    those by each leaf, the leaf's own axes behind (with `cells` there are none, and the cells come first).
+    """
+
+    def moved(*moving: Array) -> Any:
+        all = list(leaves)
+        for i, leaf in zip(active, moving, strict=True):
+            all[i] = leaf
+        return build(tuple(all), cells)
+
+    point = tuple(leaves[i] for i in active)
+    sizes = [natural_size(leaf) for leaf in point]
+    zeros = tuple(jnp.zeros_like(size) for size in sizes)
+
+    def along(k: int, tangent: Array) -> tuple[Array, ...]:
+        return (*zeros[:k], tangent, *zeros[k + 1 :])
+
+    if cells is not None:
+        tangents = [along(k, size) for k, size in enumerate(sizes)]
+
+        def gather(slopes: list[Answer]) -> list[Answer]:
+            return [
+                jax.tree.map(functools.partial(_by_cells, size), slope)
+                for slope, size in zip(slopes, sizes, strict=True)
+            ]
+    else:
+        entries = [(k, index) for k, size in enumerate(sizes) for index in np.ndindex(size.shape)]
+        tangents = [along(k, zeros[k].at[index].set(sizes[k][index])) for k, index in entries]
+
+        def gather(slopes: list[Answer]) -> list[Answer]:
+            by_leaf = [
+                [slope for (k, _), slope in zip(entries, slopes, strict=True) if k == i] for i in range(len(sizes))
+            ]
+            return [
+                jax.tree.map(functools.partial(_by_entries, size), *some)
+                for size, some in zip(sizes, by_leaf, strict=True)
+            ]
+
+    return moved(*point), directions_of(moved, point, tangents), gather
+
+
+def _by_entries(size: Array, *parts: Array) -> Array:
+    """Slopes along the entries of a leaf as those by the leaf, its axes behind."""
+    return jnp.stack(parts, axis=-1).reshape(*parts[0].shape, *size.shape) / size
+
+
+def _by_cells(size: Array, part: Array) -> Array:
+    """Slopes along a leaf as those by the leaf, with one of it for all cells or for each."""
+    return part / size.reshape((-1,) + (1,) * (part.ndim - 1))

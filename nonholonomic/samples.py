@@ -1,0 +1,144 @@
+"""Many runs sampled at given times, by the block of lanes that event times take.
+
+A step ends on every time that is asked for, so a sample has the accuracy of the method; between two samples the steps are
+even. The loop works in periods: a period records what each iteration reached, and its samples are then stored together.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .lockstep import REACHED_END, RUNNING, AbstractProblem, Block, attempt
+from .queue import Outcome, Progress, Queue
+from .runge_kutta import Lanes
+
+#: Iterations of a period: as many as have a record that fits the caches.
+PERIOD = 64
+
+#: By how much a step is stretched to end on a sample: the error stays below the tolerance, which a step is proposed to miss
+#: by `lockstep.SAFETY`.
+STRETCH = 1.08
+
+Samples = Float[Array, "cells times components"]
+
+
+class Record(NamedTuple):
+    """What the iterations of a period reached: the state, and the number of the sample that it is, if it is one."""
+
+    state: Float[Array, "iterations components lanes"]
+    sample: Int[Array, "iterations lanes"]
+
+
+class Sampled(NamedTuple):
+    """A march with samples on its way: `sample` is the number of the next one in every lane."""
+
+    progress: Progress
+    sample: Int[Array, " lanes"]
+    outcome: Outcome
+    samples: Samples
+
+
+def march_with_samples(
+    problem: AbstractProblem,
+    times: Float[Array, "times *cells"],
+    t1: Float[Array, "..."],
+    cells: Int[Array, ""],
+    rtol: Float[Array, ""],
+    atol: Float[Array, ""],
+    *,
+    solver: diffrax.AbstractERK,
+    lanes: int,
+    parts: int = 1,
+    one_kernel: bool = False,
+) -> tuple[Outcome, Samples]:
+    """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`, with samples on the way.
+
+    **Arguments:** as for `Queue.of`, and
+
+    - `times`: of the samples [s], increasing, within [0, t1]; (times,) for all cells or (times, cells).
+
+    **Returns:** the `Outcome`, its crossing times left out; and the states at the times, (cells, times, components), not a
+    number after the end of a run.
+    """
+    queue = Queue.of(problem, t1, cells, rtol, atol, solver=solver, lanes=lanes, parts=parts, one_kernel=one_kernel)
+    count, starts = times.shape[0], queue.fresh.state
+    of_cell = jnp.broadcast_to(times.reshape(count, -1), (count, queue.capacity)).T
+    first = jnp.sum(of_cell <= 0.0, axis=1)
+    own_times = times.ndim == 2
+
+    def period(run: Sampled) -> Sampled:
+        cell = jnp.minimum(run.progress.block.cell, queue.capacity - 1)
+        here = of_cell[cell].T if own_times else times
+        progress, sample, record = _recorded(queue, here, run.progress, run.sample)
+        outcome = queue.store(run.outcome, progress.block)
+        onward = queue.refill(progress)
+        fresh = onward.block.cell != progress.block.cell
+        begin = first[jnp.minimum(onward.block.cell, queue.capacity - 1)]
+        rows = jnp.moveaxis(record.state, 1, -1)
+        samples = run.samples.at[cell[None], record.sample].set(rows, mode="drop", unique_indices=True)
+        return Sampled(onward, jnp.where(fresh, begin, sample), outcome, samples)
+
+    progress = queue.start()
+    at_start = jnp.where(of_cell[..., None] <= 0.0, starts.T[:, None], jnp.nan)
+    run = Sampled(progress, first[jnp.minimum(progress.block.cell, queue.capacity - 1)], queue.empty(), at_start)
+    run = jax.lax.while_loop(lambda run: queue.unfinished(run.progress), period, run)
+    return queue.store(run.outcome, run.progress.block), run.samples
+
+
+def _recorded(
+    queue: Queue, times: Float[Array, "times ..."], progress: Progress, sample: Int[Array, " lanes"]
+) -> tuple[Progress, Int[Array, " lanes"], Record]:
+    """Let the block go on for a period, its samples recorded."""
+    here, control, atol = queue.here(progress.block)
+    count = times.shape[0]
+    horizon = jnp.broadcast_to(control.t1, progress.block.time.shape)
+
+    def going(carry: Any) -> Any:
+        block, _, _, iteration = carry
+        return queue.enough_active(block, progress.queued) & (iteration < PERIOD)
+
+    def step(carry: Any) -> Any:
+        block, sample, record, iteration = carry
+        next_time = _next_time(times, sample)
+        stop = jnp.where(sample < count, next_time, horizon)
+        block = block._replace(length=_even(block.length, stop - block.time, block.searching))
+        after = attempt(here, control._replace(t1=stop), atol, block)
+        reached = (block.status == RUNNING) & (after.status == REACHED_END)
+        is_sample = reached & (sample < count)
+        goes_on = reached & (after.time < horizon)
+        after = after._replace(status=jnp.where(goes_on, RUNNING, after.status))
+        made = Record(after.state, jnp.where(is_sample, sample, count))
+        record = jax.tree.map(functools.partial(_written, at=iteration), record, made)
+        return after, sample + is_sample, record, iteration + 1
+
+    def loop(start: tuple[Block, Int[Array, " lanes"]]) -> Any:
+        block, sample = start
+        empty = Record(
+            jnp.zeros((PERIOD, *block.state.shape), block.state.dtype), jnp.full((PERIOD, *sample.shape), count)
+        )
+        return jax.lax.while_loop(going, step, (block, sample, empty, jnp.zeros((), int)))
+
+    block, sample, record, iterations = queue.in_kernel(loop)((progress.block, sample))
+    return Progress(block, progress.queued, progress.iterations + iterations), sample, record
+
+
+def _next_time(times: Float[Array, "times ..."], sample: Int[Array, " lanes"]) -> Lanes:
+    """The time of the next sample in every lane."""
+    inside = jnp.minimum(sample, times.shape[0] - 1)
+    return times[inside] if times.ndim == 1 else jnp.take_along_axis(times, inside[None], axis=0)[0]
+
+
+def _even(length: Lanes, left: Lanes, searching: Array) -> Lanes:
+    """The length of a step, changed a little where one step or two then end on the next sample."""
+    reach = STRETCH * length
+    fitting = jnp.where(reach >= left, left, jnp.where(2.0 * reach >= left, 0.5 * left, length))
+    return jnp.where(searching, length, fitting)
+
+
+def _written(all: Array, one: Array, at: Int[Array, ""]) -> Array:
+    """A stack of arrays with one of them replaced, in place."""
+    return jax.lax.dynamic_update_index_in_dim(all, one, at, 0)

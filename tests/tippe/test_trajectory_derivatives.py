@@ -1,0 +1,113 @@
+"""Derivatives through `simulate`, and its end inside transformations: what a fit of a recording rests on."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close, rutstam_top
+
+import tippe
+
+TIMES = jnp.linspace(0.0, 0.5, 6)
+
+
+def axis_x(theta, solver=None, adjoint=None):
+    """A component of the axis that is at rest where theta = 0, half a second later."""
+    scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
+    run = tippe.simulate(scene, tippe.Launch(theta, 155.0), 0.5, times=TIMES, solver=solver, adjoint=adjoint)
+    return run.axis[-1, 0]
+
+
+def extrapolated(function, at, step):
+    """A central difference, extrapolated from two steps."""
+    one, two = ((function(at + h) - function(at - h)) / (2.0 * h) for h in (step, 2.0 * step))
+    return (4.0 * one - two) / 3.0
+
+
+def test_an_upright_start_has_its_tangent_integrated_too():
+    """At theta = 0 the state is a steady one, and steps judged by it alone outgrow what the tangent can bear."""
+
+    def outside(theta):
+        # Negative angles are the same axis on the other side.
+        return np.sign(theta) * float(axis_x(abs(theta), adjoint=None))
+
+    expected = extrapolated(outside, 0.0, 1e-3)
+    for transform in (jax.grad, jax.jacfwd):
+        assert_close(transform(axis_x)(0.0), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("adjoint", [diffrax.RecursiveCheckpointAdjoint(), diffrax.ForwardMode()])
+def test_an_upright_start_by_diffrax(adjoint):
+    transform = jax.jacfwd if isinstance(adjoint, diffrax.ForwardMode) else jax.grad
+    assert_close(transform(lambda theta: axis_x(theta, adjoint=adjoint))(0.0), jax.grad(axis_x)(0.0), rtol=1e-6)
+
+
+def test_an_upright_start_by_another_solver():
+    assert_close(jax.grad(lambda theta: axis_x(theta, solver=diffrax.Tsit5()))(0.0), jax.grad(axis_x)(0.0), rtol=1e-6)
+
+
+def lost(spin, **options):
+    scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
+    times = jnp.linspace(0.0, 6.0, 301)
+    return tippe.simulate(scene, tippe.Launch(0.1, spin), 6.0, times=times, **options)
+
+
+def test_a_transformed_run_ends_where_the_contact_is_lost():
+    run, whole = jax.jit(lost)(200.0), lost(200.0)
+    assert whole.status == "contact_lost"
+    assert run.status == 1
+    assert_close(run.end_time, whole.end_time, rtol=5e-8)
+    inside = np.isfinite(run.normal_force)
+    assert inside.sum() == len(whole.t)
+    assert np.all(run.normal_force[inside] > 0.0)
+    assert_close(run.theta[inside], whole.theta, rtol=1e-6)
+
+
+def test_the_loss_of_contact_moves_with_the_launch():
+    """By the implicit function theorem at the guard, against a difference of runs outside of transformations."""
+    expected = extrapolated(lambda spin: float(lost(spin).end_time), 200.0, 0.02)
+    assert_close(jax.grad(lambda spin: lost(spin).end_time)(200.0), expected, rtol=1e-5)
+
+
+def test_a_loss_that_leaves_out_what_is_not_a_number_has_a_gradient():
+    """Samples after the end are not numbers; a loss that passes them over must not meet them on the way back."""
+
+    def loss(spin):
+        theta = lost(spin).theta
+        return jnp.sum(jnp.where(jnp.isnan(theta), 0.0, (theta - 1.0) ** 2))
+
+    assert jnp.isfinite(jax.grad(loss)(200.0))
+
+
+def test_diffrax_ends_the_run_there_too():
+    run = jax.jit(lambda spin: lost(spin, solver=diffrax.Tsit5(), tolerance=1e-8))(200.0)
+    assert_close(run.end_time, lost(200.0).end_time, rtol=1e-6)
+
+
+def test_every_number_of_the_launch_and_some_of_the_scene():
+    """Reverse mode by many numbers at once, in groups, against differences."""
+    scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Viscous(0.3))
+
+    @jax.jit
+    def end(numbers):
+        theta, spin, eta, mu, offset = numbers
+        body = tippe.Top(scene.body.mass, scene.body.radius, offset, scene.body.I1, scene.body.I3)
+        changed = tippe.Scene(body, scene.surface, tippe.Viscous(mu))
+        launch = tippe.Launch(theta, spin, eta)
+        run = tippe.simulate(changed, launch, 0.5, times=TIMES, tolerance=1e-11)
+        return run.theta[3] + 10.0 * run.position[-1, 1] + run.spin_angle[2]
+
+    at = jnp.array([0.2, 110.0, 0.3, 0.25, 0.005])
+    gradient = jax.grad(end)(at)
+    for k, size in enumerate(np.asarray(at)):
+        expected = extrapolated(lambda value, k=k: float(end(at.at[k].set(value))), size, 3e-4 * size)
+        assert_close(gradient[k], expected, rtol=2e-6)
+
+
+def test_later_samples_are_further_along():
+    def angle(stretch):
+        scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
+        return tippe.simulate(scene, tippe.Launch(0.1, 155.0), 0.6, times=TIMES * stretch).theta[-1]
+
+    assert_close(jax.grad(angle)(1.0), extrapolated(lambda s: float(angle(jnp.asarray(s))), 1.0, 1e-3), rtol=1e-5)

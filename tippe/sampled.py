@@ -1,0 +1,249 @@
+"""Runs sampled at given times, as functions for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nonholonomic.differentiable import AbstractQuestion, ask, directions_by
+from nonholonomic.ensemble import lanes_for
+from nonholonomic.integrate import sample
+from nonholonomic.lockstep import FAILED, GUARD_LOST, AbstractProblem, event_time
+from nonholonomic.lyapunov import probed
+from nonholonomic.samples import march_with_samples
+from nonholonomic.validation import as_number
+from nonholonomic.variation import VariationalProblem, in_groups, lanes_along
+
+from .dynamics import Dynamics, stacked
+from .inversion import ABSOLUTE
+from .launch import Launch
+from .scene import Scene
+from .stick_slip.motion import Kind, StickSlip
+
+
+class Run(AbstractProblem):
+    """Launches with their cyclic coordinates: the state, the arena's path, the spin angle and the work of friction."""
+
+    dynamics: Dynamics | StickSlip | Kind
+    axial: Float[Array, "..."]
+    state: Float[Array, "components ..."]
+    path: Float[Array, "components ..."]
+    scales: Float[Array, "components ..."]
+
+    @classmethod
+    def of(cls, scene: Scene, launch: Launch, cells: int | None = None) -> "Run":
+        """The run of one launch, or the runs of some cells, whose numbers are scalars or one per cell."""
+        radius, weight = scene.body.radius, scene.body.mass * scene.gravity
+        path = jnp.stack(scene.surface.path(launch.eta))
+        extra = jnp.stack(jnp.broadcast_arrays(*([radius] * len(path)), jnp.ones(()), weight * radius))
+        parts = (scene.state(launch), path, scene.scales(launch), extra)
+        if cells is not None:
+            parts = tuple(jnp.broadcast_to(part.reshape(len(part), -1), (len(part), cells)) for part in parts)
+        return cls(scene.dynamics, scene.body.I3, parts[0], parts[1], jnp.concatenate(parts[2:]))
+
+    def start(self) -> tuple[Float[Array, "components ..."], Float[Array, "components ..."]]:
+        nothing = jnp.zeros((2, *self.state.shape[1:]))
+        return jnp.concatenate([self.state, self.path, nothing]), self.scales
+
+    def field(self, time: Float[Array, "..."], state: Float[Array, "components ..."]) -> Any:
+        lean, path = state[: len(self.state)], tuple(state[len(self.state) : -2])
+        motion = self.dynamics.motion(lean)
+        path_rate = self.dynamics.parallel.path_rate(path, motion.velocity, motion.turning)
+        return stacked((*motion.rate, *path_rate, motion.spin_momentum / self.axial, motion.friction_power), state)
+
+    def crossing(self, state: Float[Array, "components ..."]) -> None:
+        return None
+
+    def guard(self, time: Float[Array, "..."], state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        return self.dynamics.contact_margin(state[: len(self.state)])
+
+
+class Found(NamedTuple):
+    """What is found of a run, all floats: `states` not a number after the end, `lost` and `failed` 1 where they hold."""
+
+    states: Float[Array, "*cells times components"]
+    end_time: Float[Array, "*cells"]
+    lost: Float[Array, "*cells"]
+    failed: Float[Array, "*cells"]
+    steps: Float[Array, "*cells"]
+    rejected: Float[Array, "*cells"]
+
+
+def sampled(
+    scene: Scene,
+    launch: Launch,
+    times: Float[Array, " times"],
+    t1: Float[Array, ""],
+    tolerance: float,
+    solver: diffrax.AbstractSolver,
+) -> Found:
+    """Run one launch inside a transformation and sample it.
+
+    An explicit Runge-Kutta solver takes the block of lanes, of which a batch fills as many as it has runs; others run by
+    Diffrax. In both the variations of what is differentiated by take part in step control.
+
+    **Arguments:** as for `simulate`.
+    """
+    numbers, rest = eqx.partition((scene, launch), eqx.is_array)
+    leaves, structure = jax.tree.flatten(numbers)
+    kind = BlockSampling if isinstance(solver, diffrax.AbstractERK) else SingleSampling
+    question = kind(len(leaves), structure, rest, solver)
+    found = ask(question, *leaves, jax.lax.stop_gradient(times), as_number(t1), as_number(tolerance))
+    # Later by a moment, the sample is further by as much along the field.
+    run = Run.of(scene, launch)
+    rates = jax.lax.stop_gradient(run.field(times, found.states.T).T)
+    later = (times - jax.lax.stop_gradient(times))[:, None]
+    return found._replace(states=found.states + jnp.where(jnp.isfinite(rates), rates * later, 0.0))
+
+
+def sampled_by_diffrax(
+    run: Run,
+    times: Float[Array, " times"],
+    t1: Float[Array, ""],
+    tolerance: float,
+    solver: diffrax.AbstractSolver,
+    adjoint: diffrax.AbstractAdjoint,
+) -> Found:
+    """Run one launch and let Diffrax differentiate its steps, which a probe keeps short enough for tangents."""
+    size = len(run.scales)
+    path = sample(probed(run), times, t1, solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance, adjoint=adjoint)
+    failed = (path.end_time < t1) & ~path.lost
+    floats = [part.astype(float) for part in (path.lost, failed, path.accepted, path.rejected)]
+    return Found(path.states[:size].T, path.end_time, *floats)
+
+
+class BlockSampling(AbstractQuestion):
+    """Samples by the block of lanes; the leaves are those of scene and launch, the times, the horizon, the tolerance."""
+
+    movable: int
+    # JAX's PyTreeDef, which type checkers take for a variable.
+    structure: Any = eqx.field(static=True)
+    rest: Any
+    solver: diffrax.AbstractERK
+
+    def run(self, leaves: tuple[Array, ...], cells: int) -> Run:
+        """The runs of some cells."""
+        numbers = jax.tree.unflatten(self.structure, leaves)
+        return Run.of(*eqx.combine(numbers, self.rest), cells)
+
+    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Found:
+        problem = self.run(leaves[: self.movable], cells)
+        return _march(VariationalProblem(problem, (), False), leaves[self.movable :], self.solver, lanes_for(cells))[0]
+
+    def with_slopes(
+        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[Found, list[Found]]:
+        problem, directions, gather = directions_by(self.run, active, leaves[: self.movable], cells)
+
+        def run(some: tuple[Any, ...]) -> tuple[Found, list[Found]]:
+            lanes = lanes_along(cells, len(some))
+            return _march(
+                VariationalProblem(problem, some, False), leaves[self.movable :], self.solver, lanes, not again
+            )
+
+        found, slopes = in_groups(run, directions)
+        return found, gather(slopes)
+
+
+@eqx.filter_jit
+def _march(
+    varied: VariationalProblem,
+    given: tuple[Array, Array, Array],
+    solver: diffrax.AbstractERK,
+    lanes: int,
+    one_kernel: bool = True,
+) -> tuple[Found, list[Found]]:
+    """What is found of the cells, and its slope along each of the directions."""
+    times, t1, tolerance = given
+    cells = varied.problem.start()[0].shape[1]
+    # One tolerance serves a block: the smallest of a batch.
+    tolerance, parts = jnp.min(tolerance), 1 + len(varied.directions)
+    outcome, samples = march_with_samples(
+        varied,
+        times if times.ndim == 1 else times.T,
+        t1,
+        jnp.asarray(cells),
+        tolerance,
+        ABSOLUTE * tolerance,
+        solver=solver,
+        lanes=lanes,
+        parts=parts,
+        one_kernel=one_kernel,
+    )
+    states, *variations = jnp.split(samples, parts, axis=-1)
+    end, *end_variations = varied.parts(outcome.state)
+    lost = outcome.status == GUARD_LOST
+
+    def end_time(problem: Run, state: Array) -> Array:
+        return event_time(problem, lambda at: problem.guard(outcome.end_time, at), outcome.end_time, state)
+
+    def slope(direction: Any, variation: Array, at_end: Array) -> Found:
+        later = eqx.filter_jvp(end_time, (varied.problem, end), (direction, at_end))[1]
+        by_end = jnp.where(lost & (outcome.end_time > 0.0), later, 0.0)
+        return Found(jnp.where(jnp.isnan(states), 0.0, variation), by_end, None, None, None, None)
+
+    floats = [
+        part.astype(float)
+        for part in (lost, outcome.status == FAILED, outcome.steps - outcome.rejected, outcome.rejected)
+    ]
+    slopes = [slope(*one) for one in zip(varied.directions, variations, end_variations, strict=True)]
+    return Found(states, outcome.end_time, *floats), slopes
+
+
+class SingleSampling(AbstractQuestion):
+    """Samples by Diffrax, with any of its solvers; the leaves are those of `BlockSampling`."""
+
+    in_blocks = False
+
+    movable: int
+    structure: Any = eqx.field(static=True)
+    rest: Any
+    solver: diffrax.AbstractSolver
+
+    def run(self, leaves: tuple[Array, ...], cells: None) -> Run:
+        """The only run there is."""
+        numbers = jax.tree.unflatten(self.structure, leaves)
+        return Run.of(*eqx.combine(numbers, self.rest))
+
+    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Found:
+        problem = self.run(leaves[: self.movable], None)
+        found, _ = _follow(VariationalProblem(problem, (), False), leaves[self.movable :], self.solver)
+        return jax.tree.map(lambda part: part[None], found)
+
+    def with_slopes(
+        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[Found, list[Found]]:
+        problem, directions, gather = directions_by(self.run, active, leaves[: self.movable], None)
+
+        def run(some: tuple[Any, ...]) -> tuple[Found, list[Found]]:
+            return _follow(VariationalProblem(problem, some, False), leaves[self.movable :], self.solver)
+
+        found, slopes = in_groups(run, directions)
+        return jax.tree.map(lambda part: part[None], (found, gather(slopes)))
+
+
+def _follow(
+    varied: VariationalProblem, given: tuple[Array, Array, Array], solver: diffrax.AbstractSolver
+) -> tuple[Found, list[Found]]:
+    """What is found of a run, and its slope along each of the directions."""
+    times, t1, tolerance = given
+    path = sample(varied, times, t1, solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
+    states, *variations = varied.parts(path.states)
+    end, *end_variations = varied.parts(path.end_state)
+
+    def end_time(problem: Run, state: Array) -> Array:
+        return event_time(problem, lambda at: problem.guard(path.end_time, at), path.end_time, state)
+
+    def slope(direction: Any, variation: Array, at_end: Array) -> Found:
+        later = eqx.filter_jvp(end_time, (varied.problem, end), (direction, at_end))[1]
+        by_end = jnp.where(path.lost & (path.end_time > 0.0), later, 0.0)
+        return Found(jnp.where(jnp.isnan(states), 0.0, variation).T, by_end, None, None, None, None)
+
+    slopes = [slope(*one) for one in zip(varied.directions, variations, end_variations, strict=True)]
+    floats = [
+        part.astype(float) for part in (path.lost, (path.end_time < t1) & ~path.lost, path.accepted, path.rejected)
+    ]
+    return Found(states.T, path.end_time, *floats), slopes
