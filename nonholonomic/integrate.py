@@ -15,6 +15,9 @@ from .lockstep import AbstractProblem
 #: Steps that are integrated and stored at once; a longer run is made of several such pieces.
 PIECE = 2048
 
+#: Steps, rejected ones included, after which a run has failed. Their dense output takes a gigabyte and more.
+MOST_STEPS = 1_000_000
+
 #: Places in every step at which the guard is looked at, besides its ends.
 LOOKS = np.arange(1, 8) / 8.0
 
@@ -116,6 +119,7 @@ def follow(
     atol: float,
     first: float | None = None,
     t0: float = 0.0,
+    max_steps: int = MOST_STEPS,
 ) -> Path:
     """Integrate one run step by step until `t1` or until the model ceases to hold.
 
@@ -127,6 +131,7 @@ def follow(
     - `rtol`, `atol`: relative tolerance, and absolute tolerance in units of the problem's magnitudes.
     - `first`: length of the first step [s], by default selected as Diffrax does.
     - `t0`: when the run starts [s].
+    - `max_steps`: a run that is still under way after so many steps, rejected ones included, has failed.
 
     **Returns:** a `Path` with the accepted steps; it ends where the guard reaches zero, found on the dense output.
     """
@@ -163,6 +168,7 @@ def follow(
             length = jnp.asarray(ts[-1] - (ts[-2] if good > 1 else float(time)))
             time, state = jnp.asarray(ts[good - 1]), jnp.asarray(ys[:, good - 1])
         failed = failed or (not lost and bool(solution.result == diffrax.RESULTS.dt_min_reached))
+        failed = failed or (not lost and float(time) < t1 and accepted + rejected >= max_steps)
     return Path(np.concatenate(times), np.concatenate(states, axis=1), pieces, lost, failed, accepted, rejected)
 
 
@@ -193,8 +199,8 @@ def sample(
     rtol: float,
     atol: float,
     adjoint: diffrax.AbstractAdjoint,
-    max_steps: int = 1_000_000,
-) -> tuple[Float[Array, "components times"], Float[Array, ""], Array, dict[str, Any]]:
+    max_steps: int = MOST_STEPS,
+) -> tuple[Float[Array, "components times"], Float[Array, ""], Float[Array, " components"], Array, dict[str, Any]]:
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 
     The guard is looked at where steps end, and the run ends before the step at whose end it is negative.
@@ -202,8 +208,8 @@ def sample(
     **Arguments:** as for `follow`; `times`: growing, in [0, t1]; `adjoint`: how Diffrax differentiates; `max_steps`: bound
     on the steps.
 
-    **Returns:** the states, not a number after the end of the run; the time at which the run ended; whether the guard ended it;
-    Diffrax's statistics.
+    **Returns:** the states, not a number after the end of the run; the time at which the run ended, and the state there;
+    whether the guard ended it; Diffrax's statistics.
     """
     state, scales = problem.start()
     watched = problem.guard(jnp.zeros_like(t1), state) is not None
@@ -223,8 +229,8 @@ def sample(
         throw=False,
     )
     lost = jnp.zeros((), bool) if solution.event_mask is None else solution.event_mask
-    (_, ends), (states, _) = saved(solution)
+    (_, ends), (states, lasts) = saved(solution)
     end = ends[0]
     # Not a number, rather than infinite: an angle of infinite components would look like an angle.
     states = jnp.where(times <= end, states.T, jnp.nan)
-    return states, end, lost, solution.stats
+    return states, end, lasts[0], lost, solution.stats

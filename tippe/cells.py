@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,13 +46,16 @@ class Kind(NamedTuple):
         return found | {name: Variable("1", np.int64) for name in ("steps", "rejected", *self.counts)}
 
 
-WORDS = ("inverted", "not_inverted", "contact_lost", "failed")
+# Compiled once for all blocks.
+_jams = eqx.filter_jit(lambda dynamics, state: dynamics.jams(state))
+
+WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed")
 SMOOTH = Kind(WORDS, (), None)
 STICK_SLIP = Kind((*WORDS, "unresolved"), ("sticks",), ride_with_sticking)
 HYBRID = Kind((*WORDS, "unresolved"), ("hops",), ride_with_flights)
 
 #: Which word a run's status is, where it has not inverted; `not_inverted` for all others.
-WORD_OF_STATUS = {GUARD_LOST: 2, FAILED: 3, UNRESOLVED: 4}
+WORD_OF_STATUS = {GUARD_LOST: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
 
 
 def kind_of(scene: Scene) -> Kind:
@@ -98,10 +102,15 @@ class Runs(NamedTuple):
         options = {"solver": self.solver, "lanes": lanes_for(size), "passes": self.last}
         return compiled_march(problem, horizon, jnp.asarray(count), rtol, ABSOLUTE * rtol, **options)[0]
 
+    def _jams(self, scene: Scene, ended: Outcome | Journey) -> Any:
+        """Which of the cells that the guard has ended have jammed; a hybrid run flies on where contact is lost."""
+        return self.kind == HYBRID or np.asarray(_jams(scene.dynamics, jnp.asarray(ended.state)))
+
     def _named(self, scene: Scene, problem: InversionProblem, ended: Outcome | Journey) -> dict[str, Any]:
         inverted = is_inverted(ended, problem, self.last)
         others = [np.asarray(ended.status == status) for status in WORD_OF_STATUS]
         code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
+        code = np.where((code == WORDS.index("contact_lost")) & self._jams(scene, ended), WORDS.index("jammed"), code)
         return {
             "time": np.where(inverted, ended.crossing_time, np.inf),
             "status": code.astype(np.int8),

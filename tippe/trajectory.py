@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from nonholonomic.integrate import follow, sample
 from nonholonomic.lockstep import AbstractProblem
@@ -75,9 +75,11 @@ class Trajectory(eqx.Module):
     Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame
     (t1, t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre.
 
-    `status` is "reached t1", "contact_lost" or "failed" (a code 0, 1, 2 inside a transformation); the run ends at
-    `end_time`. `stats` holds accepted and rejected steps, the greatest drift of |e| and the greatest energy residual
-    |E - E(0) - work of friction| [J]; with `SetValuedCoulomb` also `sticks`, how often a slip has turned into rolling.
+    `status` is "reached t1", "contact_lost", "failed" or "jammed" (a code 0, 1, 2, 3 inside a transformation); the run ends
+    at `end_time`. It is jammed where the equation for the normal force ceases to have a solution, because friction pulls the
+    top into the arena as hard as the normal force pushes it out: strong friction, a large offset and a slip along the axis
+    do that. `stats` holds accepted and rejected steps, the greatest drift of |e| and the greatest energy residual |E - E(0)
+    - work of friction| [J]; with `SetValuedCoulomb` also `sticks`, how often a slip has turned into rolling.
     """
 
     t: Float[Array, " times"]
@@ -176,7 +178,7 @@ class Trajectory(eqx.Module):
         if is_traced(self.t) or self.t.ndim > 1:
             return f"Trajectory of {self.t.shape} times"
         end = f"{float(self.end_time):.6g} s"
-        ending = {"reached t1": f"ran to {end}", "contact_lost": f"lost contact at {end}"}
+        ending = {"reached t1": f"ran to {end}", "contact_lost": f"lost contact at {end}", "jammed": f"jammed at {end}"}
         lines = [
             f"Trajectory of {len(self.t)} times, {ending.get(self.status, f'failed at {end}')}",
             f"  theta: {float(self.theta[0]):.6g} to {float(self.theta[-1]):.6g} rad",
@@ -191,7 +193,7 @@ class Trajectory(eqx.Module):
         return str(self)
 
 
-STATUS = ("reached t1", "contact_lost", "failed")
+STATUS = ("reached t1", "contact_lost", "failed", "jammed")
 
 
 def simulate(
@@ -203,7 +205,7 @@ def simulate(
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> Trajectory | HybridTrajectory:
-    """Run one launch until `t1` or until contact is lost; through flights and impacts if the scene's contact is "hybrid".
+    """Run one launch until `t1`, or until contact is lost or jams; through flights and impacts if its contact is "hybrid".
 
     Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run are then not a
     number, and `status` and `end_time` say so.
@@ -269,10 +271,10 @@ def _traced(
     if times is None:
         raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
     adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-    states, end, lost, stats = sample(
+    states, end, last, lost, stats = sample(
         run, times, as_number(t1), solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance, adjoint=adjoint
     )
-    status = jnp.where(lost, 1, jnp.where(end < t1, 2, 0))
+    status = jnp.where(lost, _lost(run, last), jnp.where(end < t1, 2, 0))
     return Trajectory(times, scene, *_parts(run, states), status, end, stats, None)
 
 
@@ -282,9 +284,14 @@ def _parts(run: Run, states: Float[Array, "components times"]) -> tuple[Any, Any
     return states[:lean], states[lean:-2], states[-2], states[-1]
 
 
+def _lost(run: Run, state: Float[Array, " components"]) -> Int[Array, ""]:
+    """The code in `STATUS` of a run that the guard has ended in some state."""
+    return jnp.where(run.dynamics.jams(state[: len(run.state)]), 3, 1)
+
+
 def _as_trajectory(scene: Scene, run: Run, path: Any) -> Trajectory:
-    status = STATUS[1 if path.guard_lost else 2 if path.failed else 0]
     lean, cyclic, spin_angle, work = _parts(run, jnp.asarray(path.states))
+    status = STATUS[int(_lost(run, jnp.asarray(path.states[:, -1]))) if path.guard_lost else 2 if path.failed else 0]
     energy = scene.energy(lean)
     stats = {
         "accepted": path.accepted,
