@@ -102,15 +102,15 @@ class Runs(NamedTuple):
         options = {"solver": self.solver, "lanes": lanes_for(size), "passes": self.last}
         return compiled_march(problem, horizon, jnp.asarray(count), rtol, ABSOLUTE * rtol, **options)[0]
 
-    def _jams(self, scene: Scene, ended: Outcome | Journey) -> Any:
-        """Which of the cells that the guard has ended have jammed; a hybrid run flies on where contact is lost."""
-        return self.kind == HYBRID or np.asarray(_jams(scene.dynamics, jnp.asarray(ended.state)))
-
     def _named(self, scene: Scene, problem: InversionProblem, ended: Outcome | Journey) -> dict[str, Any]:
         inverted = is_inverted(ended, problem, self.last)
         others = [np.asarray(ended.status == status) for status in WORD_OF_STATUS]
         code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
-        code = np.where((code == WORDS.index("contact_lost")) & self._jams(scene, ended), WORDS.index("jammed"), code)
+        lost = code == WORDS.index("contact_lost")
+        if lost.any():
+            # A hybrid run flies on where contact is lost.
+            jams = self.kind is HYBRID or np.asarray(_jams(scene.dynamics, jnp.asarray(ended.state)))
+            code = np.where(lost & jams, WORDS.index("jammed"), code)
         return {
             "time": np.where(inverted, ended.crossing_time, np.inf),
             "status": code.astype(np.int8),

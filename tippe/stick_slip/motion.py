@@ -175,6 +175,10 @@ class Kind(eqx.Module):
             return self.both.grip_left(state)
         return jnp.minimum(self.both.slipping.contact_margin(state), self.both.slip_left(state))
 
+    def jams(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
+        """Whether a contact whose margin is zero has jammed; a rolling one does not."""
+        return self.both.jams(state) & (not self.rolls)
+
     def ended(
         self, state: Float[Array, "components ..."]
     ) -> tuple[Float[Array, "components ..."], Bool[Array, "..."], Bool[Array, "..."]]:
