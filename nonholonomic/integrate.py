@@ -15,6 +15,9 @@ from .lockstep import AbstractProblem
 #: Steps that are integrated and stored at once; a longer run is made of several such pieces.
 PIECE = 2048
 
+#: Steps, rejected ones included, after which a run has failed. Their dense output takes a gigabyte and more.
+MOST_STEPS = 1_000_000
+
 #: Places in every step at which the guard is looked at, besides its ends.
 LOOKS = np.arange(1, 8) / 8.0
 
@@ -116,6 +119,7 @@ def follow(
     atol: float,
     first: float | None = None,
     t0: float = 0.0,
+    max_steps: int = MOST_STEPS,
 ) -> Path:
     """Integrate one run step by step until `t1` or until the model ceases to hold.
 
@@ -127,6 +131,7 @@ def follow(
     - `rtol`, `atol`: relative tolerance, and absolute tolerance in units of the problem's magnitudes.
     - `first`: length of the first step [s], by default selected as Diffrax does.
     - `t0`: when the run starts [s].
+    - `max_steps`: a run that is still under way after so many steps, rejected ones included, has failed.
 
     **Returns:** a `Path` with the accepted steps; it ends where the guard reaches zero, found on the dense output.
     """
@@ -163,6 +168,7 @@ def follow(
             length = jnp.asarray(ts[-1] - (ts[-2] if good > 1 else float(time)))
             time, state = jnp.asarray(ts[good - 1]), jnp.asarray(ys[:, good - 1])
         failed = failed or (not lost and bool(solution.result == diffrax.RESULTS.dt_min_reached))
+        failed = failed or (not lost and float(time) < t1 and accepted + rejected >= max_steps)
     return Path(np.concatenate(times), np.concatenate(states, axis=1), pieces, lost, failed, accepted, rejected)
 
 
@@ -204,7 +210,7 @@ def sample(
     rtol: float | Float[Array, ""],
     atol: float | Float[Array, ""],
     adjoint: diffrax.AbstractAdjoint | None = None,
-    max_steps: int = 1_000_000,
+    max_steps: int = MOST_STEPS,
 ) -> Sampled:
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 

@@ -70,12 +70,14 @@ class Growth(NamedTuple):
     """How a direction grew in every cell, in equal stretches of time.
 
     - `logarithm`: of the growth in each stretch.
-    - `status`: code of `lockstep.py`: how the run ended; `end_time` [s]: when; `steps`: accepted and rejected ones.
+    - `status`: code of `lockstep.py`: how the run ended; `end_time` [s] and `state`: when and where; `steps`: accepted and
+      rejected ones.
     """
 
     logarithm: Float[np.ndarray, "stretches cells"]
     status: Int[np.ndarray, " cells"]
     end_time: Float[np.ndarray, " cells"]
+    state: Float[np.ndarray, "components cells"]
     steps: Int[np.ndarray, " cells"]
 
 
@@ -106,7 +108,7 @@ def growth(
     rtol, atol, stretch = jnp.asarray(tolerance), jnp.asarray(absolute * tolerance), jnp.asarray(t1 / stretches)
     direction = directions / magnitudes
     logarithms, end_time, status = [], np.zeros(cells), np.full(cells, RUNNING)
-    steps = np.zeros(cells, int)
+    steps, state = np.zeros(cells, int), np.asarray(start)
     for _ in range(stretches):
         unit = direction / jnp.linalg.norm(direction, axis=0)
         varied = VariedProblem(problem, jnp.concatenate([start, unit, jnp.zeros((1, cells))]), magnitudes)
@@ -119,7 +121,8 @@ def growth(
         steps += np.where(alive, outcome.steps, 0)
         status = np.where(alive, outcome.status, status)
         start, direction = outcome.state[:size], outcome.state[size:-1]
-    return Growth(np.stack(logarithms), status, end_time, steps)
+        state = np.where(alive, start, state)
+    return Growth(np.stack(logarithms), status, end_time, state, steps)
 
 
 def exponent_of(

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from .table import Table
 
 #: One colour each for what is not a number in a map: words of the status other than the first.
-GREYS = ("0.85", "0.6", "0.3")
+GREYS = ("0.85", "0.7", "0.55", "0.4", "0.25")
 
 
 def draw_table(table: "Table", variable: str = "time") -> Any:

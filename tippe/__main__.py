@@ -135,7 +135,7 @@ def columns(options: argparse.Namespace, found: dict[tuple[str, str], Table]) ->
 def _entry(seconds: float, word: str) -> str:
     if word == "inverted":
         return f"{seconds:.4f}"
-    return {"not_inverted": "-", "contact_lost": "lost contact", "failed": "failed"}[word]
+    return {"not_inverted": "-", "contact_lost": "lost contact", "failed": "failed", "jammed": "jammed"}[word]
 
 
 def report(options: argparse.Namespace, found: dict[tuple[str, str], Table]) -> str:

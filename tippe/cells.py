@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,13 +46,16 @@ class Kind(NamedTuple):
         return found | {name: Variable("1", np.int64) for name in ("steps", "rejected", *self.counts)}
 
 
-WORDS = ("inverted", "not_inverted", "contact_lost", "failed")
+# Compiled once for all blocks.
+_jams = eqx.filter_jit(lambda dynamics, state: dynamics.jams(state))
+
+WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed")
 SMOOTH = Kind(WORDS, (), None)
 STICK_SLIP = Kind((*WORDS, "unresolved"), ("sticks",), ride_with_sticking)
 HYBRID = Kind((*WORDS, "unresolved"), ("hops",), ride_with_flights)
 
 #: Which word a run's status is, where it has not inverted; `not_inverted` for all others.
-WORD_OF_STATUS = {GUARD_LOST: 2, FAILED: 3, UNRESOLVED: 4}
+WORD_OF_STATUS = {GUARD_LOST: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
 
 
 def kind_of(scene: Scene) -> Kind:
@@ -102,6 +106,11 @@ class Runs(NamedTuple):
         inverted = is_inverted(ended, problem, self.last)
         others = [np.asarray(ended.status == status) for status in WORD_OF_STATUS]
         code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
+        lost = code == WORDS.index("contact_lost")
+        if lost.any():
+            # A hybrid run flies on where contact is lost.
+            jams = self.kind is HYBRID or np.asarray(_jams(scene.dynamics, jnp.asarray(ended.state)))
+            code = np.where(lost & jams, WORDS.index("jammed"), code)
         return {
             "time": np.where(inverted, ended.crossing_time, np.inf),
             "status": code.astype(np.int8),

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from nonholonomic.surface import AbstractSurface, Tangent, carried
 from nonholonomic.vector import Component, Vector, add, cross, dot, multiply, scale, stored, subtract, sum_vectors
@@ -20,9 +20,18 @@ from .top import Top
 #: Where the axis' component along n stands in the state: cos(theta).
 COS_THETA = 4
 
+#: Stiffness (`Motion.stiffness`) at which a contact counts as jammed. N grows as its inverse while it falls to zero as the root
+#: of the time left, so a run ends too early by the square of this in units of 1e-4 s or so: by 1e-12 s, and 100 times as much
+#: with ten times the value, in `tests/physics/test_strong_friction.py`; theta errs by 5e-13 there, velocities by 1e-4.
+JAMMED = 1e-4
+
 
 class Motion(NamedTuple):
-    """What the equations of motion give for one state, every vector in the moving frame."""
+    """What the equations of motion give for one state, every vector in the moving frame.
+
+    `stiffness` is the factor of N in its equation, 1 + m a A in `tippe.md`, section 2: 1 without an offset, and zero where the
+    friction that each newton of N brings along pulls the top down as hard as that newton pushes it up.
+    """
 
     rate: tuple[Component, ...]
     normal_force: Float[Array, "..."]
@@ -31,6 +40,7 @@ class Motion(NamedTuple):
     velocity: Tangent
     turning: Tangent
     spin_momentum: Float[Array, "..."]
+    stiffness: Float[Array, "..."]
 
     @property
     def friction_power(self) -> Component:
@@ -116,7 +126,8 @@ class Dynamics(eqx.Module):
         centripetal = dot(V, o)
         pull = add(multiply(self.gravity, up[2]), centripetal)
         load = self.mass * pull - self.coupling * (L[0] * e_dot[1] - L[1] * e_dot[0])
-        N = load / (1.0 + self.coupling * (M1 * e[1] - M2 * e[0]))
+        stiffness = 1.0 + self.coupling * (M1 * e[1] - M2 * e[0])
+        N = load / stiffness
 
         thrust = N * self.per_mass
         u3 = multiply(-a, e_dot[2]) if o != (None, None) else None
@@ -125,15 +136,26 @@ class Dynamics(eqx.Module):
         e_dot = sum_vectors(e_dot, carried(e, o))
         L_dot = sum_vectors(scale(N, (M1, M2, M3)), carried(L, o))
         rate = (u1_dot, u2_dot, *e_dot, *L_dot, *self.parallel.place_rate(place, o))
-        return Motion(rate, N, friction, slip, V, o, spin_momentum)
+        return Motion(rate, N, friction, slip, V, o, spin_momentum, stiffness)
 
     def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """Rate of change of the state, (components, ...)."""
         return stacked(self.motion(state).rate, state)
 
     def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Normal force as a fraction of the weight, plus the round-off that a start with N = 0 exactly is allowed."""
-        return self.motion(state).normal_force / (self.mass * self.gravity) + 1e-12
+        """Positive while the contact persists and Coulomb's law has an answer.
+
+        It is the lesser of the normal force as a fraction of the weight, plus the round-off that a start with N = 0 exactly is
+        allowed, and of what the stiffness is above `JAMMED`.
+        """
+        motion = self.motion(state)
+        return jnp.minimum(motion.normal_force / (self.mass * self.gravity) + 1e-12, motion.stiffness - JAMMED)
+
+    def jams(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
+        """Whether a contact whose margin is zero has jammed; else it is lost."""
+        motion = self.motion(state)
+        # Where it is located the stiffness' excess is round-off of either sign, and N many times the weight.
+        return motion.stiffness - JAMMED <= jnp.maximum(motion.normal_force / (self.mass * self.gravity), 0.0)
 
 
 def stacked(rate: tuple[Component, ...], state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:

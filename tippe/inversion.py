@@ -30,7 +30,7 @@ ABSOLUTE = 0.1
 
 
 class InversionProblem(AbstractProblem):
-    """Launches that end when theta reaches an angle or the contact is lost."""
+    """Launches that end when theta reaches an angle or the contact is lost or jams."""
 
     dynamics: Dynamics | StickSlip | Kind
     cos_angle: Float[Array, "..."]
@@ -84,7 +84,7 @@ def inversion_time(
       above it until `t1`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
 
-    **Returns:** the time [s]; infinite if the top has not inverted by `t1` or has lost contact before.
+    **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before.
 
     **Raises:** `ValueError` for arguments outside these ranges, and for a scene with `contact="hybrid"` or
     `SetValuedCoulomb`: the derivative does not go through impacts, nor through stick and slip. `inversion_table` gives the

@@ -29,7 +29,7 @@ class LyapunovExponent(NamedTuple):
 
     - `exponent`: mean rate [1/s] of exponential parting in the second half of the run; not a number if the run ended early.
     - `error`: of the exponent [1/s]; an exponent below twice its error is no sign of chaos.
-    - `status`: "reached_end", "contact_lost" or "failed".
+    - `status`: "reached_end", "contact_lost", "jammed" or "failed".
     - `end_time`: when the run ended [s]; `steps`: accepted and rejected ones.
     - `times`: [s], (32,), and `running`: the mean rate of parting [1/s] from the start to each of them, (32, ...).
     """
@@ -83,12 +83,14 @@ def lyapunov_exponent(
         raise ValueError(f"scene and launch must hold scalars or one number per launch, not arrays of shapes {shapes}")
     shape = shapes.pop() if shapes else ()
     cells = int(np.prod(shape, dtype=int))
-    # No angle has a cosine of 2: nothing but the loss of contact ends a run before the horizon.
+    # No angle has a cosine of 2: nothing but a contact that is lost or jams ends a run before the horizon.
     problem = dataclasses.replace(InversionProblem.of(scene, launch, jnp.pi, cells), cos_angle=jnp.asarray(-2.0))
     found = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, tolerance, ABSOLUTE, solver)
     exponent, error = exponent_of(found.logarithm, float(t1))
     whole = found.status == REACHED_END
-    words = np.select([whole, found.status == GUARD_LOST], ["reached_end", "contact_lost"], "failed")
+    jams = np.asarray(problem.dynamics.jams(jnp.asarray(found.state)))
+    lost = np.where(jams, "jammed", "contact_lost")
+    words = np.select([whole, found.status == GUARD_LOST], ["reached_end", lost], "failed")
     times = t1 * np.arange(1, STRETCHES + 1) / STRETCHES
     passed = np.minimum(times[:, None], found.end_time)
     # A run that ends where it starts has not parted from anything.

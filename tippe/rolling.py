@@ -111,7 +111,7 @@ class RollingDynamics(eqx.Module):
         rate = (u1_dot, u2_dot, *e_dot, *L_dot, *self.parallel.place_rate(place, o))
         still = jnp.zeros_like(F[2])
         load = ContactLoad((F[0] / F[2], F[1] / F[2]))
-        return Motion(rate, F[2], load, Slip(still, still, (w[0], w[1], None)), V, o, dot(L, e)), F
+        return Motion(rate, F[2], load, Slip(still, still, (w[0], w[1], None)), V, o, dot(L, e), 1.0 + still), F
 
     def with_slip(self, state: Float[Array, "components ..."], slip: Slip) -> Float[Array, "components ..."]:
         """The state after the blow at the contact that gives the contact point the stated velocity along the arena.

@@ -6,7 +6,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.differentiable import AbstractQuestion, ask, directions_by
 from nonholonomic.ensemble import lanes_for
@@ -61,13 +61,24 @@ class Run(AbstractProblem):
         return self.dynamics.contact_margin(state[: len(self.state)])
 
 
+#: How a run can end, by the codes that stand for the words inside a transformation.
+STATUS = ("reached t1", "contact_lost", "failed", "jammed")
+
+
+def ended(
+    run: Run, state: Float[Array, "components ..."], guard_lost: Bool[Array, "..."], failed: Bool[Array, "..."]
+) -> Int[Array, "..."]:
+    """The code in `STATUS` of a run that ended in some state."""
+    lost = jnp.where(run.dynamics.jams(state[: len(run.state)]), STATUS.index("jammed"), STATUS.index("contact_lost"))
+    return jnp.where(guard_lost, lost, jnp.where(failed, STATUS.index("failed"), STATUS.index("reached t1")))
+
+
 class Found(NamedTuple):
-    """What is found of a run, all floats: `states` not a number after the end, `lost` and `failed` 1 where they hold."""
+    """What is found of a run, all floats: `states` not a number after the end, `status` a code in `STATUS`."""
 
     states: Float[Array, "*cells times components"]
     end_time: Float[Array, "*cells"]
-    lost: Float[Array, "*cells"]
-    failed: Float[Array, "*cells"]
+    status: Float[Array, "*cells"]
     steps: Float[Array, "*cells"]
     rejected: Float[Array, "*cells"]
 
@@ -110,8 +121,8 @@ def sampled_by_diffrax(
     """Run one launch and let Diffrax differentiate its steps, which a probe keeps short enough for tangents."""
     size = len(run.scales)
     path = sample(probed(run), times, t1, solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance, adjoint=adjoint)
-    failed = (path.end_time < t1) & ~path.lost
-    floats = [part.astype(float) for part in (path.lost, failed, path.accepted, path.rejected)]
+    status = ended(run, path.end_state[:size], path.lost, path.end_time < t1)
+    floats = [part.astype(float) for part in (status, path.accepted, path.rejected)]
     return Found(path.states[:size].T, path.end_time, *floats)
 
 
@@ -173,24 +184,41 @@ def _march(
         parts=parts,
         one_kernel=one_kernel,
     )
-    states, *variations = jnp.split(samples, parts, axis=-1)
-    end, *end_variations = varied.parts(outcome.state)
-    lost = outcome.status == GUARD_LOST
+    ends = Ends(outcome.end_time, outcome.state, outcome.status == GUARD_LOST, outcome.status == FAILED)
+    return _found(varied, samples, ends, outcome.steps - outcome.rejected, outcome.rejected)
 
-    def end_time(problem: Run, state: Array) -> Array:
-        return event_time(problem, lambda at: problem.guard(outcome.end_time, at), outcome.end_time, state)
+
+class Ends(NamedTuple):
+    """How runs ended: when, in what state, its variations behind it, and whether the guard was lost or the run failed."""
+
+    time: Float[Array, "*cells"]
+    state: Float[Array, "components *cells"]
+    guard_lost: Bool[Array, "*cells"]
+    failed: Bool[Array, "*cells"]
+
+
+def _found(
+    varied: VariationalProblem,
+    samples: Float[Array, "*cells times components"],
+    ends: Ends,
+    accepted: Int[Array, "*cells"],
+    rejected: Int[Array, "*cells"],
+) -> tuple[Found, list[Found]]:
+    """What is found, and its slope along each of the directions."""
+    states, *variations = jnp.split(samples, 1 + len(varied.directions), axis=-1)
+    end, *end_variations = varied.parts(ends.state)
+
+    def end_time(problem: Run, state: Float[Array, "components *cells"]) -> Float[Array, "*cells"]:
+        return event_time(problem, lambda at: problem.guard(ends.time, at), ends.time, state)
 
     def slope(direction: Any, variation: Array, at_end: Array) -> Found:
         later = eqx.filter_jvp(end_time, (varied.problem, end), (direction, at_end))[1]
-        by_end = jnp.where(lost & (outcome.end_time > 0.0), later, 0.0)
-        return Found(jnp.where(jnp.isnan(states), 0.0, variation), by_end, None, None, None, None)
+        moves = ends.guard_lost & (ends.time > 0.0)
+        return Found(jnp.where(jnp.isnan(states), 0.0, variation), jnp.where(moves, later, 0.0), None, None, None)
 
-    floats = [
-        part.astype(float)
-        for part in (lost, outcome.status == FAILED, outcome.steps - outcome.rejected, outcome.rejected)
-    ]
     slopes = [slope(*one) for one in zip(varied.directions, variations, end_variations, strict=True)]
-    return Found(states, outcome.end_time, *floats), slopes
+    status = ended(varied.problem, end, ends.guard_lost, ends.failed)
+    return Found(states, ends.time, *(part.astype(float) for part in (status, accepted, rejected))), slopes
 
 
 class SingleSampling(AbstractQuestion):
@@ -231,19 +259,5 @@ def _follow(
     """What is found of a run, and its slope along each of the directions."""
     times, t1, tolerance = given
     path = sample(varied, times, t1, solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
-    states, *variations = varied.parts(path.states)
-    end, *end_variations = varied.parts(path.end_state)
-
-    def end_time(problem: Run, state: Array) -> Array:
-        return event_time(problem, lambda at: problem.guard(path.end_time, at), path.end_time, state)
-
-    def slope(direction: Any, variation: Array, at_end: Array) -> Found:
-        later = eqx.filter_jvp(end_time, (varied.problem, end), (direction, at_end))[1]
-        by_end = jnp.where(path.lost & (path.end_time > 0.0), later, 0.0)
-        return Found(jnp.where(jnp.isnan(states), 0.0, variation).T, by_end, None, None, None, None)
-
-    slopes = [slope(*one) for one in zip(varied.directions, variations, end_variations, strict=True)]
-    floats = [
-        part.astype(float) for part in (path.lost, (path.end_time < t1) & ~path.lost, path.accepted, path.rejected)
-    ]
-    return Found(states.T, path.end_time, *floats), slopes
+    ends = Ends(path.end_time, path.end_state, path.lost, (path.end_time < t1) & ~path.lost)
+    return _found(varied, path.states.T, ends, path.accepted, path.rejected)

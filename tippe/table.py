@@ -68,14 +68,15 @@ def inversion_table(
       of a path will do where it fits one number only.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
-    "contact_lost", "failed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was lost, when
-    and at what angle), `steps` and `rejected`. With `errors` also `time_error` [s], infinite where the two runs disagree on
-    the status or failed, 0 where they agree that there is no time; `Table.digits("time")` shows the digits it leaves. With
-    `sensitivities` also the derivative of `time` by each number, `time_by_mu` for `"scene.friction.mu"`, 0 where the top did
-    not invert. A scene with `contact="hybrid"` flies on where contact is lost, and the angle counts in flight too; `hops` is
-    the number of flights until the run ended, and `status` may be "unresolved" (10 000 of them in a row, or sphere and stem
-    on the plane together with so much friction that the forces are not determined). With `SetValuedCoulomb`, `sticks` is how
-    often a slip has turned into rolling, and `status` may be "unresolved" (too many changes).
+    "contact_lost", "failed", "jammed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was lost
+    or jammed, when and at what angle), `steps` and `rejected`. With `errors` also `time_error` [s], infinite where the two
+    runs disagree on the status or failed, 0 where they agree that there is no time; `Table.digits("time")` shows the digits
+    it leaves. With `sensitivities` also the derivative of `time` by each number, `time_by_mu` for `"scene.friction.mu"`, 0
+    where the top did not invert. A scene with `contact="hybrid"` flies on where contact is lost, and the angle counts in
+    flight too; `hops` is the number of flights until the run ended, and `status` may be "unresolved" (10 000 of them in a
+    row, or sphere and stem on the plane together with so much friction that the forces are not determined). With
+    `SetValuedCoulomb`, `sticks` is how often a slip has turned into rolling, and `status` may be "unresolved" (too many
+    changes).
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
     """

@@ -17,7 +17,7 @@ from nonholonomic.vector import dot
 from .hybrid.trajectory import HybridTrajectory, simulate_hybrid
 from .inversion import ABSOLUTE, check_run
 from .launch import Launch
-from .sampled import Run, sampled, sampled_by_diffrax
+from .sampled import STATUS, Run, ended, sampled, sampled_by_diffrax
 from .scene import Scene
 from .stick_slip.path import follow_stick_slip
 
@@ -40,9 +40,11 @@ class Trajectory(eqx.Module):
     Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame
     (t1, t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre.
 
-    `status` is "reached t1", "contact_lost" or "failed" (a code 0, 1, 2 inside a transformation); the run ends at
-    `end_time`. `stats` holds accepted and rejected steps, the greatest drift of |e| and the greatest energy residual
-    |E - E(0) - work of friction| [J]; with `SetValuedCoulomb` also `sticks`, how often a slip has turned into rolling.
+    `status` is "reached t1", "contact_lost", "failed" or "jammed" (a code 0, 1, 2, 3 inside a transformation); the run ends
+    at `end_time`. It is jammed where the equation for the normal force ceases to have a solution, because friction pulls the
+    top into the arena as hard as the normal force pushes it out: strong friction, a large offset and a slip along the axis
+    do that. `stats` holds accepted and rejected steps, the greatest drift of |e| and the greatest energy residual |E - E(0)
+    - work of friction| [J]; with `SetValuedCoulomb` also `sticks`, how often a slip has turned into rolling.
     """
 
     t: Float[Array, " times"]
@@ -141,7 +143,7 @@ class Trajectory(eqx.Module):
         if is_traced(self.t) or self.t.ndim > 1:
             return f"Trajectory of {self.t.shape} times"
         end = f"{float(self.end_time):.6g} s"
-        ending = {"reached t1": f"ran to {end}", "contact_lost": f"lost contact at {end}"}
+        ending = {"reached t1": f"ran to {end}", "contact_lost": f"lost contact at {end}", "jammed": f"jammed at {end}"}
         lines = [
             f"Trajectory of {len(self.t)} times, {ending.get(self.status, f'failed at {end}')}",
             f"  theta: {float(self.theta[0]):.6g} to {float(self.theta[-1]):.6g} rad",
@@ -156,9 +158,6 @@ class Trajectory(eqx.Module):
         return str(self)
 
 
-STATUS = ("reached t1", "contact_lost", "failed")
-
-
 def simulate(
     scene: Scene,
     launch: Launch,
@@ -168,7 +167,7 @@ def simulate(
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> Trajectory | HybridTrajectory:
-    """Run one launch until `t1` or until contact is lost; through flights and impacts if the scene's contact is "hybrid".
+    """Run one launch until `t1`, or until contact is lost or jams; through flights and impacts if its contact is "hybrid".
 
     Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run are then not a
     number, and `status` and `end_time` say so. A batch, as `vmap` makes it, runs as the cells of one block, as tables do.
@@ -239,7 +238,7 @@ def _traced(
         found = sampled(scene, launch, times, t1, tolerance, solver)
     else:
         found = sampled_by_diffrax(run, times, as_number(t1), tolerance, solver, adjoint)
-    status = jnp.where(found.lost > 0.0, 1, jnp.where(found.failed > 0.0, 2, 0))
+    status = found.status.astype(int)
     stats = {"accepted": found.steps.astype(int), "rejected": found.rejected.astype(int)}
     return Trajectory(times, scene, *_parts(run, found.states.T), status, found.end_time, stats, None)
 
@@ -251,8 +250,10 @@ def _parts(run: Run, states: Float[Array, "components times"]) -> tuple[Any, Any
 
 
 def _as_trajectory(scene: Scene, run: Run, path: Any) -> Trajectory:
-    status = STATUS[1 if path.guard_lost else 2 if path.failed else 0]
     lean, cyclic, spin_angle, work = _parts(run, jnp.asarray(path.states))
+    status = STATUS[
+        int(ended(run, jnp.asarray(path.states[:, -1]), jnp.asarray(path.guard_lost), jnp.asarray(path.failed)))
+    ]
     energy = scene.energy(lean)
     stats = {
         "accepted": path.accepted,

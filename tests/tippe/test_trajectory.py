@@ -10,6 +10,8 @@ import pytest
 from conftest import assert_close, rutstam_top
 
 import tippe
+from nonholonomic.integrate import PIECE, follow
+from tippe.trajectory import Run
 
 LAUNCH = tippe.Launch(0.1, 155.0)
 
@@ -42,6 +44,17 @@ def test_more_steps_than_a_piece_holds(rutstam_scene):
     assert_close(run.jellett, run.jellett[0], rtol=1e-10)
     assert np.all(np.diff(run.t) > 0.0)
     assert_close(run.t[-1], 8.0)
+
+
+def test_a_run_of_too_many_steps_fails(rutstam_scene):
+    """It says so and ends where it is, rather than go on for ever."""
+    options = {"solver": diffrax.Dopri8(), "rtol": 3e-14, "atol": 3e-15}
+    path = follow(Run.of(rutstam_scene, LAUNCH), 1e6, max_steps=3000, **options)
+    assert path.failed
+    assert not path.guard_lost
+    assert 3000 <= path.accepted + path.rejected < 3000 + PIECE
+    assert np.isfinite(path.states).all()
+    assert 0.0 < path.times[-1] < 100.0
 
 
 @pytest.mark.parametrize(("solver", "tolerance"), [(diffrax.Tsit5(), 1e-9), (diffrax.Kvaerno5(), 1e-7)])

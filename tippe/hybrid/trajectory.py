@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from nonholonomic.integrate import Path, follow
-from nonholonomic.lockstep import FAILED, REACHED_END, RUNNING, AbstractProblem
+from nonholonomic.integrate import MOST_STEPS, Path, follow
+from nonholonomic.lockstep import FAILED, GUARD_LOST, REACHED_END, RUNNING, AbstractProblem
 from nonholonomic.phases import UNRESOLVED
 from nonholonomic.validation import require
 from nonholonomic.vector import dot, scale, sum_vectors
@@ -34,7 +34,7 @@ SHOWN = 0.4
 #: No angle has this cosine: a trajectory goes on through all of them.
 NEVER = -2.0
 
-STATUS = {REACHED_END: "reached t1", FAILED: "failed", UNRESOLVED: "unresolved"}
+STATUS = {REACHED_END: "reached t1", GUARD_LOST: "jammed", FAILED: "failed", UNRESOLVED: "unresolved"}
 
 #: Rows of what is shown of a run: state, velocity and height of the centre of mass, its place, spin angle, work.
 ROWS = 14
@@ -144,12 +144,13 @@ def _rows_in_flight(
 class HybridTrajectory(eqx.Module):
     """A run through contacts, flights and impacts; vectors are arrays (times, 3) in the fixed frame (x, y, z).
 
-    `status` is "reached t1", "failed" or "unresolved" (more than 10 000 contacts and flights, or sphere and stem on the
-    plane together with so much friction that the forces are not determined); the run ends at `end_time`. `contact` says at
-    each time which sphere touches: 0 the top's, 1 its stem's, 2 both, -1 none. At the time of an impact the values are those
-    before it. `hops` has a row for each flight until `end_time`, its begin and its end [s]; a table counts those before the
-    inversion. `work` is that of friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest
-    drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J].
+    `status` is "reached t1", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 contacts and flights,
+    or sphere and stem on the plane together with so much friction that the forces are not determined); the run ends at
+    `end_time`. `contact` says at each time which sphere touches: 0 the top's, 1 its stem's, 2 both, -1 none. At the time of
+    an impact the values are those before it. `hops` has a row for each flight until `end_time`, its begin and its end [s]; a
+    table counts those before the inversion. `work` is that of friction and of the impacts [J]. `stats` holds accepted and
+    rejected steps, the greatest drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts
+    [J].
     """
 
     t: Float[np.ndarray, " times"]
@@ -334,7 +335,8 @@ def _pieces(
         start = jnp.concatenate([jnp.asarray(state), jnp.asarray(rest)])
         dynamics = leaning(scene) if number == BOTH else standing_on(scene.dynamics, own)
         problem = Contact(dynamics, own, other, scene.body.I3, start, scales)
-        path = follow(problem, t1 - time, solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
+        most = MOST_STEPS - accepted - rejected
+        path = follow(problem, t1 - time, solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance, max_steps=most)
         pieces.append(Sojourn(time, path, scene, own, number))
         time, accepted, rejected = pieces[-1].end, accepted + path.accepted, rejected + path.rejected
         if path.failed or not path.guard_lost:
@@ -345,6 +347,8 @@ def _pieces(
             number, state = numbers[0], states[:, 0]
             continue
         air = _lost_contact(scene, jnp.asarray(number), jnp.asarray(state)[:, None])
+        if int(air.status[0]) != RUNNING:
+            return ended(int(air.status[0]))
         while bool(air.open[0]):
             if air.falls is None or not bool(air.falls[0]):
                 before = air

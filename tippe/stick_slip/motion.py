@@ -92,6 +92,10 @@ class StickSlip(eqx.Module):
         """Normal force as a fraction of the weight, plus the round-off that a start with N = 0 exactly is allowed."""
         return self.motion(state).normal_force / (self.slipping.mass * self.slipping.gravity) + 1e-12
 
+    def jams(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
+        """Whether a contact whose margin is zero has jammed, which only one that slips can do; else it is lost."""
+        return self.slipping.jams(state)
+
     def slip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Slip speed above that at which a slip is over, in units of sqrt(g R)."""
         slip = self.slipping.motion(state).slip
@@ -170,6 +174,10 @@ class Kind(eqx.Module):
         if self.rolls:
             return self.both.grip_left(state)
         return jnp.minimum(self.both.slipping.contact_margin(state), self.both.slip_left(state))
+
+    def jams(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
+        """Whether a contact whose margin is zero has jammed; a rolling one does not."""
+        return self.both.jams(state) & (not self.rolls)
 
     def ended(
         self, state: Float[Array, "components ..."]

@@ -1,0 +1,102 @@
+"""Routh's impact with friction in plain NumPy and SciPy, for any friction however strong, SI units.
+
+The velocity v of the contact point obeys dv/dp = W (f, 1), with p the normal impulse, W the response to impulses and f the
+friction of Coulomb's regularised law, f = -mu v_t / sqrt(v_t^2 + slip_speed^2). The motion is followed in p, which always
+grows, by an implicit method, because a contact that sticks or reverses is stiff: first through compression, however the normal
+velocity goes to and fro, then until it is `restitution` times that of the approach, or until the energy is what it was before.
+W comes from the rigid body's mass matrix. Nothing here is shared with the simulator.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+
+class Body(NamedTuple):
+    """A sphere with its centre of mass at `offset` from its centre."""
+
+    mass: float
+    radius: float
+    offset: float
+    I1: float
+    I3: float
+
+
+class Impact(NamedTuple):
+    """Velocity of the centre of mass and angular velocity after an impact, the normal impulse and the least stiffness.
+
+    The stiffness is the normal velocity gained per unit normal impulse, in units of that without friction: where it is negative
+    friction pulls the body down faster than the impulse pushes it up.
+    """
+
+    velocity: np.ndarray
+    turning: np.ndarray
+    normal_impulse: float
+    least_stiffness: float
+
+
+def skew(r):
+    """The matrix of w -> r x w."""
+    return np.array(((0.0, -r[2], r[1]), (r[2], 0.0, -r[0]), (-r[1], r[0], 0.0)))
+
+
+def strike(body, axis, velocity, turning, mu, slip_speed, restitution):
+    """The motion after an impact of the sphere on the plane z = 0, from the motion before.
+
+    `axis`, `velocity` (of the centre of mass [m/s]) and `turning` (angular velocity [rad/s]) are vectors (3,).
+    """
+    arm = body.offset * axis - body.radius * np.array((0.0, 0.0, 1.0))
+    inertia = body.I1 * np.eye(3) + (body.I3 - body.I1) * np.outer(axis, axis)
+    mass_matrix = np.block([[body.mass * np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), inertia]])
+    # The contact's velocity is J (velocity, turning); an impulse there changes both by M^-1 J^T.
+    jacobian = np.hstack([np.eye(3), -skew(arm)])
+    lever = np.linalg.solve(mass_matrix, jacobian.T)
+    response = jacobian @ lever
+    before = jacobian @ np.concatenate([velocity, turning])
+    speed = -before[2]
+    # In units of the speed of approach, and of the impulse that it would take without friction.
+    start, matrix, slow = before / speed, response / response[2, 2], slip_speed / speed
+
+    def force(v):
+        factor = -mu / np.sqrt(v[0] ** 2 + v[1] ** 2 + slow**2)
+        return np.array((factor * v[0], factor * v[1], 1.0))
+
+    def rate(_, impulse):
+        return force(start + matrix @ impulse)
+
+    def jacobian_of_rate(_, impulse):
+        v = start + matrix @ impulse
+        square = v[0] ** 2 + v[1] ** 2 + slow**2
+        slope = np.zeros((3, 3))
+        slope[:2, :2] = -mu / np.sqrt(square) * (np.eye(2) - np.outer(v[:2], v[:2]) / square)
+        return slope @ matrix
+
+    def compressed(_, impulse):
+        return (start + matrix @ impulse)[2]
+
+    def rebounds(_, impulse):
+        return (start + matrix @ impulse)[2] - restitution
+
+    def restores(_, impulse):
+        return impulse @ start + 0.5 * impulse @ matrix @ impulse
+
+    for event in (compressed, rebounds, restores):
+        event.terminal, event.direction = True, 1.0
+
+    def until(impulse, events):
+        span = (impulse[2], impulse[2] + 1e6)
+        options = {"method": "Radau", "rtol": 1e-10, "atol": 1e-13, "jac": jacobian_of_rate}
+        run = solve_ivp(rate, span, impulse, events=events, **options)
+        least = min(matrix[2] @ rate(0.0, one) for one in run.y.T)
+        ends = [one[0] for one in run.y_events if len(one)]
+        assert ends, "an impact without an end"
+        return ends[0], least
+
+    impulse, least = until(np.zeros(3), [compressed])
+    if restitution > 0.0:
+        impulse, later = until(impulse, [rebounds, restores])
+        least = min(least, later)
+    scale = speed / response[2, 2]
+    change = lever @ (scale * impulse)
+    return Impact(velocity + change[:3], turning + change[3:], scale * impulse[2], least)

@@ -1,0 +1,211 @@
+"""Friction so strong that rigid bodies jam: impacts always end, and sliding ends where Coulomb's law has no answer."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close
+from hop_reference import Case, contact, launch, rate, row
+from impact_reference import Body
+from impact_reference import strike as reference_strike
+from scipy.integrate import solve_ivp
+
+import tippe
+from tippe.dynamics import JAMMED
+from tippe.hybrid.free_body import FreeBody, angular_velocity, balls, energy, gap_rate, jellett
+from tippe.hybrid.impact import strike
+
+# Impacts
+
+COUNT = 1000
+
+
+class Falls(eqx.Module):
+    """Random tops, every number an array (COUNT,), about to strike the plane."""
+
+    body: tippe.Top
+    friction: tippe.Coulomb
+    axis: np.ndarray
+    velocity: np.ndarray
+    turning: np.ndarray
+    restitution: np.ndarray
+
+    @property
+    def free(self) -> FreeBody:
+        """The bodies before the impact."""
+        along = np.sum(self.turning * self.axis, axis=0)
+        momentum = self.body.I1 * self.turning + (self.body.I3 - self.body.I1) * along * self.axis
+        vectors = (tuple(jnp.asarray(vector)) for vector in (self.velocity, self.axis, momentum))
+        velocity, axis, momentum = vectors
+        return FreeBody(velocity, self.body.radius - self.body.offset * axis[2], axis, momentum)
+
+
+def random_falls(least_mu: float, most_mu: float) -> Falls:
+    """Offsets to 0.9 R, any axis, slow and fast falls, spins of 100 rad/s, restitutions from 0 to 1."""
+    random = np.random.default_rng(1)
+
+    def between(low, high, log=False):
+        return np.exp(random.uniform(np.log(low), np.log(high), COUNT)) if log else random.uniform(low, high, COUNT)
+
+    mass, radius = between(1e-3, 1.0, log=True), between(5e-3, 0.1, log=True)
+    I1 = mass * radius**2 * between(0.15, 0.6)
+    body = tippe.Top(mass, radius, radius * between(0.0, 0.9), I1, I1 * between(0.5, 1.8))
+    axis = random.normal(size=(3, COUNT))
+    axis /= np.linalg.norm(axis, axis=0)
+    across = random.normal(scale=0.3, size=(2, COUNT))
+    turning = random.normal(scale=30.0, size=(3, COUNT)) + random.normal(scale=100.0, size=COUNT) * axis
+    friction = tippe.Coulomb(between(least_mu, most_mu), between(0.005, 0.1, log=True))
+    velocity = np.stack([*across, -between(0.05, 3.0, log=True)])
+    return Falls(body, friction, axis, velocity, turning, random.choice([0.0, 0.3, 0.7, 1.0], COUNT))
+
+
+struck = eqx.filter_jit(
+    lambda falls: strike(falls.body, falls.friction, balls(falls.body)[0], falls.free, falls.restitution)
+)
+
+
+@pytest.mark.parametrize("mus", [(0.0, 1.0), (1.0, 5.0)])
+def test_every_impact_ends(mus):
+    """1000 at a time: none is given up; energy never grows, Jellett's quantity stays, nothing sinks into the plane."""
+    falls = random_falls(*mus)
+    after, fails = struck(falls)
+    assert not np.asarray(fails).any()
+    free, ball = falls.free, balls(falls.body)[0]
+    before = np.asarray(energy(falls.body, 9.81, free))
+    assert np.max(np.asarray(energy(falls.body, 9.81, after)) / before) < 1.0 + 1e-13
+    size = np.asarray(falls.body.radius) * np.linalg.norm(np.stack(free.momentum), axis=0)
+    assert np.max(np.abs(np.asarray(jellett(ball, after) - jellett(ball, free))) / size) < 1e-13
+    rebound, approach = np.asarray(gap_rate(falls.body, ball, after)), -np.asarray(gap_rate(falls.body, ball, free))
+    falling = approach > 0.0
+    assert np.sum(falling) > 800
+    assert np.all((rebound > -1e-13)[falling])
+    assert np.all((rebound <= falls.restitution * approach + 1e-13)[falling])
+    assert_close(rebound[~falling], -approach[~falling], atol=1e-13)
+
+
+def test_impacts_in_which_friction_pulls_down_first():
+    """Against an independent program: also where the sphere is driven into the plane faster before it is pushed out."""
+    falls = random_falls(1.0, 5.0)
+    after, _ = struck(falls)
+    velocity = np.stack(after.velocity)
+    turning = np.stack(angular_velocity(falls.body, after.axis, after.momentum))
+    falling = np.flatnonzero(-np.asarray(gap_rate(falls.body, balls(falls.body)[0], falls.free)) > 1e-3)
+    pulled = 0
+    for i in falling[:40]:
+        body = Body(*(float(getattr(falls.body, name)[i]) for name in Body._fields))
+        law = float(falls.friction.mu[i]), float(falls.friction.slip_speed[i])
+        motion = falls.axis[:, i], falls.velocity[:, i], falls.turning[:, i]
+        expected = reference_strike(body, *motion, *law, falls.restitution[i])
+        speed = np.linalg.norm(motion[1]) + body.radius * np.linalg.norm(motion[2])
+        # The greatest difference seen is 1e-11, of the reference's tolerance.
+        assert_close(velocity[:, i], expected.velocity, atol=1e-9 * speed)
+        assert_close(turning[:, i], expected.turning, atol=1e-9 * speed / body.radius)
+        pulled += expected.least_stiffness < 0.0
+    assert pulled >= 5
+
+
+def test_tables_go_through_such_impacts():
+    """Inversion times behind them, mu = 0.8, against the reference of whole runs."""
+    case = Case(0.02, 0.02, 0.016, 1.6e-6, 1.9e-6, 0.8, 1.5, 0.0, slip_speed=0.02, t1=0.4)
+    scene = tippe.Scene(
+        tippe.Top(0.02, 0.02, 0.016, 1.6e-6, 1.9e-6), friction=tippe.Coulomb(0.8, 0.02), contact="hybrid"
+    )
+    table = tippe.inversion_table(scene, theta=1.5, spin=[325.0, 350.0, 375.0], t1=0.4, tolerance=1e-11)
+    assert list(table.status) == ["not_inverted", "inverted", "inverted"]
+    for spin, time, hops in zip((350.0, 375.0), table.time[1:], table.hops[1:], strict=True):
+        expected = row(Case(**{**case.__dict__, "spin": spin}))
+        assert_close(time, float(expected["time"]), rtol=1e-10)
+        assert hops == expected["flights"]
+
+
+# Sliding
+
+NUMBERS = (0.02, 0.02, 0.012858357968757133, 1.5903702885037918e-06, 2.4e-06)
+MU, SLIP_SPEED, THETA, SPIN = 2.1886000603993936, 0.005, 1.144778063767833, 90.49142009506902
+
+
+def jamming_scene(**options) -> tippe.Scene:
+    """A top of great offset under strong friction."""
+    return tippe.Scene(tippe.Top(*NUMBERS), friction=tippe.Coulomb(MU, SLIP_SPEED), **options)
+
+
+def reference_jam(spin: float, slip_speed: float = SLIP_SPEED) -> tuple[float, float]:
+    """When and at what theta 1/N vanishes: by Newton's and Euler's equations, with the normal impulse as the clock.
+
+    In that clock nothing is singular: the time grows by 1/N, which passes through zero.
+    """
+    case = Case(*NUMBERS, MU, THETA, spin, slip_speed=slip_speed)
+    start, number = launch(case)
+    standing = [case.balls[number]]
+
+    def softness(_, y):
+        return 1.0 / contact(case, y[:-1], standing)[0][0]
+
+    def rates(_, y):
+        each = softness(0.0, y)
+        return np.append(rate(case, y[:-1], standing) * each, each)
+
+    softness.terminal, softness.direction = True, -1.0
+    y0 = np.append(start, 0.0)
+    run = solve_ivp(rates, (0.0, 1.0), y0, method="DOP853", rtol=1e-12, atol=1e-14, events=softness)
+    end = run.y_events[0][0]
+    return end[-1], np.arccos(end[8])
+
+
+def test_a_jam_is_where_the_normal_force_is_infinite():
+    """The table ends at once with its own word, where an independent program sees 1/N vanish."""
+    spins = [SPIN, 100.0]
+    table = tippe.inversion_table(jamming_scene(), theta=THETA, spin=spins, t1=0.1, tolerance=1e-11)
+    assert list(table.status) == ["jammed", "jammed"]
+    assert np.isinf(table.time).all()
+    assert (table.steps < 500).all()
+    for spin, time, theta in zip(spins, table.end_time, table.end_theta, strict=True):
+        exact = reference_jam(spin)
+        # Located at a stiffness of `JAMMED`, which is early by the square of it, in units of 1e-4 s.
+        assert_close(time, exact[0], rtol=1e-9)
+        assert_close(theta, exact[1], rtol=1e-9)
+        assert -1e-14 < exact[0] - time < 1e-3 * JAMMED**2
+
+
+def test_every_road_tells_of_the_jam():
+    """Single runs, hybrid ones, transformed ones, exponents and times of inversion."""
+    scene, launch_ = jamming_scene(), tippe.Launch(THETA, SPIN)
+    exact = reference_jam(SPIN)
+    run = tippe.simulate(scene, launch_, t1=0.1)
+    assert run.status == "jammed"
+    assert "jammed at 0.019781 s" in str(run)
+    assert_close(float(run.end_time), exact[0], rtol=1e-8)
+    assert_close(float(run.theta[-1]), exact[1], rtol=1e-8)
+    assert run.stats["energy_residual"] < 1e-9 * run.energy[0]
+
+    hybrid = jamming_scene(contact="hybrid")
+    run = tippe.simulate(hybrid, launch_, t1=0.1)
+    assert run.status == "jammed"
+    assert_close(run.end_time, exact[0], rtol=1e-8)
+    table = tippe.inversion_table(hybrid, theta=THETA, spin=[SPIN, 95.0, 100.0], t1=0.1)
+    assert list(table.status) == 3 * ["jammed"]
+    assert_close(table.end_time[0], exact[0], rtol=1e-8)
+
+    found = tippe.lyapunov_exponent(scene, launch_, 0.1)
+    assert found.status == "jammed"
+    assert_close(float(found.end_time), exact[0], rtol=1e-8)
+
+    def traced(spin):
+        run = tippe.simulate(scene, tippe.Launch(THETA, spin), 0.1, times=[0.0, 0.01, 0.05])
+        return run.status, run.theta
+
+    status, theta = jax.jit(traced)(SPIN)
+    assert status == 3
+    np.testing.assert_array_equal(np.isfinite(theta), [True, True, False])
+    time, slope = jax.value_and_grad(lambda spin: tippe.inversion_time(scene, tippe.Launch(THETA, spin), 0.1))(SPIN)
+    assert time == np.inf
+    assert slope == 0.0
+
+
+def test_exact_coulomb_friction_jams_too():
+    """While the top slips, as a slip speed of next to nothing has it."""
+    scene = tippe.Scene(tippe.Top(*NUMBERS), friction=tippe.SetValuedCoulomb(MU))
+    table = tippe.inversion_table(scene, theta=THETA, spin=SPIN, t1=0.1)
+    assert table.status == "jammed"
+    assert_close(float(table.end_time), reference_jam(SPIN, 1e-9)[0], rtol=1e-8)
