@@ -8,6 +8,7 @@ import jax
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
+from .compilation_cache import enable_compilation_cache as enable_compilation_cache
 from .surface import AbstractSurface as AbstractSurface
 from .surface import Cylinder as Cylinder
 from .surface import Plane as Plane

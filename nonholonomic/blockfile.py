@@ -11,7 +11,6 @@ try:
 except ImportError:  # not a POSIX system
     fcntl = None
 
-import h5py
 import numpy as np
 from jaxtyping import Shaped
 
@@ -57,6 +56,9 @@ class BlockFile:
             raise
 
     def _open(self, layout: "Layout") -> None:
+        # Only files need it.
+        import h5py
+
         if not self.path.exists():
             layout.write(self.path)
         grid = read_stored(self.path)

@@ -10,13 +10,15 @@ import json
 import os
 import tempfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import h5py
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
 
 from .checksum import block_checksum, header_checksum
+
+if TYPE_CHECKING:
+    import h5py
 
 Values = Shaped[np.ndarray, "..."]
 
@@ -70,6 +72,9 @@ def write_grid(
 
     **Raises:** `OSError` that names the path if it cannot be written.
     """
+    # A tenth of a second to import, which most processes can do without.
+    import h5py
+
     path = Path(path)
     if path.is_dir():
         raise OSError(f"cannot write {path}: it is a folder")
@@ -114,7 +119,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _fill(
-    file: h5py.File,
+    file: "h5py.File",
     coords: dict[str, Values],
     variables: dict[str, Values],
     units: dict[str, str],
@@ -162,6 +167,9 @@ def _fill(
 
 def _set(of: Any, name: str, value: Any) -> None:
     """Set an attribute, a text at its own length: HDF5 keeps a text of variable length where no checksum guards it."""
+    # Only files need it.
+    import h5py
+
     kind = h5py.string_dtype("utf-8", max(1, len(value.encode()))) if isinstance(value, str) else None
     of.attrs.create(name, value, dtype=kind)
 
@@ -209,6 +217,9 @@ def read_stored(path: Any) -> Grid:
 
     **Raises:** `OSError` that names the path if it cannot be read or holds no grid.
     """
+    # Only files need it.
+    import h5py
+
     if not Path(path).exists():
         raise FileNotFoundError(f"no such file: {path}")
     if Path(path).is_dir():
@@ -220,18 +231,21 @@ def read_stored(path: Any) -> Grid:
         raise OSError(f"cannot read {path}: it is not a table of nonholonomic, or it is damaged ({error})") from None
 
 
-def stored_array(file: h5py.File, name: str) -> h5py.Dataset:
+def stored_array(file: "h5py.File", name: str) -> "h5py.Dataset":
     """The array of that name in a file.
 
     **Raises:** `KeyError` if there is nothing of that name, `ValueError` if it is not an array.
     """
+    # Only files need it.
+    import h5py
+
     stored = file[name]
     if not isinstance(stored, h5py.Dataset):
         raise ValueError(f"{name} is not an array")
     return stored
 
 
-def _contents(file: h5py.File) -> Grid:
+def _contents(file: "h5py.File") -> Grid:
     coords, variables, units, words = {}, {}, {}, {}
     if "request" not in file.attrs:
         raise ValueError("it names no request")

@@ -45,7 +45,7 @@ def identify(
     - `spread`: how far they are drawn, as a factor either way, greater than 1; `seed`: of the draw.
     - `max_steps`: a fit that needs more has not converged.
     - `labels`: (n,), names of the measurements in the result.
-    - `progress`: whether to show it, on a terminal.
+    - `progress`: whether to show it, on a terminal or in a notebook.
 
     **Returns:** an `Identification`.
 

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from tqdm import tqdm
 
 from .likelihood import Measurements
+from .progress import Progress
 from .unknown import Free
 
 #: Damping of the first step, as a part of the largest squared slope (Madsen, Nielsen and Tingleff, "Methods for
@@ -181,7 +181,7 @@ def minimise(
     - `measurements`: (n,), the same for all rows, or (rows, n).
     - `held`: number of an unknown that keeps its start, or `None`.
     - `max_steps`: a row that needs more has not converged.
-    - `progress`: whether to show on a terminal how many rows are done.
+    - `progress`: whether to show, on a terminal or in a notebook, how many rows are done.
 
     **Returns:** the `Ends`.
 
@@ -192,24 +192,24 @@ def minimise(
     rows, unknowns = starts.shape
     measurements = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (rows, leaf.shape[-1])), measurements)
     embedding = jnp.eye(unknowns) if held is None else jnp.delete(jnp.eye(unknowns), held, axis=1)
-    begin = linearise(problem, starts, measurements)
-    largest = jnp.max(jnp.sum(begin.whole_jacobian**2, axis=1), axis=-1)
-    unit = jnp.sqrt(FIRST_DAMPING * jnp.where(largest > 0.0, largest, 1.0 / FIRST_DAMPING))
-    moving = starts @ embedding
-    row = _Row(measurements, starts - moving @ embedding.T, unit)
-    solver = _solver(optimistix)
-    moving, state = _begin(solver, problem, embedding, row, moving)
-    done = np.zeros(rows, bool)
-    steps = np.zeros(rows, int)
-    with tqdm(total=rows, desc="fits", unit="fit", disable=None if progress else True) as bar:
+    done, steps = np.zeros(rows, bool), np.zeros(rows, int)
+    with Progress(rows, "fit", shown=progress) as shown:
+        begin = linearise(problem, starts, measurements)
+        largest = jnp.max(jnp.sum(begin.whole_jacobian**2, axis=1), axis=-1)
+        unit = jnp.sqrt(FIRST_DAMPING * jnp.where(largest > 0.0, largest, 1.0 / FIRST_DAMPING))
+        moving = starts @ embedding
+        row = _Row(measurements, starts - moving @ embedding.T, unit)
+        solver = _solver(optimistix)
+        moving, state = _begin(solver, problem, embedding, row, moving)
         for step in range(max_steps):
             coordinates = row.held + state.y_eval @ embedding.T
             tangents = _Tangent(coordinates, *predictions_and_slopes(problem, coordinates))
             moving, state, ended = _step(solver, problem, embedding, row, tangents, moving, state, jnp.asarray(done))
             ended = np.asarray(ended)
             steps[~done] = step + 1
-            bar.update(int(np.sum(ended & ~done)))
-            bar.set_postfix(steps=step + 1)
+            if step == 0:
+                shown.begin()
+            shown.advance(int(np.sum(ended & ~done)), steps=step + 1)
             done |= ended
             if done.all():
                 break

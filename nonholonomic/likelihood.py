@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.stats import norm
+from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Bool, Float
 
 from .validation import require
@@ -64,4 +64,4 @@ def one_sided(z: Float[Array, "..."]) -> Float[Array, "..."]:
     """The residual -sqrt(-2 log Phi(z)) of a lower limit; 0 from where it is less than 1e-9."""
     # Beyond, the square root would have an infinite slope times a vanishing one.
     near = z < 9.0
-    return jnp.where(near, -jnp.sqrt(-2.0 * norm.logcdf(jnp.where(near, z, 0.0))), 0.0)
+    return jnp.where(near, -jnp.sqrt(-2.0 * log_ndtr(jnp.where(near, z, 0.0))), 0.0)

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Shaped
-from tqdm import tqdm
 
 from .blockfile import BlockFile, Layout
 from .hdf5 import UNREACHED
+from .progress import Progress
 from .table import Table
 from .validation import require
 
@@ -59,6 +59,7 @@ def sweep(
     *,
     path: Any = None,
     block: int | None = None,
+    progress: bool = True,
 ) -> Table:
     """Compute every cell of a grid.
 
@@ -71,6 +72,7 @@ def sweep(
     - `request`: plain data that says what is computed; it is stored in the table and guards the file.
     - `path`: file to write, block by block; if it holds part of the same request, only the rest is computed.
     - `block`: how many cells `run` is given at once.
+    - `progress`: whether to show it, on a terminal or in a notebook.
 
     **Returns:** the `Table`.
 
@@ -105,17 +107,16 @@ def sweep(
     try:
         found = {name: values.reshape(-1) for name, values in layout.empty().items()} if file is None else file.values()
         todo = [index for index in range(len(firsts)) if file is None or index not in file.finished]
-        # `disable=None` shows the bar on a terminal only.
-        with tqdm(total=cells, unit="cell", disable=None if len(todo) > 1 else True) as bar:
-            bar.update(cells - sum(min(block, cells - firsts[index]) for index in todo))
+        with Progress(cells, "cell", shown=progress) as shown:
             if todo:
                 run(columns(todo[0]), 0)
+            shown.begin(cells - sum(min(block, cells - firsts[index]) for index in todo))
             for index, values in _as_they_finish(work, todo):
                 for name, some in values.items():
                     found[name][firsts[index] : firsts[index] + len(some)] = some
                 if file is not None:
                     file.write(index, firsts[index], values)
-                bar.update(min(block, cells - firsts[index]))
+                shown.advance(min(block, cells - firsts[index]))
     finally:
         if file is not None:
             file.close()

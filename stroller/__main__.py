@@ -11,6 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.ground import AbstractGround, Spheroid
 from nonholonomic.midpoint import ImplicitMidpoint
 from nonholonomic.surface import Plane
@@ -153,6 +154,7 @@ def main(arguments: list[str] | None = None) -> int:
     **Returns:** the exit status: 0, or 2 for input that cannot be used.
     """
     options = parser().parse_args(arguments)
+    enable_compilation_cache()
     started = time.perf_counter()
     try:
         print(

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.surface import Cylinder, Plane
 from nonholonomic.table import Table
 
@@ -199,6 +200,7 @@ def main(arguments: list[str] | None = None) -> int:
     **Returns:** the exit status: 0, or 2 for input that cannot be used.
     """
     options = parser().parse_args(arguments)
+    enable_compilation_cache()
     started = time.perf_counter()
     try:
         found = tables(options)

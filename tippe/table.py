@@ -44,6 +44,7 @@ def inversion_table(
     method: str = "ensemble",
     errors: bool = False,
     sensitivities: Sequence[str] = (),
+    progress: bool = True,
 ) -> Table:
     """Inversion times over a grid of launches and scenes, in one batched call on all cores.
 
@@ -66,6 +67,7 @@ def inversion_table(
     - `errors`: whether to run every cell again at ten times the tolerance, for an estimate of the error of its time.
     - `sensitivities`: paths of numbers to differentiate the times by, such as `["scene.friction.mu", "launch.theta"]`; the end
       of a path will do where it fits one number only.
+    - `progress`: whether to show it, on a terminal or in a notebook; `NONHOLONOMIC_PROGRESS=0` hides it everywhere.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
     "contact_lost", "failed", "jammed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was lost
@@ -144,7 +146,7 @@ def inversion_table(
     if paths:
         request |= {"sensitivities": paths}
         variables = variables | slope_variables(paths, units)
-    return sweep(run, grid, variables, request, path=path)
+    return sweep(run, grid, variables, request, path=path, progress=progress)
 
 
 def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:

@@ -1,6 +1,7 @@
 """Identification without a simulation: textbook estimates, one-sided likelihoods, bounds, what data cannot see."""
 
 import sys
+import time
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,9 @@ import pytest
 import scipy.optimize
 import scipy.stats
 from conftest import assert_close
+from terminal import Terminal
 
+from nonholonomic import levenberg_marquardt
 from nonholonomic.identify import identify
 from nonholonomic.identify_result import coordinate_covariance
 from nonholonomic.likelihood import MISSING, Measurements, one_sided
@@ -44,6 +47,20 @@ def test_linear_regression_is_that_of_the_textbook(regression):
     assert "slope" in str(found)
     low, high = found.interval("slope")
     assert_close(high - low, 2.0 * 1.96 * found.standard_errors["slope"], rtol=1e-9)
+
+
+def test_it_says_on_a_terminal_what_it_does(regression, monkeypatch):
+    value, found = regression
+    monkeypatch.setattr("nonholonomic.progress.INTERVAL", 0.01)
+    # All is compiled by now; the first thing that a fit does is made to take its time.
+    compiled = levenberg_marquardt.linearise
+    monkeypatch.setattr(levenberg_marquardt, "linearise", lambda *given: (time.sleep(0.2), compiled(*given))[1])
+    for progress in (True, False):
+        stream = Terminal()
+        monkeypatch.setattr(sys, "stderr", stream)
+        again = identify(line, Measurements(value, ERROR), {"height": 0.5, "slope": 0.0}, starts=3, progress=progress)
+        assert again.estimates == found.estimates
+        assert [text.startswith("compiling") for _, text in stream.lines[:1]] == [True] * progress
 
 
 def test_profile_of_a_linear_model_is_a_parabola(regression):
