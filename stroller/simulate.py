@@ -1,5 +1,6 @@
 """Run the stroller from a launch."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import diffrax
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.midpoint import ImplicitMidpoint
-from nonholonomic.validation import as_number, is_traced, require
+from nonholonomic.validation import Bound, as_number, is_traced, legal, nan_unless, require_all
 
 from .dynamics import State
 from .input import Input
@@ -54,12 +55,11 @@ def simulate(
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
     scene.check(launch)
-    require(t1, "t1", above=0.0)
-    require(tolerance, "tolerance", above=0.0, below=1.0)
+    require_all(run_bounds(t1, tolerance))
     times = jnp.linspace(0.0, t1, DEFAULT_TIMES) if times is None else as_number(times)
     if times.ndim != 1 or times.size < 1:
         raise ValueError(f"times = {times!r} must be a list of at least one time")
-    require(times, "times", at_least=0.0, at_most=t1)
+    require_all(times_bounds(times, t1))
     if not is_traced(times) and np.any(np.diff(np.asarray(times)) <= 0.0):
         raise ValueError(f"times = {times!r} must be increasing")
     solver = diffrax.Dopri8() if solver is None else solver
@@ -69,8 +69,36 @@ def simulate(
     if isinstance(solver, ImplicitMidpoint):
         grid = even_steps(times, end, solver.step_length)
         max_steps = grid.size
+    numbers = (scene, launch, input, end, times, tolerance)
+    if not any(is_traced(leaf) for leaf in jax.tree.leaves(numbers)):
+        return _run(*numbers, grid, solver, max_steps, adjoint)
+    may = scene.may_start(launch, input) & jnp.all(legal([*run_bounds(end, tolerance), *times_bounds(times, end)]))
+    may &= jnp.all(jnp.diff(times) > 0.0)
+    # Steps of illegal numbers might never reach the end, so they are not begun; those of a given length do.
+    begins = may | (grid is not None)
+    times_run = jnp.where(begins, times, 0.0)
+    run = _run(
+        scene, launch, input, jnp.where(begins, end, 0.0), times_run, tolerance, grid, solver, max_steps, adjoint
+    )
+    stats = run.stats._replace(finished=run.stats.finished & may)
+    return eqx.tree_at(lambda one: (one.t, one.stats), nan_unless(may, run), (times, stats))
+
+
+def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:
+    """The ranges of the horizon [s] and of the tolerance."""
+    yield Bound(t1, "t1", above=0.0)
+    yield Bound(tolerance, "tolerance", above=0.0, below=1.0)
+
+
+def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
+    """The range of the times of output [s]."""
+    yield Bound(times, "times", at_least=0.0, at_most=t1)
+
+
+def _run(scene, launch, input, t1, times, tolerance, grid, solver, max_steps, adjoint) -> Trajectory:
+    """Integrate and read off."""
     states, watch, stats = solve(
-        scene, launch, input, end, times, grid, as_number(tolerance), solver, max_steps, adjoint
+        scene, launch, input, t1, times, grid, as_number(tolerance), solver, max_steps, adjoint
     )
     return read_off(scene, input, times, states, watch, stats)
 
