@@ -13,11 +13,12 @@ from jaxtyping import Array, ArrayLike, Float
 from nonholonomic.midpoint import ImplicitMidpoint
 from nonholonomic.validation import Bound, as_number, is_traced, legal, nan_unless, require_all
 
+from .crossings import Recipe, Watch, watched
 from .dynamics import State
 from .input import Input
 from .launch import Launch
 from .scene import Scene
-from .trajectory import Stats, Trajectory, Watch, read_off, watched
+from .trajectory import Stats, Trajectory, read_off
 
 #: How many times are saved where none are asked for.
 DEFAULT_TIMES = 201
@@ -100,7 +101,7 @@ def _run(scene, launch, input, t1, times, tolerance, grid, solver, max_steps, ad
     states, watch, stats = solve(
         scene, launch, input, t1, times, grid, as_number(tolerance), solver, max_steps, adjoint
     )
-    return read_off(scene, input, times, states, watch, stats)
+    return read_off(Recipe.of(scene, input, solver), times, states, watch, stats)
 
 
 def even_steps(
@@ -127,7 +128,7 @@ def solve(scene, launch, input, t1, times, grid, tolerance, solver, max_steps, a
     dynamics = scene.dynamics
     subs = (
         diffrax.SubSaveAt(ts=times),
-        diffrax.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: watched(scene, y)),
+        diffrax.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: (y, *watched(scene, y))),
     )
     solution: Any = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: dynamics.field(t, y, input)),

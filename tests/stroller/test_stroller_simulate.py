@@ -117,7 +117,7 @@ def test_illegal_numbers_in_a_batch_of_rides_give_nothing_that_looks_right():
 
     def ride(mass, steering, latitude, damping):
         scene = Scene(Stroller(mass, 0.7, 0.4, 0.05), Sphere(2.0), Damping(damping), side="inside")
-        return stroller.simulate(scene, Launch((0.3, latitude), 0.5, 1.5, steering), 0.1, times=[0.0, 0.1])
+        return stroller.simulate(scene, Launch((0.3, latitude), 0.5, 1.5, steering), 0.1, push, times=[0.0, 0.1])
 
     good, columns = (1.7, 0.2, -0.6, 0.3), [(1.7, 0.2, -0.6, 0.3)]
     for which, values in ((0, (-1.7, np.nan)), (1, (np.pi / 2,)), (2, (2.0,)), (3, (-0.3,))):
