@@ -7,19 +7,20 @@ would give and back.
 """
 
 import abc
+from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .validation import as_number, require
+from .validation import Bound, Bounded, as_number, require
 from .vector import Component, Vector, dot, multiply, scale, subtract, sum_vectors
 
 Place = tuple[Float[Array, "..."], ...]
 
 
-class AbstractGround(eqx.Module):
+class AbstractGround(Bounded):
     """A surface to drive on. `outward` is its unit normal n away from the centre of curvature, upwards on a plane."""
 
     #: How many of a position's three components do not vanish identically.
@@ -134,9 +135,9 @@ class Spheroid(AbstractQuadric):
     equatorial: Float[Array, "..."] = eqx.field(converter=as_number)
     polar: Float[Array, "..."] = eqx.field(converter=as_number)
 
-    def __check_init__(self):
-        require(self.equatorial, "equatorial", above=0.0)
-        require(self.polar, "polar", above=0.0)
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.equatorial, "equatorial", above=0.0)
+        yield Bound(self.polar, "polar", above=0.0)
 
     @classmethod
     def from_oblate(cls, a: Float[Array, "..."], xi: Float[Array, "..."]) -> "Spheroid":

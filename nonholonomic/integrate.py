@@ -235,7 +235,7 @@ def sample(
         state,
         args=problem,
         stepsize_controller=_control(rtol, jax.lax.stop_gradient(atol * scales)),
-        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=times), diffrax.SubSaveAt(t1=True)]),
+        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=jnp.minimum(times, t1)), diffrax.SubSaveAt(t1=True)]),
         max_steps=max_steps,
         event=event if watched else None,
         adjoint=diffrax.ForwardMode() if adjoint is None else adjoint,

@@ -59,7 +59,8 @@ def march_with_samples(
 
     **Arguments:** as for `Queue.of`, and
 
-    - `times`: of the samples [s], increasing, within [0, t1]; (times,) for all cells or (times, cells).
+    - `times`: of the samples [s], increasing, from 0 or later; (times,) for all cells or (times, cells). Those after `t1` are
+      not reached.
 
     **Returns:** the `Outcome`, its crossing times left out; and the states at the times, (cells, times, components), not a
     number after the end of a run.
@@ -104,11 +105,11 @@ def _recorded(
     def step(carry: Any) -> Any:
         block, sample, record, iteration = carry
         next_time = _next_time(times, sample)
-        stop = jnp.where(sample < count, next_time, horizon)
+        stop = jnp.where(sample < count, jnp.minimum(next_time, horizon), horizon)
         block = block._replace(length=_even(block.length, stop - block.time, block.searching))
         after = attempt(here, control._replace(t1=stop), atol, block)
         reached = (block.status == RUNNING) & (after.status == REACHED_END)
-        is_sample = reached & (sample < count)
+        is_sample = reached & (sample < count) & (after.time >= next_time)
         goes_on = reached & (after.time < horizon)
         after = after._replace(status=jnp.where(goes_on, RUNNING, after.status))
         made = Record(after.state, jnp.where(is_sample, sample, count))

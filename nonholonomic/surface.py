@@ -12,6 +12,7 @@ fixed frame asks the surface as a ground (see `ground.py`).
 
 import abc
 import math
+from collections.abc import Iterable, Iterator
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -20,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .ground import AbstractGround, AbstractQuadric, Place
-from .validation import as_number, is_traced, require
+from .validation import Bound, Bounded, as_number, is_traced, require_all
 from .vector import Component, Vector, dot, multiply, subtract
 
 Tangent = tuple[Component, Component]
@@ -32,13 +33,17 @@ def carried(vector: tuple[Component, ...], turning: Tangent) -> tuple[Component,
     return (multiply(turning[0], vector[2]), multiply(turning[1], vector[2]), subtract(None, along_normal))
 
 
-class AbstractSurface(eqx.Module):
+class AbstractSurface(Bounded):
     """A surface described by a moving frame (t1, t2, n), with n pointing into the room where the body is.
 
     With V the velocity along the surface, the normal turns as n' = -(o1 t1 + o2 t2), where (o1, o2) = S V and S is the
     shape operator, positive where the surface is concave towards the room. The frame does not turn about n, so the
     components of a fixed vector change as `carried` states.
     """
+
+    def room(self, distance: Float[ArrayLike, "..."]) -> Iterable[Bound]:
+        """What the surface's numbers must be for a ball whose radius is the given distance [m] to fit."""
+        return ()
 
     @abc.abstractmethod
     def parallel(self, distance: Float[ArrayLike, "..."]) -> "AbstractSurface":
@@ -108,9 +113,9 @@ class Plane(AbstractSurface, AbstractGround):
 
     tilt: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
 
-    def __check_init__(self):
+    def bounds(self) -> Iterator[Bound]:
         if self.tilt is not None:
-            require(self.tilt, "tilt", at_least=-math.pi / 2.0, at_most=math.pi / 2.0)
+            yield Bound(self.tilt, "tilt", at_least=-math.pi / 2.0, at_most=math.pi / 2.0)
 
     def parallel(self, distance: Float[ArrayLike, "..."]) -> "Plane":
         if self.tilt is not None:
@@ -194,11 +199,14 @@ class Cylinder(AbstractSurface):
 
     radius: Float[Array, "..."] = eqx.field(converter=as_number)
 
-    def __check_init__(self):
-        require(self.radius, "surface radius", above=0.0)
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.radius, "surface radius", above=0.0)
+
+    def room(self, distance: Float[ArrayLike, "..."]) -> Iterator[Bound]:
+        yield Bound(self.radius, "surface radius", above=distance, why="the body must fit inside")
 
     def parallel(self, distance: Float[ArrayLike, "..."]) -> "Cylinder":
-        require(self.radius, "surface radius", above=distance, why="the body must fit inside")
+        require_all(self.room(distance))
         return Cylinder(self.radius - distance)
 
     def place(self, eta: Float[ArrayLike, "..."]) -> Place:
@@ -250,11 +258,14 @@ class Sphere(AbstractSurface, AbstractQuadric):
 
     radius: Float[Array, "..."] = eqx.field(converter=as_number)
 
-    def __check_init__(self):
-        require(self.radius, "surface radius", above=0.0)
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.radius, "surface radius", above=0.0)
+
+    def room(self, distance: Float[ArrayLike, "..."]) -> Iterator[Bound]:
+        yield Bound(self.radius, "surface radius", above=distance, why="the body must fit inside")
 
     def parallel(self, distance: Float[ArrayLike, "..."]) -> "Sphere":
-        require(self.radius, "surface radius", above=distance, why="the body must fit inside")
+        require_all(self.room(distance))
         return Sphere(self.radius - distance)
 
     def place(self, eta: Float[ArrayLike, "..."]) -> Place:

@@ -1,11 +1,21 @@
-"""Checks of arguments, made on concrete numbers before anything compiles; traced numbers pass through."""
+"""Checks of arguments, made on concrete numbers before anything compiles.
 
-from typing import Any
+Traced numbers pass them. A module says once, in its `bounds`, what its numbers may be: where they are concrete it is refused
+with a message, and where they are traced `legal` says so in the program, whose results are then not a number.
+"""
 
+import dataclasses
+import functools
+import operator
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
 def as_number(value: Any) -> Float[Array, "..."]:
@@ -83,3 +93,75 @@ def require(
         if not np.all(allowed):
             told = f"{name} = {_first(numbers, allowed)} must be {words} {_first(limits, allowed)}"
             raise ValueError(told + remark)
+
+
+class Bound(NamedTuple):
+    """A number, what to call it, and the range in which it is legal; as for `require`."""
+
+    value: Any
+    name: str
+    above: Any = None
+    at_least: Any = None
+    below: Any = None
+    at_most: Any = None
+    why: str = ""
+
+    def require(self) -> None:
+        """Raise `ValueError` unless the number is legal or traced."""
+        require(*self[:2], **dict(zip(self._fields[2:], self[2:], strict=True)))
+
+    @property
+    def holds(self) -> Bool[Array, "..."]:
+        """Whether the number is legal, as an array of the program."""
+        conditions = [jnp.isfinite(self.value)]
+        limits = (
+            (operator.gt, self.above),
+            (operator.ge, self.at_least),
+            (operator.lt, self.below),
+            (operator.le, self.at_most),
+        )
+        conditions += [holds(self.value, limit) for holds, limit in limits if limit is not None]
+        return functools.reduce(jnp.logical_and, conditions)
+
+
+class Bounded(eqx.Module):
+    """A module whose numbers have ranges: it cannot be made of concrete numbers outside of them."""
+
+    def bounds(self) -> Iterable[Bound]:
+        """The ranges of the module's own numbers, in the order in which they are to be checked.
+
+        A generator, so that a range that is computed from a number is so only once that number has been checked.
+        """
+        return ()
+
+    def __check_init__(self):
+        require_all(self.bounds())
+
+
+def require_all(bounds: Iterable[Bound]) -> None:
+    """Raise `ValueError` for the first number that is neither legal nor traced."""
+    for bound in bounds:
+        bound.require()
+
+
+def all_bounds(module: Any) -> Iterator[Bound]:
+    """The ranges of the numbers of a module and of the modules in it; none for what is no `Bounded`."""
+    if isinstance(module, Bounded):
+        yield from module.bounds()
+        for field in dataclasses.fields(module):
+            yield from all_bounds(getattr(module, field.name))
+
+
+def legal(bounds: Iterable[Bound]) -> Bool[Array, "..."]:
+    """Whether all numbers are within their ranges, for numbers that were traced when `require` saw them.
+
+    Numbers of different shapes are broadcast: one for all cells, or one for each.
+    """
+    return functools.reduce(jnp.logical_and, (bound.holds for bound in bounds), jnp.asarray(True))
+
+
+def nan_unless(holds: Bool[Array, ""], tree: Any) -> Any:
+    """The tree with every floating number, and every derivative through it, not a number unless `holds`."""
+    # A product, not a select: the derivative of what was not selected would be 0.
+    factor = jnp.where(holds, 1.0, jnp.nan)
+    return jax.tree.map(lambda leaf: leaf * factor if eqx.is_inexact_array(leaf) else leaf, tree)

@@ -1,13 +1,14 @@
 """Friction of the wheels and of the fork, along the velocities that the constraints leave free. A law is one class."""
 
 import abc
+from collections.abc import Iterator
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import as_number, require
+from nonholonomic.validation import Bound, Bounded, as_number
 from nonholonomic.vector import Component
 
 
@@ -34,7 +35,7 @@ class Drag(NamedTuple):
     steering: Component = None
 
 
-class AbstractFriction(eqx.Module):
+class AbstractFriction(Bounded):
     """A friction law."""
 
     #: Whether the law can take energy; the work of one that cannot is not recorded.
@@ -77,9 +78,9 @@ class Damping(AbstractFriction):
     scrub: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
     steering: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
 
-    def __check_init__(self):
+    def bounds(self) -> Iterator[Bound]:
         for name in ("rolling", "front", "scrub", "steering"):
-            require(getattr(self, name), name, at_least=0.0)
+            yield Bound(getattr(self, name), name, at_least=0.0)
 
     def drag(self, rolling: Rolling) -> Drag:
         return Drag(
@@ -105,9 +106,9 @@ class RollingResistance(AbstractFriction):
     coefficient: Float[Array, "..."] = eqx.field(converter=as_number)
     speed: Float[Array, "..."] = eqx.field(converter=as_number)
 
-    def __check_init__(self):
-        require(self.coefficient, "coefficient", at_least=0.0)
-        require(self.speed, "speed", above=0.0)
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.coefficient, "coefficient", at_least=0.0)
+        yield Bound(self.speed, "speed", above=0.0)
 
     def drag(self, rolling: Rolling) -> Drag:
         return Drag(

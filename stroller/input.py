@@ -4,13 +4,13 @@ Any function `(t, motion) -> (force, torque)` will do. It is called with arrays 
 is to be written with `jax.numpy` and without `if`. One that is an `equinox.Module` may hold numbers to differentiate.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import as_number, require
+from nonholonomic.validation import Bound, Bounded, as_number
 from nonholonomic.vector import Vector
 
 
@@ -34,7 +34,7 @@ class Motion(NamedTuple):
 Input: TypeAlias = Callable[[Float[Array, "..."], Motion], tuple[Float[Array, "..."], Float[Array, "..."]]]
 
 
-class Steady(eqx.Module):
+class Steady(Bounded):
     """A constant drive force and steering torque.
 
     **Arguments:**
@@ -46,9 +46,9 @@ class Steady(eqx.Module):
     force: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
     torque: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
 
-    def __check_init__(self):
-        require(self.force, "force")
-        require(self.torque, "torque")
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.force, "force")
+        yield Bound(self.torque, "torque")
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         return self.force, self.torque

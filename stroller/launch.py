@@ -1,11 +1,12 @@
 """How a run starts."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import as_number, require
+from nonholonomic.validation import Bound, Bounded, as_number
 
 
 def as_pair(value: Any) -> Any:
@@ -17,7 +18,7 @@ def as_pair(value: Any) -> Any:
     return (as_number(first), as_number(second))
 
 
-class Launch(eqx.Module):
+class Launch(Bounded):
     """A start: where the rear axle is, where the stroller heads, how fast it rolls and steers.
 
     **Arguments:**
@@ -43,7 +44,9 @@ class Launch(eqx.Module):
     def __check_init__(self):
         if not (isinstance(self.place, tuple) and len(self.place) == 2):
             raise ValueError(f"place = {self.place!r} must be a pair of numbers, (x, y) [m] or (mu, eta) [rad]")
+
+    def bounds(self) -> Iterator[Bound]:
         for number, name in zip(self.place, ("place[0]", "place[1]"), strict=True):
-            require(number, name)
+            yield Bound(number, name)
         for name in ("heading", "speed", "steering", "steering_rate"):
-            require(getattr(self, name), name)
+            yield Bound(getattr(self, name), name)

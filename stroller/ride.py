@@ -13,12 +13,13 @@ from nonholonomic.lyapunov import probed
 from nonholonomic.validation import is_traced
 from nonholonomic.variation import VariationalProblem, in_groups
 
+from .crossings import Watch, watched
 from .dynamics import State
 from .input import Input
 from .launch import Launch
 from .scene import Scene
 from .table import RideProblem
-from .trajectory import Stats, Watch, watched
+from .trajectory import Stats
 
 #: Directions whose variations run along together with a ride.
 TOGETHER = 4
@@ -161,7 +162,7 @@ def _follow(
         controller = diffrax.StepTo(grid)
     subs = (
         diffrax.SubSaveAt(ts=times),
-        diffrax.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: watched(problem.scene, y[:size])),
+        diffrax.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: (y[:size], *watched(problem.scene, y[:size]))),
     )
     solution: Any = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: whole.field(t, y)),

@@ -1,16 +1,17 @@
 """The scene: what rolls, on what ground, with what friction, under what gravity."""
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from nonholonomic.ground import AbstractGround
 from nonholonomic.surface import Plane
-from nonholonomic.validation import as_number, is_traced, require
+from nonholonomic.validation import Bound, Bounded, all_bounds, as_number, is_traced, legal, require_all
 from nonholonomic.vector import multiply
 
 from .dynamics import Dynamics, State, stacked
@@ -33,7 +34,12 @@ def require_word(word: Any, name: str, words: dict[str, Any]) -> None:
         raise ValueError(f"{name} = {word!r} must be one of {', '.join(map(repr, words))}")
 
 
-class Scene(eqx.Module):
+def _holds_somewhere(condition: Any) -> bool:
+    """Whether a condition holds anywhere; not for one that is traced."""
+    return not is_traced(condition) and bool(np.any(condition))
+
+
+class Scene(Bounded):
     """A stroller on a ground.
 
     Every number in it is a leaf of a pytree: it can be swept, traced and differentiated.
@@ -67,7 +73,6 @@ class Scene(eqx.Module):
         for name, part, kind in (*parts, ("friction", self.friction, AbstractFriction)):
             if not isinstance(part, kind):
                 raise ValueError(f"{name} = {part!r} must be a {kind.__name__.removeprefix('Abstract')}")
-        require(self.gravity, "gravity", at_least=0.0)
         require_word(self.side, "side", SIDES)
         require_word(self.fork, "fork", FORKS)
         require_word(self.heading, "heading", HEADINGS)
@@ -76,6 +81,9 @@ class Scene(eqx.Module):
             raise ValueError("side = 'inside' must be 'outside' on a Plane")
         if not flat and self.body.centre is not None:
             raise ValueError(f"centre = {self.body.centre!r} must be 0.0 on a curved surface, where it is not exact")
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.gravity, "gravity", at_least=0.0)
 
     @property
     def dynamics(self) -> Dynamics:
@@ -94,26 +102,43 @@ class Scene(eqx.Module):
         """Raise `ValueError` if the scene cannot start as the launch says."""
         if not isinstance(launch, Launch):
             raise ValueError(f"launch = {launch!r} must be a Launch")
-        if not isinstance(self.surface, Plane):
-            limit = math.pi / 2.0 + 1e-12
-            require(
-                launch.place[1], "place[1]", at_least=-limit, at_most=limit, why="reduced latitude, from -pi/2 to pi/2"
-            )
-        if is_traced(launch.steering) or is_traced(launch.speed) or is_traced(launch.place[1]):
-            return
-        sideways = np.abs(np.cos(np.asarray(launch.steering))) < RIGHT_ANGLE
-        if np.any(sideways & (np.asarray(launch.speed) != 0.0)):
+        require_all(self.start_bounds(launch))
+        if _holds_somewhere(self.sideways(launch)):
             raise ValueError(
                 f"steering = {launch.steering!r} must differ from a right angle for speed = {launch.speed!r}: "
                 "the rear axle stands still when the front wheel stands across"
             )
-        if self.heading == "projected" and not isinstance(self.surface, Plane):
-            level = np.abs(np.sin(np.asarray(launch.place[1]))) < RIGHT_ANGLE
-            if np.any(level):
-                raise ValueError(
-                    f"place[1] = {launch.place[1]!r} must differ from 0 for heading = 'projected': on the equator no "
-                    "horizontal speed belongs to a motion along the ground, and the constraints may lose rank"
-                )
+        if _holds_somewhere(self.level(launch)):
+            raise ValueError(
+                f"place[1] = {launch.place[1]!r} must differ from 0 for heading = 'projected': on the equator no "
+                "horizontal speed belongs to a motion along the ground, and the constraints may lose rank"
+            )
+
+    def start_bounds(self, launch: Launch) -> Iterator[Bound]:
+        """The ranges that the scene sets to a launch."""
+        if not isinstance(self.surface, Plane):
+            limit = math.pi / 2.0 + 1e-12
+            why = "reduced latitude, from -pi/2 to pi/2"
+            yield Bound(launch.place[1], "place[1]", at_least=-limit, at_most=limit, why=why)
+
+    def sideways(self, launch: Launch) -> Any:
+        """Whether a launch has speed although its front wheel stands across; concrete for a concrete launch."""
+        steering, speed = launch.steering, launch.speed
+        of = jnp if is_traced(steering) or is_traced(speed) else np
+        return (of.abs(of.cos(of.asarray(steering))) < RIGHT_ANGLE) & (of.asarray(speed) != 0.0)
+
+    def level(self, launch: Launch) -> Any:
+        """Whether a launch with a projected heading is on the equator; concrete for a concrete launch."""
+        if self.heading != "projected" or isinstance(self.surface, Plane):
+            return False
+        of = jnp if is_traced(launch.place[1]) else np
+        return of.abs(of.sin(of.asarray(launch.place[1]))) < RIGHT_ANGLE
+
+    def may_start(self, launch: Launch, *others: Any) -> Bool[Array, ""]:
+        """Whether the numbers of the scene, a launch and other modules are legal, for what `check` could not look at."""
+        own = [bound for module in (self, launch, *others) for bound in all_bounds(module)]
+        stuck = jnp.asarray(self.sideways(launch) | self.level(launch))
+        return jnp.all(legal([*own, *self.start_bounds(launch)]) & ~stuck)
 
     def state(self, launch: Launch, driven: bool = False) -> State:
         """The state at the start of a run (see `dynamics.py` for its components).

@@ -1,14 +1,19 @@
 """Run the stroller from a launch."""
 
+from collections.abc import Iterator
+from typing import Any
+
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.midpoint import ImplicitMidpoint
-from nonholonomic.validation import as_number, is_traced, require
+from nonholonomic.validation import Bound, as_number, is_traced, legal, nan_unless, require_all
 
+from .crossings import Recipe
 from .input import Input
 from .launch import Launch
 from .ride import Settings, differentiable_ride, is_closed, opened, ride
@@ -53,12 +58,11 @@ def simulate(
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
     scene.check(launch)
-    require(t1, "t1", above=0.0)
-    require(tolerance, "tolerance", above=0.0, below=1.0)
+    require_all(run_bounds(t1, tolerance))
     times = jnp.linspace(0.0, t1, DEFAULT_TIMES) if times is None else as_number(times)
     if times.ndim != 1 or times.size < 1:
         raise ValueError(f"times = {times!r} must be a list of at least one time")
-    require(times, "times", at_least=0.0, at_most=t1)
+    require_all(times_bounds(times, t1))
     if not is_traced(times) and np.any(np.diff(np.asarray(times)) <= 0.0):
         raise ValueError(f"times = {times!r} must be increasing")
     solver = diffrax.Dopri8() if solver is None else solver
@@ -68,12 +72,30 @@ def simulate(
         max_steps = grid.size
     steering = input if is_closed(input, scene, launch) else opened(input, scene, launch)
     settings = Settings(solver, max_steps, adjoint)
-    given = (scene, launch, steering)
-    if adjoint is None and any(is_traced(leaf) for leaf in jax.tree.leaves((given, times, end))):
-        states, watch, stats = differentiable_ride(given, times, end, grid, as_number(tolerance), settings)
-    else:
-        states, watch, stats = ride(given, times, end, grid, as_number(tolerance), settings)
-    return read_off(scene, input, times, states, watch, stats)
+    numbers = (scene, launch, steering, end, times, tolerance)
+    recipe = Recipe.of(scene, input, solver)
+    if not any(is_traced(leaf) for leaf in jax.tree.leaves(numbers)):
+        return read_off(recipe, times, *ride(numbers[:3], times, end, grid, as_number(tolerance), settings))
+    may = scene.may_start(launch, input) & jnp.all(legal([*run_bounds(end, tolerance), *times_bounds(times, end)]))
+    may &= jnp.all(jnp.diff(times) > 0.0)
+    # Steps of illegal numbers might never reach the end, so they are not begun; those of a given length do.
+    begins = may | (grid is not None)
+    end, run_times = jnp.where(begins, end, 0.0), jnp.where(begins, times, 0.0)
+    solve = differentiable_ride if adjoint is None else ride
+    run = read_off(recipe, run_times, *solve(numbers[:3], run_times, end, grid, as_number(tolerance), settings))
+    stats = run.stats._replace(finished=run.stats.finished & may)
+    return eqx.tree_at(lambda one: (one.t, one.stats), nan_unless(may, run), (times, stats))
+
+
+def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:
+    """The ranges of the horizon [s] and of the tolerance."""
+    yield Bound(t1, "t1", above=0.0)
+    yield Bound(tolerance, "tolerance", above=0.0, below=1.0)
+
+
+def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
+    """The range of the times of output [s]."""
+    yield Bound(times, "times", at_least=0.0, at_most=t1)
 
 
 def even_steps(

@@ -1,13 +1,15 @@
 """The body: a rigid frame on two rear wheels, with one front wheel in a fork that steers."""
 
+from collections.abc import Iterator
+
 import equinox as eqx
 from jaxtyping import Array, Float
 
 from nonholonomic.surface import none_if_zero
-from nonholonomic.validation import as_number, require
+from nonholonomic.validation import Bound, Bounded, as_number
 
 
-class Stroller(eqx.Module):
+class Stroller(Bounded):
     """A stroller: wheels without mass or width, the steering axis through the front wheel's contact point.
 
     **Arguments:**
@@ -30,13 +32,13 @@ class Stroller(eqx.Module):
     steering_spring: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
     centre: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
 
-    def __check_init__(self):
+    def bounds(self) -> Iterator[Bound]:
         for name in ("mass", "wheelbase", "inertia", "steering_inertia"):
-            require(getattr(self, name), name, above=0.0)
+            yield Bound(getattr(self, name), name, above=0.0)
         if self.steering_spring is not None:
-            require(self.steering_spring, "steering_spring", at_least=0.0)
+            yield Bound(self.steering_spring, "steering_spring", at_least=0.0)
         if self.centre is not None:
-            require(self.centre, "centre", at_least=0.0)
-            require(self.centre, "centre", at_most=self.wheelbase, why="the wheelbase")
+            yield Bound(self.centre, "centre", at_least=0.0)
+            yield Bound(self.centre, "centre", at_most=self.wheelbase, why="the wheelbase")
             least = self.mass * self.centre**2
-            require(self.inertia, "inertia", at_least=least, why="mass centre^2, as it is about the rear axle")
+            yield Bound(self.inertia, "inertia", at_least=least, why="mass centre^2, as it is about the rear axle")

@@ -12,6 +12,7 @@ from nonholonomic.formulation import Multipliers
 from nonholonomic.vector import Component, dot, multiply, scale, sum_vectors
 
 from .charts import Chart, coordinates_and_rates
+from .crossings import Recipe, Watch, crossings
 from .dynamics import Power, State, padded
 from .input import Input
 from .scene import Scene
@@ -20,15 +21,6 @@ from .scene import Scene
 RANK_LOST = 1e-8
 #: Pull on the ground, relative to the weight, that still counts as round-off.
 CONTACT_ROUND_OFF = 1e-12
-
-
-class Watch(NamedTuple):
-    """What is followed from one step of the integration to the next; unused entries are infinite or NaN."""
-
-    time: Float[Array, " steps"]
-    normal_force: Float[Array, " steps"]
-    steering_cosine: Float[Array, " steps"]
-    rank: Float[Array, " steps"]
 
 
 class Stats(NamedTuple):
@@ -51,7 +43,7 @@ class Trajectory(eqx.Module):
     - `normal_force` [N] of the ground, and `load` [N] on the rear and the front axle, (times, 2);
     - `constraint` [m/s]: speed at which the rear axle and the front wheel slip sideways, (times, 2);
     - `departure`: how far the position is off the ground, relative to its size: an error of the integration;
-    - `watch` and `stats`: what the integration passed, step by step.
+    - `watch` and `stats`: what the integration passed, step by step; `recipe`: what made the run.
     """
 
     t: Float[Array, " times"]
@@ -75,6 +67,7 @@ class Trajectory(eqx.Module):
     state: Float[Array, "times components"]
     watch: Watch
     stats: Stats
+    recipe: Recipe
 
     @property
     def energy_residual(self) -> Float[Array, " times"]:
@@ -95,22 +88,23 @@ class Trajectory(eqx.Module):
         """Time [s] at which the ground first has to pull to keep the stroller on it; infinite if it never has to."""
         force = np.asarray(self.watch.normal_force)
         allowed = -CONTACT_ROUND_OFF * np.max(np.abs(force[np.isfinite(force)]), initial=0.0)
-        return first_crossing(self.watch.time, self.watch.normal_force, allowed)
+        return self._first_below("normal_force", allowed)
 
     @property
     def rank_lost_at(self) -> float:
         """Time [s] at which the constraints first lose rank, which only a projected heading can do; else infinite."""
-        return first_crossing(self.watch.time, self.watch.rank, RANK_LOST)
+        return self._first_below("rank", RANK_LOST)
 
     @property
     def jackknifed_at(self) -> Float[np.ndarray, " times"]:
         """Times [s] at which the steering angle passes a right angle, where the rear axle reverses."""
-        time, cosine = np.asarray(self.watch.time), np.asarray(self.watch.steering_cosine)
-        before, after = cosine[:-1], cosine[1:]
-        passes = np.flatnonzero((before > 0.0) != (after > 0.0))
-        passes = passes[np.isfinite(after[passes])]
-        share = before[passes] / (before[passes] - after[passes])
-        return time[passes] + share * (time[passes + 1] - time[passes])
+        return crossings(self.recipe, self.watch, "steering_cosine", 0.0)
+
+    def _first_below(self, name: str, level: float) -> float:
+        """Time [s] at which a watched quantity first is below a level; infinite if it never is."""
+        if float(getattr(self.watch, name)[0]) < level:
+            return float(self.watch.time[0])
+        return float(min(crossings(self.recipe, self.watch, name, level), default=np.inf))
 
     @property
     def status(self) -> str:
@@ -149,25 +143,6 @@ class Trajectory(eqx.Module):
 def shown(numbers: Float[Array, " n"]) -> str:
     """Numbers in brackets, to six digits."""
     return f"({', '.join(f'{float(number):.6g}' for number in numbers)})"
-
-
-def first_crossing(times: Float[Array, " steps"], values: Float[Array, " steps"], level: float) -> float:
-    """Time at which a value known at some times first falls below a level, by linear interpolation."""
-    time, value = np.asarray(times), np.asarray(values)
-    below = np.flatnonzero((value < level) & np.isfinite(time))
-    if below.size == 0:
-        return float("inf")
-    after = int(below[0])
-    if after == 0:
-        return float(time[0])
-    share = (value[after - 1] - level) / (value[after - 1] - value[after])
-    return float(time[after - 1] + share * (time[after] - time[after - 1]))
-
-
-def watched(scene: Scene, state: State) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Normal force [N], cosine of the steering angle, and relative reduced mass at a state."""
-    geometry = scene.dynamics.geometry(state)
-    return scene.contact(state), geometry.cosine, scene.rank(state)
 
 
 def side_slip(scene: Scene, rate: State, state: State) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
@@ -215,14 +190,14 @@ def side_force(
 
 @eqx.filter_jit
 def read_off(
-    scene: Scene,
-    input: Input | None,
+    recipe: Recipe,
     t: Float[Array, " times"],
     states: Float[Array, "components times"],
     watch: Watch,
     stats: Stats,
 ) -> Trajectory:
     """The trajectory of the given states at the given times."""
+    scene, input, _ = recipe.parts
     dynamics, surface = scene.dynamics, scene.surface
     g = dynamics.geometry(states)
     motion, like = g.motion, states[0]
@@ -257,4 +232,5 @@ def read_off(
         state=states.T,
         watch=watch,
         stats=stats,
+        recipe=recipe,
     )

@@ -1,6 +1,9 @@
 """The README's example runs as it stands, and its commands are the ones that work."""
 
+import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
@@ -27,3 +30,25 @@ def test_the_ride_runs(capsys):
 def test_every_file_it_names_exists():
     for name in re.findall(r"`((?:tests|tippe|nonholonomic|stroller|benchmarks|docs)/[\w/.]*)`", README):
         assert (Path(__file__).parents[1] / name).exists(), name
+
+
+#: Looks up names in a fresh process, and tells which heavy packages that has loaded.
+LOOK_UP = """
+import functools, json, sys
+import nonholonomic, stroller, tippe
+roots = {"nonholonomic": nonholonomic, "stroller": stroller, "tippe": tippe}
+for name in sys.argv[1:]:
+    root, *rest = name.split(".")
+    functools.reduce(getattr, rest, roots[root])
+print(json.dumps([name for name in ("matplotlib", "scipy.integrate", "tippe.paper", "stroller.paper") if name in sys.modules]))
+"""
+
+
+def test_every_name_it_gives_is_there_after_a_plain_import():
+    """Such as `tippe.steady`, a module; and nothing is loaded that takes long."""
+    names = sorted(set(re.findall(r"\b(?:tippe|stroller|nonholonomic)\.(?!md\b)\w+", README)))
+    assert "tippe.steady" in names
+    told = subprocess.run(
+        [sys.executable, "-c", LOOK_UP, *names], capture_output=True, text=True, check=True, timeout=120
+    )
+    assert json.loads(told.stdout) == []

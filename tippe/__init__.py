@@ -6,6 +6,7 @@ from nonholonomic.surface import Sphere as Sphere
 from nonholonomic.table import Table as Table
 from nonholonomic.unknown import Free as Free
 
+from . import steady as steady
 from .friction import AbstractFriction as AbstractFriction
 from .friction import Contensou as Contensou
 from .friction import Coulomb as Coulomb

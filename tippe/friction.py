@@ -2,13 +2,14 @@
 
 import abc
 import math
+from collections.abc import Iterator
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import as_number, require
+from nonholonomic.validation import Bound, Bounded, as_number
 from nonholonomic.vector import Component, Vector, add, dot, sum_vectors
 
 
@@ -42,7 +43,7 @@ class ContactLoad(NamedTuple):
         return add(dot(self.force, (slip.x, slip.y)), dot(self.torque, slip.turning))
 
 
-class AbstractFriction(eqx.Module):
+class AbstractFriction(Bounded):
     """A friction law whose force and torque are proportional to the normal force."""
 
     #: The units of the law's numbers, by name.
@@ -87,8 +88,8 @@ class Viscous(AbstractFriction):
 
     mu: Float[Array, "..."] = eqx.field(converter=as_number)
 
-    def __check_init__(self):
-        require(self.mu, "mu", at_least=0.0)
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.mu, "mu", at_least=0.0)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         return ContactLoad(force=(-self.mu * slip.x, -self.mu * slip.y))
@@ -114,9 +115,9 @@ class Coulomb(AbstractFriction):
     mu: Float[Array, "..."] = eqx.field(converter=as_number)
     slip_speed: Float[Array, "..."] = eqx.field(converter=as_number)
 
-    def __check_init__(self):
-        require(self.mu, "mu", at_least=0.0)
-        require(self.slip_speed, "slip_speed", above=0.0)
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.mu, "mu", at_least=0.0)
+        yield Bound(self.slip_speed, "slip_speed", above=0.0)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         speed = jnp.sqrt(slip.x * slip.x + slip.y * slip.y + self.slip_speed * self.slip_speed)
@@ -146,10 +147,10 @@ class Contensou(AbstractFriction):
     contact_radius: Float[Array, "..."] = eqx.field(converter=as_number)
     slip_speed: Float[Array, "..."] = eqx.field(converter=as_number)
 
-    def __check_init__(self):
-        require(self.mu, "mu", at_least=0.0)
-        require(self.contact_radius, "contact_radius", at_least=0.0)
-        require(self.slip_speed, "slip_speed", above=0.0)
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.mu, "mu", at_least=0.0)
+        yield Bound(self.contact_radius, "contact_radius", at_least=0.0)
+        yield Bound(self.slip_speed, "slip_speed", above=0.0)
 
     @property
     def drills(self) -> bool:
@@ -181,14 +182,16 @@ class Rolling(AbstractFriction):
     sliding: AbstractFriction
 
     def __check_init__(self):
-        require(self.resistance, "resistance", at_least=0.0)
-        require(self.turning_speed, "turning_speed", above=0.0)
         if not isinstance(self.sliding, AbstractFriction):
             raise ValueError(f"sliding = {self.sliding!r} must be a Friction, such as Coulomb(mu, slip_speed)")
         if isinstance(self.sliding, Rolling) or self.sliding.set_valued:
             raise ValueError(
                 f"sliding = {self.sliding!r} must be a law of sliding that has a force at every slip velocity"
             )
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.resistance, "resistance", at_least=0.0)
+        yield Bound(self.turning_speed, "turning_speed", above=0.0)
 
     @property
     def units(self) -> dict[str, str]:
@@ -223,8 +226,8 @@ class SetValuedCoulomb(AbstractFriction):
 
     mu: Float[Array, "..."] = eqx.field(converter=as_number)
 
-    def __check_init__(self):
-        require(self.mu, "mu", at_least=0.0)
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.mu, "mu", at_least=0.0)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         """The load of a contact that slips; where it does not, the law alone says nothing, and the load is 0."""

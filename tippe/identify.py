@@ -138,7 +138,7 @@ class Recording(eqx.Module):
             run = simulate(
                 roots["scene"],
                 roots["launch"],
-                jnp.asarray(float(self.times[-1])),
+                self.times[-1],
                 self.times,
                 tolerance,
                 adjoint=diffrax.ForwardMode(),

@@ -2,22 +2,23 @@
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from nonholonomic.ensemble import Outcome, lanes_for, traced_march
-from nonholonomic.lockstep import CROSSED, REACHED_END, AbstractProblem
+from nonholonomic.lockstep import CROSSED, FAILED, REACHED_END, AbstractProblem
 from nonholonomic.paths import numbers
 from nonholonomic.phases import Journey
 from nonholonomic.runge_kutta import explicit_tableau
 from nonholonomic.slopes import directions_of, traced_march_with_slopes
-from nonholonomic.validation import as_number, require
+from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, require_all
 from nonholonomic.variation import natural_size
 
 from .dynamics import COS_THETA, Dynamics
@@ -27,6 +28,9 @@ from .stick_slip.motion import Kind, StickSlip
 
 #: The absolute tolerance is this part of the relative one, in units of the state's own magnitudes.
 ABSOLUTE = 0.1
+
+#: The greatest relative tolerance that is accepted.
+LOOSEST = 1e-2
 
 
 class InversionProblem(AbstractProblem):
@@ -84,7 +88,8 @@ def inversion_time(
       above it until `t1`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
 
-    **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before.
+    **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before; not a number
+    if the integration failed, or where numbers inside a transformation are outside of their ranges.
 
     **Raises:** `ValueError` for arguments outside these ranges, and for a scene with `contact="hybrid"` or
     `SetValuedCoulomb`: the derivative does not go through impacts, nor through stick and slip. `inversion_table` gives the
@@ -96,7 +101,8 @@ def inversion_time(
     check_smooth(scene, "inversion_time")
     explicit_tableau(solver)
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
-    return _differentiable(_Run(structure, solver, crossing == "last"), len(leaves))(*leaves)
+    unchecked = any(is_traced(leaf) for leaf in leaves)
+    return _differentiable(_Run(structure, solver, crossing == "last", unchecked), len(leaves))(*leaves)
 
 
 class _Run(NamedTuple):
@@ -106,6 +112,8 @@ class _Run(NamedTuple):
     structure: Any
     solver: diffrax.AbstractERK
     last: bool
+    # Whether some numbers were traced, so that the checks could not look at them.
+    unchecked: bool
 
 
 def _differentiable(run: _Run, count: int) -> Callable[..., Float[Array, ""]]:
@@ -124,7 +132,14 @@ def _differentiable(run: _Run, count: int) -> Callable[..., Float[Array, ""]]:
             time = event_time(*leaves)
             return time, jnp.zeros_like(time)
         time, *slopes = _time_and_slopes(run, active)(*leaves)
-        return time, sum(slope * tangents[i] for slope, i in zip(slopes, active, strict=True))
+        # Nothing passes through an infinite time, neither forwards nor backwards: the cotangent of a loss such as
+        # (time - measured)^2 is infinite there, and would make NaN of a slope of 0.
+        none = jnp.isinf(time)
+
+        def share(slope: Float[Array, ""], tangent: Float[Array, ""]) -> Float[Array, ""]:
+            return jnp.where(none, 0.0, slope * jnp.where(none, 0.0, tangent))
+
+        return time, sum(share(slope, tangents[i]) for slope, i in zip(slopes, active, strict=True))
 
     return event_time
 
@@ -162,10 +177,9 @@ def _batched(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _event_times(run: _Run, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
     """The event's time in every cell, infinite where there is none."""
-    scene, launch, angle, t1, tolerance = jax.tree.unflatten(run.structure, leaves)
+    scene, launch, angle, *_ = jax.tree.unflatten(run.structure, leaves)
     problem = InversionProblem.of(scene, launch, angle, cells)
-    # One tolerance serves a block: the smallest of a batch.
-    tolerance = jnp.min(tolerance)
+    may, t1, tolerance = _permitted(run, leaves)
     outcome, _ = traced_march(
         problem,
         t1,
@@ -178,7 +192,25 @@ def _event_times(run: _Run, cells: int, *leaves: Float[Array, "..."]) -> Float[A
         one_kernel=True,
     )
     inverted = is_inverted(outcome, problem, run.last)
-    return jnp.where(inverted, outcome.crossing_time, jnp.inf)
+    time = jnp.where(inverted, outcome.crossing_time, jnp.inf)
+    return jnp.where(may & (outcome.status != FAILED), time, jnp.nan)
+
+
+@eqx.filter_jit
+def _permitted(
+    run: _Run, leaves: tuple[Float[Array, "..."], ...]
+) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, ""]]:
+    """Which cells have legal numbers; the horizons, 0 for the others; and the tolerance of the block.
+
+    One tolerance serves a block: the smallest of a batch.
+    """
+    scene, launch, angle, t1, tolerance = jax.tree.unflatten(run.structure, leaves)
+    may = jnp.asarray(True)
+    if run.unchecked:
+        bounds = (*all_bounds(scene), *all_bounds(launch), *event_bounds(angle), *run_bounds(t1, tolerance))
+        may = legal(bounds)
+        t1, tolerance = jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
+    return may, t1, jnp.min(tolerance)
 
 
 def _times_and_slopes(
@@ -202,9 +234,7 @@ def _times_and_slopes(
         tuple(size if i == k else jnp.zeros_like(size) for i, size in enumerate(sizes)) for k in range(len(point))
     ]
     problem = build(*point)
-    t1, tolerance = jax.tree.unflatten(run.structure, leaves)[-2:]
-    tolerance = jnp.min(tolerance)
-
+    may, t1, tolerance = _permitted(run, leaves)
     outcome, slopes = traced_march_with_slopes(
         problem,
         directions_of(build, point, tangents),
@@ -218,7 +248,9 @@ def _times_and_slopes(
     )
     inverted = is_inverted(outcome, problem, run.last)
     times = jnp.where(inverted, outcome.crossing_time, jnp.inf)
-    return [times, *(jnp.where(inverted, slope / size, 0.0) for slope, size in zip(slopes, sizes, strict=True))]
+    good = may & (outcome.status != FAILED)
+    found = [times, *(jnp.where(inverted, slope / size, 0.0) for slope, size in zip(slopes, sizes, strict=True))]
+    return [jnp.where(good, one, jnp.nan) for one in found]
 
 
 def is_inverted(outcome: Outcome | Journey, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:
@@ -235,12 +267,22 @@ def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any) -> None:
         raise ValueError(f"scene = {scene!r} must be a Scene")
     if not isinstance(launch, Launch):
         raise ValueError(f"launch = {launch!r} must be a Launch")
-    require(t1, "t1", above=0.0)
-    require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+    require_all(run_bounds(t1, tolerance))
     values = numbers("scene", scene) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
     for name, value in values.items():
         if value is not None and np.ndim(value) != 0:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; inversion_table takes lists")
+
+
+def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:
+    """The ranges of the horizon [s] and of the tolerance."""
+    yield Bound(t1, "t1", above=0.0)
+    yield Bound(tolerance, "tolerance", at_least=1e-14, at_most=LOOSEST)
+
+
+def event_bounds(angle: Any) -> Iterator[Bound]:
+    """The range of the angle [rad] to be reached."""
+    yield Bound(angle, "angle", above=0.0, at_most=math.pi)
 
 
 def check_smooth(scene: Scene, caller: str) -> None:
@@ -254,7 +296,7 @@ def check_smooth(scene: Scene, caller: str) -> None:
 
 def check_event(angle: Any, crossing: Any) -> None:
     """Raise `ValueError` unless the angle is in (0, pi] and the crossing a known word."""
-    require(angle, "angle", above=0.0, at_most=math.pi)
+    require_all(event_bounds(angle))
     if np.ndim(angle) != 0:
         raise ValueError(f"angle must be one number, not of shape {np.shape(angle)}")
     if crossing not in ("first", "last"):

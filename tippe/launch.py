@@ -1,14 +1,15 @@
 """How a run starts."""
 
 import math
+from collections.abc import Iterator
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import as_number, require
+from nonholonomic.validation import Bound, Bounded, as_number
 
 
-class Launch(eqx.Module):
+class Launch(Bounded):
     """A start with the angular velocity along the axis, w = spin e, and the centre at rest.
 
     **Arguments:**
@@ -26,8 +27,8 @@ class Launch(eqx.Module):
     eta: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
     azimuth: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
 
-    def __check_init__(self):
-        require(self.theta, "theta", at_least=0.0, at_most=math.pi)
-        require(self.spin, "spin")
-        require(self.eta, "eta", at_least=-math.pi, at_most=math.pi)
-        require(self.azimuth, "azimuth")
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.theta, "theta", at_least=0.0, at_most=math.pi)
+        yield Bound(self.spin, "spin")
+        yield Bound(self.eta, "eta", at_least=-math.pi, at_most=math.pi)
+        yield Bound(self.azimuth, "azimuth")

@@ -62,7 +62,7 @@ class Run(AbstractProblem):
 
 
 #: How a run can end, by the codes that stand for the words inside a transformation.
-STATUS = ("reached t1", "contact_lost", "failed", "jammed")
+STATUS = ("reached t1", "contact_lost", "failed", "jammed", "illegal")
 
 
 def ended(

@@ -1,11 +1,13 @@
 """The scene: what moves, on what arena, with what friction, under what gravity."""
 
+from collections.abc import Iterator
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.surface import AbstractSurface, Plane, none_if_zero
-from nonholonomic.validation import as_number, require
+from nonholonomic.validation import Bound, Bounded, as_number
 from nonholonomic.vector import dot
 
 from .dynamics import COS_THETA, Dynamics
@@ -21,7 +23,7 @@ NEARLY_UPRIGHT = 1e-2
 POINT_FRICTION = (Frictionless, Viscous, Coulomb)
 
 
-class Scene(eqx.Module):
+class Scene(Bounded):
     """A tippe top on an arena.
 
     Every number in it is a leaf of a pytree: it can be swept, traced and differentiated.
@@ -54,7 +56,7 @@ class Scene(eqx.Module):
         for name, part, kind in (*parts, ("friction", self.friction, AbstractFriction)):
             if not isinstance(part, kind):
                 raise ValueError(f"{name} = {part!r} must be a {kind.__name__.removeprefix('Abstract')}")
-        require(self.gravity, "gravity", above=0.0)
+        # A surface that offers a ball no room at all says so.
         self.surface.parallel(self.body.radius)
         if self.contact not in ("stop", "hybrid"):
             raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
@@ -64,10 +66,14 @@ class Scene(eqx.Module):
             raise ValueError(f"contact = 'hybrid' must be with friction at a point, not with {self.friction!r}")
         if self.contact == "stop" and self.body.stem is not None:
             raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
+        if self.restitution is not None and self.contact == "stop":
+            raise ValueError(f"restitution = {self.restitution!r} must be left out where contact = 'stop'")
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.gravity, "gravity", above=0.0)
+        yield from self.surface.room(self.body.radius)
         if self.restitution is not None:
-            if self.contact == "stop":
-                raise ValueError(f"restitution = {self.restitution!r} must be left out where contact = 'stop'")
-            require(self.restitution, "restitution", at_least=0.0, at_most=1.0)
+            yield Bound(self.restitution, "restitution", at_least=0.0, at_most=1.0)
 
     @property
     def dynamics(self) -> Dynamics | StickSlip:

@@ -1,13 +1,15 @@
 """The body: an eccentric sphere whose mass is symmetric about the axis through its two centres."""
 
+from collections.abc import Iterator
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import as_number, require
+from nonholonomic.validation import Bound, Bounded, as_number
 
 
-class Stem(eqx.Module):
+class Stem(Bounded):
     """The rounded end of a stem: a second sphere with which a top can touch the plane (`tippe.md`, section 4).
 
     **Arguments:**
@@ -21,12 +23,12 @@ class Stem(eqx.Module):
     radius: Float[Array, "..."] = eqx.field(converter=as_number)
     offset: Float[Array, "..."] = eqx.field(converter=as_number)
 
-    def __check_init__(self):
-        require(self.radius, "stem radius", above=0.0)
-        require(self.offset, "stem offset", above=0.0)
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.radius, "stem radius", above=0.0)
+        yield Bound(self.offset, "stem offset", above=0.0)
 
 
-class Top(eqx.Module):
+class Top(Bounded):
     """A tippe top: a sphere with the centre of mass off its centre, symmetric about the axis e, and the stem's end if any.
 
     The centre of mass lies at -`offset` e from the sphere's centre, e being the direction of the stem.
@@ -51,15 +53,17 @@ class Top(eqx.Module):
     stem: Stem | None = None
 
     def __check_init__(self):
-        require(self.mass, "mass", above=0.0)
-        require(self.radius, "radius", above=0.0)
-        require(self.offset, "offset", at_least=0.0)
-        require(self.offset, "offset", below=self.radius, why="the centre of mass lies inside the sphere")
-        require(self.I1, "I1", above=0.0)
-        require(self.I3, "I3", above=0.0)
-        require(self.I3, "I3", at_most=2.0 * self.I1, why="I3 <= 2 I1 for every rigid body")
+        if self.stem is not None and not isinstance(self.stem, Stem):
+            raise ValueError(f"stem = {self.stem!r} must be a Stem")
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.mass, "mass", above=0.0)
+        yield Bound(self.radius, "radius", above=0.0)
+        yield Bound(self.offset, "offset", at_least=0.0)
+        yield Bound(self.offset, "offset", below=self.radius, why="the centre of mass lies inside the sphere")
+        yield Bound(self.I1, "I1", above=0.0)
+        yield Bound(self.I3, "I3", above=0.0)
+        yield Bound(self.I3, "I3", at_most=2.0 * self.I1, why="I3 <= 2 I1 for every rigid body")
         if self.stem is not None:
-            if not isinstance(self.stem, Stem):
-                raise ValueError(f"stem = {self.stem!r} must be a Stem")
             reach = self.offset + jnp.abs(self.radius - self.stem.radius)
-            require(self.stem.offset, "stem offset", above=reach, why="neither sphere lies within the other")
+            yield Bound(self.stem.offset, "stem offset", above=reach, why="neither sphere lies within the other")

@@ -1,6 +1,6 @@
 """One run of a tippe top, with its path."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import diffrax
@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.integrate import follow
-from nonholonomic.validation import as_number, is_traced, require
+from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require, require_all
 from nonholonomic.vector import dot
 
 from .hybrid.trajectory import HybridTrajectory, simulate_hybrid
-from .inversion import ABSOLUTE, check_run
+from .inversion import ABSOLUTE, check_run, run_bounds
 from .launch import Launch
 from .sampled import STATUS, Run, ended, sampled, sampled_by_diffrax
 from .scene import Scene
@@ -40,11 +40,12 @@ class Trajectory(eqx.Module):
     Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame
     (t1, t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre.
 
-    `status` is "reached t1", "contact_lost", "failed" or "jammed" (a code 0, 1, 2, 3 inside a transformation); the run ends
-    at `end_time`. It is jammed where the equation for the normal force ceases to have a solution, because friction pulls the
-    top into the arena as hard as the normal force pushes it out: strong friction, a large offset and a slip along the axis
-    do that. `stats` holds accepted and rejected steps, the greatest drift of |e| and the greatest energy residual |E - E(0)
-    - work of friction| [J]; with `SetValuedCoulomb` also `sticks`, how often a slip has turned into rolling.
+    `status` is "reached t1", "contact_lost", "failed" or "jammed"; inside a transformation it is a code 0, 1, 2, 3, or 4,
+    "illegal", for numbers out of range, of which everything is not a number. The run ends at `end_time`. It is jammed where the
+    equation for the normal force ceases to have a solution, because friction pulls the top into the arena as hard as the
+    normal force pushes it out: strong friction, a large offset and a slip along the axis do that. `stats` holds accepted and
+    rejected steps, the greatest drift of |e| and the greatest energy residual |E - E(0) - work of friction| [J]; with
+    `SetValuedCoulomb` also `sticks`, how often a slip has turned into rolling.
     """
 
     t: Float[Array, " times"]
@@ -194,14 +195,14 @@ def simulate(
         raise ValueError(f"solver = {solver!r} must be a solver of Diffrax, such as Dopri8()")
     if times is not None:
         times = as_number(times)
-        require(times, "times", at_least=0.0, at_most=t1)
+        require_all(times_bounds(times, t1))
         _check_increasing(times)
     if scene.contact == "hybrid":
         if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1))):
             raise ValueError("contact = 'hybrid' must be 'stop' inside jit, vmap and grad")
         return simulate_hybrid(scene, launch, float(t1), times, tolerance, solver)
-    if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1))):
-        return _traced(scene, launch, times, t1, tolerance, solver, adjoint)
+    if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
+        return _legal_or_nan(scene, launch, times, t1, tolerance, solver, adjoint)
     run = Run.of(scene, launch)
     through = follow_stick_slip if scene.friction.set_valued else follow
     path = through(run, float(t1), solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
@@ -216,6 +217,24 @@ def _check_increasing(times: Any) -> None:
         raise ValueError(f"times must be a non-empty list, not of shape {np.shape(times)}")
     if not is_traced(times) and np.any(np.diff(times) <= 0.0):
         raise ValueError("times must increase")
+
+
+def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
+    """The range of the times of output [s]."""
+    yield Bound(times, "times", at_least=0.0, at_most=t1)
+
+
+def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: Any, *options: Any) -> Trajectory:
+    """What `_traced` gives, or not a number and the status "illegal" where a traced number is out of range."""
+    if times is None:
+        # It says that there must be some.
+        return _traced(scene, launch, times, t1, tolerance, *options)
+    bounds = (*all_bounds(scene), *all_bounds(launch), *run_bounds(t1, tolerance), *times_bounds(times, t1))
+    may = jnp.all(legal(bounds)) & jnp.all(jnp.diff(times) > 0.0)
+    # Steps of illegal numbers might never reach the end: they are not begun.
+    found = _traced(scene, launch, times, jnp.where(may, t1, 0.0), tolerance, *options)
+    status = jnp.where(may, found.status, STATUS.index("illegal"))
+    return eqx.tree_at(lambda one: (one.t, one.status), nan_unless(may, found), (times, status))
 
 
 def _traced(

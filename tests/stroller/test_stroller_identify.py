@@ -15,6 +15,14 @@ def scene(rolling=2.0, wheelbase=0.7):
     return stroller.Scene(body, friction=stroller.Damping(rolling))
 
 
+def test_damping_from_recorded_speeds():
+    speeds = stroller.simulate(scene(), LAUNCH, 0.5, times=[0.25, 0.5]).speed
+    data = stroller.Recording(LAUNCH, [0.25, 0.5], speeds, 0.01, quantity="speed")
+    found = stroller.identify(scene(), data, {"rolling": 1.0})
+    assert found.status == "converged"
+    assert_close(found.estimates["scene.friction.rolling"], 2.0, rtol=1e-5)
+
+
 @pytest.mark.slow
 def test_damping_and_wheelbase_from_an_exact_path():
     path = stroller.simulate(scene(), LAUNCH, 1.5, times=TIMES).position

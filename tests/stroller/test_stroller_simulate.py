@@ -112,6 +112,23 @@ def test_runs_are_vmapped_and_scene_numbers_too():
     np.testing.assert_allclose(together[1], end(1.0), atol=1e-9)
 
 
+def test_illegal_numbers_in_a_batch_of_rides_give_nothing_that_looks_right():
+    """Numbers that constructors cannot look at: the ride has failed, and all that is read off is not a number."""
+
+    def ride(mass, steering, latitude, damping):
+        scene = Scene(Stroller(mass, 0.7, 0.4, 0.05), Sphere(2.0), Damping(damping), side="inside")
+        return stroller.simulate(scene, Launch((0.3, latitude), 0.5, 1.5, steering), 0.1, push, times=[0.0, 0.1])
+
+    good, columns = (1.7, 0.2, -0.6, 0.3), [(1.7, 0.2, -0.6, 0.3)]
+    for which, values in ((0, (-1.7, np.nan)), (1, (np.pi / 2,)), (2, (2.0,)), (3, (-0.3,))):
+        columns += [tuple(value if i == which else one for i, one in enumerate(good)) for value in values]
+    rides = jax.jit(jax.vmap(ride))(*jnp.array(columns).T)
+    assert rides.stats.finished.tolist() == [True] + 5 * [False]
+    for read in (rides.position, rides.steering, rides.energy, rides.work, rides.normal_force, rides.load):
+        assert np.all(np.isfinite(read[0]))
+        assert np.all(np.isnan(read[1:]))
+
+
 def central_difference(function, tree, where, scale):
     """Central difference of a function of a tree by one of its numbers, at the step where it changes least."""
     steps = scale * np.array([3e-3, 1e-3, 3e-4, 1e-4])

@@ -87,6 +87,16 @@ def test_slopes_of_the_times_are_those_of_central_differences(rutstam_scene, tab
     assert np.all(np.abs(slopes[0, :, :2]) > 1e-3)
 
 
+def test_friction_from_a_recorded_run(rutstam_scene):
+    """As a user does it: a run's theta, and the friction that made it, from another start."""
+    launch, times = tippe.Launch(0.4, 100.0), [0.1, 0.2, 0.3]
+    run = tippe.simulate(rutstam_scene, launch, 0.3, times=times)
+    other = dataclasses.replace(rutstam_scene, friction=tippe.Viscous(0.2))
+    found = tippe.identify(other, tippe.Recording(launch, times, run.theta, 1e-3), {"mu": 0.2})
+    assert found.status == "converged"
+    assert_close(found.estimates["scene.friction.mu"], 0.3, rtol=1e-5)
+
+
 @pytest.mark.slow
 def test_recordings_are_predicted_as_simulated(rutstam_scene):
     launch, times = tippe.Launch(0.4, 100.0), np.array([0.1, 0.2, 0.3])

@@ -72,6 +72,48 @@ def test_no_inversion_is_infinite_with_derivative_zero():
         assert slope == 0.0
 
 
+def test_a_guarded_loss_has_a_gradient_where_nothing_inverts():
+    """The loss is 0 there and so is its gradient, although the cotangent that it sends back is not a number."""
+
+    def loss(mu, spin):
+        time = time_of(mu, spin=spin)
+        return jnp.where(jnp.isfinite(time), (time - 5.0) ** 2, 0.0)
+
+    for spin in (40.0, 190.0):
+        assert jax.value_and_grad(loss)(0.3, spin) == (0.0, 0.0)
+    time, slope = jax.value_and_grad(time_of)(0.3)
+    value, gradient = jax.value_and_grad(loss)(0.3, 155.0)
+    assert_close(value, (time - 5.0) ** 2, rtol=1e-12)
+    assert_close(gradient, 2.0 * (time - 5.0) * slope, rtol=1e-12)
+
+
+def test_illegal_numbers_inside_transformations_give_nothing_that_looks_right():
+    """Numbers that constructors cannot look at: not a number, nor their derivatives; their neighbours stay right."""
+    good = {"mu": 0.3, "theta": 0.1, "offset": 0.006, "tolerance": 1e-8, "t1": 20.0}
+    bad = {
+        "mu": [-0.3, math.nan],
+        "theta": [10.0, -0.1],
+        "offset": [0.03],
+        "tolerance": [math.nan],
+        "t1": [-1.0, math.inf],
+    }
+    columns = {name: [good[name]] for name in good}
+    for name, values in bad.items():
+        for value in values:
+            for other in columns:
+                columns[other].append(value if other == name else good[other])
+    times = jax.vmap(lambda numbers: time_of(**numbers))({name: jnp.array(values) for name, values in columns.items()})
+    assert_close(times[0], time_of(), rtol=1e-6)
+    assert np.all(np.isnan(times[1:]))
+    for mu in (-0.3, math.nan):
+        assert np.all(np.isnan(jax.value_and_grad(time_of)(mu)))
+
+
+def test_a_run_that_fails_inside_a_transformation_is_not_a_number():
+    """A spin that overflows is legal; a time that is infinite would say that the top does not invert."""
+    assert np.isnan(jax.jit(lambda spin: time_of(spin=spin, tolerance=1e-8))(1e200))
+
+
 def test_a_top_exactly_upright_never_leaves():
     assert np.isinf(time_of(theta=0.0))
 

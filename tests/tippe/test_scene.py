@@ -9,6 +9,7 @@ import pytest
 from conftest import assert_close, random_states, rutstam_top
 
 import tippe
+from nonholonomic.validation import all_bounds, legal
 
 GOOD = {"mass": 0.02, "radius": 0.02, "offset": 0.006, "I1": 3e-6, "I3": 3.2e-6}
 
@@ -71,6 +72,37 @@ def test_traced_numbers_pass_the_checks():
     """A scene can be built inside a transformation, whatever the numbers."""
     energy = jax.jit(lambda mass: tippe.Scene(tippe.Top(mass, 0.02, 0.006, 3e-6, 3.2e-6)).body.mass * 2.0)
     assert energy(-1.0) == -2.0
+
+
+@pytest.mark.parametrize(
+    ("make", "good", "bad"),
+    [
+        (lambda x: tippe.Top(**(GOOD | {"mass": x})), 0.02, 0.0),
+        (lambda x: tippe.Top(**(GOOD | {"offset": x})), 0.0, 0.02),
+        (lambda x: tippe.Top(**(GOOD | {"I1": x})), 3e-6, 1.5e-6),
+        (lambda x: tippe.Stem(0.005, x), 0.018, 0.0),
+        (lambda x: tippe.Launch(x, 100.0), math.pi, 3.2),
+        (lambda x: tippe.Launch(0.1, x), -100.0, math.nan),
+        (lambda x: tippe.Launch(0.1, 100.0, eta=x), -3.0, -4.0),
+        (lambda x: tippe.Scene(rutstam_top(), gravity=x), 1.6, 0.0),
+        (lambda x: tippe.Scene(rutstam_top(), tippe.Cylinder(x)), 0.021, 0.02),
+        (lambda x: tippe.Scene(rutstam_top(), tippe.Sphere(x)), 0.021, 0.01),
+        (lambda x: tippe.Scene(rutstam_top(), contact="hybrid", restitution=x), 1.0, 1.1),
+        (lambda x: tippe.Scene(rutstam_top(), friction=tippe.Viscous(x)), 0.0, -0.1),
+        (lambda x: tippe.Coulomb(0.3, x), 0.1, 0.0),
+        (lambda x: tippe.Contensou(0.3, x, 0.1), 0.0, math.inf),
+        (lambda x: tippe.Rolling(1e-4, x, tippe.Viscous(0.3)), 1.0, 0.0),
+        (lambda x: tippe.Rolling(1e-4, 1.0, tippe.Viscous(x)), 0.3, -0.3),
+        (lambda x: tippe.SetValuedCoulomb(x), 0.0, -0.1),
+    ],
+)
+def test_what_constructors_refuse_a_trace_knows_to_be_illegal(make, good, bad):
+    """One statement of every range serves both."""
+    found = jax.vmap(lambda number: legal(all_bounds(make(number))))(jnp.array([good, bad]))
+    assert found.tolist() == [True, False]
+    make(good)
+    with pytest.raises(ValueError, match="must be"):
+        make(bad)
 
 
 #: The lean field's cost in tippe.md, section 2 (i)-(iii), counted by operator overloading.

@@ -37,6 +37,25 @@ def test_given_times_and_dense_output_agree(rutstam_scene):
         whole.at([0.5, 1.5])
 
 
+def test_illegal_numbers_in_a_batch_of_runs_give_nothing_that_looks_right(rutstam_scene):
+    """Numbers that constructors cannot look at: the status says it, and all else is not a number."""
+
+    def run(mu, theta, t1):
+        scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(mu))
+        return tippe.simulate(scene, tippe.Launch(theta, 155.0), t1, times=[0.0, 0.05])
+
+    good, columns = (0.3, 0.1, 0.05), [(0.3, 0.1, 0.05)]
+    for which, values in ((0, (-0.3, math.nan)), (1, (10.0, -0.1)), (2, (-0.05, 0.01, math.nan))):
+        columns += [tuple(value if i == which else one for i, one in enumerate(good)) for value in values]
+    runs = jax.jit(jax.vmap(run))(*jnp.array(columns).T)
+    assert runs.status.tolist() == [0] + 7 * [3]
+    alone = tippe.simulate(rutstam_scene, LAUNCH, 0.05, times=[0.0, 0.05])
+    assert_close(runs.theta[0], alone.theta, rtol=1e-9)
+    for read in (runs.theta, runs.energy, runs.position, runs.normal_force, runs.work, runs.end_time):
+        assert np.all(np.isfinite(read[0]))
+        assert np.all(np.isnan(read[1:]))
+
+
 def test_more_steps_than_a_piece_holds(rutstam_scene):
     """A long run is made of pieces; the seams are not seen."""
     run = tippe.simulate(rutstam_scene, LAUNCH, 8.0, tolerance=3e-14)

@@ -1,0 +1,210 @@
+"""When something that a run's steps passed was zero: found between two steps by trying the step again with other lengths.
+
+So a time has the accuracy of the integration and not that of an interpolation. Only the field is compiled, and only where
+there is something to find; the stages of the steps are summed in NumPy.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from nonholonomic.runge_kutta import explicit_tableau
+
+from .dynamics import State
+from .input import Input
+from .scene import Scene
+
+Lanes = Float[np.ndarray, " lanes"]
+States = Float[np.ndarray, "components lanes"]
+
+#: How many states the field is given at once, so that it is compiled once.
+WIDTH = 256
+
+#: Parts of a step at whose ends the sign is looked at, where there may be a crossing.
+PARTS = 8
+
+#: How many times looks are added where the quantity is nearest to zero, so that two crossings close together are seen.
+CLOSER_LOOKS = 3
+
+#: A crossing is located once its bracket, or the change from one trial to the next, is shorter than this part of its time.
+LOCATED = 1e-14
+
+#: Trials after which the last one is taken.
+MOST_TRIALS = 60
+
+
+class Watch(NamedTuple):
+    """What is followed from one step of the integration to the next; unused entries are infinite or NaN.
+
+    Times [s] and states (steps, components), and the normal force [N], the cosine of the steering angle and the relative
+    reduced mass there.
+    """
+
+    time: Float[Array, " steps"]
+    state: Float[Array, "steps components"]
+    normal_force: Float[Array, " steps"]
+    steering_cosine: Float[Array, " steps"]
+    rank: Float[Array, " steps"]
+
+
+def watched(scene: Scene, state: State) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+    """Normal force [N], cosine of the steering angle, and relative reduced mass at a state."""
+    return scene.contact(state), scene.dynamics.geometry(state).cosine, scene.rank(state)
+
+
+class Recipe(eqx.Module):
+    """What made a run: scene, input, and the solver if it was an explicit Runge-Kutta method.
+
+    Its numbers are leaves and all else is static, so that a run can leave a transformation whatever its input is.
+    """
+
+    numbers: Any
+    rest: Any = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, scene: Scene, input: Input | None, solver: diffrax.AbstractSolver) -> "Recipe":
+        """The recipe of a run."""
+        explicit = solver if isinstance(solver, diffrax.AbstractERK) else None
+        return cls(*eqx.partition((scene, input, explicit), eqx.is_array_like))
+
+    @property
+    def parts(self) -> tuple[Scene, Input | None, diffrax.AbstractERK | None]:
+        """Scene, input and solver."""
+        return eqx.combine(self.numbers, self.rest)
+
+
+@eqx.filter_jit
+def _field(recipe: Recipe, times: Float[Array, " lanes"], states: State) -> State:
+    scene, input, _ = recipe.parts
+    return scene.dynamics.field(times, states, input)
+
+
+@eqx.filter_jit
+def _watched(recipe: Recipe, states: State) -> Float[Array, "watched lanes"]:
+    return jnp.stack(jnp.broadcast_arrays(*watched(recipe.parts[0], states)))
+
+
+def _in_blocks(function: Callable[..., Any], *columns: Any) -> Any:
+    """A compiled function of columns of any number, `WIDTH` of them at a time; the last block is filled up with its end."""
+    count = columns[0].shape[-1]
+    found = []
+    for first in range(0, count, WIDTH):
+        lanes = np.minimum(np.arange(first, first + WIDTH), count - 1)
+        found.append(np.asarray(function(*(column[..., lanes] for column in columns))))
+    return np.concatenate(found, axis=-1)[..., :count]
+
+
+class Between(NamedTuple):
+    """A watched quantity, less a level, at any time of a run: its steps, times (steps,) and states (components, steps)."""
+
+    recipe: Recipe
+    times: Float[np.ndarray, " steps"]
+    states: States
+    name: str
+    level: float
+
+    def at(self, times: Lanes) -> Lanes:
+        """The quantity at the given times; what is no number counts as beyond the level."""
+        which = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
+        found = _in_blocks(lambda at: _watched(self.recipe, at), self._states(which, times - self.times[which]))
+        value = found[Watch._fields.index(self.name) - 2] - self.level
+        return np.where(np.isfinite(value), value, -np.inf)
+
+    def _states(self, which: Any, length: Lanes) -> States:
+        """The states some time [s] after the starts of some steps."""
+
+        def field(times: Lanes, states: States) -> States:
+            return _in_blocks(lambda *at: _field(self.recipe, *at), times, states)
+
+        time, start, solver = self.times[which], self.states[:, which], self.recipe.parts[2]
+        rates = [field(time, start)]
+        if solver is None:
+            # The cubic through states and rates at both ends; an implicit step cannot be tried again so cheaply.
+            whole, end = self.times[which + 1] - time, self.states[:, which + 1]
+            part, change = length / whole, end - start
+            last = field(time + whole, end)
+            bend = (1.0 - part) * (whole * rates[0] - change) - part * (whole * last - change)
+            return start + part * (change + (1.0 - part) * bend)
+        tableau = explicit_tableau(solver)
+        for fraction, row in zip(tableau.c, tableau.a_lower, strict=True):
+            end = start + length * np.tensordot(row, np.stack(rates), 1)
+            rates.append(field(time + fraction * length, end))
+        return start + length * np.tensordot(tableau.b_sol, np.stack(rates), 1)
+
+
+def crossings(recipe: Recipe, watch: Watch, name: str, level: float) -> Float[np.ndarray, " times"]:
+    """Times [s] at which a watched quantity passes a level, in either direction, growing."""
+    time, value = np.asarray(watch.time), np.asarray(getattr(watch, name)) - level
+    used = np.isfinite(time)
+    time, value = time[used], value[used]
+    which = np.flatnonzero(_may_cross(value))
+    if which.size == 0:
+        return np.zeros(0)
+    quantity = Between(recipe, time, np.asarray(watch.state).T[:, used], name, level)
+    parts = np.arange(1, PARTS) / PARTS
+    new = (time[which] + parts[:, None] * (time[which + 1] - time[which])).ravel()
+    for _ in range(1 + CLOSER_LOOKS):
+        time, value = np.concatenate([time, new]), np.concatenate([value, quantity.at(new)])
+        order = np.argsort(time, kind="stable")
+        time, value = time[order], value[order]
+        new = _nearest(time, value)
+        if new.size == 0:
+            break
+    found = np.flatnonzero((value[:-1] > 0.0) != (value[1:] > 0.0))
+    return _root(quantity.at, time[found], time[found + 1], value[found], value[found + 1])
+
+
+def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
+    """In which steps a quantity may be zero: where it changes its sign, or changes by more than it is, there or beside."""
+    with np.errstate(invalid="ignore"):
+        change = np.abs(np.diff(value))
+        largest = np.max([change, np.append(change[1:], 0.0), np.insert(change[:-1], 0, 0.0)], axis=0)
+        small = np.minimum(np.abs(value[:-1]), np.abs(value[1:])) < largest
+    return small | ((value[:-1] > 0.0) != (value[1:] > 0.0))
+
+
+def _nearest(time: Float[np.ndarray, " looks"], value: Float[np.ndarray, " looks"]) -> Float[np.ndarray, " new"]:
+    """Where a quantity is nearest to zero between looks that do not show it change its sign: the vertices of parabolas."""
+    distance = np.abs(value)
+    least = (distance[1:-1] < distance[:-2]) & (distance[1:-1] <= distance[2:])
+    least &= (value[1:-1] > 0.0) == (value[:-2] > 0.0)
+    least &= (value[1:-1] > 0.0) == (value[2:] > 0.0)
+    middle = np.flatnonzero(least) + 1
+    before, after = time[middle] - time[middle - 1], time[middle + 1] - time[middle]
+    with np.errstate(all="ignore"):
+        fall = (distance[middle - 1] - distance[middle]) / before
+        rise = (distance[middle + 1] - distance[middle]) / after
+        vertex = time[middle] + 0.5 * (fall * after**2 - rise * before**2) / (fall * after + rise * before)
+    inside = (vertex > time[middle - 1]) & (vertex < time[middle + 1]) & (np.abs(vertex - time[middle]) > LOCATED)
+    return vertex[inside]
+
+
+def _root(function: Callable[[Lanes], Lanes], low: Lanes, high: Lanes, at_low: Lanes, at_high: Lanes) -> Lanes:
+    """Zeros of a function of many numbers, one in each bracket (Anderson and Bjorck, BIT 13 (1973) 253).
+
+    **Arguments:** `low`, `high`: the brackets; `at_low`, `at_high`: the function there, of opposite signs.
+    """
+    guess = low
+    for trial in range(MOST_TRIALS if low.size else 0):
+        last, rise = guess, at_high - at_low
+        with np.errstate(all="ignore"):
+            guess = low - at_low * (high - low) / rise
+        # Where the function is not a number, and now and then to be sure, the bracket is halved.
+        halve = ~np.isfinite(guess) | (trial % 4 == 3)
+        guess = np.where(halve, 0.5 * (low + high), np.clip(guess, low, high))
+        if np.all(np.minimum(high - low, np.abs(guess - last)) <= LOCATED * np.maximum(high, 1.0)):
+            break
+        value = function(guess)
+        beyond = (value > 0.0) != (at_low > 0.0)
+        with np.errstate(all="ignore"):
+            fade_low, fade_high = 1.0 - value / at_high, 1.0 - value / at_low
+        fade_low, fade_high = (np.where(fade > 0.0, fade, 0.5) for fade in (fade_low, fade_high))
+        # The end that stays is given less weight, so that it moves too in the next trial.
+        at_low, at_high = np.where(beyond, at_low * fade_low, value), np.where(beyond, value, at_high * fade_high)
+        low, high = np.where(beyond, low, guess), np.where(beyond, guess, high)
+    return guess
