@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .slopes import directions_of
 from .variation import natural_size
@@ -30,6 +30,10 @@ class AbstractQuestion(eqx.Module):
     in_blocks: ClassVar[bool] = True
 
     movable: eqx.AbstractVar[int]
+
+    @abc.abstractmethod
+    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
+        """Where a part of the answer says that there is nothing, such as an infinite time: its derivative is 0 there."""
 
     @abc.abstractmethod
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Answer:
@@ -48,7 +52,7 @@ class AbstractQuestion(eqx.Module):
 
 
 def ask(question: AbstractQuestion, *leaves: Float[Array, "..."]) -> Answer:
-    """The answer for one run. Where it is not finite its derivative is 0, whatever becomes of it afterwards.
+    """The answer for one run. Where it is absent its derivative is 0, whatever becomes of it afterwards.
 
     **Arguments:** `leaves`: the numbers, as the question takes them for a single cell.
 
@@ -68,19 +72,23 @@ def ask(question: AbstractQuestion, *leaves: Float[Array, "..."]) -> Answer:
             return answer, jax.tree.map(jnp.zeros_like, answer)
         answer, slopes = _with_slopes(question, active)(*leaves)
         moved = [tangents[i] for i in active]
-        return answer, jax.tree.map(lambda value, *by: _change(value, by, moved), answer, *slopes)
+        # Slopes have `None` where the answer has an array that is not differentiated.
+        return answer, jax.tree.map(lambda value, *by: _change(question, value, by, moved), answer, *slopes)
 
     return found(*leaves)
 
 
-def _change(value: Array, slopes: tuple[Any, ...], tangents: list[Array]) -> Any:
+def _change(question: AbstractQuestion, value: Array, slopes: tuple[Any, ...], tangents: list[Array]) -> Any:
     if slopes[0] is None:
         return jax.custom_derivatives.zero_from_primal(value, symbolic_zeros=True)
-    change = sum(
-        jnp.tensordot(slope, tangent, axes=jnp.ndim(tangent)) for slope, tangent in zip(slopes, tangents, strict=True)
-    )
-    # Chosen last, so that on the way back an infinite cotangent of a value that is not finite is dropped, not multiplied.
-    return jnp.where(jnp.isfinite(value), change, 0.0)
+    none = question.absent(value)
+
+    def share(slope: Array, tangent: Array) -> Array:
+        # Chosen before and after, so that an infinite tangent or cotangent of what is absent is dropped, not multiplied.
+        kept = jnp.where(jnp.all(none), 0.0, tangent)
+        return jnp.where(none, 0.0, jnp.tensordot(slope, kept, axes=jnp.ndim(tangent)))
+
+    return sum(share(slope, tangent) for slope, tangent in zip(slopes, tangents, strict=True))
 
 
 def _with_slopes(question: AbstractQuestion, active: tuple[int, ...]) -> Callable[..., tuple[Answer, list[Answer]]]:

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -73,7 +72,6 @@ class Recording(eqx.Module):
                 self.input,
                 self.times,
                 tolerance,
-                adjoint=diffrax.ForwardMode(),
             )
             return getattr(run, self.quantity).reshape(-1)
 

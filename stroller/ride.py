@@ -6,7 +6,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from nonholonomic.differentiable import AbstractQuestion, ask, directions_by
 from nonholonomic.lyapunov import probed
@@ -110,6 +110,9 @@ class RideQuestion(AbstractQuestion):
         """The only ride there is."""
         numbers = jax.tree.unflatten(self.structure, leaves)
         return RideProblem.single(*eqx.combine(numbers, self.rest))
+
+    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
+        return jnp.isnan(value)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Any:
         problem = self.problem(leaves[: self.movable], 1)

@@ -3,7 +3,6 @@
 import math
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -141,7 +140,6 @@ class Recording(eqx.Module):
                 self.times[-1],
                 self.times,
                 tolerance,
-                adjoint=diffrax.ForwardMode(),
             )
             return getattr(run, self.quantity).reshape(-1)
 

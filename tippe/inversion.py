@@ -1,9 +1,8 @@
 """Inversion: when the axis first reaches an angle, for one launch or for every cell of a grid."""
 
-import functools
 import math
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -12,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from nonholonomic.differentiable import AbstractQuestion, ask, directions_by
 from nonholonomic.ensemble import Outcome, lanes_for, traced_march
 from nonholonomic.lockstep import CROSSED, FAILED, REACHED_END, AbstractProblem
 from nonholonomic.paths import numbers
 from nonholonomic.phases import Journey
 from nonholonomic.runge_kutta import explicit_tableau
-from nonholonomic.slopes import directions_of, traced_march_with_slopes
+from nonholonomic.slopes import traced_march_with_slopes
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, require_all
-from nonholonomic.variation import natural_size
 
 from .dynamics import COS_THETA, Dynamics
 from .launch import Launch
@@ -102,155 +101,85 @@ def inversion_time(
     explicit_tableau(solver)
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
     unchecked = any(is_traced(leaf) for leaf in leaves)
-    return _differentiable(_Run(structure, solver, crossing == "last", unchecked), len(leaves))(*leaves)
+    # Horizon and tolerance, the last two numbers, do not move the event.
+    return ask(InversionQuestion(len(leaves) - 2, structure, solver, crossing == "last", unchecked), *leaves)
 
 
-class _Run(NamedTuple):
-    """What of a call is not a number."""
+class InversionQuestion(AbstractQuestion):
+    """When cells invert; the leaves are those of scene and launch, the angle, the horizon, the tolerance."""
 
+    movable: int
     # JAX's PyTreeDef, which type checkers take for a variable.
-    structure: Any
+    structure: Any = eqx.field(static=True)
     solver: diffrax.AbstractERK
-    last: bool
+    last: bool = eqx.field(static=True)
     # Whether some numbers were traced, so that the checks could not look at them.
-    unchecked: bool
+    unchecked: bool = eqx.field(static=True)
 
+    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
+        return jnp.isinf(value)
 
-def _differentiable(run: _Run, count: int) -> Callable[..., Float[Array, ""]]:
-    """The event's time as a function of the call's numbers, with its derivative and its batching."""
-
-    @jax.custom_jvp
-    def event_time(*leaves):
-        return _batched(functools.partial(_event_times, run))(*leaves)
-
-    @functools.partial(event_time.defjvp, symbolic_zeros=True)
-    def variation(leaves, tangents):
-        # Horizon and tolerance, the last two numbers, do not move the event.
-        zero = jax.custom_derivatives.SymbolicZero
-        active = [i for i in range(count - 2) if not isinstance(tangents[i], zero)]
-        if not active:
-            time = event_time(*leaves)
-            return time, jnp.zeros_like(time)
-        time, *slopes = _time_and_slopes(run, active)(*leaves)
-        # Nothing passes through an infinite time, neither forwards nor backwards: the cotangent of a loss such as
-        # (time - measured)^2 is infinite there, and would make NaN of a slope of 0.
-        none = jnp.isinf(time)
-
-        def share(slope: Float[Array, ""], tangent: Float[Array, ""]) -> Float[Array, ""]:
-            return jnp.where(none, 0.0, slope * jnp.where(none, 0.0, tangent))
-
-        return time, sum(share(slope, tangents[i]) for slope, i in zip(slopes, active, strict=True))
-
-    return event_time
-
-
-def _time_and_slopes(run: _Run, active: list[int]) -> Callable[..., list[Float[Array, ""]]]:
-    """The event's time and its derivatives by the active numbers, as a function of the call's numbers."""
-
-    @jax.custom_jvp
-    def found(*leaves):
-        return _batched(functools.partial(_times_and_slopes, run, active, True))(*leaves)
-
-    @found.defjvp
-    def second_variation(leaves, tangents):
-        # `_batched` would mark the value as batched where only the variation is, so it is left out here.
-        once = functools.partial(_times_and_slopes, run, active, False, 1)
-        return jax.jvp(lambda *numbers: [result[0] for result in once(*numbers)], leaves, tangents)
-
-    return found
-
-
-def _batched(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a function of numbers that are scalars or one per cell run a batch as cells of one block."""
-
-    @jax.custom_batching.custom_vmap
-    def one(*leaves):
-        return jax.tree.map(lambda result: result[0], function(1, *leaves))
-
-    @one.def_vmap
-    def many(size, batched, *leaves):
-        results = function(size, *leaves)
-        return results, jax.tree.map(lambda _: True, results)
-
-    return one
-
-
-def _event_times(run: _Run, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
-    """The event's time in every cell, infinite where there is none."""
-    scene, launch, angle, *_ = jax.tree.unflatten(run.structure, leaves)
-    problem = InversionProblem.of(scene, launch, angle, cells)
-    may, t1, tolerance = _permitted(run, leaves)
-    outcome, _ = traced_march(
-        problem,
-        t1,
-        jnp.asarray(cells),
-        tolerance,
-        ABSOLUTE * tolerance,
-        solver=run.solver,
-        lanes=lanes_for(cells),
-        passes=run.last,
-        one_kernel=True,
-    )
-    inverted = is_inverted(outcome, problem, run.last)
-    time = jnp.where(inverted, outcome.crossing_time, jnp.inf)
-    return jnp.where(may & (outcome.status != FAILED), time, jnp.nan)
-
-
-@eqx.filter_jit
-def _permitted(
-    run: _Run, leaves: tuple[Float[Array, "..."], ...]
-) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, ""]]:
-    """Which cells have legal numbers; the horizons, 0 for the others; and the tolerance of the block.
-
-    One tolerance serves a block: the smallest of a batch.
-    """
-    scene, launch, angle, t1, tolerance = jax.tree.unflatten(run.structure, leaves)
-    may = jnp.asarray(True)
-    if run.unchecked:
-        bounds = (*all_bounds(scene), *all_bounds(launch), *event_bounds(angle), *run_bounds(t1, tolerance))
-        may = legal(bounds)
-        t1, tolerance = jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
-    return may, t1, jnp.min(tolerance)
-
-
-def _times_and_slopes(
-    run: _Run, active: list[int], one_kernel: bool, cells: int, *leaves: Float[Array, "..."]
-) -> list[Float[Array, " cells"]]:
-    """The event's time in every cell, infinite where there is none, and its derivatives by the active numbers, 0 there.
-
-    Cells do not influence one another, so moving a number in all of them at once gives every cell its own derivative.
-    """
-
-    def build(*moving):
-        moved = list(leaves)
-        for i, leaf in zip(active, moving, strict=True):
-            moved[i] = leaf
-        scene, launch, angle, *_ = jax.tree.unflatten(run.structure, moved)
+    def problem(self, leaves: tuple[Array, ...], cells: int | None) -> InversionProblem:
+        """The launches of some cells."""
+        # The numbers that do not move the event are not needed here.
+        unused = (None,) * (self.structure.num_leaves - len(leaves))
+        scene, launch, angle, *_ = jax.tree.unflatten(self.structure, (*leaves, *unused))
+        assert cells is not None
         return InversionProblem.of(scene, launch, angle, cells)
 
-    point = tuple(leaves[i] for i in active)
-    sizes = [natural_size(leaf) for leaf in point]
-    tangents = [
-        tuple(size if i == k else jnp.zeros_like(size) for i, size in enumerate(sizes)) for k in range(len(point))
-    ]
-    problem = build(*point)
-    may, t1, tolerance = _permitted(run, leaves)
-    outcome, slopes = traced_march_with_slopes(
-        problem,
-        directions_of(build, point, tangents),
-        t1,
-        jnp.asarray(cells),
-        tolerance,
-        ABSOLUTE * tolerance,
-        solver=run.solver,
-        passes=run.last,
-        one_kernel=one_kernel,
-    )
-    inverted = is_inverted(outcome, problem, run.last)
-    times = jnp.where(inverted, outcome.crossing_time, jnp.inf)
-    good = may & (outcome.status != FAILED)
-    found = [times, *(jnp.where(inverted, slope / size, 0.0) for slope, size in zip(slopes, sizes, strict=True))]
-    return [jnp.where(good, one, jnp.nan) for one in found]
+    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
+        problem = self.problem(leaves[: self.movable], cells)
+        may, t1, tolerance = self._permitted(leaves)
+        outcome, _ = traced_march(
+            problem,
+            t1,
+            jnp.asarray(cells),
+            tolerance,
+            ABSOLUTE * tolerance,
+            solver=self.solver,
+            lanes=lanes_for(cells),
+            passes=self.last,
+            one_kernel=True,
+        )
+        time = jnp.where(is_inverted(outcome, problem, self.last), outcome.crossing_time, jnp.inf)
+        return jnp.where(may & (outcome.status != FAILED), time, jnp.nan)
+
+    def with_slopes(
+        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
+        # Cells do not influence one another, so moving a number in all of them at once gives each its own derivative.
+        problem, directions, gather = directions_by(self.problem, active, leaves[: self.movable], cells)
+        may, t1, tolerance = self._permitted(leaves)
+        outcome, slopes = traced_march_with_slopes(
+            problem,
+            directions,
+            t1,
+            jnp.asarray(cells),
+            tolerance,
+            ABSOLUTE * tolerance,
+            solver=self.solver,
+            passes=self.last,
+            one_kernel=not again,
+        )
+        inverted, good = is_inverted(outcome, problem, self.last), may & (outcome.status != FAILED)
+        time = jnp.where(good, jnp.where(inverted, outcome.crossing_time, jnp.inf), jnp.nan)
+        return time, [jnp.where(good, jnp.where(inverted, slope, 0.0), jnp.nan) for slope in gather(slopes)]
+
+    @eqx.filter_jit
+    def _permitted(
+        self, leaves: tuple[Float[Array, "..."], ...]
+    ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, ""]]:
+        """Which cells have legal numbers; the horizons, 0 for the others; and the tolerance of the block.
+
+        One tolerance serves a block: the smallest of a batch.
+        """
+        scene, launch, angle, t1, tolerance = jax.tree.unflatten(self.structure, leaves)
+        may = jnp.asarray(True)
+        if self.unchecked:
+            bounds = (*all_bounds(scene), *all_bounds(launch), *event_bounds(angle), *run_bounds(t1, tolerance))
+            may = legal(bounds)
+            t1, tolerance = jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
+        return may, t1, jnp.min(tolerance)
 
 
 def is_inverted(outcome: Outcome | Journey, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:

@@ -140,6 +140,9 @@ class BlockSampling(AbstractQuestion):
         numbers = jax.tree.unflatten(self.structure, leaves)
         return Run.of(*eqx.combine(numbers, self.rest), cells)
 
+    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
+        return jnp.isnan(value)
+
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Found:
         problem = self.run(leaves[: self.movable], cells)
         return _march(VariationalProblem(problem, (), False), leaves[self.movable :], self.solver, lanes_for(cells))[0]
@@ -235,6 +238,9 @@ class SingleSampling(AbstractQuestion):
         """The only run there is."""
         numbers = jax.tree.unflatten(self.structure, leaves)
         return Run.of(*eqx.combine(numbers, self.rest))
+
+    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
+        return jnp.isnan(value)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Found:
         problem = self.run(leaves[: self.movable], None)

@@ -48,7 +48,7 @@ def test_illegal_numbers_in_a_batch_of_runs_give_nothing_that_looks_right(rutsta
     for which, values in ((0, (-0.3, math.nan)), (1, (10.0, -0.1)), (2, (-0.05, 0.01, math.nan))):
         columns += [tuple(value if i == which else one for i, one in enumerate(good)) for value in values]
     runs = jax.jit(jax.vmap(run))(*jnp.array(columns).T)
-    assert runs.status.tolist() == [0] + 7 * [3]
+    assert runs.status.tolist() == [0] + 7 * [4]
     alone = tippe.simulate(rutstam_scene, LAUNCH, 0.05, times=[0.0, 0.05])
     assert_close(runs.theta[0], alone.theta, rtol=1e-9)
     for read in (runs.theta, runs.energy, runs.position, runs.normal_force, runs.work, runs.end_time):
