@@ -140,9 +140,26 @@ class RollingDynamics(eqx.Module):
         L = sum_vectors(scale(self.I1, w), scale((self.I3 - self.I1) * along, e))
         return jnp.stack([u[0], u[1], *e, *L, *state[8:]])
 
+    def blow(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
+        """The blow at the contact that changes the velocity of the contact point by 1 m/s along an axis of the arena [N s].
+
+        **Arguments:**
+
+        - `state`: (8 + the arena's place, ...); `axis`: 0 for t1, 1 for t2.
+        """
+        e: Vector = (state[2], state[3], state[4])
+        r, one = self._contact(e), jnp.ones_like(state[0])
+        v = (one, None, None) if axis == 0 else (None, one, None)
+        w = self._over_inertia(e, r, scale(self.mass, cross(r, v)))
+        return scale(self.mass, sum_vectors(cross(r, w), v))
+
     def _contact(self, e: Vector) -> Vector:
         """From the centre of mass to the contact, r = a e - R n [m]."""
         return (self.offset * e[0], self.offset * e[1], self.offset * e[2] - self.radius)
+
+    def angular_velocity(self, state: Float[Array, "components ..."]) -> Vector:
+        """Angular velocity of the body [rad/s] in the moving frame."""
+        return self._angular_velocity((state[2], state[3], state[4]), (state[5], state[6], state[7]))
 
     def _angular_velocity(self, e: Vector, L: Vector) -> Vector:
         """w = L / I1 + (1 / I3 - 1 / I1) (L.e) e [rad/s]."""

@@ -1,12 +1,13 @@
-"""The top on the plane under exact Coulomb friction, event by event: a reference in plain NumPy and SciPy, SI units.
+"""The top under exact Coulomb friction, event by event: a reference in plain NumPy and SciPy, SI units.
 
-State: axis e, velocity u of the centre of mass, angular velocity w, in the fixed frame (9 numbers). The three components
-of the contact force F are unknowns of one linear system, which says what the contact point's acceleration shall be:
+State: axis e, velocity u of the centre of mass, angular velocity w, place O of the sphere's centre, in the fixed frame (12
+numbers). The arena is the plane, the inside of a cylinder along y or of a sphere; n is its normal. The three components of
+the contact force F are unknowns of one linear system, which says what the contact point's acceleration shall be:
 
-    W F = q,  W = 1/m - [r]x J^-1 [r]x,  r = a e - R z,  q = wanted acceleration + g z - w x r' - (J^-1 (J w x w)) x r.
+    W F = q,  W = 1/m - [r]x J^-1 [r]x,  r = a e - R n,  q = wanted acceleration + g z - w x r' - (J^-1 (J w x w)) x r.
 
-Slipping: F = N (-mu v / |v|, 1), N from the vertical equation. Rolling: all three equations, the contact point at rest.
-A slip begins with next to no speed, where its direction is stiff, so it is followed by an implicit method.
+Slipping: F = N (n - mu v / |v|), N from v'.n = -v.n'. Rolling: all three equations, the contact point at rest.
+A slip begins with next to no speed, where its direction is stiff, so it is followed by an implicit method at first.
 """
 
 from typing import NamedTuple
@@ -18,7 +19,8 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 class Body(NamedTuple):
-    """Mass [kg], radius and offset [m], moments of inertia [kg m^2], coefficient of friction, gravity [m/s^2]."""
+    """Mass [kg], radius and offset [m], moments of inertia [kg m^2], coefficient of friction, gravity [m/s^2], the arena's
+    radius [m] and along which axes it is curved: (1, 0, 1) for the cylinder, (1, 1, 1) for the sphere."""
 
     mass: float
     radius: float
@@ -27,10 +29,12 @@ class Body(NamedTuple):
     I3: float
     mu: float
     gravity: float = 9.81
+    arena: float | None = None
+    curved: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class Phase(NamedTuple):
-    """A stretch of the run: "slipping" or "rolling", its steps' times [s] and states (9, times)."""
+    """A stretch of the run: "slipping" or "rolling", its steps' times [s] and states (12, times)."""
 
     kind: str
     times: np.ndarray
@@ -38,9 +42,10 @@ class Phase(NamedTuple):
 
 
 def start(body: Body, theta: float, spin: float) -> np.ndarray:
-    """The launch of `tippe.Launch`: angular velocity along the axis, sphere's centre at rest."""
+    """The launch of `tippe.Launch`: angular velocity along the axis, sphere's centre at rest at the lowest place."""
     e = np.array([np.sin(theta), 0.0, np.cos(theta)])
-    return np.concatenate([e, np.zeros(3), spin * e])
+    depth = 0.0 if body.arena is None else body.radius - body.arena
+    return np.concatenate([e, np.zeros(3), spin * e, depth * UP])
 
 
 def cross(a, b):
@@ -57,10 +62,15 @@ class Contact:
     """What both kinds of motion need at a state."""
 
     def __init__(self, body: Body, state: np.ndarray):
-        e, u, w = state[:3], state[3:6], state[6:]
+        e, u, w, centre = state[:3], state[3:6], state[6:9], state[9:]
         self.body, self.e, self.w = body, e, w
-        self.r = body.offset * e - body.radius * UP
         self.e_dot = cross(w, e)
+        self.V = u + body.offset * self.e_dot
+        self.n, self.n_dot = UP, np.zeros(3)
+        if body.arena is not None:
+            inward = -np.array(body.curved) / (body.arena - body.radius)
+            self.n, self.n_dot = inward * centre, inward * self.V
+        self.r = body.offset * e - body.radius * self.n
         outer = np.outer(e, e)
         J = body.I1 * np.eye(3) + (body.I3 - body.I1) * outer
         self.J_inverse = np.eye(3) / body.I1 + (1.0 / body.I3 - 1.0 / body.I1) * outer
@@ -68,7 +78,11 @@ class Contact:
         self.W = np.eye(3) / body.mass - skew(self.r) @ self.J_inverse @ skew(self.r)
         self.v = u + cross(w, self.r)
         # The acceleration of the contact point that no force at the contact makes.
-        self.drift = -body.gravity * UP + cross(self.free, self.r) + cross(w, body.offset * self.e_dot)
+        self.drift = (
+            -body.gravity * UP
+            + cross(self.free, self.r)
+            + cross(w, body.offset * self.e_dot - body.radius * self.n_dot)
+        )
 
     def rolling_force(self) -> np.ndarray:
         """Force that keeps the contact point from accelerating."""
@@ -76,25 +90,32 @@ class Contact:
 
     def slipping_force(self) -> np.ndarray:
         """Coulomb's force, and the normal force with which the contact persists."""
-        direction = UP - self.body.mu * np.array([self.v[0], self.v[1], 0.0]) / np.hypot(self.v[0], self.v[1])
-        return -self.drift[2] / (self.W[2] @ direction) * direction
+        direction = self.n - self.body.mu * self.v / np.linalg.norm(self.v)
+        load = -self.v @ self.n_dot - self.n @ self.drift
+        return load / (self.n @ self.W @ direction) * direction
 
     def rate(self, force: np.ndarray) -> np.ndarray:
         """Rate of the state under a force at the contact."""
         u_dot = force / self.body.mass - self.body.gravity * UP
-        return np.concatenate([self.e_dot, u_dot, self.free + self.J_inverse @ cross(self.r, force)])
+        return np.concatenate([self.e_dot, u_dot, self.free + self.J_inverse @ cross(self.r, force), self.V])
 
     def reserve(self) -> float:
         """mu N - |F_t| of the rolling top [N]."""
         force = self.rolling_force()
-        return self.body.mu * force[2] - np.hypot(force[0], force[1])
+        return self.body.mu * (force @ self.n) - np.linalg.norm(self.along(force))
+
+    def along(self, vector: np.ndarray) -> np.ndarray:
+        """The part of a vector along the arena."""
+        return vector - (vector @ self.n) * self.n
 
 
 def slip_to(body: Body, state: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """The state after the blow that gives the contact point the velocity v (vertical component 0)."""
+    """The state after the blow that gives the contact point the velocity v along the arena."""
     contact = Contact(body, state)
     blow = np.linalg.solve(contact.W, v - contact.v)
-    return state + np.concatenate([np.zeros(3), blow / body.mass, contact.J_inverse @ cross(contact.r, blow)])
+    return state + np.concatenate(
+        [np.zeros(3), blow / body.mass, contact.J_inverse @ cross(contact.r, blow), np.zeros(3)]
+    )
 
 
 def rate_of(body: Body, kind: str):
@@ -109,36 +130,52 @@ def rate_of(body: Body, kind: str):
 
 def begun(body: Body, state: np.ndarray, speed: float) -> np.ndarray:
     """The state of a top that begins to slip against the force that friction cannot give."""
-    force = Contact(body, state).rolling_force()
-    return slip_to(body, state, -speed * np.append(force[:2], 0.0) / np.hypot(force[0], force[1]))
+    contact = Contact(body, state)
+    force = contact.along(contact.rolling_force())
+    return slip_to(body, state, -speed * force / np.linalg.norm(force))
 
 
 def follow(
-    body: Body, state: np.ndarray, t1: float, floor: float = 1e-8, onset: float = 1e-10, rtol: float = 1e-11
+    body: Body,
+    state: np.ndarray,
+    t1: float,
+    floor: float = 1e-8,
+    onset: float = 1e-10,
+    rtol: float = 1e-11,
+    stiff: float = 2e-3,
 ) -> list[Phase]:
-    """Run to `t1` [s], phase by phase; a slip ends where its speed has fallen to `floor` and begins with `onset` [m/s]."""
-    atol = 0.1 * rtol * np.repeat([1.0, np.sqrt(body.gravity * body.radius), 100.0], 3)
+    """Run to `t1` [s], phase by phase; a slip ends where its speed has fallen to `floor` and begins with `onset` [m/s]. For
+    the time `stiff` [s] after that the method is implicit."""
+    atol = 0.1 * rtol * np.repeat([1.0, np.sqrt(body.gravity * body.radius), 100.0, body.radius], 3)
 
     def stops(_, x):
-        return np.linalg.norm(Contact(body, x).v[:2]) - floor
+        return np.linalg.norm(Contact(body, x).v) - floor
 
     def leaves(_, x):
         return Contact(body, x).reserve()
 
     stops.terminal = leaves.terminal = True
     stops.direction = leaves.direction = -1.0
-    slips, method, t, phases = stops(0.0, state) > 0.0, "DOP853", 0.0, []
+    slips, t, phases, begins = stops(0.0, state) > 0.0, 0.0, [], -stiff
     while t < t1:
         kind, event = ("slipping", stops) if slips else ("rolling", leaves)
-        out = solve_ivp(rate_of(body, kind), (t, t1), state, method, rtol=rtol, atol=atol, events=event)
+        early = slips and t < begins + stiff
+        method, end = ("Radau", min(begins + stiff, t1)) if early else ("DOP853", t1)
+        out = solve_ivp(rate_of(body, kind), (t, end), state, method, rtol=rtol, atol=atol, events=event)
         assert out.success, out.message
-        phases.append(Phase(kind, out.t, out.y))
+        if slips and not early and begins >= 0.0 and phases and phases[-1].kind == "slipping":
+            was = phases.pop()
+            phases.append(Phase(kind, np.append(was.times, out.t[1:]), np.hstack([was.states, out.y[:, 1:]])))
+        else:
+            phases.append(Phase(kind, out.t, out.y))
         t, state = out.t[-1], out.y[:, -1]
+        if out.status == 0:
+            continue
         if slips:
             state = slip_to(body, state, np.zeros(3))
         slips = leaves(t, state) <= 0.0 if slips else True
-        method = "Radau" if slips else "DOP853"
-        state = begun(body, state, onset) if slips else state
+        if slips:
+            state, begins = begun(body, state, onset), t
     return phases
 
 
@@ -149,7 +186,7 @@ def theta(states: np.ndarray) -> np.ndarray:
 
 def energy(body: Body, states: np.ndarray) -> np.ndarray:
     """Kinetic and potential energy [J]."""
-    e, u, w = states[:3], states[3:6], states[6:]
+    e, u, w = states[:3], states[3:6], states[6:9]
     axial = np.sum(w * e, axis=0)
     rotation = body.I1 * np.sum(w * w, axis=0) + (body.I3 - body.I1) * axial**2
     height = body.radius - body.offset * e[2]

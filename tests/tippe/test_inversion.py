@@ -52,7 +52,8 @@ def test_transformations_agree():
     times = np.array([float(time_of(mu)) for mu in mus])
     assert_close(jax.jit(jax.vmap(time_of))(mus), times, rtol=1e-9)
     value, slope = jax.jvp(time_of, (0.3,), (1.0,))
-    assert_close(value, times[1], rtol=1e-12)
+    # With the tangent in step control the steps are others, and so is the error.
+    assert_close(value, times[1], rtol=1e-8)
     slopes = jax.jit(jax.vmap(jax.grad(time_of)))(mus)
     assert_close(slopes[1], slope, rtol=1e-6)
 

@@ -50,7 +50,7 @@ def test_illegal_numbers_in_a_batch_of_runs_give_nothing_that_looks_right(rutsta
     runs = jax.jit(jax.vmap(run))(*jnp.array(columns).T)
     assert runs.status.tolist() == [0] + 7 * [4]
     alone = tippe.simulate(rutstam_scene, LAUNCH, 0.05, times=[0.0, 0.05])
-    assert_close(runs.theta[0], alone.theta, rtol=1e-9)
+    assert_close(runs.theta[0], alone.theta, rtol=1e-8)
     for read in (runs.theta, runs.energy, runs.position, runs.normal_force, runs.work, runs.end_time):
         assert np.all(np.isfinite(read[0]))
         assert np.all(np.isnan(read[1:]))

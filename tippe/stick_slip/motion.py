@@ -1,12 +1,15 @@
 """Stick and slip under Coulomb's law as it stands: the two kinds of motion, when each ends, and what follows.
 
 Within the friction cone rolling is the only motion near zero slip, and a slip reaches zero in finite time. The direction of
-a slip has no limit there, and steps shrink with its speed; so the slip is stopped by a blow where its speed has fallen to
-`STICK_SPEED`. Friction would have taken the same momentum in the short time that was left, and the state errs in second
-order of that speed. A slip begins where rolling would need `EXCESS` more friction than there is, with the speed that has
-gathered since the cone was left; the state errs in third order of that time (`tests/physics/test_sticking.py` has the
-figures).
+a slip has no limit there, and steps shrink with its speed; so the slip is stopped by a blow where the way that is left to
+slide, v^2 / (2 |v'|), is `LEFT` times the tolerance in units of R. Friction would have taken the same momentum in the time
+that was left, so the state errs by that way, in proportion to the tolerance. Rolling ends where mu N = |F_t|; from there the
+slip is begun by a step of its own (`onset.py`), whose estimated error is within the tolerance
+(`tests/physics/test_stick_slip.py` has the figures).
 """
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,21 +22,19 @@ from ..dynamics import Dynamics, Motion, stacked
 from ..friction import AbstractFriction, SetValuedCoulomb, Slip, length
 from ..rolling import RollingDynamics
 from ..top import Top
+from .onset import Onset, begin
 
-#: Slip speed, in units of sqrt(g R), at which a slip is over.
-STICK_SPEED = 1e-7
+#: The way that is left to slide where a slip is stopped, over the tolerance and the radius. The state errs by a tenth of the
+#: tolerance at most, and falls with it; the time of the blow is early by the speed over the deceleration, 8e-8 s at 1e-11.
+LEFT = 0.1
 
-#: Friction that rolling lacks, as a fraction of the weight, where it turns into a slip.
-EXCESS = 1e-4
+#: Slip speed, in units of sqrt(g R), below which a state counts as rolling: rounding leaves less. No run's course depends on
+#: it; where a slip begins the forces of the two kinds are the same in the limit.
+AT_REST = 1e-10
 
-#: By how much the least slip that begins is faster than one that is over.
-FASTER = 10.0
-
-#: Coarser relative tolerances are taken for this one: with them steps would leap over the end of a slip, to and fro.
-COARSEST = 1e-7
-
-#: What a slip has gathered is trusted up to this age, in units of sqrt(R / g).
-OLDEST = 0.1
+#: The round-off that rolling is allowed in its grip: a top that stands upright needs none. It delays a slip by this over the
+#: rate of the grip, some 1e-14 s.
+ROUNDING = 1e-13
 
 
 class StickSlip(eqx.Module):
@@ -80,7 +81,7 @@ class StickSlip(eqx.Module):
 
         **Returns:** a `Motion`.
         """
-        slips = self.slip_left(state) > -0.5 * STICK_SPEED
+        slips = self.slip_speed(state) > AT_REST * self.speed
         kinds = (self.slipping.motion(state), self.rolling.motion(state))
         return jax.tree.map(lambda slipping, rolling: jnp.where(slips, slipping, rolling), *kinds)
 
@@ -96,64 +97,46 @@ class StickSlip(eqx.Module):
         """Whether a contact whose margin is zero has jammed, which only one that slips can do; else it is lost."""
         return self.slipping.jams(state)
 
-    def slip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Slip speed above that at which a slip is over, in units of sqrt(g R)."""
+    def slip_speed(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Speed of the contact point along the arena [m/s]."""
         slip = self.slipping.motion(state).slip
-        return length(slip.x, slip.y) / self.speed - STICK_SPEED
+        return length(slip.x, slip.y)
+
+    def stopped(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+        """The state after the blow that stops the slip."""
+        nothing = jnp.zeros_like(state[0])
+        return self.rolling.with_slip(state, Slip(nothing, nothing))
 
     def grip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """What a rolling top has left before it slips, as a fraction of the weight."""
-        return self.rolling.grip(state, self.mu) + EXCESS
+        return self.rolling.grip(state, self.mu) + ROUNDING
 
-    def settled(
-        self, state: Float[Array, "components ..."]
-    ) -> tuple[Float[Array, "components ..."], Bool[Array, "..."]]:
-        """What becomes of a state whose slip is over, or that has rolled and cannot any longer.
 
-        **Arguments:**
+class Change(NamedTuple):
+    """What follows the end of a phase.
 
-        - `state`: (components, ...), its slip at most a few times `STICK_SPEED`.
+    - `state`: from which the motion goes on, and whether it `rolls` then; `lost`: whether the contact is lost instead.
+    - `onset`: the beginning of the slip where it does not roll; it starts `wait` [s] after the phase has ended.
+    - `elapsed`: until the motion goes on [s].
+    """
 
-        **Returns:** the state from which the motion goes on, and whether it rolls.
-        """
-        nothing = jnp.zeros_like(state[0])
-        still = self.rolling.with_slip(state, Slip(nothing, nothing))
-        margin, rate = jax.jvp(
-            lambda rolling: self.rolling.grip(rolling, self.mu), (still,), (self.rolling.field(still),)
-        )
-        holds = margin >= 0.0
-
-        # The slip sets in against the force that is missing.
-        F1, F2, _ = self.rolling.reaction(still)
-        size = length(F1, F2)
-        size = jnp.where(size > 0.0, size, 1.0)
-
-        def slipping(speed: Float[Array, "..."]) -> Float[Array, "components ..."]:
-            return self.rolling.with_slip(still, Slip(-speed * F1 / size, -speed * F2 / size))
-
-        # Since the cone was left, a time ago, the slip's acceleration has grown from zero in proportion to that time.
-        least = FASTER * STICK_SPEED * self.speed
-        slow = slipping(least)
-        _, acceleration = jax.jvp(self._slip_speed, (slow,), (self.slipping.field(slow),))
-        leaving = (margin > -2.0 * EXCESS) & (rate < 0.0)
-        age = jnp.where(leaving, margin / jnp.where(leaving, rate, 1.0), 0.0)
-        age = jnp.minimum(age, OLDEST * self.slipping.radius / self.speed)
-        gathered = jnp.maximum(0.5 * acceleration * age, least)
-        return jnp.where(holds, still, slipping(gathered)), holds
-
-    def _slip_speed(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        slip = self.slipping.motion(state).slip
-        return length(slip.x, slip.y)
+    state: Float[Array, "components ..."]
+    rolls: Bool[Array, "..."]
+    lost: Bool[Array, "..."]
+    onset: Onset
+    wait: Float[Array, "..."]
+    elapsed: Float[Array, "..."]
 
 
 class Kind(eqx.Module):
     """One of the two kinds of motion of a `StickSlip`, in place of `Dynamics`: its contact margin is what ends it.
 
-    - `both`: the scene's equations.
+    - `both`: the scene's equations; `tolerance`: relative, of the integration.
     - `rolls`: which of the two.
     """
 
     both: StickSlip
+    tolerance: Float[Array, ""]
     rolls: bool = eqx.field(static=True)
 
     @property
@@ -173,44 +156,57 @@ class Kind(eqx.Module):
         """Positive while this kind of motion lasts. Rolling leaves the friction cone before the normal force is zero."""
         if self.rolls:
             return self.both.grip_left(state)
-        return jnp.minimum(self.both.slipping.contact_margin(state), self.both.slip_left(state))
+        return jnp.minimum(self.both.slipping.contact_margin(state), self.slip_left(state))
+
+    def slip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Slip speed above that at which a slip is over, in units of sqrt(g R). A slip that grows is never over."""
+        speed, change = self._slowing(state)
+        way = LEFT * self.tolerance * self.both.slipping.radius
+        return (speed - jnp.sqrt(2.0 * way * jnp.maximum(-change, 0.0))) / self.both.speed
+
+    def _slowing(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """The slip's speed [m/s] and its rate."""
+        return jax.jvp(self.both.slip_speed, (state,), (self.both.slipping.field(state),))
 
     def jams(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
         """Whether a contact whose margin is zero has jammed; a rolling one does not."""
         return self.both.jams(state) & (not self.rolls)
 
     def ended(
-        self, state: Float[Array, "components ..."]
-    ) -> tuple[Float[Array, "components ..."], Bool[Array, "..."], Bool[Array, "..."]]:
+        self,
+        state: Float[Array, "components ..."],
+        size: int,
+        slipping: Callable[[Float[Array, "components ..."]], Float[Array, "components ..."]],
+        scales: Float[Array, "components ..."],
+        left: Float[Array, "..."],
+    ) -> Change:
         """What follows where this kind of motion has ended.
 
         **Arguments:**
 
-        - `state`: (components, ...), where the margin is 0.
-
-        **Returns:** the state from which the motion goes on, whether it rolls then, and whether it is the contact that was
-        lost instead.
+        - `state`: (components, ...), where the margin is 0; the equations know the first `size` components.
+        - `slipping`: rate of the whole state while it slips; `scales`: its magnitudes.
+        - `left`: time [s] to the horizon, which a slip's beginning does not pass.
         """
-        after, rolls = self.both.settled(state)
+        both, own, rest = self.both, state[:size], state[size:]
+        still = both.stopped(own)
+        nothing = jnp.zeros_like(own[0])
         if self.rolls:
-            return after, rolls, jnp.zeros_like(rolls)
-        lost = self.both.slipping.contact_margin(state) <= self.both.slip_left(state)
-        return jnp.where(lost, state, after), rolls, lost
-
-
-@eqx.filter_jit
-def started(
-    both: StickSlip, state: Float[Array, "components ..."]
-) -> tuple[Float[Array, "components ..."], Bool[Array, "..."]]:
-    """The start of a run: a contact at rest sticks or begins to slip.
-
-    **Arguments:**
-
-    - `both`: the scene's equations.
-    - `state`: (components, ...).
-
-    **Returns:** the state from which the run starts, and whether it rolls.
-    """
-    settled, rolls = both.settled(state)
-    rests = both.slip_left(state) <= 0.0
-    return jnp.where(rests, settled, state), rests & rolls
+            holds = lost = nothing > 0.0
+            wait = nothing
+        else:
+            holds = both.rolling.grip(still, both.mu) >= 0.0
+            lost = both.slipping.contact_margin(own) <= self.slip_left(own)
+            # A slip that only turns round goes on through zero, which it reaches in the time that is left of it.
+            speed, change = self._slowing(own)
+            slows = change < 0.0
+            wait = jnp.where(slows & ~holds & ~lost, -speed / jnp.where(slows, change, 1.0), 0.0)
+            wait = jnp.minimum(wait, left)
+            still = still + wait * both.rolling.field(still + 0.5 * wait * both.rolling.field(still))
+            rest = rest + wait * slipping(state)[size:]
+        whole = jnp.concatenate([still, rest])
+        slips = ~(holds | lost)
+        most = jnp.where(slips, left - wait, 0.0)
+        onset = begin(both.slipping, both.rolling, both.mu, slipping, whole, size, scales, most, self.tolerance)
+        after = jnp.where(slips, onset.end, jnp.where(lost, state, whole))
+        return Change(after, holds, lost, onset, wait, wait + jnp.where(slips, onset.length, 0.0))

@@ -6,12 +6,13 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from nonholonomic.integrate import Path, follow
 from nonholonomic.lockstep import AbstractProblem
 
-from .motion import COARSEST, Kind, StickSlip, started
+from .motion import AT_REST, Change, Kind, StickSlip
+from .onset import Onset
 
 #: Phases after which a run is given up.
 MOST_PHASES = 2000
@@ -97,11 +98,33 @@ class Stretch(AbstractProblem):
         return self.run.guard(time, state)
 
 
+class Begun(eqx.Module):
+    """The beginning of a slip, as a piece of a `Path`: from `t0` to `t1` [s], the onset `wait` [s] after `t0`."""
+
+    onset: Onset
+    t0: Float[Array, ""]
+    t1: Float[Array, ""]
+    wait: Float[Array, ""]
+
+    def evaluate(self, time: Float[Array, ""]) -> Float[Array, " components"]:
+        """The state at a time."""
+        return self.onset.at((time - self.t0 - self.wait) / (self.t1 - self.t0 - self.wait))
+
+
 @eqx.filter_jit
-def _next(kind: Kind, state: Float[Array, " components"], size: int) -> tuple[Array, Bool[Array, ""], Bool[Array, ""]]:
-    """After a phase: the state, whether it rolls, and whether the contact is lost."""
-    after, rolls, lost = kind.ended(state[:size])
-    return jnp.concatenate([after, state[size:]]), rolls, lost
+def _next(
+    stretch: Stretch, kind: Kind, size: int, state: Float[Array, " components"], left: Float[Array, ""]
+) -> Change:
+    """What follows a phase."""
+    slipping = eqx.tree_at(lambda one: one.run.dynamics, stretch, kind.both.slipping)
+    return kind.ended(state, size, lambda at: slipping.field(left, at), stretch.start()[1], left)
+
+
+def _joined(begun: Begun, state: Float[Array, " components"], rest: Path) -> Path:
+    """A slip with its beginning, which begins from the given state."""
+    times = np.concatenate([[float(begun.t0)], rest.times])
+    states = np.concatenate([np.asarray(state)[:, None], rest.states], axis=1)
+    return rest._replace(times=times, states=states, pieces=[begun, *rest.pieces])
 
 
 def follow_stick_slip(
@@ -117,21 +140,31 @@ def follow_stick_slip(
     **Returns:** a `StickSlipPath`.
     """
     both, size, time = run.dynamics, len(run.state), 0.0
-    state, rolls = started(both, run.state)
-    whole = jnp.concatenate([state, run.start()[0][size:]])
+    whole = run.start()[0]
+    rolls = bool(both.slip_speed(run.state) <= AT_REST * both.speed)
     path = StickSlipPath(both, size, [], [], False, False)
-    finer = min(1.0, COARSEST / rtol)
+    begun: tuple[Begun, Array] | None = None
     while True:
-        kind = Kind(both, bool(rolls))
+        kind = Kind(both, jnp.asarray(rtol, float), rolls)
         stretch = Stretch(eqx.tree_at(lambda one: one.dynamics, run, kind), whole)
-        part = follow(stretch, t1, t0=time, solver=solver, rtol=finer * rtol, atol=finer * atol)
-        path.parts.append(part)
-        path.rolls.append(kind.rolls)
+        part = follow(stretch, t1, t0=time, solver=solver, rtol=rtol, atol=atol)
+        last = jnp.asarray(part.states[:, -1])
+        if begun is not None:
+            part = _joined(*begun, part)
+        # A start at rest that friction cannot hold does not roll.
+        if part.times[-1] > part.times[0] or not part.guard_lost:
+            path.parts.append(part)
+            path.rolls.append(rolls)
         if not part.guard_lost:
             return path._replace(failed=part.failed)
-        whole, rolls, lost = _next(kind, jnp.asarray(part.states[:, -1]), size)
-        if bool(lost):
-            return path._replace(guard_lost=True)
-        if len(path.parts) == MOST_PHASES or not bool(jnp.all(jnp.isfinite(whole))):
-            return path._replace(failed=True)
         time = float(part.times[-1])
+        change = _next(stretch, kind, size, last, jnp.asarray(t1 - time))
+        if bool(change.lost):
+            return path._replace(guard_lost=True)
+        if len(path.parts) == MOST_PHASES or not bool(jnp.all(jnp.isfinite(change.state))):
+            return path._replace(failed=True)
+        whole, rolls, begun = change.state, bool(change.rolls), None
+        if not rolls:
+            end = min(time + float(change.elapsed), t1)
+            begun = (Begun(change.onset, jnp.asarray(time), jnp.asarray(end), change.wait), last)
+            time = end
