@@ -128,7 +128,7 @@ def solve(scene, launch, input, t1, times, grid, tolerance, solver, max_steps, a
     dynamics = scene.dynamics
     subs = (
         diffrax.SubSaveAt(ts=times),
-        diffrax.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: (y, *watched(scene, y))),
+        diffrax.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: (y, *watched(dynamics, y))),
     )
     solution: Any = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: dynamics.field(t, y, input)),
