@@ -11,8 +11,6 @@ class Functions(NamedTuple):
     """The functions that a field may call."""
 
     sqrt: Any
-    sin: Any
-    cos: Any
 
 
 class Top(NamedTuple):
@@ -96,8 +94,8 @@ def cylinder(y, p, functions):
 
 
 def spheroid(y, p, functions):
-    """Rate of (r1, r2, r3, e1, e2, e3, phi, P, phi', work) of a stroller inside (`stroller.md`, section 5)."""
-    r1, r2, r3, e1, e2, e3, phi, P, turning, _ = y
+    """Rate of (r1, r2, r3, e1, e2, e3, phi, P, phi', sin phi, cos phi, work) inside a spheroid (`stroller.md`, section 5)."""
+    r1, r2, r3, e1, e2, e3, phi, P, turning, sine, cosine, _ = y
     across, along = 1.0 / (p.equatorial * p.equatorial), 1.0 / (p.polar * p.polar)
     g1, g2, g3 = across * r1, across * r2, along * r3
     unit = 1.0 / functions.sqrt(g1 * g1 + g2 * g2 + g3 * g3)
@@ -105,7 +103,6 @@ def spheroid(y, p, functions):
     off = e1 * n1 + e2 * n2 + e3 * n3
     d1, d2, d3 = e1 - off * n1, e2 - off * n2, e3 - off * n3
     d = 1.0 / functions.sqrt(d1 * d1 + d2 * d2 + d3 * d3)
-    sine, cosine = functions.sin(phi), functions.cos(phi)
     arm = sine / p.wheelbase
     gauge = 1.0 / functions.sqrt(p.mass * cosine * cosine + p.inertia * arm * arm)
     w = P * gauge
@@ -127,5 +124,7 @@ def spheroid(y, p, functions):
         turning,
         gauge * (cosine * rear + front + arm * scrub - p.mass * p.gravity * cosine * d * d3),
         (steering - p.steering_spring * phi) / p.steering_inertia,
+        cosine * turning,
+        -sine * turning,
         rear * v + front * w + scrub * yaw + steering * turning,
     )

@@ -15,7 +15,7 @@ from fields import Functions
 E3 = 4
 
 #: The functions of a field on numbers.
-NUMPY = Functions(np.sqrt, np.sin, np.cos)
+NUMPY = Functions(np.sqrt)
 
 
 class Task(NamedTuple):
@@ -131,7 +131,7 @@ def heyoka_batch(task: Task) -> Callable[[float], Any]:
 
 def _heyoka_system(heyoka: Any, task: Task) -> tuple[Any, Any]:
     variables = heyoka.make_vars(*(f"y{i}" for i in range(len(task.starts))))
-    rates = task.field(variables, task.numbers, Functions(heyoka.sqrt, heyoka.sin, heyoka.cos))
+    rates = task.field(variables, task.numbers, Functions(heyoka.sqrt))
     return [(one, rate + 0.0 * one) for one, rate in zip(variables, rates, strict=True)], variables
 
 
@@ -177,11 +177,7 @@ def _numba_field(task: Task) -> Callable[..., Any]:
 
     field, numbers = numba.njit(task.field), task.numbers
 
-    functions = Functions(
-        numba.njit(lambda value: np.sqrt(value)),
-        numba.njit(lambda value: np.sin(value)),
-        numba.njit(lambda value: np.cos(value)),
-    )
+    functions = Functions(numba.njit(lambda value: np.sqrt(value)))
 
     @numba.njit
     def rate(t, y):
@@ -246,7 +242,7 @@ def vmapped_diffrax(task: Task) -> Callable[[float], Any]:
     import jax.numpy as jnp
     import optimistix
 
-    functions = Functions(jnp.sqrt, jnp.sin, jnp.cos)
+    functions = Functions(jnp.sqrt)
     term = diffrax.ODETerm(lambda t, y, args: jnp.stack(task.field(y, task.numbers, functions)))
     event = None
     if task.angle is not None:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from nonholonomic.runge_kutta import explicit_tableau
 
-from .dynamics import State
+from .dynamics import Dynamics, State
 from .input import Input
 from .scene import Scene
 
@@ -52,9 +52,9 @@ class Watch(NamedTuple):
     rank: Float[Array, " steps"]
 
 
-def watched(scene: Scene, state: State) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+def watched(dynamics: Dynamics, state: State) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
     """Normal force [N], cosine of the steering angle, and relative reduced mass at a state."""
-    return scene.contact(state), scene.dynamics.geometry(state).cosine, scene.rank(state)
+    return dynamics.contact(state), dynamics.geometry(state).cosine, dynamics.rank(state)
 
 
 class Recipe(eqx.Module):
@@ -86,7 +86,7 @@ def _field(recipe: Recipe, times: Float[Array, " lanes"], states: State) -> Stat
 
 @eqx.filter_jit
 def _watched(recipe: Recipe, states: State) -> Float[Array, "watched lanes"]:
-    return jnp.stack(jnp.broadcast_arrays(*watched(recipe.parts[0], states)))
+    return jnp.stack(jnp.broadcast_arrays(*watched(recipe.parts[0].dynamics, states)))
 
 
 def _in_blocks(function: Callable[..., Any], *columns: Any) -> Any:

@@ -2,9 +2,12 @@
 
 State, vectors in the ground's axes: position r of the rear axle, heading e, steering angle phi, quasi-momentum
 P = w sqrt(M_w) with w the speed of the front wheel and M_w its reduced mass, and the rate sg of the fork, phi' or, with
-a fork that turns with the frame, phi' + Omega. Then the work [J] done so far by the inputs and by friction, where there
-are any. The energy P^2/2 + J_f sg^2/2 + V is quadratic in the state, V linear but for the spring, so the implicit
-midpoint rule keeps its balance exactly.
+a fork that turns with the frame, phi' + Omega. Then sin(phi) and cos(phi), which the field would otherwise spend four
+fifths of its time on; phi itself is for the spring, for inputs and to be read off, and goes on beyond pi. Then the work
+[J] done so far by the inputs and by friction, where there are any. The energy P^2/2 + J_f sg^2/2 + V is quadratic in the
+state, V linear but for the spring, so the implicit midpoint rule keeps its balance exactly, and sin^2 + cos^2 too.
+Elsewhere that sum drifts with the errors of the steps. The velocities do not depend on it, except for the speed of the
+front wheel, so it is put right where a state is read off (`righted`), and not in the field.
 """
 
 from typing import NamedTuple
@@ -66,7 +69,8 @@ class Power(NamedTuple):
 class Dynamics(eqx.Module):
     """A scene with its choices resolved.
 
-    `side` is 1 outside and -1 inside; `absolute` is 1 where the fork turns with the frame and `None` where it does not.
+    `up` has the components of the upward vertical in the ground's axes; `side` is 1 outside and -1 inside; `absolute` is 1
+    where the fork turns with the frame and `None` where it does not.
     """
 
     body: Stroller
@@ -74,6 +78,7 @@ class Dynamics(eqx.Module):
     friction: AbstractFriction
     gravity: Float[Array, "..."]
     heading: AbstractHeading
+    up: Vector
     side: float = eqx.field(static=True)
     absolute: float | None = eqx.field(static=True)
 
@@ -81,6 +86,12 @@ class Dynamics(eqx.Module):
         """Position, heading and the rest of a state."""
         place, turned = self.surface.axes, self.surface.axes + self.heading.axes(self.surface)
         return padded(state[:place]), padded(state[place:turned]), state[turned:]
+
+    def righted(self, state: State) -> State:
+        """The state with sin^2 + cos^2 of the steering angle put right."""
+        first = self.surface.axes + self.heading.axes(self.surface) + 3
+        sine, cosine = state[first], state[first + 1]
+        return state.at[first : first + 2].multiply(1.0 / jnp.sqrt(sine * sine + cosine * cosine))
 
     def inertia(self, direction: Vector, lead: Component, sine: Component, cosine: Component) -> Component:
         """Reduced mass M_w = m cos^2(phi) d.d + J nu^2 sin^2(phi) / l^2 [kg] of the front wheel's speed."""
@@ -91,8 +102,7 @@ class Dynamics(eqx.Module):
     def geometry(self, state: State) -> Geometry:
         """Velocities, rates and normal force at a state (components, ...)."""
         body, surface, side = self.body, self.surface, self.side
-        r, e, (phi, P, fork_rate) = (*self.unpack(state)[:2], self.unpack(state)[2][:3])
-        sine, cosine = jnp.sin(phi), jnp.cos(phi)
+        r, e, (phi, P, fork_rate, sine, cosine) = (*self.unpack(state)[:2], self.unpack(state)[2][:5])
         n = surface.outward(r)
         unit = self.heading.unit(e, n)
         d, lead = self.heading.direction(unit, n, side), self.heading.lead(n, side)
@@ -111,7 +121,7 @@ class Dynamics(eqx.Module):
             yaw_rate=yaw_rate,
             steering_rate=subtract(fork_rate, multiply(self.absolute, yaw_rate)),
         )
-        weight = multiply(side, body.mass * self.gravity, dot(n, surface.up))
+        weight = multiply(side, body.mass * self.gravity, dot(n, self.up))
         normal_force = subtract(weight, multiply(side, body.mass, dot(turning, velocity)))
         share = None if body.centre is None else body.centre / body.wheelbase
         return Geometry(
@@ -165,20 +175,22 @@ class Dynamics(eqx.Module):
         weight = body.mass * self.gravity
         # The centre of mass ahead of the axle swings with the yaw; its weight then has a moment about the normal.
         across = cross(g.normal, e)
-        swing = multiply(weight, body.centre, self.side, dot(across, self.surface.up))
+        swing = multiply(weight, body.centre, self.side, dot(across, self.up))
         turning = subtract(drag.yaw, add(multiply(self.absolute, torque), swing))
         pushing = add(multiply(g.cosine, add(forces.drive, drag.rear)), drag.front, multiply(arm, turning))
-        falling = multiply(weight, g.cosine, dot(g.direction, self.surface.up))
+        falling = multiply(weight, g.cosine, dot(g.direction, self.up))
         momentum_rate = multiply(g.gauge, subtract(multiply(g.lead, pushing), falling))
         heading_rate = self.heading.rate(e, g.normal, g.normal_rate, g.motion.yaw_rate, self.side)
-        power = self.power(g, forces)
+        power, turn = self.power(g, forces), g.motion.steering_rate
         return stacked(
             (
                 *g.velocity[: self.surface.axes],
                 *heading_rate[: self.heading.axes(self.surface)],
-                g.motion.steering_rate,
+                turn,
                 momentum_rate,
                 multiply(torque, 1.0 / body.steering_inertia),
+                multiply(g.cosine, turn),
+                multiply(-g.sine, turn),
                 *((power.drive, power.steering) if input is not None else ()),
                 *((add(*power[2:]),) if self.friction.dissipates else ()),
             ),
@@ -189,9 +201,18 @@ class Dynamics(eqx.Module):
         """Energy H = P^2/2 + J_f sg^2/2 + m g z + k phi^2/2 [J], z the height of the centre of mass."""
         r, e, (phi, P, fork_rate) = (*self.unpack(state)[:2], self.unpack(state)[2][:3])
         body = self.body
-        height = add(self.surface.elevation(r), multiply(body.centre, dot(e, self.surface.up)))
+        height = add(self.surface.elevation(r), multiply(body.centre, dot(e, self.up)))
         kinetic = 0.5 * (P * P + body.steering_inertia * fork_rate * fork_rate)
         return add(kinetic, multiply(body.mass * self.gravity, height), multiply(0.5, body.steering_spring, phi, phi))
+
+    def rank(self, state: State) -> Float[Array, "..."]:
+        """Reduced mass M_w relative to m + J/l^2: at zero the constraints lose rank and the motion is undetermined."""
+        whole = self.body.mass + self.body.inertia / self.body.wheelbase**2
+        return 1.0 / (whole * self.geometry(state).gauge ** 2)
+
+    def contact(self, state: State) -> Float[Array, "..."]:
+        """Force of the ground on the stroller along its normal [N]; negative where the ground would have to pull."""
+        return jnp.broadcast_to(multiply(1.0, self.geometry(state).normal_force), state[0].shape)
 
     def side_force(
         self, t: Float[Array, "..."], state: State, input: Input | None
@@ -211,7 +232,7 @@ class Dynamics(eqx.Module):
         (v, yaw), (v_rate, yaw_acceleration) = jax.jvp(speeds, (state,), (rate,))
         g = self.geometry(state)
         forces = self.forces(t, g, input)
-        weight, up = body.mass * self.gravity, self.surface.up
+        weight, up = body.mass * self.gravity, self.up
         climb, bank = multiply(weight, dot(g.direction, up)), multiply(weight, dot(g.left, up))
         centre_along = subtract(v_rate, multiply(body.centre, yaw, yaw))
         centre_across = add(multiply(v, yaw), multiply(body.centre, yaw_acceleration))

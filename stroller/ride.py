@@ -165,7 +165,7 @@ def _follow(
         controller = diffrax.StepTo(grid)
     subs = (
         diffrax.SubSaveAt(ts=times),
-        diffrax.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: (y[:size], *watched(problem.scene, y[:size]))),
+        diffrax.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: (y[:size], *watched(problem.dynamics, y[:size]))),
     )
     solution: Any = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: whole.field(t, y)),

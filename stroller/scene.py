@@ -12,7 +12,6 @@ from jaxtyping import Array, Bool, Float
 from nonholonomic.ground import AbstractGround
 from nonholonomic.surface import Plane
 from nonholonomic.validation import Bound, Bounded, all_bounds, as_number, is_traced, legal, require_all
-from nonholonomic.vector import multiply
 
 from .dynamics import Dynamics, State, stacked
 from .friction import AbstractFriction, Frictionless
@@ -94,6 +93,7 @@ class Scene(Bounded):
             friction=self.friction,
             gravity=self.gravity,
             heading=HEADINGS[self.heading],
+            up=self.surface.up,
             side=SIDES[self.side],
             absolute=FORKS[self.fork],
         )
@@ -164,7 +164,7 @@ class Scene(Bounded):
             fork_rate = fork_rate + wheel * lead * sine / self.body.wheelbase
         axes = (*position[: self.surface.axes], *heading[: dynamics.heading.axes(self.surface)])
         works = (None,) * (2 * driven + self.friction.dissipates)
-        start = (*axes, launch.steering, momentum, fork_rate, *works)
+        start = (*axes, launch.steering, momentum, fork_rate, sine, cosine, *works)
         shape = jnp.broadcast_arrays(*(component for component in start if component is not None))[0]
         return stacked(start, shape[None])
 
@@ -182,7 +182,7 @@ class Scene(Bounded):
         rate = rate + jnp.abs(launch.speed) / body.wheelbase
         speed = rate * body.wheelbase
         places, headings = self.surface.axes, dynamics.heading.axes(self.surface)
-        motion = (one, jnp.sqrt(body.mass) * speed, rate)
+        motion = (one, jnp.sqrt(body.mass) * speed, rate, one, one)
         works = (body.mass * speed**2,) * (2 * driven + self.friction.dissipates)
         return stacked((*(body.wheelbase,) * places, *(one,) * headings, *motion, *works), one[None])
 
@@ -192,16 +192,13 @@ class Scene(Bounded):
 
     def work(self, state: State) -> Float[Array, "..."]:
         """Work [J] done on the stroller so far by its inputs and by friction, negative where they took energy."""
-        first = self.surface.axes + self.dynamics.heading.axes(self.surface) + 3
+        first = self.surface.axes + self.dynamics.heading.axes(self.surface) + 5
         return jnp.sum(state[first:], axis=0)
 
     def rank(self, state: State) -> Float[Array, "..."]:
         """Reduced mass M_w relative to m + J/l^2: at zero the constraints lose rank and the motion is undetermined."""
-        body, geometry = self.body, self.dynamics.geometry(state)
-        whole = body.mass + body.inertia / body.wheelbase**2
-        return 1.0 / (whole * geometry.gauge**2)
+        return self.dynamics.rank(state)
 
     def contact(self, state: State) -> Float[Array, "..."]:
         """Force of the ground on the stroller along its normal [N]; negative where the ground would have to pull."""
-        force = self.dynamics.geometry(state).normal_force
-        return jnp.broadcast_to(multiply(1.0, force), state[0].shape)
+        return self.dynamics.contact(state)

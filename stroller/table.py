@@ -19,7 +19,8 @@ from nonholonomic.sweep import Axis, Variable, axis
 from nonholonomic.table import Table
 from nonholonomic.validation import as_number, require
 
-from .dynamics import State
+from .dynamics import Dynamics, State
+from .heading import Projected
 from .input import Input
 from .launch import Launch
 from .scene import Scene
@@ -55,7 +56,7 @@ PLACES = {"launch.place[0]": ("x0", "mu0"), "launch.place[1]": ("y0", "eta0")}
 class RideProblem(AbstractProblem):
     """Rides of many cells. Where contact is watched, a ride ends where the ground would have to pull."""
 
-    scene: Scene
+    dynamics: Dynamics
     input: Input | None
     states: Float[Array, "components cells"]
     scales: Float[Array, "components cells"]
@@ -78,19 +79,19 @@ class RideProblem(AbstractProblem):
         """The problem of one ride, which goes on where contact is lost."""
         driven = input is not None
         press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
-        return cls(scene, input, scene.state(launch, driven), scene.scales(launch, driven), press, False)
+        return cls(scene.dynamics, input, scene.state(launch, driven), scene.scales(launch, driven), press, False)
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
 
     def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.scene.dynamics.field(time, state, self.input)
+        return self.dynamics.field(time, state, self.input)
 
     def crossing(self, state: Float[Array, "components lanes"]) -> Any:
-        return self.scene.contact(state) / self.press + CONTACT_ROUND_OFF if self.watched else None
+        return self.dynamics.contact(state) / self.press + CONTACT_ROUND_OFF if self.watched else None
 
     def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.scene.rank(state) / RANK_LOST - 1.0 if self.scene.heading == "projected" else None
+        return self.dynamics.rank(state) / RANK_LOST - 1.0 if isinstance(self.dynamics.heading, Projected) else None
 
 
 def sweep(
@@ -152,7 +153,7 @@ def sweep(
         if lost.any() or (count == 0 and problem.watched):
             problem, outcome = march(cells, size, count, watched=False)
         words = np.select([outcome.status == FAILED, outcome.status == GUARD_LOST, lost], [3, 2, 1], 0)
-        ends = read_ends(problem, outcome.state)
+        ends = read_ends(cells["scene"], outcome.state, problem.states)
         return {name: np.asarray(values) for name, values in ends.items()} | {
             "contact_time": contact_time,
             "end_time": np.asarray(outcome.end_time),
@@ -168,14 +169,11 @@ def sweep(
     return grids.sweep(run, grid, VARIABLES, request, path=path)
 
 
-def read_ends(problem: RideProblem, states: Float[Array, "components cells"]) -> dict[str, Float[Array, " cells"]]:
-    """What the table shows of the states at the ends of the rides."""
-    return _read_ends(problem.scene, states, problem.states)
-
-
 @eqx.filter_jit
-def _read_ends(scene: Scene, states: State, starts: State) -> dict[str, Float[Array, " cells"]]:
+def read_ends(scene: Scene, states: State, starts: State) -> dict[str, Float[Array, " cells"]]:
+    """What the table shows of the states at the ends of the rides, given those at their starts."""
     dynamics, surface = scene.dynamics, scene.surface
+    states = dynamics.righted(states)
     motion = dynamics.geometry(states).motion
     _, east, north = surface.chart(surface.place_at(motion.position))
     energy = scene.energy(states)

@@ -72,7 +72,7 @@ class Trajectory(eqx.Module):
     @property
     def energy_residual(self) -> Float[Array, " times"]:
         """Energy less its start and the work done since [J]: zero for an exact solution."""
-        return self.energy - self.energy[0] - self.work
+        return self.energy - self.energy[0] - (self.work - self.work[0])
 
     def grip(self) -> Float[Array, "times 2"]:
         """Coefficient of friction that each axle needs in order not to slip; infinite for a force without a load."""
@@ -199,6 +199,7 @@ def read_off(
     """The trajectory of the given states at the given times."""
     scene, input, _ = recipe.parts
     dynamics, surface = scene.dynamics, scene.surface
+    integrated, states = states, scene.dynamics.righted(states)
     g = dynamics.geometry(states)
     motion, like = g.motion, states[0]
     place = surface.place_at(motion.position)
@@ -229,7 +230,7 @@ def read_off(
         load=columns(normal_force - front_load, front_load),
         constraint=columns(*side_slip(scene, dynamics.field(t, states, input), states)),
         departure=spread(surface.departure(motion.position), like),
-        state=states.T,
+        state=integrated.T,
         watch=watch,
         stats=stats,
         recipe=recipe,

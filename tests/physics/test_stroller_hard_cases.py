@@ -51,7 +51,7 @@ def test_jackknifes_are_found_between_steps_of_any_length():
     expected = np.array([half, *(turn * np.pi + side * half for turn in (1, 2, 3) for side in (-1, 1))]) / rate
     for tolerance, atol in ((1e-6, 1e-5), (1e-9, 1e-8)):
         run = stroller.simulate(scene, Launch((0.0, 0.0), 0.0, 0.0, amplitude), 5.0, times=[5.0], tolerance=tolerance)
-        assert float(run.stats.steps) < 30
+        assert float(run.stats.steps) < 60
         np.testing.assert_allclose(run.jackknifed_at, expected, atol=atol)
 
 
@@ -118,9 +118,12 @@ def integrate(formulation, start, t1):
 def test_side_force_at_the_jackknife_is_the_limit_of_its_neighbours():
     """lambda_2 = J Omega' / (l cos(phi)) is 0/0 at phi = pi/2, where the forces are yet those of the multipliers."""
     scene = Scene(BODY, Spheroid(2.0, 1.1), fork="absolute")
-    place = Launch((0.3, 0.5), 0.4, 0.0, np.pi / 2, 0.7)
-    state = scene.state(place).at[7].set(0.9)
-    forces = [jnp.stack(scene.dynamics.side_force(0.0, state.at[6].add(d), None)) for d in (-1e-5, 0.0, 1e-5)]
+
+    def forces_at(steering):
+        state = scene.state(Launch((0.3, 0.5), 0.4, 0.0, steering, 0.7)).at[7].set(0.9)
+        return jnp.stack(scene.dynamics.side_force(0.0, state, None))
+
+    forces = [forces_at(np.pi / 2 + d) for d in (-1e-5, 0.0, 1e-5)]
     np.testing.assert_allclose(forces[1], 0.5 * (forces[0] + forces[2]), rtol=1e-8)
     assert np.all(np.abs(forces[1]) > 0.1)
 

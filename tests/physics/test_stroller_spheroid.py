@@ -136,7 +136,7 @@ def frame_field(scene, state):
     """The field of the P-form less a turn about the axis, which makes the parallel a fixed point."""
     field = scene.dynamics.field(0.0, state)
     rate = 1.3 / (2.0 * jnp.cos(0.6))
-    turn = jnp.array([-state[1], state[0], 0.0, -state[4], state[3], 0.0, 0.0, 0.0, 0.0])
+    turn = jnp.array([-state[1], state[0], 0.0, -state[4], state[3], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     return field - rate * turn
 
 
@@ -147,7 +147,7 @@ def test_path_at_locked_steering_does_not_depend_on_the_forces():
     slow = stroller.simulate(driven, launch, 1.0, Steady(force=1.0), tolerance=1e-13)
     assert float(slow.speed[-1]) < 2.5
     # The work of a force of 1 N is the length of the path.
-    times = slow.state[::40, 9] / 3.0
+    times = slow.state[::40, 11] / 3.0
     free = Scene(BODY, ground, gravity=WEIGHTLESS)
     along = stroller.simulate(free, launch, float(times[-1]), times=times, tolerance=1e-13)
     np.testing.assert_allclose(along.position, slow.position[::40], atol=7e-11)

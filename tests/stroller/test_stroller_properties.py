@@ -188,15 +188,18 @@ def growth_of(maps):
 
 
 def first_integrals(scene: Scene, states):
-    """What stays zero: |e| - 1, e.n, how far the position is off the ground [m]; and what stays: energy less work [J]."""
-    position, heading, (_, _, _, work) = scene.dynamics.unpack(states)
+    """What stays zero: |e| - 1, e.n, how far the position is off the ground [m], |(sin(phi), cos(phi))| - 1; and what stays:
+    energy less work [J].
+    """
+    position, heading, (_, _, _, sine, cosine, work) = scene.dynamics.unpack(states)
     length = jnp.sqrt(sum(part * part for part in heading if part is not None))
     along, off = jnp.zeros_like(length), jnp.zeros_like(length)
     if not isinstance(scene.surface, Plane):
         off = scene.surface.departure(position)
         if scene.heading == "intrinsic":
             along = sum(a * b for a, b in zip(heading, scene.surface.outward(position), strict=True))
-    return jnp.stack([length - 1.0, along, off, scene.energy(states) - work])
+    steering = jnp.sqrt(sine * sine + cosine * cosine) - 1.0
+    return jnp.stack([length - 1.0, along, off, steering, scene.energy(states) - work])
 
 
 @eqx.filter_jit
@@ -241,7 +244,7 @@ def signs_of(scene: Scene, place, heading, rest):
 
 def check_mirror(scene: Scene, launch: Launch):
     """In a mirror across y the ride is the same to the last bit, with left for right, and takes the same steps."""
-    signs = signs_of(scene, (1, -1, 1), (1, -1, 1), (-1, 1, -1, 1))
+    signs = signs_of(scene, (1, -1, 1), (1, -1, 1), (-1, 1, -1, -1, 1, 1))
     straight, mirrored = ride(scene, launch), ride(scene, launch, states=signs * scene.state(launch))
     np.testing.assert_array_equal(mirrored.status, straight.status)
     np.testing.assert_array_equal(mirrored.steps, straight.steps)
@@ -277,7 +280,7 @@ def check_units(scene: Scene, launch: Launch, exponents: tuple[int, int, int]):
     if isinstance(scene.surface, Plane):
         place = tuple(part * length for part in place)
     moved = Launch(place, launch.heading, launch.speed * length / time, launch.steering, launch.steering_rate / time)
-    rest = (1.0, math.sqrt(mass) * length / time, 1.0 / time, inertia / time**2)
+    rest = (1.0, math.sqrt(mass) * length / time, 1.0 / time, 1.0, 1.0, inertia / time**2)
     sizes = signs_of(scene, (length,) * 3, (1.0,) * 3, rest)
     near = ride(scene, launch)
     # The scales have a least rate of 1e-3 rad/s in them, so that rest has a scale.
@@ -317,7 +320,7 @@ def check_reversal(scene: Scene, launch: Launch):
     smooth = eqx.tree_at(lambda scene: scene.friction, scene, jax.tree.map(jnp.zeros_like, scene.friction))
     if isinstance(scene.friction, RollingResistance):
         smooth = eqx.tree_at(lambda scene: scene.friction.speed, smooth, scene.friction.speed)
-    signs = signs_of(scene, (1, 1, 1), (1, 1, 1), (1, -1, -1, 1))
+    signs = signs_of(scene, (1, 1, 1), (1, 1, 1), (1, -1, -1, 1, 1, 1))
     there = ride(smooth, launch, tolerance)
     back = ride(smooth, launch, tolerance, signs * there.state)
     knots = signs * knots_of(smooth, launch, STRETCHES)

@@ -82,6 +82,25 @@ def energy_residual(tolerance):
     return float(jnp.max(jnp.abs(run.energy_residual)))
 
 
+def test_energy_is_balanced_from_the_first_time_that_is_reported():
+    """Also where that is not the start: the work before it is no part of the balance."""
+    run = stroller.simulate(FULL, LAUNCH, 10.0, push, times=jnp.linspace(1.0, 10.0, 11), tolerance=1e-12)
+    assert abs(float(run.work[0])) > 0.1
+    np.testing.assert_allclose(run.energy_residual, 0.0, atol=1e-8)
+
+
+def test_the_steering_angle_counts_on_beyond_a_turn_and_its_sine_and_cosine_follow():
+    """A fork that spins freely: phi = phi0 + rate t; the errors of 70 turns stay of the order of the tolerance."""
+    scene = Scene(BODY, Spheroid(6.0, 3.0), side="inside")
+    run = stroller.simulate(scene, Launch((0.0, -0.8), 0.3, 1.0, 0.2, 3.0), 150.0, times=[75.0, 150.0], tolerance=1e-10)
+    np.testing.assert_allclose(run.steering, 0.2 + 3.0 * run.t, rtol=1e-12)
+    sine, cosine = run.state[:, 9:11].T
+    np.testing.assert_allclose(sine, np.sin(run.steering), atol=1e-8)
+    np.testing.assert_allclose(cosine, np.cos(run.steering), atol=1e-8)
+    # What is read off has them on the circle.
+    np.testing.assert_allclose(run.speed, run.front_speed * np.cos(run.steering), atol=1e-8)
+
+
 def test_any_diffrax_solver_will_do(reference):
     """Tsit5 at its own tolerance ends where Dopri8 does."""
     run = stroller.simulate(
