@@ -12,6 +12,8 @@ from stroller import Damping, Launch, Plane, Scene, Sphere, Spheroid, Steady, St
 from stroller.__main__ import main
 from stroller.table import named_axes
 
+pytestmark = pytest.mark.newest
+
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
 LAUNCH = Launch((0.3, -0.6), 0.5, 1.5, 0.2, 0.1)
 BOWL = Scene(BODY, Spheroid(2.0, 1.1), Damping(0.3, 0.2, 0.1, 0.15), side="inside", fork="absolute")
