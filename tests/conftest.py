@@ -1,10 +1,26 @@
 """What the tests share: the declared tops, and how close is close."""
 
+import os
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import nonholonomic
 import tippe
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """What one test compiles serves all others, in every worker and child process, and in the next run of the tests.
+
+    `pytest --cache-clear` forgets it; a folder that `JAX_COMPILATION_CACHE_DIR` names is used instead.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        folder = nonholonomic.enable_compilation_cache(config.cache.mkdir("compiled"))
+        if folder is not None:
+            os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+            os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+            os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 
 def rutstam_top(I1_factor: float = 131.0 / 350.0) -> tippe.Top:

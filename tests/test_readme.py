@@ -6,6 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.newest
+
 README = (Path(__file__).parents[1] / "README.md").read_text()
 
 

@@ -12,6 +12,8 @@ import pytest
 from nonholonomic import enable_compilation_cache
 from nonholonomic.compilation_cache import environment_name
 
+pytestmark = pytest.mark.newest
+
 #: Tells the result of a program, how many programs were asked for, and how many of them were found compiled.
 COUNTED = """
 import collections, json, jax, numpy as np

@@ -15,6 +15,8 @@ from nonholonomic.lockstep import CROSSED, FAILED, GUARD_LOST, REACHED_END, Abst
 from nonholonomic.reference import march_by_diffrax
 from nonholonomic.runge_kutta import explicit_tableau, inverse_root
 
+pytestmark = pytest.mark.newest
+
 
 class Oscillators(AbstractProblem):
     """x = cos(w t), y = -sin(w t); the event is x = `level`, the guard y + `floor` > 0."""

@@ -20,6 +20,8 @@ from nonholonomic import sweep as sweeping
 from nonholonomic.blockfile import BlockFile
 from nonholonomic.table import Table
 
+pytestmark = pytest.mark.newest
+
 KILLER = Path(__file__).with_name("kill_sweeps.py")
 
 

@@ -19,6 +19,8 @@ from nonholonomic.likelihood import MISSING, Measurements, one_sided
 from nonholonomic.paths import full_path
 from nonholonomic.unknown import Free, as_free
 
+pytestmark = pytest.mark.newest
+
 X = np.linspace(0.0, 1.0, 12)
 ERROR = 0.1 + 0.05 * X
 

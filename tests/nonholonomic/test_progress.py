@@ -10,6 +10,8 @@ from terminal import Terminal
 
 from nonholonomic.sweep import Variable, axis, sweep
 
+pytestmark = pytest.mark.newest
+
 
 class Pipe(Terminal):
     def isatty(self):

@@ -29,7 +29,7 @@ def relative_errors(family: str, tolerance: float) -> np.ndarray:
 @pytest.mark.parametrize(
     "family",
     [
-        "plane-viscous",
+        pytest.param("plane-viscous", marks=pytest.mark.newest),
         "cylinder-Coulomb",
         *(pytest.param(one, marks=pytest.mark.slow) for one in ("plane-Coulomb", "cylinder-viscous", "sphere-viscous")),
     ],

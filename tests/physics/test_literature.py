@@ -8,6 +8,8 @@ from conftest import assert_close, rutstam_top
 
 import tippe
 
+pytestmark = pytest.mark.newest
+
 
 @pytest.mark.parametrize(
     ("I1_factor", "right_angle", "three"),

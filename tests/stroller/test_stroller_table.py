@@ -32,6 +32,7 @@ def bowl(tmp_path_factory):
     return stroller.sweep(BOWL, LAUNCH, 3.0, input=Steady(), axes=AXES, path=path), path
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize("cell", [(0, 0, 0, 0, 0, 0), (1, 0, 1, 1, 1, 1), (1, 1, 0, 1, 0, 1)])
 def test_cells_are_the_single_rides(bowl, cell):
     """Every cell of the table is what `simulate` gives for its numbers."""
@@ -54,6 +55,7 @@ def test_cells_are_the_single_rides(bowl, cell):
     np.testing.assert_allclose(table.energy[cell], run.energy[0], atol=1e-8)
 
 
+@pytest.mark.newest
 def test_table_is_labelled_and_its_file_opens_in_xarray(bowl):
     table, path = bowl
     assert list(table.coords) == ["speed", "steering", "wheelbase", "rolling", "polar", "force"]
@@ -66,6 +68,7 @@ def test_table_is_labelled_and_its_file_opens_in_xarray(bowl):
     np.testing.assert_array_equal(Table.load(path).x, table.x)
 
 
+@pytest.mark.newest
 def test_lost_contact_is_marked_with_its_time():
     """Outside a sphere from its top: contact ends at cos = 2/3 (1 + v0^2 / (2 g R)), the time is that of `simulate`."""
     scene, launch = Scene(BODY, Sphere(1.4)), Launch((0.0, np.pi / 2), 0.0, 0.5)

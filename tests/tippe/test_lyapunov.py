@@ -40,12 +40,19 @@ def cylinder_scene():
 
 
 def test_chaos_in_a_cylinder():
-    """A top that rocks and rolls without friction parts at 2 /s; one that spins fast does not part exponentially."""
-    found = tippe.lyapunov_exponent(cylinder_scene(), tippe.Launch(THETA, SPIN, ETA, AZIMUTH), 100.0)
-    assert found.status.tolist() == ["reached_end"] * 2
-    assert_close(found.exponent[0], 2.0, atol=0.5)
-    assert found.exponent[0] > 2.0 * found.error[0]
-    assert abs(found.exponent[1]) < 2.0 * found.error[1]
+    """A top that rocks and rolls without friction parts at 2 /s; one that spins fast does not part exponentially.
+
+    The run of 100 s that one launch gives depends on the last digit of its numbers, and its exponent has a spread of 0.4 /s:
+    what is known is the mean of fifteen launches 1e-9 rad apart.
+    """
+    theta, spin, eta, azimuth = (np.repeat(pair, [15, 1]) for pair in (THETA, SPIN, ETA, AZIMUTH))
+    theta[:15] += 1e-9 * np.arange(15)
+    found = tippe.lyapunov_exponent(cylinder_scene(), tippe.Launch(theta, spin, eta, azimuth), 100.0)
+    assert found.status.tolist() == ["reached_end"] * 16
+    chaotic, ordered = found.exponent[:15], found.exponent[15]
+    assert_close(chaotic.mean(), 1.9, atol=0.4)
+    assert np.mean(chaotic > 2.0 * found.error[:15]) > 0.8
+    assert abs(ordered) < 2.0 * found.error[15]
 
 
 @pytest.mark.slow

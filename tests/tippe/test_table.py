@@ -322,6 +322,7 @@ SCENES = [(arena, law) for arena in ARENAS for law in (*LAWS, *(tippe.Rolling(1e
 QUICK = (0, 10, 17)
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize(
     ("arena", "law"),
     [pytest.param(*pair, marks=[] if place in QUICK else [pytest.mark.slow]) for place, pair in enumerate(SCENES)],
