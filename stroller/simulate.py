@@ -76,13 +76,20 @@ def simulate(
     recipe = Recipe.of(scene, input, solver)
     if not any(is_traced(leaf) for leaf in jax.tree.leaves(numbers)):
         return read_off(recipe, times, *ride(numbers[:3], times, end, grid, as_number(tolerance), settings))
+    return _legal_or_nan(scene, launch, input, steering, times, end, as_number(tolerance), grid, settings, recipe)
+
+
+# Compiled as a whole also where a bare `vmap` or `grad` would take it operation by operation.
+@eqx.filter_jit
+def _legal_or_nan(scene, launch, input, steering, times, end, tolerance, grid, settings, recipe) -> Trajectory:
+    """The run, or not a number and `finished` false where a traced number is out of range."""
     may = scene.may_start(launch, input) & jnp.all(legal([*run_bounds(end, tolerance), *times_bounds(times, end)]))
     may &= jnp.all(jnp.diff(times) > 0.0)
     # Steps of illegal numbers might never reach the end, so they are not begun; those of a given length do.
     begins = may | (grid is not None)
     end, run_times = jnp.where(begins, end, 0.0), jnp.where(begins, times, 0.0)
-    solve = differentiable_ride if adjoint is None else ride
-    run = read_off(recipe, run_times, *solve(numbers[:3], run_times, end, grid, as_number(tolerance), settings))
+    solve = differentiable_ride if settings.adjoint is None else ride
+    run = read_off(recipe, run_times, *solve((scene, launch, steering), run_times, end, grid, tolerance, settings))
     stats = run.stats._replace(finished=run.stats.finished & may)
     return eqx.tree_at(lambda one: (one.t, one.stats), nan_unless(may, run), (times, stats))
 

@@ -202,7 +202,7 @@ def simulate(
             raise ValueError("contact = 'hybrid' must be 'stop' inside jit, vmap and grad")
         return simulate_hybrid(scene, launch, float(t1), times, tolerance, solver)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
-        return _legal_or_nan(scene, launch, times, t1, tolerance, solver, adjoint)
+        return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
     run = Run.of(scene, launch)
     through = follow_stick_slip if scene.friction.set_valued else follow
     path = through(run, float(t1), solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
@@ -224,6 +224,8 @@ def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
     yield Bound(times, "times", at_least=0.0, at_most=t1)
 
 
+# Compiled as a whole also where a bare `vmap` or `grad` would take it operation by operation.
+@eqx.filter_jit
 def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: Any, *options: Any) -> Trajectory:
     """What `_traced` gives, or not a number and the status "illegal" where a traced number is out of range."""
     if times is None:
