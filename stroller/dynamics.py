@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.ground import AbstractGround
-from nonholonomic.vector import Component, Vector, add, cross, dot, multiply, scale, subtract
+from nonholonomic.vector import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors
 
 from .friction import AbstractFriction, Drag, Rolling
 from .heading import AbstractHeading
@@ -250,6 +250,38 @@ class Dynamics(eqx.Module):
         gyration = multiply(self.surface.gaussian_curvature(g.motion.position), carried, v)
         across = subtract(add(body.mass * centre_across, bank), add(gyration, multiply(forces.drag.front, g.sine)))
         return across - front * g.cosine, front
+
+    def projected_side_force(
+        self, t: Float[Array, "..."], state: State, input: Input | None
+    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Side forces [N] as `side_force`, for the projected heading on a curved ground: they act along the horizontal.
+
+        What the momentum lacks along d is -sin(phi) nu times the front force, what the spin lacks cos(phi) l times it;
+        together they give it without dividing by cos(phi). The rear force follows from the momentum across.
+        """
+        body = self.body
+
+        def moving(state):
+            g = self.geometry(state)
+            return g.velocity, g.motion.yaw_rate
+
+        _, (acceleration, yaw_acceleration) = jax.jvp(moving, (state,), (self.field(t, state, input),))
+        g = self.geometry(state)
+        forces = self.forces(t, g, input)
+        drag, heading, arm = forces.drag, g.motion.heading, body.wheelbase
+        left = cross(self.surface.up, heading)
+        ahead = sum_vectors(scale(g.cosine, heading), scale(g.sine, left))
+        pushed = sum_vectors(scale(add(forces.drive, drag.rear), heading), scale(drag.front, ahead))
+        risen = sum_vectors(acceleration, scale(self.gravity, self.surface.up))
+        lacking = sum_vectors(scale(body.mass, risen), scale(-1.0, pushed))
+        turned = add(drag.yaw, multiply(drag.front, arm, g.sine))
+        spin = add(body.inertia * yaw_acceleration, multiply(self.absolute, self.fork_torque(g, forces)))
+        swept = g.sine * g.lead
+        weighted = subtract(g.cosine / arm * subtract(spin, turned), swept * dot(lacking, g.direction))
+        front = weighted / (g.cosine**2 + swept**2)
+        square = self.heading.square(g.direction)
+        tilt = multiply(dot(heading, g.normal), dot(left, g.normal))
+        return dot(lacking, g.left) / square - front * (g.cosine + g.sine * tilt / square), front
 
 
 def padded(components: State) -> Vector:

@@ -8,10 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.formulation import Multipliers
+from nonholonomic.surface import Plane
 from nonholonomic.vector import Component, dot, multiply, scale, sum_vectors
 
-from .charts import Chart, coordinates_and_rates
 from .crossings import Recipe, Watch, crossings
 from .dynamics import Power, State, padded
 from .input import Input
@@ -176,16 +175,9 @@ def side_force(
     scene: Scene, t: Float[Array, " times"], states: Float[Array, "components times"], input: Input | None
 ) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
     """Side forces [N] on the rear axle and the front wheel, to the left of each."""
-    if scene.heading == "intrinsic":
+    if scene.heading == "intrinsic" or isinstance(scene.surface, Plane):
         return scene.dynamics.side_force(t, states, input)
-    # The paper's constraints act along the horizontal, not along the axle; their forces are its multipliers.
-    chart = Chart(scene, input)
-
-    def multipliers(t, state):
-        return Multipliers(chart).multipliers(t, *coordinates_and_rates(scene, t, state, input))
-
-    rear, front = jax.vmap(multipliers, in_axes=(0, 1), out_axes=1)(t, states)
-    return rear, front
+    return scene.dynamics.projected_side_force(t, states, input)
 
 
 @eqx.filter_jit

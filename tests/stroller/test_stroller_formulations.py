@@ -11,6 +11,7 @@ import stroller
 from nonholonomic.formulation import ConstrainedConnection, Hamel, Multipliers, ReducedBracket
 from stroller import Damping, Frictionless, Launch, Plane, RollingResistance, Scene, Spheroid, Stroller
 from stroller.charts import Chart, coordinates, coordinates_and_rates
+from stroller.trajectory import side_force
 
 FORMULATIONS = (Multipliers, Hamel, ConstrainedConnection, ReducedBracket)
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05, steering_spring=0.3)
@@ -65,9 +66,7 @@ def disagreements(scene, push, states):
         )
         found = [relative(kind(chart).acceleration(t, q, rate), expected) for kind in FORMULATIONS]
         forces = Multipliers(chart).multipliers(t, q, rate)
-        side = 0.0
-        if scene.heading == "intrinsic":
-            side = relative(jnp.stack(scene.dynamics.side_force(t, state, push)), forces)
+        side = relative(jnp.concatenate(side_force(scene, t[None], state[:, None], push)), forces)
         normal = relative(scene.contact(state), chart.normal_force(q, rate))
         energy = relative(scene.energy(state), chart.energy(q, rate))
         slip = jnp.max(jnp.abs(chart.constraints(q) @ rate))
