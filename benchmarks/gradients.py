@@ -23,8 +23,8 @@ from measure import machine, one_core, table, timed, write_csv
 from scenes import TOP
 
 import tippe
-from nonholonomic import sweep
-from nonholonomic.paths import with_numbers
+from nonholonomic.parameters import with_numbers
+from nonholonomic.sweeps import grid
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "physics"))
 from make_gradient_reference import RATIO, extrapolated
@@ -123,7 +123,7 @@ def main() -> None:
     told.add_argument("--out", type=Path, default=Path("gradients.csv"))
     options = told.parse_args()
     one_core()
-    sweep.workers = lambda: 1
+    grid.workers = lambda: 1
     print(machine())
     top = tippe.Top(*TOP)
     scenes = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3)}

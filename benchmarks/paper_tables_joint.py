@@ -18,9 +18,9 @@ import numpy as np
 from scipy.optimize import differential_evolution
 
 import tippe
-from nonholonomic.likelihood import Measurements
-from tippe import paper
+from nonholonomic.identification import Measurements
 from tippe.extended_times import extended_inversion_times
+from tippe.papers import paper
 
 HORIZON, ANGLE = 30.0, 0.95 * np.pi
 ROWS = [(table, row) for table in (paper.TABLE_2, paper.TABLE_3) for row in table.rows]

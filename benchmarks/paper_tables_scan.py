@@ -21,10 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import tippe
-from nonholonomic.ensemble import compiled_march, lanes_for
-from nonholonomic.lockstep import CROSSED, FAILED, GUARD_LOST
-from tippe import paper
+from nonholonomic.integration import CROSSED, FAILED, GUARD_LOST, compiled_march, lanes_for
 from tippe.inversion import InversionProblem
+from tippe.papers import paper
 
 ANGLE, BLOCK = 0.95 * np.pi, 4096
 NAMES = ("mass [g]", "R [mm]", "alpha", "I1/I3", "I3/mR^2", "rc/R", "azimuth", "slip speed [m/s]")

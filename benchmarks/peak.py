@@ -8,9 +8,7 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr
 from measure import timed
 
-from nonholonomic.ensemble import lanes_for
-from nonholonomic.lockstep import attempt
-from nonholonomic.queue import Queue
+from nonholonomic.integration import Queue, attempt, lanes_for
 from tippe.inversion import ABSOLUTE, InversionProblem
 
 #: What counts as one operation.

@@ -30,8 +30,8 @@ from peak import operations_per_step, peak
 from scenes import TOP
 
 import tippe
-from nonholonomic import sweep
-from nonholonomic.ensemble import compiled_march, lanes_for
+from nonholonomic.integration import compiled_march, lanes_for
+from nonholonomic.sweeps import grid
 from tippe.inversion import ABSOLUTE, InversionProblem
 
 ON_CPU = jax.default_backend() == "cpu"
@@ -41,7 +41,7 @@ TOLERANCE = 1e-9 if DOUBLE else 1e-5
 
 def with_workers(count: int) -> None:
     """Let sweeps use this many threads."""
-    sweep.workers = lambda: count
+    grid.workers = lambda: count
 
 
 def times_of(scene: tippe.Scene, launches: int) -> tippe.Table:
@@ -145,7 +145,7 @@ def main() -> None:
     print(
         f"{device}: {operations:.0f} operations a step, at most {most:.3g} a second{' on one core' if ON_CPU else ''}"
     )
-    cores = sweep.workers()
+    cores = grid.workers()
     counts = [10**power for power in range(8) if 10**power <= options.most]
     rows = [
         cpu_row(scene, count, cores, operations, most) if ON_CPU else device_row(scene, count, operations, most)

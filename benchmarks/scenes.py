@@ -10,7 +10,7 @@ from peers import NUMPY, Task
 
 import stroller
 import tippe
-from nonholonomic.lockstep import AbstractProblem
+from nonholonomic.integration import AbstractProblem
 from stroller.table import RideProblem
 from tippe.inversion import InversionProblem
 

@@ -22,8 +22,7 @@ from measure import machine, one_core, table, timed, write_csv
 from peers import PEERS, Ends, Task, available, heyoka_scalar, scipy_with
 from scenes import Case, misprint, scenes
 
-from nonholonomic.ensemble import compiled_march, lanes_for
-from nonholonomic.lockstep import CROSSED
+from nonholonomic.integration import CROSSED, compiled_march, lanes_for
 
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 

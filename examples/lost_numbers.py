@@ -9,11 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import tippe
-from nonholonomic.identify import identify
-from nonholonomic.likelihood import Measurements
-from nonholonomic.unknown import Free
-from tippe import paper
+from nonholonomic.identification import Free, Measurements, identify
 from tippe.extended_times import extended_inversion_times
+from tippe.papers import paper
 
 HORIZON = 30.0
 ROWS = [(table, row) for table in (paper.TABLE_2, paper.TABLE_3) for row in table.rows]

@@ -9,7 +9,7 @@ if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
 from .compilation_cache import enable_compilation_cache as enable_compilation_cache
-from .surface import AbstractSurface as AbstractSurface
-from .surface import Cylinder as Cylinder
-from .surface import Plane as Plane
-from .surface import Sphere as Sphere
+from .geometry import AbstractSurface as AbstractSurface
+from .geometry import Cylinder as Cylinder
+from .geometry import Plane as Plane
+from .geometry import Sphere as Sphere

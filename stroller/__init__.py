@@ -1,10 +1,10 @@
 """The stroller: a three-wheeled vehicle with nonholonomic constraints, on the plane and on curved grounds."""
 
-from nonholonomic.ground import Spheroid as Spheroid
-from nonholonomic.midpoint import ImplicitMidpoint as ImplicitMidpoint
-from nonholonomic.surface import Plane as Plane
-from nonholonomic.surface import Sphere as Sphere
-from nonholonomic.unknown import Free as Free
+from nonholonomic.geometry import Plane as Plane
+from nonholonomic.geometry import Sphere as Sphere
+from nonholonomic.geometry import Spheroid as Spheroid
+from nonholonomic.identification import Free as Free
+from nonholonomic.integration import ImplicitMidpoint as ImplicitMidpoint
 
 from .friction import AbstractFriction as AbstractFriction
 from .friction import Damping as Damping

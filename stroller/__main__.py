@@ -12,11 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from nonholonomic.compilation_cache import enable_compilation_cache
-from nonholonomic.ground import AbstractGround, Spheroid
-from nonholonomic.midpoint import ImplicitMidpoint
-from nonholonomic.surface import Plane
-from nonholonomic.sweep import versions
-from nonholonomic.table import Table
+from nonholonomic.geometry import AbstractGround, Plane, Spheroid
+from nonholonomic.integration import ImplicitMidpoint
+from nonholonomic.sweeps import Table, versions
 
 from .friction import Damping, Frictionless
 from .launch import Launch

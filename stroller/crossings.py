@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.runge_kutta import explicit_tableau
+from nonholonomic.integration import explicit_tableau
 
 from .dynamics import Dynamics, State
 from .input import Input

@@ -17,8 +17,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.ground import AbstractGround
-from nonholonomic.vector import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors
+from nonholonomic.geometry import (
+    AbstractGround,
+    Component,
+    Vector,
+    add,
+    cross,
+    dot,
+    multiply,
+    scale,
+    subtract,
+    sum_vectors,
+)
 
 from .friction import AbstractFriction, Drag, Rolling
 from .heading import AbstractHeading

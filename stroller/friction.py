@@ -8,8 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nonholonomic.geometry import Component
 from nonholonomic.validation import Bound, Bounded, as_number
-from nonholonomic.vector import Component
 
 
 class Rolling(NamedTuple):

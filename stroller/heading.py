@@ -11,8 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.ground import AbstractGround
-from nonholonomic.vector import Component, Vector, cross, dot, multiply, scale, subtract, sum_vectors
+from nonholonomic.geometry import AbstractGround, Component, Vector, cross, dot, multiply, scale, subtract, sum_vectors
 
 VERTICAL: Vector = (None, None, 1.0)
 

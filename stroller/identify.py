@@ -7,11 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic import identify as generic
-from nonholonomic.identify_result import Identification
-from nonholonomic.likelihood import Measurements
-from nonholonomic.paths import numbers
-from nonholonomic.recording import check_recording, sample_labels, samples
+from nonholonomic import identification as generic
+from nonholonomic.identification import Identification, Measurements, check_recording, sample_labels, samples
+from nonholonomic.parameters import numbers
 from nonholonomic.validation import as_number, require
 
 from .input import Input
@@ -79,7 +77,7 @@ class Recording(eqx.Module):
 
 
 class SceneModel(eqx.Module):
-    """Predictions of all recordings of a scene, as `nonholonomic.identify` wants them."""
+    """Predictions of all recordings of a scene, as `nonholonomic.identification.identify` wants them."""
 
     scene: Scene
     data: tuple[Recording, ...]
@@ -110,7 +108,7 @@ def identify(
     - `free`: path of a number -> a `Free` or only the value from which to start: `"scene.friction.rolling"`, or
       `"rolling"` where nothing else ends so; `"launch.place[0]"` and `"launch.place[1]"` are parts of the place. A number
       of the launch is the same in all recordings. Numbers that cannot be negative are fitted in their logarithms.
-    - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identify.identify`.
+    - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `tolerance`: relative tolerance of the integration.
 
     **Returns:** an `Identification`.

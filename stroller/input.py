@@ -10,8 +10,8 @@ from typing import NamedTuple, TypeAlias
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from nonholonomic.geometry import Vector
 from nonholonomic.validation import Bound, Bounded, as_number
-from nonholonomic.vector import Vector
 
 
 class Motion(NamedTuple):

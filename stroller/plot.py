@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from nonholonomic.ground import AbstractGround
-from nonholonomic.surface import Plane
+from nonholonomic.geometry import AbstractGround, Plane
 
 from .trajectory import Trajectory
 

@@ -8,10 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.differentiable import AbstractQuestion, ask, directions_by
-from nonholonomic.lyapunov import probed
+from nonholonomic.derivatives import AbstractQuestion, VariationalProblem, ask, directions_by, in_groups, probed
 from nonholonomic.validation import is_traced
-from nonholonomic.variation import VariationalProblem, in_groups
 
 from .crossings import Watch, watched
 from .dynamics import State

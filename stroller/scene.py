@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.ground import AbstractGround
-from nonholonomic.surface import Plane
+from nonholonomic.geometry import AbstractGround, Plane
 from nonholonomic.validation import Bound, Bounded, all_bounds, as_number, is_traced, legal, require_all
 
 from .dynamics import Dynamics, State, stacked

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.midpoint import ImplicitMidpoint
+from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.validation import Bound, as_number, is_traced, legal, nan_unless, require_all
 
 from .crossings import Recipe

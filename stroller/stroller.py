@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from nonholonomic.surface import none_if_zero
+from nonholonomic.geometry import none_if_zero
 from nonholonomic.validation import Bound, Bounded, as_number
 
 

@@ -9,14 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic import sweep as grids
-from nonholonomic.ensemble import compiled_march, lanes_for
-from nonholonomic.lockstep import CROSSED, FAILED, GUARD_LOST, AbstractProblem
-from nonholonomic.paths import description, with_numbers
-from nonholonomic.runge_kutta import explicit_tableau
-from nonholonomic.surface import Plane
-from nonholonomic.sweep import Axis, Variable, axis
-from nonholonomic.table import Table
+from nonholonomic.geometry import Plane
+from nonholonomic.integration import (
+    CROSSED,
+    FAILED,
+    GUARD_LOST,
+    AbstractProblem,
+    compiled_march,
+    explicit_tableau,
+    lanes_for,
+)
+from nonholonomic.parameters import description, with_numbers
+from nonholonomic.sweeps import Axis, Table, Variable, axis
+from nonholonomic.sweeps import grid as grids
 from nonholonomic.validation import as_number, require
 
 from .dynamics import Dynamics, State

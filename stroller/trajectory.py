@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.surface import Plane
-from nonholonomic.vector import Component, dot, multiply, scale, sum_vectors
+from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
 
 from .crossings import Recipe, Watch, crossings
 from .dynamics import Power, State, padded

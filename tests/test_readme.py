@@ -44,7 +44,8 @@ roots = {"nonholonomic": nonholonomic, "stroller": stroller, "tippe": tippe}
 for name in sys.argv[1:]:
     root, *rest = name.split(".")
     functools.reduce(getattr, rest, roots[root])
-print(json.dumps([name for name in ("matplotlib", "scipy.integrate", "tippe.paper", "stroller.paper") if name in sys.modules]))
+slow = ("matplotlib", "scipy.integrate", "tippe.papers.paper", "stroller.papers.paper")
+print(json.dumps([name for name in slow if name in sys.modules]))
 """
 
 

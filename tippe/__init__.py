@@ -1,10 +1,10 @@
 """The tippe top: scenes, trajectories and inversion tables."""
 
-from nonholonomic.surface import Cylinder as Cylinder
-from nonholonomic.surface import Plane as Plane
-from nonholonomic.surface import Sphere as Sphere
-from nonholonomic.table import Table as Table
-from nonholonomic.unknown import Free as Free
+from nonholonomic.geometry import Cylinder as Cylinder
+from nonholonomic.geometry import Plane as Plane
+from nonholonomic.geometry import Sphere as Sphere
+from nonholonomic.identification import Free as Free
+from nonholonomic.sweeps import Table as Table
 
 from . import steady as steady
 from .friction import AbstractFriction as AbstractFriction
@@ -14,7 +14,6 @@ from .friction import Frictionless as Frictionless
 from .friction import Rolling as Rolling
 from .friction import SetValuedCoulomb as SetValuedCoulomb
 from .friction import Viscous as Viscous
-from .hybrid.trajectory import HybridTrajectory as HybridTrajectory
 from .identify import InversionTimes as InversionTimes
 from .identify import Recording as Recording
 from .identify import identify as identify
@@ -22,6 +21,7 @@ from .inversion import inversion_time as inversion_time
 from .launch import Launch as Launch
 from .lyapunov import LyapunovExponent as LyapunovExponent
 from .lyapunov import lyapunov_exponent as lyapunov_exponent
+from .phases.flight_trajectory import HybridTrajectory as HybridTrajectory
 from .scene import Scene as Scene
 from .table import inversion_table as inversion_table
 from .top import Stem as Stem

@@ -12,12 +12,12 @@ import jax
 import numpy as np
 
 from nonholonomic.compilation_cache import enable_compilation_cache
-from nonholonomic.surface import Cylinder, Plane
-from nonholonomic.table import Table
+from nonholonomic.geometry import Cylinder, Plane
+from nonholonomic.sweeps import Table
 
-from . import paper
 from .friction import AbstractFriction, Coulomb, Viscous
 from .launch import Launch
+from .papers import paper
 from .plot import Panel, draw_launches
 from .scene import Scene
 from .table import inversion_table

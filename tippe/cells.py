@@ -9,18 +9,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nonholonomic.ensemble import Outcome, compiled_march, lanes_for
-from nonholonomic.lockstep import FAILED, GUARD_LOST
-from nonholonomic.paths import with_numbers
-from nonholonomic.phases import UNRESOLVED, Journey
-from nonholonomic.reference import march_by_diffrax
-from nonholonomic.sweep import Variable
+from nonholonomic.integration import (
+    FAILED,
+    GUARD_LOST,
+    UNRESOLVED,
+    Journey,
+    Outcome,
+    compiled_march,
+    lanes_for,
+    march_by_diffrax,
+)
+from nonholonomic.parameters import with_numbers
+from nonholonomic.sweeps import Variable
 
-from .hybrid.cells import ride as ride_with_flights
 from .inversion import ABSOLUTE, InversionProblem, is_inverted
+from .phases.flight_cells import ride as ride_with_flights
+from .phases.stick_slip_cells import ride as ride_with_sticking
 from .scene import Scene
 from .sensitivities import slopes_of_cells
-from .stick_slip.cells import ride as ride_with_sticking
 
 
 class Kind(NamedTuple):

@@ -11,8 +11,21 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.surface import AbstractSurface, Tangent, carried
-from nonholonomic.vector import Component, Vector, add, cross, dot, multiply, scale, stored, subtract, sum_vectors
+from nonholonomic.geometry import (
+    AbstractSurface,
+    Component,
+    Tangent,
+    Vector,
+    add,
+    carried,
+    cross,
+    dot,
+    multiply,
+    scale,
+    stored,
+    subtract,
+    sum_vectors,
+)
 
 from .friction import AbstractFriction, ContactLoad, Slip
 from .top import Top

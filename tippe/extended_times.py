@@ -10,10 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.lockstep import CROSSED, FAILED, crossing_time
-from nonholonomic.queue import Queue
+from nonholonomic.derivatives import VariationalProblem, in_groups, lanes_along
+from nonholonomic.integration import CROSSED, FAILED, Queue, crossing_time
 from nonholonomic.validation import as_number
-from nonholonomic.variation import VariationalProblem, in_groups, lanes_along
 
 from .inversion import ABSOLUTE, InversionProblem, check_smooth
 from .launch import Launch

@@ -9,8 +9,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nonholonomic.geometry import Component, Vector, add, dot, sum_vectors
 from nonholonomic.validation import Bound, Bounded, as_number
-from nonholonomic.vector import Component, Vector, add, dot, sum_vectors
 
 
 class Slip(NamedTuple):
@@ -213,8 +213,8 @@ class SetValuedCoulomb(AbstractFriction):
     along the arena up to mu N while it does not (`tippe.md`, section 3).
 
     The run is made of phases. In a slip the force has its full size; a slip that stops turns into rolling, with the
-    equations of `rolling.py`, if the force which that takes is within the friction cone; and the top slips again as soon
-    as it is not. While it rolls the energy is constant.
+    equations of `phases/rolling.py`, if the force which that takes is within the friction cone; and the top slips again
+    as soon as it is not. While it rolls the energy is constant.
 
     **Arguments:**
 

@@ -9,11 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic import identify as generic
-from nonholonomic.identify_result import Identification
-from nonholonomic.likelihood import Measurements
-from nonholonomic.paths import numbers, with_numbers
-from nonholonomic.recording import check_recording, sample_labels, samples
+from nonholonomic import identification as generic
+from nonholonomic.identification import Identification, Measurements, check_recording, sample_labels, samples
+from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.validation import as_number, require
 
 from .extended_times import extended_inversion_times
@@ -147,7 +145,7 @@ class Recording(eqx.Module):
 
 
 class SceneModel(eqx.Module):
-    """Predictions of all data of a scene, as `nonholonomic.identify` wants them."""
+    """Predictions of all data of a scene, as `nonholonomic.identification.identify` wants them."""
 
     scene: Scene
     data: tuple[Any, ...]
@@ -180,7 +178,7 @@ def identify(
     - `free`: path of a number -> a `Free` or only the value from which to start: `"scene.friction.mu"`, or `"friction.mu"`
       where nothing else ends so; a number of the launch is the same in all launches of all data. Numbers that cannot be
       negative are fitted in their logarithms.
-    - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identify.identify`.
+    - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `tolerance`: relative tolerance of the integration.
 
     **Returns:** an `Identification`.

@@ -11,19 +11,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from nonholonomic.differentiable import AbstractQuestion, ask, directions_by
-from nonholonomic.ensemble import Outcome, lanes_for, traced_march
-from nonholonomic.lockstep import CROSSED, FAILED, REACHED_END, AbstractProblem
-from nonholonomic.paths import numbers
-from nonholonomic.phases import Journey
-from nonholonomic.runge_kutta import explicit_tableau
-from nonholonomic.slopes import traced_march_with_slopes
+from nonholonomic.derivatives import AbstractQuestion, ask, directions_by, traced_march_with_slopes
+from nonholonomic.integration import (
+    CROSSED,
+    FAILED,
+    REACHED_END,
+    AbstractProblem,
+    Journey,
+    Outcome,
+    explicit_tableau,
+    lanes_for,
+    traced_march,
+)
+from nonholonomic.parameters import numbers
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, require_all
 
 from .dynamics import COS_THETA, Dynamics
 from .launch import Launch
+from .phases import Kind, StickSlip
 from .scene import Scene
-from .stick_slip.motion import Kind, StickSlip
 
 #: The absolute tolerance is this part of the relative one, in units of the state's own magnitudes.
 ABSOLUTE = 0.1
@@ -75,7 +81,7 @@ def inversion_time(
 
     The derivative is that of the event's time by the implicit function theorem; it is 0 where the result is infinite.
     Differentiating by one number costs about as much again as the time itself, by any number of them four to seven times
-    as much (`nonholonomic/slopes.py`); second derivatives take forward-mode passes.
+    as much (`nonholonomic/derivatives/slopes.py`); second derivatives take forward-mode passes.
 
     **Arguments:**
 

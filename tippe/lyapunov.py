@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
-from nonholonomic.lockstep import GUARD_LOST, REACHED_END
-from nonholonomic.lyapunov import exponent_of, growth
-from nonholonomic.runge_kutta import explicit_tableau
+from nonholonomic.derivatives import exponent_of, growth
+from nonholonomic.geometry import cross
+from nonholonomic.integration import GUARD_LOST, REACHED_END, explicit_tableau
 from nonholonomic.validation import require
-from nonholonomic.vector import cross
 
 from .cells import kind_of
 from .inversion import ABSOLUTE, InversionProblem
@@ -53,7 +52,7 @@ def lyapunov_exponent(
     """The largest Lyapunov exponent of one launch or of many at once, by the variational equation.
 
     Positive if nearby launches part exponentially. While a top rises, it is the rate of the rise; chaos is what stays
-    positive as `t1` grows. Source: Benettin et al., Meccanica 15 (1980) 9; see `nonholonomic/lyapunov.py`.
+    positive as `t1` grows. Source: Benettin et al., Meccanica 15 (1980) 9; see `nonholonomic/derivatives/lyapunov.py`.
 
     **Arguments:**
 

@@ -8,20 +8,31 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.differentiable import AbstractQuestion, ask, directions_by
-from nonholonomic.ensemble import lanes_for
-from nonholonomic.integrate import sample
-from nonholonomic.lockstep import FAILED, GUARD_LOST, AbstractProblem, event_time
-from nonholonomic.lyapunov import probed
-from nonholonomic.samples import march_with_samples
+from nonholonomic.derivatives import (
+    AbstractQuestion,
+    VariationalProblem,
+    ask,
+    directions_by,
+    in_groups,
+    lanes_along,
+    probed,
+)
+from nonholonomic.integration import (
+    FAILED,
+    GUARD_LOST,
+    AbstractProblem,
+    event_time,
+    lanes_for,
+    march_with_samples,
+    sample,
+)
 from nonholonomic.validation import as_number
-from nonholonomic.variation import VariationalProblem, in_groups, lanes_along
 
 from .dynamics import Dynamics, stacked
 from .inversion import ABSOLUTE
 from .launch import Launch
+from .phases import Kind, StickSlip
 from .scene import Scene
-from .stick_slip.motion import Kind, StickSlip
 
 
 class Run(AbstractProblem):

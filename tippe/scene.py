@@ -6,14 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.surface import AbstractSurface, Plane, none_if_zero
+from nonholonomic.geometry import AbstractSurface, Plane, dot, none_if_zero
 from nonholonomic.validation import Bound, Bounded, as_number
-from nonholonomic.vector import dot
 
 from .dynamics import COS_THETA, Dynamics
 from .friction import AbstractFriction, Coulomb, Frictionless, Viscous
 from .launch import Launch
-from .stick_slip.motion import StickSlip
+from .phases import StickSlip
 from .top import Top
 
 #: Tilt [rad] of a launch below which errors across the normal are measured in proportion to it.

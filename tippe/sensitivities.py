@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.ensemble import Outcome
-from nonholonomic.paths import full_path, numbers, with_numbers
-from nonholonomic.slopes import compiled_march_with_slopes, directions_of
-from nonholonomic.sweep import Variable
-from nonholonomic.variation import natural_size
+from nonholonomic.derivatives import compiled_march_with_slopes, directions_of, natural_size
+from nonholonomic.integration import Outcome
+from nonholonomic.parameters import full_path, numbers, with_numbers
+from nonholonomic.sweeps import Variable
 
 from .inversion import ABSOLUTE, InversionProblem, is_inverted
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.surface import Plane
+from nonholonomic.geometry import Plane
 from nonholonomic.validation import as_number, require
 
 from .launch import Launch

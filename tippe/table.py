@@ -7,10 +7,9 @@ from typing import Any
 import diffrax
 import numpy as np
 
-from nonholonomic.paths import description, numbers, with_numbers
-from nonholonomic.runge_kutta import explicit_tableau
-from nonholonomic.sweep import Axis, Variable, axis, sweep
-from nonholonomic.table import Table
+from nonholonomic.integration import explicit_tableau
+from nonholonomic.parameters import description, numbers, with_numbers
+from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
 
 from .cells import Runs, kind_of
 from .inversion import check_event, check_run

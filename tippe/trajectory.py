@@ -10,16 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.integrate import follow
+from nonholonomic.geometry import dot
+from nonholonomic.integration import follow
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require, require_all
-from nonholonomic.vector import dot
 
-from .hybrid.trajectory import HybridTrajectory, simulate_hybrid
 from .inversion import ABSOLUTE, check_run, run_bounds
 from .launch import Launch
+from .phases.flight_trajectory import HybridTrajectory, simulate_hybrid
+from .phases.stick_slip_path import follow_stick_slip
 from .sampled import STATUS, Run, ended, sampled, sampled_by_diffrax
 from .scene import Scene
-from .stick_slip.path import follow_stick_slip
 
 
 def _of_each_run(function: Callable[["Trajectory"], Array]) -> property:

@@ -16,7 +16,7 @@ import tippe
 from hard.lagrange import theta_by_lagrange
 from hard.limits import rutstam_top
 from hard.row import Row, of_runs
-from nonholonomic.integrate import Path, follow
+from nonholonomic.integration import Path, follow
 from tippe.trajectory import Run
 
 GRAVITY = 9.81

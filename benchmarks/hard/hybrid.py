@@ -13,7 +13,7 @@ from measure import timed
 import tippe
 from hard.limits import rutstam_top
 from hard.row import Row, of_runs, of_table
-from tippe.hybrid.stem import first_contact
+from tippe.phases import first_contact
 
 #: The reference's results, by number of its cases.
 REFERENCE = list(

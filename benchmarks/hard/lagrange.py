@@ -5,14 +5,14 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import tippe
-from tippe import euler_angles
+from tippe.witnesses import euler_angles
 
 #: Sizes of eta or x, theta, phi and the rates of eta or x, y, theta, phi, psi.
 SIZES = np.array([1.0, 1.0, 1.0, 10.0, 0.1, 10.0, 10.0, 10.0])
 
 
 def theta_by_lagrange(scene: tippe.Scene, launch: tippe.Launch, times: np.ndarray) -> np.ndarray:
-    """theta [rad] at the given times, by DOP853 at 1e-13 on `tippe.euler_angles.by_lagrange`.
+    """theta [rad] at the given times, by DOP853 at 1e-13 on `tippe.witnesses.euler_angles.by_lagrange`.
 
     The chart is singular where sin(theta) = 0; a run that comes close to a pole loses digits there.
     """

@@ -11,8 +11,8 @@ from measure import timed
 import tippe
 from hard.lagrange import theta_by_lagrange
 from hard.row import Row, of_runs, of_table
-from tippe.quadrature import FrictionlessNutation, swing
 from tippe.steady import growth_rate, standing_matrix, tumbling_angles
+from tippe.witnesses.quadrature import FrictionlessNutation, swing
 
 VISCOUS = tippe.Viscous(0.3)
 

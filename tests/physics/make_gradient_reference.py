@@ -19,9 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import tippe
-from nonholonomic.ensemble import compiled_march
-from nonholonomic.lockstep import CROSSED
-from nonholonomic.paths import with_numbers
+from nonholonomic.integration import CROSSED, compiled_march
+from nonholonomic.parameters import with_numbers
 from tippe.inversion import ABSOLUTE, InversionProblem
 
 HERE = Path(__file__).parent

@@ -10,7 +10,7 @@ from conftest import assert_close, homogeneous_ball, rutstam_top
 from scipy.special import ellipk
 
 import tippe
-from nonholonomic.integrate import follow
+from nonholonomic.integration import follow
 from tippe.trajectory import Run
 
 GRAVITY = 9.81

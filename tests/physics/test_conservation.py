@@ -98,7 +98,7 @@ def test_a_frictionless_run_goes_back_to_its_start():
 
     import diffrax
 
-    from nonholonomic.integrate import follow
+    from nonholonomic.integration import follow
     from tippe.trajectory import Run
 
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Frictionless())

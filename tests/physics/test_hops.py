@@ -14,10 +14,10 @@ from hop_reference import CASES, Case, row
 from hop_reference import strike as reference_strike
 
 import tippe
-from tippe.hybrid.flight import Descent, angle_reached, cone, flown, landing
-from tippe.hybrid.free_body import FreeBody, angular_velocity, balls, energy, gap_rate, jellett, standing_on
-from tippe.hybrid.impact import strike
-from tippe.hybrid.stem import first_contact, standing_spin
+from tippe.phases import first_contact, standing_spin
+from tippe.phases.flight import Descent, angle_reached, cone, flown, landing
+from tippe.phases.free_body import FreeBody, angular_velocity, balls, energy, gap_rate, jellett, standing_on
+from tippe.phases.impact import strike
 
 REFERENCE = list(csv.DictReader(Path(__file__).with_name("hop_reference.csv").read_text().splitlines()))
 

@@ -13,11 +13,11 @@ from scipy.integrate import solve_ivp
 from test_hops import scene_of
 
 import tippe
-from tippe.hybrid.free_body import FreeBody, angular_velocity, balls, freed, gap_rate, jellett
-from tippe.hybrid.free_body import energy as energy_of
-from tippe.hybrid.leaning import BOTH, at_rest
-from tippe.hybrid.sliding import leaning
-from tippe.hybrid.stem import first_contact
+from tippe.phases import first_contact
+from tippe.phases.free_body import FreeBody, angular_velocity, balls, freed, gap_rate, jellett
+from tippe.phases.free_body import energy as energy_of
+from tippe.phases.leaning import BOTH, at_rest
+from tippe.phases.sliding import leaning
 
 REFERENCE = list(csv.DictReader(Path(__file__).with_name("hop_reference.csv").read_text().splitlines()))
 

@@ -9,10 +9,10 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
 import tippe
-from nonholonomic.formulation import Multipliers
-from tippe import euler_angles, poincare, quadrature
+from nonholonomic.formulations import Multipliers
 from tippe.friction import AbstractFriction, ContactLoad, Slip
-from tippe.rolling import RollingDynamics
+from tippe.phases import RollingDynamics
+from tippe.witnesses import euler_angles, poincare, quadrature
 
 ARENAS = [tippe.Plane(), tippe.Cylinder(0.1), tippe.Sphere(0.1)]
 

@@ -10,7 +10,7 @@ from conftest import assert_close, homogeneous_ball, rutstam_top
 from scipy.integrate import solve_ivp
 
 import tippe
-from tippe.stick_slip.path import follow_stick_slip
+from tippe.phases.stick_slip_path import follow_stick_slip
 from tippe.trajectory import Run
 
 

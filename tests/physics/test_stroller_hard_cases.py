@@ -8,9 +8,9 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 import stroller
-from nonholonomic.formulation import Multipliers
+from nonholonomic.formulations import Multipliers
 from stroller import Launch, Scene, Sphere, Spheroid, Stroller
-from stroller.charts import Chart
+from stroller.witnesses.charts import Chart
 
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
 M, L, J = 1.7, 0.7, 0.4

@@ -8,9 +8,9 @@ from geographiclib.geodesic import Geodesic
 from scipy.special import ellipk
 
 import stroller
-from nonholonomic.formulation import Hamel
+from nonholonomic.formulations import Hamel
 from stroller import Damping, Launch, Scene, Sphere, Spheroid, Steady, Stroller
-from stroller.charts import Chart
+from stroller.witnesses.charts import Chart
 
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
 M, L, J = 1.7, 0.7, 0.4

@@ -13,8 +13,8 @@ from scipy.integrate import solve_ivp
 
 import tippe
 from tippe.dynamics import JAMMED
-from tippe.hybrid.free_body import FreeBody, angular_velocity, balls, energy, gap_rate, jellett
-from tippe.hybrid.impact import strike
+from tippe.phases.free_body import FreeBody, angular_velocity, balls, energy, gap_rate, jellett
+from tippe.phases.impact import strike
 
 # Impacts
 

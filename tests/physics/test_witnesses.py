@@ -8,8 +8,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import tippe
-from nonholonomic import formulation
-from tippe import euler_angles, poincare, quadrature, reduced
+from nonholonomic.formulations import formulation
+from tippe.witnesses import euler_angles, poincare, quadrature, reduced
 
 STATES = 1000
 ARENAS = ["plane", "cylinder"]

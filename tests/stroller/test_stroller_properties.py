@@ -15,8 +15,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from nonholonomic.ensemble import compiled_march
-from nonholonomic.lockstep import GUARD_LOST, REACHED_END
+from nonholonomic.integration import GUARD_LOST, REACHED_END, compiled_march
 from stroller import Damping, Launch, Plane, RollingResistance, Scene, Sphere, Spheroid, Stroller
 from stroller.table import RideProblem
 

@@ -9,8 +9,8 @@ from conftest import assert_close, random_states, rutstam_top
 from hard.friction import hertz_disc
 
 import tippe
-from tippe import reduced
 from tippe.friction import Slip
+from tippe.witnesses import reduced
 
 ARENAS = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3), "sphere": tippe.Sphere(0.3)}
 BOTH = tippe.Rolling(2e-3, 3.0, tippe.Contensou(0.4, 4e-3, 0.1))

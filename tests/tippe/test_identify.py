@@ -10,10 +10,9 @@ import pytest
 from conftest import assert_close, rutstam_top
 
 import tippe
-from nonholonomic.identify_result import coordinate_covariance
-from nonholonomic.levenberg_marquardt import Problem, linearise, minimise
-from nonholonomic.likelihood import Measurements
-from nonholonomic.unknown import Free
+from nonholonomic.identification import Free, Measurements
+from nonholonomic.identification.levenberg_marquardt import Problem, linearise, minimise
+from nonholonomic.identification.result import coordinate_covariance
 from tippe.extended_times import extended_inversion_times
 from tippe.identify import SceneModel
 

@@ -13,8 +13,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import tippe
-from nonholonomic.ensemble import compiled_march
-from nonholonomic.lockstep import FAILED, GUARD_LOST, REACHED_END
+from nonholonomic.integration import FAILED, GUARD_LOST, REACHED_END, compiled_march
 from tippe.inversion import InversionProblem
 
 #: Examples are drawn in batches of this many lanes, so that one compiled program runs them all.

@@ -17,7 +17,7 @@ import xarray
 from conftest import assert_close, rutstam_top
 
 import tippe
-from nonholonomic import sweep as sweeping
+from nonholonomic.sweeps import grid as sweeping
 
 THETA, SPIN = [0.08, 0.1, 0.12], [90.0, 110.0]
 

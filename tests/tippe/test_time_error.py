@@ -8,8 +8,8 @@ from conftest import assert_close, rutstam_top
 from lagrange_top import inversion
 
 import tippe
-from nonholonomic.digits import concise
-from nonholonomic.ensemble import compiled_march, lanes_for
+from nonholonomic.integration import compiled_march, lanes_for
+from nonholonomic.sweeps.digits import concise
 from tippe import steady
 from tippe.inversion import ABSOLUTE, InversionProblem, is_inverted
 from tippe.time_error import COARSER, time_error

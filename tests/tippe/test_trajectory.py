@@ -10,7 +10,8 @@ import pytest
 from conftest import assert_close, rutstam_top
 
 import tippe
-from nonholonomic.integrate import PIECE, follow
+from nonholonomic.integration import follow
+from nonholonomic.integration.single_run import PIECE
 from tippe.trajectory import Run
 
 LAUNCH = tippe.Launch(0.1, 155.0)

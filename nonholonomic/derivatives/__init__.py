@@ -1,0 +1,19 @@
+"""Derivatives of what a run ends with: along with it, and back through it; and the rate at which neighbours part.
+
+Along one direction the variation runs with the run; along several every run is taken back once. Step lengths
+are held fixed in both.
+"""
+
+from .differentiable import AbstractQuestion as AbstractQuestion
+from .differentiable import ask as ask
+from .differentiable import directions_by as directions_by
+from .lyapunov import exponent_of as exponent_of
+from .lyapunov import growth as growth
+from .lyapunov import probed as probed
+from .slopes import compiled_march_with_slopes as compiled_march_with_slopes
+from .slopes import directions_of as directions_of
+from .slopes import traced_march_with_slopes as traced_march_with_slopes
+from .variation import VariationalProblem as VariationalProblem
+from .variation import in_groups as in_groups
+from .variation import lanes_along as lanes_along
+from .variation import natural_size as natural_size

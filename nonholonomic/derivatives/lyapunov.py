@@ -1,0 +1,150 @@
+"""The largest Lyapunov exponent of a problem: the mean rate at which nearby runs part, by the variational equation.
+
+A direction w rides along with the state y' = f(y). It is kept at unit length while it follows the linearised motion
+(Benettin et al., Meccanica 15 (1980) 9, with the renormalisation made continuous), and what the renormalisation takes away
+is added up: w' = J w - g w, g = (w . J w) / (w . w), growth' = g, where J w is a Jacobian-vector product of f. Directions
+and lengths are those of the state in units of the problem's magnitudes.
+"""
+
+import math
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..integration import REACHED_END, RUNNING, AbstractProblem, compiled_march, lanes_for
+
+
+class VariedProblem(AbstractProblem):
+    """A problem without its event, with a direction and the logarithm of its growth riding along.
+
+    **Arguments:**
+
+    - `problem`: an autonomous problem; only its field and its guard are used.
+    - `states`: the problem's state, the direction and the growth of every cell.
+    - `magnitudes`: of the problem's own components.
+    """
+
+    problem: AbstractProblem
+    states: Float[Array, "twice_components_and_one cells"]
+    magnitudes: Float[Array, "components cells"]
+
+    def start(self) -> tuple[Float[Array, "all cells"], Float[Array, "all cells"]]:
+        ones = jnp.ones((self.states.shape[0] - len(self.magnitudes), *self.states.shape[1:]))
+        return self.states, jnp.concatenate([self.magnitudes, ones])
+
+    def field(self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]) -> Float[Array, "all lanes"]:
+        size = len(self.magnitudes)
+        y, w = state[:size], state[size:-1]
+        rate, carried = jax.jvp(lambda at: self.problem.field(time, at), (y,), (w * self.magnitudes,))
+        carried = carried / self.magnitudes
+        growth = jnp.sum(w * carried, axis=0) / jnp.sum(w * w, axis=0)
+        return jnp.concatenate([rate, carried - growth * w, growth[None]])
+
+    def crossing(self, state: Float[Array, "all lanes"]) -> None:
+        return None
+
+    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]) -> Float[Array, " lanes"] | None:
+        return self.problem.guard(time, state[: len(self.magnitudes)])
+
+
+def probed(problem: AbstractProblem) -> VariedProblem:
+    """A run and a direction with nothing special about it, for a derivative that takes no part in step control itself.
+
+    The direction follows the linearised motion and takes part in step control, so that the steps bear tangents also where
+    the state is at rest.
+    """
+    start, magnitudes = problem.start()
+    direction = jnp.cos(1.0 + jnp.arange(len(start)))
+    direction = jnp.broadcast_to(direction.reshape(-1, *(1,) * (start.ndim - 1)), start.shape)
+    unit = direction / jnp.linalg.norm(direction, axis=0)
+    states = jnp.concatenate([start, unit, jnp.zeros((1, *start.shape[1:]))])
+    return VariedProblem(problem, states, magnitudes)
+
+
+class Growth(NamedTuple):
+    """How a direction grew in every cell, in equal stretches of time.
+
+    - `logarithm`: of the growth in each stretch.
+    - `status`: code of `integration/lockstep.py`: how the run ended; `end_time` [s] and `state`: when and where;
+      `steps`: accepted and rejected ones.
+    """
+
+    logarithm: Float[np.ndarray, "stretches cells"]
+    status: Int[np.ndarray, " cells"]
+    end_time: Float[np.ndarray, " cells"]
+    state: Float[np.ndarray, "components cells"]
+    steps: Int[np.ndarray, " cells"]
+
+
+def growth(
+    problem: AbstractProblem,
+    directions: Float[Array, "components cells"],
+    t1: float,
+    stretches: int,
+    tolerance: float,
+    absolute: float,
+    solver: diffrax.AbstractERK,
+) -> Growth:
+    """Follow every cell of an autonomous problem and a direction in it.
+
+    **Arguments:**
+
+    - `problem`: as for `march`.
+    - `directions`: to follow, in the problem's own units.
+    - `t1`: horizon [s].
+    - `stretches`: of time, in each of which the growth is counted by itself.
+    - `tolerance`, `absolute`: relative tolerance, and the absolute one as a part of it, in units of the magnitudes.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax.
+
+    **Returns:** the `Growth`; nothing grows in a cell after its run has ended.
+    """
+    start, magnitudes = problem.start()
+    size, cells = start.shape
+    rtol, atol, stretch = jnp.asarray(tolerance), jnp.asarray(absolute * tolerance), jnp.asarray(t1 / stretches)
+    direction = directions / magnitudes
+    logarithms, end_time, status = [], np.zeros(cells), np.full(cells, RUNNING)
+    steps, state = np.zeros(cells, int), np.asarray(start)
+    for _ in range(stretches):
+        unit = direction / jnp.linalg.norm(direction, axis=0)
+        varied = VariedProblem(problem, jnp.concatenate([start, unit, jnp.zeros((1, cells))]), magnitudes)
+        outcome, _ = compiled_march(
+            varied, stretch, jnp.asarray(cells), rtol, atol, solver=solver, lanes=lanes_for(cells)
+        )
+        alive = (status == RUNNING) | (status == REACHED_END)
+        logarithms.append(np.where(alive, outcome.state[-1], 0.0))
+        end_time += np.where(alive, outcome.end_time, 0.0)
+        steps += np.where(alive, outcome.steps, 0)
+        status = np.where(alive, outcome.status, status)
+        start, direction = outcome.state[:size], outcome.state[size:-1]
+        state = np.where(alive, start, state)
+    return Growth(np.stack(logarithms), status, end_time, state, steps)
+
+
+def exponent_of(
+    logarithm: Float[np.ndarray, "stretches cells"], t1: float
+) -> tuple[Float[np.ndarray, " cells"], Float[np.ndarray, " cells"]]:
+    """The exponent that a growth shows, and its error.
+
+    The first half of the run is left out: there the direction still turns to that of fastest growth. The error has two
+    parts: the scatter of the other half's stretches, in groups of 1, 2 and 4 and that of the last three quarters, the greatest
+    counting, because chaotic motion lingers near orderly motion (Flyvbjerg and Petersen, J. Chem. Phys. 91 (1989) 461); and
+    ln 2 over half the run, which is what the linear parting of orderly motion adds. An exponent below twice its error is no
+    sign of chaos. Where motion lingers for long, the error is too small by up to four (`tests/tippe/test_lyapunov.py`).
+
+    **Arguments:** `logarithm`: as in `Growth`, the stretches a multiple of 8; `t1`: time [s] that it spans.
+
+    **Returns:** exponent and error [1/s].
+    """
+    count = logarithm.shape[0]
+    rates = logarithm / (t1 / count)
+    half, quarter = count // 2, count // 4
+    exponent = np.mean(rates[half:], axis=0)
+    scatter = np.zeros_like(exponent)
+    for first, group in ((half, 1), (half, 2), (half, 4), (quarter, quarter)):
+        means = np.mean(rates[first:].reshape((count - first) // group, group, -1), axis=1)
+        scatter = np.maximum(scatter, np.std(means, axis=0, ddof=1) / math.sqrt(half // group))
+    return exponent, np.hypot(scatter, math.log(2.0) / (0.5 * t1))

@@ -1,0 +1,169 @@
+"""Derivatives of the event times of many cells along directions in which the numbers of a problem move.
+
+Along one direction its variation runs along (`variation.py`); along several every run is taken back once (`_adjoint.py`).
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Literal
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float, Int
+
+from ..integration import AbstractProblem, Block, Outcome, Queue, alone, lanes_for, with_crossing_times
+from ._adjoint import march_with_gradient
+from .variation import VariationalProblem, in_groups, lanes_along, slopes_by_variations
+
+
+def march_with_slopes(
+    problem: AbstractProblem,
+    directions: tuple[Any, ...],
+    t1: Float[Array, "..."],
+    cells: Int[Array, ""],
+    rtol: Float[Array, ""],
+    atol: Float[Array, ""],
+    *,
+    solver: diffrax.AbstractERK,
+    passes: bool = False,
+    one_kernel: bool = False,
+) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+    """Run every cell, and differentiate the time of its event in some directions.
+
+    **Arguments:** as for `march`, but `lanes` and `max_steps`, and
+
+    - `directions`: tangents of the problem, as for `VariationalProblem`. Their variations, or a mixture of them, take part in
+      step control.
+    - `one_kernel`: as there, not for programs that are differentiated again; nor is the way back, so that without it
+      variations run along any number of directions.
+
+    **Returns:** the `Outcome`, and for each direction the derivative of `crossing_time`, 0 where that is infinite. Source:
+    implicit function theorem at the event; step lengths are held fixed.
+    """
+    size = problem.start()[0].shape[1]
+    options = {"solver": solver, "one_kernel": one_kernel}
+    horizon = t1
+    if passes:
+        whole = Queue.of(problem, t1, cells, rtol, atol, passes=True, lanes=lanes_for(size), **options)
+        outcome = whole.outcome()[0]
+        # The slopes need the run up to the event alone, whose time is known by now.
+        horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
+    given = (not passes, horizon, cells, rtol, atol)
+
+    def along(some: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+        return slopes_by_variations(problem, some, *given, lanes=lanes_along(size, len(some)), **options)
+
+    if one_kernel and len(directions) > 1:
+        there, slopes = _slopes_by_adjoint(problem, directions, *given, lanes=lanes_for(size), **options)
+    else:
+        there, slopes = in_groups(along, directions)
+    if not passes:
+        outcome = with_crossing_times(problem, there)
+    # At the very start the event is there at once, whatever moves.
+    happened = jnp.isfinite(outcome.crossing_time) & (there.end_time > 0.0)
+    return outcome, [jnp.where(happened, slope, 0.0) for slope in slopes]
+
+
+def _slopes_by_adjoint(
+    problem: AbstractProblem, directions: tuple[Any, ...], ends_on_event: bool, *given: Any, **options: Any
+) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+    """What `slopes_by_variations` gives, at a cost that does not depend on the number of directions."""
+    moving = _moving(problem, directions[0])
+    # Without directions it is the problem itself, which can be told not to end on its event.
+    there, by_start, by_number = march_with_gradient(
+        VariationalProblem(problem, (), ends_on_event),
+        VariationalProblem(moving, (), ends_on_event),
+        _mixed(directions),
+        *given,
+        measured=_event_time,
+        **options,
+    )
+
+    def slope(direction: Any) -> Float[Array, " cells"]:
+        start = eqx.filter_jvp(lambda problem: problem.start()[0], (problem,), (direction,))[1]
+        rates = eqx.filter(direction, moving)
+        shares = [
+            gradient * rate for gradient, rate in zip(jax.tree.leaves(by_number), jax.tree.leaves(rates), strict=True)
+        ]
+        return sum(shares, jnp.zeros(by_start.shape[1]) if start is None else jnp.sum(by_start * start, axis=0))
+
+    return there, [slope(direction) for direction in directions]
+
+
+def _mixed(directions: tuple[Any, ...]) -> Any:
+    """A direction in which all of some directions have a share, by shares that are not likely to cancel."""
+    shares = [0.5 + math.modf(0.618 * k)[0] for k in range(len(directions))]
+    return jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *directions)
+
+
+def _event_time(varied: VariationalProblem, block: Block) -> Float[Array, " lanes"]:
+    """When the crossing function vanishes, for a block that has ended there (implicit function theorem).
+
+    To first order, unlike `crossing_time`: the event is located to 1e-10 of a step, and its time is not differentiated again.
+    """
+    crossing, rate = varied.problem.crossing, varied.problem.field(block.time, block.state)
+    fall = stop_gradient(jax.jvp(crossing, (stop_gradient(block.state),), (rate,))[1])
+    return block.time - crossing(block.state) / jnp.where(fall == 0.0, 1.0, fall)
+
+
+def _moving(problem: AbstractProblem, direction: Any) -> Any:
+    """Which numbers of a problem a direction moves, of those on which the field or the event depends."""
+    leaves, structure = jax.tree.flatten(problem)
+    states = problem.start()[0]
+
+    def seen(*leaves: Any) -> Any:
+        one = jax.tree.unflatten(structure, leaves)
+        return one.field(jnp.zeros_like(states[0]), states), one.crossing(states)
+
+    closed = jax.make_jaxpr(seen)(*leaves)
+    needed = set(closed.jaxpr.outvars)
+    for equation in reversed(closed.jaxpr.eqns):
+        if not needed.isdisjoint(equation.outvars):
+            needed |= {variable for variable in equation.invars if not isinstance(variable, Literal)}
+    used = jax.tree.unflatten(structure, [variable in needed for variable in closed.jaxpr.invars])
+    return jax.tree.map(lambda rate, one: one and rate is not None, direction, used, is_leaf=lambda rate: rate is None)
+
+
+#: `march_with_slopes`, compiled on its own, for use outside of other transformed functions.
+compiled_march_with_slopes = alone(eqx.Partial(march_with_slopes, one_kernel=True))
+
+#: `march_with_slopes`, for use inside other transformed functions.
+traced_march_with_slopes = eqx.filter_jit(march_with_slopes)
+
+
+def directions_of(
+    build: Callable[..., AbstractProblem], numbers: tuple[Any, ...], tangents: list[tuple[Any, ...]]
+) -> tuple[Any, ...]:
+    """The tangents of a problem that is built from numbers.
+
+    **Arguments:**
+
+    - `build`: numbers -> problem.
+    - `numbers`: what it is built from, arrays.
+    - `tangents`: for each direction the rate at which each number moves.
+
+    **Returns:** for each direction the tangent of the problem, `None` for what depends on no number.
+    """
+
+    def built(*numbers: Any) -> Any:
+        # A problem may hold functions too.
+        return eqx.filter(build(*numbers), eqx.is_inexact_array)
+
+    reached = _reached(jax.make_jaxpr(built)(*numbers))
+    structure = jax.tree.structure(jax.eval_shape(built, *numbers))
+    moving = jax.tree.unflatten(structure, reached)
+    found = [jax.jvp(built, numbers, tangent)[1] for tangent in tangents]
+    return tuple(eqx.filter(one, moving) for one in found)
+
+
+def _reached(closed: Any) -> list[bool]:
+    """Which outputs of a traced function depend on an input."""
+    depends = set(closed.jaxpr.invars)
+    for equation in closed.jaxpr.eqns:
+        if any(not isinstance(variable, Literal) and variable in depends for variable in equation.invars):
+            depends |= set(equation.outvars)
+    return [not isinstance(variable, Literal) and variable in depends for variable in closed.jaxpr.outvars]

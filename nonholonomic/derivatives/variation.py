@@ -1,0 +1,138 @@
+"""First derivatives of event times along a direction or two: the variations of the state run along with it.
+
+A problem and its variations are one problem with a longer state, so that they run through the same loop as the problem
+alone; differentiating the loop as a whole costs several times as much. For many directions see `_adjoint.py`.
+"""
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..integration import AbstractProblem, Outcome, Queue, crossing_time, lanes_for
+
+#: Directions that run along together: more of them cost less time in all, but more to compile.
+TOGETHER = 2
+
+
+def natural_size(number: Float[Array, "..."]) -> Float[Array, "..."]:
+    """By how much to move a number: by its own size, or by 1 where it is zero."""
+    return jax.lax.stop_gradient(jnp.where(number == 0.0, 1.0, jnp.abs(number)))
+
+
+def lanes_along(cells: int, directions: int) -> int:
+    """How many cells should advance together with their variations in some directions: the whole state fits the caches."""
+    return max(8, 3 * lanes_for(cells) // (2 + 2 * directions)) if directions else lanes_for(cells)
+
+
+class VariationalProblem(AbstractProblem):
+    """A problem and its first variation in each of some directions, the variations stacked behind the state.
+
+    A direction is a tangent of the problem: the same tree, with the rate at which each number moves, `None` where none of
+    the directions moves it. A variation's absolute tolerance is that of the state, so a direction should move a number by
+    about its own size (`natural_size`).
+    """
+
+    problem: AbstractProblem
+    directions: tuple[Any, ...]
+    ends_on_event: bool = eqx.field(static=True)
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        states, scales = self.problem.start()
+
+        def variation(direction: Any) -> Float[Array, "components cells"]:
+            moved = eqx.filter_jvp(lambda problem: problem.start()[0], (self.problem,), (direction,))[1]
+            return jnp.zeros_like(states) if moved is None else moved
+
+        variations = [variation(direction) for direction in self.directions]
+        return jnp.concatenate([states, *variations]), jnp.concatenate([scales] * (1 + len(variations)))
+
+    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        at, *variations = self.parts(state)
+        if not variations:
+            return self.problem.field(time, at)
+        moving = _where_moved(self.problem, self.directions[0])
+
+        def rate(moving: Any, at: Float[Array, "components lanes"]) -> Float[Array, "components lanes"]:
+            return eqx.combine(moving, self.problem).field(time, at)
+
+        # Linearised once: the rate is computed once, and the directions share what their changes have in common.
+        here, change = jax.linearize(rate, moving, at)
+        return jnp.concatenate([here, *(change(*moved) for moved in zip(self.directions, variations, strict=True))])
+
+    def crossing(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"] | None:
+        return self.problem.crossing(self.parts(state)[0]) if self.ends_on_event else None
+
+    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.problem.guard(time, self.parts(state)[0])
+
+    def parts(self, state: Float[Array, "components ..."]) -> list[Float[Array, "components ..."]]:
+        """The state and its variations."""
+        return jnp.split(state, 1 + len(self.directions)) if self.directions else [state]
+
+
+def slopes_by_variations(
+    problem: AbstractProblem, directions: tuple[Any, ...], ends_on_event: bool, *given: Any, **options: Any
+) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+    """Run every cell with its variations, and let them move the event at its end.
+
+    **Arguments:**
+
+    - `problem`, `directions`: as for `VariationalProblem`.
+    - `ends_on_event`: whether runs end on the event, or at the horizon, which is then the event's time.
+    - `given`, `options`: horizon, number of cells and tolerances, and the rest, as for `Queue.of`.
+
+    **Returns:** the `Outcome`, with crossing times left out, and for each direction the derivative of the event's time.
+    """
+    varied = VariationalProblem(problem, directions, ends_on_event)
+    # The variations take part in step control: the state alone may be at rest where its tangent is not, and steps would
+    # outgrow what the tangent can bear.
+    there, _ = Queue.of(varied, *given, parts=1 + len(directions), **options).outcome()
+    state, *variations = varied.parts(there.state)
+
+    def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+        return crossing_time(problem, there.end_time, state)
+
+    slopes = [
+        eqx.filter_jvp(event_time, (problem, state), moved)[1] for moved in zip(directions, variations, strict=True)
+    ]
+    return there._replace(state=state), slopes
+
+
+def in_groups(
+    run: Callable[..., tuple[Any, list[Any]]], directions: tuple[Any, ...], together: int = TOGETHER
+) -> tuple[Any, list[Any]]:
+    """What `run` finds along many directions, a few at a time by one program.
+
+    **Arguments:**
+
+    - `run`: a tuple of `together` directions, or of fewer if there are no more -> a result that does not depend on them, and
+      a slope for each.
+    - `directions`: any number of them.
+    - `together`: how many run along at a time.
+
+    **Returns:** the result, and the slopes.
+    """
+    if len(directions) <= together:
+        return run(directions)
+    # The last group is filled with directions that lead nowhere.
+    empty = -len(directions) % together
+    padded = [*directions, *[jax.tree.map(jnp.zeros_like, directions[0])] * empty]
+    stacked = [jax.tree.map(lambda *rates: jnp.stack(rates), *padded[k::together]) for k in range(together)]
+    results, slopes = jax.lax.map(lambda group: run(tuple(group)), stacked)
+    groups = range(len(padded) // together)
+    each = [jax.tree.map(operator.itemgetter(group), slope) for group in groups for slope in slopes]
+    return jax.tree.map(lambda leaf: leaf[0], results), each[: len(directions)]
+
+
+def _where_moved(problem: Any, direction: Any) -> Any:
+    """The numbers of a problem that a direction moves, `None` for the others."""
+
+    def moved(rate: Any, number: Any) -> Any:
+        return None if rate is None else number
+
+    return jax.tree.map(moved, direction, problem, is_leaf=lambda rate: rate is None)

@@ -1,0 +1,13 @@
+"""Equations of motion from a metric, a potential and constraints, in several independent forms.
+
+The forms agree where all of them apply, so each is a check of the others and of equations written out by hand.
+"""
+
+from .formulation import AbstractSystem as AbstractSystem
+from .formulation import ConstrainedConnection as ConstrainedConnection
+from .formulation import Coordinates as Coordinates
+from .formulation import Hamel as Hamel
+from .formulation import Multipliers as Multipliers
+from .formulation import ReducedBracket as ReducedBracket
+from .formulation import Routhian as Routhian
+from .formulation import structure_constants as structure_constants

@@ -1,0 +1,375 @@
+"""Four formulations of one constrained mechanical system, from its data alone; every derivative is taken by JAX.
+
+The data of a system are its metric G(q), potential V(q), constraint one-forms W(q) with W q' = 0, frame E(q), and the
+generalised force f(t, q, q') of drives and friction. From them follow
+
+- `Multipliers`: Hamilton's equations with Lagrange multipliers, the constrained port-Hamiltonian form;
+- `Hamel`: Poincare's equations in the quasi-velocities of the frame, Hamel's where there are constraints;
+- `ConstrainedConnection`: geodesics, with forces, of the constrained Levi-Civita connection;
+- `ReducedBracket`: the reduced Poisson-like bracket of van der Schaft and Maschke.
+
+They use the data in different ways, so that their agreement is a check on all of them. A user chooses by handing in the
+object. They serve one state (n,); `jax.vmap` serves many. The production models are faster and do not need them.
+"""
+
+import abc
+import warnings
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ..geometry import solve
+from ..validation import as_number, is_traced, require
+
+Coordinates = Float[Array, " n"]
+Frame = Callable[[Coordinates], Float[Array, "n n"]]
+
+#: Violation of the constraints, relative to the velocity, above which a start is worth a warning.
+START_TOLERANCE = 1e-9
+
+
+class AbstractSystem(eqx.Module):
+    """The data of a mechanical system with n coordinates and k linear constraints on its velocity."""
+
+    @property
+    @abc.abstractmethod
+    def dimension(self) -> int:
+        """Number n of coordinates."""
+
+    @property
+    def freedom(self) -> int:
+        """Number n - k of independent velocities."""
+        q = jax.ShapeDtypeStruct((self.dimension,), jnp.result_type(float))
+        return self.dimension - jax.eval_shape(self.constraints, q).shape[0]
+
+    @abc.abstractmethod
+    def metric(self, q: Coordinates) -> Float[Array, "n n"]:
+        """Kinetic metric G(q): the kinetic energy is q'.G q' / 2."""
+
+    def potential(self, q: Coordinates) -> Float[Array, ""]:
+        """Potential energy V(q); zero unless a system says otherwise."""
+        return jnp.zeros((), q.dtype)
+
+    def constraints(self, q: Coordinates) -> Float[Array, "k n"]:
+        """One-forms W(q), a row each, that vanish on every velocity; none unless a system says otherwise."""
+        return jnp.zeros((0, q.size), q.dtype)
+
+    def frame(self, q: Coordinates) -> Float[Array, "n n"]:
+        """Frame fields E(q), a column each; the first n - k are annihilated by W. By default, the coordinates' own."""
+        return jnp.eye(q.size, dtype=q.dtype)
+
+    def force(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
+        """Generalised force f(t, q, q') besides that of the potential; zero unless a system says otherwise."""
+        return jnp.zeros_like(q)
+
+    def lagrangian(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
+        """The Lagrangian L(q, q') = q'.G q' / 2 - V."""
+        return 0.5 * rate @ self.metric(q) @ rate - self.potential(q)
+
+    def energy(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
+        """Energy q'.dL/dq' - L; for a Lagrangian quadratic in q', kinetic plus potential energy."""
+        return jax.grad(self.lagrangian, argnums=1)(q, rate) @ rate - self.lagrangian(q, rate)
+
+
+class Routhian(AbstractSystem):
+    """A system with one cyclic coordinate eliminated at a given momentum, R = L - beta psi'.
+
+    The coordinate is cyclic if neither metric, potential nor force depends on it, and the force has no component along
+    it. What remains has a Lagrangian with terms linear in the velocity, which `Hamel` takes as it is.
+
+    **Arguments:**
+
+    - `full`: the unconstrained system to reduce.
+    - `cyclic`: index of the cyclic coordinate.
+    - `momentum`: its constant momentum beta.
+    """
+
+    full: AbstractSystem
+    cyclic: int = eqx.field(static=True)
+    momentum: Float[Array, ""] = eqx.field(converter=as_number)
+
+    def __check_init__(self):
+        require(self.momentum, "momentum")
+
+    @property
+    def dimension(self) -> int:
+        return self.full.dimension - 1
+
+    def complete(self, q: Coordinates, rate: Coordinates) -> tuple[Coordinates, Coordinates]:
+        """All coordinates and velocities, the cyclic coordinate at 0, its velocity from the momentum."""
+        q = jnp.insert(q, self.cyclic, 0.0)
+        rate = jnp.insert(rate, self.cyclic, 0.0)
+        row = self.full.metric(q)[self.cyclic]
+        return q, rate.at[self.cyclic].set((self.momentum - row @ rate) / row[self.cyclic])
+
+    def metric(self, q: Coordinates) -> Float[Array, "m m"]:
+        whole = self.full.metric(jnp.insert(q, self.cyclic, 0.0))
+        kept = np.delete(np.arange(len(whole)), self.cyclic)
+        column = whole[kept, self.cyclic]
+        return whole[np.ix_(kept, kept)] - jnp.outer(column, column) / whole[self.cyclic, self.cyclic]
+
+    def lagrangian(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
+        q, rate = self.complete(q, rate)
+        return self.full.lagrangian(q, rate) - self.momentum * rate[self.cyclic]
+
+    def force(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
+        return jnp.delete(self.full.force(t, *self.complete(q, rate)), self.cyclic)
+
+
+def lie_brackets(fields: Callable[[Coordinates], Float[Array, "n m"]], q: Coordinates) -> Float[Array, "n m m"]:
+    """Lie brackets of vector fields: component i of [X_a, X_b] = (X_a.d) X_b - (X_b.d) X_a at [i, a, b].
+
+    **Arguments:**
+
+    - `fields`: function of the coordinates (n,) that gives m fields as the columns of an (n, m) array.
+    - `q`: where to evaluate, (n,).
+    """
+    along = jnp.einsum("ibk,ka->iab", jax.jacfwd(fields)(q), fields(q))
+    return along - jnp.swapaxes(along, 1, 2)
+
+
+def structure_constants(frame: Frame, q: Coordinates) -> Float[Array, "n n n"]:
+    """Structure coefficients of a frame, [E_a, E_b] = c^c_ab E_c, at [c, a, b].
+
+    **Arguments:** as for `lie_brackets`, with as many fields as coordinates.
+    """
+    brackets = lie_brackets(frame, q)
+    return solve(frame(q), brackets.reshape(q.size, -1)).reshape(brackets.shape)
+
+
+class AbstractFormulation(eqx.Module):
+    """Equations of motion of a system, as a first-order field of their own state.
+
+    **Arguments:**
+
+    - `system`: the data, an `AbstractSystem`.
+    """
+
+    system: eqx.AbstractVar[AbstractSystem]
+
+    @abc.abstractmethod
+    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
+        """The state that stands for coordinates and velocity, each (n,); the velocity is to obey the constraints."""
+
+    @abc.abstractmethod
+    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
+        """Coordinates and velocity, each (n,), that a state stands for."""
+
+    @abc.abstractmethod
+    def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
+        """Rate of change of the state, with the signature of a Diffrax vector field."""
+
+    def acceleration(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
+        """Second derivative of the coordinates, by the chain rule through this formulation's state."""
+        state = self.state(q, rate)
+        _, (_, acceleration) = jax.jvp(self.split, (state,), (self.field(t, state),))
+        return acceleration
+
+    def energy(self, state: Float[Array, " state"]) -> Float[Array, ""]:
+        """Energy at a state."""
+        return self.system.energy(*self.split(state))
+
+
+def reduced_fields(system: AbstractSystem, q: Coordinates) -> Float[Array, "n r"]:
+    """The frame's first fields, which span the velocities that the constraints allow."""
+    return system.frame(q)[:, : system.freedom]
+
+
+class Multipliers(AbstractFormulation):
+    """Hamilton's equations with multipliers, q' = dH/dp, p' = -dH/dq + f + W^T lambda (`stroller.md`, section 6, F1).
+
+    The state is (q, p). The multipliers keep W q' constant, whatever it is at the start, and it drifts with the
+    integrator's error; two remedies are on offer, and both leave an exact solution as it is.
+
+    **Arguments:**
+
+    - `system`: the data, an `AbstractSystem`.
+    - `baumgarte`: rate [1/s] at which a violation W q' is made to decay, at least 0.
+    - `project`: whether to take the velocity from the momentum after projecting it on the constraints.
+
+    **Raises:** `ValueError` for a negative rate.
+    """
+
+    system: AbstractSystem
+    baumgarte: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
+    project: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        require(self.baumgarte, "baumgarte", at_least=0.0)
+
+    def projected(self, q: Coordinates, p: Coordinates) -> Coordinates:
+        """The momentum closest to p, in the kinetic metric, whose velocity obeys the constraints."""
+        W = self.system.constraints(q)
+        per_mass = solve(self.system.metric(q), jnp.column_stack([W.T, p]), positive=True)
+        return p - W.T @ solve(W @ per_mass[:, :-1], W @ per_mass[:, -1], positive=True)
+
+    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
+        """The state (q, p), with p projected on the constraints; warns where a concrete velocity violates them."""
+        violation = self.system.constraints(q) @ rate
+        if not is_traced(violation) and violation.size:
+            worst = float(jnp.max(jnp.abs(violation)) / jnp.maximum(jnp.max(jnp.abs(rate)), 1e-300))
+            if worst > START_TOLERANCE:
+                warnings.warn(f"velocity violates the constraints by {worst:.1e} of itself; projected", stacklevel=2)
+        return jnp.concatenate([q, self.projected(q, self.system.metric(q) @ rate)])
+
+    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
+        q, p = jnp.split(state, 2)
+        if self.project:
+            p = self.projected(q, p)
+        return q, solve(self.system.metric(q), p, positive=True)
+
+    def multipliers(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Float[Array, " k"]:
+        """Multipliers lambda, the forces that keep W q' from changing."""
+        system = self.system
+        W, bend = jax.jvp(system.constraints, (q,), (rate,))
+        G, swell = jax.jvp(system.metric, (q,), (rate,))
+        free = jax.grad(system.lagrangian)(q, rate) + system.force(t, q, rate) - swell @ rate
+        per_mass = solve(G, jnp.column_stack([W.T, free]), positive=True)
+        wanted = bend @ rate + W @ per_mass[:, -1] + self.baumgarte * (W @ rate)
+        return -solve(W @ per_mass[:, :-1], wanted, positive=True)
+
+    def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
+        q, rate = self.split(state)
+        force = jax.grad(self.system.lagrangian)(q, rate) + self.system.force(t, q, rate)
+        force = force + self.system.constraints(q).T @ self.multipliers(t, q, rate)
+        return jnp.concatenate([rate, force])
+
+
+class Hamel(AbstractFormulation):
+    """Poincare's equations in quasi-velocities u, q' = E u (`stroller.md`, section 6, F2).
+
+    With l(q, u) = L(q, E u) and p = dl/du, p_i' = E_i(l) + c^k_ji u^j p_k + E_i.f. Constraints drop the equations and
+    the quasi-velocities of the frame's last fields, yet not their momenta, in which nonholonomy shows (Hamel). The
+    Lagrangian may have terms linear in the velocity (`Routhian`). The state is (q, u).
+
+    **Arguments:**
+
+    - `system`: the data, an `AbstractSystem`.
+    """
+
+    system: AbstractSystem
+
+    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
+        return jnp.concatenate([q, solve(self.system.frame(q), rate)[: self.system.freedom]])
+
+    def quasi_velocity(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
+        """Coordinates and all n quasi-velocities, those that the constraints forbid at 0."""
+        n = self.system.dimension
+        return state[:n], jnp.zeros(n, state.dtype).at[: self.system.freedom].set(state[n:])
+
+    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
+        q, u = self.quasi_velocity(state)
+        return q, self.system.frame(q) @ u
+
+    def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
+        system, free = self.system, self.system.freedom
+        q, u = self.quasi_velocity(state)
+        E = system.frame(q)
+        rate = E @ u
+
+        def lagrangian(q, u):
+            return system.lagrangian(q, system.frame(q) @ u)
+
+        momentum = jax.grad(lagrangian, argnums=1)
+        p, swell = jax.jvp(lambda q: momentum(q, u), (q,), (rate,))
+        inertia = jax.jacfwd(momentum, argnums=1)(q, u)[:free, :free]
+        gyroscopic = jnp.einsum("kji,j,k->i", structure_constants(system.frame, q), u, p)
+        forces = E.T @ (jax.grad(lagrangian)(q, u) + system.force(t, q, rate)) + gyroscopic - swell
+        return jnp.concatenate([rate, solve(inertia, forces[:free])])
+
+
+class ConstrainedConnection(AbstractFormulation):
+    """Geodesics, with forces, of the constrained Levi-Civita connection (`stroller.md`, section 6, F3).
+
+    With Q the metric projector on the forbidden directions, nabla^D = nabla + nabla Q is a connection on all of the
+    configuration space whose geodesics that start within the constraints stay within them (Lewis; Vershik and Faddeev):
+    no multiplier appears. The state is (q, q'). The Lagrangian is to be kinetic minus potential energy.
+
+    **Arguments:**
+
+    - `system`: the data, an `AbstractSystem`.
+    """
+
+    system: AbstractSystem
+
+    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
+        return jnp.concatenate([q, rate])
+
+    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
+        q, rate = jnp.split(state, 2)
+        return q, rate
+
+    def forbidden(self, q: Coordinates) -> Float[Array, "n n"]:
+        """Projector Q = G^-1 W^T (W G^-1 W^T)^-1 W on the directions orthogonal to the allowed ones."""
+        W = self.system.constraints(q)
+        raised = solve(self.system.metric(q), W.T, positive=True)
+        return raised @ solve(W @ raised, W, positive=True)
+
+    def christoffel(self, q: Coordinates) -> Float[Array, "n n n"]:
+        """Christoffel symbols Gamma^i_jk of the kinetic metric, at [i, j, k]."""
+        slope = jax.jacfwd(self.system.metric)(q)
+        lowered = 0.5 * (slope + slope.swapaxes(1, 2) - jnp.moveaxis(slope, 2, 0))
+        return solve(self.system.metric(q), lowered.reshape(q.size, -1), positive=True).reshape(lowered.shape)
+
+    def connection(self, q: Coordinates) -> Float[Array, "n n n"]:
+        """Coefficients Gamma^D i_jk = Gamma^i_jk + (nabla_j Q)^i_k of the constrained connection, at [i, j, k]."""
+        gamma, Q, slope = self.christoffel(q), self.forbidden(q), jax.jacfwd(self.forbidden)(q)
+        carried = jnp.einsum("ijl,lk->ijk", gamma, Q) - jnp.einsum("ljk,il->ijk", gamma, Q)
+        return gamma + jnp.einsum("ikj->ijk", slope) + carried
+
+    def coefficients(self, q: Coordinates) -> Float[Array, "r r r"]:
+        """Coefficients of nabla^D_{X_a} X_b = Gamma^c_ab X_c in the fields that span the constraints, at [c, a, b]."""
+        E, r = self.system.frame(q), self.system.freedom
+        X = E[:, :r]
+        slope = jax.jacfwd(lambda q: reduced_fields(self.system, q))(q)
+        derivative = jnp.einsum("ibk,ka->iab", slope, X) + jnp.einsum("ijk,ja,kb->iab", self.connection(q), X, X)
+        return solve(E, derivative.reshape(q.size, -1)).reshape(derivative.shape)[:r]
+
+    def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
+        q, rate = self.split(state)
+        force = self.system.force(t, q, rate) - jax.grad(self.system.potential)(q)
+        push = solve(self.system.metric(q), force, positive=True)
+        bend = jnp.einsum("ijk,j,k->i", self.connection(q), rate, rate)
+        return jnp.concatenate([rate, push - self.forbidden(q) @ push - bend])
+
+
+class ReducedBracket(AbstractFormulation):
+    """The reduced bracket of van der Schaft and Maschke (1994) (`stroller.md`, section 6, F4).
+
+    With X = (X_1, ...) the allowed fields, p = G X u, and H(q, p~) = p~.(X^T G X)^-1 p~ / 2 + V,
+    q' = X dH/dp~ and p~' = -X^T dH/dq - p.[X_a, X_b] dH/dp~ + X^T f. The state is (q, p~), p~ = X^T p. The
+    Lagrangian is to be kinetic minus potential energy.
+
+    **Arguments:**
+
+    - `system`: the data, an `AbstractSystem`.
+    """
+
+    system: AbstractSystem
+
+    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
+        return jnp.concatenate([q, reduced_fields(self.system, q).T @ self.system.metric(q) @ rate])
+
+    def hamiltonian(self, q: Coordinates, momentum: Float[Array, " r"]) -> Float[Array, ""]:
+        """Energy as a function of the coordinates and the reduced momentum p~."""
+        X = reduced_fields(self.system, q)
+        inertia = X.T @ self.system.metric(q) @ X
+        return 0.5 * momentum @ solve(inertia, momentum, positive=True) + self.system.potential(q)
+
+    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
+        q, momentum = state[: self.system.dimension], state[self.system.dimension :]
+        return q, reduced_fields(self.system, q) @ jax.grad(self.hamiltonian, argnums=1)(q, momentum)
+
+    def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
+        system, n = self.system, self.system.dimension
+        q, momentum = state[:n], state[n:]
+        slope, u = jax.grad(self.hamiltonian, argnums=(0, 1))(q, momentum)
+        X = reduced_fields(system, q)
+        rate = X @ u
+        brackets = lie_brackets(lambda q: reduced_fields(system, q), q)
+        bracket = -jnp.einsum("i,iab->ab", system.metric(q) @ rate, brackets)
+        return jnp.concatenate([rate, X.T @ (system.force(t, q, rate) - slope) + bracket @ u])

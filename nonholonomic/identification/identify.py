@@ -1,0 +1,117 @@
+"""Parameters from measurements: maximum likelihood, with errors and with what the measurements leave open."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..parameters import full_path
+from ..validation import require
+from .levenberg_marquardt import Problem, linearise, minimise, required
+from .likelihood import Measurements
+from .result import Identification, summarise
+from .unknown import Free, as_free, draw_starts
+
+
+def identify(
+    model: Callable[[dict[str, Float[Array, " rows"]]], Float[Array, "rows n"]],
+    measurements: Measurements,
+    free: dict[str, Any],
+    *,
+    starts: int = 1,
+    spread: float = 2.0,
+    seed: int = 0,
+    max_steps: int = 60,
+    labels: tuple[str, ...] | None = None,
+    progress: bool = True,
+) -> Identification:
+    """Find the numbers of a model that make measurements most likely.
+
+    Levenberg-Marquardt from every start at once, on the residuals of the data (`likelihood.py`) and of the priors. It finds
+    a minimum near each start, not the least of all; the result is the best of them and tells where the others ended.
+
+    **Arguments:**
+
+    - `model`: parameters, name -> (rows,), to predictions (rows, n); `jax.vmap` makes one of a function of one set. It is
+      differentiated forwards.
+    - `measurements`: `Measurements` of shape (n,).
+    - `free`: name -> a `Free`, or only the number from which to start.
+    - `starts`: from how many points to fit: the one given, and others drawn about it.
+    - `spread`: how far they are drawn, as a factor either way, greater than 1; `seed`: of the draw.
+    - `max_steps`: a fit that needs more has not converged.
+    - `labels`: (n,), names of the measurements in the result.
+    - `progress`: whether to show it, on a terminal or in a notebook.
+
+    **Returns:** an `Identification`.
+
+    **Raises:** `ValueError` for arguments out of range; `ImportError` if Optimistix is not installed.
+    """
+    required()
+    unknowns = as_free(free)
+    if not isinstance(measurements, Measurements) or measurements.value.ndim != 1:
+        raise ValueError(f"measurements = {measurements!r} must be Measurements of shape (n,)")
+    for name, value, least in (("starts", starts, 1), ("max_steps", max_steps, 1)):
+        if not isinstance(value, int | np.integer) or value < least:
+            raise ValueError(f"{name} = {value!r} must be a whole number of at least {least}")
+    require(spread, "spread", above=1.0)
+    count = measurements.value.size
+    labels = tuple(f"#{i + 1}" for i in range(count)) if labels is None else tuple(labels)
+    if len(labels) != count:
+        raise ValueError(f"labels must be {count}, one for each measurement, not {len(labels)}")
+    problem = Problem(model, tuple(unknowns.items()))
+    begins = draw_starts(unknowns, starts, spread, seed)
+    shape = eqx.filter_eval_shape(problem.predict, jnp.asarray(begins)).shape
+    if shape != (starts, count):
+        raise ValueError(f"model must predict {(starts, count)} for {starts} sets, not {shape}")
+    ends = minimise(problem, jnp.asarray(begins), measurements, max_steps=max_steps, progress=progress)
+    there = linearise(problem, ends.coordinates, measurements)
+    if not math.isfinite(float(jnp.min(there.deviance))):
+        raise ValueError("model: no start led to finite predictions")
+    return summarise(
+        problem, measurements, labels, begins, np.asarray(ends.coordinates), np.asarray(ends.converged), there
+    )
+
+
+def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...]]:
+    """The measurements of several data sets, each with `measurements` and `labels`, one after the other, and their labels."""
+    measurements = [one.measurements for one in data]
+    labels = tuple(
+        f"{i + 1}: {label}" if len(data) > 1 else label for i, one in enumerate(data) for label in one.labels
+    )
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *measurements), labels
+
+
+def free_numbers(
+    free: Any, roots: dict[str, Any], known: list[str], replace: Callable[[dict[str, Any], dict[str, Any]], Any]
+) -> dict[str, Free]:
+    """The unknowns of a scene: their full paths, and a lower bound of 0 for numbers that cannot be negative.
+
+    **Arguments:**
+
+    - `free`: path, or its unambiguous end, -> a `Free` or where to start.
+    - `roots`: name -> tree of modules, `known`: the paths of their numbers.
+    - `replace`: (roots, path -> number) -> roots; it raises `ValueError` for numbers that the modules refuse.
+
+    **Returns:** path -> `Free`.
+
+    **Raises:** `ValueError` for an unknown path, or starts that the modules refuse.
+    """
+    given = {}
+    for name, one in as_free(free).items():
+        path = full_path("free", name, known)
+        if path in given:
+            raise ValueError(f"free: {path!r} is named twice")
+        given[path] = one
+    replace(roots, {path: one.start for path, one in given.items()})
+    lower = {}
+    for path, one in given.items():
+        try:
+            replace(roots, {path: -(abs(one.start) or 1.0)})
+        except ValueError:
+            lower[path] = 0.0
+    return as_free(given, lower)

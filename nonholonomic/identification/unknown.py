@@ -1,0 +1,109 @@
+"""Unknown numbers: where a fit starts, what values they may take, and the coordinate in which they are fitted."""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..validation import require
+
+
+class Free(NamedTuple):
+    """A number to be fitted.
+
+    One with a lower bound is fitted in the logarithm of its distance from it, so a positive number, `lower=0.0`, in its
+    own logarithm; one between two bounds in the logit of its place between them; one without bounds as it is.
+
+    - `start`: value from which the fit starts, strictly within the bounds.
+    - `lower`, `upper`: bounds, which a fit approaches but does not reach.
+    - `prior`: mean and standard deviation of a Gaussian prior of the number itself, or `None`.
+    """
+
+    start: float
+    lower: float = -math.inf
+    upper: float = math.inf
+    prior: tuple[float, float] | None = None
+
+    @property
+    def unit(self) -> float:
+        """What counts as a relative change of 1: e-fold for a number fitted in its logarithm, else the start's size."""
+        return abs(self.start) or (self.prior[1] if self.prior else 1.0)
+
+    @property
+    def positive(self) -> bool:
+        """Whether the number cannot be negative."""
+        return self.lower >= 0.0
+
+    def value(self, coordinate: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The number at a coordinate."""
+        if math.isfinite(self.lower) and math.isfinite(self.upper):
+            return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(coordinate)
+        if math.isfinite(self.lower):
+            return self.lower + jnp.exp(coordinate)
+        if math.isfinite(self.upper):
+            return self.upper - jnp.exp(-coordinate)
+        return self.start + self.unit * coordinate
+
+    def coordinate(self, value: Any) -> Float[Array, "..."]:
+        """The coordinate of a number strictly within the bounds; the inverse of `value`."""
+        value = jnp.asarray(value, float)
+        if math.isfinite(self.lower) and math.isfinite(self.upper):
+            return jnp.log(value - self.lower) - jnp.log(self.upper - value)
+        if math.isfinite(self.lower):
+            return jnp.log(value - self.lower)
+        if math.isfinite(self.upper):
+            return -jnp.log(self.upper - value)
+        return (value - self.start) / self.unit
+
+
+def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]:
+    """Unknowns, checked.
+
+    **Arguments:**
+
+    - `free`: name -> a `Free`, or only the number from which to start.
+    - `lower`: name -> lower bound of those that are given by a number only, or without any bounds.
+
+    **Returns:** name -> `Free`.
+
+    **Raises:** `ValueError` that names the unknown and what is wrong with it.
+    """
+    if not isinstance(free, dict) or not free:
+        raise ValueError(f"free = {free!r} must be a non-empty dictionary, name of a number -> where to start")
+    found = {}
+    for name, given in free.items():
+        one = given if isinstance(given, Free) else Free(given)
+        if one.lower == -math.inf and one.upper == math.inf:
+            one = one._replace(lower=(lower or {}).get(name, -math.inf))
+        require(one.start, f"start of {name}")
+        if np.ndim(one.start) != 0:
+            raise ValueError(f"start of {name} must be one number, not of shape {np.shape(one.start)}")
+        require(one.start, f"start of {name}", above=one.lower, below=one.upper, why="the bounds")
+        if one.prior is not None:
+            if np.shape(one.prior) != (2,):
+                raise ValueError(f"prior of {name} = {one.prior!r} must be a mean and a standard deviation")
+            require(one.prior[0], f"mean of the prior of {name}")
+            require(one.prior[1], f"standard deviation of the prior of {name}", above=0.0)
+        found[name] = one._replace(start=float(one.start), lower=float(one.lower), upper=float(one.upper))
+    return found
+
+
+def draw_starts(free: dict[str, Free], count: int, spread: float, seed: int) -> Float[np.ndarray, "count unknowns"]:
+    """Coordinates of several starts: the given one first, then others about it.
+
+    A number fitted in a logarithm is drawn uniformly in it, up to a factor `spread` either way; another up to as far
+    from its start as the factor would take it.
+    """
+    centre = np.array([float(one.coordinate(one.start)) for one in free.values()])
+    reach = np.array(
+        [
+            math.log(spread) if math.isfinite(one.lower) or math.isfinite(one.upper) else spread - 1.0
+            for one in free.values()
+        ]
+    )
+    drawn = centre + reach * np.random.default_rng(seed).uniform(-1.0, 1.0, (count, len(free)))
+    drawn[0] = centre
+    return drawn

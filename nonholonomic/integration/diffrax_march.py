@@ -1,0 +1,73 @@
+"""The outcome of every cell by vmapped `diffrax.diffeqsolve`: slow, and independent of the lockstep driver."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix
+from jaxtyping import Array, Float
+
+from .lockstep import CROSSED, FAILED, GUARD_LOST, REACHED_END, AbstractProblem
+from .march import Outcome
+from .single_run import saved
+
+
+@eqx.filter_jit
+def march_by_diffrax(
+    problem: AbstractProblem,
+    t1: Float[Array, ""],
+    rtol: Float[Array, ""],
+    atol: Float[Array, ""],
+    *,
+    solver: diffrax.AbstractSolver,
+    max_steps: int = 100_000,
+) -> Outcome:
+    """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`.
+
+    The guard is looked at where steps end; events are located on Diffrax's dense output.
+
+    **Arguments:** as for `march`; any solver of Diffrax will do.
+
+    **Returns:** the `Outcome`.
+    """
+    starts, scales = problem.start()
+    varying = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 0 else -1, problem)
+
+    def one(here: AbstractProblem, state: Array, scale: Array) -> Outcome:
+        conditions = {
+            CROSSED: None if problem.crossing(starts) is None else (lambda t, y, args, **_: args.crossing(y)),
+            GUARD_LOST: None
+            if problem.guard(starts[0], starts) is None
+            else (lambda t, y, args, **_: args.guard(t, y)),
+        }
+        conditions = {code: condition for code, condition in conditions.items() if condition is not None}
+        event = diffrax.Event(list(conditions.values()), root_finder=optimistix.Newton(1e-13, 1e-13))
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
+            solver,
+            0.0,
+            t1,
+            None,
+            state,
+            args=here,
+            stepsize_controller=diffrax.PIDController(rtol, atol * scale),
+            max_steps=max_steps,
+            event=event if conditions else None,
+            throw=False,
+        )
+        ends, finals = saved(solution)
+        end, final = ends[0], finals[0]
+        status = jnp.where(end >= t1, REACHED_END, FAILED)
+        for code, happened in zip(conditions, solution.event_mask or [], strict=True):
+            status = jnp.where(happened, code, status)
+        return Outcome(
+            status,
+            jnp.where(status == CROSSED, end, jnp.inf),
+            end,
+            final,
+            solution.stats["num_steps"],
+            solution.stats["num_rejected_steps"],
+        )
+
+    out = Outcome._make((0, 0, 0, -1, 0, 0))
+    return jax.vmap(one, in_axes=(varying, -1, -1), out_axes=out)(problem, starts, scales)

@@ -1,0 +1,97 @@
+"""Many lanes at once: the driver for event times and end states of a whole grid.
+
+A block of lanes advances in lockstep, every lane with its own step length; cells wait in a queue for a lane (`queue.py`).
+The state is one array (components, lanes); the numbers of the problem are scalars or one per cell.
+
+Derivatives (forward mode) flow through the states alone; step lengths are held fixed. `derivatives/slopes.py` has the
+fast ways to first derivatives.
+"""
+
+import functools
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .lockstep import CROSSED, AbstractProblem, crossing_time
+from .queue import Outcome as Outcome
+from .queue import Queue
+
+
+def march(
+    problem: AbstractProblem,
+    t1: Float[Array, "..."],
+    cells: Int[Array, ""],
+    rtol: Float[Array, ""],
+    atol: Float[Array, ""],
+    *,
+    solver: diffrax.AbstractERK,
+    lanes: int,
+    passes: bool = False,
+    max_steps: int = 2_000_000,
+    one_kernel: bool = False,
+) -> tuple[Outcome, Int[Array, ""]]:
+    """Run every cell of a problem from t = 0 to its event, to the end of the model's validity, or to `t1`.
+
+    **Arguments:**
+
+    - `problem`: the number of cells is the last axis of its `start()`.
+    - `t1`: horizon [s], one for all or one per cell.
+    - `cells`: how many of the problem's cells to run; the rest is padding, so that one compiled program serves grids of
+      different sizes.
+    - `rtol`, `atol`: relative tolerance, and absolute tolerance in units of the problem's magnitudes.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax.
+    - `lanes`: how many cells advance together.
+    - `passes`: whether a run goes on through the event, in either direction, rather than ending there.
+    - `max_steps`: a cell that needs more has failed.
+    - `one_kernel`: whether to have the loop compiled into a single kernel on a CPU, which halves its cost; not for
+      programs that are differentiated again.
+
+    **Returns:** the `Outcome`, and the number of lockstep iterations, each of which advanced `lanes` lanes.
+    """
+    queue = Queue.of(
+        problem,
+        t1,
+        cells,
+        rtol,
+        atol,
+        solver=solver,
+        lanes=lanes,
+        passes=passes,
+        max_steps=max_steps,
+        one_kernel=one_kernel,
+    )
+    outcome, iterations = queue.outcome()
+    return (outcome if passes else with_crossing_times(problem, outcome)), iterations
+
+
+def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
+    """The outcome with the time of the event in the cells that ended on it, infinite in the others."""
+    if problem.crossing(outcome.state) is None:
+        return outcome
+    time = crossing_time(problem, outcome.end_time, outcome.state)
+    # A cell that starts beyond the event is there at once.
+    time = jnp.where(outcome.end_time > 0.0, time, 0.0)
+    return outcome._replace(crossing_time=jnp.where(outcome.status == CROSSED, time, jnp.inf))
+
+
+#: JAX takes compiler options only for the outermost compiled function. Wide vectors pay here, although compilers shy away
+#: from them: the sums over stages are streams of multiply-adds.
+alone = eqx.filter_jit(compiler_options={"xla_cpu_prefer_vector_width": 512})
+
+#: `march`, compiled on its own, for use outside of other transformed functions.
+compiled_march = alone(functools.partial(march, one_kernel=True))
+
+#: `march`, for use inside other transformed functions.
+traced_march = eqx.filter_jit(march)
+
+
+def lanes_for(cells: int) -> int:
+    """How many cells should advance together.
+
+    On a CPU a block and its stages should fit the first caches; an accelerator is idle below tens of thousands.
+    """
+    most = 64 if jax.default_backend() == "cpu" else 32768
+    return min(most, 1 << (cells - 1).bit_length())

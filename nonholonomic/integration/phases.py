@@ -1,0 +1,195 @@
+"""Motion in smooth phases with jumps between them, for many cells at once.
+
+A phase has its own equations and ends where they cease to hold: a contact opens or closes, slipping ends. What follows
+there is a function, the phase's `leave`: an impact, a flight in closed form, other equations. All phases share one layout
+of the state. The cells advance in rounds: in each, the cells that are now in a phase are gathered and marched together
+(`march.py`) to the event, to the horizon or to the end of the phase, and those at its end are passed on.
+"""
+
+import abc
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .lockstep import FAILED, GUARD_LOST, REACHED_END, RUNNING, AbstractProblem
+from .march import compiled_march, lanes_for
+
+#: A cell that is still under way after so many rounds is given up.
+UNRESOLVED = 5
+
+#: Rounds after which what is still under way is given up.
+MOST_ROUNDS = 2000
+
+
+class Passage(NamedTuple):
+    """What follows the end of a phase, one number per cell.
+
+    `status` is `RUNNING` where the motion goes on in the phase numbered `phase`, else how it ended; `state` is the state
+    then, `elapsed` [s] the time that passed on the way, `crossing_time` [s] when on the way the event was passed (for the
+    last time), infinite if it was not; `counts` what happened how often, a row for each kind.
+    """
+
+    phase: Int[Array, " cells"]
+    state: Float[Array, "components cells"]
+    elapsed: Float[Array, " cells"]
+    status: Int[Array, " cells"]
+    crossing_time: Float[Array, " cells"]
+    counts: Int[Array, "kinds cells"]
+
+
+class AbstractPhase(eqx.Module):
+    """One phase of the motion. Its leaves are scalars, or hold one number per cell in their last axis."""
+
+    @abc.abstractmethod
+    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+        """The motion in this phase from the given states on; the problem's guard ends the phase."""
+
+    @abc.abstractmethod
+    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+        """What follows where the guard has ended the phase.
+
+        **Arguments:**
+
+        - `state`: the states there.
+        - `left`: time [s] to the horizon.
+
+        **Returns:** a `Passage`, which ends with `REACHED_END` where it would take longer than `left`.
+        """
+
+
+class Journey(NamedTuple):
+    """How every cell ended, as in `march.Outcome`, after which phase, and what happened how often on the way."""
+
+    status: Int[np.ndarray, " cells"]
+    crossing_time: Float[np.ndarray, " cells"]
+    end_time: Float[np.ndarray, " cells"]
+    state: Float[np.ndarray, "components cells"]
+    steps: Int[np.ndarray, " cells"]
+    rejected: Int[np.ndarray, " cells"]
+    phase: Int[np.ndarray, " cells"]
+    counts: Int[np.ndarray, "kinds cells"]
+
+
+@eqx.filter_jit
+def _problem(phase: AbstractPhase, state: Float[Array, "components cells"]) -> AbstractProblem:
+    return phase.problem(state)
+
+
+@eqx.filter_jit
+def _leave(phase: AbstractPhase, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+    return phase.leave(state, left)
+
+
+def travel(
+    phases: tuple[AbstractPhase, ...],
+    phase: Int[np.ndarray, " cells"],
+    state: Float[np.ndarray, "components cells"],
+    t1: float,
+    cells: int,
+    rtol: float,
+    atol: float,
+    *,
+    kinds: int,
+    solver: diffrax.AbstractERK,
+    passes: bool = False,
+    most_rounds: int = MOST_ROUNDS,
+) -> Journey:
+    """Run every cell through its phases to its event, to `t1`, or to where the model ends.
+
+    It runs on the host, round by round, and is called with concrete numbers. All calls with as many cells in all, padding
+    included, share their compiled programs.
+
+    **Arguments:**
+
+    - `phases`: the phases, of which `phase` and `Passage.phase` are numbers.
+    - `phase`, `state`: where every cell starts.
+    - `t1`: horizon [s].
+    - `cells`: how many cells to run; the rest is padding. With none, everything is compiled.
+    - `rtol`, `atol`: relative tolerance, and absolute tolerance in units of the problems' magnitudes.
+    - `kinds`: rows of `Passage.counts`.
+    - `solver`, `passes`: as for `march`.
+    - `most_rounds`: a cell that needs more ends as `UNRESOLVED`.
+
+    **Returns:** a `Journey`.
+    """
+    size = len(phase)
+    found = Journey(
+        status=np.full(size, RUNNING),
+        crossing_time=np.full(size, np.inf),
+        end_time=np.zeros(size),
+        state=np.array(state),
+        steps=np.zeros(size, int),
+        rejected=np.zeros(size, int),
+        phase=np.array(phase),
+        counts=np.zeros((kinds, size), int),
+    )
+    found.status[cells:] = REACHED_END
+    method = (jnp.asarray(rtol, float), jnp.asarray(atol, float), solver, passes)
+    if cells == 0:
+        for one in phases:
+            _march(one, found, np.arange(0), t1, method)
+            _pass_on(one, found, np.arange(0), t1)
+    for _ in range(most_rounds):
+        # Taken before the round: a cell that changes its phase in it waits for the next.
+        here = [np.flatnonzero((found.status == RUNNING) & (found.phase == number)) for number in range(len(phases))]
+        for one, some in zip(phases, here, strict=True):
+            if some.size:
+                _march(one, found, some, t1, method)
+                lost = some[found.status[some] == GUARD_LOST]
+                if lost.size:
+                    _pass_on(one, found, lost, t1)
+        if not (found.status == RUNNING).any():
+            break
+    found.status[found.status == RUNNING] = UNRESOLVED
+    return found
+
+
+def _gather(phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"], t1: float) -> tuple[Any, ...]:
+    """The phase, the states and the remaining times of some cells, padded to the size of the whole."""
+    size = len(found.status)
+    cell = np.concatenate([some, np.full(size - some.size, some[-1] if some.size else 0)])
+    numbers, rest = eqx.partition(phase, eqx.is_array)
+    numbers = jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., cell], numbers)
+    left = jnp.asarray(np.maximum(t1 - found.end_time[cell], 0.0))
+    return eqx.combine(numbers, rest), jnp.asarray(found.state[:, cell]), left
+
+
+def _march(phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"], t1: float, method: Any) -> None:
+    """March some cells to the end of their phase and note what was found."""
+    rtol, atol, solver, passes = method
+    phase, state, left = _gather(phase, found, some, t1)
+    problem = _problem(phase, state)
+    lanes = lanes_for(len(found.status))
+    count = jnp.asarray(some.size)
+    outcome, _ = compiled_march(problem, left, count, rtol, atol, solver=solver, lanes=lanes, passes=passes)
+    outcome = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], outcome)
+    began = found.end_time[some]
+    # A cell that comes into a phase beyond the event has passed it before, unless it started there.
+    passed = np.isfinite(outcome.crossing_time) & ((outcome.crossing_time > 0.0) | np.isinf(found.crossing_time[some]))
+    found.crossing_time[some] = np.where(passed, began + outcome.crossing_time, found.crossing_time[some])
+    found.end_time[some] = np.where(outcome.status == REACHED_END, t1, began + outcome.end_time)
+    found.state[:, some] = outcome.state
+    found.steps[some] += outcome.steps
+    found.rejected[some] += outcome.rejected
+    found.status[some] = outcome.status
+
+
+def _pass_on(phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"], t1: float) -> None:
+    """Pass some cells on to the phase that follows and note what happened on the way."""
+    passage = _leave(*_gather(phase, found, some, t1))
+    passage = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], passage)
+    began = found.end_time[some]
+    passed = np.isfinite(passage.crossing_time)
+    found.crossing_time[some] = np.where(passed, began + passage.crossing_time, found.crossing_time[some])
+    found.end_time[some] = np.where(passage.status == REACHED_END, t1, began + passage.elapsed)
+    found.state[:, some] = passage.state
+    found.phase[some] = passage.phase
+    found.counts[:, some] += passage.counts
+    # What is not finite would be marched for ever.
+    sound = np.isfinite(passage.state).all(axis=0) & np.isfinite(passage.elapsed)
+    found.status[some] = np.where(sound, passage.status, FAILED)

@@ -1,0 +1,251 @@
+"""The cells of a problem and the block of lanes that works through them.
+
+A lane whose run has ended takes the next cell of the queue, so lanes of different cost share a block without waiting for
+one another.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlib
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float, Int
+
+from .lockstep import (
+    CROSSED,
+    GUARD_LOST,
+    REACHED_END,
+    RUNNING,
+    AbstractProblem,
+    Block,
+    Control,
+    Search,
+    attempt,
+    least_margin,
+)
+from .runge_kutta import explicit_tableau, first_length
+
+
+class Outcome(NamedTuple):
+    """How every cell ended.
+
+    `status` is one of the codes of `lockstep.py`; `crossing_time` [s] is the time of the event (of the last one, where
+    runs pass through it), infinite if there was none; `end_time` [s] and `state` are those at which the run ended;
+    `steps` counts accepted and rejected steps, `rejected` the latter.
+    """
+
+    status: Int[Array, " cells"]
+    crossing_time: Float[Array, " cells"]
+    end_time: Float[Array, " cells"]
+    state: Float[Array, "components cells"]
+    steps: Int[Array, " cells"]
+    rejected: Int[Array, " cells"]
+
+
+class Progress(NamedTuple):
+    """The block of lanes, how many cells have left the queue, and how many iterations the block has made."""
+
+    block: Block
+    queued: Int[Array, ""]
+    iterations: Int[Array, ""]
+
+
+class Queue(eqx.Module):
+    """The cells of a problem at their starts, and how they are run.
+
+    Leaves of `problem`, `t1`, `atols` and `fresh` are scalars or hold one number per cell in their last axis.
+    """
+
+    problem: AbstractProblem
+    control: Control
+    atols: Float[Array, "components cells"]
+    fresh: Block
+    cells: Int[Array, ""]
+    lanes: int = eqx.field(static=True)
+    one_kernel: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls,
+        problem: AbstractProblem,
+        t1: Float[Array, "..."],
+        cells: Int[Array, ""],
+        rtol: Float[Array, ""],
+        atol: Float[Array, ""],
+        *,
+        solver: diffrax.AbstractERK,
+        lanes: int,
+        passes: bool = False,
+        max_steps: int = 2_000_000,
+        one_kernel: bool = False,
+        parts: int = 1,
+    ) -> "Queue":
+        """The queue of a problem.
+
+        **Arguments:** as for `march`, and `parts`: of how many equal parts the state is made, as for `Control`.
+        """
+        control = Control(explicit_tableau(solver), solver.order(None), rtol, t1, max_steps, passes, parts)
+        starts, scales = problem.start()
+        zero = jnp.zeros_like(starts[0])
+        rates, atols = problem.field(zero, starts), atol * scales
+        lengths = first_length(problem.field, zero, starts, rates, control.order, rtol, atols, parts)
+        fresh = _fresh_block(problem, control, starts, rates, jnp.minimum(stop_gradient(lengths), t1))
+        return cls(problem, control, atols, fresh, cells, lanes, one_kernel)
+
+    @property
+    def capacity(self) -> int:
+        """How many cells the problem has, padding included."""
+        return self.fresh.cell.shape[0]
+
+    def pick(self, tree: Any, cell: Int[Array, " lanes"]) -> Any:
+        """The numbers of some cells, scalars as they are."""
+        inside = jnp.minimum(cell, self.capacity - 1)
+        return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., inside], tree)
+
+    def here(self, block: Block) -> tuple[AbstractProblem, Control, Float[Array, "components lanes"]]:
+        """Problem, control and absolute tolerances of the cells in a block."""
+        control = self.control._replace(t1=self.pick(self.control.t1, block.cell))
+        return self.pick(self.problem, block.cell), control, self.pick(self.atols, block.cell)
+
+    def outcome(self) -> tuple[Outcome, Int[Array, ""]]:
+        """Run every cell.
+
+        **Returns:** the `Outcome`, its crossing times those of events that were passed, and the number of iterations.
+        """
+
+        def period(carry: tuple[Progress, Outcome]) -> tuple[Progress, Outcome]:
+            progress, outcome = carry
+            progress = self.run(progress)
+            return self.refill(progress), self.store(outcome, progress.block)
+
+        carry = (self.start(), self.empty())
+        progress, outcome = jax.lax.while_loop(lambda carry: self.unfinished(carry[0]), period, carry)
+        return self.store(outcome, progress.block), progress.iterations
+
+    def start(self) -> Progress:
+        """The first cells, one in each lane."""
+        block = self._load(jnp.arange(self.lanes))
+        return Progress(block, jnp.minimum(self.lanes, self.cells), jnp.zeros((), int))
+
+    def unfinished(self, progress: Progress) -> Bool[Array, ""]:
+        """Whether a lane is running or a cell waiting."""
+        return jnp.any(progress.block.status == RUNNING) | (progress.queued < self.cells)
+
+    def enough_active(self, block: Block, queued: Int[Array, ""]) -> Bool[Array, ""]:
+        """Whether the block should go on: while cells wait, it stops to refill once a sixteenth of the lanes is idle."""
+        least_active = jnp.where(queued < self.cells, self.lanes - max(1, self.lanes // 16), 0)
+        return jnp.sum(block.status == RUNNING) > least_active
+
+    def run(self, progress: Progress) -> Progress:
+        """Let the block go on until it should be refilled, or ends."""
+        here = self.here(progress.block)
+
+        def loop(carry: tuple[Block, Int[Array, ""]]) -> tuple[Block, Int[Array, ""]]:
+            return jax.lax.while_loop(
+                lambda inner: self.enough_active(inner[0], progress.queued),
+                lambda inner: (attempt(*here, inner[0]), inner[1] + 1),
+                carry,
+            )
+
+        block, iterations = self.in_kernel(loop)((progress.block, progress.iterations))
+        return Progress(block, progress.queued, iterations)
+
+    def in_kernel(self, loop: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """A loop over steps, compiled into a single kernel if the queue's are."""
+        return in_one_kernel(loop) if self.one_kernel else loop
+
+    def refill(self, progress: Progress) -> Progress:
+        """Give every idle lane the next cell that waits."""
+        block, queued, iterations = progress
+        idle = block.status != RUNNING
+        loaded = self._load(jnp.where(idle, jnp.minimum(queued + jnp.cumsum(idle) - 1, self.capacity), block.cell))
+        block = jax.tree.map(lambda new, old: jnp.where(idle, new, old), loaded, block)
+        return Progress(block, jnp.minimum(queued + jnp.sum(idle), self.cells), iterations)
+
+    def empty(self) -> Outcome:
+        """An outcome of the right shapes, to be filled."""
+        fresh = self.fresh
+        return Outcome(fresh.status, fresh.crossing_time, fresh.time, fresh.state, fresh.steps, fresh.rejected)
+
+    def store(self, outcome: Outcome, block: Block) -> Outcome:
+        """The outcome with the cells of a block that have ended."""
+        found = Outcome(block.status, block.crossing_time, block.time, block.state, block.steps, block.rejected)
+        to = jnp.where((block.status != RUNNING) & (block.cell < self.cells), block.cell, self.capacity)
+        return jax.tree.map(lambda all, some: all.at[..., to].set(some, mode="drop"), outcome, found)
+
+    def _load(self, cell: Int[Array, " lanes"]) -> Block:
+        block = self.pick(self.fresh, cell)
+        # A lane whose cell does not exist has nothing to do.
+        return block._replace(cell=cell, status=jnp.where(cell < self.cells, block.status, REACHED_END))
+
+
+def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A function that XLA compiles, on a CPU, into a single kernel.
+
+    Otherwise every fused operation of a loop's body is a call of its own, and for blocks that fit the first caches calling
+    costs as much as computing. XLA does so by itself for loops over very small arrays only. What the attributes do is known
+    of jaxlib 0.10 alone; with others the function is left as it is.
+    """
+    if jax.default_backend() != "cpu" or not jaxlib.__version__.startswith("0.10."):
+        return function
+
+    def called(argument: Any) -> Any:
+        # The attributes also keep the small functions inside, such as `where`, from being fused into all that use them.
+        with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+            closed, shape = jax.make_jaxpr(function, return_shape=True)(argument)
+
+            def looking_at_all(*arguments: Any) -> Any:
+                constants, leaves = arguments[: len(closed.consts)], arguments[len(closed.consts) :]
+                look = sum(jnp.ravel(leaf)[0].astype(float) for leaf in arguments)
+                return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))(*leaves), look
+
+            # XLA 0.10.2 aborts on a call with an argument that it does not use. So each is looked at, from behind a
+            # barrier, for what is known to be constant would not be.
+            given = jax.lax.optimization_barrier([*closed.consts, *jax.tree.leaves(argument)])
+            results, _ = jax.lax.optimization_barrier(jax.jit(looking_at_all)(*given))
+        return jax.tree.unflatten(jax.tree.structure(shape), results)
+
+    return called
+
+
+def _fresh_block(
+    problem: AbstractProblem,
+    control: Control,
+    states: Float[Array, "components cells"],
+    rates: Float[Array, "components cells"],
+    lengths: Float[Array, " cells"],
+) -> Block:
+    """Every cell at its start; one that starts beyond the event or beyond the guard has ended."""
+    zero, none = jnp.zeros_like(lengths), jnp.zeros(lengths.shape, int)
+    no = jnp.zeros(lengths.shape, bool)
+    crossing, guard = problem.crossing(states), problem.guard(zero, states)
+    beyond = no
+    if crossing is not None:
+        # On the event exactly, it is the way onwards that counts.
+        falls = jax.jvp(problem.crossing, (states,), (rates,))[1] <= 0.0
+        beyond = (crossing < 0.0) | ((crossing == 0.0) & (falls | (not control.passes)))
+    side = jnp.where(beyond & control.passes, -1.0, 1.0).astype(lengths.dtype)
+    status = jnp.where(beyond & (not control.passes), CROSSED, RUNNING)
+    if guard is not None:
+        status = jnp.where(guard <= 0.0, GUARD_LOST, status)
+    return Block(
+        cell=jnp.arange(lengths.shape[0]),
+        status=status,
+        time=zero,
+        state=states,
+        rate=rates,
+        length=lengths,
+        side=side,
+        margin=stop_gradient(least_margin(problem, side, zero, states)),
+        crossing_time=jnp.where(beyond, zero, jnp.inf),
+        searching=no,
+        search=Search(zero, zero, zero, zero, zero, none),
+        steps=none,
+        rejected=none,
+    )

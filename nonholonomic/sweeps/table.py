@@ -1,0 +1,120 @@
+"""A labelled result over a grid, and its file."""
+
+import json
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Shaped
+
+from ._hdf5 import UNREACHED, read_grid, write_grid
+from .digits import concise_texts
+
+Values = Shaped[np.ndarray, "..."]
+
+
+class Table(eqx.Module):
+    """Variables over a grid of named coordinates; each variable is also an attribute, such as `table.time`.
+
+    **Arguments:**
+
+    - `coords`: name -> values, one for each axis of the grid, in order.
+    - `variables`: name -> array over the grid; `status` is an array of words.
+    - `units`: name of a coordinate or variable -> its unit.
+    - `attributes`: what was computed, with what versions: plain data.
+    - `words`: variable that consists of words -> the words, in the order of the numbers that stand for them in a file.
+    """
+
+    coords: dict[str, Values]
+    variables: dict[str, Values]
+    units: dict[str, str]
+    attributes: dict[str, Any]
+    words: dict[str, tuple[str, ...]] = eqx.field(default_factory=dict)
+
+    def __getattr__(self, name: str) -> Values:
+        # Reached only for names that are not fields.
+        variables = object.__getattribute__(self, "variables")
+        if name in variables:
+            return variables[name]
+        raise AttributeError(f"the table has no variable {name!r}; it has {', '.join(variables)}")
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the grid."""
+        return tuple(len(values) for values in self.coords.values())
+
+    def save(self, path: Any) -> None:
+        """Write the table to an HDF5 file that `xarray.open_dataset(path, engine="h5netcdf")` opens as it is.
+
+        **Raises:** `OSError` that names the path if it cannot be written.
+        """
+        write_grid(path, self.coords, self.variables, self.units, self.attributes, self.words)
+
+    @classmethod
+    def load(cls, path: Any) -> "Table":
+        """Read a table from a file that `save` or a sweep wrote; a cell that a sweep has not reached is `pending`.
+
+        **Raises:** `OSError` that names the path if it cannot be read or holds no table.
+        """
+        return cls(*read_grid(path))
+
+    def digits(self, variable: str = "time") -> Values:
+        """A variable with the digits that its error leaves: "5.01142(3)" is 5.01142 with an error of 0.00003.
+
+        **Arguments:** `variable`: name of a numeric variable, such as "time", whose error the table holds as "time_error".
+
+        **Returns:** an array of texts over the grid. Where there is no number the text is the cell's status; where even that
+        is in doubt, the status with a question mark.
+
+        **Raises:** `ValueError` if the table does not hold the variable and its error.
+        """
+        for name in (variable, f"{variable}_error"):
+            if name not in self.variables:
+                raise ValueError(
+                    f"variable = {variable!r}: the table has no {name!r}; it has {', '.join(self.variables)}"
+                )
+        values, errors = self.variables[variable], self.variables[f"{variable}_error"]
+        return concise_texts(values, errors, self.variables.get("status", values))
+
+    def plot(self, variable: str = "time") -> Any:
+        """Draw a variable over the grid (needs matplotlib): lines over the first axis, or a map of the first two.
+
+        **Arguments:** `variable`: name of a numeric variable. **Returns:** a matplotlib figure.
+        """
+        from ..views import draw_table
+
+        return draw_table(self, variable)
+
+    def __str__(self) -> str:
+        axes = ", ".join(f"{name} ({len(values)})" for name, values in self.coords.items())
+        lines = [f"Table over {axes or 'one cell'}"]
+        # What has not been computed is told by the status alone.
+        computed = self.variables["status"] != UNREACHED if "status" in self.variables else ...
+        for name, values in self.variables.items():
+            unit = f" [{self.units[name]}]" if self.units.get(name, "1") not in ("1", "") else ""
+            lines.append(f"  {name}{unit}: {_summary(values if name == 'status' else values[computed])}")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+def _summary(values: Values) -> str:
+    """A variable in a few words: how often each word occurs, or its range."""
+    if values.dtype.kind == "U":
+        words, counts = np.unique(values, return_counts=True)
+        return ", ".join(f"{count} {word}" for word, count in zip(words, counts, strict=True))
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
+        return "none finite"
+    missing = values.size - finite.size
+    return f"{finite.min():.6g} to {finite.max():.6g}" + (f", {missing} not finite" if missing else "")
+
+
+def same_request(left: str, right: str) -> str | None:
+    """The first difference between two requests (JSON), in words; `None` if they are the same."""
+    one, other = json.loads(left), json.loads(right)
+    for name in [*one, *(name for name in other if name not in one)]:
+        if one.get(name) != other.get(name):
+            return f"{name} is {one.get(name)!r} there and {other.get(name)!r} here"
+    return None

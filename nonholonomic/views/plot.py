@@ -1,0 +1,77 @@
+"""Pictures of tables (needs matplotlib)."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from ..sweeps import Table
+
+#: One colour each for what is not a number in a map: words of the status other than the first.
+GREYS = ("0.85", "0.7", "0.55", "0.4", "0.25")
+
+
+def draw_table(table: "Table", variable: str = "time") -> Any:
+    """Draw a variable over the grid of a table: lines over the first axis, or a map of the first two.
+
+    Cells without a finite value are left out of lines and marked by their status in maps. With three axes or more, the
+    first value of the others is drawn.
+
+    **Arguments:**
+
+    - `table`: a `Table` with at least one axis.
+    - `variable`: name of a numeric variable.
+
+    **Returns:** a matplotlib figure.
+
+    **Raises:** `ValueError` for a table without axes or for a variable that is not numeric.
+    """
+    from matplotlib.figure import Figure
+
+    values = table.variables.get(variable)
+    if values is None or values.dtype.kind == "U":
+        raise ValueError(f"variable = {variable!r} must be a numeric variable of the table")
+    names = list(table.coords)
+    if not names:
+        raise ValueError("a table of one cell has nothing to draw")
+    figure = Figure(figsize=(7.0, 4.5), layout="constrained")
+    drawing = figure.add_subplot()
+    label = f"{variable} [{table.units.get(variable, '1')}]"
+    drawing.set_xlabel(f"{names[0]} [{table.units.get(names[0], '1')}]")
+    shown = np.where(np.isfinite(values), values, np.nan)
+    if len(names) == 1 or len(table.coords[names[1]]) <= 8:
+        _draw_lines(drawing, table, names, shown)
+        drawing.set_ylabel(label)
+        return figure
+    first = (slice(None), slice(None), *([0] * (len(names) - 2)))
+    drawing.set_ylabel(f"{names[1]} [{table.units.get(names[1], '1')}]")
+    image = drawing.pcolormesh(table.coords[names[0]], table.coords[names[1]], shown[first].T, shading="nearest")
+    figure.colorbar(image, label=label)
+    if "status" in table.variables:
+        _mark_words(drawing, table, names, table.variables["status"][first])
+    return figure
+
+
+def _draw_lines(drawing: Any, table: "Table", names: list[str], shown: Any) -> None:
+    lines = shown.reshape(shown.shape[0], shown.shape[1] if shown.ndim > 1 else 1, -1)[:, :, 0]
+    for column, line in enumerate(lines.T):
+        label = f"{names[1]} = {table.coords[names[1]][column]:.4g}" if len(names) > 1 else None
+        drawing.plot(table.coords[names[0]], line, "o-", markersize=3, label=label)
+    if len(names) > 1:
+        drawing.legend()
+
+
+def _mark_words(drawing: Any, table: "Table", names: list[str], status: Any) -> None:
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Patch
+
+    others = [word for word in dict.fromkeys(status.ravel().tolist()) if word != "inverted"]
+    patches = []
+    for word, grey in zip(others, GREYS, strict=False):
+        mask = np.where(status == word, 1.0, np.nan)
+        drawing.pcolormesh(
+            table.coords[names[0]], table.coords[names[1]], mask.T, shading="nearest", cmap=ListedColormap([grey])
+        )
+        patches.append(Patch(color=grey, label=word))
+    if patches:
+        drawing.legend(handles=patches, loc="upper right")

@@ -1,0 +1,163 @@
+"""The stroller in coordinates, as data for the formulations of `nonholonomic/formulations/formulation.py`.
+
+Coordinates: q = (x, y, theta, phi) on a plane and (eta, mu, psi, phi), reduced latitude first as in the paper, on a
+sphere or spheroid, psi being the paper's theta where the heading is projected. They have poles, which the P-form has
+not; they are the independent witness that it is right (`stroller.md`, sections 2 to 4 and 6), and how the paper writes
+it.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nonholonomic.formulations import AbstractSystem, Coordinates
+from nonholonomic.geometry import AbstractQuadric, Plane, add, inverse, multiply, subtract
+
+from ..dynamics import State
+from ..friction import Rolling
+from ..input import Input, Motion
+from ..scene import FORKS, SIDES, Scene
+
+
+class Chart(AbstractSystem):
+    """A scene in coordinates: metric, potential, constraints, frame and forces.
+
+    The constraints are those of the two axles, w1 = lat and w2 = -sin(phi) long + cos(phi) lat + l cos(phi) yaw; the
+    frame's first two fields are the motion of unit front-wheel speed at a fixed steering angle, and steering.
+
+    **Arguments:**
+
+    - `scene`: a `Scene`.
+    - `input`: as for `simulate`.
+    """
+
+    scene: Scene
+    input: Input | None = None
+
+    @property
+    def dimension(self) -> int:
+        return 4
+
+    @property
+    def quadric(self) -> AbstractQuadric | None:
+        """The sphere or spheroid; `None` on a plane."""
+        return self.scene.surface if isinstance(self.scene.surface, AbstractQuadric) else None
+
+    def ground_metric(self, q: Coordinates) -> Float[Array, " 2"]:
+        """Squares of the scale factors of the first two coordinates [m^2 or 1]."""
+        if self.quadric is None:
+            return jnp.ones(2)
+        equatorial, polar = self.quadric.semi_axes
+        sine, cosine = jnp.sin(q[0]), jnp.cos(q[0])
+        return jnp.array([(equatorial * sine) ** 2 + (polar * cosine) ** 2, (equatorial * cosine) ** 2])
+
+    def forms(self, q: Coordinates) -> Float[Array, "3 4"]:
+        """The one-forms long, lat and yaw, a row each: what the rear axle rolls, slips to the left, and turns left."""
+        zero, one = jnp.zeros(()), jnp.ones(())
+        sine, cosine = jnp.sin(q[2]), jnp.cos(q[2])
+        if self.quadric is None:
+            return jnp.array([[cosine, sine, zero, zero], [-sine, cosine, zero, zero], [zero, zero, one, zero]])
+        equatorial, _ = self.quadric.semi_axes
+        if self.scene.heading == "projected":
+            # The pull-back of cos(theta) dx + sin(theta) dy and its like by x = A cos(eta) cos(mu), y = ... sin(mu).
+            inwards, across = -equatorial * jnp.sin(q[0]), equatorial * jnp.cos(q[0])
+            sine, cosine = jnp.sin(q[2] - q[1]), jnp.cos(q[2] - q[1])
+            long = [inwards * cosine, across * sine, zero, zero]
+            lat = [-inwards * sine, across * cosine, zero, zero]
+            return jnp.array([long, lat, [zero, zero, one, zero]])
+        h_eta, h_mu = jnp.sqrt(self.ground_metric(q))
+        connection = equatorial * jnp.sin(q[0]) / h_eta
+        side = SIDES[self.scene.side]
+        lat = [side * h_eta * cosine, -side * h_mu * sine, zero, zero]
+        return jnp.array([[h_eta * sine, h_mu * cosine, zero, zero], lat, [zero, side * connection, side * one, zero]])
+
+    def metric(self, q: Coordinates) -> Float[Array, "4 4"]:
+        body, absolute = self.scene.body, FORKS[self.scene.fork]
+        _, lat, yaw = self.forms(q)
+        fork = jnp.zeros(4).at[3].set(1.0) + (0.0 if absolute is None else absolute * yaw)
+        G = body.mass * jnp.diag(jnp.concatenate([self.ground_metric(q), jnp.zeros(2)]))
+        G = G + body.inertia * jnp.outer(yaw, yaw) + body.steering_inertia * jnp.outer(fork, fork)
+        if body.centre is not None:
+            # The centre of mass moves across at b Omega besides; the inertia is about the axle and has m b^2 already.
+            across = jnp.outer(lat, yaw)
+            G = G + body.mass * body.centre * (across + across.T)
+        return G
+
+    def potential(self, q: Coordinates) -> Float[Array, ""]:
+        scene = self.scene
+        if self.quadric is None:
+            slope = scene.surface.up[0]
+            along = add(q[0], multiply(scene.body.centre, jnp.cos(q[2])))
+            height = multiply(along, slope)
+        else:
+            height = self.quadric.semi_axes[1] * (1.0 + jnp.sin(q[0]))
+        weight = multiply(scene.body.mass * scene.gravity, height)
+        spring = multiply(0.5, scene.body.steering_spring, q[3], q[3])
+        return add(jnp.zeros(()), weight, spring)
+
+    def constraints(self, q: Coordinates) -> Float[Array, "2 4"]:
+        long, lat, yaw = self.forms(q)
+        sine, cosine = jnp.sin(q[3]), jnp.cos(q[3])
+        return jnp.stack([lat, -sine * long + cosine * lat + self.scene.body.wheelbase * cosine * yaw])
+
+    def frame(self, q: Coordinates) -> Float[Array, "4 4"]:
+        sine, cosine, length = jnp.sin(q[3]), jnp.cos(q[3]), self.scene.body.wheelbase
+        forms = self.forms(q)
+        # Long and lat have no part along the turn of the heading, and nothing but steering has one along phi.
+        across = inverse(forms[:2, :2])
+        level = jnp.concatenate([across, -forms[2:, :2] @ across / forms[2, 2], jnp.zeros((1, 2))])
+        (long, lat), yaw, steering = level.T, jnp.zeros(4).at[2].set(1.0 / forms[2, 2]), jnp.zeros(4).at[3].set(1.0)
+        return jnp.stack([cosine * long + sine / length * yaw, steering, lat, cosine * yaw - length * sine * long], 1)
+
+    def rolling(self, q: Coordinates, rate: Coordinates) -> tuple[Float[Array, "4 4"], Rolling]:
+        """The one-forms of rear-wheel speed, front-wheel speed, yaw and steering rate, a row each, and their values."""
+        body, (long, lat, yaw) = self.scene.body, self.forms(q)
+        sine, cosine = jnp.sin(q[3]), jnp.cos(q[3])
+        front = cosine * long + sine * lat + body.wheelbase * sine * yaw
+        rows = jnp.stack([long, front, yaw, jnp.zeros(4).at[3].set(1.0)])
+        load = self.normal_force(q, rate)
+        front_load = None if body.centre is None else load * body.centre / body.wheelbase
+        v, w, yaw_rate, steering_rate = rows @ rate
+        return rows, Rolling(v, w, yaw_rate, steering_rate, subtract(load, front_load), front_load)
+
+    def normal_force(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
+        """Normal force [N], from the principal curvatures A c / h_eta^3 and c / (A h_eta) of a spheroid."""
+        scene = self.scene
+        weight = scene.body.mass * scene.gravity
+        if self.quadric is None:
+            return multiply(weight, scene.surface.up[2])
+        equatorial, polar = self.quadric.semi_axes
+        squares = self.ground_metric(q)
+        h_eta = jnp.sqrt(squares[0])
+        curvatures = jnp.array([equatorial * polar / h_eta**3, polar / (equatorial * h_eta)])
+        bend = scene.body.mass * jnp.sum(curvatures * squares * rate[:2] ** 2)
+        return SIDES[scene.side] * (weight * equatorial * jnp.sin(q[0]) / h_eta - bend)
+
+    def motion(self, q: Coordinates, rolling: Rolling) -> Motion:
+        """What an input sees."""
+        place = (q[0], q[1]) if self.quadric is None else (q[1], q[0])
+        position, east, north = self.scene.surface.chart(place)
+        heading = self.scene.dynamics.heading.at_angle(q[2], east, north)
+        return Motion(position, heading, q[3], *rolling[:4])
+
+    def force(self, t: Float[Array, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
+        rows, rolling = self.rolling(q, rate)
+        drive, torque = (None, None) if self.input is None else self.input(t, self.motion(q, rolling))
+        drag = self.scene.friction.drag(rolling)
+        loads = (add(drive, drag.rear), drag.front, drag.yaw, add(torque, drag.steering))
+        return sum((load * row for load, row in zip(loads, rows, strict=True) if load is not None), jnp.zeros(4))
+
+
+def coordinates(scene: Scene, state: State) -> Coordinates:
+    """Coordinates q of a state (components,) of the P-form."""
+    position, heading, rest = scene.dynamics.unpack(state)
+    place = scene.surface.place_at(position)
+    _, east, north = scene.surface.chart(place)
+    first = place if isinstance(scene.surface, Plane) else place[::-1]
+    return jnp.stack([*first, scene.dynamics.heading.angle(heading, east, north), rest[0]])
+
+
+def coordinates_and_rates(scene: Scene, t, state: State, input: Input | None = None) -> tuple[Coordinates, Coordinates]:
+    """Coordinates and velocity (q, q') of a state (components,) of the P-form at a time [s]."""
+    rate = scene.dynamics.field(t, state, input)
+    return jax.jvp(lambda state: coordinates(scene, state), (state,), (rate,))

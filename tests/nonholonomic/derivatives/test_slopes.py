@@ -1,0 +1,162 @@
+"""Derivatives of event times, along with a run and back through it, on a problem with a closed form."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close
+
+import nonholonomic.derivatives._adjoint as adjoint
+from nonholonomic.derivatives import directions_of
+from nonholonomic.derivatives._shared_values import sharing_values
+from nonholonomic.derivatives.slopes import march_with_slopes
+from nonholonomic.integration import CROSSED, GUARD_LOST, AbstractProblem
+
+MOVED = ("rate", "height", "growth")
+HEIGHTS = np.linspace(0.6, 4.0, 100)
+RATES = np.geomspace(3.0, 0.2, 100)
+
+
+class Decays(AbstractProblem):
+    """y' = -rate (1 + growth t) y from y = height, and a clock; the event is y = 1/2, the guard is up when patience is."""
+
+    rate: jax.Array
+    height: jax.Array
+    growth: jax.Array
+    patience: jax.Array
+
+    def start(self):
+        zero = jnp.zeros_like(self.height)
+        return jnp.stack([self.height, zero]), jnp.stack([zero + 1.0, zero + 1.0])
+
+    def field(self, time, state):
+        return jnp.stack([-self.rate * (1.0 + self.growth * time) * state[0], jnp.ones_like(state[0])])
+
+    def crossing(self, state):
+        return state[0] - 0.5
+
+    def guard(self, time, state):
+        return self.patience - state[1]
+
+
+def time_of_decay(rate, height, growth):
+    return (jnp.sqrt(1.0 + 2.0 * growth * jnp.log(2.0 * height) / rate) - 1.0) / growth
+
+
+def found_and_expected(names=MOVED, patience=1e3, heights=HEIGHTS, cells=100, **options):
+    """Outcome, slopes by the named numbers, and what they should be; rate and height differ from cell to cell."""
+    point = (jnp.asarray(RATES), jnp.asarray(heights), jnp.asarray(0.7))
+    tangents = [
+        tuple(jnp.full_like(one, name == moved) for one, moved in zip(point, MOVED, strict=True)) for name in names
+    ]
+
+    @eqx.filter_jit
+    def run(point, tangents):
+        def build(*numbers):
+            return Decays(*numbers, jnp.asarray(patience))
+
+        given = (jnp.asarray(50.0), jnp.asarray(cells), jnp.asarray(1e-11), jnp.asarray(1e-12))
+        directions = directions_of(build, point, tangents)
+        return march_with_slopes(build(*point), directions, *given, **({"one_kernel": True} | options))
+
+    outcome, slopes = run(point, tangents)
+    every = jax.vmap(jax.grad(time_of_decay, (0, 1, 2)), (0, 0, None))(*point)
+    return outcome, slopes, [every[MOVED.index(name)] for name in names]
+
+
+@pytest.mark.parametrize(
+    ("names", "passes", "solver"),
+    [
+        (MOVED, False, diffrax.Dopri8()),
+        (MOVED, True, diffrax.Tsit5()),
+        (("height", "rate"), True, diffrax.Dopri8()),
+        (("height", "height"), False, diffrax.Tsit5()),
+        (("growth",), False, diffrax.Dopri8()),
+        (("growth",), True, diffrax.Tsit5()),
+    ],
+)
+def test_the_slopes_are_those_of_the_closed_form(names, passes, solver):
+    """For a field that depends on time, more cells than lanes, methods whose last stage is and is not their end."""
+    outcome, slopes, expected = found_and_expected(names, solver=solver, passes=passes)
+    assert_close(outcome.crossing_time, time_of_decay(RATES, HEIGHTS, 0.7), rtol=1e-9)
+    for one, other in zip(slopes, expected, strict=True):
+        assert_close(one, other, rtol=1e-7)
+
+
+def test_a_cell_that_ends_otherwise_has_no_slope_and_leaves_the_others_theirs():
+    outcome, slopes, expected = found_and_expected(patience=1.0, solver=diffrax.Dopri8())
+    late = np.asarray(time_of_decay(RATES, HEIGHTS, 0.7)) > 1.0
+    assert 20 < late.sum() < 80
+    assert (np.asarray(outcome.status) == np.where(late, GUARD_LOST, CROSSED)).all()
+    for one, other in zip(slopes, expected, strict=True):
+        assert_close(one, np.where(late, 0.0, other), rtol=1e-7)
+
+
+@pytest.mark.parametrize("cells", [0, 1, 70])
+def test_padding_and_cells_beyond_the_event_have_no_slope(cells):
+    """Some cells start beyond the event, and of the cells only some are run: fewer than lanes, and none."""
+    heights = np.where(np.arange(100) % 3 == 0, 0.4, HEIGHTS)
+    outcome, slopes, expected = found_and_expected(heights=heights, cells=cells, solver=diffrax.Dopri8())
+    run = np.arange(100) < cells
+    assert (np.asarray(outcome.status)[run] == CROSSED).all()
+    for one, other in zip(slopes, expected, strict=True):
+        assert_close(one, np.where(run & (heights > 0.5), other, 0.0), rtol=1e-7)
+
+
+@pytest.mark.parametrize("kept", [2, 5])
+def test_runs_longer_than_what_is_kept_are_repeated(kept, monkeypatch):
+    """Periods of two iterations, of which the starts of a few are kept: the slopes are the same to the last digit."""
+    _, whole, _ = found_and_expected(solver=diffrax.Dopri8())
+    monkeypatch.setattr(adjoint, "PERIOD", 2)
+    monkeypatch.setattr(adjoint, "KEPT", kept)
+    _, pieces, expected = found_and_expected(solver=diffrax.Dopri8())
+    for one, other, third in zip(whole, pieces, expected, strict=True):
+        assert_close(one, other, rtol=1e-12)
+        assert_close(other, third, rtol=1e-7)
+
+
+def test_the_starts_that_are_kept_are_spread_out(monkeypatch):
+    """Of two hundred starts eight are kept: the first and the last always, the others with no gap above half of the run."""
+    monkeypatch.setattr(adjoint, "KEPT", 8)
+    kept = adjoint.Kept.of(jnp.zeros(()))
+    for index in range(1, 200):
+        kept = kept.added(jnp.asarray(index), jnp.asarray(float(index)), jnp.asarray(True))
+    indices = np.asarray(kept.index)
+    assert (indices[0], indices[-1], int(kept.depth)) == (0, 199, 8)
+    assert (np.diff(indices) > 0).all()
+    assert np.diff(indices).max() <= 100
+    assert_close(np.asarray(kept.progress)[np.asarray(kept.slot)], indices)
+
+
+def test_a_shared_value_is_computed_once():
+    """A function whose results all need one value: the same numbers, and its square root once instead of four times."""
+
+    def function(x, scale):
+        root = jnp.sqrt(jnp.stack([x * scale, x])[0] + 1.0)
+        return {"a": (root * x, root - x), "b": jnp.stack([root + 1.0, jnp.where(x > 1.0, root, x)])}
+
+    x, scale = jnp.linspace(0.5, 2.0, 8), jnp.asarray(3.0)
+    plain, shared = function(x, scale), sharing_values(function)(x, scale)
+    jax.tree.map(lambda one, other: assert_close(one, other, rtol=1e-15), plain, shared)
+    text = str(jax.make_jaxpr(sharing_values(function))(x, scale))
+    assert text.count("sqrt") == 1
+    assert text.count("optimization_barrier") == 1
+
+
+def test_values_of_several_kinds_are_shared():
+    """Truth values beside numbers, stacks of stacks, and a stack taken apart along its other axis."""
+
+    def function(x, y):
+        root = jnp.sqrt(x) * y
+        above, below = root * root > 1.0, jnp.sqrt(root + 1.0)
+        table = jnp.stack([x, y, x + y])
+        deep = jnp.stack([table, 2.0 * table])
+        along = jnp.unstack(table, axis=1)
+        return jnp.where(above, x, y), jnp.where(above, y, below), jnp.where(above, x * y, below), deep + root, along
+
+    x, y = jnp.linspace(0.5, 2.0, 3), jnp.linspace(2.0, 0.1, 3)
+    jax.tree.map(
+        lambda one, other: assert_close(one, other, rtol=1e-15), function(x, y), sharing_values(function)(x, y)
+    )

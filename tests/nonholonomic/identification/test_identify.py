@@ -1,0 +1,198 @@
+"""Identification without a simulation: textbook estimates, one-sided likelihoods, bounds, what data cannot see."""
+
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+import scipy.stats
+from conftest import assert_close
+from terminal import Terminal
+
+from nonholonomic.identification import Free, Measurements, identify, levenberg_marquardt
+from nonholonomic.identification.likelihood import MISSING, one_sided
+from nonholonomic.identification.result import coordinate_covariance
+from nonholonomic.identification.unknown import as_free
+from nonholonomic.parameters import full_path
+
+pytestmark = pytest.mark.newest
+
+X = np.linspace(0.0, 1.0, 12)
+ERROR = 0.1 + 0.05 * X
+
+
+def line(numbers):
+    """Straight lines, a row each."""
+    return numbers["height"][:, None] + numbers["slope"][:, None] * X
+
+
+@pytest.fixture(scope="module")
+def regression():
+    value = 2.0 - 3.0 * X + ERROR * np.random.default_rng(0).normal(size=X.size)
+    return value, identify(line, Measurements(value, ERROR), {"height": 0.5, "slope": 0.0}, starts=3)
+
+
+def test_linear_regression_is_that_of_the_textbook(regression):
+    """Weighted least squares: (A^T W A)^-1 A^T W y and (A^T W A)^-1."""
+    value, found = regression
+    A, W = np.stack([np.ones_like(X), X], axis=1), np.diag(ERROR**-2)
+    covariance = np.linalg.inv(A.T @ W @ A)
+    assert_close(list(found.estimates.values()), covariance @ A.T @ W @ value, rtol=1e-7)
+    assert_close(found.covariance, covariance, rtol=1e-9)
+    assert_close(list(found.standard_errors.values()), np.sqrt(np.diag(covariance)), rtol=1e-9)
+    assert found.statuses == ("converged",) * 3
+    assert found.degrees == 10
+    assert "slope" in str(found)
+    low, high = found.interval("slope")
+    assert_close(high - low, 2.0 * 1.96 * found.standard_errors["slope"], rtol=1e-9)
+
+
+def test_it_says_on_a_terminal_what_it_does(regression, monkeypatch):
+    value, found = regression
+    monkeypatch.setattr("nonholonomic.progress.INTERVAL", 0.01)
+    # All is compiled by now; the first thing that a fit does is made to take its time.
+    compiled = levenberg_marquardt.linearise
+    monkeypatch.setattr(levenberg_marquardt, "linearise", lambda *given: (time.sleep(0.2), compiled(*given))[1])
+    for progress in (True, False):
+        stream = Terminal()
+        monkeypatch.setattr(sys, "stderr", stream)
+        again = identify(line, Measurements(value, ERROR), {"height": 0.5, "slope": 0.0}, starts=3, progress=progress)
+        assert again.estimates == found.estimates
+        assert [text.startswith("compiling") for _, text in stream.lines[:1]] == [True] * progress
+
+
+def test_profile_of_a_linear_model_is_a_parabola(regression):
+    _, found = regression
+    profile = found.profile("slope")
+    deviations = (profile.values - found.estimates["slope"]) / found.standard_errors["slope"]
+    assert_close(profile.deviance, deviations**2, atol=1e-7)
+    assert profile.converged.all()
+    # The other number follows along the regression line.
+    follows = found.covariance[0, 1] / found.covariance[1, 1] * (profile.values - found.estimates["slope"])
+    assert_close(profile.estimates["height"], found.estimates["height"] + follows, rtol=1e-6)
+
+
+def test_a_lower_limit_has_the_one_sided_likelihood():
+    z = np.linspace(-30.0, 7.0, 75)
+    # log1p of the small tail: the plain logarithm loses it where it is close to 0.
+    right = np.log1p(-scipy.stats.norm.sf(np.maximum(z, 0.0)))
+    expected = -2.0 * np.where(z < 0.0, scipy.stats.norm.logcdf(z), right)
+    assert_close(one_sided(jnp.asarray(z)) ** 2, expected, rtol=1e-9, atol=1e-15)
+    for far in (8.0, 9.0, 40.0, 1e10):
+        assert abs(one_sided(far)) < 1e-7
+        assert np.isfinite(jax.grad(one_sided)(far))
+
+
+def test_censored_mean_is_that_of_scipy():
+    """The mean of normal numbers of which those above 1 were only seen to exceed 1 (a Tobit model)."""
+    value = np.random.default_rng(2).normal(0.7, 0.5, 60)
+    hidden = value > 1.0
+    data = Measurements(np.minimum(value, 1.0), 0.5, hidden)
+    found = identify(lambda p: jnp.repeat(p["mean"][:, None], 60, axis=1), data, {"mean": 0.0})
+
+    def deviance(mean):
+        seen = scipy.stats.norm.logpdf(value[~hidden], mean, 0.5).sum()
+        return -2.0 * (seen + hidden.sum() * scipy.stats.norm.logsf(1.0, mean, 0.5))
+
+    best = scipy.optimize.minimize_scalar(deviance, (0.0, 1.0), tol=1e-12)
+    assert_close(found.estimates["mean"], best.x, atol=1e-5)
+    assert found.residuals[int(np.argmax(hidden))].censored
+
+
+def test_missing_predictions_are_a_penalty_without_slope():
+    data = Measurements(np.zeros(4), 1.0, np.array([False, True, True, False]))
+    prediction = jnp.array([jnp.nan, jnp.nan, jnp.inf, 2.0])
+    value, slope = jax.jvp(data.residuals, (prediction,), (jnp.ones(4),))
+    assert_close(value, [MISSING, MISSING, 0.0, 2.0])
+    assert_close(slope, [0.0, 0.0, 0.0, 1.0])
+
+
+def test_bounds_are_kept_and_positive_numbers_are_fitted_in_logarithms():
+    data = Measurements(np.array([4.0, 4.1]), 0.1)
+    found = identify(lambda p: jnp.repeat(p["x"][:, None], 2, axis=1), data, {"x": Free(1.0, 0.0, 3.0)})
+    assert 2.99 < found.estimates["x"] < 3.0
+    for free in (Free(2.0), Free(2.0, 0.0), Free(2.0, -1.0, 3.0), Free(2.0, upper=5.0)):
+        assert_close(free.value(free.coordinate(2.5)), 2.5, rtol=1e-12)
+    found = identify(lambda p: jnp.repeat(p["x"][:, None], 2, axis=1), data, {"x": Free(1.0, 0.0)})
+    assert_close(np.sqrt(found.coordinate_covariance[0, 0]), 0.1 / np.sqrt(2.0) / 4.05, rtol=1e-4)
+
+
+def test_a_prior_is_one_more_measurement():
+    data = Measurements(np.array([4.0]), 0.3)
+    found = identify(lambda p: p["x"][:, None], data, {"x": Free(1.0, prior=(3.0, 0.6))})
+    assert_close(found.estimates["x"], (4.0 / 0.09 + 3.0 / 0.36) / (1.0 / 0.09 + 1.0 / 0.36), rtol=1e-8)
+    assert_close(found.standard_errors["x"], (1.0 / 0.09 + 1.0 / 0.36) ** -0.5, rtol=1e-9)
+    # What the data alone fix does not change.
+    assert_close(found.identifiability.singular_values, 1.0 / 0.3, rtol=1e-9)
+
+
+def test_a_direction_that_the_data_cannot_see_is_named():
+    """Only the product a b and c enter: a and b cannot be told apart, c can."""
+    t = np.linspace(0.5, 2.0, 9)
+
+    def model(p):
+        return (p["a"] * p["b"])[:, None] * jnp.exp(-p["c"][:, None] * t)
+
+    data = Measurements(6.0 * np.exp(-0.5 * t), 0.01)
+    found = identify(model, data, {"a": Free(1.0, 0.0), "b": Free(2.0, 0.0), "c": 0.4})
+    assert found.identifiability.singular_values[2] < 1e-6 * found.identifiability.singular_values[0]
+    assert_close(np.abs(found.identifiability.directions[2]), [0.5**0.5, 0.5**0.5, 0.0], atol=1e-6)
+    assert len(found.identifiability.unseen) == 1
+    assert found.identifiability.unseen[0] in ("a +1 %, b -1 %", "a -1 %, b +1 %")
+    assert np.isinf(found.standard_errors["a"])
+    assert np.isinf(found.standard_errors["b"])
+    assert found.standard_errors["c"] < 0.01
+    assert_close(found.estimates["a"] * found.estimates["b"], 6.0, rtol=1e-6)
+    assert "NOT SEEN" in str(found)
+    with pytest.raises(ValueError, match="'a', whose standard error is infinite"):
+        found.profile("a")
+    assert_close(coordinate_covariance(np.array([[2.0, 0.0]])), [[0.25, 0.0], [0.0, np.inf]])
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"free": {}}, "free = {} must be a non-empty"),
+        ({"free": {"x": np.nan}}, "start of x"),
+        ({"free": {"x": [1.0, 2.0]}}, "must be one number"),
+        ({"free": {"x": Free(-1.0, lower=0.0)}}, "start of x = -1.0 must be greater than 0.0"),
+        ({"free": {"x": Free(1.0, prior=(0.0, 0.0))}}, "standard deviation of the prior of x"),
+        ({"free": {"x": Free(1.0, prior=3.0)}}, "must be a mean and a standard deviation"),
+        ({"starts": 0}, "starts = 0"),
+        ({"spread": 1.0}, "spread = 1.0"),
+        ({"max_steps": 2.5}, "max_steps = 2.5"),
+        ({"labels": ("a",)}, "labels must be 2"),
+        ({"measurements": 3.0}, "must be Measurements"),
+        ({"model": lambda p: p["x"][:, None]}, "model must predict"),
+    ],
+)
+def test_bad_arguments_are_named(change, told):
+    arguments = {"model": lambda p: jnp.repeat(p["x"][:, None], 2, axis=1), "free": {"x": 1.0}}
+    arguments |= {"measurements": Measurements(np.zeros(2), 1.0)}
+    with pytest.raises(ValueError, match=told):
+        identify(**(arguments | change))
+
+
+@pytest.mark.parametrize("given", [(1.0, 1.0), ([1.0], 0.0), ([np.nan], 1.0), ([1.0, 2.0], [1.0, 2.0, 3.0])])
+def test_bad_measurements_are_refused(given):
+    with pytest.raises(ValueError, match=r"value|error"):
+        Measurements(*given)
+
+
+def test_names_are_paths_or_their_ends():
+    known = ["scene.body.offset", "scene.friction.mu", "launch.spin", "launch.mu"]
+    assert full_path("free", "offset", known) == "scene.body.offset"
+    assert full_path("free", "friction.mu", known) == "scene.friction.mu"
+    with pytest.raises(ValueError, match=r"scene.friction.mu or launch.mu"):
+        full_path("free", "mu", known)
+    with pytest.raises(ValueError, match="must be one of"):
+        full_path("free", "fset", known)
+
+
+def test_without_optimistix_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "optimistix", None)
+    with pytest.raises(ImportError, match=r"pip install 'nonholonomic\[fit\]'"):
+        identify(line, Measurements(X, 1.0), as_free({"height": 1.0, "slope": 1.0}))

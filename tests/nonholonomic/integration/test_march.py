@@ -1,0 +1,202 @@
+"""The lockstep driver on problems with closed forms: events, guards, refilled lanes, order of the method."""
+
+import math
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close
+from scipy.optimize import brentq
+
+from nonholonomic.integration import (
+    CROSSED,
+    FAILED,
+    GUARD_LOST,
+    REACHED_END,
+    AbstractProblem,
+    compiled_march,
+    explicit_tableau,
+    march_by_diffrax,
+)
+from nonholonomic.integration.march import march
+from nonholonomic.integration.runge_kutta import inverse_root
+
+pytestmark = pytest.mark.newest
+
+
+class Oscillators(AbstractProblem):
+    """x = cos(w t), y = -sin(w t); the event is x = `level`, the guard y + `floor` > 0."""
+
+    frequency: jax.Array
+    level: jax.Array
+    floor: jax.Array
+
+    def start(self):
+        one = jnp.ones_like(self.frequency)
+        return jnp.stack([one, 0.0 * one]), jnp.stack([one, one])
+
+    def field(self, time, state):
+        return jnp.stack([self.frequency * state[1], -self.frequency * state[0]])
+
+    def crossing(self, state):
+        return state[0] - self.level
+
+    def guard(self, time, state):
+        return state[1] + self.floor
+
+
+def run(frequency, level=0.5, floor=2.0, t1=10.0, lanes=8, tolerance=1e-10, solver=None, **options):
+    frequency = jnp.atleast_1d(jnp.asarray(frequency, float))
+    problem = Oscillators(frequency, jnp.asarray(level), jnp.asarray(floor))
+    cells = frequency.shape[0]
+    return compiled_march(
+        problem,
+        jnp.asarray(t1),
+        jnp.asarray(cells),
+        jnp.asarray(tolerance),
+        jnp.asarray(0.1 * tolerance),
+        solver=diffrax.Dopri8() if solver is None else solver,
+        lanes=min(lanes, cells),
+        **options,
+    )
+
+
+def test_the_first_crossing_is_located():
+    """cos(w t) = 1/2 at pi/(3 w), for more cells than lanes and very different costs."""
+    frequency = np.geomspace(0.2, 50.0, 37)
+    outcome, iterations = run(frequency)
+    assert (np.asarray(outcome.status) == CROSSED).all()
+    assert_close(outcome.crossing_time, math.pi / 3.0 / frequency, rtol=1e-9)
+    assert int(outcome.steps.sum()) <= int(iterations) * 8
+
+
+def test_the_guard_ends_a_run_where_it_vanishes():
+    """y = -sin(w t) falls to -0.3 before x falls to 1/2."""
+    outcome, _ = run([1.0, 3.0], floor=0.3)
+    assert (np.asarray(outcome.status) == GUARD_LOST).all()
+    assert_close(outcome.end_time, math.asin(0.3) / np.array([1.0, 3.0]), rtol=1e-9)
+
+
+def test_the_horizon_is_met_exactly():
+    outcome, _ = run([1.0, 2.0], level=-2.0, t1=7.5)
+    assert (np.asarray(outcome.status) == REACHED_END).all()
+    assert_close(outcome.end_time, 7.5)
+    assert_close(outcome.state[0], np.cos(7.5 * np.array([1.0, 2.0])), atol=1e-8)
+    assert np.isinf(outcome.crossing_time).all()
+
+
+def test_the_last_crossing_of_many():
+    """Passing through: x falls below 1/2 at (2 pi k + pi/3)/w; the last time before t1 counts."""
+    frequency = np.array([0.7, 1.3, 5.0])
+    outcome, _ = run(frequency, passes=True, t1=20.0)
+    turns = np.floor((20.0 * frequency - math.pi / 3.0) / (2.0 * math.pi))
+    assert_close(outcome.crossing_time, (2.0 * math.pi * turns + math.pi / 3.0) / frequency, rtol=1e-9)
+    assert_close(outcome.state[0], np.cos(20.0 * frequency), atol=1e-7)
+
+
+def test_a_dip_between_the_ends_of_a_step_is_found():
+    """The guard is negative for a third of a period; a loose tolerance makes steps of half of one."""
+    outcome, _ = run([1.0], level=-2.0, floor=0.5, tolerance=1e-2)
+    assert outcome.status[0] == GUARD_LOST
+    assert_close(outcome.end_time, math.asin(0.5), atol=2e-2)
+
+
+def test_padding_is_not_run():
+    frequency = jnp.array([1.0, 2.0, 3.0, 4.0])
+    problem = Oscillators(frequency, jnp.asarray(0.5), jnp.asarray(2.0))
+    small = jnp.asarray(1e-9)
+    options = {"solver": diffrax.Dopri8(), "lanes": 4}
+    outcome, iterations = compiled_march(problem, jnp.asarray(9.0), jnp.asarray(2), small, small, **options)
+    assert_close(outcome.crossing_time[:2], math.pi / 3.0 / frequency[:2], rtol=1e-8)
+    assert outcome.steps[2:].tolist() == [0, 0]
+    _, nothing = compiled_march(problem, jnp.asarray(9.0), jnp.asarray(0), small, small, **options)
+    assert nothing == 0
+    assert iterations > 0
+
+
+def test_a_dip_between_the_stages_of_a_step_is_found():
+    """x = cos t is below -0.9999 for 0.028 s, within a step twenty times as long that sees nothing of it at its stages."""
+    level = -0.9999
+    outcome, _ = run([1.0], level=level, t1=8.0, tolerance=1e-6)
+    assert int(outcome.status[0]) == CROSSED
+    assert int(outcome.steps[0]) < 60
+    assert_close(outcome.crossing_time, [math.acos(level)], atol=1e-3)
+
+
+def test_too_many_steps_and_nonsense_are_failures():
+    outcome, _ = run([1.0], level=-2.0, t1=1e3, max_steps=20)
+    assert outcome.status[0] == FAILED
+    outcome, _ = run([math.nan], level=-2.0)
+    assert outcome.status[0] == FAILED
+
+
+def test_the_derivative_is_that_of_the_implicit_function_theorem():
+    """t = acos(level)/w: dt/dw = -t/w, dt/dlevel = -1/(w sqrt(1 - level^2)), and the second derivatives."""
+
+    def time_of(numbers):
+        problem = Oscillators(numbers[:1], numbers[1:], jnp.asarray(2.0))
+        tolerance = jnp.asarray(1e-12)
+        outcome, _ = march(
+            problem, jnp.asarray(9.0), jnp.asarray(1), tolerance, tolerance, solver=diffrax.Dopri8(), lanes=1
+        )
+        return outcome.crossing_time[0]
+
+    def exact(numbers):
+        return jnp.arccos(numbers[1]) / numbers[0]
+
+    point = jnp.array([1.7, 0.4])
+    assert_close(jax.jacfwd(time_of)(point), jax.jacfwd(exact)(point), rtol=1e-10)
+    assert_close(jax.jacfwd(jax.jacfwd(time_of))(point), jax.hessian(exact)(point), rtol=1e-8, atol=1e-9)
+
+
+class Growing(AbstractProblem):
+    """x = exp(t/20) cos(t); the event, x = -2, comes in the third period."""
+
+    def start(self):
+        return jnp.array([[1.0], [0.0]]), jnp.ones((2, 1))
+
+    def field(self, time, state):
+        return jnp.stack([0.05 * state[0] + state[1], 0.05 * state[1] - state[0]])
+
+    def crossing(self, state):
+        return state[0] + 2.0
+
+    def guard(self, time, state):
+        return None
+
+
+@pytest.mark.parametrize("solver", [diffrax.Bosh3(), diffrax.Dopri5(), diffrax.Tsit5(), diffrax.Dopri8()])
+def test_locating_an_event_adds_no_error_of_its_own(solver):
+    """The crossing time is as good as the solution: its error is that of x at the event, divided by x'."""
+    exact = brentq(lambda t: math.exp(t / 20.0) * math.cos(t) + 2.0, 15.0, 15.7, xtol=1e-15)
+    slope = math.exp(exact / 20.0) * (math.cos(exact) / 20.0 - math.sin(exact))
+    for tolerance in (1e-6, 1e-8, 1e-10):
+        small, options = jnp.asarray(tolerance), {"solver": solver, "lanes": 1}
+        located, _ = compiled_march(Growing(), jnp.asarray(20.0), jnp.asarray(1), small, small, **options)
+        reached, _ = compiled_march(Growing(), jnp.asarray(exact), jnp.asarray(1), small, small, passes=True, **options)
+        error, state_error = float(located.crossing_time[0]) - exact, float(reached.state[0, 0]) + 2.0
+        assert_close(error, -state_error / slope, rtol=0.2, atol=1e-11)
+
+
+def test_an_interpolated_event_would_be_a_hundred_times_worse():
+    """Dopri8 at 1e-10: Diffrax's dense output locates the same event with an error of 1e-8, this driver with 1e-11."""
+    exact = brentq(lambda t: math.exp(t / 20.0) * math.cos(t) + 2.0, 15.0, 15.7, xtol=1e-15)
+    small = jnp.asarray(1e-10)
+    dense = march_by_diffrax(Growing(), jnp.asarray(20.0), small, small, solver=diffrax.Dopri8())
+    located, _ = compiled_march(
+        Growing(), jnp.asarray(20.0), jnp.asarray(1), small, small, solver=diffrax.Dopri8(), lanes=1
+    )
+    assert abs(float(located.crossing_time[0]) - exact) < 0.01 * abs(float(dense.crossing_time[0]) - exact)
+
+
+def test_implicit_solvers_are_refused():
+    with pytest.raises(ValueError, match="must be an explicit Runge-Kutta solver of Diffrax"):
+        explicit_tableau(diffrax.Kvaerno5())
+
+
+@pytest.mark.parametrize("order", [2, 3, 4, 5, 8])
+def test_inverse_root(order):
+    values = jnp.array([1e-12, 0.3, 1.0, 1e9])
+    assert_close(inverse_root(values, order), np.asarray(values) ** (-1.0 / order), rtol=1e-14)

@@ -1,0 +1,79 @@
+"""Samples of many runs against closed forms."""
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close
+
+from nonholonomic.integration import GUARD_LOST, REACHED_END, AbstractProblem, march_with_samples
+
+CELLS = 40
+
+
+class Oscillators(AbstractProblem):
+    """x'' = -rate^2 x from x = 1 at rest; the guard is lost where x falls below `least`."""
+
+    rate: jnp.ndarray
+    least: jnp.ndarray
+
+    def start(self):
+        one = jnp.ones_like(self.rate)
+        return jnp.stack([one, 0.0 * one]), jnp.stack([one, self.rate])
+
+    def field(self, time, state):
+        return jnp.stack([state[1], -(self.rate**2) * state[0]])
+
+    def crossing(self, state):
+        return None
+
+    def guard(self, time, state):
+        return state[0] - self.least
+
+
+RATES = jnp.linspace(1.0, 9.0, CELLS)
+
+
+def run(times, least=-2.0, solver=None, tolerance=1e-10):
+    problem = Oscillators(RATES, jnp.full(CELLS, least))
+    options = {"solver": diffrax.Dopri8() if solver is None else solver, "lanes": 16}
+    numbers = (jnp.asarray(10.0), jnp.asarray(CELLS), jnp.asarray(tolerance), jnp.asarray(tolerance))
+    return eqx.filter_jit(march_with_samples)(problem, jnp.asarray(times), *numbers, **options)
+
+
+@pytest.mark.parametrize("count", [3, 701])
+def test_samples_are_as_good_as_the_end(count):
+    """More runs than lanes; the samples lie wider than the steps, and closer."""
+    times = np.linspace(0.0, 9.5, count)
+    outcome, samples = run(times)
+    assert np.all(outcome.status == REACHED_END)
+    errors = np.abs(samples[..., 0] - np.cos(np.outer(RATES, times)))
+    at_end = np.abs(outcome.state[0] - np.cos(10.0 * RATES))
+    assert np.max(errors) < 10.0 * np.max(at_end)
+    assert np.max(errors) < 1e-7
+
+
+def test_each_run_has_its_own_times():
+    times = np.linspace(0.3, 5.0, 7)[:, None] + np.linspace(0.0, 4.0, CELLS)
+    _, samples = run(times)
+    assert_close(samples[..., 0].T, np.cos(np.asarray(RATES) * times), atol=1e-7)
+
+
+def test_after_the_end_there_are_no_numbers():
+    times = np.linspace(0.0, 10.0, 201)
+    outcome, samples = run(times, least=0.5)
+    assert np.all(outcome.status == GUARD_LOST)
+    ends = np.pi / 3.0 / np.asarray(RATES)
+    assert_close(outcome.end_time, ends, rtol=1e-8)
+    assert np.array_equal(np.isfinite(samples[..., 0]), times <= ends[:, None])
+
+
+def test_the_error_falls_with_the_tolerance():
+    times = np.linspace(0.0, 10.0, 31)
+    errors = [
+        float(np.max(np.abs(run(times, tolerance=tolerance)[1][..., 0] - np.cos(np.outer(RATES, times)))))
+        for tolerance in (1e-6, 1e-8, 1e-10)
+    ]
+    assert errors[1] < 0.05 * errors[0]
+    assert errors[2] < 0.05 * errors[1]

@@ -1,0 +1,72 @@
+"""Start sweeps, kill them at random moments (SIGKILL), and hold what is left to the truth: `kill_sweeps.py FOLDER ROUNDS`.
+
+The sweeps run in forks of this process, so that a round costs a fraction of a second. The test suite runs this as a program
+of its own, because a process that has begun to use JAX must not fork.
+"""
+
+import os
+import random
+import signal
+import sys
+import time
+from pathlib import Path
+
+from cheap_sweep import cheap_sweep, finished_blocks, resumed
+
+from nonholonomic.sweeps import Table
+
+
+def child(path: Path, log: Path) -> int:
+    """Fork a sweep that notes in `log` each block that it begins; the number of the process."""
+    number = os.fork()
+    if number == 0:
+        try:
+            with log.open("a", buffering=1) as stream:
+
+                def note(block):
+                    stream.write(f"{block}\n")
+                    time.sleep(0.004)
+
+                cheap_sweep(path, note)
+            os._exit(0)
+        finally:
+            os._exit(1)
+    return number
+
+
+def main(folder: Path, rounds: int) -> None:
+    """Kill `rounds` sweeps; print how many of them were killed at work and how many files were filled."""
+    luck = random.Random(0)
+    sweeps = killed = cut = files = 0
+    longest = 0.3
+    path, log, before = folder / "0.h5", folder / "log", set()
+    while killed < rounds:
+        log.write_text("")
+        began = time.monotonic()
+        number = child(path, log)
+        time.sleep(luck.uniform(0.0, longest))
+        os.kill(number, signal.SIGKILL)
+        _, status = os.waitpid(number, 0)
+        sweeps += 1
+        if os.WIFEXITED(status):
+            assert os.WEXITSTATUS(status) == 0, "a sweep ended with an error"
+            longest = max(0.05, 0.9 * (time.monotonic() - began))
+        else:
+            assert os.WTERMSIG(status) == signal.SIGKILL
+            killed += 1
+            longest *= 1.05
+        begun = [int(line) for line in log.read_text().split()]
+        assert not set(begun) & before, "a finished block was computed again"
+        after = finished_blocks(Table.load(path)) if path.exists() else set()
+        assert before <= after <= before | set(begun), "a finished block was lost"
+        cut += bool(begun) and len(after) < 7
+        before = after
+        if len(after) >= luck.randint(3, 7):
+            assert resumed(path) == set(range(7)) - after
+            files += 1
+            path, before = folder / f"{files}.h5", set()
+    print(f"{sweeps} sweeps, {killed} killed, {cut} of them amid their blocks, {files} files filled")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]))

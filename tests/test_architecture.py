@@ -1,0 +1,182 @@
+"""The rooms: which way their imports point, and what stays inside them."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("nonholonomic", "tippe", "stroller")
+
+#: A room of `nonholonomic` imports only from rooms further down; those of one height only if that closes no circle.
+HEIGHT = {
+    "geometry": 0,
+    "integration": 0,
+    "formulations": 0,
+    "derivatives": 1,
+    "sweeps": 2,
+    "identification": 3,
+    "views": 4,
+}
+
+#: Rooms that check what the others compute; papers may use witnesses, and command lines, which show the papers' tables
+#: beside their own, may use papers.
+CHECKS = ("witnesses", "papers")
+
+MOST_LINES = 400
+MOST_FILES_OUTSIDE = 6
+
+
+class Arrow(NamedTuple):
+    """One import: from a file to a module, and the names taken from it; `asked` if it stands inside a function."""
+
+    file: str
+    module: str
+    names: tuple[str, ...]
+    asked: bool
+
+    def __str__(self) -> str:
+        return f"{self.file} imports {', '.join(self.names) or 'all'} from {self.module}"
+
+
+def files(*folders: str) -> list[str]:
+    return sorted(str(path.relative_to(ROOT)) for folder in folders for path in (ROOT / folder).rglob("*.py"))
+
+
+def statements(node: ast.AST, asked: bool = False) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
+    """Every import below a node and whether it stands in a function; those for type checkers alone are left out."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Import | ast.ImportFrom):
+            yield child, asked
+        elif not (isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)):
+            yield from statements(child, asked or isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef))
+
+
+def arrows_of(file: str) -> Iterator[Arrow]:
+    """The imports of this project's modules in a file; a module that is imported whole has no names."""
+    here = Path(file).parts[:-1]
+    for node, asked in statements(ast.parse((ROOT / file).read_text())):
+        if isinstance(node, ast.Import):
+            found = [(name.name, ()) for name in node.names]
+        else:
+            above = here[: len(here) - node.level + 1] if node.level else ()
+            module = ".".join([*above, *([node.module] if node.module else [])])
+            whole = [name.name for name in node.names if is_module(f"{module}.{name.name}")]
+            found = [(f"{module}.{name}", ()) for name in whole]
+            rest = tuple(name.name for name in node.names if name.name not in whole)
+            found += [(module, rest)] if rest else []
+        yield from (Arrow(file, module, names, asked) for module, names in found if module.split(".")[0] in PACKAGES)
+
+
+def is_module(name: str) -> bool:
+    path = ROOT.joinpath(*name.split("."))
+    return path.with_suffix(".py").exists() or (path / "__init__.py").exists()
+
+
+def room(name: str) -> str:
+    """The room, `package/room`, of a file or a module; the package for what stands outside of rooms."""
+    parts = name.removesuffix(".py").split("/") if "/" in name else name.split(".")
+    if parts[0] == "tests" and parts[1] in PACKAGES and len(parts) > 3:
+        parts = parts[1:]
+    inside = len(parts) > 1 and (ROOT / parts[0] / parts[1] / "__init__.py").exists()
+    return "/".join(parts[:2]) if inside else parts[0]
+
+
+ARROWS = [arrow for file in files(*PACKAGES) for arrow in arrows_of(file)]
+ALL_ARROWS = ARROWS + [arrow for file in files("tests", "benchmarks", "examples") for arrow in arrows_of(file)]
+
+
+def allowed(arrow: Arrow) -> bool:
+    """Whether an import inside the packages points the right way."""
+    start, end = room(arrow.file), room(arrow.module)
+    (package, _, here), (target, _, there) = start.partition("/"), end.partition("/")
+    if target != package:
+        return target == "nonholonomic"
+    if start == end or package != "nonholonomic" or arrow.file == f"{package}/__init__.py" or not there:
+        return True
+    if not here:
+        return False
+    # Something may show itself when it is asked to.
+    return HEIGHT[there] < HEIGHT[here] or HEIGHT[there] == HEIGHT[here] == 0 or (there == "views" and arrow.asked)
+
+
+def circle(edges: set[tuple[str, str]]) -> list[str]:
+    """What is left when everything that imports nothing left is taken away again and again: circles and what needs them."""
+    left = {end for edge in edges for end in edge}
+    while free := {one for one in left if not any(start == one and end in left for start, end in edges)}:
+        left -= free
+    return sorted(left)
+
+
+def test_the_reader_of_imports_sees_them():
+    seen = {(room(arrow.file), room(arrow.module)) for arrow in ARROWS}
+    assert {("nonholonomic/derivatives", "nonholonomic/integration"), ("tippe", "nonholonomic/geometry")} <= seen
+    assert ("nonholonomic/sweeps", "nonholonomic/views") in {
+        (room(arrow.file), room(arrow.module)) for arrow in ARROWS if arrow.asked
+    }
+    assert circle({("a", "b"), ("b", "a"), ("b", "c")}) == ["a", "b"]
+
+
+def test_every_room_has_its_height_and_says_what_it_is_for():
+    rooms = [path.parent for package in PACKAGES for path in (ROOT / package).glob("*/__init__.py")]
+    assert {path.name for path in rooms if path.parent.name == "nonholonomic"} == set(HEIGHT)
+    assert [path for path in rooms if not ast.get_docstring(ast.parse((path / "__init__.py").read_text()))] == []
+
+
+def test_imports_point_one_way():
+    assert [str(arrow) for arrow in ARROWS if not allowed(arrow)] == []
+
+
+def test_rooms_close_no_circle():
+    shown = {(room(arrow.file), room(arrow.module)) for arrow in ARROWS if arrow.asked and arrow.module.count(".views")}
+    edges = {(room(arrow.file), room(arrow.module)) for arrow in ARROWS} - shown
+    inner = {(start, end) for start, end in edges if start != end and "/" in start and "/" in end}
+    assert circle(inner) == []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_modules_close_no_circle(package):
+    edges = {
+        (arrow.file.removesuffix(".py").replace("/", "."), arrow.module)
+        for arrow in ARROWS
+        if arrow.file.startswith(package + "/") and not arrow.asked and not arrow.file.endswith("__init__.py")
+    }
+    assert circle(edges) == []
+
+
+def test_witnesses_and_papers_are_not_needed_to_compute_anything():
+    wrong = []
+    for arrow in ARROWS:
+        here, there = room(arrow.file).rpartition("/")[2], room(arrow.module).rpartition("/")[2]
+        by_right = here == there or (here, there) == ("papers", "witnesses") or arrow.file.endswith("/__main__.py")
+        if there in CHECKS and not by_right:
+            wrong.append(str(arrow))
+    assert wrong == []
+
+
+def test_private_modules_and_names_stay_in_their_rooms():
+    def private(arrow: Arrow) -> bool:
+        parts = [*arrow.module.split("."), *arrow.names]
+        return any(part.startswith("_") and not part.endswith("__") for part in parts)
+
+    assert [str(arrow) for arrow in ALL_ARROWS if private(arrow) and room(arrow.file) != room(arrow.module)] == []
+
+
+def test_no_file_is_long():
+    lengths = {file: len((ROOT / file).read_text().splitlines()) for file in files(*PACKAGES)}
+    assert {file: length for file, length in lengths.items() if length > MOST_LINES} == {}
+
+
+def test_few_files_stand_outside_of_the_rooms():
+    assert len(list((ROOT / "nonholonomic").glob("*.py"))) <= MOST_FILES_OUTSIDE
+
+
+def test_every_file_that_the_walk_names_exists():
+    named = re.findall(
+        r"`((?:tests|tippe|nonholonomic|stroller)/[\w/.]*)`", (ROOT / "docs" / "architecture.md").read_text()
+    )
+    assert named
+    assert [name for name in named if not (ROOT / name).exists()] == []

@@ -1,1 +1,0 @@
-"""Contact loss, flight, landing, the stem and leaning on it: scenes with `contact="hybrid"`."""

@@ -1,0 +1,113 @@
+"""The paper this model answers, as data: its units, tables, rotation generators and the formulas that it misprints.
+
+"Modeling of Dynamics Object with Non-Holonomic Constraints Based on Maple in Cylinder Coordinate R x S^1 x SO(3)". Its
+numbers are in g, cm and s; they are converted here and nowhere else. What became of each equation stands in `audit.py`.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..launch import Launch
+from ..scene import Scene
+from ..top import Top
+from ..witnesses.euler_angles import crossing
+
+#: The paper's units in SI.
+GRAM, CENTIMETRE = 1e-3, 1e-2
+
+#: beta1 of Tables 2 and 3 [kg m^2/s], its "2,500 g m^2 rad/s" read as 2500 g cm^2/s.
+BETA1 = 2500.0 * GRAM * CENTIMETRE**2
+#: The same with the header taken at its word [kg m^2/s].
+BETA1_AS_PRINTED = 2500.0 * GRAM
+
+#: Columns of Table 1, "Initial state of TT". Its numbers are missing from the paper.
+TABLE_1_COLUMNS = ("I [g cm^2]", "I3 [g cm^2]", "m_total [g]", "R [cm]", "D [cm]")
+
+
+class Row(NamedTuple):
+    """One row of Table 2 or 3.
+
+    - `theta`: inclination at the start [rad].
+    - `time`: time at which the paper has the top reversed [s]; None for "Not reversed".
+    """
+
+    theta: float
+    time: float | None
+
+
+class Table(NamedTuple):
+    """Table 2 or 3, whose rows share all but the inclination.
+
+    - `eta`: place at the start [rad].
+    - `mu`: coefficient of friction, of a law that the paper does not state.
+    - `rows`: the nine rows.
+    """
+
+    eta: float
+    mu: float
+    rows: tuple[Row, ...]
+
+
+THETAS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, float(jnp.pi) / 2.0)
+TABLE_2 = Table(0.0, 0.3, tuple(map(Row, THETAS, (25.0, 22.0, *(None,) * 7))))
+TABLE_3 = Table(float(jnp.pi) / 2.0, 0.3, tuple(map(Row, THETAS, (23.0, 19.0, 20.0, 22.0, *(None,) * 5))))
+
+
+def launch(table: Table, row: Row, body: Top) -> Launch:
+    """The start of a row, its beta1 = I3 omega3 read as the spin at t = 0, everything else at rest."""
+    return Launch(row.theta, BETA1 / body.I3, eta=table.eta)
+
+
+# Formulas as printed
+
+
+def rotation_generators(place: Float[Array, " 3"]) -> Float[Array, "3 3"]:
+    """The last lines of (3)-(5) as printed: fields about x, y, z in the coordinates (r, eta, y), a column each.
+
+    They are the rotations y d/dz - z d/dy and so on for x = r sin(eta), z = r cos(eta). Only the second is tangent to
+    the cylinder.
+    """
+    r, eta, y = place
+    s, c = jnp.sin(eta), jnp.cos(eta)
+    zero, one = jnp.zeros_like(s), jnp.ones_like(s)
+    about_x = jnp.stack([y * c, -y / r * s, -r * c])
+    about_y = jnp.stack([zero, one, zero])
+    about_z = jnp.stack([-y * s, -y / r * c, r * s])
+    return jnp.stack([about_x, about_y, about_z], axis=1)
+
+
+def printed_jellett(
+    scene: Scene, theta: Float[Array, ""], omega3: Float[Array, ""], eta_dot: Float[Array, ""]
+) -> Float[Array, ""]:
+    """(1) as printed: C n (R cos(theta) + A eta' R sin(theta)^2), with n the spin omega3, C = I3 and A = I1."""
+    body = scene.body
+    return body.I3 * omega3 * (body.radius * jnp.cos(theta) + body.I1 * eta_dot * body.radius * jnp.sin(theta) ** 2)
+
+
+def printed_kinetic_energy(
+    scene: Scene,
+    theta: Float[Array, ""],
+    theta_dot: Float[Array, ""],
+    phi_dot: Float[Array, ""],
+    beta1: Float[Array, ""],
+) -> Float[Array, ""]:
+    """(9) as printed: (I theta'^2 + I sin(theta)^2 phi'^2 + beta1^2 / I3) / 2 [J]."""
+    body = scene.body
+    return 0.5 * (body.I1 * (theta_dot**2 + (jnp.sin(theta) * phi_dot) ** 2) + beta1**2 / body.I3)
+
+
+def printed_normal_force(scene: Scene, state: Float[Array, " 8"], theta_2: Float[Array, ""]) -> Float[Array, ""]:
+    """(12) as printed, last expression: m (g cos(eta) + a (theta'' sin(theta) + theta'^2 cos(theta)) + r eta'^2) [N].
+
+    **Arguments:**
+
+    - `state`: (8,) as in `witnesses/euler_angles.py`; r is taken as rho, the better of its two readings.
+    - `theta_2`: theta'' [rad/s^2].
+    """
+    metric, turns = crossing(scene)
+    eta, theta, _, eta_dot, _, theta_dot, _, _ = state
+    swing = theta_2 * jnp.sin(theta) + theta_dot**2 * jnp.cos(theta)
+    pull = scene.gravity * jnp.cos(turns * eta) + metric * (turns * eta_dot) ** 2
+    return scene.body.mass * (pull + scene.body.offset * swing)

@@ -1,0 +1,12 @@
+"""What a top does between two events: slipping and rolling, flying, striking the ground, leaning on its stem.
+
+A `Scene` is built from the phases handed out here, so the files that need a `Scene` themselves, the runs through
+flights (`flight_cells`, `flight_trajectory`) and through sticking (`stick_slip_cells`, `stick_slip_path`), are
+imported by their own names.
+"""
+
+from .rolling import RollingDynamics as RollingDynamics
+from .stem import first_contact as first_contact
+from .stem import standing_spin as standing_spin
+from .stick_slip import Kind as Kind
+from .stick_slip import StickSlip as StickSlip

@@ -1,0 +1,95 @@
+"""The top free of the plane, and the spheres with which it can touch it.
+
+In contact the velocity and the height of the centre of mass follow from the axis; a free body carries them on its own.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
+
+from ..dynamics import Dynamics
+from ..top import Top
+
+
+class Ball(NamedTuple):
+    """A sphere of the body: how far its centre is from the centre of mass along e [m], and its radius [m]."""
+
+    offset: Float[Array, "..."]
+    radius: Float[Array, "..."]
+
+
+class FreeBody(NamedTuple):
+    """A top that touches nothing: velocity [m/s] and height [m] of its centre of mass, axis, angular momentum about it.
+
+    Vectors are tuples of components along x, y and the plane's normal z.
+    """
+
+    velocity: Vector
+    height: Float[Array, "..."]
+    axis: Vector
+    momentum: Vector
+
+
+def balls(body: Top) -> tuple[Ball, ...]:
+    """The spheres of a top with which it can touch the plane: its own, and that of its stem if it has one."""
+    main = Ball(body.offset, body.radius)
+    return (main,) if body.stem is None else (main, Ball(body.stem.offset, body.stem.radius))
+
+
+def standing_on(dynamics: Dynamics, ball: Ball) -> Dynamics:
+    """The equations of motion of a top that stands on another of its spheres: of the same form with its numbers."""
+    coupling = dynamics.mass * ball.offset * dynamics.per_transverse
+    return dataclasses.replace(dynamics, offset=ball.offset, radius=ball.radius, coupling=coupling)
+
+
+def freed(body: Top, ball: Ball, state: Float[Array, "components ..."]) -> FreeBody:
+    """A top that stands on a sphere, as a free body: the sphere's centre is at rest along the normal.
+
+    **Arguments:** `state`: (8, ...), as `tippe/dynamics.py` has it.
+    """
+    axis, momentum = tuple(state[2:5]), tuple(state[5:8])
+    height = ball.radius - ball.offset * axis[2]
+    return FreeBody((state[0], state[1], -ball.offset * axis_rate(body, axis, momentum)[2]), height, axis, momentum)
+
+
+def grounded(free: FreeBody) -> Float[Array, "components ..."]:
+    """The state (8, ...) of a top in contact; what is left out follows from the contact."""
+    return jnp.stack(jnp.broadcast_arrays(*free.velocity[:2], *free.axis, *free.momentum))
+
+
+def axis_rate(body: Top, axis: Vector, momentum: Vector) -> Vector:
+    """Rate of the axis e' = L x e / I1 [1/s]."""
+    return scale(1.0 / body.I1, cross(momentum, axis))
+
+
+def angular_velocity(body: Top, axis: Vector, momentum: Vector) -> Vector:
+    """w = L / I1 + (1 / I3 - 1 / I1) (L.e) e [rad/s]."""
+    along = (1.0 / body.I3 - 1.0 / body.I1) * dot(momentum, axis)
+    return sum_vectors(scale(1.0 / body.I1, momentum), scale(along, axis))
+
+
+def gap(ball: Ball, free: FreeBody) -> Float[Array, "..."]:
+    """Distance [m] of a sphere from the plane."""
+    return free.height + ball.offset * free.axis[2] - ball.radius
+
+
+def gap_rate(body: Top, ball: Ball, free: FreeBody) -> Float[Array, "..."]:
+    """Rate of that distance [m/s]."""
+    return free.velocity[2] + ball.offset * axis_rate(body, free.axis, free.momentum)[2]
+
+
+def energy(body: Top, gravity: Float[Array, "..."], free: FreeBody) -> Float[Array, "..."]:
+    """Kinetic energy plus weight times height above the plane [J]."""
+    axial = dot(free.momentum, free.axis)
+    across = dot(free.momentum, free.momentum) - axial**2
+    rotation = across / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
+    return body.mass * (0.5 * dot(free.velocity, free.velocity) + gravity * free.height) + rotation
+
+
+def jellett(ball: Ball, free: FreeBody) -> Float[Array, "..."]:
+    """Jellett's quantity L.(R n - a e) [kg m^3/s] for one of the spheres: constant while no force acts at another."""
+    return ball.radius * free.momentum[2] - ball.offset * dot(free.axis, free.momentum)

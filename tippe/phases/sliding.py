@@ -1,0 +1,286 @@
+"""Sliding as a phase of the motion, on one sphere or on both, and what follows it: a flight, the other sphere, or the end."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from nonholonomic.integration import (
+    CROSSED,
+    FAILED,
+    GUARD_LOST,
+    REACHED_END,
+    RUNNING,
+    UNRESOLVED,
+    AbstractPhase,
+    AbstractProblem,
+    Passage,
+)
+
+from ..dynamics import COS_THETA, Dynamics
+from ..scene import Scene
+from .flight import angle_reached, flown, fly
+from .free_body import Ball, FreeBody, balls, freed, gap, gap_rate, grounded, standing_on
+from .impact import strike
+from .leaning import LeaningDynamics, at_rest
+
+Cells = Float[Array, " cells"]
+
+#: A rebound slower than this part of sqrt(g R) is none: the contact closes. Its height would be half the square of it, in R.
+#: A top that rocks from one sphere to the other, ever less, comes so to lean on both. Where a top only bounces, ten times the
+#: value moves inversion times by 3e-12 and a tenth by 6e-14. Where it comes to lean the error is of first order, for the blows
+#: that are left out have friction too: an inversion after 7.3 s is late by 2.9e-7 of that, by 2.9e-6 with ten times the value.
+#: A lower value needs less round-off in `clearance`: 1e-7 with 1e-15 leaves 3e-9; 1e-6 with the 1e-12 there never closes.
+CLOSING_SPEED = 1e-5
+
+#: Two spheres are at the plane together if neither is farther from it than this part of R. Ten times the value and a tenth of
+#: it change no bit of a time.
+TOUCHING = 1e-9
+
+#: Bounces in a row after which a run is given up.
+MOST_BOUNCES = 10_000
+
+
+class Sliding(AbstractProblem):
+    """Sliding until theta reaches an angle, a contact is lost or jams, or a sphere that does not touch the plane does.
+
+    `own` is the sphere that slides and `other` the one that does not; `None` if there is none.
+    """
+
+    dynamics: Dynamics | LeaningDynamics
+    own: Ball | None
+    other: Ball | None
+    cos_angle: Float[Array, "..."]
+    states: Float[Array, "components cells"]
+    scales: Float[Array, "components cells"]
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        return self.states, self.scales
+
+    def field(self, time: Cells, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
+        return self.dynamics.field(state)
+
+    def crossing(self, state: Float[Array, "components cells"]) -> Cells:
+        return state[COS_THETA] - self.cos_angle
+
+    def guard(self, time: Cells, state: Float[Array, "components cells"]) -> Cells:
+        margin = self.dynamics.contact_margin(state)
+        if self.own is None or self.other is None:
+            return margin
+        return jnp.minimum(margin, clearance(self.own, self.other, state))
+
+
+def clearance(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    """Distance of the other sphere from the plane as a part of the own radius, plus the round-off of a change of spheres.
+
+    Ten times that round-off moves inversion times over sphere and stem by 4e-11, a tenth of it by 3e-12; that of a top that
+    comes to lean is off by 2e-9.
+    """
+    height = own.radius - other.radius + (other.offset - own.offset) * state[COS_THETA]
+    return height / own.radius + 1e-12
+
+
+class Slide(AbstractPhase):
+    """Sliding on the sphere numbered `number`, in the order of `free_body.balls`, up to an angle of theta.
+
+    The number is an array, so that one program serves both spheres; `last` says whether the run goes on through the angle.
+    """
+
+    scene: Scene
+    scales: Float[Array, "components cells"]
+    cos_angle: Float[Array, "..."]
+    number: Int[Array, ""]
+    last: bool = eqx.field(static=True)
+
+    def problem(self, state: Float[Array, "components cells"]) -> Sliding:
+        own, other = _own_and_other(balls(self.scene.body), self.number)
+        return Sliding(standing_on(self.scene.dynamics, own), own, other, self.cos_angle, state, self.scales)
+
+    def leave(self, state: Float[Array, "components cells"], left: Cells) -> Passage:
+        """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land where it is that which touches.
+
+        Counted are the flights.
+        """
+
+        def hop(carry: tuple[Air, Array]) -> tuple[Air, Array]:
+            air, count = carry
+            after, landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
+            if air.falls is not None:
+                after, landed = _where(air.falls, air, after), air.falls | landed
+            after = _where(landed, land(self.scene, after), after)
+            return _where(air.open, after, air), count + 1
+
+        def under_way(carry: tuple[Air, Array]) -> Array:
+            return jnp.any(carry[0].open) & (carry[1] < MOST_BOUNCES)
+
+        start = lost_contact(self.scene, self.number, state)
+        air, _ = jax.lax.while_loop(under_way, hop, (start, jnp.zeros((), int)))
+        status = jnp.where(air.open, UNRESOLVED, air.status)
+        return Passage(air.ball, grounded(air.free), air.elapsed, status, air.crossing_time, air.flights[None])
+
+
+class Lean(AbstractPhase):
+    """Sliding on both spheres; the phase after those of the spheres."""
+
+    scene: Scene
+    scales: Float[Array, "components cells"]
+    cos_angle: Float[Array, "..."]
+
+    def problem(self, state: Float[Array, "components cells"]) -> Sliding:
+        return Sliding(leaning(self.scene), None, None, self.cos_angle, state, self.scales)
+
+    def leave(self, state: Float[Array, "components cells"], left: Cells) -> Passage:
+        """Slide on the sphere whose normal force has not vanished."""
+        number, state = lifted(self.scene, state)
+        zero = jnp.zeros_like(state[0])
+        running, none = jnp.full(zero.shape, RUNNING), jnp.zeros((1, *zero.shape), int)
+        return Passage(number, state, zero, running, jnp.full_like(zero, jnp.inf), none)
+
+
+def phases(
+    scene: Scene, scales: Float[Array, "components cells"], cos_angle: Float[Array, "..."], last: bool
+) -> tuple[AbstractPhase, ...]:
+    """The phases of a scene: sliding on each of its spheres, and on both if there are two."""
+    spheres = len(balls(scene.body))
+    single = tuple(Slide(scene, scales, cos_angle, jnp.asarray(number), last) for number in range(spheres))
+    return single if spheres == 1 else (*single, Lean(scene, scales, cos_angle))
+
+
+def leaning(scene: Scene) -> LeaningDynamics:
+    """The equations of motion of a scene's top on both of its spheres."""
+    return LeaningDynamics(scene.body, scene.friction, scene.gravity)
+
+
+def lifted(
+    scene: Scene, state: Float[Array, "components cells"]
+) -> tuple[Int[Array, " cells"], Float[Array, "components cells"]]:
+    """The number of the sphere that stays when the other's normal force has vanished, and the state then."""
+    number = leaning(scene).heavier(state)
+    return number, grounded(at_rest(scene.body, freed(scene.body, balls(scene.body)[0], state)))
+
+
+class Air(NamedTuple):
+    """A top that may be in the air.
+
+    - `free`, `elapsed` [s]: the body and the time since the contact was lost.
+    - `ball`: the sphere that touched last; `rising`: whether it left with a speed; `falls`: whether, without a flight, it is
+      about to strike the plane, `None` for a top without stem. Once the contact is closed, the number of the phase.
+    - `status`: `RUNNING`, or how the run ended, `GUARD_LOST` if it has jammed; `crossing_time` [s] of the event, infinite if
+      there was none.
+    - `flights`: so far; `open`: whether there is no contact and the run goes on.
+    """
+
+    free: FreeBody
+    elapsed: Cells
+    ball: Int[Array, " cells"]
+    rising: Bool[Array, " cells"]
+    falls: Bool[Array, " cells"] | None
+    status: Int[Array, " cells"]
+    crossing_time: Cells
+    flights: Int[Array, " cells"]
+    open: Bool[Array, " cells"]
+
+
+def first_ball(spheres: tuple[Ball, ...], state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+    """The number of the sphere on which a launch stands: the lower one."""
+    if len(spheres) == 1:
+        return jnp.zeros(state.shape[1:], int)
+    main, stem = spheres
+    return (clearance(main, stem, state) < 0.0).astype(int)
+
+
+def lost_contact(scene: Scene, number: Int[Array, ""], state: Float[Array, "components cells"]) -> Air:
+    """The top at the end of sliding on the sphere with a number: its contact is lost or jams, or the other is at the plane."""
+    own, other = _own_and_other(balls(scene.body), number)
+    zero = jnp.zeros_like(state[0])
+    dynamics = standing_on(scene.dynamics, own)
+    falls, ball, jams = None, jnp.broadcast_to(number, zero.shape), dynamics.jams(state)
+    if other is not None:
+        falls = clearance(own, other, state) <= dynamics.contact_margin(state)
+        ball, jams = jnp.where(falls, 1 - number, number), jams & ~falls
+    return Air(
+        free=freed(scene.body, own, state),
+        elapsed=zero,
+        ball=ball,
+        rising=jnp.zeros(zero.shape, bool),
+        falls=falls,
+        status=jnp.where(jams, GUARD_LOST, RUNNING),
+        crossing_time=jnp.full_like(zero, jnp.inf),
+        flights=jnp.zeros(zero.shape, int),
+        open=~jams,
+    )
+
+
+def take_flight(
+    scene: Scene, air: Air, cos_angle: Float[Array, "..."], left: Cells, last: bool
+) -> tuple[Air, Bool[Array, " cells"]]:
+    """One flight, until a sphere reaches the plane, theta the angle (unless `last`), or the time from the loss `left` [s].
+
+    **Returns:** the top at its end; and where a sphere has reached the plane.
+    """
+    body, gravity = scene.body, scene.gravity
+    flight = fly(body, gravity, balls(body), air.free, air.ball, air.rising, jnp.maximum(left - air.elapsed, 0.0))
+    reached = angle_reached(body, air.free, cos_angle, flight.duration, last)
+    crosses = jnp.isfinite(reached) & (not last)
+    duration = jnp.where(crosses, reached, flight.duration)
+    landed = flight.landed & ~crosses & ~flight.lost
+    status = jnp.where(crosses, CROSSED, jnp.where(flight.landed, air.status, REACHED_END))
+    after = Air(
+        free=flown(body, gravity, air.free, duration),
+        elapsed=air.elapsed + duration,
+        ball=jnp.where(landed, flight.ball, air.ball),
+        rising=air.rising,
+        falls=air.falls,
+        status=jnp.where(flight.lost, FAILED, status),
+        crossing_time=jnp.where(jnp.isfinite(reached), air.elapsed + reached, air.crossing_time),
+        flights=air.flights + 1,
+        open=landed,
+    )
+    return after, landed
+
+
+def land(scene: Scene, air: Air) -> Air:
+    """The impact of the sphere that has reached the plane; slow rebounds are none, and the contact closes."""
+    body, spheres = scene.body, balls(scene.body)
+    own, other = _own_and_other(spheres, air.ball)
+    speed = jnp.maximum(-gap_rate(body, own, air.free), 0.0)
+    restitution = (
+        jnp.zeros_like(speed) if scene.restitution is None else jnp.broadcast_to(scene.restitution, speed.shape)
+    )
+    closing = CLOSING_SPEED * jnp.sqrt(scene.gravity * body.radius)
+    rebounds = restitution * speed > closing
+    free, fails = strike(body, scene.friction, own, air.free, jnp.where(rebounds, restitution, 0.0))
+    struck = air._replace(free=free, rising=rebounds, open=rebounds, status=jnp.where(fails, FAILED, air.status))
+    if other is not None:
+        struck = _with_other(scene, struck, other, closing)
+    return struck._replace(open=struck.open & ~fails)
+
+
+def _with_other(scene: Scene, air: Air, other: Ball, closing: Cells) -> Air:
+    """What an impact means to the other sphere if that is at the plane: it strikes too, or the top comes to rest on both."""
+    speed = gap_rate(scene.body, other, air.free)
+    touches = gap(other, air.free) < TOUCHING * scene.body.radius
+    falls, rests = touches & (speed < -closing), touches & (jnp.abs(speed) <= closing) & ~air.rising
+    free, number, definite = leaning(scene).settled(air.free)
+    return air._replace(
+        free=_where(rests, free, air.free),
+        ball=jnp.where(rests, number, jnp.where(falls, 1 - air.ball, air.ball)),
+        falls=falls,
+        status=jnp.where(rests & ~definite & (air.status == RUNNING), UNRESOLVED, air.status),
+        open=air.open | falls,
+    )
+
+
+def _where(condition: Bool[Array, " cells"], this: Any, that: Any) -> Any:
+    """Each leaf of one tree where a condition holds, of the other elsewhere."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), this, that)
+
+
+def _own_and_other(spheres: tuple[Ball, ...], number: Int[Array, "..."]) -> tuple[Ball, Ball | None]:
+    """The sphere with a number, and the other if there is one."""
+    if len(spheres) == 1:
+        return spheres[0], None
+    main, stem = spheres
+    return _where(number == 0, main, stem), _where(number == 0, stem, main)

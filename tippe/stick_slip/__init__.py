@@ -1,1 +1,0 @@
-"""Stick and slip under `SetValuedCoulomb`: slipping and rolling in turn."""

@@ -1,0 +1,135 @@
+"""Poincare's equations for the tippe top: the paper's (2) corrected, and the top as data for the general formulations.
+
+The frame of the configuration space has the fields X_1 = d/dpsi, which is cyclic, and besides it
+d/dtheta, (d/dphi - cos(theta) d/dpsi) / sin(theta), d/deta, d/dy and d/dgap. All commute with X_1; the bracket of the
+first two has X_1 as a component, which is where beta1 enters the equations.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic.formulations import AbstractSystem, structure_constants
+
+from ..scene import Scene
+from .euler_angles import Accelerations, metric, per_normal_force, potential, slip_velocity, spread
+
+#: Place of the cyclic angle psi among (eta, y, theta, phi, psi, gap).
+PSI = 4
+
+
+def nodal_frame(q: Float[Array, " n"]) -> Float[Array, "n n"]:
+    """The frame of the module as columns, in the order of the coordinates (eta, y, theta, phi, psi, ...).
+
+    The field that stands in the place of phi is (d/dphi - cos(theta) d/dpsi) / sin(theta).
+    """
+    s, c = jnp.sin(q[2]), jnp.cos(q[2])
+    return jnp.eye(q.size, dtype=q.dtype).at[3, 3].set(1.0 / s).at[PSI, 3].set(-c / s)
+
+
+@eqx.filter_jit
+def by_equation_2(scene: Scene, state: Float[Array, " 8"]) -> Accelerations:
+    """The paper's (2) with its indices right and with friction: Poincare's equations after Routh's reduction.
+
+    d/dt dR/dv^rho - c^l_mu,rho v^mu dR/dv^l - c^1_mu,rho v^mu beta1 - X_rho R = Q_rho, R = L - beta1 v^1,
+    beta1' = Q_1, with [X_mu, X_rho] = c^l_mu,rho X_l. The printed form has c^l where c^1 belongs and leaves out the
+    forces Q; with friction, beta1 is then no constant (`tippe.md`, section 1).
+
+    **Arguments:**
+
+    - `scene`: a `Scene` on a `Plane` or a `Cylinder`, with any friction.
+    - `state`: (8,) as in `euler_angles.py`.
+
+    **Returns:** `Accelerations`.
+    """
+    q, q_dot = spread(state)
+    frame = nodal_frame(q)
+    v = jnp.linalg.solve(frame, q_dot)
+    kept = np.delete(np.arange(6), PSI)
+    rest = v[kept]
+
+    def parts(place):
+        # R = rest.A rest / 2 + beta1 b.rest - beta1^2 / (2 g_11) - U, where g is the metric in the frame.
+        fields = nodal_frame(place)
+        g = fields.T @ metric(scene, place) @ fields
+        b = g[PSI, kept] / g[PSI, PSI]
+        return g[np.ix_(kept, kept)] - g[PSI, PSI] * jnp.outer(b, b), b, g[PSI, PSI]
+
+    A, b, axial = parts(q)
+    beta = axial * (v[PSI] + b @ rest)
+
+    def routhian(place):
+        A, b, axial = parts(place)
+        return 0.5 * rest @ A @ rest + beta * (b @ rest) - 0.5 * beta**2 / axial - potential(scene, place)
+
+    def momenta(place):
+        A, b, _ = parts(place)
+        return A @ rest + beta * b
+
+    p = momenta(q)
+    _, drift = jax.jvp(momenta, (q,), (q_dot,))
+    c = structure_constants(nodal_frame, q)
+    gyroscopic = jnp.einsum("lmr,m,l->r", c[np.ix_(kept, np.arange(6), kept)], v, p) + beta * v @ c[PSI][:, kept]
+    along = frame[:, kept].T @ jax.grad(routhian)(q)
+
+    # With the generalised forces Q = N contact, the equations are linear in the four v' that the gap leaves, and in N.
+    contact = frame.T @ per_normal_force(scene, q, q_dot)
+    column = contact[PSI] * b - contact[kept]
+    system = jnp.concatenate([A[:, :4], column[:, None]], axis=1)
+    solution = jnp.linalg.solve(system, gyroscopic + along - drift)
+    rest_dot, N = jnp.append(solution[:4], 0.0), solution[4]
+
+    def velocity(place, rest, beta):
+        _, b, axial = parts(place)
+        return nodal_frame(place) @ jnp.insert(rest, PSI, beta / axial - b @ rest)
+
+    _, second_rates = jax.jvp(velocity, (q, rest, beta), (q_dot, rest_dot, N * contact[PSI]))
+    return Accelerations(second_rates[:5], N)
+
+
+class TopSystem(AbstractSystem):
+    """The top in contact, as the data that `nonholonomic.formulations.formulation` works on: coordinates (eta, y,
+    theta, phi, psi).
+
+    **Arguments:**
+
+    - `scene`: a `Scene` on a `Plane` or a `Cylinder`. Its friction is not looked at: it needs the normal force.
+    - `rolling`: whether the contact point is at rest, the one case in which the top is nonholonomic.
+    """
+
+    scene: Scene
+    rolling: bool = eqx.field(static=True, default=False)
+
+    @property
+    def dimension(self) -> int:
+        return 5
+
+    def metric(self, q: Float[Array, " 5"]) -> Float[Array, "5 5"]:
+        return metric(self.scene, jnp.append(q, 0.0))[:5, :5]
+
+    def potential(self, q: Float[Array, " 5"]) -> Float[Array, ""]:
+        return potential(self.scene, jnp.append(q, 0.0))
+
+    def constraints(self, q: Float[Array, " 5"]) -> Float[Array, "k 5"]:
+        if not self.rolling:
+            return jnp.zeros((0, 5), q.dtype)
+        whole = jnp.append(q, 0.0)
+        return jax.jacfwd(lambda rate: slip_velocity(self.scene, whole, jnp.append(rate, 0.0)))(jnp.zeros_like(q))
+
+    def frame(self, q: Float[Array, " 5"]) -> Float[Array, "5 5"]:
+        """The nodal frame; when rolling, the first three fields carry the centre along so that the slip vanishes."""
+        frame = nodal_frame(q)
+        if not self.rolling:
+            return frame
+        slip = self.constraints(q)
+        turning = frame[:, 2:]
+        carried = turning.at[:2].add(-jnp.linalg.solve(slip[:, :2], slip @ turning))
+        return jnp.concatenate([carried, frame[:, :2]], axis=1)
+
+
+def from_angles(state: Float[Array, " 8"]) -> tuple[Float[Array, " 5"], Float[Array, " 5"]]:
+    """Coordinates and rates of `TopSystem` for a state of `euler_angles.py`; the cyclic coordinates are put to 0."""
+    q, q_dot = spread(state)
+    return q[:5], q_dot[:5]
