@@ -15,13 +15,12 @@ import argparse
 import time
 from typing import NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import tippe
-from nonholonomic.integration import CROSSED, FAILED, GUARD_LOST, compiled_march, lanes_for
+from nonholonomic.integration import CROSSED, FAILED, GUARD_LOST, Settings, compiled_march
 from tippe.inversion import InversionProblem
 from tippe.papers import paper
 
@@ -96,11 +95,7 @@ def rows(
             InversionProblem.of(scene, launch, ANGLE, BLOCK),
             jnp.asarray(options.horizon),
             jnp.asarray(count),
-            jnp.asarray(options.tolerance),
-            jnp.asarray(0.1 * options.tolerance),
-            solver=diffrax.Dopri8(),
-            lanes=lanes_for(BLOCK),
-            max_steps=100_000,
+            Settings(options.tolerance, max_steps=100_000),
         )
         time_[begin : begin + count] = outcome.crossing_time[:count]
         status[begin : begin + count] = outcome.status[:count]

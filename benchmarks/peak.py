@@ -2,14 +2,13 @@
 
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr
 from measure import timed
 
-from nonholonomic.integration import Queue, attempt, lanes_for
-from tippe.inversion import ABSOLUTE, InversionProblem
+from nonholonomic.integration import Queue, Settings, attempt
+from tippe.inversion import InversionProblem
 
 #: What counts as one operation.
 ARITHMETIC = ("add", "add_any", "sub", "mul", "div", "sqrt", "max", "min")
@@ -21,8 +20,7 @@ CHAINS, LINKS = 8, 64
 def operations_per_step(problem: InversionProblem, tolerance: float) -> float:
     """Arithmetic operations of one attempted step of one lane: stages, error, step control and event."""
     cells = problem.states.shape[1]
-    numbers = (jnp.asarray(30.0), jnp.asarray(cells), jnp.asarray(tolerance), jnp.asarray(ABSOLUTE * tolerance))
-    queue = Queue.of(problem, *numbers, solver=diffrax.Dopri8(), lanes=lanes_for(cells))
+    queue = Queue.of(problem, jnp.asarray(30.0), jnp.asarray(cells), Settings(tolerance))
     block = queue.start().block
     here = queue.here(block)
     return _counted(jax.make_jaxpr(lambda block: attempt(*here, block))(block).jaxpr) / queue.lanes

@@ -21,7 +21,6 @@ import resource
 import time
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,9 +29,9 @@ from peak import operations_per_step, peak
 from scenes import TOP
 
 import tippe
-from nonholonomic.integration import compiled_march, lanes_for
+from nonholonomic.integration import Settings, compiled_march, lanes_for
 from nonholonomic.sweeps import grid
-from tippe.inversion import ABSOLUTE, InversionProblem
+from tippe.inversion import InversionProblem
 
 ON_CPU = jax.default_backend() == "cpu"
 DOUBLE = jnp.result_type(float) == jnp.float64
@@ -92,10 +91,7 @@ def useful_share(scene: tippe.Scene) -> float:
         problem,
         jnp.asarray(30.0),
         jnp.asarray(4096),
-        jnp.asarray(TOLERANCE),
-        jnp.asarray(ABSOLUTE * TOLERANCE),
-        solver=diffrax.Dopri8(),
-        lanes=lanes_for(4096),
+        Settings(TOLERANCE),
     )
     return float(outcome.steps.sum()) / (float(iterations) * lanes_for(4096))
 
@@ -112,10 +108,7 @@ def lanes_table(scene: tippe.Scene) -> list[dict[str, str]]:
                 problem,
                 jnp.asarray(30.0),
                 jnp.asarray(cells),
-                jnp.asarray(TOLERANCE),
-                jnp.asarray(ABSOLUTE * TOLERANCE),
-                solver=diffrax.Dopri8(),
-                lanes=lanes,
+                Settings(TOLERANCE, lanes=lanes),
             )
 
         measured = timed(run, 1)

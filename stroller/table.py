@@ -15,9 +15,9 @@ from nonholonomic.integration import (
     FAILED,
     GUARD_LOST,
     AbstractProblem,
+    Settings,
     compiled_march,
     explicit_tableau,
-    lanes_for,
 )
 from nonholonomic.parameters import description, with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis
@@ -146,8 +146,7 @@ def sweep(
 
     def march(cells: dict[str, Any], size: int, count: int, watched: bool) -> tuple[RideProblem, Any]:
         problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", input), size, watched)
-        numbers = (as_number(t1), jnp.asarray(count), as_number(tolerance), as_number(0.1 * tolerance))
-        return problem, compiled_march(problem, *numbers, solver=solver, lanes=lanes_for(size))[0]
+        return problem, compiled_march(problem, as_number(t1), jnp.asarray(count), Settings(tolerance, solver))[0]
 
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
         cells = replaced(roots, columns)

@@ -15,14 +15,14 @@ from nonholonomic.integration import (
     UNRESOLVED,
     Journey,
     Outcome,
+    Settings,
     compiled_march,
-    lanes_for,
     march_by_diffrax,
 )
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Variable
 
-from .inversion import ABSOLUTE, InversionProblem, is_inverted
+from .inversion import InversionProblem, is_inverted
 from .phases.flight_cells import ride as ride_with_flights
 from .phases.stick_slip_cells import ride as ride_with_sticking
 from .scene import Scene
@@ -96,17 +96,16 @@ class Runs(NamedTuple):
             journey = self.kind.ride(scene, problem, self.t1, tolerance, self.last, self.solver, count)
             return self._named(scene, problem, journey) | dict(zip(self.kind.counts, journey.counts, strict=True))
         if not self.paths:
-            return self._named(scene, problem, self._outcome(problem, tolerance, count, size))
+            return self._named(scene, problem, self._outcome(problem, tolerance, count))
         options = {"count": count, "size": size, "solver": self.solver, "last": self.last}
         outcome, slopes = slopes_of_cells(roots, columns, self.paths, self.angle, self.t1, tolerance, **options)
         return self._named(scene, problem, outcome) | slopes
 
-    def _outcome(self, problem: InversionProblem, tolerance: float, count: int, size: int) -> Outcome:
-        horizon, rtol = jnp.asarray(self.t1), jnp.asarray(tolerance, float)
+    def _outcome(self, problem: InversionProblem, tolerance: float, count: int) -> Outcome:
+        horizon, settings = jnp.asarray(self.t1), Settings(tolerance, self.solver)
         if self.method == "diffrax":
-            return march_by_diffrax(problem, horizon, rtol, ABSOLUTE * rtol, solver=self.solver)
-        options = {"solver": self.solver, "lanes": lanes_for(size), "passes": self.last}
-        return compiled_march(problem, horizon, jnp.asarray(count), rtol, ABSOLUTE * rtol, **options)[0]
+            return march_by_diffrax(problem, horizon, settings)
+        return compiled_march(problem, horizon, jnp.asarray(count), settings, passes=self.last)[0]
 
     def _named(self, scene: Scene, problem: InversionProblem, ended: Outcome | Journey) -> dict[str, Any]:
         inverted = is_inverted(ended, problem, self.last)

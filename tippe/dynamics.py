@@ -22,10 +22,10 @@ from nonholonomic.geometry import (
     dot,
     multiply,
     scale,
-    stored,
     subtract,
     sum_vectors,
 )
+from nonholonomic.xla_cpu import stored
 
 from .friction import AbstractFriction, ContactLoad, Slip
 from .top import Top

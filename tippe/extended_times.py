@@ -4,17 +4,16 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.derivatives import VariationalProblem, in_groups, lanes_along
-from nonholonomic.integration import CROSSED, FAILED, Queue, crossing_time
+from nonholonomic.derivatives import VariationalProblem, in_groups
+from nonholonomic.integration import CROSSED, FAILED, Queue, Settings, crossing_time
 from nonholonomic.validation import as_number
 
-from .inversion import ABSOLUTE, InversionProblem, check_smooth
+from .inversion import InversionProblem, check_smooth
 from .launch import Launch
 from .scene import Scene
 
@@ -110,11 +109,7 @@ def _times_and_slopes(
         varied,
         t1,
         jnp.asarray(cells),
-        tolerance,
-        ABSOLUTE * tolerance,
-        solver=diffrax.Dopri8(),
-        lanes=lanes_along(cells, len(directions)),
-        max_steps=MOST_STEPS,
+        Settings(tolerance, max_steps=MOST_STEPS),
         one_kernel=cells >= MANY,
         parts=1 + len(directions),
     ).outcome()

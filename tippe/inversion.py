@@ -19,8 +19,8 @@ from nonholonomic.integration import (
     AbstractProblem,
     Journey,
     Outcome,
+    Settings,
     explicit_tableau,
-    lanes_for,
     traced_march,
 )
 from nonholonomic.parameters import numbers
@@ -30,9 +30,6 @@ from .dynamics import COS_THETA, Dynamics
 from .launch import Launch
 from .phases import Kind, StickSlip
 from .scene import Scene
-
-#: The absolute tolerance is this part of the relative one, in units of the state's own magnitudes.
-ABSOLUTE = 0.1
 
 #: The greatest relative tolerance that is accepted.
 LOOSEST = 1e-2
@@ -140,10 +137,7 @@ class InversionQuestion(AbstractQuestion):
             problem,
             t1,
             jnp.asarray(cells),
-            tolerance,
-            ABSOLUTE * tolerance,
-            solver=self.solver,
-            lanes=lanes_for(cells),
+            Settings(tolerance, self.solver),
             passes=self.last,
             one_kernel=True,
         )
@@ -161,9 +155,7 @@ class InversionQuestion(AbstractQuestion):
             directions,
             t1,
             jnp.asarray(cells),
-            tolerance,
-            ABSOLUTE * tolerance,
-            solver=self.solver,
+            Settings(tolerance, self.solver),
             passes=self.last,
             one_kernel=not again,
         )

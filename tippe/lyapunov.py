@@ -11,11 +11,11 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from nonholonomic.derivatives import exponent_of, growth
 from nonholonomic.geometry import cross
-from nonholonomic.integration import GUARD_LOST, REACHED_END, explicit_tableau
+from nonholonomic.integration import GUARD_LOST, REACHED_END, Settings, explicit_tableau
 from nonholonomic.validation import require
 
 from .cells import kind_of
-from .inversion import ABSOLUTE, InversionProblem
+from .inversion import InversionProblem
 from .launch import Launch
 from .scene import Scene
 
@@ -84,7 +84,7 @@ def lyapunov_exponent(
     cells = int(np.prod(shape, dtype=int))
     # No angle has a cosine of 2: nothing but a contact that is lost or jams ends a run before the horizon.
     problem = dataclasses.replace(InversionProblem.of(scene, launch, jnp.pi, cells), cos_angle=jnp.asarray(-2.0))
-    found = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, tolerance, ABSOLUTE, solver)
+    found = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, Settings(tolerance, solver))
     exponent, error = exponent_of(found.logarithm, float(t1))
     whole = found.status == REACHED_END
     jams = np.asarray(problem.dynamics.jams(jnp.asarray(found.state)))

@@ -14,22 +14,20 @@ from nonholonomic.derivatives import (
     ask,
     directions_by,
     in_groups,
-    lanes_along,
     probed,
 )
 from nonholonomic.integration import (
     FAILED,
     GUARD_LOST,
     AbstractProblem,
+    Settings,
     event_time,
-    lanes_for,
     march_with_samples,
     sample,
 )
 from nonholonomic.validation import as_number
 
 from .dynamics import Dynamics, stacked
-from .inversion import ABSOLUTE
 from .launch import Launch
 from .phases import Kind, StickSlip
 from .scene import Scene
@@ -131,7 +129,7 @@ def sampled_by_diffrax(
 ) -> Found:
     """Run one launch and let Diffrax differentiate its steps, which a probe keeps short enough for tangents."""
     size = len(run.scales)
-    path = sample(probed(run), times, t1, solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance, adjoint=adjoint)
+    path = sample(probed(run), times, t1, Settings(tolerance, solver), adjoint)
     status = ended(run, path.end_state[:size], path.lost, path.end_time < t1)
     floats = [part.astype(float) for part in (status, path.accepted, path.rejected)]
     return Found(path.states[:size].T, path.end_time, *floats)
@@ -156,7 +154,7 @@ class BlockSampling(AbstractQuestion):
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Found:
         problem = self.run(leaves[: self.movable], cells)
-        return _march(VariationalProblem(problem, (), False), leaves[self.movable :], self.solver, lanes_for(cells))[0]
+        return _march(VariationalProblem(problem, (), False), leaves[self.movable :], self.solver)[0]
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
@@ -164,10 +162,8 @@ class BlockSampling(AbstractQuestion):
         problem, directions, gather = directions_by(self.run, active, leaves[: self.movable], cells)
 
         def run(some: tuple[Any, ...]) -> tuple[Found, list[Found]]:
-            lanes = lanes_along(cells, len(some))
-            return _march(
-                VariationalProblem(problem, some, False), leaves[self.movable :], self.solver, lanes, not again
-            )
+            varied = VariationalProblem(problem, some, False)
+            return _march(varied, leaves[self.movable :], self.solver, not again)
 
         found, slopes = in_groups(run, directions)
         return found, gather(slopes)
@@ -178,7 +174,6 @@ def _march(
     varied: VariationalProblem,
     given: tuple[Array, Array, Array],
     solver: diffrax.AbstractERK,
-    lanes: int,
     one_kernel: bool = True,
 ) -> tuple[Found, list[Found]]:
     """What is found of the cells, and its slope along each of the directions."""
@@ -191,10 +186,7 @@ def _march(
         times if times.ndim == 1 else times.T,
         t1,
         jnp.asarray(cells),
-        tolerance,
-        ABSOLUTE * tolerance,
-        solver=solver,
-        lanes=lanes,
+        Settings(tolerance, solver),
         parts=parts,
         one_kernel=one_kernel,
     )
@@ -275,6 +267,6 @@ def _follow(
 ) -> tuple[Found, list[Found]]:
     """What is found of a run, and its slope along each of the directions."""
     times, t1, tolerance = given
-    path = sample(varied, times, t1, solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
+    path = sample(varied, times, t1, Settings(tolerance, solver))
     ends = Ends(path.end_time, path.end_state, path.lost, (path.end_time < t1) & ~path.lost)
     return _found(varied, path.states.T, ends, path.accepted, path.rejected)

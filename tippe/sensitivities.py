@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.derivatives import compiled_march_with_slopes, directions_of, natural_size
-from nonholonomic.integration import Outcome
+from nonholonomic.integration import Outcome, Settings
 from nonholonomic.parameters import full_path, numbers, with_numbers
 from nonholonomic.sweeps import Variable
 
-from .inversion import ABSOLUTE, InversionProblem, is_inverted
+from .inversion import InversionProblem, is_inverted
 
 
 def sensitivity_paths(roots: dict[str, Any], names: Any) -> list[str]:
@@ -79,9 +79,7 @@ def slopes_of_cells(
         directions,
         jnp.asarray(t1, float),
         jnp.asarray(count),
-        jnp.asarray(tolerance, float),
-        jnp.asarray(ABSOLUTE * tolerance, float),
-        solver=solver,
+        Settings(tolerance, solver),
         passes=last,
     )
     inverted = is_inverted(outcome, problem, last)

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import dot
-from nonholonomic.integration import follow
+from nonholonomic.integration import Settings, follow
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require, require_all
 
-from .inversion import ABSOLUTE, check_run, run_bounds
+from .inversion import check_run, run_bounds
 from .launch import Launch
 from .phases.flight_trajectory import HybridTrajectory, simulate_hybrid
 from .phases.stick_slip_path import follow_stick_slip
@@ -205,7 +205,7 @@ def simulate(
         return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
     run = Run.of(scene, launch)
     through = follow_stick_slip if scene.friction.set_valued else follow
-    path = through(run, float(t1), solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
+    path = through(run, float(t1), Settings(tolerance, solver))
     trajectory = _as_trajectory(scene, run, path)
     if times is None:
         return trajectory

@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +15,7 @@ import tippe
 from hard.lagrange import theta_by_lagrange
 from hard.limits import rutstam_top
 from hard.row import Row, of_runs
-from nonholonomic.integration import Path, follow
+from nonholonomic.integration import Path, Settings, follow
 from tippe.trajectory import Run
 
 GRAVITY = 9.81
@@ -80,7 +79,7 @@ def set_going(scene: tippe.Scene, launch: tippe.Launch, velocity: float, momentu
     run = Run.of(scene, launch)
     state = run.state.at[0].set(velocity).at[6].add(momentum)
     run = Run(run.dynamics, run.axial, state, run.path, run.scales)
-    return follow(run, end, solver=diffrax.Dopri8(), rtol=1e-12, atol=1e-13)
+    return follow(run, end, Settings(1e-12))
 
 
 def ball_that_drills() -> Row:

@@ -15,5 +15,4 @@ from .slopes import directions_of as directions_of
 from .slopes import traced_march_with_slopes as traced_march_with_slopes
 from .variation import VariationalProblem as VariationalProblem
 from .variation import in_groups as in_groups
-from .variation import lanes_along as lanes_along
 from .variation import natural_size as natural_size

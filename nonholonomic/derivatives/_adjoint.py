@@ -26,6 +26,7 @@ from ..integration import (
     Outcome,
     Progress,
     Queue,
+    Settings,
     States,
     attempt,
     length_to_try,
@@ -117,17 +118,14 @@ def march_with_gradient(
     probe: Any,
     t1: Float[Array, "..."],
     cells: Int[Array, ""],
-    rtol: Float[Array, ""],
-    atol: Float[Array, ""],
+    settings: Settings,
     *,
     measured: Measured,
-    solver: diffrax.AbstractERK,
-    lanes: int,
     one_kernel: bool = False,
 ) -> tuple[Outcome, Float[Array, "components cells"], Any]:
     """Run every cell to its end, and differentiate what is measured there by the numbers of the problem.
 
-    **Arguments:** as for `march`, but `passes` and `max_steps`, and
+    **Arguments:** as for `march`, except `passes`, and
 
     - `problem`: without directions.
     - `moving`: a tree like the problem of booleans: which of its numbers to differentiate by, scalars or (cells,).
@@ -156,7 +154,7 @@ def march_with_gradient(
         is_leaf=lambda rate: rate is None,
     )
     probed = dataclasses.replace(problem, directions=(probe,))
-    queue = Queue.of(probed, t1, cells, rtol, atol, solver=solver, lanes=lanes, one_kernel=one_kernel, parts=2)
+    queue = Queue.of(probed, t1, cells, settings, one_kernel=one_kernel, parts=2)
     rows = components + len(jax.tree.leaves(numbers))
 
     def period(run: Backward) -> Backward:
@@ -181,7 +179,7 @@ def march_with_gradient(
         kept=Kept.of(queue.start()),
         needed=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
         outcome=queue.empty(),
-        adjoint=jnp.zeros((rows, lanes), states.dtype),
+        adjoint=jnp.zeros((rows, queue.lanes), states.dtype),
         gradient=jnp.zeros((rows, size), states.dtype),
     )
     run = jax.lax.while_loop(lambda run: run.needed > 0, period, run)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import Literal
 
-from ..geometry import stored
+from ..xla_cpu import stored
 
 #: A value is stored if computing it anew for every use would cost so many operations more.
 WORTH_STORING = 2

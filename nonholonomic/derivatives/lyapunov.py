@@ -9,13 +9,12 @@ and lengths are those of the state in units of the problem's magnitudes.
 import math
 from typing import NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..integration import REACHED_END, RUNNING, AbstractProblem, compiled_march, lanes_for
+from ..integration import REACHED_END, RUNNING, AbstractProblem, Settings, compiled_march
 
 
 class VariedProblem(AbstractProblem):
@@ -69,7 +68,7 @@ class Growth(NamedTuple):
     """How a direction grew in every cell, in equal stretches of time.
 
     - `logarithm`: of the growth in each stretch.
-    - `status`: code of `integration/lockstep.py`: how the run ended; `end_time` [s] and `state`: when and where;
+    - `status`: code of `integration/status.py`: how the run ended; `end_time` [s] and `state`: when and where;
       `steps`: accepted and rejected ones.
     """
 
@@ -85,9 +84,7 @@ def growth(
     directions: Float[Array, "components cells"],
     t1: float,
     stretches: int,
-    tolerance: float,
-    absolute: float,
-    solver: diffrax.AbstractERK,
+    settings: Settings,
 ) -> Growth:
     """Follow every cell of an autonomous problem and a direction in it.
 
@@ -97,23 +94,19 @@ def growth(
     - `directions`: to follow, in the problem's own units.
     - `t1`: horizon [s].
     - `stretches`: of time, in each of which the growth is counted by itself.
-    - `tolerance`, `absolute`: relative tolerance, and the absolute one as a part of it, in units of the magnitudes.
-    - `solver`: an explicit Runge-Kutta solver of Diffrax.
+    - `settings`: with an explicit Runge-Kutta solver of Diffrax.
 
     **Returns:** the `Growth`; nothing grows in a cell after its run has ended.
     """
     start, magnitudes = problem.start()
     size, cells = start.shape
-    rtol, atol, stretch = jnp.asarray(tolerance), jnp.asarray(absolute * tolerance), jnp.asarray(t1 / stretches)
-    direction = directions / magnitudes
+    stretch, direction = jnp.asarray(t1 / stretches), directions / magnitudes
     logarithms, end_time, status = [], np.zeros(cells), np.full(cells, RUNNING)
     steps, state = np.zeros(cells, int), np.asarray(start)
     for _ in range(stretches):
         unit = direction / jnp.linalg.norm(direction, axis=0)
         varied = VariedProblem(problem, jnp.concatenate([start, unit, jnp.zeros((1, cells))]), magnitudes)
-        outcome, _ = compiled_march(
-            varied, stretch, jnp.asarray(cells), rtol, atol, solver=solver, lanes=lanes_for(cells)
-        )
+        outcome, _ = compiled_march(varied, stretch, jnp.asarray(cells), settings)
         alive = (status == RUNNING) | (status == REACHED_END)
         logarithms.append(np.where(alive, outcome.state[-1], 0.0))
         end_time += np.where(alive, outcome.end_time, 0.0)

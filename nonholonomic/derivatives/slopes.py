@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,9 +14,10 @@ from jax.extend.core import Literal
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from ..integration import AbstractProblem, Block, Outcome, Queue, alone, lanes_for, with_crossing_times
+from ..integration import AbstractProblem, Block, Outcome, Queue, Settings, with_crossing_times
+from ..xla_cpu import compiled_alone
 from ._adjoint import march_with_gradient
-from .variation import VariationalProblem, in_groups, lanes_along, slopes_by_variations
+from .variation import VariationalProblem, in_groups, slopes_by_variations
 
 
 def march_with_slopes(
@@ -25,16 +25,14 @@ def march_with_slopes(
     directions: tuple[Any, ...],
     t1: Float[Array, "..."],
     cells: Int[Array, ""],
-    rtol: Float[Array, ""],
-    atol: Float[Array, ""],
+    settings: Settings,
     *,
-    solver: diffrax.AbstractERK,
     passes: bool = False,
     one_kernel: bool = False,
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """Run every cell, and differentiate the time of its event in some directions.
 
-    **Arguments:** as for `march`, but `lanes` and `max_steps`, and
+    **Arguments:** as for `march`, and
 
     - `directions`: tangents of the problem, as for `VariationalProblem`. Their variations, or a mixture of them, take part in
       step control.
@@ -44,21 +42,19 @@ def march_with_slopes(
     **Returns:** the `Outcome`, and for each direction the derivative of `crossing_time`, 0 where that is infinite. Source:
     implicit function theorem at the event; step lengths are held fixed.
     """
-    size = problem.start()[0].shape[1]
-    options = {"solver": solver, "one_kernel": one_kernel}
     horizon = t1
     if passes:
-        whole = Queue.of(problem, t1, cells, rtol, atol, passes=True, lanes=lanes_for(size), **options)
+        whole = Queue.of(problem, t1, cells, settings, passes=True, one_kernel=one_kernel)
         outcome = whole.outcome()[0]
         # The slopes need the run up to the event alone, whose time is known by now.
         horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
-    given = (not passes, horizon, cells, rtol, atol)
+    given = (not passes, horizon, cells, settings)
 
     def along(some: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
-        return slopes_by_variations(problem, some, *given, lanes=lanes_along(size, len(some)), **options)
+        return slopes_by_variations(problem, some, *given, one_kernel=one_kernel)
 
     if one_kernel and len(directions) > 1:
-        there, slopes = _slopes_by_adjoint(problem, directions, *given, lanes=lanes_for(size), **options)
+        there, slopes = _slopes_by_adjoint(problem, directions, *given)
     else:
         there, slopes = in_groups(along, directions)
     if not passes:
@@ -69,7 +65,7 @@ def march_with_slopes(
 
 
 def _slopes_by_adjoint(
-    problem: AbstractProblem, directions: tuple[Any, ...], ends_on_event: bool, *given: Any, **options: Any
+    problem: AbstractProblem, directions: tuple[Any, ...], ends_on_event: bool, *given: Any
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """What `slopes_by_variations` gives, at a cost that does not depend on the number of directions."""
     moving = _moving(problem, directions[0])
@@ -80,7 +76,7 @@ def _slopes_by_adjoint(
         _mixed(directions),
         *given,
         measured=_event_time,
-        **options,
+        one_kernel=True,
     )
 
     def slope(direction: Any) -> Float[Array, " cells"]:
@@ -129,7 +125,7 @@ def _moving(problem: AbstractProblem, direction: Any) -> Any:
 
 
 #: `march_with_slopes`, compiled on its own, for use outside of other transformed functions.
-compiled_march_with_slopes = alone(eqx.Partial(march_with_slopes, one_kernel=True))
+compiled_march_with_slopes = compiled_alone(eqx.Partial(march_with_slopes, one_kernel=True))
 
 #: `march_with_slopes`, for use inside other transformed functions.
 traced_march_with_slopes = eqx.filter_jit(march_with_slopes)

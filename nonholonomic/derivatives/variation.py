@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..integration import AbstractProblem, Outcome, Queue, crossing_time, lanes_for
+from ..integration import AbstractProblem, Outcome, Queue, crossing_time
 
 #: Directions that run along together: more of them cost less time in all, but more to compile.
 TOGETHER = 2
@@ -22,11 +22,6 @@ TOGETHER = 2
 def natural_size(number: Float[Array, "..."]) -> Float[Array, "..."]:
     """By how much to move a number: by its own size, or by 1 where it is zero."""
     return jax.lax.stop_gradient(jnp.where(number == 0.0, 1.0, jnp.abs(number)))
-
-
-def lanes_along(cells: int, directions: int) -> int:
-    """How many cells should advance together with their variations in some directions: the whole state fits the caches."""
-    return max(8, 3 * lanes_for(cells) // (2 + 2 * directions)) if directions else lanes_for(cells)
 
 
 class VariationalProblem(AbstractProblem):
@@ -76,7 +71,7 @@ class VariationalProblem(AbstractProblem):
 
 
 def slopes_by_variations(
-    problem: AbstractProblem, directions: tuple[Any, ...], ends_on_event: bool, *given: Any, **options: Any
+    problem: AbstractProblem, directions: tuple[Any, ...], ends_on_event: bool, *given: Any, one_kernel: bool
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """Run every cell with its variations, and let them move the event at its end.
 
@@ -84,14 +79,14 @@ def slopes_by_variations(
 
     - `problem`, `directions`: as for `VariationalProblem`.
     - `ends_on_event`: whether runs end on the event, or at the horizon, which is then the event's time.
-    - `given`, `options`: horizon, number of cells and tolerances, and the rest, as for `Queue.of`.
+    - `given`, `one_kernel`: horizon, number of cells and settings, as for `Queue.of`.
 
     **Returns:** the `Outcome`, with crossing times left out, and for each direction the derivative of the event's time.
     """
     varied = VariationalProblem(problem, directions, ends_on_event)
     # The variations take part in step control: the state alone may be at rest where its tangent is not, and steps would
     # outgrow what the tangent can bear.
-    there, _ = Queue.of(varied, *given, parts=1 + len(directions), **options).outcome()
+    there, _ = Queue.of(varied, *given, parts=1 + len(directions), one_kernel=one_kernel).outcome()
     state, *variations = varied.parts(there.state)
 
     def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:

@@ -23,6 +23,5 @@ from .vector import cross as cross
 from .vector import dot as dot
 from .vector import multiply as multiply
 from .vector import scale as scale
-from .vector import stored as stored
 from .vector import subtract as subtract
 from .vector import sum_vectors as sum_vectors

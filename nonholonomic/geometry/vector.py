@@ -7,9 +7,6 @@ vanishes identically (no curvature on a plane, no force without friction). Sums 
 
 from typing import Any, TypeAlias
 
-import jax
-import jax.numpy as jnp
-
 #: An array over the lanes, a number, or `None` where the component vanishes identically.
 Component: TypeAlias = Any
 Vector: TypeAlias = tuple[Component, Component, Component]
@@ -64,16 +61,3 @@ def cross(left: Vector, right: Vector) -> Vector:
 def sum_vectors(*vectors: tuple[Component, ...]) -> tuple[Component, ...]:
     """Sum of vectors of the same length."""
     return tuple(add(*components) for components in zip(*vectors, strict=True))
-
-
-def stored(*components: Component) -> tuple[Component, ...]:
-    """The same components, computed once where several results depend on them.
-
-    XLA otherwise fuses every result with all that leads to it and evaluates the common part again for each. A barrier
-    alone does not keep it from that; joining the components, with a barrier behind it, does.
-    """
-    present = [component for component in components if component is not None]
-    if not present:
-        return components
-    joined = iter(jnp.unstack(jax.lax.optimization_barrier(jnp.stack(jnp.broadcast_arrays(*present)))))
-    return tuple(None if component is None else next(joined) for component in components)

@@ -2,33 +2,25 @@
 
 `compiled_march` runs many cells of a problem in lanes that keep step with one another; `travel` runs cells
 through phases; `follow` and `sample` are single runs with any solver of Diffrax, and `march_by_diffrax` is the
-independent second road. The codes of a run's status are `RUNNING`, `CROSSED`, `GUARD_LOST`, `REACHED_END` and
-`FAILED`.
+independent second road. `Settings` says how, and the codes of a run's status are `RUNNING`, `REACHED_END`,
+`CROSSED`, `GUARD_LOST`, `FAILED` and `UNRESOLVED`.
 """
 
+from .attempt import Block as Block
+from .attempt import attempt as attempt
+from .attempt import length_to_try as length_to_try
 from .diffrax_march import march_by_diffrax as march_by_diffrax
-from .lockstep import CROSSED as CROSSED
-from .lockstep import FAILED as FAILED
-from .lockstep import GUARD_LOST as GUARD_LOST
-from .lockstep import REACHED_END as REACHED_END
-from .lockstep import RUNNING as RUNNING
-from .lockstep import AbstractProblem as AbstractProblem
-from .lockstep import Block as Block
-from .lockstep import attempt as attempt
-from .lockstep import crossing_time as crossing_time
-from .lockstep import event_time as event_time
-from .lockstep import length_to_try as length_to_try
-from .march import alone as alone
 from .march import compiled_march as compiled_march
-from .march import lanes_for as lanes_for
 from .march import traced_march as traced_march
 from .march import with_crossing_times as with_crossing_times
 from .midpoint import ImplicitMidpoint as ImplicitMidpoint
-from .phases import UNRESOLVED as UNRESOLVED
 from .phases import AbstractPhase as AbstractPhase
 from .phases import Journey as Journey
 from .phases import Passage as Passage
 from .phases import travel as travel
+from .problem import AbstractProblem as AbstractProblem
+from .problem import crossing_time as crossing_time
+from .problem import event_time as event_time
 from .queue import Outcome as Outcome
 from .queue import Progress as Progress
 from .queue import Queue as Queue
@@ -37,7 +29,15 @@ from .runge_kutta import States as States
 from .runge_kutta import explicit_tableau as explicit_tableau
 from .runge_kutta import moved_state as moved_state
 from .samples import march_with_samples as march_with_samples
-from .single_run import MOST_STEPS as MOST_STEPS
+from .settings import ABSOLUTE as ABSOLUTE
+from .settings import Settings as Settings
+from .settings import lanes_for as lanes_for
 from .single_run import Path as Path
 from .single_run import follow as follow
 from .single_run import sample as sample
+from .status import CROSSED as CROSSED
+from .status import FAILED as FAILED
+from .status import GUARD_LOST as GUARD_LOST
+from .status import REACHED_END as REACHED_END
+from .status import RUNNING as RUNNING
+from .status import UNRESOLVED as UNRESOLVED

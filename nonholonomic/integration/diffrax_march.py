@@ -7,30 +7,31 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Float
 
-from .lockstep import CROSSED, FAILED, GUARD_LOST, REACHED_END, AbstractProblem
 from .march import Outcome
+from .problem import AbstractProblem
+from .settings import Settings
 from .single_run import saved
+from .status import CROSSED, FAILED, GUARD_LOST, REACHED_END
+
+#: A run that needs more has failed.
+MOST_STEPS = 100_000
 
 
 @eqx.filter_jit
 def march_by_diffrax(
     problem: AbstractProblem,
     t1: Float[Array, ""],
-    rtol: Float[Array, ""],
-    atol: Float[Array, ""],
-    *,
-    solver: diffrax.AbstractSolver,
-    max_steps: int = 100_000,
+    settings: Settings,
 ) -> Outcome:
     """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`.
 
     The guard is looked at where steps end; events are located on Diffrax's dense output.
 
-    **Arguments:** as for `march`; any solver of Diffrax will do.
+    **Arguments:** as for `march`, but any solver of Diffrax will do.
 
     **Returns:** the `Outcome`.
     """
-    starts, scales = problem.start()
+    (starts, scales), rtol = problem.start(), settings.tolerance
     varying = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 0 else -1, problem)
 
     def one(here: AbstractProblem, state: Array, scale: Array) -> Outcome:
@@ -44,14 +45,14 @@ def march_by_diffrax(
         event = diffrax.Event(list(conditions.values()), root_finder=optimistix.Newton(1e-13, 1e-13))
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-            solver,
+            settings.solver,
             0.0,
             t1,
             None,
             state,
             args=here,
-            stepsize_controller=diffrax.PIDController(rtol, atol * scale),
-            max_steps=max_steps,
+            stepsize_controller=diffrax.PIDController(rtol, settings.absolute * rtol * scale),
+            max_steps=min(settings.max_steps, MOST_STEPS),
             event=event if conditions else None,
             throw=False,
         )
@@ -63,11 +64,12 @@ def march_by_diffrax(
         return Outcome(
             status,
             jnp.where(status == CROSSED, end, jnp.inf),
+            jnp.where(status == CROSSED, end, jnp.inf),
             end,
             final,
             solution.stats["num_steps"],
             solution.stats["num_rejected_steps"],
         )
 
-    out = Outcome._make((0, 0, 0, -1, 0, 0))
+    out = Outcome._make((0, 0, 0, 0, -1, 0, 0))
     return jax.vmap(one, in_axes=(varying, -1, -1), out_axes=out)(problem, starts, scales)

@@ -9,28 +9,25 @@ fast ways to first derivatives.
 
 import functools
 
-import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .lockstep import CROSSED, AbstractProblem, crossing_time
+from ..xla_cpu import compiled_alone
+from .problem import AbstractProblem, crossing_time
 from .queue import Outcome as Outcome
 from .queue import Queue
+from .settings import Settings
+from .status import CROSSED
 
 
 def march(
     problem: AbstractProblem,
     t1: Float[Array, "..."],
     cells: Int[Array, ""],
-    rtol: Float[Array, ""],
-    atol: Float[Array, ""],
+    settings: Settings,
     *,
-    solver: diffrax.AbstractERK,
-    lanes: int,
     passes: bool = False,
-    max_steps: int = 2_000_000,
     one_kernel: bool = False,
 ) -> tuple[Outcome, Int[Array, ""]]:
     """Run every cell of a problem from t = 0 to its event, to the end of the model's validity, or to `t1`.
@@ -41,29 +38,14 @@ def march(
     - `t1`: horizon [s], one for all or one per cell.
     - `cells`: how many of the problem's cells to run; the rest is padding, so that one compiled program serves grids of
       different sizes.
-    - `rtol`, `atol`: relative tolerance, and absolute tolerance in units of the problem's magnitudes.
-    - `solver`: an explicit Runge-Kutta solver of Diffrax.
-    - `lanes`: how many cells advance together.
+    - `settings`: with an explicit Runge-Kutta solver of Diffrax.
     - `passes`: whether a run goes on through the event, in either direction, rather than ending there.
-    - `max_steps`: a cell that needs more has failed.
     - `one_kernel`: whether to have the loop compiled into a single kernel on a CPU, which halves its cost; not for
       programs that are differentiated again.
 
-    **Returns:** the `Outcome`, and the number of lockstep iterations, each of which advanced `lanes` lanes.
+    **Returns:** the `Outcome`, and the number of lockstep iterations, each of which advanced a block of lanes.
     """
-    queue = Queue.of(
-        problem,
-        t1,
-        cells,
-        rtol,
-        atol,
-        solver=solver,
-        lanes=lanes,
-        passes=passes,
-        max_steps=max_steps,
-        one_kernel=one_kernel,
-    )
-    outcome, iterations = queue.outcome()
+    outcome, iterations = Queue.of(problem, t1, cells, settings, passes=passes, one_kernel=one_kernel).outcome()
     return (outcome if passes else with_crossing_times(problem, outcome)), iterations
 
 
@@ -74,24 +56,12 @@ def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
     time = crossing_time(problem, outcome.end_time, outcome.state)
     # A cell that starts beyond the event is there at once.
     time = jnp.where(outcome.end_time > 0.0, time, 0.0)
-    return outcome._replace(crossing_time=jnp.where(outcome.status == CROSSED, time, jnp.inf))
+    time = jnp.where(outcome.status == CROSSED, time, jnp.inf)
+    return outcome._replace(first_crossing=time, crossing_time=time)
 
-
-#: JAX takes compiler options only for the outermost compiled function. Wide vectors pay here, although compilers shy away
-#: from them: the sums over stages are streams of multiply-adds.
-alone = eqx.filter_jit(compiler_options={"xla_cpu_prefer_vector_width": 512})
 
 #: `march`, compiled on its own, for use outside of other transformed functions.
-compiled_march = alone(functools.partial(march, one_kernel=True))
+compiled_march = compiled_alone(functools.partial(march, one_kernel=True))
 
 #: `march`, for use inside other transformed functions.
 traced_march = eqx.filter_jit(march)
-
-
-def lanes_for(cells: int) -> int:
-    """How many cells should advance together.
-
-    On a CPU a block and its stages should fit the first caches; an accelerator is idle below tens of thousands.
-    """
-    most = 64 if jax.default_backend() == "cpu" else 32768
-    return min(most, 1 << (cells - 1).bit_length())

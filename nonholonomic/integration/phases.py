@@ -9,18 +9,16 @@ of the state. The cells advance in rounds: in each, the cells that are now in a 
 import abc
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .lockstep import FAILED, GUARD_LOST, REACHED_END, RUNNING, AbstractProblem
-from .march import compiled_march, lanes_for
-
-#: A cell that is still under way after so many rounds is given up.
-UNRESOLVED = 5
+from .march import compiled_march
+from .problem import AbstractProblem
+from .settings import Settings
+from .status import FAILED, GUARD_LOST, REACHED_END, RUNNING, UNRESOLVED
 
 #: Rounds after which what is still under way is given up.
 MOST_ROUNDS = 2000
@@ -91,11 +89,9 @@ def travel(
     state: Float[np.ndarray, "components cells"],
     t1: float,
     cells: int,
-    rtol: float,
-    atol: float,
+    settings: Settings,
     *,
     kinds: int,
-    solver: diffrax.AbstractERK,
     passes: bool = False,
     most_rounds: int = MOST_ROUNDS,
 ) -> Journey:
@@ -110,9 +106,9 @@ def travel(
     - `phase`, `state`: where every cell starts.
     - `t1`: horizon [s].
     - `cells`: how many cells to run; the rest is padding. With none, everything is compiled.
-    - `rtol`, `atol`: relative tolerance, and absolute tolerance in units of the problems' magnitudes.
+    - `settings`: with an explicit Runge-Kutta solver of Diffrax.
     - `kinds`: rows of `Passage.counts`.
-    - `solver`, `passes`: as for `march`.
+    - `passes`: as for `march`.
     - `most_rounds`: a cell that needs more ends as `UNRESOLVED`.
 
     **Returns:** a `Journey`.
@@ -129,17 +125,16 @@ def travel(
         counts=np.zeros((kinds, size), int),
     )
     found.status[cells:] = REACHED_END
-    method = (jnp.asarray(rtol, float), jnp.asarray(atol, float), solver, passes)
     if cells == 0:
         for one in phases:
-            _march(one, found, np.arange(0), t1, method)
+            _march(one, found, np.arange(0), t1, settings, passes)
             _pass_on(one, found, np.arange(0), t1)
     for _ in range(most_rounds):
         # Taken before the round: a cell that changes its phase in it waits for the next.
         here = [np.flatnonzero((found.status == RUNNING) & (found.phase == number)) for number in range(len(phases))]
         for one, some in zip(phases, here, strict=True):
             if some.size:
-                _march(one, found, some, t1, method)
+                _march(one, found, some, t1, settings, passes)
                 lost = some[found.status[some] == GUARD_LOST]
                 if lost.size:
                     _pass_on(one, found, lost, t1)
@@ -159,14 +154,14 @@ def _gather(phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"]
     return eqx.combine(numbers, rest), jnp.asarray(found.state[:, cell]), left
 
 
-def _march(phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"], t1: float, method: Any) -> None:
+def _march(
+    phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"], t1: float, settings: Settings, passes: bool
+) -> None:
     """March some cells to the end of their phase and note what was found."""
-    rtol, atol, solver, passes = method
     phase, state, left = _gather(phase, found, some, t1)
     problem = _problem(phase, state)
-    lanes = lanes_for(len(found.status))
     count = jnp.asarray(some.size)
-    outcome, _ = compiled_march(problem, left, count, rtol, atol, solver=solver, lanes=lanes, passes=passes)
+    outcome, _ = compiled_march(problem, left, count, settings, passes=passes)
     outcome = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], outcome)
     began = found.end_time[some]
     # A cell that comes into a phase beyond the event has passed it before, unless it started there.

@@ -7,40 +7,31 @@ one another.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlib
-from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from .lockstep import (
-    CROSSED,
-    GUARD_LOST,
-    REACHED_END,
-    RUNNING,
-    AbstractProblem,
-    Block,
-    Control,
-    Search,
-    attempt,
-    least_margin,
-)
+from ..xla_cpu import in_one_kernel
+from .attempt import Block, Control, attempt
+from .event import Search
+from .problem import AbstractProblem, least_margin
 from .runge_kutta import explicit_tableau, first_length
+from .settings import Settings
+from .status import CROSSED, GUARD_LOST, REACHED_END, RUNNING
 
 
 class Outcome(NamedTuple):
     """How every cell ended.
 
-    `status` is one of the codes of `lockstep.py`; `crossing_time` [s] is the time of the event (of the last one, where
-    runs pass through it), infinite if there was none; `end_time` [s] and `state` are those at which the run ended;
-    `steps` counts accepted and rejected steps, `rejected` the latter.
+    `status` is one of the codes of `status.py`; `first_crossing` and `crossing_time` [s] are the times of the first and the
+    last event, the same where runs end on it, infinite if there was none; `end_time` [s] and `state` are those at which
+    the run ended; `steps` counts accepted and rejected steps, `rejected` the latter.
     """
 
     status: Int[Array, " cells"]
+    first_crossing: Float[Array, " cells"]
     crossing_time: Float[Array, " cells"]
     end_time: Float[Array, " cells"]
     state: Float[Array, "components cells"]
@@ -76,13 +67,9 @@ class Queue(eqx.Module):
         problem: AbstractProblem,
         t1: Float[Array, "..."],
         cells: Int[Array, ""],
-        rtol: Float[Array, ""],
-        atol: Float[Array, ""],
+        settings: Settings,
         *,
-        solver: diffrax.AbstractERK,
-        lanes: int,
         passes: bool = False,
-        max_steps: int = 2_000_000,
         one_kernel: bool = False,
         parts: int = 1,
     ) -> "Queue":
@@ -90,13 +77,14 @@ class Queue(eqx.Module):
 
         **Arguments:** as for `march`, and `parts`: of how many equal parts the state is made, as for `Control`.
         """
-        control = Control(explicit_tableau(solver), solver.order(None), rtol, t1, max_steps, passes, parts)
+        solver, rtol = settings.solver, settings.tolerance
+        control = Control(explicit_tableau(solver), solver.order(None), rtol, t1, settings.max_steps, passes, parts)
         starts, scales = problem.start()
         zero = jnp.zeros_like(starts[0])
-        rates, atols = problem.field(zero, starts), atol * scales
+        rates, atols = problem.field(zero, starts), settings.absolute * rtol * scales
         lengths = first_length(problem.field, zero, starts, rates, control.order, rtol, atols, parts)
         fresh = _fresh_block(problem, control, starts, rates, jnp.minimum(stop_gradient(lengths), t1))
-        return cls(problem, control, atols, fresh, cells, lanes, one_kernel)
+        return cls(problem, control, atols, fresh, cells, settings.lanes_of(starts.shape[1], parts), one_kernel)
 
     @property
     def capacity(self) -> int:
@@ -170,12 +158,11 @@ class Queue(eqx.Module):
 
     def empty(self) -> Outcome:
         """An outcome of the right shapes, to be filled."""
-        fresh = self.fresh
-        return Outcome(fresh.status, fresh.crossing_time, fresh.time, fresh.state, fresh.steps, fresh.rejected)
+        return _outcome_of(self.fresh)
 
     def store(self, outcome: Outcome, block: Block) -> Outcome:
         """The outcome with the cells of a block that have ended."""
-        found = Outcome(block.status, block.crossing_time, block.time, block.state, block.steps, block.rejected)
+        found = _outcome_of(block)
         to = jnp.where((block.status != RUNNING) & (block.cell < self.cells), block.cell, self.capacity)
         return jax.tree.map(lambda all, some: all.at[..., to].set(some, mode="drop"), outcome, found)
 
@@ -185,33 +172,9 @@ class Queue(eqx.Module):
         return block._replace(cell=cell, status=jnp.where(cell < self.cells, block.status, REACHED_END))
 
 
-def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """A function that XLA compiles, on a CPU, into a single kernel.
-
-    Otherwise every fused operation of a loop's body is a call of its own, and for blocks that fit the first caches calling
-    costs as much as computing. XLA does so by itself for loops over very small arrays only. What the attributes do is known
-    of jaxlib 0.10 alone; with others the function is left as it is.
-    """
-    if jax.default_backend() != "cpu" or not jaxlib.__version__.startswith("0.10."):
-        return function
-
-    def called(argument: Any) -> Any:
-        # The attributes also keep the small functions inside, such as `where`, from being fused into all that use them.
-        with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-            closed, shape = jax.make_jaxpr(function, return_shape=True)(argument)
-
-            def looking_at_all(*arguments: Any) -> Any:
-                constants, leaves = arguments[: len(closed.consts)], arguments[len(closed.consts) :]
-                look = sum(jnp.ravel(leaf)[0].astype(float) for leaf in arguments)
-                return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))(*leaves), look
-
-            # XLA 0.10.2 aborts on a call with an argument that it does not use. So each is looked at, from behind a
-            # barrier, for what is known to be constant would not be.
-            given = jax.lax.optimization_barrier([*closed.consts, *jax.tree.leaves(argument)])
-            results, _ = jax.lax.optimization_barrier(jax.jit(looking_at_all)(*given))
-        return jax.tree.unflatten(jax.tree.structure(shape), results)
-
-    return called
+def _outcome_of(block: Block) -> Outcome:
+    times = (block.first_crossing, block.crossing_time, block.time)
+    return Outcome(block.status, *times, block.state, block.steps, block.rejected)
 
 
 def _fresh_block(
@@ -243,6 +206,7 @@ def _fresh_block(
         length=lengths,
         side=side,
         margin=stop_gradient(least_margin(problem, side, zero, states)),
+        first_crossing=jnp.where(beyond, zero, jnp.inf),
         crossing_time=jnp.where(beyond, zero, jnp.inf),
         searching=no,
         search=Search(zero, zero, zero, zero, zero, none),

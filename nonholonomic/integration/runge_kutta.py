@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..xla_cpu import stored_halves
+
 Lanes = Float[Array, " lanes"]
 States = Float[Array, "components lanes"]
 
@@ -91,17 +93,13 @@ def _places_to_look(fractions: Float[np.ndarray, " stages"]) -> set[int]:
 
 
 def moved_state(state: States, length: Lanes, weights: Float[np.ndarray, " stages"], rates: list[States]) -> States:
-    """The state moved along the weighted sum of the rates, joined from two halves.
-
-    Joining, with a barrier behind it, makes the compiler store the result. It would otherwise evaluate the sum anew for
-    every quantity of the field that depends on it; a barrier alone does not keep it from that.
-    """
+    """The state moved along the weighted sum of the rates."""
     half = state.shape[0] // 2
-    parts = [
+    first, second = (
         state[rows] + length * weighted_sum(weights, [rate[rows] for rate in rates])
         for rows in (slice(half), slice(half, None))
-    ]
-    return jax.lax.optimization_barrier(jnp.concatenate(parts))
+    )
+    return stored_halves(first, second)
 
 
 def weighted_sum(weights: Float[np.ndarray, " stages"], rates: list[States]) -> States:

@@ -7,20 +7,22 @@ even. The loop works in periods: a period records what each iteration reached, a
 import functools
 from typing import Any, NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .lockstep import REACHED_END, RUNNING, AbstractProblem, Block, attempt
+from .attempt import Block, attempt
+from .problem import AbstractProblem
 from .queue import Outcome, Progress, Queue
 from .runge_kutta import Lanes
+from .settings import Settings
+from .status import REACHED_END, RUNNING
 
 #: Iterations of a period: as many as have a record that fits the caches.
 PERIOD = 64
 
 #: By how much a step is stretched to end on a sample: the error stays below the tolerance, which a step is proposed to miss
-#: by `lockstep.SAFETY`.
+#: by `attempt.SAFETY`.
 STRETCH = 1.08
 
 Samples = Float[Array, "cells times components"]
@@ -47,11 +49,8 @@ def march_with_samples(
     times: Float[Array, "times *cells"],
     t1: Float[Array, "..."],
     cells: Int[Array, ""],
-    rtol: Float[Array, ""],
-    atol: Float[Array, ""],
+    settings: Settings,
     *,
-    solver: diffrax.AbstractERK,
-    lanes: int,
     parts: int = 1,
     one_kernel: bool = False,
 ) -> tuple[Outcome, Samples]:
@@ -65,7 +64,7 @@ def march_with_samples(
     **Returns:** the `Outcome`, its crossing times left out; and the states at the times, (cells, times, components), not a
     number after the end of a run.
     """
-    queue = Queue.of(problem, t1, cells, rtol, atol, solver=solver, lanes=lanes, parts=parts, one_kernel=one_kernel)
+    queue = Queue.of(problem, t1, cells, settings, parts=parts, one_kernel=one_kernel)
     count, starts = times.shape[0], queue.fresh.state
     of_cell = jnp.broadcast_to(times.reshape(count, -1), (count, queue.capacity)).T
     first = jnp.sum(of_cell <= 0.0, axis=1)

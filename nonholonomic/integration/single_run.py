@@ -10,13 +10,11 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Bool, Float, Int
 
-from .lockstep import AbstractProblem
+from .problem import AbstractProblem
+from .settings import Settings
 
 #: Steps that are integrated and stored at once; a longer run is made of several such pieces.
 PIECE = 2048
-
-#: Steps, rejected ones included, after which a run has failed. Their dense output takes a gigabyte and more.
-MOST_STEPS = 1_000_000
 
 #: Places in every step at which the guard is looked at, besides its ends.
 LOOKS = np.arange(1, 8) / 8.0
@@ -66,9 +64,10 @@ def _guard_on(problem: AbstractProblem, solution: diffrax.Solution, time: Float[
     return _guard(problem, time, solution.evaluate(time))
 
 
-def _control(rtol: float | Float[Array, ""], atol: Float[Array, " components"]) -> diffrax.PIDController:
+def _control(settings: Settings, scales: Float[Array, " components"]) -> diffrax.PIDController:
     # The greatest error counts, not the mean: cyclic coordinates that ride along must not dilute the others' errors.
-    return diffrax.PIDController(rtol, atol, norm=optimistix.max_norm)
+    atol = settings.absolute * settings.tolerance * jax.lax.stop_gradient(scales)
+    return diffrax.PIDController(settings.tolerance, atol, norm=optimistix.max_norm)
 
 
 @eqx.filter_jit
@@ -78,21 +77,20 @@ def _piece(
     t1: Float[Array, ""],
     first: Float[Array, ""] | None,
     state: Float[Array, " components"],
-    solver: diffrax.AbstractSolver,
-    rtol: Float[Array, ""],
-    atol: Float[Array, " components"],
+    scales: Float[Array, " components"],
+    settings: Settings,
 ) -> tuple[diffrax.Solution, Float[Array, " steps"]]:
     """At most `PIECE` steps, and the least value of the guard seen in each."""
     watched = problem.guard(t0, state) is not None
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-        solver,
+        settings.solver,
         t0,
         t1,
         first,
         state,
         args=problem,
-        stepsize_controller=_control(rtol, atol),
+        stepsize_controller=_control(settings, scales),
         saveat=diffrax.SaveAt(t0=True, steps=True, dense=True),
         max_steps=PIECE,
         event=diffrax.Event(lambda t, y, args, **_: args.guard(t, y) < 0.0) if watched else None,
@@ -113,13 +111,10 @@ def _piece(
 def follow(
     problem: AbstractProblem,
     t1: float,
+    settings: Settings,
     *,
-    solver: diffrax.AbstractSolver,
-    rtol: float,
-    atol: float,
     first: float | None = None,
     t0: float = 0.0,
-    max_steps: int = MOST_STEPS,
 ) -> Path:
     """Integrate one run step by step until `t1` or until the model ceases to hold.
 
@@ -127,11 +122,10 @@ def follow(
 
     - `problem`: with a `start()` of shape (components,).
     - `t1`: horizon [s].
-    - `solver`: any solver of Diffrax.
-    - `rtol`, `atol`: relative tolerance, and absolute tolerance in units of the problem's magnitudes.
+    - `settings`: with any solver of Diffrax; a run that is still under way after `max_steps` steps, rejected ones included, has
+      failed.
     - `first`: length of the first step [s], by default selected as Diffrax does.
     - `t0`: when the run starts [s].
-    - `max_steps`: a run that is still under way after so many steps, rejected ones included, has failed.
 
     **Returns:** a `Path` with the accepted steps; it ends where the guard reaches zero, found on the dense output.
     """
@@ -146,7 +140,7 @@ def follow(
     if margin is not None and float(margin) <= 0.0:
         return Path(times[0], states[0], [], True, False, 0, 0)
     while float(time) < t1 and not (lost or failed):
-        solution, guards = _piece(problem, time, end, length, state, solver, jnp.asarray(rtol), atol * scales)
+        solution, guards = _piece(problem, time, end, length, state, scales, settings)
         steps = int(solution.stats["num_accepted_steps"])
         accepted, rejected = accepted + steps, rejected + int(solution.stats["num_rejected_steps"])
         ts, ys = saved(solution)
@@ -168,7 +162,7 @@ def follow(
             length = jnp.asarray(ts[-1] - (ts[-2] if good > 1 else float(time)))
             time, state = jnp.asarray(ts[good - 1]), jnp.asarray(ys[:, good - 1])
         failed = failed or (not lost and bool(solution.result == diffrax.RESULTS.dt_min_reached))
-        failed = failed or (not lost and float(time) < t1 and accepted + rejected >= max_steps)
+        failed = failed or (not lost and float(time) < t1 and accepted + rejected >= settings.max_steps)
     return Path(np.concatenate(times), np.concatenate(states, axis=1), pieces, lost, failed, accepted, rejected)
 
 
@@ -205,19 +199,14 @@ def sample(
     problem: AbstractProblem,
     times: Float[Array, " times"],
     t1: Float[Array, ""],
-    *,
-    solver: diffrax.AbstractSolver,
-    rtol: float | Float[Array, ""],
-    atol: float | Float[Array, ""],
+    settings: Settings,
     adjoint: diffrax.AbstractAdjoint | None = None,
-    max_steps: int = MOST_STEPS,
 ) -> Sampled:
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 
     The guard is looked at where steps end, and the run ends where it is zero on the dense output.
 
-    **Arguments:** as for `follow`; `times`: growing, in [0, t1]; `adjoint`: how Diffrax differentiates, by default forwards;
-    `max_steps`: bound on the steps.
+    **Arguments:** as for `follow`; `times`: growing, in [0, t1]; `adjoint`: how Diffrax differentiates, by default forwards.
 
     **Returns:** a `Sampled`.
     """
@@ -228,15 +217,15 @@ def sample(
     )
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-        solver,
+        settings.solver,
         jnp.zeros_like(t1),
         t1,
         None,
         state,
         args=problem,
-        stepsize_controller=_control(rtol, jax.lax.stop_gradient(atol * scales)),
+        stepsize_controller=_control(settings, scales),
         saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=jnp.minimum(times, t1)), diffrax.SubSaveAt(t1=True)]),
-        max_steps=max_steps,
+        max_steps=settings.max_steps,
         event=event if watched else None,
         adjoint=diffrax.ForwardMode() if adjoint is None else adjoint,
         throw=False,

@@ -14,14 +14,13 @@ import math
 from pathlib import Path
 from typing import Any
 
-import diffrax
 import jax.numpy as jnp
 import numpy as np
 
 import tippe
-from nonholonomic.integration import CROSSED, compiled_march
+from nonholonomic.integration import CROSSED, Settings, compiled_march
 from nonholonomic.parameters import with_numbers
-from tippe.inversion import ABSOLUTE, InversionProblem
+from tippe.inversion import InversionProblem
 
 HERE = Path(__file__).parent
 ANGLE, TOLERANCE, STEP, RATIO, STEPS = 0.95 * math.pi, 1e-13, 1e-3, 1.6, 16
@@ -52,10 +51,7 @@ def times_of(row: dict[str, str], columns: dict[str, np.ndarray], t1: float) -> 
     size = len(columns["launch.theta"])
     roots = with_numbers(roots_of(row), columns)
     problem = InversionProblem.of(roots["scene"], roots["launch"], ANGLE, size)
-    numbers = [jnp.asarray(number, float) for number in (TOLERANCE, ABSOLUTE * TOLERANCE)]
-    outcome, _ = compiled_march(
-        problem, jnp.asarray(t1), jnp.asarray(size), *numbers, solver=diffrax.Dopri8(), lanes=32
-    )
+    outcome, _ = compiled_march(problem, jnp.asarray(t1), jnp.asarray(size), Settings(TOLERANCE, lanes=32))
     return np.where(outcome.status == CROSSED, outcome.crossing_time, np.inf)
 
 

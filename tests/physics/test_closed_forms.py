@@ -2,7 +2,6 @@
 
 import math
 
-import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from conftest import assert_close, homogeneous_ball, rutstam_top
 from scipy.special import ellipk
 
 import tippe
-from nonholonomic.integration import follow
+from nonholonomic.integration import Settings, follow
 from tippe.trajectory import Run
 
 GRAVITY = 9.81
@@ -20,7 +19,7 @@ def thrown(scene: tippe.Scene, velocity: float, times, tolerance: float = 1e-11)
     """A ball thrown along t1 without spin: states at the given times. A launch starts at rest, so the run is made here."""
     run = Run.of(scene, tippe.Launch(theta=0.7, spin=0.0))
     run = Run(run.dynamics, run.axial, run.state.at[0].set(velocity), run.path, run.scales)
-    path = follow(run, float(times[-1]), solver=diffrax.Dopri8(), rtol=tolerance, atol=0.1 * tolerance)
+    path = follow(run, float(times[-1]), Settings(tolerance))
     return jnp.asarray(path.at(np.asarray(times)))[:8]
 
 
@@ -58,7 +57,7 @@ def test_a_free_ball_turns_about_its_angular_momentum():
     momentum = np.array([1.0, -2.0, 3.0]) * 3e-4
     run = Run(run.dynamics, run.axial, run.state.at[5:8].set(momentum), run.path, run.scales)
     end = 2.0
-    path = follow(run, end, solver=diffrax.Dopri8(), rtol=1e-12, atol=1e-13)
+    path = follow(run, end, Settings(1e-12))
     angle, axis = np.linalg.norm(momentum) / float(top.I1) * end, momentum / np.linalg.norm(momentum)
     e = np.asarray(run.state[2:5])
     expected = e * math.cos(angle) + np.cross(axis, e) * math.sin(angle) + axis * (axis @ e) * (1.0 - math.cos(angle))

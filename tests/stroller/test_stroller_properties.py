@@ -6,7 +6,6 @@ One measure judges them all: every step may err by its tolerance, and the linear
 import dataclasses
 import math
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from nonholonomic.integration import GUARD_LOST, REACHED_END, compiled_march
+from nonholonomic.integration import GUARD_LOST, REACHED_END, Settings, compiled_march
 from stroller import Damping, Launch, Plane, RollingResistance, Scene, Sphere, Spheroid, Stroller
 from stroller.table import RideProblem
 
@@ -121,8 +120,8 @@ def ride(scene: Scene, launch: Launch, tolerance: float = 1e-9, states=None, sca
     problem = eqx.tree_at(lambda problem: problem.states, problem, jnp.asarray(np.tile(start, cells // count)))
     if scales is not None:
         problem = eqx.tree_at(lambda problem: problem.scales, problem, jnp.asarray(np.tile(scales, copies)))
-    numbers = (jnp.asarray(horizon), jnp.asarray(count), jnp.asarray(tolerance), jnp.asarray(0.1 * tolerance))
-    outcome = compiled_march(problem, *numbers, solver=diffrax.Dopri8(), lanes=LANES, max_steps=200_000)[0]
+    settings = Settings(tolerance, lanes=LANES, max_steps=200_000)
+    outcome = compiled_march(problem, jnp.asarray(horizon), jnp.asarray(count), settings)[0]
     return jax.tree.map(lambda leaf: np.asarray(leaf)[..., :count], outcome)
 
 

@@ -2,7 +2,6 @@
 
 import math
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import tippe
-from nonholonomic.integration import FAILED, GUARD_LOST, REACHED_END, compiled_march
+from nonholonomic.integration import FAILED, GUARD_LOST, REACHED_END, Settings, compiled_march
 from tippe.inversion import InversionProblem
 
 #: Examples are drawn in batches of this many lanes, so that one compiled program runs them all.
@@ -61,10 +60,7 @@ def ends(scene: tippe.Scene, launch: tippe.Launch, tolerance: float = 1e-9, stat
         problem,
         jnp.asarray(horizon),
         jnp.asarray(LANES),
-        jnp.asarray(tolerance),
-        jnp.asarray(0.1 * tolerance),
-        solver=diffrax.Dopri8(),
-        lanes=LANES,
+        Settings(tolerance, lanes=LANES),
     )
     return outcome
 

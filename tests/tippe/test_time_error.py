@@ -1,6 +1,5 @@
 """The error estimate of a table's times: against references, near the threshold, and as digits."""
 
-import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,10 +7,10 @@ from conftest import assert_close, rutstam_top
 from lagrange_top import inversion
 
 import tippe
-from nonholonomic.integration import compiled_march, lanes_for
+from nonholonomic.integration import Settings, compiled_march
 from nonholonomic.sweeps.digits import concise
 from tippe import steady
-from tippe.inversion import ABSOLUTE, InversionProblem, is_inverted
+from tippe.inversion import InversionProblem, is_inverted
 from tippe.time_error import COARSER, time_error
 
 SCENE = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
@@ -180,10 +179,8 @@ def times(scene, launch, tolerance, crossing, t1=12.0):
     """Times and codes of every cell at one tolerance."""
     cells = launch.theta.size
     problem = InversionProblem.of(scene, launch, 0.95 * np.pi, cells)
-    numbers = (jnp.asarray(value) for value in (t1, cells, tolerance, ABSOLUTE * tolerance))
-    outcome, _ = compiled_march(
-        problem, *numbers, solver=diffrax.Dopri8(), lanes=lanes_for(cells), passes=crossing == "last"
-    )
+    given = (problem, jnp.asarray(t1), jnp.asarray(cells), Settings(tolerance))
+    outcome, _ = compiled_march(*given, passes=crossing == "last")
     inverted = np.asarray(is_inverted(outcome, problem, crossing == "last"))
     return np.where(inverted, outcome.crossing_time, np.inf), np.where(inverted, -1, outcome.status)
 

@@ -10,7 +10,7 @@ import pytest
 from conftest import assert_close, rutstam_top
 
 import tippe
-from nonholonomic.integration import follow
+from nonholonomic.integration import Settings, follow
 from nonholonomic.integration.single_run import PIECE
 from tippe.trajectory import Run
 
@@ -68,8 +68,7 @@ def test_more_steps_than_a_piece_holds(rutstam_scene):
 
 def test_a_run_of_too_many_steps_fails(rutstam_scene):
     """It says so and ends where it is, rather than go on for ever."""
-    options = {"solver": diffrax.Dopri8(), "rtol": 3e-14, "atol": 3e-15}
-    path = follow(Run.of(rutstam_scene, LAUNCH), 1e6, max_steps=3000, **options)
+    path = follow(Run.of(rutstam_scene, LAUNCH), 1e6, Settings(3e-14, max_steps=3000))
     assert path.failed
     assert not path.guard_lost
     assert 3000 <= path.accepted + path.rejected < 3000 + PIECE

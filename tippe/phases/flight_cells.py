@@ -3,9 +3,9 @@
 import diffrax
 import numpy as np
 
-from nonholonomic.integration import Journey, travel
+from nonholonomic.integration import Journey, Settings, travel
 
-from ..inversion import ABSOLUTE, InversionProblem
+from ..inversion import InversionProblem
 from ..scene import Scene
 from .free_body import balls
 from .sliding import first_ball, phases
@@ -36,9 +36,7 @@ def ride(
         np.asarray(problem.states),
         t1,
         count,
-        tolerance,
-        ABSOLUTE * tolerance,
+        Settings(tolerance, solver),
         kinds=1,
-        solver=solver,
         passes=last,
     )

@@ -1,5 +1,6 @@
 """One run through contacts, flights and impacts, with its path."""
 
+import dataclasses
 from typing import Any, NamedTuple, TypeAlias
 
 import diffrax
@@ -13,18 +14,17 @@ from nonholonomic.geometry import dot, scale, sum_vectors
 from nonholonomic.integration import (
     FAILED,
     GUARD_LOST,
-    MOST_STEPS,
     REACHED_END,
     RUNNING,
     UNRESOLVED,
     AbstractProblem,
     Path,
+    Settings,
     follow,
 )
 from nonholonomic.validation import require
 
 from ..dynamics import Dynamics, stacked
-from ..inversion import ABSOLUTE
 from ..launch import Launch
 from ..scene import Scene
 from .flight import cone, flown
@@ -301,7 +301,7 @@ def simulate_hybrid(
     scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver
 ) -> HybridTrajectory:
     """Run one launch of a hybrid scene until `t1`. **Arguments:** as for `simulate`, checked."""
-    pieces, status, steps, loss = _pieces(scene, launch, t1, tolerance, solver)
+    pieces, status, steps, loss = _pieces(scene, launch, t1, Settings(tolerance, solver))
     hops = np.array([(piece.begin, piece.end) for piece in pieces if isinstance(piece, Arc)]).reshape(-1, 2)
     # A contact that was lost as soon as it began has no time of its own.
     shown = [np.zeros(1), *(piece.shown() for piece in pieces)]
@@ -321,7 +321,7 @@ def simulate_hybrid(
 
 
 def _pieces(
-    scene: Scene, launch: Launch, t1: float, tolerance: float, solver: diffrax.AbstractSolver
+    scene: Scene, launch: Launch, t1: float, settings: Settings
 ) -> tuple[list[Any], str, tuple[int, int], float]:
     """Contacts and flights one after another, how the run ended, accepted and rejected steps, energy lost in impacts."""
     spheres = balls(scene.body)
@@ -343,8 +343,8 @@ def _pieces(
         start = jnp.concatenate([jnp.asarray(state), jnp.asarray(rest)])
         dynamics = leaning(scene) if number == BOTH else standing_on(scene.dynamics, own)
         problem = Contact(dynamics, own, other, scene.body.I3, start, scales)
-        most = MOST_STEPS - accepted - rejected
-        path = follow(problem, t1 - time, solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance, max_steps=most)
+        left = dataclasses.replace(settings, max_steps=settings.max_steps - accepted - rejected)
+        path = follow(problem, t1 - time, left)
         pieces.append(Sojourn(time, path, scene, own, number))
         time, accepted, rejected = pieces[-1].end, accepted + path.accepted, rejected + path.rejected
         if path.failed or not path.guard_lost:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
-from nonholonomic.integration import GUARD_LOST, AbstractProblem, lanes_for, traced_march
+from nonholonomic.integration import GUARD_LOST, AbstractProblem, Settings, traced_march
 
 from ..friction import AbstractFriction, Slip
 from ..top import Top
@@ -150,11 +150,7 @@ def strike(
         problem,
         jnp.asarray(LARGEST),
         jnp.asarray(cells),
-        jnp.asarray(TOLERANCE),
-        jnp.asarray(TOLERANCE),
-        solver=diffrax.Dopri5(),
-        lanes=lanes_for(cells),
-        max_steps=MOST_STEPS,
+        Settings(TOLERANCE, diffrax.Dopri5(), absolute=1.0, max_steps=MOST_STEPS),
     )
     impulse = problem.ended(outcome.end_time, outcome.state)
     velocity = sum_vectors(free.velocity, scale(1.0 / body.mass, impulse))

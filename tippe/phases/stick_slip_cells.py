@@ -6,10 +6,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.integration import CROSSED, GUARD_LOST, REACHED_END, RUNNING, AbstractPhase, Journey, Passage, travel
+from nonholonomic.integration import (
+    CROSSED,
+    GUARD_LOST,
+    REACHED_END,
+    RUNNING,
+    AbstractPhase,
+    Journey,
+    Passage,
+    Settings,
+    travel,
+)
 
 from ..dynamics import COS_THETA
-from ..inversion import ABSOLUTE, InversionProblem
+from ..inversion import InversionProblem
 from ..scene import Scene
 from .stick_slip import AT_REST, Kind, StickSlip
 
@@ -80,9 +90,7 @@ def ride(
         np.asarray(problem.states),
         t1,
         count,
-        tolerance,
-        ABSOLUTE * tolerance,
+        Settings(tolerance, solver),
         kinds=1,
-        solver=solver,
         passes=last,
     )

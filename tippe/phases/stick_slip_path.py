@@ -2,13 +2,12 @@
 
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.integration import AbstractProblem, Path, follow
+from nonholonomic.integration import AbstractProblem, Path, Settings, follow
 
 from .onset import Onset
 from .stick_slip import AT_REST, Change, Kind, StickSlip
@@ -126,15 +125,13 @@ def _joined(begun: Begun, state: Float[Array, " components"], rest: Path) -> Pat
     return rest._replace(times=times, states=states, pieces=[begun, *rest.pieces])
 
 
-def follow_stick_slip(
-    run: Any, t1: float, *, solver: diffrax.AbstractSolver, rtol: float, atol: float
-) -> StickSlipPath:
+def follow_stick_slip(run: Any, t1: float, settings: Settings) -> StickSlipPath:
     """One run, phase by phase, until `t1` or until contact is lost.
 
     **Arguments:**
 
     - `run`: a `trajectory.Run` of a scene with `SetValuedCoulomb`.
-    - `t1`, `solver`, `rtol`, `atol`: as for `integrate.follow`.
+    - `t1`, `settings`: as for `follow`.
 
     **Returns:** a `StickSlipPath`.
     """
@@ -144,9 +141,9 @@ def follow_stick_slip(
     path = StickSlipPath(both, size, [], [], False, False)
     begun: tuple[Begun, Array] | None = None
     while True:
-        kind = Kind(both, jnp.asarray(rtol, float), rolls)
+        kind = Kind(both, settings.tolerance, rolls)
         stretch = Stretch(eqx.tree_at(lambda one: one.dynamics, run, kind), whole)
-        part = follow(stretch, t1, t0=time, solver=solver, rtol=rtol, atol=atol)
+        part = follow(stretch, t1, settings, t0=time)
         last = jnp.asarray(part.states[:, -1])
         if begun is not None:
             part = _joined(*begun, part)

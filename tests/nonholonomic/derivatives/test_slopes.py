@@ -12,7 +12,7 @@ import nonholonomic.derivatives._adjoint as adjoint
 from nonholonomic.derivatives import directions_of
 from nonholonomic.derivatives._shared_values import sharing_values
 from nonholonomic.derivatives.slopes import march_with_slopes
-from nonholonomic.integration import CROSSED, GUARD_LOST, AbstractProblem
+from nonholonomic.integration import CROSSED, GUARD_LOST, AbstractProblem, Settings
 
 MOVED = ("rate", "height", "growth")
 HEIGHTS = np.linspace(0.6, 4.0, 100)
@@ -57,7 +57,7 @@ def found_and_expected(names=MOVED, patience=1e3, heights=HEIGHTS, cells=100, **
         def build(*numbers):
             return Decays(*numbers, jnp.asarray(patience))
 
-        given = (jnp.asarray(50.0), jnp.asarray(cells), jnp.asarray(1e-11), jnp.asarray(1e-12))
+        given = (jnp.asarray(50.0), jnp.asarray(cells), Settings(1e-11, options.pop("solver", diffrax.Dopri8())))
         directions = directions_of(build, point, tangents)
         return march_with_slopes(build(*point), directions, *given, **({"one_kernel": True} | options))
 

@@ -16,6 +16,7 @@ from nonholonomic.integration import (
     GUARD_LOST,
     REACHED_END,
     AbstractProblem,
+    Settings,
     compiled_march,
     explicit_tableau,
     march_by_diffrax,
@@ -47,7 +48,10 @@ class Oscillators(AbstractProblem):
         return state[1] + self.floor
 
 
-def run(frequency, level=0.5, floor=2.0, t1=10.0, lanes=8, tolerance=1e-10, solver=None, **options):
+SOLVER = diffrax.Dopri8()
+
+
+def run(frequency, level=0.5, floor=2.0, t1=10.0, lanes=8, tolerance=1e-10, solver=SOLVER, max_steps=10_000, **options):
     frequency = jnp.atleast_1d(jnp.asarray(frequency, float))
     problem = Oscillators(frequency, jnp.asarray(level), jnp.asarray(floor))
     cells = frequency.shape[0]
@@ -55,10 +59,7 @@ def run(frequency, level=0.5, floor=2.0, t1=10.0, lanes=8, tolerance=1e-10, solv
         problem,
         jnp.asarray(t1),
         jnp.asarray(cells),
-        jnp.asarray(tolerance),
-        jnp.asarray(0.1 * tolerance),
-        solver=diffrax.Dopri8() if solver is None else solver,
-        lanes=min(lanes, cells),
+        Settings(tolerance, solver, lanes=min(lanes, cells), max_steps=max_steps),
         **options,
     )
 
@@ -106,12 +107,11 @@ def test_a_dip_between_the_ends_of_a_step_is_found():
 def test_padding_is_not_run():
     frequency = jnp.array([1.0, 2.0, 3.0, 4.0])
     problem = Oscillators(frequency, jnp.asarray(0.5), jnp.asarray(2.0))
-    small = jnp.asarray(1e-9)
-    options = {"solver": diffrax.Dopri8(), "lanes": 4}
-    outcome, iterations = compiled_march(problem, jnp.asarray(9.0), jnp.asarray(2), small, small, **options)
+    settings = Settings(1e-9, absolute=1.0, lanes=4)
+    outcome, iterations = compiled_march(problem, jnp.asarray(9.0), jnp.asarray(2), settings)
     assert_close(outcome.crossing_time[:2], math.pi / 3.0 / frequency[:2], rtol=1e-8)
     assert outcome.steps[2:].tolist() == [0, 0]
-    _, nothing = compiled_march(problem, jnp.asarray(9.0), jnp.asarray(0), small, small, **options)
+    _, nothing = compiled_march(problem, jnp.asarray(9.0), jnp.asarray(0), settings)
     assert nothing == 0
     assert iterations > 0
 
@@ -137,10 +137,8 @@ def test_the_derivative_is_that_of_the_implicit_function_theorem():
 
     def time_of(numbers):
         problem = Oscillators(numbers[:1], numbers[1:], jnp.asarray(2.0))
-        tolerance = jnp.asarray(1e-12)
-        outcome, _ = march(
-            problem, jnp.asarray(9.0), jnp.asarray(1), tolerance, tolerance, solver=diffrax.Dopri8(), lanes=1
-        )
+        settings = Settings(1e-12, absolute=1.0, lanes=1)
+        outcome, _ = march(problem, jnp.asarray(9.0), jnp.asarray(1), settings)
         return outcome.crossing_time[0]
 
     def exact(numbers):
@@ -173,9 +171,9 @@ def test_locating_an_event_adds_no_error_of_its_own(solver):
     exact = brentq(lambda t: math.exp(t / 20.0) * math.cos(t) + 2.0, 15.0, 15.7, xtol=1e-15)
     slope = math.exp(exact / 20.0) * (math.cos(exact) / 20.0 - math.sin(exact))
     for tolerance in (1e-6, 1e-8, 1e-10):
-        small, options = jnp.asarray(tolerance), {"solver": solver, "lanes": 1}
-        located, _ = compiled_march(Growing(), jnp.asarray(20.0), jnp.asarray(1), small, small, **options)
-        reached, _ = compiled_march(Growing(), jnp.asarray(exact), jnp.asarray(1), small, small, passes=True, **options)
+        settings = Settings(tolerance, solver, absolute=1.0, lanes=1)
+        located, _ = compiled_march(Growing(), jnp.asarray(20.0), jnp.asarray(1), settings)
+        reached, _ = compiled_march(Growing(), jnp.asarray(exact), jnp.asarray(1), settings, passes=True)
         error, state_error = float(located.crossing_time[0]) - exact, float(reached.state[0, 0]) + 2.0
         assert_close(error, -state_error / slope, rtol=0.2, atol=1e-11)
 
@@ -183,11 +181,9 @@ def test_locating_an_event_adds_no_error_of_its_own(solver):
 def test_an_interpolated_event_would_be_a_hundred_times_worse():
     """Dopri8 at 1e-10: Diffrax's dense output locates the same event with an error of 1e-8, this driver with 1e-11."""
     exact = brentq(lambda t: math.exp(t / 20.0) * math.cos(t) + 2.0, 15.0, 15.7, xtol=1e-15)
-    small = jnp.asarray(1e-10)
-    dense = march_by_diffrax(Growing(), jnp.asarray(20.0), small, small, solver=diffrax.Dopri8())
-    located, _ = compiled_march(
-        Growing(), jnp.asarray(20.0), jnp.asarray(1), small, small, solver=diffrax.Dopri8(), lanes=1
-    )
+    settings = Settings(1e-10, absolute=1.0, lanes=1)
+    dense = march_by_diffrax(Growing(), jnp.asarray(20.0), settings)
+    located, _ = compiled_march(Growing(), jnp.asarray(20.0), jnp.asarray(1), settings)
     assert abs(float(located.crossing_time[0]) - exact) < 0.01 * abs(float(dense.crossing_time[0]) - exact)
 
 

@@ -1,13 +1,12 @@
 """Samples of many runs against closed forms."""
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import assert_close
 
-from nonholonomic.integration import GUARD_LOST, REACHED_END, AbstractProblem, march_with_samples
+from nonholonomic.integration import GUARD_LOST, REACHED_END, AbstractProblem, Settings, march_with_samples
 
 CELLS = 40
 
@@ -35,11 +34,10 @@ class Oscillators(AbstractProblem):
 RATES = jnp.linspace(1.0, 9.0, CELLS)
 
 
-def run(times, least=-2.0, solver=None, tolerance=1e-10):
+def run(times, least=-2.0, tolerance=1e-10):
     problem = Oscillators(RATES, jnp.full(CELLS, least))
-    options = {"solver": diffrax.Dopri8() if solver is None else solver, "lanes": 16}
-    numbers = (jnp.asarray(10.0), jnp.asarray(CELLS), jnp.asarray(tolerance), jnp.asarray(tolerance))
-    return eqx.filter_jit(march_with_samples)(problem, jnp.asarray(times), *numbers, **options)
+    given = (jnp.asarray(10.0), jnp.asarray(CELLS), Settings(tolerance, lanes=16))
+    return eqx.filter_jit(march_with_samples)(problem, jnp.asarray(times), *given)
 
 
 @pytest.mark.parametrize("count", [3, 701])

@@ -1,0 +1,169 @@
+"""One attempted step of a block of lanes: step control, events, and what becomes of each lane.
+
+A lane is free until an accepted step ends beyond an event; then it searches for the event by trying that step again with
+other lengths, its start kept, until the step ends on the event. So the event has the accuracy of the method.
+"""
+
+from typing import NamedTuple
+
+import diffrax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float, Int
+
+from ..xla_cpu import stored
+from .event import Search, dip, narrow
+from .problem import AbstractProblem, crossing_time, least_margin
+from .runge_kutta import Lanes, States, Step, explicit_step, inverse_root, scaled_error
+from .status import CROSSED, FAILED, GUARD_LOST, REACHED_END, RUNNING
+
+#: Step control as in Diffrax's I controller with its defaults.
+SAFETY, SHRINK, GROW = 0.9, 0.2, 10.0
+
+
+class Control(NamedTuple):
+    """How steps are taken.
+
+    `tableau` and `order` are the method's; `rtol` the relative tolerance; `t1` the horizon [s], one for all or one per lane;
+    a lane that needs more than `max_steps` has failed; `passes` says whether a run goes on through its event; `parts` is of how
+    many equal parts the state is made, such as a state and its variations: a step is judged by the part that errs most.
+    """
+
+    tableau: diffrax.ButcherTableau
+    order: int
+    rtol: Float[Array, ""]
+    t1: Float[Array, "..."]
+    max_steps: int
+    passes: bool
+    parts: int
+
+
+class Block(NamedTuple):
+    """The lanes of a block.
+
+    - `cell`: which cell of the problem a lane runs; `status`: one of the codes above.
+    - `time` [s], `state`, `rate`: where the lane is, and the field there.
+    - `length`: of the step to be tried [s], if the horizon is not nearer.
+    - `side`: 1 before the event, -1 beyond it; `margin`: the least of `side` times the crossing function and the guard.
+    - `first_crossing`, `crossing_time`: of the first and the last event that were passed [s], infinite if there was none.
+    - `searching`: whether the lane looks for an event, `search`: where.
+    - `steps`: tried so far, `rejected`: by step control.
+    """
+
+    cell: Int[Array, " lanes"]
+    status: Int[Array, " lanes"]
+    time: Lanes
+    state: States
+    rate: States
+    length: Lanes
+    side: Lanes
+    margin: Lanes
+    first_crossing: Lanes
+    crossing_time: Lanes
+    searching: Bool[Array, " lanes"]
+    search: Search
+    steps: Int[Array, " lanes"]
+    rejected: Int[Array, " lanes"]
+
+
+def length_to_try(control: Control, block: Block) -> Lanes:
+    """Length of each lane's next step [s]: the last one ends on the horizon exactly, also where round-off would miss it."""
+    left = control.t1 - block.time
+    return jnp.where(~block.searching & (block.length >= left * (1.0 - 1e-12)), left, block.length)
+
+
+def attempt(problem: AbstractProblem, control: Control, atol: States, block: Block) -> Block:
+    """Try a step in every lane of a block and decide what becomes of it.
+
+    **Arguments:**
+
+    - `problem`: the problem with one number per lane (or a scalar) in every leaf.
+    - `control`: the method and its tolerances.
+    - `atol`: absolute tolerances, (components, lanes).
+    - `block`: the lanes; those that have ended stay as they are.
+
+    **Returns:** the block after the attempt.
+    """
+
+    def watch(time: Lanes, state: States) -> Lanes:
+        return least_margin(problem, block.side, time, state)
+
+    tried_length = length_to_try(control, block)
+    tried = explicit_step(control.tableau, problem.field, watch, block.time, block.state, block.rate, tried_length)
+    running = block.status == RUNNING
+    free = running & ~block.searching
+    error = scaled_error(*stop_gradient((tried.error, block.state, tried.state)), control.rtol, atol, control.parts)
+    # An event is located where the margin is round-off. Joined, with a barrier behind it, it is computed once; the compiler
+    # would else fuse it into several kernels of different round-off, in one of which the event is found and in another not.
+    error, margin = stored(error, stop_gradient(tried.watched))
+    # A step into nonsense counts as one with a huge error.
+    error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
+    good = error <= 1.0
+    # Negative in between: end the step there and look again, so that the first event of several is found.
+    dips = dip(problem.crossing, block.side, (block.state, block.rate), tried, tried_length)
+    negative = jnp.minimum(tried.first_negative, stop_gradient(dips))
+    between = good & (negative < 1.0)
+    beyond = good & ~between & (margin <= 0.0)
+    forward = free & good & ~between & ~beyond
+
+    search, guess, found = narrow(block.searching, block.search, block.margin, margin, tried_length)
+    hit = running & found
+    searching = (block.searching | (free & beyond)) & ~hit
+    moved = forward | hit
+    time = jnp.where(moved, block.time + tried_length, block.time)
+
+    length = tried_length * _factor(error, good, control.order)
+    length = jnp.where(between, tried_length * negative, length)
+    length = jnp.where(searching, guess, jnp.where(hit, search.stride, length))
+    status, side, first, latest = _fate(problem, control, block, tried, time, hit)
+    ended = running & (status == RUNNING) & moved & (time >= control.t1)
+    steps = block.steps + running
+    # Written so that a length that is not a number counts as stuck.
+    tiny = 8.0 * jnp.finfo(time.dtype).eps * jnp.maximum(time, 1e-3)
+    stuck = free & ~forward & ~searching & ~(length > tiny)
+    stuck |= forward & (time == block.time) & (tried_length > 0.0)
+    failed = running & (status == RUNNING) & ~ended & (stuck | (steps >= control.max_steps))
+    status = jnp.where(failed, FAILED, jnp.where(ended, REACHED_END, status))
+    return Block(
+        cell=block.cell,
+        status=status,
+        time=jnp.where(ended, control.t1, time),
+        state=jnp.where(moved, tried.state, block.state),
+        rate=jnp.where(moved, tried.rate, block.rate),
+        length=length,
+        side=side,
+        # Just past a crossing the margin is round-off of either sign.
+        margin=jnp.where(hit, jnp.abs(margin), jnp.where(forward, margin, block.margin)),
+        first_crossing=first,
+        crossing_time=latest,
+        searching=searching,
+        search=search,
+        steps=steps,
+        rejected=block.rejected + (free & ~forward & ~beyond),
+    )
+
+
+def _factor(error: Lanes, good: Bool[Array, " lanes"], order: int) -> Lanes:
+    """By how much the next step is longer, as Diffrax's I controller has it."""
+    factor = SAFETY * inverse_root(jnp.maximum(error, 1e-30), order)
+    return jnp.where(good, jnp.clip(factor, 1.0, GROW), jnp.clip(factor, SHRINK, SAFETY))
+
+
+def _fate(
+    problem: AbstractProblem, control: Control, block: Block, tried: Step, time: Lanes, hit: Bool[Array, " lanes"]
+) -> tuple[Int[Array, " lanes"], Lanes, Lanes, Lanes]:
+    """Status, side, first and latest crossing time of the lanes, where `hit` says that an event was located."""
+    crossing, guard = problem.crossing(tried.state), problem.guard(time, tried.state)
+    # The lesser of the two is what was located; by its sign it may be round-off.
+    by_guard = hit if crossing is None else hit & (False if guard is None else guard <= block.side * crossing)
+    crossed = hit & ~by_guard
+    if not control.passes:
+        status = jnp.where(hit, jnp.where(by_guard, GUARD_LOST, CROSSED), block.status)
+        return status, block.side, block.first_crossing, block.crossing_time
+    # Only the way from positive to negative is the event; the way back is passed in silence.
+    counts = crossed & (block.side > 0.0)
+    here = crossing_time(problem, time, tried.state)
+    first = jnp.where(counts & jnp.isinf(block.first_crossing), here, block.first_crossing)
+    latest = jnp.where(counts, here, block.crossing_time)
+    status = jnp.where(by_guard, GUARD_LOST, block.status)
+    return status, jnp.where(crossed, -block.side, block.side), first, latest

@@ -1,0 +1,63 @@
+"""What is integrated."""
+
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .runge_kutta import Lanes, States
+
+
+class AbstractProblem(eqx.Module):
+    """What is integrated: a field, a function whose zero is the event, and a guard that ends the run.
+
+    The leaves of a problem are scalars, or hold one number per cell in their last axis.
+    """
+
+    @abc.abstractmethod
+    def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
+        """State at the start of every cell, and the magnitudes by which its absolute errors are measured."""
+
+    @abc.abstractmethod
+    def field(self, time: Lanes, state: States) -> States:
+        """Rate of change of the state, lane by lane; the state may come as a tuple of its components."""
+
+    @abc.abstractmethod
+    def crossing(self, state: States) -> Lanes | None:
+        """A smooth function of order 1, positive before the event, negative after it; `None` if there is no event."""
+
+    @abc.abstractmethod
+    def guard(self, time: Lanes, state: States) -> Lanes | None:
+        """A function of order 1 that is positive while the model holds; `None` if it always does."""
+
+
+def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: States) -> Lanes:
+    """The least of the problem's crossing function, counted positive on the lane's side of the event, and its guard."""
+    crossing, guard = problem.crossing(state), problem.guard(time, state)
+    if crossing is None:
+        return jnp.ones_like(side) if guard is None else guard
+    return side * crossing if guard is None else jnp.minimum(side * crossing, guard)
+
+
+def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes:
+    """When the crossing function vanishes, for a state close to that (`event_time`)."""
+    return event_time(problem, problem.crossing, time, state)
+
+
+def event_time(problem: AbstractProblem, function: Callable[[States], Lanes], time: Lanes, state: States) -> Lanes:
+    """When a function of the state vanishes along a motion, for a state close to that, to third order in the distance.
+
+    It gives the time of a located event its derivatives: `time` is held fixed, the state varies with the parameters, and
+    the series t - g/g' - g'' g^2 / (2 g'^3) turns its variation into that of the time (implicit function theorem).
+    """
+
+    def slope(at: States) -> Lanes:
+        return jax.jvp(function, (at,), (problem.field(time, at),))[1]
+
+    first, second = jax.jvp(slope, (state,), (problem.field(time, state),))
+    first = jnp.where(first == 0.0, 1.0, first)
+    shift = function(state) / first
+    return time - shift - 0.5 * second / first * shift * shift

@@ -1,0 +1,44 @@
+"""How runs are integrated."""
+
+import diffrax
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float
+
+from ..validation import as_number
+
+#: The absolute tolerance as a fraction of the relative one, in units of a problem's own magnitudes.
+ABSOLUTE = 0.1
+
+
+class Settings(eqx.Module):
+    """How runs are integrated, whatever is asked of them.
+
+    **Arguments:**
+
+    - `tolerance`: relative tolerance.
+    - `solver`: a solver of Diffrax, an explicit Runge-Kutta one for blocks of lanes.
+    - `absolute`: absolute tolerance as a fraction of the relative one, in units of the problem's magnitudes.
+    - `max_steps`: a run that needs more has failed.
+    - `lanes`: how many cells of a block advance together; by default as many as suit the machine (`lanes_for`).
+    """
+
+    tolerance: Float[Array, ""] = eqx.field(converter=as_number)
+    solver: diffrax.AbstractSolver = diffrax.Dopri8()
+    absolute: float = eqx.field(static=True, default=ABSOLUTE)
+    max_steps: int = eqx.field(static=True, default=2_000_000)
+    lanes: int | None = eqx.field(static=True, default=None)
+
+    def lanes_of(self, cells: int, parts: int = 1) -> int:
+        """How many of the cells of a problem advance together, its state being of so many parts."""
+        return lanes_for(cells, parts) if self.lanes is None else self.lanes
+
+
+def lanes_for(cells: int, parts: int = 1) -> int:
+    """How many cells should advance together, given their number and of how many parts the state is made.
+
+    On a CPU a block and its stages should fit the first caches; an accelerator is idle below tens of thousands.
+    """
+    most = 64 if jax.default_backend() == "cpu" else 32768
+    alone = min(most, 1 << (cells - 1).bit_length())
+    return alone if parts == 1 else max(8, 3 * alone // (2 * parts))

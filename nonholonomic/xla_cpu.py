@@ -1,0 +1,84 @@
+"""What is done for XLA on a CPU, each trick with what it gains, the versions it is for, and when it can go.
+
+Measured on jaxlib 0.10.2 and a core with AVX-512 unless another version is named; `benchmarks/scaling.py` and
+`benchmarks/work_precision.py` time the whole.
+"""
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlib
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jaxtyping import Array, Float
+
+#: Wide vectors, which compilers shy away from, pay for the sums over stages, streams of multiply-adds: 1.2 to 1.6 times. JAX
+#: takes compiler options only for the outermost compiled function, so it is for programs that are called on their own. It can
+#: go when XLA prefers 512 bits by itself; without AVX-512 it does nothing.
+compiled_alone = eqx.filter_jit(compiler_options={"xla_cpu_prefer_vector_width": 512})
+
+
+def stored(*values: Float[Array, "..."] | None) -> tuple[Float[Array, "..."] | None, ...]:
+    """The same values, computed once where several results depend on them; `None` stays.
+
+    XLA otherwise fuses every result with all that leads to it and evaluates the common part again for each. A barrier
+    alone does not keep it from that; joining the values, with a barrier behind it, does: 1.2 times for the top's field. It also
+    gives one value to all who read it: two kernels may round differently. It can go when XLA's fusion counts what it repeats.
+    """
+    present = [value for value in values if value is not None]
+    if not present:
+        return values
+    joined = iter(jnp.unstack(jax.lax.optimization_barrier(jnp.stack(jnp.broadcast_arrays(*present)))))
+    return tuple(None if value is None else next(joined) for value in values)
+
+
+def stored_halves(first: Float[Array, "..."], second: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Two halves of a state, joined along axis 0 and stored: 1.4 times for a Runge-Kutta step, for the reason of `stored`."""
+    return jax.lax.optimization_barrier(jnp.concatenate([first, second]))
+
+
+def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A function of a tree of arrays that XLA compiles, on a CPU, into a single kernel.
+
+    Otherwise every fused operation of a loop's body is a call of its own, and for blocks that fit the first caches calling
+    costs as much as computing. XLA does so by itself for loops over very small arrays only. The gain is 2.5 times with jaxlib
+    0.10.2 and 1.3 times with 0.12. It can go when XLA's threshold can be set for one program.
+    """
+    if jax.default_backend() != "cpu" or not _knows_the_attributes():
+        return function
+
+    def called(argument: Any) -> Any:
+        # The attributes also keep the small functions inside, such as `where`, from being fused into all that use them.
+        with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+            closed, shape = jax.make_jaxpr(function, return_shape=True)(argument)
+
+            def looking_at_all(*arguments: Any) -> Any:
+                constants, leaves = arguments[: len(closed.consts)], arguments[len(closed.consts) :]
+                look = sum(jnp.ravel(leaf)[0].astype(float) for leaf in arguments)
+                return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))(*leaves), look
+
+            # XLA 0.10.2 aborts on a call with an argument that it does not use. So each is looked at, from behind a
+            # barrier, for what is known to be constant would not be.
+            given = jax.lax.optimization_barrier([*closed.consts, *jax.tree.leaves(argument)])
+            results, _ = jax.lax.optimization_barrier(jax.jit(looking_at_all)(*given))
+        return jax.tree.unflatten(jax.tree.structure(shape), results)
+
+    return called
+
+
+def _knows_the_attributes() -> bool:
+    """Whether the kernel attributes are known to help: they were tried with jaxlib 0.10 to 0.12."""
+    minor = int(jaxlib.__version__.split(".")[1])
+    if jaxlib.__version__.startswith("0.") and 10 <= minor <= 12:
+        return True
+    warnings.warn(
+        f"loops are compiled without XLA's kernel attributes, which were tried with jaxlib 0.10 to 0.12, not with "
+        f"{jaxlib.__version__}: results are the same, tables may take up to 2.5 times as long. "
+        "Install one of these versions where that matters.",
+        stacklevel=2,
+    )
+    return False
