@@ -89,24 +89,23 @@ def spin_of(options: argparse.Namespace, scene: Scene) -> float:
     return options.beta1 / float(scene.body.I3) if options.spin is None else options.spin
 
 
-def tables(options: argparse.Namespace) -> dict[tuple[str, str], Table]:
-    """The table of each arena for the first and for the last crossing of the angle, each written to its file."""
+def tables(options: argparse.Namespace) -> dict[str, Table]:
+    """The table of each arena, first and last crossing of the angle, written to its file."""
     arenas, found = scenes(options), {}
     options.out.mkdir(parents=True, exist_ok=True)
     for name, scene in arenas.items():
-        for crossing in ("first", "last"):
-            found[name, crossing] = inversion_table(
-                scene,
-                theta=options.theta,
-                # On the plane every place is alike.
-                eta=options.eta if name == "cylinder" else 0.0,
-                spin=spin_of(options, scene),
-                t1=options.t1,
-                angle=options.angle,
-                tolerance=options.tolerance,
-                crossing=crossing,
-                path=options.out / f"{name}_{crossing}.h5",
-            )
+        found[name] = inversion_table(
+            scene,
+            theta=options.theta,
+            # On the plane every place is alike.
+            eta=options.eta if name == "cylinder" else 0.0,
+            spin=spin_of(options, scene),
+            t1=options.t1,
+            angle=options.angle,
+            tolerance=options.tolerance,
+            crossing="both",
+            path=options.out / f"{name}.h5",
+        )
     return found
 
 
@@ -118,14 +117,14 @@ def printed_times(options: argparse.Namespace, eta: float) -> list[str] | None:
     return None
 
 
-def columns(options: argparse.Namespace, found: dict[tuple[str, str], Table]) -> list[tuple[str, list[str]]]:
+def columns(options: argparse.Namespace, found: dict[str, Table]) -> list[tuple[str, list[str]]]:
     """The columns of the report: a heading of two words or more, and an entry for every theta(0)."""
     shown = [("theta(0)|[rad]", [f"{theta:.4g}" for theta in options.theta])]
     places = [("cylinder", f"eta={eta:.4g}", (slice(None), i)) for i, eta in enumerate(options.eta)]
     for arena, place, cells in [*places, ("plane", "", (slice(None),))]:
-        for crossing in ("first", "last"):
-            table = found[arena, crossing]
-            entries = [_entry(t, word) for t, word in zip(table.time[cells], table.status[cells], strict=True)]
+        table = found[arena]
+        for crossing, times in (("first", table.first_time), ("last", table.last_time)):
+            entries = [_entry(t, word) for t, word in zip(times[cells], table.status[cells], strict=True)]
             shown.append((f"{arena} {place}|{crossing} [s]", entries))
         printed = printed_times(options, options.eta[cells[1]]) if arena == "cylinder" else None
         if printed is not None:
@@ -134,12 +133,12 @@ def columns(options: argparse.Namespace, found: dict[tuple[str, str], Table]) ->
 
 
 def _entry(seconds: float, word: str) -> str:
-    if word == "inverted":
+    if math.isfinite(seconds):
         return f"{seconds:.4f}"
     return {"not_inverted": "-", "contact_lost": "lost contact", "failed": "failed", "jammed": "jammed"}[word]
 
 
-def report(options: argparse.Namespace, found: dict[tuple[str, str], Table]) -> str:
+def report(options: argparse.Namespace, found: dict[str, Table]) -> str:
     """The tables side by side, as text."""
     scene = scenes(options)["cylinder"]
     body = scene.body
@@ -169,26 +168,25 @@ def _friction(law: AbstractFriction) -> str:
     return f"viscous mu = {float(law.mu):g} s/m"
 
 
-def picture(options: argparse.Namespace, found: dict[tuple[str, str], Table]) -> Any:
+def picture(options: argparse.Namespace, found: dict[str, Table]) -> Any:
     """theta(t) of every launch, all launches of a place in one batched run."""
     times = np.linspace(0.0, options.t1, SAMPLES)
-    panels = []
-    arenas = scenes(options)
-    places = [("cylinder", eta, (slice(None), i)) for i, eta in enumerate(options.eta)]
+    panels, thetas = [], np.asarray(options.theta)
 
     @jax.jit
     def theta_of(scene: Scene, launches: Launch) -> Any:
         run = jax.vmap(lambda launch: simulate(scene, launch, options.t1, times, options.tolerance).theta)
         return run(launches)
 
-    for arena, eta, cells in [*places, ("plane", 0.0, (slice(None),))]:
-        table = found[arena, "last"]
-        thetas = np.asarray(options.theta)
-        spin = np.full_like(thetas, spin_of(options, arenas[arena]))
-        launches = Launch(thetas, spin, np.full_like(thetas, eta), np.zeros_like(thetas))
-        theta = np.asarray(theta_of(arenas[arena], launches))
-        title = f"cylinder, η(0) = {eta:.4g}" if arena == "cylinder" else "plane"
-        panels.append(Panel(title, times, theta, thetas, table.time[cells]))
+    for arena, scene in scenes(options).items():
+        etas = options.eta if arena == "cylinder" else [0.0]
+        eta, theta = (values.ravel() for values in np.meshgrid(etas, thetas, indexing="ij"))
+        launches = Launch(theta, np.full_like(theta, spin_of(options, scene)), eta, np.zeros_like(theta))
+        shown = np.asarray(theta_of(scene, launches)).reshape(len(etas), len(thetas), -1)
+        ends = found[arena].last_time.reshape(len(thetas), len(etas))
+        for i, eta in enumerate(etas):
+            title = f"cylinder, η(0) = {eta:.4g}" if arena == "cylinder" else "plane"
+            panels.append(Panel(title, times, shown[i], thetas, ends[:, i]))
     return draw_launches(panels, options.angle)
 
 
@@ -205,7 +203,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         found = tables(options)
         print(report(options, found))
-        written = sorted({str(options.out / f"{arena}_{crossing}.h5") for arena, crossing in found})
+        written = [str(options.out / f"{arena}.h5") for arena in found]
         if find_spec("matplotlib") is None:
             print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
         else:
@@ -214,7 +212,7 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"python -m tippe: {error}", file=sys.stderr)
         return 2
-    cells = sum(table.time.size for table in found.values())
+    cells = sum(table.status.size for table in found.values())
     print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. Wrote {', '.join(written)}.")
     return 0
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nonholonomic.integration import (
+    CROSSED,
     FAILED,
     GUARD_LOST,
     UNRESOLVED,
@@ -46,8 +47,8 @@ class Kind(NamedTuple):
 
     @property
     def variables(self) -> dict[str, Variable]:
-        """The table's variables."""
-        found = {"time": Variable("s", np.float64), "status": Variable("1", np.int8, self.words)}
+        """The table's variables besides the times."""
+        found = {"status": Variable("1", np.int8, self.words)}
         found |= {"end_time": Variable("s", np.float64), "end_theta": Variable("rad", np.float64)}
         return found | {name: Variable("1", np.int64) for name in ("steps", "rejected", *self.counts)}
 
@@ -77,10 +78,25 @@ class Runs(NamedTuple):
     kind: Kind
     t1: float
     angle: float
-    last: bool
+    crossing: str
     solver: diffrax.AbstractERK
     method: str
     paths: list[str]
+
+    @property
+    def times(self) -> tuple[str, ...]:
+        """The table's variables that are times of crossings."""
+        return ("first_time", "last_time") if self.crossing == "both" else ("time",)
+
+    @property
+    def last(self) -> bool:
+        """Whether a run goes on through the angle: where it ends above it, the last crossing counts."""
+        return self.crossing != "first"
+
+    @property
+    def variables(self) -> dict[str, Variable]:
+        """The table's variables, but errors and derivatives."""
+        return {name: Variable("s", np.float64) for name in self.times} | self.kind.variables
 
     def results(self, roots: dict[str, Any], columns: dict[str, Any], tolerance: float, count: int) -> dict[str, Any]:
         """The variables of some cells.
@@ -93,13 +109,24 @@ class Runs(NamedTuple):
         size = next((len(values) for values in columns.values()), 1)
         problem = InversionProblem.of(scene, launch, self.angle, size)
         if self.kind.ride is not None:
-            journey = self.kind.ride(scene, problem, self.t1, tolerance, self.last, self.solver, count)
-            return self._named(scene, problem, journey) | dict(zip(self.kind.counts, journey.counts, strict=True))
+            return self._ridden(scene, problem, tolerance, count)
         if not self.paths:
             return self._named(scene, problem, self._outcome(problem, tolerance, count))
         options = {"count": count, "size": size, "solver": self.solver, "last": self.last}
         outcome, slopes = slopes_of_cells(roots, columns, self.paths, self.angle, self.t1, tolerance, **options)
         return self._named(scene, problem, outcome) | slopes
+
+    def _ridden(self, scene: Scene, problem: InversionProblem, tolerance: float, count: int) -> dict[str, Any]:
+        def ride(last: bool) -> Journey:
+            return self.kind.ride(scene, problem, self.t1, tolerance, last, self.solver, count)
+
+        journey = ride(self.last)
+        named = self._named(scene, problem, journey) | dict(zip(self.kind.counts, journey.counts, strict=True))
+        if self.crossing == "both":
+            # Through phases the first crossing takes a ride of its own, which ends there.
+            first = ride(False)
+            named["first_time"] = np.where(first.status == CROSSED, first.crossing_time, np.inf)
+        return named
 
     def _outcome(self, problem: InversionProblem, tolerance: float, count: int) -> Outcome:
         horizon, settings = jnp.asarray(self.t1), Settings(tolerance, self.solver)
@@ -116,8 +143,10 @@ class Runs(NamedTuple):
             # A hybrid run flies on where contact is lost.
             jams = self.kind is HYBRID or np.asarray(_jams(scene.dynamics, jnp.asarray(ended.state)))
             code = np.where(lost & jams, WORDS.index("jammed"), code)
-        return {
-            "time": np.where(inverted, ended.crossing_time, np.inf),
+        times = {self.times[-1]: np.where(inverted, ended.crossing_time, np.inf)}
+        if isinstance(ended, Outcome) and self.crossing == "both":
+            times["first_time"] = np.asarray(ended.first_crossing)
+        return times | {
             "status": code.astype(np.int8),
             "end_time": np.asarray(ended.end_time),
             "end_theta": np.asarray(jax.vmap(scene.theta, 1)(jnp.asarray(ended.state))),

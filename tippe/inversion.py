@@ -221,10 +221,10 @@ def check_smooth(scene: Scene, caller: str) -> None:
         raise ValueError(f"friction = {kind} must be a law without phases for {caller}; inversion_table has them")
 
 
-def check_event(angle: Any, crossing: Any) -> None:
-    """Raise `ValueError` unless the angle is in (0, pi] and the crossing a known word."""
+def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:
+    """Raise `ValueError` unless the angle is in (0, pi] and the crossing one of the known words."""
     require_all(event_bounds(angle))
     if np.ndim(angle) != 0:
         raise ValueError(f"angle must be one number, not of shape {np.shape(angle)}")
-    if crossing not in ("first", "last"):
-        raise ValueError(f"crossing = {crossing!r} must be 'first' or 'last'")
+    if crossing not in known:
+        raise ValueError(f"crossing = {crossing!r} must be {' or '.join(map(repr, known))}")

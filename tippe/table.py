@@ -57,7 +57,8 @@ def inversion_table(
     - `angle`: angle [rad] that counts as inverted.
     - `tolerance`: relative tolerance of the integration.
     - `crossing`: "first" for the first time theta reaches the angle; "last" for the up-crossing after which theta stays
-      above it until `t1` (first crossings are ill-conditioned where theta oscillates about the angle).
+      above it until `t1` (first crossings are ill-conditioned where theta oscillates about the angle); "both" for the two from
+      one run, in the variables `first_time` and `last_time` in place of `time`, the status being that of the last.
     - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
     - `axes`: further axes, path of a number -> values, such as `{"scene.body.offset": [0.005, 0.006]}`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
@@ -82,7 +83,7 @@ def inversion_table(
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
     """
     solver = diffrax.Dopri8() if solver is None else solver
-    check_event(angle, crossing)
+    check_event(angle, crossing, ("first", "last", "both"))
     explicit_tableau(solver)
     if not isinstance(errors, bool):
         raise ValueError(f"errors = {errors!r} must be True or False")
@@ -90,6 +91,8 @@ def inversion_table(
         raise ValueError(f"method = {method!r} must be 'ensemble' or 'diffrax'")
     if method == "diffrax" and sensitivities:
         raise ValueError("method = 'diffrax' must be 'ensemble' for sensitivities")
+    if crossing == "both" and sensitivities:
+        raise ValueError("crossing = 'both' must be 'first' or 'last' for sensitivities, which are of one time")
     if method == "diffrax" and crossing != "first":
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     if not isinstance(scene, Scene):
@@ -121,7 +124,7 @@ def inversion_table(
     if not kind.smooth and (method == "diffrax" or paths):
         what = "method = 'diffrax'" if method == "diffrax" else f"sensitivities = {sensitivities!r}"
         raise ValueError(f"{what} is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
-    runs = Runs(kind, float(t1), float(angle), crossing == "last", solver, method, paths)
+    runs = Runs(kind, float(t1), float(angle), crossing, solver, method, paths)
 
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
         if method == "diffrax" and count == 0:
@@ -131,17 +134,19 @@ def inversion_table(
         if errors:
             coarse = runs._replace(paths=[]).results(roots, columns, COARSER * tolerance, count)
             agreed = (found["status"] == coarse["status"]) & (found["status"] != kind.words.index("failed"))
-            found["time_error"] = time_error(found["time"], coarse["time"], agreed)
+            for name in runs.times:
+                alike = agreed & (np.isfinite(found[name]) == np.isfinite(coarse[name]))
+                found[f"{name}_error"] = time_error(found[name], coarse[name], alike)
         return found
 
     request = description("scene", roots["scene"]) | description("launch", roots["launch"])
     request |= {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
     request |= {"solver": type(solver).__name__, "method": method}
     request |= {one.path: "an axis" for one in grid}
-    variables = kind.variables
+    variables = runs.variables
     if errors:
         request |= {"errors": True}
-        variables = variables | {"time_error": Variable("s", np.float64)}
+        variables = variables | {f"{name}_error": Variable("s", np.float64) for name in runs.times}
     if paths:
         request |= {"sensitivities": paths}
         variables = variables | slope_variables(paths, units)

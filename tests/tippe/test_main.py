@@ -17,8 +17,8 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys):
     assert "first [s]" in told
     assert "9.98" in told
     assert (tmp_path / "out" / "theta.png").read_bytes().startswith(b"\x89PNG")
-    with xarray.open_dataset(tmp_path / "out" / "cylinder_first.h5", engine="h5netcdf") as data:
-        assert data["time"].dims == ("theta", "eta")
+    with xarray.open_dataset(tmp_path / "out" / "cylinder.h5", engine="h5netcdf") as data:
+        assert data["first_time"].dims == ("theta", "eta")
         assert json.loads(data.attrs["request"])["scene.surface"] == "Cylinder"
     # The same again is read from the files; another scene in the same folder is refused.
     assert main([*SMALL, "--out", str(tmp_path / "out")]) == 0

@@ -388,3 +388,37 @@ def test_a_table_prints_and_draws(table):
         table.plot("status")
     with pytest.raises(AttributeError, match="no variable 'tme'; it has time"):
         _ = table.tme
+
+
+@pytest.mark.parametrize("arena", [tippe.Plane(), tippe.Cylinder(0.3)])
+def test_first_and_last_crossing_come_from_one_run(arena):
+    """From the cylinder's wall theta swings past the angle and back, so the two differ; each is what its own table says."""
+    scene = tippe.Scene(rutstam_top(), arena, tippe.Viscous(0.3))
+    eta = 0.0 if isinstance(arena, tippe.Plane) else math.pi / 2.0
+    asked = {"theta": np.linspace(0.1, 0.4, 4), "spin": 100.0, "eta": eta, "t1": 15.0, "angle": 2.5}
+    both = tippe.inversion_table(scene, crossing="both", errors=True, **asked)
+    first = tippe.inversion_table(scene, crossing="first", **asked)
+    last = tippe.inversion_table(scene, crossing="last", **asked)
+    assert_close(both.first_time, first.time, rtol=1e-11)
+    assert_close(both.last_time, last.time, rtol=1e-11)
+    assert both.status.tolist() == last.status.tolist()
+    assert np.isfinite(both.first_time).any()
+    if isinstance(arena, tippe.Cylinder):
+        assert (both.last_time > both.first_time).any()
+    assert both.digits("last_time").shape == both.digits("first_time").shape == (4,)
+    assert "time" not in both.variables
+
+
+def test_both_crossings_through_phases():
+    """Flights: the first crossing of a run that goes on, and the last."""
+    scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), contact="hybrid")
+    asked = {"theta": [0.1], "spin": 200.0, "t1": 8.0}
+    both = tippe.inversion_table(scene, crossing="both", **asked)
+    for name in ("first", "last"):
+        assert_close(both.variables[f"{name}_time"], tippe.inversion_table(scene, crossing=name, **asked).time)
+
+
+def test_both_crossings_have_no_one_derivative():
+    scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
+    with pytest.raises(ValueError, match="crossing = 'both' must be 'first' or 'last' for sensitivities"):
+        tippe.inversion_table(scene, theta=[0.1], spin=100.0, t1=1.0, crossing="both", sensitivities=["friction.mu"])
