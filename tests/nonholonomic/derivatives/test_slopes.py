@@ -160,3 +160,45 @@ def test_values_of_several_kinds_are_shared():
     jax.tree.map(
         lambda one, other: assert_close(one, other, rtol=1e-15), function(x, y), sharing_values(function)(x, y)
     )
+
+
+class AtRest(AbstractProblem):
+    """x' = 1 + y, y' = -500 (y - rest), both from 0; the event is x = 1. With rest = 0, y is at rest, but not its tangent.
+
+    Then dt/drest = -(1 - (1 - exp(-500)) / 500), and dt/dpush = -1 for a push added to x'.
+    """
+
+    rest: jnp.ndarray
+    push: jnp.ndarray
+
+    def start(self):
+        return jnp.zeros((2, 4)), jnp.ones((2, 4))
+
+    def field(self, time, state):
+        rate = -500.0 * (state[1] - self.rest)
+        return jnp.stack([1.0 + state[1] + self.push, rate])
+
+    def crossing(self, state):
+        return 1.0 - state[0]
+
+    def guard(self, time, state):
+        return None
+
+
+@pytest.mark.parametrize("names", [("rest",), ("rest", "push")])
+def test_a_component_at_rest_has_its_tangent_integrated(names):
+    """Steps judged by the run alone would reach the event in a few strides of which the tangent bears none: along one
+    direction, and on the way back by two."""
+    point = (jnp.zeros(4), jnp.zeros(4))
+    tangents = [tuple(jnp.full(4, name == moved) * 1.0 for moved in ("rest", "push")) for name in names]
+
+    @eqx.filter_jit
+    def run():
+        directions = directions_of(AtRest, point, tangents)
+        given = (jnp.asarray(5.0), jnp.asarray(4), Settings(1e-10))
+        return march_with_slopes(AtRest(*point), directions, *given, one_kernel=True)
+
+    _, slopes = run()
+    expected = {"rest": -(1.0 - 1.0 / 500.0), "push": -1.0}
+    for name, slope in zip(names, slopes, strict=True):
+        assert_close(slope, np.full(4, expected[name]), rtol=1e-8)
