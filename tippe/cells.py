@@ -8,41 +8,45 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
 from nonholonomic.integration import (
     FAILED,
     GUARD_LOST,
     UNRESOLVED,
+    AbstractPhase,
     Journey,
     Outcome,
     compiled_march,
     lanes_for,
     march_by_diffrax,
+    travel,
 )
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Variable
 
 from .inversion import ABSOLUTE, InversionProblem, is_inverted
-from .phases.flight_cells import ride as ride_with_flights
-from .phases.stick_slip_cells import ride as ride_with_sticking
+from .phases.sliding import phases as hybrid_phases
+from .phases.stick_slip_runs import phases as stick_slip_phases
 from .scene import Scene
 from .sensitivities import slopes_of_cells
 
 
 class Kind(NamedTuple):
-    """A kind of runs: the words of its status, what is counted besides steps, and how the runs go.
+    """A kind of runs: the words of its status, what is counted besides steps, and through which phases the runs go.
 
-    `ride` takes (scene, problem, t1, tolerance, last, solver, count); `None` for runs of one smooth motion.
+    `phases` takes (scene, problem, tolerance, last) and gives the phases and the number of each cell's first; `None` for runs
+    of one smooth motion.
     """
 
     words: tuple[str, ...]
     counts: tuple[str, ...]
-    ride: Callable[..., Journey] | None
+    phases: Callable[..., tuple[tuple[AbstractPhase, ...], Int[Array, " cells"]]] | None
 
     @property
     def smooth(self) -> bool:
         """Whether a run is one smooth motion."""
-        return self.ride is None
+        return self.phases is None
 
     @property
     def variables(self) -> dict[str, Variable]:
@@ -57,8 +61,8 @@ _jams = eqx.filter_jit(lambda dynamics, state: dynamics.jams(state))
 
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed")
 SMOOTH = Kind(WORDS, (), None)
-STICK_SLIP = Kind((*WORDS, "unresolved"), ("sticks",), ride_with_sticking)
-HYBRID = Kind((*WORDS, "unresolved"), ("hops",), ride_with_flights)
+STICK_SLIP = Kind((*WORDS, "unresolved"), ("sticks",), stick_slip_phases)
+HYBRID = Kind((*WORDS, "unresolved"), ("hops",), hybrid_phases)
 
 #: Which word a run's status is, where it has not inverted; `not_inverted` for all others.
 WORD_OF_STATUS = {GUARD_LOST: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
@@ -92,8 +96,13 @@ class Runs(NamedTuple):
         scene, launch = cells["scene"], cells["launch"]
         size = next((len(values) for values in columns.values()), 1)
         problem = InversionProblem.of(scene, launch, self.angle, size)
-        if self.kind.ride is not None:
-            journey = self.kind.ride(scene, problem, self.t1, tolerance, self.last, self.solver, count)
+        if self.kind.phases is not None:
+            phases, first = self.kind.phases(scene, problem, tolerance, self.last)
+            start, options = (
+                (np.asarray(first), np.asarray(problem.states)),
+                {"solver": self.solver, "passes": self.last},
+            )
+            journey = travel(phases, *start, self.t1, count, tolerance, ABSOLUTE * tolerance, kinds=1, **options)
             return self._named(scene, problem, journey) | dict(zip(self.kind.counts, journey.counts, strict=True))
         if not self.paths:
             return self._named(scene, problem, self._outcome(problem, tolerance, count, size))
