@@ -8,42 +8,46 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
 from nonholonomic.integration import (
     CROSSED,
     FAILED,
     GUARD_LOST,
     UNRESOLVED,
+    AbstractPhase,
     Journey,
     Outcome,
     Settings,
     compiled_march,
     march_by_diffrax,
+    travel,
 )
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Variable
 
 from .inversion import InversionProblem, is_inverted
-from .phases.flight_cells import ride as ride_with_flights
-from .phases.stick_slip_cells import ride as ride_with_sticking
+from .phases.sliding import phases as hybrid_phases
+from .phases.stick_slip_runs import phases as stick_slip_phases
 from .scene import Scene
 from .sensitivities import slopes_of_cells
 
 
 class Kind(NamedTuple):
-    """A kind of runs: the words of its status, what is counted besides steps, and how the runs go.
+    """A kind of runs: the words of its status, what is counted besides steps, and through which phases the runs go.
 
-    `ride` takes (scene, problem, t1, tolerance, last, solver, count); `None` for runs of one smooth motion.
+    `phases` takes (scene, problem, tolerance, last) and gives the phases and the number of each cell's first; `None` for runs
+    of one smooth motion.
     """
 
     words: tuple[str, ...]
     counts: tuple[str, ...]
-    ride: Callable[..., Journey] | None
+    phases: Callable[..., tuple[tuple[AbstractPhase, ...], Int[Array, " cells"]]] | None
 
     @property
     def smooth(self) -> bool:
         """Whether a run is one smooth motion."""
-        return self.ride is None
+        return self.phases is None
 
     @property
     def variables(self) -> dict[str, Variable]:
@@ -58,8 +62,8 @@ _jams = eqx.filter_jit(lambda dynamics, state: dynamics.jams(state))
 
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed")
 SMOOTH = Kind(WORDS, (), None)
-STICK_SLIP = Kind((*WORDS, "unresolved"), ("sticks",), ride_with_sticking)
-HYBRID = Kind((*WORDS, "unresolved"), ("hops",), ride_with_flights)
+STICK_SLIP = Kind((*WORDS, "unresolved"), ("sticks",), stick_slip_phases)
+HYBRID = Kind((*WORDS, "unresolved"), ("hops",), hybrid_phases)
 
 #: Which word a run's status is, where it has not inverted; `not_inverted` for all others.
 WORD_OF_STATUS = {GUARD_LOST: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
@@ -108,23 +112,28 @@ class Runs(NamedTuple):
         scene, launch = cells["scene"], cells["launch"]
         size = next((len(values) for values in columns.values()), 1)
         problem = InversionProblem.of(scene, launch, self.angle, size)
-        if self.kind.ride is not None:
-            return self._ridden(scene, problem, tolerance, count)
+        if self.kind.phases is not None:
+            return self._travelled(scene, problem, tolerance, count)
         if not self.paths:
             return self._named(scene, problem, self._outcome(problem, tolerance, count))
         options = {"count": count, "size": size, "solver": self.solver, "last": self.last}
         outcome, slopes = slopes_of_cells(roots, columns, self.paths, self.angle, self.t1, tolerance, **options)
         return self._named(scene, problem, outcome) | slopes
 
-    def _ridden(self, scene: Scene, problem: InversionProblem, tolerance: float, count: int) -> dict[str, Any]:
-        def ride(last: bool) -> Journey:
-            return self.kind.ride(scene, problem, self.t1, tolerance, last, self.solver, count)
+    def _travelled(self, scene: Scene, problem: InversionProblem, tolerance: float, count: int) -> dict[str, Any]:
+        """The variables of cells whose runs have phases."""
 
-        journey = ride(self.last)
-        named = self._named(scene, problem, journey) | dict(zip(self.kind.counts, journey.counts, strict=True))
+        def journey(last: bool) -> Journey:
+            assert self.kind.phases is not None
+            phases, first = self.kind.phases(scene, problem, tolerance, last)
+            start, settings = (np.asarray(first), np.asarray(problem.states)), Settings(tolerance, self.solver)
+            return travel(phases, *start, self.t1, count, settings, kinds=1, passes=last)
+
+        found = journey(self.last)
+        named = self._named(scene, problem, found) | dict(zip(self.kind.counts, found.counts, strict=True))
         if self.crossing == "both":
-            # Through phases the first crossing takes a ride of its own, which ends there.
-            first = ride(False)
+            # Through phases the first crossing takes a journey of its own, which ends there.
+            first = journey(False)
             named["first_time"] = np.where(first.status == CROSSED, first.crossing_time, np.inf)
         return named
 

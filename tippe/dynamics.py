@@ -33,6 +33,9 @@ from .top import Top
 #: Where the axis' component along n stands in the state: cos(theta).
 COS_THETA = 4
 
+#: No angle has this cosine: it stands for the angle of runs that go on through all of them.
+NO_COSINE = -2.0
+
 #: Stiffness (`Motion.stiffness`) at which a contact counts as jammed. N grows as its inverse while it falls to zero as the root
 #: of the time left, so a run ends too early by the square of this in units of 1e-4 s or so: by 1e-12 s, and 100 times as much
 #: with ten times the value, in `tests/physics/test_strong_friction.py`; theta errs by 5e-13 there, velocities by 1e-4.

@@ -34,13 +34,17 @@ from .scene import Scene
 
 
 class Run(AbstractProblem):
-    """Launches with their cyclic coordinates: the state, the arena's path, the spin angle and the work of friction."""
+    """Launches with their cyclic coordinates: the state, the arena's path, the spin angle and the work of friction.
+
+    `rest` are spin angle and work at the start, `None` where both are 0.
+    """
 
     dynamics: Dynamics | StickSlip | Kind
     axial: Float[Array, "..."]
     state: Float[Array, "components ..."]
     path: Float[Array, "components ..."]
     scales: Float[Array, "components ..."]
+    rest: Float[Array, "2 ..."] | None = None
 
     @classmethod
     def of(cls, scene: Scene, launch: Launch, cells: int | None = None) -> "Run":
@@ -54,8 +58,8 @@ class Run(AbstractProblem):
         return cls(scene.dynamics, scene.body.I3, parts[0], parts[1], jnp.concatenate(parts[2:]))
 
     def start(self) -> tuple[Float[Array, "components ..."], Float[Array, "components ..."]]:
-        nothing = jnp.zeros((2, *self.state.shape[1:]))
-        return jnp.concatenate([self.state, self.path, nothing]), self.scales
+        rest = jnp.zeros((2, *self.state.shape[1:])) if self.rest is None else self.rest
+        return jnp.concatenate([self.state, self.path, rest]), self.scales
 
     def field(self, time: Float[Array, "..."], state: Float[Array, "components ..."]) -> Any:
         lean, path = state[: len(self.state)], tuple(state[len(self.state) : -2])

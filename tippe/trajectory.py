@@ -1,6 +1,6 @@
 """One run of a tippe top, with its path."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import diffrax
@@ -8,33 +8,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from nonholonomic.geometry import dot
-from nonholonomic.integration import Settings, follow
-from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require, require_all
+from nonholonomic.integration import Path, PhasedPath, Settings, follow
+from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require_all
 
 from .inversion import check_run, run_bounds
 from .launch import Launch
+from .observables import AbstractTrajectory, check_increasing, of_each_run
 from .phases.flight_trajectory import HybridTrajectory, simulate_hybrid
-from .phases.stick_slip_path import follow_stick_slip
+from .phases.stick_slip_runs import follow_stick_slip
 from .sampled import STATUS, Run, ended, sampled, sampled_by_diffrax
 from .scene import Scene
 
 
-def _of_each_run(function: Callable[["Trajectory"], Array]) -> property:
-    """A property of one run that is, for a batch of runs as `vmap` returns it, the property of each."""
-
-    def get(self):
-        mapped = function
-        for _ in range(self.t.ndim - 1):
-            mapped = eqx.filter_vmap(mapped)
-        return mapped(self)
-
-    return property(get, doc=function.__doc__)
-
-
-class Trajectory(eqx.Module):
+class Trajectory(AbstractTrajectory):
     """A run of a tippe top, or a batch of runs, with the batch first.
 
     Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame
@@ -59,104 +47,32 @@ class Trajectory(eqx.Module):
     stats: dict[str, Any]
     dense: Any
 
-    @_of_each_run
-    def theta(self) -> Float[Array, " times"]:
-        """Angle from the normal to the axis [rad]."""
-        return self.scene.theta(self.states)
+    @property
+    def above(self) -> tuple[None, None]:
+        """No distance from the arena: the contact persists."""
+        return None, None
 
-    @_of_each_run
-    def eta(self) -> Float[Array, " times"]:
-        """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
-        return self.scene.surface.angle(tuple(self.states[8:]), tuple(self.path))
-
-    @_of_each_run
-    def azimuth(self) -> Float[Array, " times"]:
-        """Direction in which the axis leans [rad], from t1 towards t2, in (-pi, pi]."""
-        return jnp.arctan2(self.states[3], self.states[2])
-
-    @_of_each_run
-    def spin(self) -> Float[Array, " times"]:
-        """Angular velocity about the axis [rad/s]."""
-        return self.scene.spin(self.states)
-
-    @_of_each_run
-    def axis(self) -> Float[Array, "times 3"]:
-        """The unit vector e along the axis."""
-        return self._fixed(tuple(self.states[2:5]))
-
-    @_of_each_run
-    def angular_momentum(self) -> Float[Array, "times 3"]:
-        """Angular momentum about the centre of mass [kg m^2/s]."""
-        return self._fixed(tuple(self.states[5:8]))
-
-    @_of_each_run
-    def velocity(self) -> Float[Array, "times 3"]:
-        """Velocity of the sphere's centre [m/s]."""
-        V = self.scene.dynamics.motion(self.states).velocity
-        return self._fixed((*V, jnp.zeros_like(V[0])))
-
-    @_of_each_run
-    def position(self) -> Float[Array, "times 3"]:
-        """Position of the sphere's centre [m]; the plane is z = 0, the cylinder's axis x = z = 0."""
-        foot = self.scene.surface.position(tuple(self.states[8:]), tuple(self.path))
-        normal = self.scene.surface.frame(tuple(self.states[8:]), tuple(self.path))[2]
-        return jnp.stack([q + self.scene.body.radius * n for q, n in zip(foot, normal, strict=True)], axis=-1)
-
-    @_of_each_run
+    @of_each_run
     def energy(self) -> Float[Array, " times"]:
         """Kinetic and potential energy [J]."""
         return self.scene.energy(self.states)
 
-    @_of_each_run
-    def jellett(self) -> Float[Array, " times"]:
-        """Jellett's quantity [kg m^3/s]; constant on the plane where friction acts at a point."""
-        return self.scene.jellett(self.states)
-
-    @_of_each_run
+    @of_each_run
     def normal_force(self) -> Float[Array, " times"]:
         """Normal force [N]."""
         return self.scene.normal_force(self.states)
 
-    @_of_each_run
+    @of_each_run
     def slip(self) -> Float[Array, "times 2"]:
         """Velocity of the contact point along the arena, in the moving frame [m/s]."""
         return self.scene.slip_velocity(self.states).T
 
-    def at(self, times: Float[ArrayLike, " times"]) -> "Trajectory":
-        """The same run at other times, from the dense output.
-
-        **Arguments:** `times`: increasing, within [0, `end_time`] [s].
-
-        **Raises:** `ValueError` for times outside the run, or if the run was made inside a transformation.
-        """
-        if self.dense is None:
-            raise ValueError("a run made inside jit, vmap or grad has no dense output: hand `times` to simulate")
-        times = np.asarray(times, dtype=float)
-        require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
-        _check_increasing(times)
-        return _cut(self, times, self.dense.at(times))
-
-    def _fixed(self, vector: tuple[Array, Array, Array]) -> Float[Array, "times 3"]:
-        frame = self.scene.surface.frame(tuple(self.states[8:]), tuple(self.path))
-        return jnp.stack([dot(vector, directions) for directions in zip(*frame, strict=True)], axis=-1)
-
-    def __str__(self) -> str:
-        if is_traced(self.t) or self.t.ndim > 1:
-            return f"Trajectory of {self.t.shape} times"
-        end = f"{float(self.end_time):.6g} s"
-        ending = {"reached t1": f"ran to {end}", "contact_lost": f"lost contact at {end}", "jammed": f"jammed at {end}"}
-        lines = [
-            f"Trajectory of {len(self.t)} times, {ending.get(self.status, f'failed at {end}')}",
-            f"  theta: {float(self.theta[0]):.6g} to {float(self.theta[-1]):.6g} rad",
-        ]
-        if "accepted" in self.stats:
-            lines.append(f"  steps: {self.stats['accepted']} accepted, {self.stats['rejected']} rejected")
-            lines.append(f"  drift of |e|: {self.stats['axis_drift']:.1e}")
-            lines.append(f"  energy residual: {self.stats['energy_residual']:.1e} J of {float(self.energy[0]):.4g} J")
-        return "\n".join(lines)
-
-    def __repr__(self) -> str:
-        return str(self)
+    def resampled(self, times: Float[np.ndarray, " times"]) -> "Trajectory":
+        """The same run at other times, which are not checked."""
+        states = jnp.asarray(self.dense.at(times))
+        size = len(self.states)
+        found = (jnp.asarray(times), states[:size], states[size:-2], states[-2], states[-1])
+        return eqx.tree_at(lambda one: (one.t, one.states, one.path, one.spin_angle, one.work), self, found)
 
 
 def simulate(
@@ -196,7 +112,7 @@ def simulate(
     if times is not None:
         times = as_number(times)
         require_all(times_bounds(times, t1))
-        _check_increasing(times)
+        check_increasing(times)
     if scene.contact == "hybrid":
         if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1))):
             raise ValueError("contact = 'hybrid' must be 'stop' inside jit, vmap and grad")
@@ -210,13 +126,6 @@ def simulate(
     if times is None:
         return trajectory
     return trajectory.at(np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)])
-
-
-def _check_increasing(times: Any) -> None:
-    if np.ndim(times) != 1 or np.shape(times)[0] == 0:
-        raise ValueError(f"times must be a non-empty list, not of shape {np.shape(times)}")
-    if not is_traced(times) and np.any(np.diff(times) <= 0.0):
-        raise ValueError("times must increase")
 
 
 def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
@@ -270,31 +179,8 @@ def _parts(run: Run, states: Float[Array, "components times"]) -> tuple[Any, Any
     return states[:lean], states[lean:-2], states[-2], states[-1]
 
 
-def _as_trajectory(scene: Scene, run: Run, path: Any) -> Trajectory:
-    lean, cyclic, spin_angle, work = _parts(run, jnp.asarray(path.states))
-    status = STATUS[
-        int(ended(run, jnp.asarray(path.states[:, -1]), jnp.asarray(path.guard_lost), jnp.asarray(path.failed)))
-    ]
-    energy = scene.energy(lean)
-    stats = {
-        "accepted": path.accepted,
-        "rejected": path.rejected,
-        "axis_drift": float(jnp.max(jnp.abs(jnp.sqrt(jnp.sum(lean[2:5] ** 2, axis=0)) - 1.0))),
-        "energy_residual": float(jnp.max(jnp.abs(energy - energy[0] - work))),
-    }
-    if scene.friction.set_valued:
-        stats["sticks"] = path.sticks
-    times = jnp.asarray(path.times)
-    return Trajectory(times, scene, lean, cyclic, spin_angle, work, status, times[-1], stats, path)
-
-
-def _cut(trajectory: Trajectory, times: Any, states: Any) -> Trajectory:
-    run_size = trajectory.states.shape[0]
-    return eqx.tree_at(
-        lambda one: (one.t, one.states, one.path, one.spin_angle, one.work),
-        trajectory,
-        (
-            jnp.asarray(times),
-            *(jnp.asarray(part) for part in (states[:run_size], states[run_size:-2], states[-2], states[-1])),
-        ),
-    )
+def _as_trajectory(scene: Scene, run: Run, path: Path | PhasedPath) -> Trajectory:
+    states, times = jnp.asarray(path.states), jnp.asarray(path.times)
+    status = STATUS[int(ended(run, states[:, -1], jnp.asarray(path.guard_lost), jnp.asarray(path.failed)))]
+    sticks = {"sticks": int(path.counts[0])} if isinstance(path, PhasedPath) else {}
+    return Trajectory(times, scene, *_parts(run, states), status, times[-1], {}, path).with_stats(path, **sticks)

@@ -116,10 +116,10 @@ def the_law_itself() -> Row:
     """SetValuedCoulomb: the slip ends and the top rolls."""
     run = timed(lambda: final_theta(tippe.SetValuedCoulomb(0.3), diffrax.Dopri8(), 1e-9), 1)
     found = float(run.result.theta[-1])
-    slip = run.result.dense.parts[0]
+    slip = run.result.dense.stays[0]
     return of_runs(
         "Cohen's top under Coulomb's law itself",
-        f"slips to {slip.times[-1]:.5f} s, then rolls; theta(0.5 s) = {found:.6f} rad",
+        f"slips to {slip.end:.5f} s, then rolls; theta(0.5 s) = {found:.6f} rad",
         abs(found - by_events()),
         1e-8,
         "SciPy by events [rad]",

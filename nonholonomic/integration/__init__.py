@@ -1,9 +1,9 @@
 """Runs in time: from a start along a field to an event, to the end of the model's validity, or to a horizon.
 
-`compiled_march` runs many cells of a problem in lanes that keep step with one another; `travel` runs cells
-through phases; `follow` and `sample` are single runs with any solver of Diffrax, and `march_by_diffrax` is the
-independent second road. `Settings` says how, and the codes of a run's status are `RUNNING`, `REACHED_END`,
-`CROSSED`, `GUARD_LOST`, `FAILED` and `UNRESOLVED`.
+`compiled_march` runs many cells of a problem in lanes that keep step with one another; `follow` and `sample` are single runs
+with any solver of Diffrax. `travel` runs many cells through phases, `follow_phases` a single run with its path.
+`march_by_diffrax` is the independent second road. `Settings` says how, and the codes of a run's status are `RUNNING`,
+`REACHED_END`, `CROSSED`, `GUARD_LOST`, `FAILED` and `UNRESOLVED`.
 """
 
 from .attempt import Block as Block
@@ -14,9 +14,13 @@ from .march import compiled_march as compiled_march
 from .march import traced_march as traced_march
 from .march import with_crossing_times as with_crossing_times
 from .midpoint import ImplicitMidpoint as ImplicitMidpoint
+from .phased_run import BETWEEN as BETWEEN
+from .phased_run import PhasedPath as PhasedPath
+from .phased_run import follow_phases as follow_phases
 from .phases import AbstractPhase as AbstractPhase
 from .phases import Journey as Journey
 from .phases import Passage as Passage
+from .phases import Record as Record
 from .phases import travel as travel
 from .problem import AbstractProblem as AbstractProblem
 from .problem import crossing_time as crossing_time

@@ -20,8 +20,21 @@ from .problem import AbstractProblem
 from .settings import Settings
 from .status import FAILED, GUARD_LOST, REACHED_END, RUNNING, UNRESOLVED
 
-#: Rounds after which what is still under way is given up.
+#: Rounds, and so phases of a single run, after which what is still under way is given up.
 MOST_ROUNDS = 2000
+
+
+class Record(NamedTuple):
+    """The way of a single run from one phase to the next, as stretches of motion of known form that follow one another.
+
+    - `ends`: when each stretch ends [s], counted from the end of the phase; infinite where there are no more.
+    - `motions`: what `AbstractPhase.between` needs of each, with the stretches on the first axis of every leaf.
+    - `shown`: at how many times each is to be shown where nobody asks for others.
+    """
+
+    ends: Float[Array, " stretches 1"]
+    motions: Any
+    shown: Int[Array, " stretches 1"]
 
 
 class Passage(NamedTuple):
@@ -29,7 +42,8 @@ class Passage(NamedTuple):
 
     `status` is `RUNNING` where the motion goes on in the phase numbered `phase`, else how it ended; `state` is the state
     then, `elapsed` [s] the time that passed on the way, `crossing_time` [s] when on the way the event was passed (for the
-    last time), infinite if it was not; `counts` what happened how often, a row for each kind.
+    last time), infinite if it was not; `counts` what happened how often, a row for each kind. `record` is for a single run
+    that keeps its path (`phased_run.py`); `None` where no time passes on the way, or where the path is not kept.
     """
 
     phase: Int[Array, " cells"]
@@ -38,6 +52,7 @@ class Passage(NamedTuple):
     status: Int[Array, " cells"]
     crossing_time: Float[Array, " cells"]
     counts: Int[Array, "kinds cells"]
+    record: Record | None = None
 
 
 class AbstractPhase(eqx.Module):
@@ -58,6 +73,14 @@ class AbstractPhase(eqx.Module):
 
         **Returns:** a `Passage`, which ends with `REACHED_END` where it would take longer than `left`.
         """
+
+    def shown(self, state: Float[Array, "components times"]) -> Float[Array, "shown times"]:
+        """What a path shows of states in this phase: in all phases of a run as many components."""
+        return state
+
+    def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
+        """What a path shows of one of the stretches in `Passage.record`, some time [s] after it has begun."""
+        raise NotImplementedError(f"{type(self).__name__} records stretches but does not say what they show")
 
 
 class Journey(NamedTuple):

@@ -9,8 +9,8 @@ from conftest import assert_close, homogeneous_ball, rutstam_top
 from scipy.integrate import solve_ivp
 
 import tippe
-from nonholonomic.integration import Settings
-from tippe.phases.stick_slip_path import follow_stick_slip
+from nonholonomic.integration import PhasedPath, Settings
+from tippe.phases.stick_slip_runs import ROLLING, follow_stick_slip
 from tippe.trajectory import Run
 
 
@@ -22,6 +22,11 @@ def cohen_top() -> tippe.Top:
 
 def scene_of(body: tippe.Top, mu: float) -> tippe.Scene:
     return tippe.Scene(body, tippe.Plane(), tippe.SetValuedCoulomb(mu))
+
+
+def kinds(path: PhasedPath) -> list[bool]:
+    """Whether each phase of a run rolls."""
+    return [piece.number == ROLLING for piece in path.stays]
 
 
 def reference(body: tippe.Top, mu: float, theta: float, spin: float, t1: float) -> list[coulomb_top.Phase]:
@@ -38,19 +43,19 @@ def test_cohens_top_stops_slipping_and_rolls():
     expected = reference(cohen_top(), 0.3, 0.1, 100.0, 0.05)
     assert run.stats["sticks"] == 1
     assert [phase.kind for phase in expected] == ["slipping", "rolling"]
-    slip, rolling = run.dense.parts
+    slip, rolling = run.dense.stays
     # The blow comes earlier by the time left: the speed, 1e-6 m/s at this tolerance, over the deceleration.
-    assert_close(slip.times[-1], expected[0].times[-1], atol=2e-7)
-    assert_close(slip.times[-1], 0.02879, atol=5e-6)
+    assert_close(slip.end, expected[0].times[-1], atol=2e-7)
+    assert_close(slip.end, 0.02879, atol=5e-6)
     at_end = run.at([0.03, 0.05])
     assert_close(at_end.axis[1], expected[1].states[:3, -1], atol=1e-9)
-    assert_close(run.scene.theta(jnp.asarray(slip.states[:8, -1])), 0.0529, atol=5e-5)
+    assert_close(run.scene.theta(jnp.asarray(slip.motion.states[:8, -1])), 0.0529, atol=5e-5)
     rolls = run.t > 0.03
     assert_close(run.energy[rolls], 2.153106e-2, rtol=1e-6)
     assert_close(run.energy[rolls], run.energy[-1], rtol=1e-9)
     assert_close(run.jellett, run.jellett[0], rtol=1e-9)
     assert_close(np.max(run.theta[rolls]), 0.0749, atol=1e-4)
-    force = run.scene.dynamics.rolling.reaction(jnp.asarray(rolling.states[:8]))
+    force = run.scene.dynamics.rolling.reaction(jnp.asarray(rolling.motion.states[:8]))
     needed = np.hypot(force[0], force[1]) / force[2]
     assert_close(needed[0], 0.0865, atol=1e-4)
     assert_close(np.max(needed), 0.0910, atol=1e-4)
@@ -61,7 +66,7 @@ def test_a_top_that_sticks_and_slips_again():
     """Rutstam's top at mu = 0.2 slips, rolls, slips, rolls and slips within 0.9 s; against SciPy, event by event."""
     run = tippe.simulate(scene_of(rutstam_top(), 0.2), tippe.Launch(1.5, 30.0), 0.9, tolerance=1e-10)
     expected = reference(rutstam_top(), 0.2, 1.5, 30.0, 0.9)
-    assert run.dense.rolls == [phase.kind == "rolling" for phase in expected] == [False, True, False, True, False]
+    assert kinds(run.dense) == [phase.kind == "rolling" for phase in expected] == [False, True, False, True, False]
     assert run.stats["sticks"] == 2
     assert_close(run.axis[-1], expected[-1].states[:3, -1], atol=1e-7)
     assert_close(run.jellett, run.jellett[0], rtol=1e-9)
@@ -76,8 +81,8 @@ def test_a_bowling_ball_slides_and_then_rolls():
     run = Run.of(scene, tippe.Launch(theta=0.7, spin=0.0))
     run = Run(run.dynamics, run.axial, run.state.at[0].set(1.0), run.path, run.scales)
     path = follow_stick_slip(run, 3.0 * end, Settings(1e-11))
-    assert path.rolls == [False, True]
-    assert_close(path.parts[0].times[-1], end, atol=1e-7)
+    assert kinds(path) == [False, True]
+    assert_close(path.stays[0].end, end, atol=1e-7)
     times = np.array([0.3, 0.9, 0.999, 1.5, 3.0]) * end
     expected = np.where(times < end, 1.0 - 0.3 * 9.81 * times, 5.0 / 7.0)
     assert_close(path.at(times)[0], expected, rtol=1e-10)
@@ -90,8 +95,8 @@ def test_starts_at_rest():
     leaning = tippe.simulate(scene, tippe.Launch(1.0, 0.0), 0.2)
     slippery = tippe.simulate(scene_of(cohen_top(), 0.0), tippe.Launch(0.1, 100.0), 0.2)
     assert_close(upright.theta, 0.0)
-    assert upright.dense.rolls == leaning.dense.rolls == [True]
-    assert slippery.dense.rolls == [False]
+    assert kinds(upright.dense) == kinds(leaning.dense) == [True]
+    assert kinds(slippery.dense) == [False]
     for run in (upright, leaning, slippery):
         assert run.status == "reached t1"
         assert_close(run.energy, run.energy[0], rtol=1e-8)
@@ -105,7 +110,7 @@ def test_a_ball_on_a_slope_rolls_where_friction_is_two_sevenths_of_the_slope():
     assert_close(scene.dynamics.rolling.grip(states, 2.0 / 7.0 * np.tan(eta)), 0.0, atol=1e-14)
     for place in eta:
         run = tippe.simulate(scene, tippe.Launch(0.1, 0.0, place), 0.01)
-        assert run.dense.rolls == [bool(2.0 / 7.0 * np.tan(place) < 0.3)]
+        assert kinds(run.dense) == [bool(2.0 / 7.0 * np.tan(place) < 0.3)]
 
 
 @pytest.mark.parametrize("spin", [-20.0, 0.0])
@@ -131,7 +136,7 @@ def test_a_ball_that_friction_cannot_hold_slips_down_through_a_turn_of_its_slip(
         time, state = out.t[-1], out.y[:, -1]
     launch = tippe.Launch(np.pi / 2.0, spin, 0.8, np.pi / 2.0)
     run = tippe.simulate(scene, launch, 0.1, tolerance=1e-10)
-    assert not any(run.dense.rolls)
+    assert not any(kinds(run.dense))
     found = [run.path[0, -1], run.velocity[-1] @ np.array([np.cos(state[0]), 0.0, np.sin(state[0])]), run.spin[-1]]
     assert_close(found, state, atol=1e-9)
 

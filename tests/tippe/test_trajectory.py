@@ -114,6 +114,7 @@ def test_a_batch_of_runs_says_which_lost_contact():
     assert_close(runs.theta[0], one.theta, rtol=1e-7)
     assert_close(runs.position[0], one.position, atol=1e-8)
     assert not np.isfinite(runs.theta[1][times > runs.end_time[1]]).any()
+    assert "lost contact at 0.79" in str(jax.tree.map(lambda leaf: leaf[1], runs))
 
 
 def test_a_ceiling_start_has_no_contact(rutstam_scene):

@@ -1,8 +1,8 @@
 """What a top does between two events: slipping and rolling, flying, striking the ground, leaning on its stem.
 
-A `Scene` is built from the phases handed out here, so the files that need a `Scene` themselves, the runs through
-flights (`flight_cells`, `flight_trajectory`) and through sticking (`stick_slip_cells`, `stick_slip_path`), are
-imported by their own names.
+A `Scene` is built from what is handed out here, so the files that need a `Scene` themselves, the phases of runs through
+flights (`sliding`) and through sticking (`stick_slip_runs`) and the path of a flight (`flight_trajectory`), are imported by
+their own names.
 """
 
 from .rolling import RollingDynamics as RollingDynamics

@@ -1,4 +1,8 @@
-"""Sliding as a phase of the motion, on one sphere or on both, and what follows it: a flight, the other sphere, or the end."""
+"""Sliding as a phase of the motion, on one sphere or on both, and what follows it: a flight, the other sphere, or the end.
+
+A single run whose path is kept carries four more numbers behind its state, which ride along: the place (x, y) of the centre of
+mass [m], the angle by which the top has turned about its axis [rad], and the work of friction and impacts [J].
+"""
 
 from typing import Any, NamedTuple
 
@@ -7,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.geometry import dot
 from nonholonomic.integration import (
     CROSSED,
     FAILED,
@@ -17,12 +22,15 @@ from nonholonomic.integration import (
     AbstractPhase,
     AbstractProblem,
     Passage,
+    Record,
 )
 
-from ..dynamics import COS_THETA, Dynamics
+from ..dynamics import COS_THETA, Dynamics, stacked
+from ..inversion import InversionProblem
 from ..scene import Scene
-from .flight import angle_reached, flown, fly
-from .free_body import Ball, FreeBody, balls, freed, gap, gap_rate, grounded, standing_on
+from ..top import Top
+from .flight import angle_reached, cone, flown, fly
+from .free_body import Ball, FreeBody, balls, energy, freed, gap, gap_rate, grounded, shown, standing_on
 from .impact import strike
 from .leaning import LeaningDynamics, at_rest
 
@@ -42,11 +50,18 @@ TOUCHING = 1e-9
 #: Bounces in a row after which a run is given up.
 MOST_BOUNCES = 10_000
 
+#: Components of a state, behind which others may ride along.
+OWN = 8
+
+#: Angle by which the axis turns between the times at which a flight is shown by default [rad].
+SHOWN = 0.4
+
 
 class Sliding(AbstractProblem):
     """Sliding until theta reaches an angle, a contact is lost or jams, or a sphere that does not touch the plane does.
 
-    `own` is the sphere that slides and `other` the one that does not; `None` if there is none.
+    `own` is the sphere that slides and `other` the one that does not; `None` if there is none. `axial` is the moment of inertia
+    about the axis [kg m^2], `None` where nothing rides along.
     """
 
     dynamics: Dynamics | LeaningDynamics
@@ -55,12 +70,17 @@ class Sliding(AbstractProblem):
     cos_angle: Float[Array, "..."]
     states: Float[Array, "components cells"]
     scales: Float[Array, "components cells"]
+    axial: Float[Array, "..."] | None
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
 
     def field(self, time: Cells, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
-        return self.dynamics.field(state)
+        if self.axial is None:
+            return self.dynamics.field(state)
+        motion = self.dynamics.motion(state)
+        riding = (state[0], state[1], motion.spin_momentum / self.axial, motion.friction_power)
+        return stacked((*motion.rate, *riding), state)
 
     def crossing(self, state: Float[Array, "components cells"]) -> Cells:
         return state[COS_THETA] - self.cos_angle
@@ -85,7 +105,8 @@ def clearance(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> 
 class Slide(AbstractPhase):
     """Sliding on the sphere numbered `number`, in the order of `free_body.balls`, up to an angle of theta.
 
-    The number is an array, so that one program serves both spheres; `last` says whether the run goes on through the angle.
+    The number is an array, so that one program serves both spheres; `last` says whether the run goes on through the angle,
+    `rides` whether it is a single one that carries more than its state and records its flights.
     """
 
     scene: Scene
@@ -93,10 +114,21 @@ class Slide(AbstractPhase):
     cos_angle: Float[Array, "..."]
     number: Int[Array, ""]
     last: bool = eqx.field(static=True)
+    rides: bool = eqx.field(static=True)
 
     def problem(self, state: Float[Array, "components cells"]) -> Sliding:
         own, other = _own_and_other(balls(self.scene.body), self.number)
-        return Sliding(standing_on(self.scene.dynamics, own), own, other, self.cos_angle, state, self.scales)
+        dynamics, axial = standing_on(self.scene.dynamics, own), self.scene.body.I3 if self.rides else None
+        return Sliding(dynamics, own, other, self.cos_angle, state, self.scales, axial)
+
+    def shown(self, state: Float[Array, "12 times"]) -> Float[Array, "14 times"]:
+        own, _ = _own_and_other(balls(self.scene.body), self.number)
+        return shown(self.scene.body, freed(self.scene.body, own, state), state[OWN:])
+
+    def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "14 times"]:
+        free, riding = motion
+        later = flown(self.scene.body, self.scene.gravity, free, passed)
+        return shown(self.scene.body, later, _carried(self.scene.body, free, riding, passed))
 
     def leave(self, state: Float[Array, "components cells"], left: Cells) -> Passage:
         """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land where it is that which touches.
@@ -104,21 +136,28 @@ class Slide(AbstractPhase):
         Counted are the flights.
         """
 
-        def hop(carry: tuple[Air, Array]) -> tuple[Air, Array]:
-            air, count = carry
+        def hop(carry: tuple[Air, Array, Record | None]) -> tuple[Air, Array, Record | None]:
+            air, count, record = carry
             after, landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
             if air.falls is not None:
                 after, landed = _where(air.falls, air, after), air.falls | landed
+            record = _with_flight(self.scene.body, record, air, after)
             after = _where(landed, land(self.scene, after), after)
-            return _where(air.open, after, air), count + 1
+            return _where(air.open, after, air), count + 1, record
 
-        def under_way(carry: tuple[Air, Array]) -> Array:
+        def under_way(carry: tuple[Air, Array, Record | None]) -> Array:
             return jnp.any(carry[0].open) & (carry[1] < MOST_BOUNCES)
 
         start = lost_contact(self.scene, self.number, state)
-        air, _ = jax.lax.while_loop(under_way, hop, (start, jnp.zeros((), int)))
+        if self.rides:
+            start = start._replace(riding=state[OWN:])
+        record = _no_flights(start) if self.rides else None
+        air, _, record = jax.lax.while_loop(under_way, hop, (start, jnp.zeros((), int), record))
         status = jnp.where(air.open, UNRESOLVED, air.status)
-        return Passage(air.ball, grounded(air.free), air.elapsed, status, air.crossing_time, air.flights[None])
+        state = grounded(air.free)
+        if air.riding is not None:
+            state = jnp.concatenate([state, air.riding])
+        return Passage(air.ball, state, air.elapsed, status, air.crossing_time, air.flights[None], record)
 
 
 class Lean(AbstractPhase):
@@ -127,38 +166,45 @@ class Lean(AbstractPhase):
     scene: Scene
     scales: Float[Array, "components cells"]
     cos_angle: Float[Array, "..."]
+    rides: bool = eqx.field(static=True)
 
     def problem(self, state: Float[Array, "components cells"]) -> Sliding:
-        return Sliding(leaning(self.scene), None, None, self.cos_angle, state, self.scales)
+        axial = self.scene.body.I3 if self.rides else None
+        return Sliding(leaning(self.scene), None, None, self.cos_angle, state, self.scales, axial)
+
+    def shown(self, state: Float[Array, "12 times"]) -> Float[Array, "14 times"]:
+        return shown(self.scene.body, freed(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])
 
     def leave(self, state: Float[Array, "components cells"], left: Cells) -> Passage:
         """Slide on the sphere whose normal force has not vanished."""
-        number, state = lifted(self.scene, state)
+        number = leaning(self.scene).heavier(state)
+        own = grounded(at_rest(self.scene.body, freed(self.scene.body, balls(self.scene.body)[0], state)))
+        state = jnp.concatenate([own, state[OWN:]])
         zero = jnp.zeros_like(state[0])
         running, none = jnp.full(zero.shape, RUNNING), jnp.zeros((1, *zero.shape), int)
         return Passage(number, state, zero, running, jnp.full_like(zero, jnp.inf), none)
 
 
 def phases(
-    scene: Scene, scales: Float[Array, "components cells"], cos_angle: Float[Array, "..."], last: bool
-) -> tuple[AbstractPhase, ...]:
-    """The phases of a scene: sliding on each of its spheres, and on both if there are two."""
-    spheres = len(balls(scene.body))
-    single = tuple(Slide(scene, scales, cos_angle, jnp.asarray(number), last) for number in range(spheres))
-    return single if spheres == 1 else (*single, Lean(scene, scales, cos_angle))
+    scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
+) -> tuple[tuple[AbstractPhase, ...], Int[Array, " cells"]]:
+    """The phases of runs, sliding on each sphere and on both if there are two; and the number of that in which each starts.
+
+    **Arguments:**
+
+    - `scene`: with `contact="hybrid"`; `problem`: of its launches, which stand on their lower sphere.
+    - `tolerance`: no phase needs it; `last`: whether the last crossing counts; `rides`: as for `Slide`.
+    """
+    spheres, given = balls(scene.body), (scene, problem.scales, problem.cos_angle)
+    found = tuple(Slide(*given, jnp.asarray(number), last, rides) for number in range(len(spheres)))
+    if len(spheres) == 1:
+        return found, jnp.zeros(problem.states.shape[1:], int)
+    return (*found, Lean(*given, rides)), (clearance(*spheres, problem.states) < 0.0).astype(int)
 
 
 def leaning(scene: Scene) -> LeaningDynamics:
     """The equations of motion of a scene's top on both of its spheres."""
     return LeaningDynamics(scene.body, scene.friction, scene.gravity)
-
-
-def lifted(
-    scene: Scene, state: Float[Array, "components cells"]
-) -> tuple[Int[Array, " cells"], Float[Array, "components cells"]]:
-    """The number of the sphere that stays when the other's normal force has vanished, and the state then."""
-    number = leaning(scene).heavier(state)
-    return number, grounded(at_rest(scene.body, freed(scene.body, balls(scene.body)[0], state)))
 
 
 class Air(NamedTuple):
@@ -170,6 +216,7 @@ class Air(NamedTuple):
     - `status`: `RUNNING`, or how the run ended, `GUARD_LOST` if it has jammed; `crossing_time` [s] of the event, infinite if
       there was none.
     - `flights`: so far; `open`: whether there is no contact and the run goes on.
+    - `riding`: what rides along with a single run.
     """
 
     free: FreeBody
@@ -181,14 +228,7 @@ class Air(NamedTuple):
     crossing_time: Cells
     flights: Int[Array, " cells"]
     open: Bool[Array, " cells"]
-
-
-def first_ball(spheres: tuple[Ball, ...], state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-    """The number of the sphere on which a launch stands: the lower one."""
-    if len(spheres) == 1:
-        return jnp.zeros(state.shape[1:], int)
-    main, stem = spheres
-    return (clearance(main, stem, state) < 0.0).astype(int)
+    riding: Float[Array, "4 cells"] | None = None
 
 
 def lost_contact(scene: Scene, number: Int[Array, ""], state: Float[Array, "components cells"]) -> Air:
@@ -237,6 +277,7 @@ def take_flight(
         crossing_time=jnp.where(jnp.isfinite(reached), air.elapsed + reached, air.crossing_time),
         flights=air.flights + 1,
         open=landed,
+        riding=None if air.riding is None else _carried(body, air.free, air.riding, duration),
     )
     return after, landed
 
@@ -255,6 +296,9 @@ def land(scene: Scene, air: Air) -> Air:
     struck = air._replace(free=free, rising=rebounds, open=rebounds, status=jnp.where(fails, FAILED, air.status))
     if other is not None:
         struck = _with_other(scene, struck, other, closing)
+    if air.riding is not None:
+        gained = energy(body, scene.gravity, struck.free) - energy(body, scene.gravity, air.free)
+        struck = struck._replace(riding=air.riding.at[3].add(gained))
     return struck._replace(open=struck.open & ~fails)
 
 
@@ -271,6 +315,36 @@ def _with_other(scene: Scene, air: Air, other: Ball, closing: Cells) -> Air:
         status=jnp.where(rests & ~definite & (air.status == RUNNING), UNRESOLVED, air.status),
         open=air.open | falls,
     )
+
+
+def _carried(
+    body: Top, free: FreeBody, riding: Float[Array, "4 ..."], time: Float[Array, "..."]
+) -> Float[Array, "4 ..."]:
+    """What rides along after some time [s] in flight."""
+    rates = (free.velocity[0], free.velocity[1], dot(free.axis, free.momentum) / body.I3, 0.0)
+    return jnp.stack([number + rate * time for number, rate in zip(riding, rates, strict=True)])
+
+
+def _no_flights(start: Air) -> Record:
+    """Room for the flights of a single run."""
+
+    def room(leaf: Array) -> Array:
+        return jnp.zeros((MOST_BOUNCES, *leaf.shape), leaf.dtype)
+
+    motions = jax.tree.map(room, (start.free, start.riding))
+    return Record(jnp.inf + room(start.elapsed), motions, room(start.flights))
+
+
+def _with_flight(body: Top, record: Record | None, before: Air, after: Air) -> Record | None:
+    """A record, if one is kept, with the flight that leads from one state of a single run to another, if it flew."""
+    if record is None:
+        return None
+    place, flew = before.flights[0], after.flights > before.flights
+    turned = cone(body, before.free).rate * (after.elapsed - before.elapsed)
+    new = Record(
+        jnp.where(flew, after.elapsed, jnp.inf), (before.free, before.riding), 1 + (turned / SHOWN).astype(int)
+    )
+    return jax.tree.map(lambda kept, leaf: kept.at[place].set(leaf), record, new)
 
 
 def _where(condition: Bool[Array, " cells"], this: Any, that: Any) -> Any:

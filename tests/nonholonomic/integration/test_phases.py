@@ -1,0 +1,222 @@
+"""Runs of several phases against a closed form: balls that fall, rebound and come to rest."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close
+
+from nonholonomic.integration import (
+    BETWEEN,
+    CROSSED,
+    REACHED_END,
+    RUNNING,
+    UNRESOLVED,
+    AbstractPhase,
+    AbstractProblem,
+    Passage,
+    Record,
+    Settings,
+    follow_phases,
+    travel,
+)
+
+GRAVITY, CLOSING = 9.81, 1e-3
+
+CELLS, PADDING = 40, 8
+
+FALLING, RESTING = range(2)
+
+SETTINGS = Settings(1e-10)
+
+
+class Motion(AbstractProblem):
+    """Height [m], velocity [m/s] and number of bounces under an acceleration [m/s^2]; the guard is the height, if any."""
+
+    state: jnp.ndarray
+    acceleration: jnp.ndarray
+    falls: bool
+
+    def start(self):
+        return self.state, jnp.ones_like(self.state)
+
+    def field(self, time, state):
+        return jnp.stack([state[1], self.acceleration + 0.0 * state[1], 0.0 * state[2]])
+
+    def crossing(self, state):
+        return None
+
+    def guard(self, time, state):
+        return state[0] if self.falls else None
+
+
+class Fall(AbstractPhase):
+    """Down to the ground; then up again in closed form, to rest, or to the end at the last bounce."""
+
+    restitution: jnp.ndarray
+    bounces: jnp.ndarray
+
+    def problem(self, state):
+        return Motion(state, jnp.asarray(-GRAVITY), True)
+
+    def leave(self, state, left):
+        height, velocity, count = state
+        speed = jnp.sqrt(velocity**2 + 2.0 * GRAVITY * height)
+        # The ground is found to round-off of a step; the rest of the way, of either sign, is known.
+        late = (speed + velocity) / GRAVITY
+        rebound, count = self.restitution * speed, count + 1.0
+        last, rests = count >= self.bounces, rebound < CLOSING
+        rise = jnp.where(last | rests, 0.0, jnp.minimum(rebound / GRAVITY, left - late))
+        end = self.between((late, rebound, count), late + rise)
+        end = jnp.where(rests & ~last, end * jnp.array([[0.0], [0.0], [1.0]]), end)
+        cut = rise < rebound / GRAVITY
+        return Passage(
+            phase=jnp.where(rests, RESTING, FALLING),
+            state=end,
+            elapsed=late + rise,
+            status=jnp.where(last, CROSSED, jnp.where(cut & ~rests, REACHED_END, RUNNING)),
+            crossing_time=jnp.where(last, late, jnp.inf),
+            counts=jnp.ones((1, *count.shape), int),
+            record=Record(
+                (late + rise)[None], (late[None], rebound[None], count[None]), jnp.full((1, *count.shape), 3)
+            ),
+        )
+
+    def between(self, motion, passed):
+        late, rebound, count = motion
+        time = passed - late
+        height = rebound * time - 0.5 * GRAVITY * time**2
+        return jnp.stack([height, rebound - GRAVITY * time, count + 0.0 * time])
+
+
+class Rest(AbstractPhase):
+    """On the ground."""
+
+    def problem(self, state):
+        return Motion(state, jnp.asarray(0.0), False)
+
+    def leave(self, state, left):
+        zero = jnp.zeros_like(left)
+        never = jnp.full(zero.shape, jnp.inf)
+        none = Record(never[None], (zero[None],) * 3, jnp.ones((1, *zero.shape), int))
+        return Passage(zero.astype(int), state, zero, zero.astype(int), never, jnp.zeros((1, *zero.shape), int), none)
+
+
+class Ball(NamedTuple):
+    """The closed form: dropped from a height [m]."""
+
+    height: float
+    restitution: float
+
+    @property
+    def speed(self) -> float:
+        return float(np.sqrt(2.0 * GRAVITY * self.height))
+
+    @property
+    def rests_after(self) -> int:
+        """How many bounces it takes until the rebound is slower than `CLOSING`."""
+        return int(np.ceil(np.log(CLOSING / self.speed) / np.log(self.restitution)))
+
+    def bounce(self, number: int) -> float:
+        """When it strikes the ground for the n-th time [s]."""
+        return self.speed / GRAVITY * (1.0 + 2.0 * sum(self.restitution**k for k in range(1, number)))
+
+    def state(self, time: float) -> list[float]:
+        """Height, velocity and number of bounces."""
+        count = sum(self.bounce(number) < time for number in range(1, self.rests_after + 1))
+        if count == self.rests_after:
+            return [0.0, 0.0, count]
+        rebound, passed = self.speed * self.restitution**count, time - (self.bounce(count) if count else 0.0)
+        if count == 0:
+            return [self.height - 0.5 * GRAVITY * time**2, -GRAVITY * time, 0.0]
+        return [rebound * passed - 0.5 * GRAVITY * passed**2, rebound - GRAVITY * passed, count]
+
+
+HEIGHTS = np.linspace(0.3, 2.0, CELLS)
+RESTITUTIONS = np.linspace(0.9, 0.2, CELLS)
+BALLS = [Ball(height, restitution) for height, restitution in zip(HEIGHTS, RESTITUTIONS, strict=True)]
+
+
+def padded(values):
+    return np.concatenate([values, np.full(PADDING, values[-1])])
+
+
+def table(t1, bounces, most_rounds=200):
+    heights = padded(HEIGHTS)
+    phases = (Fall(jnp.asarray(padded(RESTITUTIONS)), jnp.asarray(padded(bounces), float)), Rest())
+    state = np.stack([heights, 0.0 * heights, 0.0 * heights])
+    start = np.full(CELLS + PADDING, FALLING)
+    return travel(phases, start, state, t1, CELLS, SETTINGS, kinds=1, most_rounds=most_rounds)
+
+
+def single(ball, t1, bounces=np.inf):
+    phases = (Fall(jnp.array([ball.restitution]), jnp.array([float(bounces)])), Rest())
+    return follow_phases(phases, FALLING, jnp.array([ball.height, 0.0, 0.0]), t1, SETTINGS, kinds=1)
+
+
+def test_the_times_of_bounces_of_many_balls():
+    """Each ends at a bounce of its own, the first to the fourth, before it would come to rest."""
+    bounces = 1 + np.arange(CELLS) % 4
+    found = table(50.0, bounces)
+    times = [ball.bounce(number) for ball, number in zip(BALLS, bounces, strict=True)]
+    assert (found.status[:CELLS] == CROSSED).all()
+    assert_close(found.end_time[:CELLS], times, rtol=2e-14)
+    assert_close(found.crossing_time[:CELLS], times, rtol=2e-14)
+    assert_close(found.state[0, :CELLS], 0.0, atol=1e-14)
+    speeds = [ball.speed * ball.restitution**number for ball, number in zip(BALLS, bounces, strict=True)]
+    assert_close(found.state[1, :CELLS], speeds, rtol=2e-14)
+    assert found.counts[0, :CELLS].tolist() == found.state[2, :CELLS].tolist() == bounces.tolist()
+
+
+@pytest.mark.parametrize("t1", [0.2, 0.9, 1.7, 30.0])
+def test_the_states_of_many_balls_at_a_horizon(t1):
+    """Falling, rising or at rest after up to 80 bounces, each cell in a phase of its own."""
+    found = table(t1, np.full(CELLS, np.inf))
+    expected = np.array([ball.state(t1) for ball in BALLS]).T
+    assert (found.status == REACHED_END).all()
+    assert (found.end_time[:CELLS] == t1).all()
+    assert_close(found.state[:, :CELLS], expected, atol=2e-13)
+    assert found.counts[0, :CELLS].tolist() == expected[2].tolist()
+    rests = [ball.rests_after == count for ball, count in zip(BALLS, expected[2], strict=True)]
+    assert (found.phase[:CELLS] == np.where(rests, RESTING, FALLING)).all()
+    assert all(rests) == (t1 == 30.0)
+
+
+def test_a_single_ball_at_any_time():
+    ball = BALLS[20]
+    path = single(ball, 4.0)
+    ends = [piece.end for piece in path.stays]
+    assert_close(ends[:-1], [ball.bounce(number) for number in range(1, ball.rests_after + 1)], rtol=1e-14)
+    assert path.counts.tolist() == [ball.rests_after]
+    assert path.status == REACHED_END
+    assert path.end_time == path.times[-1] == 4.0
+    assert np.all(np.diff(path.times) > 0.0)
+    times = np.linspace(0.0, 4.0, 1001)
+    expected = np.array([ball.state(time) for time in times]).T
+    # The dense output of a fall has the round-off of its polynomial.
+    assert_close(path.at(times), expected, atol=5e-13)
+    rises = path.numbers(times) == BETWEEN
+    assert_close(path.at(times[rises]), expected[:, rises], atol=1e-13)
+    assert set(path.numbers(times)) == {FALLING, RESTING, BETWEEN}
+    assert path.at(np.zeros(0)).shape == (3, 0)
+
+
+def test_a_single_ball_ends_as_it_does_in_a_table():
+    bounces = np.full(CELLS, 3)
+    found = table(1.2, bounces)
+    assert set(found.status) == {CROSSED, REACHED_END}
+    for number in (0, 20, 39):
+        path = single(BALLS[number], 1.2, 3)
+        assert path.status == found.status[number]
+        assert_close(path.end_time, found.end_time[number], rtol=1e-14)
+        assert_close(path.state, found.state[:, number], atol=2e-14)
+        assert path.counts.tolist() == [found.counts[0, number]]
+
+
+def test_what_needs_too_many_rounds_is_given_up():
+    found = table(30.0, np.full(CELLS, np.inf), most_rounds=10)
+    # One round for each fall, and one for the rest.
+    tired = [ball.rests_after + 1 > 10 for ball in BALLS]
+    assert (found.status[:CELLS] == np.where(tired, UNRESOLVED, REACHED_END)).all()
+    assert 0 < sum(tired) < CELLS

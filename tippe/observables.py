@@ -1,0 +1,166 @@
+"""What is read off a run of a tippe top, with its contact kept or through flights: one state at each time."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from nonholonomic.geometry import Component, Vector, add, dot, multiply
+from nonholonomic.integration import Path, PhasedPath
+from nonholonomic.validation import is_traced, require
+
+from .sampled import STATUS
+from .scene import Scene
+
+
+def of_each_run(function: Callable[[Any], Array]) -> property:
+    """A property of one run that is, for a batch of runs as `vmap` returns it, the property of each."""
+
+    def get(self):
+        mapped = function
+        for _ in range(self.t.ndim - 1):
+            mapped = eqx.filter_vmap(mapped)
+        return mapped(self)
+
+    return property(get, doc=function.__doc__)
+
+
+def check_increasing(times: Any) -> None:
+    """Raise `ValueError` unless these are times, one at least, that increase."""
+    if np.ndim(times) != 1 or np.shape(times)[0] == 0:
+        raise ValueError(f"times must be a non-empty list, not of shape {np.shape(times)}")
+    if not is_traced(times) and np.any(np.diff(times) <= 0.0):
+        raise ValueError("times must increase")
+
+
+class AbstractTrajectory(eqx.Module):
+    """A run at its times `t`: states as in `tippe/dynamics.py`, the path on the arena, spin angle [rad] and work [J].
+
+    Vectors are arrays (times, 3) in the fixed frame (x, y, z); `Trajectory` says more.
+    """
+
+    t: eqx.AbstractVar[Float[Any, " times"]]
+    scene: eqx.AbstractVar[Scene]
+    states: eqx.AbstractVar[Float[Any, "components times"]]
+    path: eqx.AbstractVar[Float[Any, "paths times"]]
+    spin_angle: eqx.AbstractVar[Float[Any, " times"]]
+    work: eqx.AbstractVar[Float[Any, " times"]]
+    status: eqx.AbstractVar[Any]
+    end_time: eqx.AbstractVar[Any]
+    stats: eqx.AbstractVar[dict[str, Any]]
+    dense: eqx.AbstractVar[Any]
+    energy: eqx.AbstractVar[Float[Array, " times"]]
+
+    @property
+    @abc.abstractmethod
+    def above(self) -> tuple[Component, Component]:
+        """Distance of the top's sphere from the arena [m] and its rate [m/s]; `None` where it touches at all times."""
+
+    @abc.abstractmethod
+    def resampled(self, times: Float[np.ndarray, " times"]) -> Self:
+        """The same run at other times, which are not checked."""
+
+    @of_each_run
+    def theta(self) -> Float[Array, " times"]:
+        """Angle from the normal to the axis [rad]."""
+        return self.scene.theta(self.states)
+
+    @of_each_run
+    def eta(self) -> Float[Array, " times"]:
+        """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
+        return self.scene.surface.angle(self._place, tuple(self.path))
+
+    @of_each_run
+    def azimuth(self) -> Float[Array, " times"]:
+        """Direction in which the axis leans [rad], from t1 towards t2, in (-pi, pi]."""
+        return jnp.arctan2(self.states[3], self.states[2])
+
+    @of_each_run
+    def spin(self) -> Float[Array, " times"]:
+        """Angular velocity about the axis [rad/s]."""
+        return self.scene.spin(self.states)
+
+    @of_each_run
+    def axis(self) -> Float[Array, "times 3"]:
+        """The unit vector e along the axis."""
+        return self._fixed(tuple(self.states[2:5]))
+
+    @of_each_run
+    def angular_momentum(self) -> Float[Array, "times 3"]:
+        """Angular momentum about the centre of mass [kg m^2/s]."""
+        return self._fixed(tuple(self.states[5:8]))
+
+    @of_each_run
+    def velocity(self) -> Float[Array, "times 3"]:
+        """Velocity of the sphere's centre [m/s]."""
+        return self._fixed((*self.scene.dynamics.motion(self.states).velocity, self.above[1]))
+
+    @of_each_run
+    def position(self) -> Float[Array, "times 3"]:
+        """Position of the sphere's centre [m]; the plane is z = 0, the cylinder's axis x = z = 0, and a run on the plane
+        starts above the origin."""
+        foot = self.scene.surface.position(self._place, tuple(self.path))
+        normal = self.scene.surface.frame(self._place, tuple(self.path))[2]
+        height = add(self.scene.body.radius, self.above[0])
+        return jnp.stack([add(q, multiply(height, n)) for q, n in zip(foot, normal, strict=True)], axis=-1)
+
+    @of_each_run
+    def jellett(self) -> Float[Array, " times"]:
+        """Jellett's quantity of the top's own sphere [kg m^3/s]; constant on the plane where friction acts at one of its
+        points, so not while a stem touches."""
+        return self.scene.jellett(self.states)
+
+    def at(self, times: Float[ArrayLike, " times"]) -> Self:
+        """The same run at other times, from the dense output.
+
+        **Arguments:** `times`: increasing, within [0, `end_time`] [s].
+
+        **Raises:** `ValueError` for times outside the run, or if the run was made inside a transformation.
+        """
+        if self.dense is None:
+            raise ValueError("a run made inside jit, vmap or grad has no dense output: hand `times` to simulate")
+        times = np.asarray(times, dtype=float)
+        require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
+        check_increasing(times)
+        return self.resampled(times)
+
+    def with_stats(self, path: Path | PhasedPath, **more: Any) -> Self:
+        """The same run with what it took, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and more."""
+        energy, work = np.asarray(self.energy), np.asarray(self.work)
+        stats = {
+            "accepted": path.accepted,
+            "rejected": path.rejected,
+            "axis_drift": float(np.max(np.abs(np.linalg.norm(self.states[2:5], axis=0) - 1.0))),
+            "energy_residual": float(np.max(np.abs(energy - energy[0] - work))),
+        }
+        return eqx.tree_at(lambda one: one.stats, self, stats | more)
+
+    @property
+    def _place(self) -> tuple[Array, ...]:
+        return tuple(self.states[8:])
+
+    def _fixed(self, vector: Vector) -> Float[Array, "times 3"]:
+        frame = self.scene.surface.frame(self._place, tuple(self.path))
+        return jnp.stack([dot(vector, directions) for directions in zip(*frame, strict=True)], axis=-1)
+
+    def __str__(self) -> str:
+        if is_traced(self.t) or self.t.ndim > 1:
+            return f"Trajectory of {self.t.shape} times"
+        word = self.status if isinstance(self.status, str) else STATUS[int(self.status)]
+        ending = {"reached t1": "ran to", "contact_lost": "lost contact at"}.get(word, f"{word} at")
+        lines = [
+            f"Trajectory of {len(self.t)} times, {ending} {float(self.end_time):.6g} s",
+            f"  theta: {float(self.theta[0]):.6g} to {float(self.theta[-1]):.6g} rad",
+        ]
+        if "axis_drift" in self.stats:
+            lines.append(f"  steps: {self.stats['accepted']} accepted, {self.stats['rejected']} rejected")
+            lines.append(f"  drift of |e|: {self.stats['axis_drift']:.1e}")
+            lines.append(f"  energy residual: {self.stats['energy_residual']:.1e} J of {float(self.energy[0]):.4g} J")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return str(self)

@@ -1,0 +1,140 @@
+"""Runs through stick and slip: the cells of a table, and a single run with its path."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from nonholonomic.integration import (
+    CROSSED,
+    GUARD_LOST,
+    REACHED_END,
+    RUNNING,
+    AbstractPhase,
+    AbstractProblem,
+    Passage,
+    PhasedPath,
+    Record,
+    Settings,
+    follow_phases,
+)
+
+from ..dynamics import COS_THETA, NO_COSINE, Dynamics
+from ..inversion import InversionProblem
+from ..sampled import Run
+from ..scene import Scene
+from .onset import Onset
+from .stick_slip import AT_REST, Change, Kind, StickSlip
+
+#: The numbers of the two phases.
+SLIPPING, ROLLING = range(2)
+
+
+class StickSlipPhase(AbstractPhase):
+    """Slipping or rolling up to an angle of theta; `last` is whether the last crossing of it counts.
+
+    With a single run whose path is kept, what a `Run` carries rides along behind the first `size` components of the state:
+    `axial` is then the moment of inertia about the axis [kg m^2]. For the cells of a table both are `None`.
+    """
+
+    kind: Kind
+    cos_angle: Float[Array, "..."]
+    scales: Float[Array, "components cells"]
+    last: bool = eqx.field(static=True)
+    axial: Float[Array, ""] | None = None
+    size: int | None = eqx.field(static=True, default=None)
+
+    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+        return self._under(self.kind, state)
+
+    def shown(self, state: Float[Array, "components times"]) -> Float[Array, "components times"]:
+        """The velocity of a rolling top follows from the rest of its state."""
+        if not self.kind.rolls:
+            return state
+        own = self.kind.both.rolling.carried_along(state[: self._size(state)])
+        return jnp.concatenate([own, state[self._size(state) :]])
+
+    def between(self, motion: tuple[Onset, Array], passed: Float[Array, " times"]) -> Float[Array, "components times"]:
+        onset, wait = motion
+        return onset.at((passed - wait) / jnp.where(onset.length > 0.0, onset.length, 1.0))
+
+    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+        """Stick, slip, or end where the contact is lost. Counted is how often a slip has turned into rolling."""
+        slipping = self._under(self.kind.both.slipping, state)
+        change = self.kind.ended(state, self._size(state), lambda at: slipping.field(left, at), self.scales, left)
+        onset, length = change.onset, change.onset.length
+        began = -change.wait / jnp.where(length > 0.0, length, 1.0)
+        falls = (state[COS_THETA] > self.cos_angle) & (change.state[COS_THETA] <= self.cos_angle)
+        crosses = falls & ~change.rolls & ~change.lost
+        fraction = onset.falls_to(COS_THETA, self.cos_angle, began)
+        crossing = change.wait + fraction * length
+        ends = crosses & (not self.last)
+        status = jnp.where(change.elapsed >= left, REACHED_END, RUNNING)
+        status = jnp.where(change.lost, GUARD_LOST, jnp.where(ends, CROSSED, status))
+        return Passage(
+            phase=jnp.where(change.rolls, ROLLING, SLIPPING),
+            state=jnp.where(ends, onset.at(fraction), change.state),
+            elapsed=jnp.where(ends, crossing, change.elapsed),
+            status=status,
+            crossing_time=jnp.where(crosses, crossing, jnp.inf),
+            counts=(change.rolls & ~change.lost & (not self.kind.rolls)).astype(int)[None],
+            record=None if self.axial is None else _recorded(change),
+        )
+
+    def _size(self, state: Float[Array, "components ..."]) -> int:
+        """How many components the equations of motion know."""
+        return len(state) if self.size is None else self.size
+
+    def _under(self, equations: Dynamics | Kind, state: Float[Array, "components cells"]) -> AbstractProblem:
+        """The motion from some states on under given equations."""
+        if self.axial is None:
+            return InversionProblem(equations, self.cos_angle, state, self.scales)
+        own, path, rest = jnp.split(state, (self._size(state), len(state) - 2))
+        return Run(equations, self.axial, own, path, self.scales, rest)
+
+
+def _recorded(change: Change) -> Record:
+    """The beginning of a slip, where there is one."""
+    ends = jnp.where(change.rolls | change.lost, jnp.inf, change.elapsed)
+    motions = jax.tree.map(lambda leaf: leaf[None], (change.onset, change.wait))
+    return Record(ends[None], motions, jnp.ones((1, len(ends)), int))
+
+
+def phases(
+    scene: Scene | None,
+    problem: InversionProblem,
+    tolerance: float,
+    last: bool,
+    axial: Float[Array, ""] | None = None,
+    size: int | None = None,
+) -> tuple[tuple[AbstractPhase, ...], Int[Array, " cells"]]:
+    """The phases of runs, and the number of that in which each starts.
+
+    **Arguments:**
+
+    - `problem`: of a scene with `SetValuedCoulomb` and its launches; it says all that is needed of the scene.
+    - `tolerance`: relative, of the integration; `last`: whether the last crossing counts.
+    - `axial`, `size`: as for `StickSlipPhase`.
+    """
+    both = problem.dynamics
+    assert isinstance(both, StickSlip)
+    kinds = (Kind(both, jnp.asarray(tolerance, float), rolls) for rolls in (False, True))
+    rests = both.slip_speed(problem.states) <= AT_REST * both.speed
+    found = tuple(StickSlipPhase(kind, problem.cos_angle, problem.scales, last, axial, size) for kind in kinds)
+    return found, jnp.where(rests, ROLLING, SLIPPING)
+
+
+def follow_stick_slip(run: Run, t1: float, settings: Settings) -> PhasedPath:
+    """One run, phase by phase, until `t1` or until contact is lost.
+
+    **Arguments:**
+
+    - `run`: of a scene with `SetValuedCoulomb`.
+    - `t1`, `settings`: as for `follow`.
+
+    **Returns:** a `PhasedPath`, whose counts tell how often slipping has turned into rolling.
+    """
+    state, scales = run.start()
+    problem = InversionProblem(run.dynamics, jnp.asarray(NO_COSINE), run.state[:, None], scales[:, None])
+    both, first = phases(None, problem, settings.tolerance, False, run.axial, len(run.state))
+    return follow_phases(both, int(first[0]), state, t1, settings, kinds=1)
