@@ -133,7 +133,7 @@ class Trajectory(eqx.Module):
             raise ValueError("a run made inside jit, vmap or grad has no dense output: hand `times` to simulate")
         times = np.asarray(times, dtype=float)
         require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
-        _check_increasing(times)
+        check_increasing(times)
         return _cut(self, times, self.dense.at(times))
 
     def _fixed(self, vector: tuple[Array, Array, Array]) -> Float[Array, "times 3"]:
@@ -196,7 +196,7 @@ def simulate(
     if times is not None:
         times = as_number(times)
         require_all(times_bounds(times, t1))
-        _check_increasing(times)
+        check_increasing(times)
     if scene.contact == "hybrid":
         if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1))):
             raise ValueError("contact = 'hybrid' must be 'stop' inside jit, vmap and grad")
@@ -212,7 +212,8 @@ def simulate(
     return trajectory.at(np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)])
 
 
-def _check_increasing(times: Any) -> None:
+def check_increasing(times: Any) -> None:
+    """Raise `ValueError` unless these are times, one or more, each later than the one before."""
     if np.ndim(times) != 1 or np.shape(times)[0] == 0:
         raise ValueError(f"times must be a non-empty list, not of shape {np.shape(times)}")
     if not is_traced(times) and np.any(np.diff(times) <= 0.0):
