@@ -28,3 +28,4 @@ from .top import Stem as Stem
 from .top import Top as Top
 from .trajectory import Trajectory as Trajectory
 from .trajectory import simulate as simulate
+from .trajectory_table import trajectory_table as trajectory_table

@@ -8,21 +8,14 @@ import diffrax
 import numpy as np
 
 from nonholonomic.integration import explicit_tableau
-from nonholonomic.parameters import description, numbers, with_numbers
-from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
+from nonholonomic.sweeps import Table, Variable, sweep
 
 from .cells import Runs, kind_of
-from .inversion import check_event, check_run
-from .launch import Launch
+from .inversion import check_event
+from .launches import described, launches
 from .scene import Scene
 from .sensitivities import sensitivity_paths, slope_variables
 from .time_error import COARSER, time_error
-
-#: Cells that are checked together, to bound the memory it takes.
-CHECKED_AT_ONCE = 1 << 20
-
-UNITS = {"mass": "kg", "radius": "m", "offset": "m", "I1": "kg m2", "I3": "kg m2", "gravity": "m s-2"}
-UNITS |= {"theta": "rad", "eta": "rad", "azimuth": "rad", "spin": "rad s-1"}
 
 
 def inversion_table(
@@ -95,30 +88,8 @@ def inversion_table(
         raise ValueError("crossing = 'both' must be 'first' or 'last' for sensitivities, which are of one time")
     if method == "diffrax" and crossing != "first":
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
-    if not isinstance(scene, Scene):
-        raise ValueError(f"scene = {scene!r} must be a Scene")
-    if axes is not None and not isinstance(axes, dict):
-        raise ValueError(f"axes = {axes!r} must be a dictionary, path of a number -> values")
-    known = numbers("scene.friction", scene.friction)
-    of_mu = next((number for number in known if number.endswith(".mu")), "scene.friction.mu")
-    given = {"launch.theta": theta, "launch.eta": eta, of_mu: mu, "launch.spin": spin, "launch.azimuth": azimuth}
-    if mu is None:
-        del given[of_mu]
-    for number in given:
-        if number in (axes or {}):
-            raise ValueError(f"axes: {number!r} is an argument of its own")
-    given |= axes or {}
-    fixed = {number: value for number, value in given.items() if np.ndim(value) == 0}
-    names = [number.rsplit(".", 1)[-1] for number in given]
-    units = UNITS | scene.friction.units
-    grid = []
-    for number, name in zip(given, names, strict=True):
-        if number not in fixed:
-            unit = units.get(name, "1")
-            grid.append(axis(name if names.count(name) == 1 else number, number, unit, given[number]))
-    roots = with_numbers({"scene": scene, "launch": Launch(theta=0.0, spin=0.0)}, fixed)
-    check_run(roots["scene"], roots["launch"], t1, tolerance)
-    _check_cells(roots, grid)
+    given = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
+    roots, grid, units = launches(scene, given, axes, t1, tolerance)
     paths = sensitivity_paths(roots, sensitivities)
     kind = kind_of(scene)
     if not kind.smooth and (method == "diffrax" or paths):
@@ -139,10 +110,8 @@ def inversion_table(
                 found[f"{name}_error"] = time_error(found[name], coarse[name], alike)
         return found
 
-    request = description("scene", roots["scene"]) | description("launch", roots["launch"])
-    request |= {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
-    request |= {"solver": type(solver).__name__, "method": method}
-    request |= {one.path: "an axis" for one in grid}
+    request = {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
+    request = described(roots, grid) | request | {"solver": type(solver).__name__, "method": method}
     variables = runs.variables
     if errors:
         request |= {"errors": True}
@@ -151,12 +120,3 @@ def inversion_table(
         request |= {"sensitivities": paths}
         variables = variables | slope_variables(paths, units)
     return sweep(run, grid, variables, request, path=path, progress=progress)
-
-
-def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:
-    """Have the modules check every cell, before anything compiles: numbers may be impossible only together."""
-    shape = tuple(len(one.values) for one in grid)
-    cells = int(np.prod(shape, dtype=int))
-    for first in range(0, cells, CHECKED_AT_ONCE):
-        places = np.unravel_index(np.arange(first, min(first + CHECKED_AT_ONCE, cells)), shape) if grid else ()
-        with_numbers(roots, {one.path: one.values[place] for one, place in zip(grid, places, strict=True)})

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from ._checksum import block_checksum
-from ._hdf5 import CHECKSUMS, FINISHED, Grid, blank, read_stored, stored_array, write_grid
+from ._hdf5 import CHECKSUMS, FINISHED, Grid, axes_of, blank, read_stored, stored_array, write_grid
 from .table import same_request
 
 Values = Shaped[np.ndarray, "..."]
@@ -64,7 +64,7 @@ class BlockFile:
         grid = read_stored(self.path)
         self._check(grid, layout)
         self.attributes, self._header, self._finished = grid.attributes, grid.header, grid.finished
-        self._values = {name: values.reshape(-1) for name, values in grid.variables.items()}
+        self._values = layout.rows(grid.variables)
         with h5py.File(self.path, "r") as file:
             arrays = {name: stored_array(file, name) for name in (*layout.kinds, FINISHED, CHECKSUMS)}
             self._places = {name: (array.id.get_offset(), array.dtype) for name, array in arrays.items()}
@@ -108,7 +108,7 @@ class BlockFile:
             self._lock.close()
 
     def values(self) -> dict[str, Values]:
-        """The numbers that the file held when it was opened, variable by variable, cells in a row."""
+        """The numbers that the file held when it was opened, variable by variable, cells along the first axis."""
         return self._values
 
     def _check(self, grid: Grid, layout: "Layout") -> None:
@@ -129,7 +129,7 @@ class BlockFile:
                 f"{self.path} holds the result of another run: {difference}; give another path or remove the file"
             )
         kinds = {name: values.dtype for name, values in grid.variables.items()}
-        if not np.array_equal(grid.firsts, layout.firsts) or kinds != layout.kinds:
+        if not np.array_equal(grid.firsts, layout.firsts) or kinds != layout.kinds or grid.inner != layout.inner:
             raise ValueError(
                 f"{self.path} was not written by a sweep in {len(layout.firsts)} blocks; give another path"
             )
@@ -157,7 +157,7 @@ class BlockFile:
         """
         stored = {name: np.asarray(some, self._places[name][1]) for name, some in values.items()}
         for name, some in stored.items():
-            self._put(name, first, some)
+            self._put(name, first * int(np.prod(some.shape[1:], dtype=int)), some)
         self._put(CHECKSUMS, block, block_checksum(self._header, stored))
         self._sync()
         self._put(FINISHED, block, 1)
@@ -195,22 +195,32 @@ class Layout:
         words: dict[str, tuple[str, ...]],
         attributes: dict[str, Any],
         firsts: Any,
+        inner: dict[str, tuple[str, ...]] | None = None,
     ):
         """State the grid.
 
         **Arguments:** as for `write_grid`, with `kinds`: variable -> dtype, and `firsts`: the first cell of each block.
         """
         self.coords, self.kinds, self.units, self.words = coords, kinds, units, words
-        self.attributes, self.firsts = attributes, firsts
+        self.attributes, self.firsts, self.inner = attributes, firsts, inner or {}
 
     @property
     def shape(self) -> tuple[int, ...]:
-        return tuple(len(values) for values in self.coords.values())
+        return tuple(len(self.coords[name]) for name in axes_of(self.coords, self.inner))
 
     def empty(self) -> dict[str, Values]:
         """The variables before anything is computed: not a number, or pending."""
-        return {name: np.full(self.shape, blank(kind), kind) for name, kind in self.kinds.items()}
+        return {
+            name: np.full(
+                (*self.shape, *(len(self.coords[dim]) for dim in self.inner.get(name, ()))), blank(kind), kind
+            )
+            for name, kind in self.kinds.items()
+        }
+
+    def rows(self, variables: dict[str, Values]) -> dict[str, Values]:
+        """The variables with all cells along one axis, the first."""
+        return {name: values.reshape(-1, *values.shape[len(self.shape) :]) for name, values in variables.items()}
 
     def write(self, path: Path) -> None:
         """Make the file."""
-        write_grid(path, self.coords, self.empty(), self.units, self.attributes, self.words, self.firsts)
+        write_grid(path, self.coords, self.empty(), self.units, self.attributes, self.words, self.firsts, self.inner)

@@ -28,6 +28,9 @@ PENDING, UNREACHED = -1, "pending"
 #: The blocks: the first cell of each, whether it is finished, and its checksum.
 FIRSTS, FINISHED, CHECKSUMS = "block", "block_finished", "block_checksum"
 
+#: The file's attribute that names the dimensions which variables have besides the grid's.
+INNER = "inner"
+
 
 class Grid(NamedTuple):
     """What a file holds, as it is stored: numbers for words, and nothing where a block is not finished.
@@ -41,10 +44,17 @@ class Grid(NamedTuple):
     units: dict[str, str]
     attributes: dict[str, Any]
     words: dict[str, tuple[str, ...]]
+    inner: dict[str, tuple[str, ...]]
     firsts: Int[np.ndarray, " blocks"]
     finished: Bool[np.ndarray, " blocks"]
     damaged: Bool[np.ndarray, " blocks"]
     header: int
+
+
+def axes_of(coords: dict[str, Values], inner: dict[str, tuple[str, ...]]) -> list[str]:
+    """The coordinates that are axes of the grid: all but those of dimensions that only some variables have."""
+    within = {dim for dims in inner.values() for dim in dims}
+    return [name for name in coords if name not in within]
 
 
 def blank(kind: Any) -> Any:
@@ -60,6 +70,7 @@ def write_grid(
     attributes: dict[str, Any],
     words: dict[str, tuple[str, ...]] | None = None,
     pending: Any = (),
+    inner: dict[str, tuple[str, ...]] | None = None,
 ) -> None:
     """Write a grid of variables, all at once or not at all.
 
@@ -69,6 +80,7 @@ def write_grid(
     - `coords`, `variables`, `units`, `attributes`: as in `Table`.
     - `words`: for variables of words, or of codes that stand for them, the words in the order of their codes.
     - `pending`: the first cells of the blocks that are still to be filled in; by default all is there.
+    - `inner`: as in `Table`.
 
     **Raises:** `OSError` that names the path if it cannot be written.
     """
@@ -80,7 +92,7 @@ def write_grid(
         raise OSError(f"cannot write {path}: it is a folder")
     # HDF5 builds the file in memory: on a full disk it would abort the process.
     with h5py.File(path.name, "w", driver="core", backing_store=False, libver="v108", track_order=True) as file:
-        _fill(file, coords, variables, units, attributes, words or {}, pending)
+        _fill(file, coords, variables, units, attributes, words or {}, pending, inner or {})
         file.flush()
         image = file.id.get_file_image()
     scratch = None
@@ -126,28 +138,30 @@ def _fill(
     attributes: dict[str, Any],
     words: dict[str, tuple[str, ...]],
     pending: Any,
+    inner: dict[str, tuple[str, ...]],
 ) -> None:
     _set(file, "Conventions", "CF-1.10")
+    attributes = attributes | ({INNER: inner} if inner else {})
     attributes = {
         name: value if isinstance(value, str | int | float) else json.dumps(value) for name, value in attributes.items()
     }
     for name, value in attributes.items():
         _set(file, name, value)
-    coords = {name: np.asarray(values) for name, values in coords.items()}
     known, words, stored = words, {}, {}
-    for name, values in variables.items():
+    for name, values in (coords | variables).items():
         stored[name], meanings = _coded(np.asarray(values), known.get(name))
         if meanings is not None:
             words[name] = meanings
-    units = {name: units.get(name, "1") for name in (*coords, *stored) if name not in words}
-    for name, values in coords.items():
-        scale = file.create_dataset(name, data=values)
-        scale.make_scale(name)
-        _set(scale, "units", units[name])
-    for name, values in stored.items():
+    units = {name: units.get(name, "1") for name in stored if name not in words}
+    coords = {name: stored.pop(name) for name in coords}
+    axes = axes_of(coords, inner)
+    for name, values in (coords | stored).items():
         array = file.create_dataset(name, data=values)
-        for axis, coordinate in enumerate(coords):
-            array.dims[axis].attach_scale(file[coordinate])
+        if name in coords:
+            array.make_scale(name)
+        else:
+            for axis, coordinate in enumerate((*axes, *inner.get(name, ()))):
+                array.dims[axis].attach_scale(file[coordinate])
         if name in words:
             array.attrs["flag_values"] = np.arange(len(words[name]), dtype=np.int8)
             _set(array, "flag_meanings", " ".join(words[name]))
@@ -194,7 +208,7 @@ def _coded(values: Values, words: tuple[str, ...] | None) -> tuple[Values, tuple
 def read_grid(path: Any) -> tuple[Any, ...]:
     """Read what `write_grid` wrote.
 
-    **Returns:** `coords`, `variables`, `units`, `attributes` and `words`, as in `Table`.
+    **Returns:** `coords`, `variables`, `units`, `attributes`, `words` and `inner`, as in `Table`.
 
     **Raises:** `OSError` that names the path if it cannot be read, holds no grid, or holds numbers other than those
     that were written.
@@ -209,7 +223,7 @@ def read_grid(path: Any) -> tuple[Any, ...]:
         name: np.array([*grid.words[name], UNREACHED])[values] if name in grid.words else values
         for name, values in grid.variables.items()
     }
-    return grid.coords, variables, grid.units, grid.attributes, grid.words
+    return grid.coords, variables, grid.units, grid.attributes, grid.words, grid.inner
 
 
 def read_stored(path: Any) -> Grid:
@@ -251,34 +265,35 @@ def _contents(file: "h5py.File") -> Grid:
         raise ValueError("it names no request")
     # The marks come first: what is marked by now is complete, even if another process is writing the file.
     firsts, marks, checksums = (stored_array(file, name)[()] for name in (FIRSTS, FINISHED, CHECKSUMS))
-    for name in json.loads(_attribute(file, "axes")):
+    attributes = {name: _attribute(file, name) for name in file.attrs if name != "Conventions"}
+    axes = json.loads(attributes["axes"])
+    inner = {name: tuple(dims) for name, dims in json.loads(attributes.get(INNER, "{}")).items()}
+    dims = dict.fromkeys((*axes, *(dim for dims in inner.values() for dim in dims)))
+    for name in (*dims, *(name for name in file if name not in (*dims, FIRSTS, FINISHED, CHECKSUMS))):
         stored = stored_array(file, name)
-        coords[name] = stored[()]
-        units[name] = _attribute(stored, "units")
-    shape = tuple(len(axis) for axis in coords.values())
-    cells = int(np.prod(shape, dtype=int))
-    for name in file:
-        if name in (*coords, FIRSTS, FINISHED, CHECKSUMS):
-            continue
-        stored = stored_array(file, name)
-        if stored.shape != shape:
+        if name in dims:
+            coords[name] = stored[()]
+        elif stored.shape == tuple(len(coords[dim]) for dim in (*axes, *inner.get(name, ()))):
+            variables[name] = np.asarray(stored[()])
+        else:
             raise ValueError(f"{name} has the wrong shape")
-        variables[name] = np.asarray(stored[()])
         if "flag_meanings" in stored.attrs:
             words[name] = tuple(_attribute(stored, "flag_meanings").split())
         else:
             units[name] = _attribute(stored, "units")
-    attributes = {name: _attribute(file, name) for name in file.attrs if name != "Conventions"}
+    cells = int(np.prod([len(coords[name]) for name in axes], dtype=int))
     ends = np.append(firsts[1:], cells)
     if not (len(firsts) == len(marks) == len(checksums) > 0 == firsts[0]) or np.any(ends < firsts):
         raise ValueError("its blocks do not cover it")
     header = header_checksum(coords, units, attributes, words)
     finished, damaged = marks != 0, np.zeros(len(marks), bool)
     for block, (first, end) in enumerate(zip(firsts, ends, strict=True)):
-        some = {name: values.reshape(-1)[first:end] for name, values in variables.items()}
+        some = {name: values.reshape(cells, -1)[first:end] for name, values in variables.items()}
         if finished[block]:
             damaged[block] = block_checksum(header, some) != checksums[block]
         if damaged[block] or not finished[block]:
             for values in some.values():
                 values[...] = blank(values.dtype)
-    return Grid(coords, variables, units, attributes, words, firsts, finished & ~damaged, damaged, header)
+    attributes.pop(INNER, None)
+    coords = {name: np.array(words.pop(name))[values] if name in words else values for name, values in coords.items()}
+    return Grid(coords, variables, units, attributes, words, inner, firsts, finished & ~damaged, damaged, header)

@@ -3,7 +3,7 @@
 import json
 import os
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, NamedTuple
@@ -32,11 +32,15 @@ class Axis(NamedTuple):
 
 
 class Variable(NamedTuple):
-    """One result of every cell: its unit and dtype, and, if it is a code, the words it stands for."""
+    """One result of every cell: its unit and dtype, and, if it is a code, the words it stands for.
+
+    `inner` names the dimensions of a result that is an array, in order.
+    """
 
     unit: str
     kind: Any
     words: tuple[str, ...] | None = None
+    inner: tuple[str, ...] = ()
 
 
 def axis(name: str, path: str, unit: str, values: Any) -> Axis:
@@ -59,6 +63,8 @@ def sweep(
     *,
     path: Any = None,
     block: int | None = None,
+    most: int | None = None,
+    inner: Sequence[Axis] = (),
     progress: bool = True,
 ) -> Table:
     """Compute every cell of a grid.
@@ -71,18 +77,21 @@ def sweep(
     - `variables`: what `run` returns.
     - `request`: plain data that says what is computed; it is stored in the table and guards the file.
     - `path`: file to write, block by block; if it holds part of the same request, only the rest is computed.
-    - `block`: how many cells `run` is given at once.
+    - `block`: how many cells `run` is given at once, `block_for` their number by default; `most`: the most of them, where
+      results are large.
+    - `inner`: the coordinates of the dimensions that results have besides the grid's, numbers or words.
     - `progress`: whether to show it, on a terminal or in a notebook.
 
     **Returns:** the `Table`.
 
     **Raises:** `OSError` or `ValueError` if the file cannot be written or holds another request.
     """
-    coords = {one.name: one.values for one in axes}
-    units = {one.name: one.unit for one in axes}
+    coords = {one.name: one.values for one in (*axes, *inner)}
+    units = {one.name: one.unit for one in (*axes, *inner) if one.values.dtype.kind != "U"}
     units |= {name: one.unit for name, one in variables.items() if one.words is None}
     cells = int(np.prod([len(one.values) for one in axes], dtype=int))
     block = block_for(cells) if block is None else block
+    block = block if most is None else min(block, most)
     firsts = range(0, cells, block)
     request = request | {"float": str(np.dtype(jnp.result_type(float)))}
     attributes = {
@@ -92,7 +101,8 @@ def sweep(
     }
     words = {name: one.words for name, one in variables.items() if one.words is not None}
     kinds = {name: one.kind for name, one in variables.items()}
-    layout = Layout(coords, kinds, units, words, attributes, firsts)
+    dims = {name: one.inner for name, one in variables.items() if one.inner}
+    layout = Layout(coords, kinds, units, words, attributes, firsts, dims)
 
     def columns(index: int) -> dict[str, Values]:
         cell = np.minimum(np.arange(firsts[index], firsts[index] + block), cells - 1)
@@ -105,7 +115,7 @@ def sweep(
 
     file = None if path is None else BlockFile(path, layout)
     try:
-        found = {name: values.reshape(-1) for name, values in layout.empty().items()} if file is None else file.values()
+        found = layout.rows(layout.empty()) if file is None else file.values()
         todo = [index for index in range(len(firsts)) if file is None or index not in file.finished]
         with Progress(cells, "cell", shown=progress) as shown:
             if todo:
@@ -120,9 +130,9 @@ def sweep(
     finally:
         if file is not None:
             file.close()
-    shaped = {name: values.reshape(layout.shape) for name, values in found.items()}
+    shaped = {name: values.reshape((*layout.shape, *values.shape[1:])) for name, values in found.items()}
     shaped |= {name: np.array([*words[name], UNREACHED])[shaped[name]] for name in words}
-    return Table(coords, shaped, units, attributes if file is None else file.attributes, words)
+    return Table(coords, shaped, units, attributes if file is None else file.attributes, words, dims)
 
 
 def _as_they_finish(work: Callable[[int], Any], todo: list[int]) -> Iterator[tuple[int, Any]]:

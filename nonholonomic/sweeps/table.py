@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Shaped
 
-from ._hdf5 import UNREACHED, read_grid, write_grid
+from ._hdf5 import UNREACHED, axes_of, read_grid, write_grid
 from .digits import concise_texts
 
 Values = Shaped[np.ndarray, "..."]
@@ -18,11 +18,13 @@ class Table(eqx.Module):
 
     **Arguments:**
 
-    - `coords`: name -> values, one for each axis of the grid, in order.
+    - `coords`: name -> values, one for each axis of the grid, in order, and then for the dimensions that some variables have
+      besides, such as "time".
     - `variables`: name -> array over the grid; `status` is an array of words.
     - `units`: name of a coordinate or variable -> its unit.
     - `attributes`: what was computed, with what versions: plain data.
     - `words`: variable that consists of words -> the words, in the order of the numbers that stand for them in a file.
+    - `inner`: variable -> the names of its dimensions after those of the grid, for variables that have such.
     """
 
     coords: dict[str, Values]
@@ -30,6 +32,7 @@ class Table(eqx.Module):
     units: dict[str, str]
     attributes: dict[str, Any]
     words: dict[str, tuple[str, ...]] = eqx.field(default_factory=dict)
+    inner: dict[str, tuple[str, ...]] = eqx.field(default_factory=dict)
 
     def __getattr__(self, name: str) -> Values:
         # Reached only for names that are not fields.
@@ -41,14 +44,32 @@ class Table(eqx.Module):
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of the grid."""
-        return tuple(len(values) for values in self.coords.values())
+        return tuple(len(self.coords[name]) for name in axes_of(self.coords, self.inner))
+
+    def dims(self, variable: str) -> tuple[str, ...]:
+        """The names of a variable's dimensions: the axes of the grid, and its own."""
+        return (*axes_of(self.coords, self.inner), *self.inner.get(variable, ()))
+
+    def to_xarray(self) -> Any:
+        """The table as an `xarray.Dataset` (needs xarray), with named dimensions and units; words stay words.
+
+        **Returns:** the dataset; `Table.save` and a sweep's file hold the same.
+        """
+        import xarray
+
+        def described(name: str, dims: tuple[str, ...], values: Values) -> tuple[Any, ...]:
+            return dims, values, {"units": self.units[name]} if name in self.units else {}
+
+        variables = {name: described(name, self.dims(name), values) for name, values in self.variables.items()}
+        coords = {name: described(name, (name,), values) for name, values in self.coords.items()}
+        return xarray.Dataset(variables, coords, self.attributes)
 
     def save(self, path: Any) -> None:
         """Write the table to an HDF5 file that `xarray.open_dataset(path, engine="h5netcdf")` opens as it is.
 
         **Raises:** `OSError` that names the path if it cannot be written.
         """
-        write_grid(path, self.coords, self.variables, self.units, self.attributes, self.words)
+        write_grid(path, self.coords, self.variables, self.units, self.attributes, self.words, inner=self.inner)
 
     @classmethod
     def load(cls, path: Any) -> "Table":
@@ -86,13 +107,14 @@ class Table(eqx.Module):
         return draw_table(self, variable)
 
     def __str__(self) -> str:
-        axes = ", ".join(f"{name} ({len(values)})" for name, values in self.coords.items())
+        axes = ", ".join(f"{name} ({len(self.coords[name])})" for name in axes_of(self.coords, self.inner))
         lines = [f"Table over {axes or 'one cell'}"]
         # What has not been computed is told by the status alone.
         computed = self.variables["status"] != UNREACHED if "status" in self.variables else ...
         for name, values in self.variables.items():
             unit = f" [{self.units[name]}]" if self.units.get(name, "1") not in ("1", "") else ""
-            lines.append(f"  {name}{unit}: {_summary(values if name == 'status' else values[computed])}")
+            dims = "".join(f" x {dim} ({len(self.coords[dim])})" for dim in self.inner.get(name, ()))
+            lines.append(f"  {name}{unit}{dims}: {_summary(values if name == 'status' else values[computed])}")
         return "\n".join(lines)
 
     def __repr__(self) -> str:

@@ -31,9 +31,13 @@ def draw_table(table: "Table", variable: str = "time") -> Any:
     values = table.variables.get(variable)
     if values is None or values.dtype.kind == "U":
         raise ValueError(f"variable = {variable!r} must be a numeric variable of the table")
-    names = list(table.coords)
-    if not names:
+    dims = table.dims(variable)
+    if not dims:
         raise ValueError("a table of one cell has nothing to draw")
+    # What runs along a dimension of its own, such as time, is drawn over that.
+    cells = len(table.shape)
+    names = [*dims[cells:], *dims[:cells]]
+    values = np.moveaxis(values, range(cells), range(-cells, 0))
     figure = Figure(figsize=(7.0, 4.5), layout="constrained")
     drawing = figure.add_subplot()
     label = f"{variable} [{table.units.get(variable, '1')}]"
@@ -47,7 +51,7 @@ def draw_table(table: "Table", variable: str = "time") -> Any:
     drawing.set_ylabel(f"{names[1]} [{table.units.get(names[1], '1')}]")
     image = drawing.pcolormesh(table.coords[names[0]], table.coords[names[1]], shown[first].T, shading="nearest")
     figure.colorbar(image, label=label)
-    if "status" in table.variables:
+    if "status" in table.variables and len(dims) == cells:
         _mark_words(drawing, table, names, table.variables["status"][first])
     return figure
 

@@ -182,7 +182,7 @@ def test_an_interrupted_sweep_resumes_and_recomputes_no_finished_block(rutstam_s
 
 KILLED = """
 import sys, numpy as np, tippe
-from nonholonomic import sweep
+from nonholonomic.sweeps import grid as sweep
 sweep.block_for = lambda cells: 4
 sweep.workers = lambda: 1
 mass, radius = 0.02, 0.02

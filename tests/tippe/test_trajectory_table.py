@@ -1,0 +1,231 @@
+"""Tables of trajectories: single runs and batches, axes, ends, files, and what is refused."""
+
+import doctest
+import re
+import sys
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray
+from conftest import assert_close, rutstam_top
+
+import tippe
+from nonholonomic.sweeps import grid as sweeping
+
+# The same number of times, the same quantities and one size of block wherever it can be, so that one program serves.
+TIMES = np.linspace(0.0, 1.5, 31)
+THETA, SPIN, MU = [0.1, 0.2, 1.6], [100.0, 250.0], [0.2, 0.3]
+VECTORS = ("axis", "position", "velocity", "angular_momentum", "slip")
+SCALARS = ("theta", "eta", "azimuth", "spin", "energy", "jellett", "normal_force")
+
+
+@pytest.fixture(scope="module")
+def scene() -> tippe.Scene:
+    return tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
+
+
+@pytest.fixture(scope="module")
+def table(scene, tmp_path_factory) -> tippe.Table:
+    """The one that most tests look at; its file is beside it."""
+    path = tmp_path_factory.mktemp("tables") / "table.h5"
+    table = tippe.trajectory_table(scene, theta=THETA, spin=SPIN, mu=MU, times=TIMES, path=path)
+    return table, path
+
+
+def single(scene, theta, spin, mu=0.3, times=TIMES, t1=TIMES[-1]):
+    scene = tippe.Scene(scene.body, scene.surface, tippe.Viscous(mu))
+    return tippe.simulate(scene, tippe.Launch(theta, spin), t1, times)
+
+
+def test_every_cell_is_a_single_run(table, scene):
+    """Among them runs that lose contact: what is after that is not a number."""
+    table, _ = table
+    assert list(table.coords) == ["launch.theta", "mu", "launch.spin", "time"]
+    assert table.shape == (3, 2, 2)
+    assert table.theta.shape == table.eta.shape == (3, 2, 2, 31)
+    assert set(table.status.ravel()) == {"reached_end", "contact_lost"}
+    for i, theta in enumerate(THETA):
+        run = single(scene, theta, 250.0)
+        assert_close(table.theta[i, 1, 1, : len(run.t)], run.theta, atol=1e-7)
+        assert np.isnan(table.theta[i, 1, 1, len(run.t) :]).all()
+        assert np.isnan(table.eta[i, 1, 1, len(run.t) :]).all()
+        assert_close(table.end_time[i, 1, 1], run.end_time, atol=1e-7)
+        assert table.status[i, 1, 1].replace("_end", " t1") == run.status
+    assert_close(table.theta[1, 0, 0], single(scene, 0.2, 100.0, mu=0.2).theta, atol=1e-7)
+
+
+def test_a_batch_by_vmap_is_the_same(table, scene):
+    table, _ = table
+    spins = jnp.asarray(table.coords["launch.spin"])
+    runs = jax.vmap(lambda spin: tippe.simulate(scene, tippe.Launch(0.2, spin), TIMES[-1], TIMES))(spins)
+    assert_close(table.theta[1, 1], runs.theta, atol=1e-7)
+    assert_close(table.end_time[1, 1], runs.end_time, atol=1e-7)
+
+
+@pytest.mark.parametrize("arena", [tippe.Cylinder(0.3), tippe.Sphere(0.3)], ids=["cylinder", "sphere"])
+def test_every_quantity_is_that_of_a_single_run_and_comes_back_from_a_file(arena, tmp_path):
+    """In a cylinder and a sphere some are read off the arena's path, which the runs then carry."""
+    scene, names = tippe.Scene(rutstam_top(), arena, tippe.Viscous(0.3)), SCALARS + VECTORS
+    table = tippe.trajectory_table(scene, theta=[0.1, 0.3], spin=120.0, eta=0.2, times=TIMES, quantities=names)
+    for i, theta in enumerate((0.1, 0.3)):
+        run = tippe.simulate(scene, tippe.Launch(theta, 120.0, 0.2), TIMES[-1], TIMES)
+        for name in names:
+            found, expected = table.variables[name][i], np.asarray(getattr(run, name))
+            assert found.shape == expected.shape
+            assert_close(found, expected, atol=1e-6 * np.abs(expected).max())
+    assert table.dims("position") == ("launch.theta", "time", "component")
+    assert table.dims("slip") == ("launch.theta", "time", "tangent")
+    assert table.dims("energy") == ("launch.theta", "time")
+    table.save(tmp_path / "saved.h5")
+    loaded = tippe.Table.load(tmp_path / "saved.h5")
+    assert list(loaded.coords) == list(table.coords)
+    assert loaded.coords["component"].tolist() == table.coords["component"].tolist() == ["x", "y", "z"]
+    np.testing.assert_array_equal(loaded.position, table.position)
+    with xarray.open_dataset(tmp_path / "saved.h5", engine="h5netcdf") as data:
+        assert data["velocity"].dims == ("launch.theta", "time", "component")
+        assert data["component"].attrs["flag_meanings"] == "x y z"
+        assert_close(data["velocity"], table.velocity)
+
+
+def test_further_axes_and_none(scene):
+    axes = {"launch.azimuth": [0.0, 1.0, -2.0], "scene.body.offset": [0.005, 0.006]}
+    turned = tippe.trajectory_table(scene, theta=0.2, spin=100.0, times=TIMES, axes=axes)
+    assert list(turned.coords) == ["launch.azimuth", "offset", "time"]
+    # The plane looks the same in every direction.
+    assert_close(turned.theta, np.broadcast_to(turned.theta[0], turned.theta.shape), atol=1e-7)
+    one = tippe.trajectory_table(scene, theta=0.2, spin=100.0, times=TIMES)
+    assert one.shape == ()
+    assert one.theta.shape == (31,)
+    assert one.status == "reached_end"
+    assert_close(one.theta, turned.theta[0, 1], atol=1e-7)
+    assert "theta [rad] x time (31)" in str(one)
+
+
+def test_the_file_opens_in_xarray_as_the_table_does(table):
+    table, path = table
+    loaded = tippe.Table.load(path)
+    with xarray.open_dataset(path, engine="h5netcdf") as data:
+        for dataset in (data, table.to_xarray(), loaded.to_xarray()):
+            assert dataset["theta"].dims == ("launch.theta", "mu", "launch.spin", "time")
+            assert dataset["end_time"].dims == ("launch.theta", "mu", "launch.spin")
+            assert dataset["theta"].attrs["units"] == "rad"
+            assert dataset["time"].attrs["units"] == "s"
+            assert dataset["mu"].attrs["units"] == "s m-1"
+            cell = dataset["theta"].sel({"launch.theta": 0.2, "mu": 0.3, "launch.spin": 100.0})
+            assert_close(cell.sel(time=1.5), table.theta[1, 1, 0, -1])
+        assert data["status"].attrs["flag_meanings"].split()[0] == "reached_end"
+    assert set(table.to_xarray()["status"].values.ravel()) == {"reached_end", "contact_lost"}
+    assert loaded.inner == table.inner
+    for name in table.variables:
+        np.testing.assert_array_equal(loaded.variables[name], table.variables[name])
+
+
+def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(sweeping, "block_for", lambda cells: 64)
+    monkeypatch.setattr(sweeping, "workers", lambda: 1)
+    path, written, done = tmp_path / "table.h5", sweeping.BlockFile.write, []
+    arguments = {"theta": np.linspace(0.1, 1.6, 20), "spin": [*SPIN, 90.0, 130.0], "mu": MU, "times": TIMES}
+
+    def until_the_second(self, block, first, values):
+        if len(done) == 1:
+            raise KeyboardInterrupt
+        done.append(block)
+        written(self, block, first, values)
+
+    monkeypatch.setattr(sweeping.BlockFile, "write", until_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        tippe.trajectory_table(scene, path=path, **arguments)
+    part = tippe.Table.load(path)
+    assert (part.status == "pending").sum() == 96
+    assert np.isfinite(part.theta[part.status == "reached_end"]).all()
+    assert np.isnan(part.theta[part.status == "pending"]).all()
+
+    def counted(self, block, first, values):
+        done.append(block)
+        written(self, block, first, values)
+
+    monkeypatch.setattr(sweeping.BlockFile, "write", counted)
+    whole = tippe.trajectory_table(scene, path=path, **arguments)
+    assert sorted(done) == [0, 1, 2]
+    with h5py.File(path, "r+") as file:
+        file["theta"][9, 1, 3, 7] += 1e-12
+    with pytest.raises(OSError, match="1 of its 3 blocks do not match"):
+        tippe.Table.load(path)
+    with pytest.warns(RuntimeWarning, match="1 finished blocks"):
+        mended = tippe.trajectory_table(scene, path=path, **arguments)
+    assert sorted(done) == [0, 1, 1, 2]
+    fresh = tippe.trajectory_table(scene, **arguments)
+    for table in (whole, mended, tippe.Table.load(path)):
+        np.testing.assert_array_equal(table.theta, fresh.theta)
+        np.testing.assert_array_equal(table.status, fresh.status)
+    with pytest.raises(ValueError, match=r"another run: quantities is \['theta', 'eta'\] there"):
+        tippe.trajectory_table(scene, path=path, quantities=["theta"], **arguments)
+    with pytest.raises(ValueError, match="another run: the axis time differs"):
+        tippe.trajectory_table(scene, path=path, **arguments | {"times": TIMES * 0.9})
+
+
+def test_it_is_drawn_over_time(table):
+    table, _ = table
+    drawing = table.plot("theta").axes[0]
+    assert drawing.get_xlabel() == "time [s]"
+    assert len(drawing.get_lines()) == 3
+    assert_close(drawing.get_lines()[1].get_ydata(), table.theta[1, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"times": []}, "times must be a non-empty list"),
+        ({"times": 1.0}, "times must be a non-empty list"),
+        ({"times": [0.0, 1.0, 0.5]}, "times must increase"),
+        ({"times": [-0.1, 1.0]}, "times = -0.1 must be at least 0.0"),
+        ({"times": [0.0, float("nan")]}, "times = nan must be finite"),
+        ({"times": [0.0]}, "times[-1] = 0.0 must be greater than 0.0 (it is the horizon)"),
+        ({"times": "soon"}, "times = 'soon' is not a number"),
+        ({"theta": [0.1, 4.0]}, "theta = 4.0 must be at most"),
+        ({"theta": None}, "theta"),
+        ({"spin": [[1.0]]}, "launch.spin must be a number or a non-empty list"),
+        ({"mu": [0.1, -0.1]}, "mu = -0.1 must be at least 0.0"),
+        ({"tolerance": 0.5}, "tolerance = 0.5 must be at most 0.01"),
+        ({"quantities": "theta"}, "quantities = 'theta' must be a list of names"),
+        ({"quantities": ()}, "quantities = () must be a list of names"),
+        ({"quantities": ["theta", "mood"]}, "quantities: 'mood' must be one of theta, eta"),
+        ({"quantities": ["theta", "theta"]}, "quantities: 'theta' must be there once only"),
+        ({"axes": {"scene.body.colour": [1.0]}}, "unknown axis 'scene.body.colour'"),
+        ({"axes": {"launch.theta": [0.1]}}, "'launch.theta' is an argument of its own"),
+        ({"scene": "a top"}, "scene = 'a top' must be a Scene"),
+    ],
+    ids=str,
+)
+def test_what_is_refused_before_anything_compiles(scene, change, told, monkeypatch):
+    monkeypatch.setattr("tippe.trajectory_cells.Followed.of", lambda *_: pytest.fail("it was run"))
+    arguments = {"scene": scene, "theta": 0.1, "spin": 100.0, "times": TIMES} | change
+    with pytest.raises(ValueError, match=re.escape(told)):
+        tippe.trajectory_table(arguments.pop("scene"), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"contact": "hybrid"}, "contact = 'hybrid' must be 'stop' for trajectory_table: .* by simulate"),
+        ({"friction": tippe.SetValuedCoulomb(0.3)}, "friction = SetValuedCoulomb must be a law without phases"),
+    ],
+    ids=["hybrid", "set-valued"],
+)
+def test_scenes_whose_runs_have_phases_are_refused(change, told):
+    scene = tippe.Scene(rutstam_top(), tippe.Plane(), **{"friction": tippe.Viscous(0.3)} | change)
+    with pytest.raises(ValueError, match=told):
+        tippe.trajectory_table(scene, theta=0.1, spin=100.0, times=TIMES)
+
+
+def test_the_example_of_its_docstring():
+    results = doctest.DocTestRunner()
+    for example in doctest.DocTestFinder().find(
+        tippe.trajectory_table, "trajectory_table", sys.modules["tippe.trajectory_table"], {}
+    ):
+        results.run(example)
+    assert results.tries > 4
+    assert results.failures == 0

@@ -1,0 +1,136 @@
+"""How the cells of a table of trajectories are run and read: samples of many launches, and what is observed at them."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from nonholonomic.geometry import Plane
+from nonholonomic.integration import FAILED, GUARD_LOST, AbstractProblem, Outcome, Settings, march_with_samples
+from nonholonomic.xla_cpu import compiled_alone
+
+from .launch import Launch
+from .sampled import Run, ended
+from .scene import Scene
+from .trajectory import Trajectory
+
+
+class Quantity(NamedTuple):
+    """A property of `Trajectory` that a table can hold: its unit, and the dimension of its components if it is a vector."""
+
+    unit: str
+    components: str | None = None
+
+
+QUANTITIES = {
+    "theta": Quantity("rad"),
+    "eta": Quantity("rad"),
+    "azimuth": Quantity("rad"),
+    "spin": Quantity("rad s-1"),
+    "energy": Quantity("J"),
+    "jellett": Quantity("kg m3 s-1"),
+    "normal_force": Quantity("N"),
+    "axis": Quantity("1", "component"),
+    "position": Quantity("m", "component"),
+    "velocity": Quantity("m s-1", "component"),
+    "angular_momentum": Quantity("kg m2 s-1", "component"),
+    "slip": Quantity("m s-1", "tangent"),
+}
+
+#: The directions that components belong to: of the fixed frame, and of the moving one.
+COMPONENTS = {"component": ("x", "y", "z"), "tangent": ("t1", "t2")}
+
+#: What can be read off the state alone; all else needs the path, except on the plane, where only the position does.
+OF_THE_STATE = {"theta", "azimuth", "spin", "energy", "jellett", "normal_force", "slip"}
+
+
+class Followed(AbstractProblem):
+    """Launches with as much of a `Run` as is asked for: its path only where something is read off it, no spin angle, no work.
+
+    On the plane a run without its path takes a fifth less time.
+    """
+
+    run: Run
+    with_path: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> "Followed":
+        """The runs of some cells, of which the named quantities are to be read."""
+        needed = {"position"} if isinstance(scene.surface, Plane) else set(QUANTITIES) - OF_THE_STATE
+        return cls(Run.of(scene, launch, cells), not needed.isdisjoint(names))
+
+    @property
+    def size(self) -> int:
+        """How many components the state has."""
+        return len(self.run.state) + (len(self.run.path) if self.with_path else 0)
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        states, scales = self.run.start()
+        return states[: self.size], scales[: self.size]
+
+    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        # What the rates do not depend on, and those that are left out, the compiler drops.
+        missing = jnp.zeros((len(self.run.scales) - self.size, *state.shape[1:]))
+        return self.run.field(time, jnp.concatenate([state, missing]))[: self.size]
+
+    def crossing(self, state: Float[Array, "components lanes"]) -> None:
+        return None
+
+    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
+        return self.run.guard(time, state)
+
+    def read(
+        self, scene: Scene, times: Float[Array, " times"], samples: Float[Array, "cells times components"], name: str
+    ) -> Float[Array, "cells times ..."]:
+        """A quantity at every sample, not a number after the end of a run."""
+        state_size, path_size = len(self.run.state), len(self.run.path)
+
+        def one(scene: Scene, states: Float[Array, "times components"]) -> Float[Array, "times ..."]:
+            state, path = jnp.split(states.T, [state_size])
+            path = path if self.with_path else jnp.zeros((path_size, len(times)))
+            nothing = jnp.zeros(len(times))
+            values = getattr(Trajectory(times, scene, state, path, nothing, nothing, None, times[-1], {}, None), name)
+            # What does not depend on the state would be a number after the end too.
+            there = jnp.isfinite(states[:, 0]).reshape(-1, *[1] * (values.ndim - 1))
+            return jnp.where(there, values, jnp.nan)
+
+        def cell_axis(leaf: Any) -> int | None:
+            return 0 if eqx.is_array(leaf) and leaf.ndim else None
+
+        return eqx.filter_vmap(one, in_axes=(cell_axis, 0))(scene, samples)
+
+
+# On its own, not inside other transformed functions: only so does it get the compiler's options.
+@compiled_alone
+def _followed(
+    problem: Followed,
+    scene: Scene,
+    times: Float[Array, " times"],
+    count: Int[Array, ""],
+    settings: Settings,
+    names: tuple[str, ...],
+) -> tuple[Outcome, Int[Array, " cells"], dict[str, Float[Array, "cells times ..."]]]:
+    """How the runs end, the codes of that in `sampled.STATUS`, and the named quantities on the way."""
+    outcome, samples = march_with_samples(problem, times, times[-1], count, settings, one_kernel=True)
+    status = ended(problem.run, outcome.state, outcome.status == GUARD_LOST, outcome.status == FAILED)
+    return outcome, status, {name: problem.read(scene, times, samples, name) for name in names}
+
+
+def follow_cells(
+    scene: Scene, launch: Launch, cells: int, times: Any, tolerance: float, names: tuple[str, ...], count: int
+) -> dict[str, Array]:
+    """The variables of some cells.
+
+    **Arguments:** `scene`, `launch`: numbers that are scalars or one per cell; `cells`: how many there are, of which the first
+    `count` are to be run; `times`: of the samples [s], the last the horizon; `tolerance`: relative tolerance; `names`: the
+    quantities to be read.
+
+    **Returns:** name -> values, the cells first.
+    """
+    numbers = (jnp.asarray(times, float), jnp.asarray(count), Settings(tolerance))
+    problem = Followed.of(scene, launch, cells, names)
+    outcome, status, values = _followed(problem, scene, *numbers, names)
+    ending = {"status": status, "end_time": outcome.end_time, "steps": outcome.steps, "rejected": outcome.rejected}
+    return jax.tree.map(jnp.asarray, values | ending)
