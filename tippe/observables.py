@@ -53,12 +53,16 @@ class AbstractTrajectory(eqx.Module):
     end_time: eqx.AbstractVar[Any]
     stats: eqx.AbstractVar[dict[str, Any]]
     dense: eqx.AbstractVar[Any]
-    energy: eqx.AbstractVar[Float[Array, " times"]]
 
     @property
     @abc.abstractmethod
     def above(self) -> tuple[Component, Component]:
         """Distance of the top's sphere from the arena [m] and its rate [m/s]; `None` where it touches at all times."""
+
+    @property
+    @abc.abstractmethod
+    def energy(self) -> Float[Array, " times"]:
+        """Kinetic and potential energy [J]."""
 
     @abc.abstractmethod
     def resampled(self, times: Float[np.ndarray, " times"]) -> Self:

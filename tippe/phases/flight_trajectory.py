@@ -6,7 +6,7 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from nonholonomic.integration import (
     BETWEEN,
@@ -50,13 +50,13 @@ class HybridTrajectory(AbstractTrajectory):
     path: Float[np.ndarray, "2 times"]
     spin_angle: Float[np.ndarray, " times"]
     work: Float[np.ndarray, " times"]
-    distance: Float[np.ndarray, "2 times"]
-    contact: Int[np.ndarray, " times"]
-    hops: Float[np.ndarray, "hops 2"]
     status: str
     end_time: float
     stats: dict[str, Any]
     dense: PhasedPath
+    distance: Float[np.ndarray, "2 times"]
+    contact: Int[np.ndarray, " times"]
+    hops: Float[np.ndarray, "hops 2"]
 
     @property
     def above(self) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, " times"]]:
@@ -67,7 +67,7 @@ class HybridTrajectory(AbstractTrajectory):
     def _free(self) -> FreeBody:
         """The top as a free body, in contact too."""
         body, states = self.scene.body, self.states
-        free = freed(body, balls(body)[0], states)
+        free = freed(body, balls(body)[0], jnp.asarray(states))
         (distance, rate), (u1, u2, u3) = self.above, free.velocity
         return FreeBody((u1, u2, u3 + rate), free.height + distance, free.axis, free.momentum)
 
@@ -80,7 +80,7 @@ class HybridTrajectory(AbstractTrajectory):
         )
 
     @property
-    def energy(self) -> Float[np.ndarray, " times"]:
+    def energy(self) -> Float[Array, " times"]:
         """Kinetic energy plus weight times the height of the centre of mass [J]."""
         return energy(self.scene.body, self.scene.gravity, self._free)
 
@@ -121,14 +121,15 @@ def simulate_hybrid(
     path = follow_phases(kinds, int(first[0]), state, t1, Settings(tolerance, solver), kinds=1)
     hops = np.array([(one.begin, one.end) for one in path.pieces if one.number == BETWEEN]).reshape(-1, 2)
     status, shown = STATUS[path.status], path.times
-    parts = _parts(path.at(shown))
-    run = HybridTrajectory(shown, scene, *parts, path.numbers(shown), hops, status, path.end_time, {}, path)
+    states, place, spin_angle, work, distance = _parts(path.at(shown))
+    ends = (status, path.end_time, {}, path, distance, path.numbers(shown), hops)
+    run = HybridTrajectory(shown, scene, states, place, spin_angle, work, *ends)
     in_contact = sum(one.motion.states[-1, -1] - one.motion.states[-1, 0] for one in path.stays)
     # What is left of the work is that of the impacts.
     run = run.with_stats(path, impact_loss=float(in_contact - path.state[-1]))
     return run if times is None else run.resampled(np.asarray(times)[np.asarray(times) <= run.end_time])
 
 
-def _parts(shown: Float[np.ndarray, "14 times"]) -> tuple[Float[np.ndarray, "..."], ...]:
+def _parts(shown: Float[np.ndarray, "14 times"]) -> tuple[Any, Any, Any, Any, Any]:
     """State, path, spin angle, work, and the distance with its rate, from what the phases show."""
     return shown[:8], shown[8:10], shown[10], shown[11], shown[12:]

@@ -199,7 +199,8 @@ def phases(
     found = tuple(Slide(*given, jnp.asarray(number), last, rides) for number in range(len(spheres)))
     if len(spheres) == 1:
         return found, jnp.zeros(problem.states.shape[1:], int)
-    return (*found, Lean(*given, rides)), (clearance(*spheres, problem.states) < 0.0).astype(int)
+    main, stem = spheres
+    return (*found, Lean(*given, rides)), (clearance(main, stem, problem.states) < 0.0).astype(int)
 
 
 def leaning(scene: Scene) -> LeaningDynamics:
