@@ -28,7 +28,7 @@ import numpy as np
 from measure import machine, one_core, table, timed
 
 import tippe
-from nonholonomic.integration import ABSOLUTE, alone
+from nonholonomic.integration import ABSOLUTE
 
 HORIZON, TOLERANCE, TIGHT, SPIN, MU = 10.0, 1e-9, 1e-13, 100.0, 0.3
 
@@ -97,7 +97,7 @@ def main() -> None:
         found, back = jax.vjp(lambda mu: simulated(*given, mu), mu)
         return found, back(ones)
 
-    narrow, wide, obvious = jax.jit(simulated), alone(simulated), jax.jit(by_diffrax)
+    narrow, wide, obvious = jax.jit(simulated), compiled_alone(simulated), jax.jit(by_diffrax)
     along, back_through = jax.jit(forward), jax.jit(reverse)
     ways: dict[str, tuple[Callable[[], Any], int]] = {
         "inversion_table": (
