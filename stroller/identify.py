@@ -113,7 +113,7 @@ def identify(
 
     **Returns:** an `Identification`.
 
-    **Raises:** `ValueError` for arguments out of range or an unknown path; `ImportError` if Optimistix is not installed.
+    **Raises:** `ValueError` for arguments out of range or an unknown path.
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")

@@ -52,6 +52,9 @@ class AbstractFriction(Bounded):
     #: Whether the force of a contact at rest is whatever keeps it there, within limits.
     set_valued: ClassVar[bool] = False
 
+    #: Whether the load is a force that depends on the slip velocity alone, without a torque. Impacts need such a law.
+    acts_at_point: ClassVar[bool] = False
+
     @property
     def drills(self) -> bool:
         """Whether the law depends on the body's angular velocity about the normal."""
@@ -72,6 +75,8 @@ class AbstractFriction(Bounded):
 class Frictionless(AbstractFriction):
     """No friction: the arena pushes along its normal only."""
 
+    acts_at_point: ClassVar[bool] = True
+
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         return ContactLoad(force=(None, None))
 
@@ -85,6 +90,7 @@ class Viscous(AbstractFriction):
     """
 
     units: ClassVar[dict[str, str]] = {"mu": "s m-1"}
+    acts_at_point: ClassVar[bool] = True
 
     mu: Float[Array, "..."] = eqx.field(converter=as_number)
 
@@ -111,6 +117,7 @@ class Coulomb(AbstractFriction):
     """
 
     units: ClassVar[dict[str, str]] = {"mu": "1", "slip_speed": "m s-1"}
+    acts_at_point: ClassVar[bool] = True
 
     mu: Float[Array, "..."] = eqx.field(converter=as_number)
     slip_speed: Float[Array, "..."] = eqx.field(converter=as_number)

@@ -184,7 +184,7 @@ def identify(
     **Returns:** an `Identification`.
 
     **Raises:** `ValueError` for arguments out of range, an unknown path, and a scene with `contact="hybrid"` or
-    `SetValuedCoulomb`, through whose phases the derivative does not go; `ImportError` if Optimistix is not installed.
+    `SetValuedCoulomb`, through whose phases the derivative does not go.
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")

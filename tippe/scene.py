@@ -10,16 +10,13 @@ from nonholonomic.geometry import AbstractSurface, Plane, dot, none_if_zero
 from nonholonomic.validation import Bound, Bounded, as_number
 
 from .dynamics import COS_THETA, Dynamics
-from .friction import AbstractFriction, Coulomb, Frictionless, Viscous
+from .friction import AbstractFriction, Frictionless
 from .launch import Launch
 from .phases import StickSlip
 from .top import Top
 
 #: Tilt [rad] of a launch below which errors across the normal are measured in proportion to it.
 NEARLY_UPRIGHT = 1e-2
-
-#: Laws for impacts: those that depend on the slip velocity alone and exert no torque about the contact point.
-POINT_FRICTION = (Frictionless, Viscous, Coulomb)
 
 
 class Scene(Bounded):
@@ -36,7 +33,7 @@ class Scene(Bounded):
       `SetValuedCoulomb(mu)`.
     - `gravity`: acceleration of free fall [m/s^2], positive.
     - `contact`: "stop": a run ends where the contact is lost; "hybrid", on the plane: it goes on through flights, impacts
-      and changes to the stem and back (`hybrid/`). A top with a stem needs the latter.
+      and changes to the stem and back (`phases/`). A top with a stem needs the latter.
     - `restitution`: Newton's coefficient e_N of impacts [1], in [0, 1], for "hybrid" only; `None` is 0.
 
     **Raises:** `ValueError` if a part is of the wrong kind, if the top does not fit into the arena, if gravity is not
@@ -61,7 +58,7 @@ class Scene(Bounded):
             raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
         if self.contact == "hybrid" and not isinstance(self.surface, Plane):
             raise ValueError(f"contact = 'hybrid' must be on a Plane(), not on {self.surface!r}")
-        if self.contact == "hybrid" and not isinstance(self.friction, POINT_FRICTION):
+        if self.contact == "hybrid" and not self.friction.acts_at_point:
             raise ValueError(f"contact = 'hybrid' must be with friction at a point, not with {self.friction!r}")
         if self.contact == "stop" and self.body.stem is not None:
             raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from ..parameters import full_path
 from ..validation import require
-from .levenberg_marquardt import Problem, linearise, minimise, required
+from .levenberg_marquardt import Problem, linearise, minimise
 from .likelihood import Measurements
 from .result import Identification, summarise
 from .unknown import Free, as_free, draw_starts
@@ -49,9 +49,8 @@ def identify(
 
     **Returns:** an `Identification`.
 
-    **Raises:** `ValueError` for arguments out of range; `ImportError` if Optimistix is not installed.
+    **Raises:** `ValueError` for arguments out of range.
     """
-    required()
     unknowns = as_free(free)
     if not isinstance(measurements, Measurements) or measurements.value.ndim != 1:
         raise ValueError(f"measurements = {measurements!r} must be Measurements of shape (n,)")

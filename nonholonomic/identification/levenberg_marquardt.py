@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 from jaxtyping import Array, Bool, Float, Int
 
 from ..progress import Progress
@@ -184,10 +185,7 @@ def minimise(
     - `progress`: whether to show, on a terminal or in a notebook, how many rows are done.
 
     **Returns:** the `Ends`.
-
-    **Raises:** `ImportError` if Optimistix is not installed.
     """
-    optimistix = required()
     starts = jnp.asarray(starts, float)
     rows, unknowns = starts.shape
     measurements = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (rows, leaf.shape[-1])), measurements)
@@ -199,7 +197,7 @@ def minimise(
         unit = jnp.sqrt(FIRST_DAMPING * jnp.where(largest > 0.0, largest, 1.0 / FIRST_DAMPING))
         moving = starts @ embedding
         row = _Row(measurements, starts - moving @ embedding.T, unit)
-        solver = _solver(optimistix)
+        solver = _solver()
         moving, state = _begin(solver, problem, embedding, row, moving)
         for step in range(max_steps):
             coordinates = row.held + state.y_eval @ embedding.T
@@ -216,19 +214,7 @@ def minimise(
     return Ends(row.held + moving @ embedding.T, jnp.asarray(done), jnp.asarray(steps))
 
 
-def required() -> Any:
-    """Optimistix.
-
-    **Raises:** `ImportError` that says how to install it.
-    """
-    try:
-        import optimistix
-    except ImportError:
-        raise ImportError("identification needs Optimistix: pip install 'nonholonomic[fit]'") from None
-    return optimistix
-
-
-def _solver(optimistix: Any) -> Any:
+def _solver() -> Any:
     """Levenberg-Marquardt, with a damping that is eased sooner than Optimistix does it."""
     search = optimistix.ClassicalTrustRegion(high_cutoff=GOOD, high_constant=EASED, low_constant=1.0 / HARDENED)
     solver = optimistix.LevenbergMarquardt(rtol=CONVERGED, atol=CONVERGED)

@@ -15,7 +15,6 @@ from terminal import Terminal
 from nonholonomic.identification import Free, Measurements, identify, levenberg_marquardt
 from nonholonomic.identification.likelihood import MISSING, one_sided
 from nonholonomic.identification.result import coordinate_covariance
-from nonholonomic.identification.unknown import as_free
 from nonholonomic.parameters import full_path
 
 pytestmark = pytest.mark.newest
@@ -190,9 +189,3 @@ def test_names_are_paths_or_their_ends():
         full_path("free", "mu", known)
     with pytest.raises(ValueError, match="must be one of"):
         full_path("free", "fset", known)
-
-
-def test_without_optimistix_it_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "optimistix", None)
-    with pytest.raises(ImportError, match=r"pip install 'nonholonomic\[fit\]'"):
-        identify(line, Measurements(X, 1.0), as_free({"height": 1.0, "slope": 1.0}))
