@@ -116,5 +116,5 @@ def test_a_law_says_itself_whether_impacts_can_use_it():
     scene = tippe.Scene(rutstam_top(), friction=OwnLawAtPoint(), contact="hybrid")
     state = scene.state(tippe.Launch(0.3, 100.0))
     assert_close(scene.friction_power(state) / scene.normal_force(state), -0.2 * scene.slip_velocity(state)[1] ** 2)
-    with pytest.raises(ValueError, match="contact = 'hybrid' must be with friction at a point, not with .*OwnLaw"):
+    with pytest.raises(ValueError, match=r"contact = 'hybrid' must be with friction at a point, not with .*OwnLaw"):
         tippe.Scene(rutstam_top(), friction=OwnLaw(), contact="hybrid")
