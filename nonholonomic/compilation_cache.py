@@ -80,8 +80,8 @@ def user_folder() -> Path:
 
 def environment_name() -> str:
     """A name for all that compiled code depends on besides the program: jaxlib, the processor, and the flags of XLA."""
-    told = "\n".join([platform.system(), platform.machine(), processor(), os.environ.get("XLA_FLAGS", "")])
-    return f"jaxlib-{version('jaxlib')}-{hashlib.sha256(told.encode()).hexdigest()[:12]}"
+    machine = "\n".join([platform.system(), platform.machine(), processor(), os.environ.get("XLA_FLAGS", "")])
+    return f"jaxlib-{version('jaxlib')}-{hashlib.sha256(machine.encode()).hexdigest()[:12]}"
 
 
 def processor() -> str:
@@ -92,9 +92,9 @@ def processor() -> str:
         return platform.processor()
     # One core stands for all. On ARM the features have another name.
     kinds = ("vendor_id", "cpu family", "model", "flags", "CPU implementer", "CPU part", "Features")
-    told = dict(line.split(":", 1) for line in reversed(lines) if ":" in line)
-    told = {name.strip(): value.strip() for name, value in told.items()}
-    return "\n".join(told.get(name, "") for name in kinds)
+    lines_by_name = dict(line.split(":", 1) for line in reversed(lines) if ":" in line)
+    lines_by_name = {name.strip(): value.strip() for name, value in lines_by_name.items()}
+    return "\n".join(lines_by_name.get(name, "") for name in kinds)
 
 
 def remove_damaged(folder: Path) -> None:

@@ -91,8 +91,8 @@ def require(
         numbers, limits = np.broadcast_arrays(numbers, np.asarray(bound, dtype=float))
         allowed = holds(numbers, limits)
         if not np.all(allowed):
-            told = f"{name} = {_first(numbers, allowed)} must be {words} {_first(limits, allowed)}"
-            raise ValueError(told + remark)
+            message = f"{name} = {_first(numbers, allowed)} must be {words} {_first(limits, allowed)}"
+            raise ValueError(message + remark)
 
 
 class Bound(NamedTuple):

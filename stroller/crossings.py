@@ -67,10 +67,10 @@ class Recipe(eqx.Module):
     rest: Any = eqx.field(static=True)
 
     @classmethod
-    def of(cls, scene: Scene, input: Input | None, solver: diffrax.AbstractSolver) -> "Recipe":
+    def of(cls, scene: Scene, controls: Input | None, solver: diffrax.AbstractSolver) -> "Recipe":
         """The recipe of a run."""
         explicit = solver if isinstance(solver, diffrax.AbstractERK) else None
-        return cls(*eqx.partition((scene, input, explicit), eqx.is_array_like))
+        return cls(*eqx.partition((scene, controls, explicit), eqx.is_array_like))
 
     @property
     def parts(self) -> tuple[Scene, Input | None, diffrax.AbstractERK | None]:
@@ -80,8 +80,8 @@ class Recipe(eqx.Module):
 
 @eqx.filter_jit
 def _field(recipe: Recipe, times: Float[Array, " lanes"], states: State) -> State:
-    scene, input, _ = recipe.parts
-    return scene.dynamics.field(times, states, input)
+    scene, controls, _ = recipe.parts
+    return scene.dynamics.field(times, states, controls)
 
 
 @eqx.filter_jit

@@ -30,7 +30,7 @@ from nonholonomic.geometry import (
     sum_vectors,
 )
 
-from .friction import AbstractFriction, Drag, Rolling
+from .friction import AbstractFriction, Drag, WheelMotion
 from .heading import AbstractHeading
 from .input import Input, Motion
 from .stroller import Stroller
@@ -151,13 +151,13 @@ class Dynamics(eqx.Module):
             front_load=multiply(normal_force, share),
         )
 
-    def forces(self, t: Float[Array, "..."], geometry: Geometry, input: Input | None) -> Forces:
+    def forces(self, t: Float[Array, "..."], geometry: Geometry, controls: Input | None) -> Forces:
         """What drives and what brakes, at a time [s]."""
         motion = geometry.motion
-        drive, torque = (None, None) if input is None else input(t, motion)
+        drive, torque = (None, None) if controls is None else controls(t, motion)
         rear_load = subtract(geometry.normal_force, geometry.front_load)
         speeds = (motion.speed, motion.front_speed, motion.yaw_rate, motion.steering_rate)
-        return Forces(drive, torque, self.friction.drag(Rolling(*speeds, rear_load, geometry.front_load)))
+        return Forces(drive, torque, self.friction.drag(WheelMotion(*speeds, rear_load, geometry.front_load)))
 
     def fork_torque(self, geometry: Geometry, forces: Forces) -> Component:
         """All torque [N m] about the steering axis."""
@@ -176,10 +176,10 @@ class Dynamics(eqx.Module):
             fork=multiply(drag.steering, motion.steering_rate),
         )
 
-    def field(self, t: Float[Array, "..."], state: State, input: Input | None = None) -> State:
+    def field(self, t: Float[Array, "..."], state: State, controls: Input | None = None) -> State:
         """Rate of change of the state, (components, ...)."""
         body, g, e = self.body, self.geometry(state), self.unpack(state)[1]
-        forces = self.forces(t, g, input)
+        forces = self.forces(t, g, controls)
         drag, torque = forces.drag, self.fork_torque(g, forces)
         arm = g.sine / body.wheelbase
         weight = body.mass * self.gravity
@@ -201,7 +201,7 @@ class Dynamics(eqx.Module):
                 multiply(torque, 1.0 / body.steering_inertia),
                 multiply(g.cosine, turn),
                 multiply(-g.sine, turn),
-                *((power.drive, power.steering) if input is not None else ()),
+                *((power.drive, power.steering) if controls is not None else ()),
                 *((add(*power[2:]),) if self.friction.dissipates else ()),
             ),
             state,
@@ -225,7 +225,7 @@ class Dynamics(eqx.Module):
         return jnp.broadcast_to(multiply(1.0, self.geometry(state).normal_force), state[0].shape)
 
     def side_force(
-        self, t: Float[Array, "..."], state: State, input: Input | None
+        self, t: Float[Array, "..."], state: State, controls: Input | None
     ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Side forces [N] of the ground on the rear axle and on the front wheel, to the left of each.
 
@@ -238,10 +238,10 @@ class Dynamics(eqx.Module):
             motion = self.geometry(state).motion
             return motion.speed, motion.yaw_rate
 
-        rate = self.field(t, state, input)
+        rate = self.field(t, state, controls)
         (v, yaw), (v_rate, yaw_acceleration) = jax.jvp(speeds, (state,), (rate,))
         g = self.geometry(state)
-        forces = self.forces(t, g, input)
+        forces = self.forces(t, g, controls)
         weight, up = body.mass * self.gravity, self.up
         climb, bank = multiply(weight, dot(g.direction, up)), multiply(weight, dot(g.left, up))
         centre_along = subtract(v_rate, multiply(body.centre, yaw, yaw))
@@ -262,7 +262,7 @@ class Dynamics(eqx.Module):
         return across - front * g.cosine, front
 
     def projected_side_force(
-        self, t: Float[Array, "..."], state: State, input: Input | None
+        self, t: Float[Array, "..."], state: State, controls: Input | None
     ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Side forces [N] as `side_force`, for the projected heading on a curved ground: they act along the horizontal.
 
@@ -275,9 +275,9 @@ class Dynamics(eqx.Module):
             g = self.geometry(state)
             return g.velocity, g.motion.yaw_rate
 
-        _, (acceleration, yaw_acceleration) = jax.jvp(moving, (state,), (self.field(t, state, input),))
+        _, (acceleration, yaw_acceleration) = jax.jvp(moving, (state,), (self.field(t, state, controls),))
         g = self.geometry(state)
-        forces = self.forces(t, g, input)
+        forces = self.forces(t, g, controls)
         drag, heading, arm = forces.drag, g.motion.heading, body.wheelbase
         left = cross(self.surface.up, heading)
         ahead = sum_vectors(scale(g.cosine, heading), scale(g.sine, left))

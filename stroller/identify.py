@@ -105,7 +105,7 @@ def identify(
 
     - `scene`: a `Scene`; what is not free is taken from it.
     - `data`: a `Recording`, or a list of several to be fitted together.
-    - `free`: path of a number -> a `Free` or only the value from which to start: `"scene.friction.rolling"`, or
+    - `free`: full name of a number -> a `Free` or only the value from which to start: `"scene.friction.rolling"`, or
       `"rolling"` where nothing else ends so; `"launch.place[0]"` and `"launch.place[1]"` are parts of the place. A number
       of the launch is the same in all recordings. Numbers that cannot be negative are fitted in their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
@@ -113,7 +113,7 @@ def identify(
 
     **Returns:** an `Identification`.
 
-    **Raises:** `ValueError` for arguments out of range or an unknown path.
+    **Raises:** `ValueError` for arguments out of range or an unknown name.
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
@@ -124,7 +124,7 @@ def identify(
     for one in data:
         scene.check(one.launch)
     roots = {"scene": scene, "launch": data[0].launch}
-    known = [path for root, tree in roots.items() for path in numbers(root, tree)] + list(PLACES)
+    known = [name for root, tree in roots.items() for name in numbers(root, tree)] + list(PLACES)
     unknowns = generic.free_numbers(free, roots, known, replaced)
     measurements, labels = generic.joined(data)
     return generic.identify(

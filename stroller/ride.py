@@ -34,17 +34,17 @@ class Settings(NamedTuple):
     adjoint: diffrax.AbstractAdjoint | None
 
 
-def is_closed(input: Input | None, scene: Scene, launch: Launch) -> bool:
+def is_closed(controls: Input | None, scene: Scene, launch: Launch) -> bool:
     """Whether an input is a module, or a function that holds no number that is being differentiated or batched."""
-    if input is None or isinstance(input, eqx.Module):
+    if controls is None or isinstance(controls, eqx.Module):
         return True
-    closed = jax.make_jaxpr(input)(*_example(scene, launch))
+    closed = jax.make_jaxpr(controls)(*_example(scene, launch))
     return not any(is_traced(constant) for constant in closed.consts)
 
 
-def opened(input: Any, scene: Scene, launch: Launch) -> Input:
+def opened(controls: Any, scene: Scene, launch: Launch) -> Input:
     """A function as a module, whose leaves are the numbers that the function holds."""
-    return eqx.filter_closure_convert(input, *_example(scene, launch))
+    return eqx.filter_closure_convert(controls, *_example(scene, launch))
 
 
 def _example(scene: Scene, launch: Launch) -> tuple[Any, Any]:

@@ -171,12 +171,12 @@ def spread(component: Component, like: Float[Array, "..."]) -> Float[Array, "...
 
 
 def side_force(
-    scene: Scene, t: Float[Array, " times"], states: Float[Array, "components times"], input: Input | None
+    scene: Scene, t: Float[Array, " times"], states: Float[Array, "components times"], controls: Input | None
 ) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
     """Side forces [N] on the rear axle and the front wheel, to the left of each."""
     if scene.heading == "intrinsic" or isinstance(scene.surface, Plane):
-        return scene.dynamics.side_force(t, states, input)
-    return scene.dynamics.projected_side_force(t, states, input)
+        return scene.dynamics.side_force(t, states, controls)
+    return scene.dynamics.projected_side_force(t, states, controls)
 
 
 @eqx.filter_jit
@@ -188,14 +188,14 @@ def read_off(
     stats: Stats,
 ) -> Trajectory:
     """The trajectory of the given states at the given times."""
-    scene, input, _ = recipe.parts
+    scene, controls, _ = recipe.parts
     dynamics, surface = scene.dynamics, scene.surface
     integrated, states = states, scene.dynamics.righted(states)
     g = dynamics.geometry(states)
     motion, like = g.motion, states[0]
     place = surface.place_at(motion.position)
     _, east, north = surface.chart(place)
-    power = dynamics.power(g, dynamics.forces(t, g, input))
+    power = dynamics.power(g, dynamics.forces(t, g, controls))
     normal_force = spread(g.normal_force, like)
     front_load = spread(g.front_load, like)
 
@@ -216,10 +216,10 @@ def read_off(
         energy=scene.energy(states),
         work=scene.work(states),
         power=Power(*(spread(part, like) for part in power)),
-        side_force=columns(*side_force(scene, t, states, input)),
+        side_force=columns(*side_force(scene, t, states, controls)),
         normal_force=normal_force,
         load=columns(normal_force - front_load, front_load),
-        constraint=columns(*side_slip(scene, dynamics.field(t, states, input), states)),
+        constraint=columns(*side_slip(scene, dynamics.field(t, states, controls), states)),
         departure=spread(surface.departure(motion.position), like),
         state=integrated.T,
         watch=watch,

@@ -29,7 +29,7 @@ from .scene import Scene
 from .sensitivities import slopes_of_cells
 
 
-class Kind(NamedTuple):
+class Driver(NamedTuple):
     """A kind of runs: the words of its status, what is counted besides steps, and how the runs go.
 
     `ride` takes (scene, problem, t1, tolerance, last, solver, count); `None` for runs of one smooth motion.
@@ -56,49 +56,49 @@ class Kind(NamedTuple):
 _jams = eqx.filter_jit(lambda dynamics, state: dynamics.jams(state))
 
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed")
-SMOOTH = Kind(WORDS, (), None)
-STICK_SLIP = Kind((*WORDS, "unresolved"), ("sticks",), ride_with_sticking)
-HYBRID = Kind((*WORDS, "unresolved"), ("hops",), ride_with_flights)
+SMOOTH = Driver(WORDS, (), None)
+STICK_SLIP = Driver((*WORDS, "unresolved"), ("sticks",), ride_with_sticking)
+HYBRID = Driver((*WORDS, "unresolved"), ("hops",), ride_with_flights)
 
 #: Which word a run's status is, where it has not inverted; `not_inverted` for all others.
 WORD_OF_STATUS = {GUARD_LOST: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
 
 
-def kind_of(scene: Scene) -> Kind:
+def driver_of(scene: Scene) -> Driver:
     """The kind of a scene's runs."""
     if scene.friction.set_valued:
         return STICK_SLIP
     return HYBRID if scene.contact == "hybrid" else SMOOTH
 
 
-class Runs(NamedTuple):
+class CellRuns(NamedTuple):
     """What is asked of every cell of a table; see `inversion_table`."""
 
-    kind: Kind
+    driver: Driver
     t1: float
     angle: float
     last: bool
     solver: diffrax.AbstractERK
     method: str
-    paths: list[str]
+    slopes_by: list[str]
 
     def results(self, roots: dict[str, Any], columns: dict[str, Any], tolerance: float, count: int) -> dict[str, Any]:
         """The variables of some cells.
 
-        **Arguments:** `roots`: scene and launch; `columns`: path of a number -> its value in every cell, the first `count`
+        **Arguments:** `roots`: scene and launch; `columns`: full name of a number -> its value in every cell, the first `count`
         of which are to be run; `tolerance`: relative tolerance.
         """
         cells = with_numbers(roots, columns)
         scene, launch = cells["scene"], cells["launch"]
         size = next((len(values) for values in columns.values()), 1)
         problem = InversionProblem.of(scene, launch, self.angle, size)
-        if self.kind.ride is not None:
-            journey = self.kind.ride(scene, problem, self.t1, tolerance, self.last, self.solver, count)
-            return self._named(scene, problem, journey) | dict(zip(self.kind.counts, journey.counts, strict=True))
-        if not self.paths:
+        if self.driver.ride is not None:
+            journey = self.driver.ride(scene, problem, self.t1, tolerance, self.last, self.solver, count)
+            return self._named(scene, problem, journey) | dict(zip(self.driver.counts, journey.counts, strict=True))
+        if not self.slopes_by:
             return self._named(scene, problem, self._outcome(problem, tolerance, count, size))
         options = {"count": count, "size": size, "solver": self.solver, "last": self.last}
-        outcome, slopes = slopes_of_cells(roots, columns, self.paths, self.angle, self.t1, tolerance, **options)
+        outcome, slopes = slopes_of_cells(roots, columns, self.slopes_by, self.angle, self.t1, tolerance, **options)
         return self._named(scene, problem, outcome) | slopes
 
     def _outcome(self, problem: InversionProblem, tolerance: float, count: int, size: int) -> Outcome:
@@ -115,7 +115,7 @@ class Runs(NamedTuple):
         lost = code == WORDS.index("contact_lost")
         if lost.any():
             # A hybrid run flies on where contact is lost.
-            jams = self.kind is HYBRID or np.asarray(_jams(scene.dynamics, jnp.asarray(ended.state)))
+            jams = self.driver is HYBRID or np.asarray(_jams(scene.dynamics, jnp.asarray(ended.state)))
             code = np.where(lost & jams, WORDS.index("jammed"), code)
         return {
             "time": np.where(inverted, ended.crossing_time, np.inf),

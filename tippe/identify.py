@@ -85,7 +85,7 @@ class InversionTimes(eqx.Module):
     ) -> Float[Array, "rows launches"]:
         """Times of all launches in every row, all of them lanes of one block."""
         launches = len(self.time)
-        spread = {path: jnp.repeat(value, launches) for path, value in values.items()}
+        spread = {name: jnp.repeat(value, launches) for name, value in values.items()}
         launch = jax.tree.map(lambda leaf: jnp.tile(jnp.broadcast_to(leaf, (launches,)), rows), self.launch)
         roots = with_numbers({"scene": scene, "launch": launch}, spread)
         times = extended_inversion_times(
@@ -175,7 +175,7 @@ def identify(
 
     - `scene`: a `Scene`; what is not free is taken from it.
     - `data`: an `InversionTimes` or a `Recording`, or a list of several to be fitted together.
-    - `free`: path of a number -> a `Free` or only the value from which to start: `"scene.friction.mu"`, or `"friction.mu"`
+    - `free`: full name of a number -> a `Free` or only the value from which to start: `"scene.friction.mu"`, or `"friction.mu"`
       where nothing else ends so; a number of the launch is the same in all launches of all data. Numbers that cannot be
       negative are fitted in their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
@@ -183,7 +183,7 @@ def identify(
 
     **Returns:** an `Identification`.
 
-    **Raises:** `ValueError` for arguments out of range, an unknown path, and a scene with `contact="hybrid"` or
+    **Raises:** `ValueError` for arguments out of range, an unknown name, and a scene with `contact="hybrid"` or
     `SetValuedCoulomb`, through whose phases the derivative does not go.
     """
     if not isinstance(scene, Scene):
@@ -194,7 +194,7 @@ def identify(
         raise ValueError(f"data = {data!r} must be an InversionTimes or a Recording, or a list of them")
     roots = {"scene": scene, "launch": data[0].launch}
     check_run(scene, Launch(0.0, 0.0), 1.0, tolerance)
-    known = [path for root, tree in roots.items() for path in numbers(root, tree)]
+    known = [name for root, tree in roots.items() for name in numbers(root, tree)]
     unknowns = generic.free_numbers(free, roots, known, with_numbers)
     measurements, labels = generic.joined(data)
     return generic.identify(

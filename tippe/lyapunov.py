@@ -14,7 +14,7 @@ from nonholonomic.geometry import cross
 from nonholonomic.integration import GUARD_LOST, REACHED_END, explicit_tableau
 from nonholonomic.validation import require
 
-from .cells import kind_of
+from .cells import driver_of
 from .inversion import ABSOLUTE, InversionProblem
 from .launch import Launch
 from .scene import Scene
@@ -71,7 +71,7 @@ def lyapunov_exponent(
         raise ValueError(f"scene = {scene!r} must be a Scene")
     if not isinstance(launch, Launch):
         raise ValueError(f"launch = {launch!r} must be a Launch")
-    if not kind_of(scene).smooth:
+    if not driver_of(scene).smooth:
         raise ValueError(
             "contact = 'hybrid' and SetValuedCoulomb have no exponents: variations end at a change of phase"
         )

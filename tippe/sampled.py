@@ -35,35 +35,35 @@ from .phases import Kind, StickSlip
 from .scene import Scene
 
 
-class Run(AbstractProblem):
-    """Launches with their cyclic coordinates: the state, the arena's path, the spin angle and the work of friction."""
+class TrajectoryProblem(AbstractProblem):
+    """Launches with their cyclic coordinates: the state, those of the arena, the spin angle and the work of friction."""
 
     dynamics: Dynamics | StickSlip | Kind
     axial: Float[Array, "..."]
     state: Float[Array, "components ..."]
-    path: Float[Array, "components ..."]
+    cyclic: Float[Array, "components ..."]
     scales: Float[Array, "components ..."]
 
     @classmethod
-    def of(cls, scene: Scene, launch: Launch, cells: int | None = None) -> "Run":
+    def of(cls, scene: Scene, launch: Launch, cells: int | None = None) -> "TrajectoryProblem":
         """The run of one launch, or the runs of some cells, whose numbers are scalars or one per cell."""
         radius, weight = scene.body.radius, scene.body.mass * scene.gravity
-        path = jnp.stack(scene.surface.path(launch.eta))
-        extra = jnp.stack(jnp.broadcast_arrays(*([radius] * len(path)), jnp.ones(()), weight * radius))
-        parts = (scene.state(launch), path, scene.scales(launch), extra)
+        cyclic = jnp.stack(scene.surface.cyclic(launch.eta))
+        extra = jnp.stack(jnp.broadcast_arrays(*([radius] * len(cyclic)), jnp.ones(()), weight * radius))
+        parts = (scene.state(launch), cyclic, scene.scales(launch), extra)
         if cells is not None:
             parts = tuple(jnp.broadcast_to(part.reshape(len(part), -1), (len(part), cells)) for part in parts)
         return cls(scene.dynamics, scene.body.I3, parts[0], parts[1], jnp.concatenate(parts[2:]))
 
     def start(self) -> tuple[Float[Array, "components ..."], Float[Array, "components ..."]]:
         nothing = jnp.zeros((2, *self.state.shape[1:]))
-        return jnp.concatenate([self.state, self.path, nothing]), self.scales
+        return jnp.concatenate([self.state, self.cyclic, nothing]), self.scales
 
     def field(self, time: Float[Array, "..."], state: Float[Array, "components ..."]) -> Any:
-        lean, path = state[: len(self.state)], tuple(state[len(self.state) : -2])
+        lean, cyclic = state[: len(self.state)], tuple(state[len(self.state) : -2])
         motion = self.dynamics.motion(lean)
-        path_rate = self.dynamics.parallel.path_rate(path, motion.velocity, motion.turning)
-        return stacked((*motion.rate, *path_rate, motion.spin_momentum / self.axial, motion.friction_power), state)
+        cyclic_rate = self.dynamics.parallel.cyclic_rate(cyclic, motion.velocity, motion.turning)
+        return stacked((*motion.rate, *cyclic_rate, motion.spin_momentum / self.axial, motion.friction_power), state)
 
     def crossing(self, state: Float[Array, "components ..."]) -> None:
         return None
@@ -77,7 +77,10 @@ STATUS = ("reached t1", "contact_lost", "failed", "jammed", "illegal")
 
 
 def ended(
-    run: Run, state: Float[Array, "components ..."], guard_lost: Bool[Array, "..."], failed: Bool[Array, "..."]
+    run: TrajectoryProblem,
+    state: Float[Array, "components ..."],
+    guard_lost: Bool[Array, "..."],
+    failed: Bool[Array, "..."],
 ) -> Int[Array, "..."]:
     """The code in `STATUS` of a run that ended in some state."""
     lost = jnp.where(run.dynamics.jams(state[: len(run.state)]), STATUS.index("jammed"), STATUS.index("contact_lost"))
@@ -115,14 +118,14 @@ def sampled(
     question = kind(len(leaves), structure, rest, solver)
     found = ask(question, *leaves, jax.lax.stop_gradient(times), as_number(t1), as_number(tolerance))
     # Later by a moment, the sample is further by as much along the field.
-    run = Run.of(scene, launch)
+    run = TrajectoryProblem.of(scene, launch)
     rates = jax.lax.stop_gradient(run.field(times, found.states.T).T)
     later = (times - jax.lax.stop_gradient(times))[:, None]
     return found._replace(states=found.states + jnp.where(jnp.isfinite(rates), rates * later, 0.0))
 
 
 def sampled_by_diffrax(
-    run: Run,
+    run: TrajectoryProblem,
     times: Float[Array, " times"],
     t1: Float[Array, ""],
     tolerance: float,
@@ -131,10 +134,10 @@ def sampled_by_diffrax(
 ) -> Found:
     """Run one launch and let Diffrax differentiate its steps, which a probe keeps short enough for tangents."""
     size = len(run.scales)
-    path = sample(probed(run), times, t1, solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance, adjoint=adjoint)
-    status = ended(run, path.end_state[:size], path.lost, path.end_time < t1)
-    floats = [part.astype(float) for part in (status, path.accepted, path.rejected)]
-    return Found(path.states[:size].T, path.end_time, *floats)
+    found = sample(probed(run), times, t1, solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance, adjoint=adjoint)
+    status = ended(run, found.end_state[:size], found.lost, found.end_time < t1)
+    floats = [part.astype(float) for part in (status, found.accepted, found.rejected)]
+    return Found(found.states[:size].T, found.end_time, *floats)
 
 
 class BlockSampling(AbstractQuestion):
@@ -146,10 +149,10 @@ class BlockSampling(AbstractQuestion):
     rest: Any
     solver: diffrax.AbstractERK
 
-    def run(self, leaves: tuple[Array, ...], cells: int) -> Run:
+    def run(self, leaves: tuple[Array, ...], cells: int) -> TrajectoryProblem:
         """The runs of some cells."""
         numbers = jax.tree.unflatten(self.structure, leaves)
-        return Run.of(*eqx.combine(numbers, self.rest), cells)
+        return TrajectoryProblem.of(*eqx.combine(numbers, self.rest), cells)
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isnan(value)
@@ -222,7 +225,7 @@ def _found(
     states, *variations = jnp.split(samples, 1 + len(varied.directions), axis=-1)
     end, *end_variations = varied.parts(ends.state)
 
-    def end_time(problem: Run, state: Float[Array, "components *cells"]) -> Float[Array, "*cells"]:
+    def end_time(problem: TrajectoryProblem, state: Float[Array, "components *cells"]) -> Float[Array, "*cells"]:
         return event_time(problem, lambda at: problem.guard(ends.time, at), ends.time, state)
 
     def slope(direction: Any, variation: Array, at_end: Array) -> Found:
@@ -245,10 +248,10 @@ class SingleSampling(AbstractQuestion):
     rest: Any
     solver: diffrax.AbstractSolver
 
-    def run(self, leaves: tuple[Array, ...], cells: None) -> Run:
+    def run(self, leaves: tuple[Array, ...], cells: None) -> TrajectoryProblem:
         """The only run there is."""
         numbers = jax.tree.unflatten(self.structure, leaves)
-        return Run.of(*eqx.combine(numbers, self.rest))
+        return TrajectoryProblem.of(*eqx.combine(numbers, self.rest))
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isnan(value)
@@ -275,6 +278,6 @@ def _follow(
 ) -> tuple[Found, list[Found]]:
     """What is found of a run, and its slope along each of the directions."""
     times, t1, tolerance = given
-    path = sample(varied, times, t1, solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
-    ends = Ends(path.end_time, path.end_state, path.lost, (path.end_time < t1) & ~path.lost)
-    return _found(varied, path.states.T, ends, path.accepted, path.rejected)
+    found = sample(varied, times, t1, solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
+    ends = Ends(found.end_time, found.end_state, found.lost, (found.end_time < t1) & ~found.lost)
+    return _found(varied, found.states.T, ends, found.accepted, found.rejected)

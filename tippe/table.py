@@ -11,11 +11,11 @@ from nonholonomic.integration import explicit_tableau
 from nonholonomic.parameters import description, numbers, with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
 
-from .cells import Runs, kind_of
+from .cells import CellRuns, driver_of
 from .inversion import check_event, check_run
 from .launch import Launch
 from .scene import Scene
-from .sensitivities import sensitivity_paths, slope_variables
+from .sensitivities import sensitivity_names, slope_variables
 from .time_error import COARSER, time_error
 
 #: Cells that are checked together, to bound the memory it takes.
@@ -59,13 +59,13 @@ def inversion_table(
     - `crossing`: "first" for the first time theta reaches the angle; "last" for the up-crossing after which theta stays
       above it until `t1` (first crossings are ill-conditioned where theta oscillates about the angle).
     - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
-    - `axes`: further axes, path of a number -> values, such as `{"scene.body.offset": [0.005, 0.006]}`.
+    - `axes`: further axes, full name of a number -> values, such as `{"scene.body.offset": [0.005, 0.006]}`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
     - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which knows first
       crossings only.
     - `errors`: whether to run every cell again at ten times the tolerance, for an estimate of the error of its time.
-    - `sensitivities`: paths of numbers to differentiate the times by, such as `["scene.friction.mu", "launch.theta"]`; the end
-      of a path will do where it fits one number only.
+    - `sensitivities`: full names of numbers to differentiate the times by, such as `["scene.friction.mu", "launch.theta"]`; the
+      end of a name will do where it fits one number only.
     - `progress`: whether to show it, on a terminal or in a notebook; `NONHOLONOMIC_PROGRESS=0` hides it everywhere.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
@@ -95,7 +95,7 @@ def inversion_table(
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
     if axes is not None and not isinstance(axes, dict):
-        raise ValueError(f"axes = {axes!r} must be a dictionary, path of a number -> values")
+        raise ValueError(f"axes = {axes!r} must be a dictionary, full name of a number -> values")
     known = numbers("scene.friction", scene.friction)
     of_mu = next((number for number in known if number.endswith(".mu")), "scene.friction.mu")
     given = {"launch.theta": theta, "launch.eta": eta, of_mu: mu, "launch.spin": spin, "launch.azimuth": azimuth}
@@ -116,12 +116,12 @@ def inversion_table(
     roots = with_numbers({"scene": scene, "launch": Launch(theta=0.0, spin=0.0)}, fixed)
     check_run(roots["scene"], roots["launch"], t1, tolerance)
     _check_cells(roots, grid)
-    paths = sensitivity_paths(roots, sensitivities)
-    kind = kind_of(scene)
-    if not kind.smooth and (method == "diffrax" or paths):
+    slopes_by = sensitivity_names(roots, sensitivities)
+    driver = driver_of(scene)
+    if not driver.smooth and (method == "diffrax" or slopes_by):
         what = "method = 'diffrax'" if method == "diffrax" else f"sensitivities = {sensitivities!r}"
         raise ValueError(f"{what} is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
-    runs = Runs(kind, float(t1), float(angle), crossing == "last", solver, method, paths)
+    runs = CellRuns(driver, float(t1), float(angle), crossing == "last", solver, method, slopes_by)
 
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
         if method == "diffrax" and count == 0:
@@ -129,22 +129,22 @@ def inversion_table(
             return {}
         found = runs.results(roots, columns, tolerance, count)
         if errors:
-            coarse = runs._replace(paths=[]).results(roots, columns, COARSER * tolerance, count)
-            agreed = (found["status"] == coarse["status"]) & (found["status"] != kind.words.index("failed"))
+            coarse = runs._replace(slopes_by=[]).results(roots, columns, COARSER * tolerance, count)
+            agreed = (found["status"] == coarse["status"]) & (found["status"] != driver.words.index("failed"))
             found["time_error"] = time_error(found["time"], coarse["time"], agreed)
         return found
 
     request = description("scene", roots["scene"]) | description("launch", roots["launch"])
     request |= {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
     request |= {"solver": type(solver).__name__, "method": method}
-    request |= {one.path: "an axis" for one in grid}
-    variables = kind.variables
+    request |= {one.number: "an axis" for one in grid}
+    variables = driver.variables
     if errors:
         request |= {"errors": True}
         variables = variables | {"time_error": Variable("s", np.float64)}
-    if paths:
-        request |= {"sensitivities": paths}
-        variables = variables | slope_variables(paths, units)
+    if slopes_by:
+        request |= {"sensitivities": slopes_by}
+        variables = variables | slope_variables(slopes_by, units)
     return sweep(run, grid, variables, request, path=path, progress=progress)
 
 
@@ -154,4 +154,4 @@ def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:
     cells = int(np.prod(shape, dtype=int))
     for first in range(0, cells, CHECKED_AT_ONCE):
         places = np.unravel_index(np.arange(first, min(first + CHECKED_AT_ONCE, cells)), shape) if grid else ()
-        with_numbers(roots, {one.path: one.values[place] for one, place in zip(grid, places, strict=True)})
+        with_numbers(roots, {one.number: one.values[place] for one, place in zip(grid, places, strict=True)})

@@ -18,7 +18,7 @@ from .inversion import ABSOLUTE, check_run, run_bounds
 from .launch import Launch
 from .phases.flight_trajectory import HybridTrajectory, simulate_hybrid
 from .phases.stick_slip_path import follow_stick_slip
-from .sampled import STATUS, Run, ended, sampled, sampled_by_diffrax
+from .sampled import STATUS, TrajectoryProblem, ended, sampled, sampled_by_diffrax
 from .scene import Scene
 
 
@@ -51,7 +51,7 @@ class Trajectory(eqx.Module):
     t: Float[Array, " times"]
     scene: Scene
     states: Float[Array, "components times"]
-    path: Float[Array, "paths times"]
+    cyclic: Float[Array, "cyclic times"]
     spin_angle: Float[Array, " times"]
     work: Float[Array, " times"]
     status: Any
@@ -67,7 +67,7 @@ class Trajectory(eqx.Module):
     @_of_each_run
     def eta(self) -> Float[Array, " times"]:
         """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
-        return self.scene.surface.angle(tuple(self.states[8:]), tuple(self.path))
+        return self.scene.surface.angle(tuple(self.states[8:]), tuple(self.cyclic))
 
     @_of_each_run
     def azimuth(self) -> Float[Array, " times"]:
@@ -98,8 +98,8 @@ class Trajectory(eqx.Module):
     @_of_each_run
     def position(self) -> Float[Array, "times 3"]:
         """Position of the sphere's centre [m]; the plane is z = 0, the cylinder's axis x = z = 0."""
-        foot = self.scene.surface.position(tuple(self.states[8:]), tuple(self.path))
-        normal = self.scene.surface.frame(tuple(self.states[8:]), tuple(self.path))[2]
+        foot = self.scene.surface.position(tuple(self.states[8:]), tuple(self.cyclic))
+        normal = self.scene.surface.frame(tuple(self.states[8:]), tuple(self.cyclic))[2]
         return jnp.stack([q + self.scene.body.radius * n for q, n in zip(foot, normal, strict=True)], axis=-1)
 
     @_of_each_run
@@ -137,7 +137,7 @@ class Trajectory(eqx.Module):
         return _cut(self, times, self.dense.at(times))
 
     def _fixed(self, vector: tuple[Array, Array, Array]) -> Float[Array, "times 3"]:
-        frame = self.scene.surface.frame(tuple(self.states[8:]), tuple(self.path))
+        frame = self.scene.surface.frame(tuple(self.states[8:]), tuple(self.cyclic))
         return jnp.stack([dot(vector, directions) for directions in zip(*frame, strict=True)], axis=-1)
 
     def __str__(self) -> str:
@@ -203,10 +203,10 @@ def simulate(
         return simulate_hybrid(scene, launch, float(t1), times, tolerance, solver)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
         return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
-    run = Run.of(scene, launch)
+    run = TrajectoryProblem.of(scene, launch)
     through = follow_stick_slip if scene.friction.set_valued else follow
-    path = through(run, float(t1), solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
-    trajectory = _as_trajectory(scene, run, path)
+    followed = through(run, float(t1), solver=solver, rtol=tolerance, atol=ABSOLUTE * tolerance)
+    trajectory = _as_trajectory(scene, run, followed)
     if times is None:
         return trajectory
     return trajectory.at(np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)])
@@ -254,7 +254,7 @@ def _traced(
         )
     if times is None:
         raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
-    run = Run.of(scene, launch)
+    run = TrajectoryProblem.of(scene, launch)
     if adjoint is None:
         found = sampled(scene, launch, times, t1, tolerance, solver)
     else:
@@ -264,34 +264,38 @@ def _traced(
     return Trajectory(times, scene, *_parts(run, found.states.T), status, found.end_time, stats, None)
 
 
-def _parts(run: Run, states: Float[Array, "components times"]) -> tuple[Any, Any, Any, Any]:
-    """State, path, spin angle and work."""
+def _parts(run: TrajectoryProblem, states: Float[Array, "components times"]) -> tuple[Any, Any, Any, Any]:
+    """State, cyclic coordinates, spin angle and work."""
     lean = len(run.state)
     return states[:lean], states[lean:-2], states[-2], states[-1]
 
 
-def _as_trajectory(scene: Scene, run: Run, path: Any) -> Trajectory:
-    lean, cyclic, spin_angle, work = _parts(run, jnp.asarray(path.states))
+def _as_trajectory(scene: Scene, run: TrajectoryProblem, followed: Any) -> Trajectory:
+    lean, cyclic, spin_angle, work = _parts(run, jnp.asarray(followed.states))
     status = STATUS[
-        int(ended(run, jnp.asarray(path.states[:, -1]), jnp.asarray(path.guard_lost), jnp.asarray(path.failed)))
+        int(
+            ended(
+                run, jnp.asarray(followed.states[:, -1]), jnp.asarray(followed.guard_lost), jnp.asarray(followed.failed)
+            )
+        )
     ]
     energy = scene.energy(lean)
     stats = {
-        "accepted": path.accepted,
-        "rejected": path.rejected,
+        "accepted": followed.accepted,
+        "rejected": followed.rejected,
         "axis_drift": float(jnp.max(jnp.abs(jnp.sqrt(jnp.sum(lean[2:5] ** 2, axis=0)) - 1.0))),
         "energy_residual": float(jnp.max(jnp.abs(energy - energy[0] - work))),
     }
     if scene.friction.set_valued:
-        stats["sticks"] = path.sticks
-    times = jnp.asarray(path.times)
-    return Trajectory(times, scene, lean, cyclic, spin_angle, work, status, times[-1], stats, path)
+        stats["sticks"] = followed.sticks
+    times = jnp.asarray(followed.times)
+    return Trajectory(times, scene, lean, cyclic, spin_angle, work, status, times[-1], stats, followed)
 
 
 def _cut(trajectory: Trajectory, times: Any, states: Any) -> Trajectory:
     run_size = trajectory.states.shape[0]
     return eqx.tree_at(
-        lambda one: (one.t, one.states, one.path, one.spin_angle, one.work),
+        lambda one: (one.t, one.states, one.cyclic, one.spin_angle, one.work),
         trajectory,
         (
             jnp.asarray(times),

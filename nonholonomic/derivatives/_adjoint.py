@@ -352,11 +352,11 @@ def step_taken_back(
     return adjoint + total, room
 
 
-def _read(all: Array, at: Int[Array, ""]) -> Array:
+def _read(whole: Array, at: Int[Array, ""]) -> Array:
     """One of the arrays that are stacked in another."""
-    return jax.lax.dynamic_index_in_dim(all, at, 0, keepdims=False)
+    return jax.lax.dynamic_index_in_dim(whole, at, 0, keepdims=False)
 
 
-def _written(all: Array, one: Array, at: Int[Array, ""]) -> Array:
+def _written(whole: Array, one: Array, at: Int[Array, ""]) -> Array:
     """A stack of arrays with one of them replaced; without the look at bounds that `at[].set` has, it is done in place."""
-    return jax.lax.dynamic_update_index_in_dim(all, one, at, 0)
+    return jax.lax.dynamic_update_index_in_dim(whole, one, at, 0)

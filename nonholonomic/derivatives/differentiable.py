@@ -148,10 +148,10 @@ def directions_by(
     """
 
     def moved(*moving: Array) -> Any:
-        all = list(leaves)
+        every = list(leaves)
         for i, leaf in zip(active, moving, strict=True):
-            all[i] = leaf
-        return build(tuple(all), cells)
+            every[i] = leaf
+        return build(tuple(every), cells)
 
     point = tuple(leaves[i] for i in active)
     sizes = [natural_size(leaf) for leaf in point]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..parameters import full_path
+from ..parameters import full_name
 from ..validation import require
 from .levenberg_marquardt import Problem, linearise, minimise
 from .likelihood import Measurements
@@ -88,29 +88,29 @@ def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...]]:
 def free_numbers(
     free: Any, roots: dict[str, Any], known: list[str], replace: Callable[[dict[str, Any], dict[str, Any]], Any]
 ) -> dict[str, Free]:
-    """The unknowns of a scene: their full paths, and a lower bound of 0 for numbers that cannot be negative.
+    """The unknowns of a scene: their full names, and a lower bound of 0 for numbers that cannot be negative.
 
     **Arguments:**
 
-    - `free`: path, or its unambiguous end, -> a `Free` or where to start.
-    - `roots`: name -> tree of modules, `known`: the paths of their numbers.
-    - `replace`: (roots, path -> number) -> roots; it raises `ValueError` for numbers that the modules refuse.
+    - `free`: name, or its unambiguous end, -> a `Free` or where to start.
+    - `roots`: name -> tree of modules, `known`: the full names of their numbers.
+    - `replace`: (roots, name -> number) -> roots; it raises `ValueError` for numbers that the modules refuse.
 
-    **Returns:** path -> `Free`.
+    **Returns:** full name -> `Free`.
 
-    **Raises:** `ValueError` for an unknown path, or starts that the modules refuse.
+    **Raises:** `ValueError` for an unknown name, or starts that the modules refuse.
     """
     given = {}
-    for name, one in as_free(free).items():
-        path = full_path("free", name, known)
-        if path in given:
-            raise ValueError(f"free: {path!r} is named twice")
-        given[path] = one
-    replace(roots, {path: one.start for path, one in given.items()})
+    for short, one in as_free(free).items():
+        name = full_name("free", short, known)
+        if name in given:
+            raise ValueError(f"free: {name!r} is named twice")
+        given[name] = one
+    replace(roots, {name: one.start for name, one in given.items()})
     lower = {}
-    for path, one in given.items():
+    for name, one in given.items():
         try:
-            replace(roots, {path: -(abs(one.start) or 1.0)})
+            replace(roots, {name: -(abs(one.start) or 1.0)})
         except ValueError:
-            lower[path] = 0.0
+            lower[name] = 0.0
     return as_free(given, lower)

@@ -38,6 +38,6 @@ from .runge_kutta import explicit_tableau as explicit_tableau
 from .runge_kutta import moved_state as moved_state
 from .samples import march_with_samples as march_with_samples
 from .single_run import MOST_STEPS as MOST_STEPS
-from .single_run import Path as Path
+from .single_run import Followed as Followed
 from .single_run import follow as follow
 from .single_run import sample as sample

@@ -140,6 +140,6 @@ def _even(length: Lanes, left: Lanes, searching: Array) -> Lanes:
     return jnp.where(searching, length, fitting)
 
 
-def _written(all: Array, one: Array, at: Int[Array, ""]) -> Array:
+def _written(whole: Array, one: Array, at: Int[Array, ""]) -> Array:
     """A stack of arrays with one of them replaced, in place."""
-    return jax.lax.dynamic_update_index_in_dim(all, one, at, 0)
+    return jax.lax.dynamic_update_index_in_dim(whole, one, at, 0)

@@ -22,7 +22,7 @@ MOST_STEPS = 1_000_000
 LOOKS = np.arange(1, 8) / 8.0
 
 
-class Path(NamedTuple):
+class Followed(NamedTuple):
     """A run: its times and states, the pieces of its dense output, how it ended and what it took."""
 
     times: Float[np.ndarray, " times"]
@@ -120,7 +120,7 @@ def follow(
     first: float | None = None,
     t0: float = 0.0,
     max_steps: int = MOST_STEPS,
-) -> Path:
+) -> Followed:
     """Integrate one run step by step until `t1` or until the model ceases to hold.
 
     **Arguments:**
@@ -133,7 +133,7 @@ def follow(
     - `t0`: when the run starts [s].
     - `max_steps`: a run that is still under way after so many steps, rejected ones included, has failed.
 
-    **Returns:** a `Path` with the accepted steps; it ends where the guard reaches zero, found on the dense output.
+    **Returns:** a `Followed` with the accepted steps; it ends where the guard reaches zero, found on the dense output.
     """
     state, scales = problem.start()
     state, scales = jnp.asarray(state), jnp.asarray(scales)
@@ -144,7 +144,7 @@ def follow(
     length = None if first is None else jnp.asarray(first, state.dtype)
     margin = problem.guard(time, state)
     if margin is not None and float(margin) <= 0.0:
-        return Path(times[0], states[0], [], True, False, 0, 0)
+        return Followed(times[0], states[0], [], True, False, 0, 0)
     while float(time) < t1 and not (lost or failed):
         solution, guards = _piece(problem, time, end, length, state, solver, jnp.asarray(rtol), atol * scales)
         steps = int(solution.stats["num_accepted_steps"])
@@ -169,7 +169,7 @@ def follow(
             time, state = jnp.asarray(ts[good - 1]), jnp.asarray(ys[:, good - 1])
         failed = failed or (not lost and bool(solution.result == diffrax.RESULTS.dt_min_reached))
         failed = failed or (not lost and float(time) < t1 and accepted + rejected >= max_steps)
-    return Path(np.concatenate(times), np.concatenate(states, axis=1), pieces, lost, failed, accepted, rejected)
+    return Followed(np.concatenate(times), np.concatenate(states, axis=1), pieces, lost, failed, accepted, rejected)
 
 
 def _loss(problem: AbstractProblem, solution: diffrax.Solution, begin: float, end: float) -> float:

@@ -142,8 +142,8 @@ class BlockFile:
             )
         others = [name for name in ours if name not in ("nonholonomic", "python") and theirs.get(name) != ours[name]]
         if others and not grid.finished.all():
-            told = ", ".join(f"{name} {theirs.get(name)}, now {ours[name]}" for name in others)
-            warnings.warn(f"{self.path} was begun with {told}: digits may differ", RuntimeWarning, stacklevel=6)
+            versions = ", ".join(f"{name} {theirs.get(name)}, now {ours[name]}" for name in others)
+            warnings.warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning, stacklevel=6)
 
     @property
     def finished(self) -> set[int]:

@@ -23,10 +23,10 @@ Values = Shaped[np.ndarray, "..."]
 
 
 class Axis(NamedTuple):
-    """One axis of a grid: its name in the table, the path of the number it varies, and the unit."""
+    """One axis of a grid: its name in the table, the full name of the number it varies, and the unit."""
 
     name: str
-    path: str
+    number: str
     unit: str
     values: Values
 
@@ -39,16 +39,16 @@ class Variable(NamedTuple):
     words: tuple[str, ...] | None = None
 
 
-def axis(name: str, path: str, unit: str, values: Any) -> Axis:
+def axis(name: str, number: str, unit: str, values: Any) -> Axis:
     """An axis, checked.
 
     **Raises:** `ValueError` that names the axis if the values are not a non-empty one-dimensional array of finite numbers.
     """
     require(values, name)
-    numbers = np.asarray(values, dtype=float)
-    if numbers.ndim != 1 or numbers.size == 0:
-        raise ValueError(f"{name} must be a number or a non-empty list of numbers, not of shape {numbers.shape}")
-    return Axis(name, path, unit, numbers)
+    array = np.asarray(values, dtype=float)
+    if array.ndim != 1 or array.size == 0:
+        raise ValueError(f"{name} must be a number or a non-empty list of numbers, not of shape {array.shape}")
+    return Axis(name, number, unit, array)
 
 
 def sweep(
@@ -65,8 +65,8 @@ def sweep(
 
     **Arguments:**
 
-    - `run`: (path -> values of a block's cells, how many of them count) -> name -> results. It is called from several
-      threads at once; the first call, with no cell that counts, lets it compile.
+    - `run`: (full name of a number -> values of a block's cells, how many of them count) -> name -> results. It is called
+      from several threads at once; the first call, with no cell that counts, lets it compile.
     - `axes`: the grid, the last axis varying fastest.
     - `variables`: what `run` returns.
     - `request`: plain data that says what is computed; it is stored in the table and guards the file.
@@ -97,7 +97,7 @@ def sweep(
     def columns(index: int) -> dict[str, Values]:
         cell = np.minimum(np.arange(firsts[index], firsts[index] + block), cells - 1)
         places = np.unravel_index(cell, layout.shape) if axes else ()
-        return {one.path: one.values[place] for one, place in zip(axes, places, strict=True)}
+        return {one.number: one.values[place] for one, place in zip(axes, places, strict=True)}
 
     def work(index: int) -> dict[str, Values]:
         count = min(block, cells - firsts[index])

@@ -99,10 +99,10 @@ def test_a_frictionless_run_goes_back_to_its_start():
     import diffrax
 
     from nonholonomic.integration import follow
-    from tippe.trajectory import Run
+    from tippe.trajectory import TrajectoryProblem
 
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Frictionless())
-    run = Run.of(scene, tippe.Launch(0.3, 60.0, eta=0.5))
+    run = TrajectoryProblem.of(scene, tippe.Launch(0.3, 60.0, eta=0.5))
     there = follow(run, 1.0, solver=diffrax.Dopri8(), rtol=1e-12, atol=1e-13).states[:10, -1]
     sign = np.array([-1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0, 1.0])
     back = replace(run, state=jnp.asarray(there * sign))

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 import tippe
 from tippe.phases.stick_slip_path import follow_stick_slip
-from tippe.trajectory import Run
+from tippe.trajectory import TrajectoryProblem
 
 
 def cohen_top() -> tippe.Top:
@@ -73,8 +73,8 @@ def test_a_top_that_sticks_and_slips_again():
 def test_a_bowling_ball_slides_and_then_rolls():
     """v = v0 - mu g t until t* = 2 v0 / (7 mu g), then 5 v0 / 7 (row 2), with no error of a slip speed."""
     scene, end = scene_of(homogeneous_ball(), 0.3), 2.0 / (7.0 * 0.3 * 9.81)
-    run = Run.of(scene, tippe.Launch(theta=0.7, spin=0.0))
-    run = Run(run.dynamics, run.axial, run.state.at[0].set(1.0), run.path, run.scales)
+    run = TrajectoryProblem.of(scene, tippe.Launch(theta=0.7, spin=0.0))
+    run = TrajectoryProblem(run.dynamics, run.axial, run.state.at[0].set(1.0), run.cyclic, run.scales)
     path = follow_stick_slip(run, 3.0 * end, solver=diffrax.Dopri8(), rtol=1e-11, atol=1e-12)
     assert path.rolls == [False, True]
     assert_close(path.parts[0].times[-1], end, atol=1e-7)
@@ -132,7 +132,7 @@ def test_a_ball_that_friction_cannot_hold_slips_down_through_a_turn_of_its_slip(
     launch = tippe.Launch(np.pi / 2.0, spin, 0.8, np.pi / 2.0)
     run = tippe.simulate(scene, launch, 0.1, tolerance=1e-10)
     assert not any(run.dense.rolls)
-    found = [run.path[0, -1], run.velocity[-1] @ np.array([np.cos(state[0]), 0.0, np.sin(state[0])]), run.spin[-1]]
+    found = [run.cyclic[0, -1], run.velocity[-1] @ np.array([np.cos(state[0]), 0.0, np.sin(state[0])]), run.spin[-1]]
     assert_close(found, state, atol=1e-9)
 
 

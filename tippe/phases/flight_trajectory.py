@@ -18,7 +18,7 @@ from nonholonomic.integration import (
     RUNNING,
     UNRESOLVED,
     AbstractProblem,
-    Path,
+    Followed,
     follow,
 )
 from nonholonomic.validation import require
@@ -80,7 +80,7 @@ class Sojourn(NamedTuple):
     """A stretch of the run on one sphere: when it begins [s], the numbers of the motion since, the sphere and its number."""
 
     begin: float
-    path: Path
+    path: Followed
     scene: Scene
     ball: Ball
     number: int

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.integration import AbstractProblem, Path, follow
+from nonholonomic.integration import AbstractProblem, Followed, follow
 
 from .onset import Onset
 from .stick_slip import AT_REST, Change, Kind, StickSlip
@@ -18,14 +18,14 @@ MOST_PHASES = 2000
 
 
 class StickSlipPath(NamedTuple):
-    """A run: the paths of its phases, whether each rolls, and how it ended, as in `integrate.Path`.
+    """A run: the paths of its phases, whether each rolls, and how it ended, as in `Followed`.
 
     `sticks` counts how often a slip has turned into rolling; `size` is that of the state without the rest that rides along.
     """
 
     both: StickSlip
     size: int
-    parts: list[Path]
+    parts: list[Followed]
     rolls: list[bool]
     guard_lost: bool
     failed: bool
@@ -98,7 +98,7 @@ class Stretch(AbstractProblem):
 
 
 class Begun(eqx.Module):
-    """The beginning of a slip, as a piece of a `Path`: from `t0` to `t1` [s], the onset `wait` [s] after `t0`."""
+    """The beginning of a slip, as a piece of a `Followed`: from `t0` to `t1` [s], the onset `wait` [s] after `t0`."""
 
     onset: Onset
     t0: Float[Array, ""]
@@ -119,7 +119,7 @@ def _next(
     return kind.ended(state, size, lambda at: slipping.field(left, at), stretch.start()[1], left)
 
 
-def _joined(begun: Begun, state: Float[Array, " components"], rest: Path) -> Path:
+def _joined(begun: Begun, state: Float[Array, " components"], rest: Followed) -> Followed:
     """A slip with its beginning, which begins from the given state."""
     times = np.concatenate([[float(begun.t0)], rest.times])
     states = np.concatenate([np.asarray(state)[:, None], rest.states], axis=1)
@@ -133,7 +133,7 @@ def follow_stick_slip(
 
     **Arguments:**
 
-    - `run`: a `trajectory.Run` of a scene with `SetValuedCoulomb`.
+    - `run`: a `trajectory.TrajectoryProblem` of a scene with `SetValuedCoulomb`.
     - `t1`, `solver`, `rtol`, `atol`: as for `integrate.follow`.
 
     **Returns:** a `StickSlipPath`.

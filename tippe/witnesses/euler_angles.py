@@ -21,14 +21,14 @@ from ..friction import Slip
 from ..scene import Scene
 
 
-class Crossing(NamedTuple):
+class Across(NamedTuple):
     """The coordinate across the arena: length [m] per unit of it, and turning [rad] of the frame per unit of it."""
 
     metric: Float[Array, ""] | float
     turning: float
 
 
-def crossing(scene: Scene) -> Crossing:
+def across(scene: Scene) -> Across:
     """Length and turning per unit of the coordinate across the arena: (1, 0) on a plane, (rho, 1) on a cylinder.
 
     **Arguments:**
@@ -40,7 +40,7 @@ def crossing(scene: Scene) -> Crossing:
     curvature, along = scene.surface.parallel(scene.body.radius).turning((1.0, 0.0))
     if along is not None:
         raise ValueError(f"surface = {scene.surface!r} must be a Plane or a Cylinder for these coordinates")
-    return Crossing(1.0, 0.0) if curvature is None else Crossing(1.0 / curvature, 1.0)
+    return Across(1.0, 0.0) if curvature is None else Across(1.0 / curvature, 1.0)
 
 
 def from_vector_state(scene: Scene, state: Float[Array, " components"]) -> Float[Array, " 8"]:
@@ -54,7 +54,7 @@ def from_vector_state(scene: Scene, state: Float[Array, " components"]) -> Float
     **Returns:** (eta or x, theta, phi, and the rates of eta or x, y, theta, phi, psi), an array (8,) in rad, m and s; x
     is 0.
     """
-    metric, turns = crossing(scene)
+    metric, turns = across(scene)
     e, L = state[2:5], state[5:8]
     spinning = jnp.cross(L, e) / scene.body.I1
     velocity = state[:2] + scene.body.offset * spinning[:2]
@@ -118,7 +118,7 @@ def contact_motion(
     **Returns:** O' [m/s] and e' [1/s] in the frame (t1, t2, n), and (p, q, omega3) [rad/s], the frame turning at
     -eta' t2.
     """
-    metric, turns = crossing(scene)
+    metric, turns = across(scene)
     _, _, theta, phi, _, gap = q
     eta_dot, y_dot, theta_dot, phi_dot, psi_dot, gap_dot = q_dot
     turning = turns * eta_dot
@@ -228,7 +228,7 @@ def equations(scene: Scene, state: Float[Array, " 8"]) -> tuple[Float[Array, "6 
     **Returns:** A (6, 6) and b (6,).
     """
     body = scene.body
-    metric, turns = crossing(scene)
+    metric, turns = across(scene)
     q, q_dot = spread(state)
     eta, theta, phi, eta_dot, _, theta_dot, phi_dot, psi_dot = state
     turning = turns * eta_dot
@@ -306,7 +306,7 @@ def normal_force(scene: Scene, state: Float[Array, " 8"], second_rates: Float[Ar
     - `state`: (8,) as the module states it.
     - `second_rates`: (5,) as in `Accelerations`.
     """
-    metric, turns = crossing(scene)
+    metric, turns = across(scene)
     eta, theta, phi, eta_dot, _, theta_dot, phi_dot, _ = state
     turning = turns * eta_dot
     s, c, sp, cp = jnp.sin(theta), jnp.cos(theta), jnp.sin(phi), jnp.cos(phi)
