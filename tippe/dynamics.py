@@ -1,8 +1,8 @@
 """The equations of motion of the tippe top, in vector form and free of trigonometry (`tippe.md`, section 2).
 
-State, in the arena's moving frame (t1, t2, n): velocity (u1, u2) of the centre of mass along the arena, axis
-(e1, e2, e3), angular momentum (L1, L2, L3) about the centre of mass, then the arena's place. The velocity along n follows
-from the axis, because the contact persists. Cyclic coordinates (position, spin angle) are not part of it.
+The state is that of `state.py`: velocity, axis and angular momentum in the arena's moving frame (t1, t2, n), and the place.
+The velocity along n follows from the axis, because the contact persists. Cyclic coordinates (position, spin angle) are not
+part of it.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,6 @@ from nonholonomic.geometry import (
     AbstractSurface,
     Component,
     Tangent,
-    Vector,
     add,
     carried,
     cross,
@@ -28,10 +27,8 @@ from nonholonomic.geometry import (
 )
 
 from .friction import AbstractFriction, ContactLoad, Slip
+from .state import parts
 from .top import Top
-
-#: Where the axis' component along n stands in the state: cos(theta).
-COS_THETA = 4
 
 #: Stiffness (`Motion.stiffness`) at which a contact counts as jammed. N grows as its inverse while it falls to zero as the root
 #: of the time left, so a run ends too early by the square of this in units of 1e-4 s or so: by 1e-12 s, and 100 times as much
@@ -105,10 +102,7 @@ class Dynamics(eqx.Module):
 
         **Returns:** a `Motion`; `rate` is (m/s^2, 1/s, N m, 1/s). Source: `tippe.md`, section 2 (i)-(iii).
         """
-        u1, u2 = state[0], state[1]
-        e: Vector = (state[2], state[3], state[4])
-        L: Vector = (state[5], state[6], state[7])
-        place = tuple(state[8:])
+        (u1, u2), e, L, place = parts(state)
         R, a = self.radius, self.offset
 
         # The axis turns with the body; V is the velocity of the sphere's centre, o the turning of the frame with it.

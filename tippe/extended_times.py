@@ -17,6 +17,7 @@ from nonholonomic.validation import as_number
 from .inversion import ABSOLUTE, InversionProblem, check_smooth
 from .launch import Launch
 from .scene import Scene
+from .state import inclination, parts
 
 #: A cell that needs more steps than this has failed: numbers tried on the way may be far off.
 MOST_STEPS = 100_000
@@ -140,5 +141,5 @@ def _times_and_slopes(
 
 def _e_folds(state: Float[Array, "components cells"], angle: Float[Array, "..."]) -> Float[Array, " cells"]:
     """How many times theta must still grow e-fold to reach an angle."""
-    theta = jnp.arctan2(jnp.hypot(state[2], state[3]), state[4])
+    theta = inclination(parts(state).axis)
     return jnp.log(angle / jnp.clip(theta, LEAST_ANGLE, angle))

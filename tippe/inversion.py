@@ -26,10 +26,11 @@ from nonholonomic.integration import (
 from nonholonomic.parameters import numbers
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, require_all
 
-from .dynamics import COS_THETA, Dynamics
+from .dynamics import Dynamics
 from .launch import Launch
 from .phases import Kind, StickSlip
 from .scene import Scene
+from .state import COS_THETA
 
 #: The absolute tolerance is this part of the relative one, in units of the state's own magnitudes.
 ABSOLUTE = 0.1

@@ -18,6 +18,7 @@ from .cells import driver_of
 from .inversion import ABSOLUTE, InversionProblem
 from .launch import Launch
 from .scene import Scene
+from .state import joined, parts
 
 #: Stretches of time in which growth is counted; half of them give the exponent and its scatter.
 STRETCHES = 32
@@ -109,7 +110,7 @@ def _direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, "compon
     """A direction with nothing special about it, tangent to the states there are: axis and vertical stay of length 1."""
     magnitudes = scene.scales(launch)
     u1, u2, r1, r2, r3, *L = (magnitudes[i] * jnp.cos(1.0 + i) for i in range(8))
-    e = tuple(scene.state(launch)[2:5])
+    e = parts(scene.state(launch)).axis
     _, place = jax.jvp(scene.surface.place, (launch.eta,), (jnp.ones_like(launch.eta),))
-    parts = (u1, u2, *cross((r1, r2, r3), e), *L, *place)
-    return jnp.stack([jnp.broadcast_to(part, (cells,)) for part in parts])
+    direction = joined((u1, u2), cross((r1, r2, r3), e), tuple(L), place)
+    return jnp.broadcast_to(direction.reshape(len(direction), -1), (len(direction), cells))

@@ -9,10 +9,11 @@ from jaxtyping import Array, Float
 from nonholonomic.geometry import AbstractSurface, Plane, dot, none_if_zero
 from nonholonomic.validation import Bound, Bounded, as_number
 
-from .dynamics import COS_THETA, Dynamics
+from .dynamics import Dynamics
 from .friction import AbstractFriction, Frictionless
 from .launch import Launch
 from .phases import StickSlip
+from .state import inclination, joined, parts
 from .top import Top
 
 #: Tilt [rad] of a launch below which errors across the normal are measured in proportion to it.
@@ -78,7 +79,7 @@ class Scene(Bounded):
         return equations.of(self.body, self.surface, self.friction, self.gravity)
 
     def state(self, launch: Launch) -> Float[Array, "components ..."]:
-        """The state at the start of a run (see `dynamics.py` for its components).
+        """The state at the start of a run (see `state.py` for its components).
 
         **Arguments:**
 
@@ -90,7 +91,7 @@ class Scene(Bounded):
         e = (sine * jnp.cos(launch.azimuth), sine * jnp.sin(launch.azimuth), jnp.cos(launch.theta))
         L = tuple(self.body.I3 * launch.spin * component for component in e)
         zero = jnp.zeros_like(launch.theta)
-        return jnp.stack(jnp.broadcast_arrays(zero, zero, *e, *L, *self.surface.place(launch.eta)))
+        return joined((zero, zero), e, L, self.surface.place(launch.eta))
 
     def scales(self, launch: Launch) -> Float[Array, "components ..."]:
         """Magnitudes by which absolute errors of the state are measured, component by component.
@@ -105,12 +106,12 @@ class Scene(Bounded):
         rate = jnp.sqrt(self.gravity / self.body.radius)
         velocity = rate * self.body.radius
         momentum = jnp.maximum(self.body.I3 * jnp.abs(launch.spin), self.body.I1 * rate)
-        place = [one for _ in self.surface.place(launch.eta)]
+        place = tuple(one for _ in self.surface.place(launch.eta))
         tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
         # A top that stands exactly has no growth to resolve.
         tilt = jnp.where(tilt > 0.0, jnp.clip(tilt, 1e-280, 1.0), 1.0)
-        across = [velocity * tilt, velocity * tilt, tilt, tilt, one, momentum * tilt, momentum * tilt, momentum]
-        return jnp.stack(jnp.broadcast_arrays(*across, *place))
+        velocities, momenta = (velocity * tilt, velocity * tilt), (momentum * tilt, momentum * tilt, momentum)
+        return joined(velocities, (tilt, tilt, one), momenta, place)
 
     def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """Rate of change of the state: (m/s^2, 1/s, N m, 1/s) for (velocity, axis, angular momentum, place)."""
@@ -134,9 +135,9 @@ class Scene(Bounded):
     def energy(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Kinetic energy plus weight times the height of the centre of mass above the arena's lowest point [J]."""
         body, dynamics = self.body, self.dynamics
-        e, L, place = tuple(state[2:5]), tuple(state[5:8]), tuple(state[8:])
+        (u1, u2), e, L, place = parts(state)
         e3_dot = (L[0] * e[1] - L[1] * e[0]) / body.I1
-        speed2 = state[0] ** 2 + state[1] ** 2 + (body.offset * e3_dot) ** 2
+        speed2 = u1**2 + u2**2 + (body.offset * e3_dot) ** 2
         axial = dot(L, e)
         rotation = (dot(L, L) - axial**2) / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
         climb = dynamics.parallel.height(place)
@@ -150,12 +151,14 @@ class Scene(Bounded):
         On a curved arena it changes at the rate R L.n', and a contact torque N tau changes it at the rate
         N tau.(R n - a e) (`tippe.md`, section 2).
         """
-        return self.body.radius * state[7] - self.body.offset * dot(tuple(state[2:5]), tuple(state[5:8]))
+        _, e, L, _ = parts(state)
+        return self.body.radius * L[2] - self.body.offset * dot(e, L)
 
     def theta(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Angle [rad] from the arena's normal to the axis, in [0, pi]."""
-        return jnp.arctan2(jnp.hypot(state[2], state[3]), state[COS_THETA])
+        return inclination(parts(state).axis)
 
     def spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Angular velocity about the axis, w.e [rad/s]."""
-        return dot(tuple(state[2:5]), tuple(state[5:8])) / self.body.I3
+        _, e, L, _ = parts(state)
+        return dot(e, L) / self.body.I3

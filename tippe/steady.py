@@ -23,6 +23,7 @@ from nonholonomic.validation import as_number, require
 
 from .launch import Launch
 from .scene import Scene
+from .state import AXIS, joined, parts
 from .top import Top
 
 
@@ -224,14 +225,14 @@ def tumbling_state(scene: Scene, motion: Tumbling) -> Float[Array, " 8"]:
     body, s, c = scene.body, jnp.sin(motion.theta), jnp.cos(motion.theta)
     zero = jnp.zeros_like(s)
     across, along = -body.I1 * motion.precession * s, body.I3 * motion.spin
-    return jnp.stack([zero, zero, s, zero, c, across * c + along * s, zero, -across * s + along * c])
+    return joined((zero, zero), (s, zero, c), (across * c + along * s, zero, -across * s + along * c))
 
 
 def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
     """Rate of a state of the plane when everything turns about the vertical at 1 rad/s."""
-    zero = jnp.zeros_like(state[0])
-    turned = [-state[1], state[0], -state[3], state[2], zero, -state[6], state[5], zero]
-    return jnp.stack(turned)
+    (u1, u2), (e1, e2, _), (L1, L2, _), _ = parts(state)
+    zero = jnp.zeros_like(u1)
+    return joined((-u2, u1), (-e2, e1, zero), (-L2, L1, zero))
 
 
 @eqx.filter_jit
@@ -253,7 +254,7 @@ def tumbling_matrix(scene: Scene, motion: Tumbling) -> Float[Array, "5 5"]:
         return (scene.field(whole) - motion.precession * quarter_turn(whole)) / scales
 
     scaled = state / scales
-    length = jax.grad(lambda x: jnp.sum((x * scales)[2:5] ** 2))(scaled)
+    length = jax.grad(lambda x: jnp.sum((x * scales)[AXIS] ** 2))(scaled)
     jellett = jax.grad(lambda x: scene.jellett(x * scales))(scaled)
     excluded = jnp.stack([length, jellett, quarter_turn(state) / scales], axis=1)
     basis = jnp.linalg.qr(excluded / jnp.linalg.norm(excluded, axis=0), mode="complete")[0][:, 3:]

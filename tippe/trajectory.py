@@ -20,6 +20,7 @@ from .phases.flight_trajectory import HybridTrajectory, simulate_hybrid
 from .phases.stick_slip_path import follow_stick_slip
 from .sampled import STATUS, TrajectoryProblem, ended, sampled, sampled_by_diffrax
 from .scene import Scene
+from .state import AXIS, MOMENTUM, PLACE
 
 
 def _of_each_run(function: Callable[["Trajectory"], Array]) -> property:
@@ -67,12 +68,13 @@ class Trajectory(eqx.Module):
     @_of_each_run
     def eta(self) -> Float[Array, " times"]:
         """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
-        return self.scene.surface.angle(tuple(self.states[8:]), tuple(self.cyclic))
+        return self.scene.surface.angle(tuple(self.states[PLACE]), tuple(self.cyclic))
 
     @_of_each_run
     def azimuth(self) -> Float[Array, " times"]:
         """Direction in which the axis leans [rad], from t1 towards t2, in (-pi, pi]."""
-        return jnp.arctan2(self.states[3], self.states[2])
+        axis = self.states[AXIS]
+        return jnp.arctan2(axis[1], axis[0])
 
     @_of_each_run
     def spin(self) -> Float[Array, " times"]:
@@ -82,12 +84,12 @@ class Trajectory(eqx.Module):
     @_of_each_run
     def axis(self) -> Float[Array, "times 3"]:
         """The unit vector e along the axis."""
-        return self._fixed(tuple(self.states[2:5]))
+        return self._fixed(tuple(self.states[AXIS]))
 
     @_of_each_run
     def angular_momentum(self) -> Float[Array, "times 3"]:
         """Angular momentum about the centre of mass [kg m^2/s]."""
-        return self._fixed(tuple(self.states[5:8]))
+        return self._fixed(tuple(self.states[MOMENTUM]))
 
     @_of_each_run
     def velocity(self) -> Float[Array, "times 3"]:
@@ -98,8 +100,8 @@ class Trajectory(eqx.Module):
     @_of_each_run
     def position(self) -> Float[Array, "times 3"]:
         """Position of the sphere's centre [m]; the plane is z = 0, the cylinder's axis x = z = 0."""
-        foot = self.scene.surface.position(tuple(self.states[8:]), tuple(self.cyclic))
-        normal = self.scene.surface.frame(tuple(self.states[8:]), tuple(self.cyclic))[2]
+        foot = self.scene.surface.position(tuple(self.states[PLACE]), tuple(self.cyclic))
+        normal = self.scene.surface.frame(tuple(self.states[PLACE]), tuple(self.cyclic))[2]
         return jnp.stack([q + self.scene.body.radius * n for q, n in zip(foot, normal, strict=True)], axis=-1)
 
     @_of_each_run
@@ -137,7 +139,7 @@ class Trajectory(eqx.Module):
         return _cut(self, times, self.dense.at(times))
 
     def _fixed(self, vector: tuple[Array, Array, Array]) -> Float[Array, "times 3"]:
-        frame = self.scene.surface.frame(tuple(self.states[8:]), tuple(self.cyclic))
+        frame = self.scene.surface.frame(tuple(self.states[PLACE]), tuple(self.cyclic))
         return jnp.stack([dot(vector, directions) for directions in zip(*frame, strict=True)], axis=-1)
 
     def __str__(self) -> str:
@@ -283,7 +285,7 @@ def _as_trajectory(scene: Scene, run: TrajectoryProblem, followed: Any) -> Traje
     stats = {
         "accepted": followed.accepted,
         "rejected": followed.rejected,
-        "axis_drift": float(jnp.max(jnp.abs(jnp.sqrt(jnp.sum(lean[2:5] ** 2, axis=0)) - 1.0))),
+        "axis_drift": float(jnp.max(jnp.abs(jnp.sqrt(jnp.sum(lean[AXIS] ** 2, axis=0)) - 1.0))),
         "energy_residual": float(jnp.max(jnp.abs(energy - energy[0] - work))),
     }
     if scene.friction.set_valued:

@@ -19,8 +19,9 @@ from nonholonomic.integration import (
     Passage,
 )
 
-from ..dynamics import COS_THETA, Dynamics
+from ..dynamics import Dynamics
 from ..scene import Scene
+from ..state import COS_THETA
 from .flight import angle_reached, flown, fly
 from .free_body import Ball, FreeBody, balls, freed, gap, gap_rate, grounded, standing_on
 from .impact import strike

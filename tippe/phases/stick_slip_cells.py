@@ -8,9 +8,9 @@ from jaxtyping import Array, Float
 
 from nonholonomic.integration import CROSSED, GUARD_LOST, REACHED_END, RUNNING, AbstractPhase, Journey, Passage, travel
 
-from ..dynamics import COS_THETA
 from ..inversion import ABSOLUTE, InversionProblem
 from ..scene import Scene
+from ..state import COS_THETA
 from .stick_slip import AT_REST, Kind, StickSlip
 
 #: The numbers of the two phases.

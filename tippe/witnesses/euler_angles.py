@@ -19,6 +19,7 @@ from nonholonomic.geometry import carried
 
 from ..friction import Slip
 from ..scene import Scene
+from ..state import AXIS, MOMENTUM, PLACE, VELOCITY
 
 
 class Across(NamedTuple):
@@ -49,15 +50,15 @@ def from_vector_state(scene: Scene, state: Float[Array, " components"]) -> Float
     **Arguments:**
 
     - `scene`: a `Scene` on a `Plane` or a `Cylinder`.
-    - `state`: (8 or 10,) as in `tippe/dynamics.py`.
+    - `state`: (8 or 10,) as in `tippe/state.py`.
 
     **Returns:** (eta or x, theta, phi, and the rates of eta or x, y, theta, phi, psi), an array (8,) in rad, m and s; x
     is 0.
     """
     metric, turns = across(scene)
-    e, L = state[2:5], state[5:8]
+    e, L = state[AXIS], state[MOMENTUM]
     spinning = jnp.cross(L, e) / scene.body.I1
-    velocity = state[:2] + scene.body.offset * spinning[:2]
+    velocity = state[VELOCITY] + scene.body.offset * spinning[:2]
     turning = scene.surface.parallel(scene.body.radius).turning((velocity[0], velocity[1]))
     seen = jnp.stack([a if b is None else a + b for a, b in zip(spinning, carried(tuple(e), turning), strict=True)])
 
@@ -65,7 +66,7 @@ def from_vector_state(scene: Scene, state: Float[Array, " components"]) -> Float
         return jnp.stack([jnp.arctan2(jnp.hypot(axis[0], axis[1]), axis[2]), jnp.arctan2(axis[1], axis[0])])
 
     (theta, phi), (theta_dot, phi_dot) = jax.jvp(angles, (e,), (seen,))
-    eta = jnp.arctan2(state[8], state[9]) if turns else jnp.zeros_like(theta)
+    eta = jnp.arctan2(*state[PLACE]) if turns else jnp.zeros_like(theta)
     eta_dot = velocity[0] / metric
     psi_dot = L @ e / scene.body.I3 - phi_dot * e[2] + turns * eta_dot * e[1]
     return jnp.stack([eta, theta, phi, eta_dot, velocity[1], theta_dot, phi_dot, psi_dot])

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..scene import Scene
+from ..state import AXIS, MOMENTUM, VELOCITY
 
 #: Gauss points for the divided difference along each direction, and cosines for the time as a function of chi.
 POINTS, COSINES = 24, 96
@@ -63,8 +64,8 @@ class FrictionlessNutation(AbstractNutation):
     @classmethod
     def of(cls, scene: Scene, state: Float[Array, " 8"]) -> "FrictionlessNutation":
         """The nutation that starts at a state of the vector form."""
-        drift = 0.5 * scene.body.mass * (state[0] ** 2 + state[1] ** 2)
-        return cls(scene, scene.energy(state) - drift, state[7], state[2:5] @ state[5:8])
+        drift = 0.5 * scene.body.mass * jnp.sum(state[VELOCITY] ** 2)
+        return cls(scene, scene.energy(state) - drift, state[MOMENTUM][2], state[AXIS] @ state[MOMENTUM])
 
     def inertia(self, z: Float[Array, ""]) -> Float[Array, ""]:
         body = self.scene.body
