@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.integration import explicit_tableau
+from nonholonomic.integration import explicit_tableau, few_trials
 
 from .dynamics import Dynamics, State
 from .input import Input
@@ -31,11 +31,8 @@ PARTS = 8
 #: How many times looks are added where the quantity is nearest to zero, so that two crossings close together are seen.
 CLOSER_LOOKS = 3
 
-#: A crossing is located once its bracket, or the change from one trial to the next, is shorter than this part of its time.
-LOCATED = 1e-14
-
-#: Trials after which the last one is taken.
-MOST_TRIALS = 60
+#: Looks closer together than this [s] would show nothing new.
+CLOSEST = 1e-14
 
 
 class Watch(NamedTuple):
@@ -156,7 +153,7 @@ def crossings(recipe: Recipe, watch: Watch, name: str, level: float) -> Float[np
         if new.size == 0:
             break
     found = np.flatnonzero((value[:-1] > 0.0) != (value[1:] > 0.0))
-    return _root(quantity.at, time[found], time[found + 1], value[found], value[found + 1])
+    return few_trials(quantity.at, time[found], time[found + 1], value[found], value[found + 1])
 
 
 def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
@@ -180,31 +177,5 @@ def _nearest(time: Float[np.ndarray, " looks"], value: Float[np.ndarray, " looks
         fall = (distance[middle - 1] - distance[middle]) / before
         rise = (distance[middle + 1] - distance[middle]) / after
         vertex = time[middle] + 0.5 * (fall * after**2 - rise * before**2) / (fall * after + rise * before)
-    inside = (vertex > time[middle - 1]) & (vertex < time[middle + 1]) & (np.abs(vertex - time[middle]) > LOCATED)
+    inside = (vertex > time[middle - 1]) & (vertex < time[middle + 1]) & (np.abs(vertex - time[middle]) > CLOSEST)
     return vertex[inside]
-
-
-def _root(function: Callable[[Lanes], Lanes], low: Lanes, high: Lanes, at_low: Lanes, at_high: Lanes) -> Lanes:
-    """Zeros of a function of many numbers, one in each bracket (Anderson and Bjorck, BIT 13 (1973) 253).
-
-    **Arguments:** `low`, `high`: the brackets; `at_low`, `at_high`: the function there, of opposite signs.
-    """
-    guess = low
-    for trial in range(MOST_TRIALS if low.size else 0):
-        last, rise = guess, at_high - at_low
-        with np.errstate(all="ignore"):
-            guess = low - at_low * (high - low) / rise
-        # Where the function is not a number, and now and then to be sure, the bracket is halved.
-        halve = ~np.isfinite(guess) | (trial % 4 == 3)
-        guess = np.where(halve, 0.5 * (low + high), np.clip(guess, low, high))
-        if np.all(np.minimum(high - low, np.abs(guess - last)) <= LOCATED * np.maximum(high, 1.0)):
-            break
-        value = function(guess)
-        beyond = (value > 0.0) != (at_low > 0.0)
-        with np.errstate(all="ignore"):
-            fade_low, fade_high = 1.0 - value / at_high, 1.0 - value / at_low
-        fade_low, fade_high = (np.where(fade > 0.0, fade, 0.5) for fade in (fade_low, fade_high))
-        # The end that stays is given less weight, so that it moves too in the next trial.
-        at_low, at_high = np.where(beyond, at_low * fade_low, value), np.where(beyond, value, at_high * fade_high)
-        low, high = np.where(beyond, low, guess), np.where(beyond, guess, high)
-    return guess

@@ -9,7 +9,6 @@ The stability matrices are Jacobians of the scene's own field, less the directio
 conservation, so that an eigenvalue with positive real part is an instability and nothing else.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import Plane
+from nonholonomic.integration import sign_changes
 from nonholonomic.validation import as_number, require
 
 from .launch import Launch
@@ -205,19 +205,7 @@ def tumbling_angles(scene: Scene, jellett: float, samples: int = 2001) -> list[f
     def slope(theta):
         return jax.vmap(jax.grad(lambda angle: effective_energy(scene, angle, jellett)))(theta) / jnp.sin(theta)
 
-    return [float(root) for root in roots_by_halving(slope, grid[1:-1])]
-
-
-def roots_by_halving(function: Callable[[Array], Array], grid: Float[Array, " n"]) -> Float[Array, " roots"]:
-    """Zeros of a function of many numbers between neighbours of a grid where it changes sign, to rounding error."""
-    values = function(grid)
-    found = np.flatnonzero(np.sign(values[:-1]) != np.sign(values[1:]))
-    low, high, sign = grid[found], grid[found + 1], np.sign(values[found])
-    for _ in range(60 if found.size else 0):
-        middle = 0.5 * (low + high)
-        same = np.sign(function(middle)) == sign
-        low, high = jnp.where(same, middle, low), jnp.where(same, high, middle)
-    return jnp.asarray(0.5 * (low + high))
+    return [float(root) for root in sign_changes(slope, grid[1:-1])]
 
 
 def tumbling_state(scene: Scene, motion: Tumbling) -> Float[Array, " 8"]:

@@ -41,3 +41,6 @@ from .single_run import MOST_STEPS as MOST_STEPS
 from .single_run import Followed as Followed
 from .single_run import follow as follow
 from .single_run import sample as sample
+from .zeros import few_trials as few_trials
+from .zeros import halved as halved
+from .zeros import sign_changes as sign_changes

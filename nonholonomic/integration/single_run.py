@@ -11,6 +11,7 @@ import optimistix
 from jaxtyping import Array, Bool, Float, Int
 
 from .lockstep import AbstractProblem
+from .zeros import halved
 
 #: Steps that are integrated and stored at once; a longer run is made of several such pieces.
 PIECE = 2048
@@ -58,12 +59,6 @@ def _guard(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array,
     guard = problem.guard(time, state)
     assert guard is not None
     return guard
-
-
-@eqx.filter_jit
-def _guard_on(problem: AbstractProblem, solution: diffrax.Solution, time: Float[Array, ""]) -> Float[Array, ""]:
-    """The guard on the dense output."""
-    return _guard(problem, time, solution.evaluate(time))
 
 
 def _control(rtol: float | Float[Array, ""], atol: Float[Array, " components"]) -> diffrax.PIDController:
@@ -157,7 +152,7 @@ def follow(
             lost, steps = True, int(out[0]) + 1
             begin = float(ts[out[0] - 1]) if out[0] else float(time)
             ts, ys, finite = ts[:steps].copy(), ys[:, :steps].copy(), finite[:steps]
-            ts[-1] = _loss(problem, solution, begin, float(ts[-1]))
+            ts[-1] = float(_loss(problem, solution, jnp.asarray(begin), jnp.asarray(ts[-1])))
             ys[:, -1] = np.asarray(solution.evaluate(ts[-1]))
         failed = steps == 0 or not finite.all()
         good = int(finite.sum()) if finite.all() else int(np.argmin(finite))
@@ -172,22 +167,18 @@ def follow(
     return Followed(np.concatenate(times), np.concatenate(states, axis=1), pieces, lost, failed, accepted, rejected)
 
 
-def _loss(problem: AbstractProblem, solution: diffrax.Solution, begin: float, end: float) -> float:
-    """The first time in a step at which the guard is zero, by bisection on the dense output."""
-    previous = begin
-    for fraction in (*LOOKS, 1.0):
-        at = begin + (end - begin) * fraction
-        if float(_guard_on(problem, solution, jnp.asarray(at))) < 0.0:
-            break
-        previous = at
-    low, high = previous, at
-    while high - low > 4.0 * np.finfo(float).eps * max(high, 1e-3):
-        middle = 0.5 * (low + high)
-        if not low < middle < high:
-            break
-        negative = float(_guard_on(problem, solution, jnp.asarray(middle))) < 0.0
-        low, high = (low, middle) if negative else (middle, high)
-    return low
+@eqx.filter_jit
+def _loss(
+    problem: AbstractProblem, solution: diffrax.Solution, begin: Float[Array, ""], end: Float[Array, ""]
+) -> Float[Array, ""]:
+    """The last time in a step at which the guard has not been negative yet, on the dense output."""
+
+    def holds(time):
+        return ~(_guard(problem, time, solution.evaluate(time)) < 0.0)
+
+    looks = begin + (end - begin) * jnp.asarray([0.0, *LOOKS, 1.0])
+    first = jnp.argmin(jax.vmap(holds)(looks[1:]))
+    return halved(holds, looks[first], looks[first + 1])[0]
 
 
 class Sampled(NamedTuple):
