@@ -106,7 +106,7 @@ class Between(NamedTuple):
     level: float
 
     def at(self, times: Lanes) -> Lanes:
-        """The quantity at the given times; what is no number counts as beyond the level."""
+        """The quantity at the given times; NaN counts as beyond the level."""
         which = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         found = _in_blocks(lambda at: _watched(self.recipe, at), self._states(which, times - self.times[which]))
         value = found[Watch._fields.index(self.name) - 2] - self.level

@@ -22,7 +22,7 @@ SIDES = {"outside": 1.0, "inside": -1.0}
 FORKS = {"relative": None, "absolute": 1.0}
 HEADINGS = {"intrinsic": Intrinsic(), "projected": Projected()}
 
-#: Cosine of the steering angle, or of the slope, below which a start cannot be told from one at a right angle.
+#: Cosine of the steering angle, or of the slope, below which a start cannot be distinguished from a right angle.
 RIGHT_ANGLE = 1e-9
 
 

@@ -82,7 +82,7 @@ def simulate(
 # Compiled as a whole also where a bare `vmap` or `grad` would take it operation by operation.
 @eqx.filter_jit
 def _legal_or_nan(scene, launch, controls, steering, times, end, tolerance, grid, settings, recipe) -> Trajectory:
-    """The run, or not a number and `finished` false where a traced number is out of range."""
+    """The run, or NaN and `finished` false where a traced number is out of range."""
     may = scene.may_start(launch, controls) & jnp.all(legal([*run_bounds(end, tolerance), *times_bounds(times, end)]))
     may &= jnp.all(jnp.diff(times) > 0.0)
     # Steps of illegal numbers might never reach the end, so they are not begun; those of a given length do.

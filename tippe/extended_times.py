@@ -22,7 +22,7 @@ from .state import inclination, parts
 #: A cell that needs more steps than this has failed: numbers tried on the way may be far off.
 MOST_STEPS = 100_000
 
-#: The least angle [rad] that is told from 0 in the penalty for a top that does not invert.
+#: The least angle [rad] distinguished from 0 in the penalty for a top that does not invert.
 LEAST_ANGLE = 1e-6
 
 #: From how many cells on it pays to compile for twice as long what then runs in a third of the time.
@@ -51,7 +51,7 @@ def extended_inversion_times(
     - `t1`, `angle`, `tolerance`: as for `inversion_time`.
     - `lanes`: how many.
 
-    **Returns:** (lanes,) [s]; not a number where the integration failed.
+    **Returns:** (lanes,) [s]; NaN where the integration failed.
 
     **Raises:** `ValueError` for a scene with `contact="hybrid"` or `SetValuedCoulomb`.
     """

@@ -128,7 +128,7 @@ class Recording(eqx.Module):
         return sample_labels(self.times, QUANTITIES[self.quantity])
 
     def predict(self, scene: Scene, values: dict[str, Array], rows: int, tolerance: float) -> Float[Array, "rows n"]:
-        """The samples in every row; not a number after a run's end."""
+        """The samples in every row; NaN after a run's end."""
 
         def one(values):
             roots = with_numbers({"scene": scene, "launch": self.launch}, values)

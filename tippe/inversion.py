@@ -32,7 +32,7 @@ from .phases import Kind, StickSlip
 from .scene import Scene
 from .state import COS_THETA
 
-#: The absolute tolerance is this part of the relative one, in units of the state's own magnitudes.
+#: The absolute tolerance is this fraction of the relative one, in units of the state's own magnitudes.
 ABSOLUTE = 0.1
 
 #: The greatest relative tolerance that is accepted.
@@ -94,7 +94,7 @@ def inversion_time(
       above it until `t1`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
 
-    **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before; not a number
+    **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before; NaN
     if the integration failed, or where numbers inside a transformation are outside of their ranges.
 
     **Raises:** `ValueError` for arguments outside these ranges, and for a scene with `contact="hybrid"` or

@@ -1,4 +1,4 @@
-"""The Lyapunov exponent of a launch: whether nearby launches part exponentially, and how fast."""
+"""The Lyapunov exponent of a launch: whether nearby launches diverge exponentially, and how fast."""
 
 import dataclasses
 from typing import NamedTuple
@@ -27,7 +27,7 @@ STRETCHES = 32
 class LyapunovExponent(NamedTuple):
     """The largest Lyapunov exponent of a run, or of each of several.
 
-    - `exponent`: mean rate [1/s] of exponential parting in the second half of the run; not a number if the run ended early.
+    - `exponent`: mean rate [1/s] of exponential divergence in the second half of the run; NaN if the run ended early.
     - `error`: of the exponent [1/s]; an exponent below twice its error is no sign of chaos.
     - `status`: "reached_end", "contact_lost", "jammed" or "failed".
     - `end_time`: when the run ended [s]; `steps`: accepted and rejected ones.
@@ -52,7 +52,7 @@ def lyapunov_exponent(
 ) -> LyapunovExponent:
     """The largest Lyapunov exponent of one launch or of many at once, by the variational equation.
 
-    Positive if nearby launches part exponentially. While a top rises, it is the rate of the rise; chaos is what stays
+    Positive if nearby launches diverge exponentially. While a top rises, it is the rate of the rise; chaos is what stays
     positive as `t1` grows. Source: Benettin et al., Meccanica 15 (1980) 9; see `nonholonomic/derivatives/lyapunov.py`.
 
     **Arguments:**

@@ -88,7 +88,7 @@ def ended(
 
 
 class Found(NamedTuple):
-    """What is found of a run, all floats: `states` not a number after the end, `status` a code in `STATUS`."""
+    """What is found of a run, all floats: `states` are NaN after the end, `status` a code in `STATUS`."""
 
     states: Float[Array, "*cells times components"]
     end_time: Float[Array, "*cells"]

@@ -1,4 +1,4 @@
-"""Derivatives of the inversion times of a table's cells with respect to numbers of the scene and the launch."""
+"""Derivatives of the inversion times of a table's cells with respect to parameters of the scene and the launch."""
 
 from typing import Any
 

@@ -42,7 +42,7 @@ class Trajectory(eqx.Module):
     (t1, t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre.
 
     `status` is "reached t1", "contact_lost", "failed" or "jammed"; inside a transformation it is a code 0, 1, 2, 3, or 4,
-    "illegal", for numbers out of range, of which everything is not a number. The run ends at `end_time`. It is jammed where the
+    "illegal", for numbers out of range, for which everything is NaN. The run ends at `end_time`. It is jammed where the
     equation for the normal force ceases to have a solution, because friction pulls the top into the arena as hard as the
     normal force pushes it out: strong friction, a large offset and a slip along the axis do that. `stats` holds accepted and
     rejected steps, the greatest drift of |e| and the greatest energy residual |E - E(0) - work of friction| [J]; with
@@ -172,8 +172,8 @@ def simulate(
 ) -> Trajectory | HybridTrajectory:
     """Run one launch until `t1`, or until contact is lost or jams; through flights and impacts if its contact is "hybrid".
 
-    Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run are then not a
-    number, and `status` and `end_time` say so. A batch, as `vmap` makes it, runs as the cells of one block, as tables do.
+    Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run are then
+    NaN, and `status` and `end_time` say so. A batch, as `vmap` makes it, runs as the cells of one block, as tables do.
 
     **Arguments:**
 
@@ -229,7 +229,7 @@ def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
 # Compiled as a whole also where a bare `vmap` or `grad` would take it operation by operation.
 @eqx.filter_jit
 def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: Any, *options: Any) -> Trajectory:
-    """What `_traced` gives, or not a number and the status "illegal" where a traced number is out of range."""
+    """What `_traced` gives, or NaN and the status "illegal" where a traced number is out of range."""
     if times is None:
         # It says that there must be some.
         return _traced(scene, launch, times, t1, tolerance, *options)

@@ -34,7 +34,7 @@ def march_with_slopes(
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """Run every cell, and differentiate the time of its event in some directions.
 
-    **Arguments:** as for `march`, but `lanes` and `max_steps`, and
+    **Arguments:** as for `march`, except `lanes` and `max_steps`, and
 
     - `directions`: tangents of the problem, as for `VariationalProblem`. Their variations, or a mixture of them, take part in
       step control.

@@ -3,11 +3,11 @@
 Every surface answers two kinds of question, and a new surface is one new class.
 
 In a frame that moves with the body, (t1, t2, n) with n the unit normal from the arena into the room where the body is:
-how the frame turns with the velocity (the shape operator), which way is up, and how the place changes. This is what a
-field that is integrated needs; components that vanish identically are `None` (see `vector.py`).
+how the frame turns with the velocity (the shape operator), which way is up, and how the place changes. This is what the
+equations of motion need; components that vanish identically are `None` (see `vector.py`).
 
-In the fixed frame (x, y, z), z up: position, normal, frame. This is what a picture needs. A model that lives in the
-fixed frame asks the surface as a ground (see `ground.py`).
+In the fixed frame (x, y, z), z up: position, normal, frame. This is what a picture needs. A model formulated in the
+fixed frame uses the surface as a ground (see `ground.py`).
 """
 
 import abc
@@ -42,7 +42,7 @@ class AbstractSurface(Bounded):
     """
 
     def room(self, distance: Float[ArrayLike, "..."]) -> Iterable[Bound]:
-        """What the surface's numbers must be for a ball whose radius is the given distance [m] to fit."""
+        """The ranges of the surface's numbers in which a ball of the given radius [m] fits."""
         return ()
 
     @abc.abstractmethod
@@ -74,7 +74,7 @@ class AbstractSurface(Bounded):
 
     @abc.abstractmethod
     def cyclic(self, eta: Float[ArrayLike, "..."]) -> Place:
-        """Cyclic coordinates at the start, which a field needs only if the path is to be drawn."""
+        """Cyclic coordinates at the start, integrated only if the position is wanted too."""
 
     @abc.abstractmethod
     def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
@@ -94,7 +94,7 @@ class AbstractSurface(Bounded):
 
 
 def none_if_zero(value: Any) -> Any:
-    """A number as an array, or `None` for one that is known to be zero everywhere, which then costs nothing."""
+    """A number as an array, or `None` if it is known to be zero everywhere, so that it costs nothing."""
     if value is None:
         return None
     number = as_number(value)
@@ -102,7 +102,7 @@ def none_if_zero(value: Any) -> Any:
 
 
 class Plane(AbstractSurface, AbstractGround):
-    """A plane; its frame does not turn. A level one, which is all that a rolling ball is offered, carries no terms.
+    """A plane; its frame does not turn. A level plane, the only kind for a rolling ball, adds no terms.
 
     **Arguments:**
 
@@ -247,7 +247,7 @@ class Cylinder(AbstractSurface):
 
 
 class Sphere(AbstractSurface, AbstractQuadric):
-    """A sphere, for a rolling ball its inside; the frame is carried parallel to itself, so no place is singular.
+    """A sphere (its inside, for a rolling ball); the frame is carried parallel to itself, so no place is singular.
 
     The place is the vertical seen in the moving frame; `cyclic` adds the horizontal x axis seen in it.
 

@@ -69,8 +69,8 @@ def sum_vectors(*vectors: tuple[Component, ...]) -> tuple[Component, ...]:
 def stored(*components: Component) -> tuple[Component, ...]:
     """The same components, computed once where several results depend on them.
 
-    XLA otherwise fuses every result with all that leads to it and evaluates the common part again for each. A barrier
-    alone does not keep it from that; joining the components, with a barrier behind it, does.
+    XLA otherwise fuses every result with everything that leads to it and evaluates the common part again for each. A
+    barrier alone does not prevent that; joining the components and then a barrier does.
     """
     present = [component for component in components if component is not None]
     if not present:

@@ -18,11 +18,11 @@ from ..progress import Progress
 from .likelihood import Measurements
 from .unknown import Free
 
-#: Damping of the first step, as a part of the largest squared slope (Madsen, Nielsen and Tingleff, "Methods for
+#: Damping of the first step, as a fraction of the largest squared slope (Madsen, Nielsen and Tingleff, "Methods for
 #: non-linear least squares problems", 2nd edition (2004), section 3.2).
 FIRST_DAMPING = 1e-2
 
-#: A step that gains more than this part of what it promised is followed by one with less damping, by the factor `EASED`;
+#: A step that gains more than this fraction of what it promised is followed by one with less damping, by the factor `EASED`;
 #: one that gains next to nothing is taken back, and tried again with more damping, by the factor `HARDENED`.
 GOOD, EASED, HARDENED = 0.5, 10.0, 4.0
 
@@ -33,7 +33,7 @@ CONVERGED = 1e-6
 #: it is as far as the errors of the integration allow, within a thirtieth of a standard error of the minimum.
 NEGLIGIBLE = 1e-3
 
-#: Singular values of a row's slopes below this part of the largest are round-off.
+#: Singular values of a row's slopes below this fraction of the largest are round-off.
 ROUND_OFF = 1e-7
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from .levenberg_marquardt import Linearised, Problem, linearise, minimise
 from .likelihood import Measurements
 
-#: Singular values below this part of the largest are those of a direction that the data do not see at all.
+#: Singular values below this fraction of the largest are those of a direction that the data do not see at all.
 NO_SLOPE = 1e-7
 
 #: A combination of numbers counts as unseen where its relative error exceeds this.
@@ -128,7 +128,7 @@ class Identification:
         k = self._place(name)
         free = self.problem.free[k][1]
         if len(self.problem.free) == 1:
-            raise ValueError(f"name = {name!r} is the only free number: there is nothing to fit again")
+            raise ValueError(f"name = {name!r} is the only free parameter: there is nothing to fit again")
         if values is None:
             if not np.isfinite(self.standard_errors[name]):
                 raise ValueError(f"values must be given for {name!r}, whose standard error is infinite")
@@ -179,7 +179,7 @@ class Identification:
 
 
 def deviance_of(problem: Problem, coordinates: Any, measurements: Measurements) -> Float[np.ndarray, " rows"]:
-    """-2 log likelihood of every row; infinite where it is not a number."""
+    """-2 log likelihood of every row; infinite where it would be NaN."""
     deviance = linearise(problem, jnp.asarray(coordinates), measurements).deviance
     return np.asarray(jnp.where(jnp.isfinite(deviance), deviance, jnp.inf))
 

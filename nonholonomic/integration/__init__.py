@@ -1,8 +1,8 @@
 """Runs in time: from a start along a field to an event, to the end of the model's validity, or to a horizon.
 
-`compiled_march` runs many cells of a problem in lanes that keep step with one another; `travel` runs cells
+`compiled_march` runs many cells of a problem in lanes that advance together; `travel` runs cells
 through phases; `follow` and `sample` are single runs with any solver of Diffrax, and `march_by_diffrax` is the
-independent second road. The codes of a run's status are `RUNNING`, `CROSSED`, `GUARD_LOST`, `REACHED_END` and
+independent check. The codes of a run's status are `RUNNING`, `CROSSED`, `GUARD_LOST`, `REACHED_END` and
 `FAILED`.
 """
 

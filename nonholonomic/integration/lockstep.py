@@ -1,7 +1,7 @@
 """One attempted step of a block of lanes: step control, events, and what becomes of each lane.
 
 A lane is free until an accepted step ends beyond an event; then it searches for the event by trying that step again with
-other lengths, its start kept, until the step ends on the event. So the event has the accuracy of the method.
+other lengths from the same start, until the step ends on the event. So the event has the accuracy of the method.
 """
 
 import abc
@@ -22,17 +22,17 @@ RUNNING, REACHED_END, CROSSED, GUARD_LOST, FAILED = range(5)
 #: Step control as in Diffrax's I controller with its defaults.
 SAFETY, SHRINK, GROW = 0.9, 0.2, 10.0
 
-#: An event is located once the next trial would differ by less than this part of the step in which it lies. The end of contact
-#: errs by 2e-13 of its time from it, and by 2e-12 with ten times the value; `crossing_time` takes it out of a crossing.
+#: An event is located once the next trial would differ by less than this fraction of the step in which it lies. It causes an
+#: error of 2e-13 of the time at which contact ends, 2e-12 with ten times the value; `crossing_time` removes it from a crossing.
 LOCATED = 1e-10
 
-#: A dip of the crossing function within a step is looked at if its estimate is below this part of the values at both ends.
-#: With a tenth of it one first crossing of 1279 in a cylinder is missed at a tolerance of 1e-7 and none at 1e-9; with ten
-#: times as much none is found that was not, for a quarter more steps.
+#: A dip of the crossing function within a step is looked at if its estimate is below this fraction of the values at both ends.
+#: With a tenth of it, one of 1279 first crossings in a cylinder is missed at a tolerance of 1e-7 and none at 1e-9; with ten
+#: times as much, no further crossing is found, at the cost of a quarter more steps.
 DIP = 0.2
 
-#: Trials after which the far end of what is left of the step is taken for the event. It is a net: ten times as many change no
-#: bit of a result, six would let the end of contact err by 1e-8.
+#: After this many trials the far end of the bracket is taken for the event. It is a safety net: ten times as many change no
+#: bit of a result; with six, the time at which contact ends would be wrong by 1e-8.
 MOST_TRIALS = 64
 
 
@@ -63,8 +63,8 @@ class Control(NamedTuple):
     """How steps are taken.
 
     `tableau` and `order` are the method's; `rtol` the relative tolerance; `t1` the horizon [s], one for all or one per lane;
-    a lane that needs more than `max_steps` has failed; `passes` says whether a run goes on through its event; `parts` is of how
-    many equal parts the state is made, such as a state and its variations: a step is judged by the part that errs most.
+    a lane that needs more than `max_steps` has failed; `passes` says whether a run goes on through its event; `parts` is the
+    number of equal parts of the state, such as a state and its variations: the part with the largest error decides.
     """
 
     tableau: diffrax.ButcherTableau
@@ -126,7 +126,7 @@ def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: Stat
 
 
 def length_to_try(control: Control, block: Block) -> Lanes:
-    """Length of each lane's next step [s]: the last one ends on the horizon exactly, also where round-off would miss it."""
+    """Length of each lane's next step [s]: the last one ends on the horizon exactly, even where round-off would miss it."""
     left = control.t1 - block.time
     return jnp.where(~block.searching & (block.length >= left * (1.0 - 1e-12)), left, block.length)
 
@@ -152,10 +152,10 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     running = block.status == RUNNING
     free = running & ~block.searching
     error = scaled_error(*stop_gradient((tried.error, block.state, tried.state)), control.rtol, atol, control.parts)
-    # An event is located where the margin is round-off. Joined, with a barrier behind it, it is computed once; the compiler
-    # would else fuse it into several kernels of different round-off, in one of which the event is found and in another not.
+    # An event is located where the margin is round-off. Joined and behind a barrier it is computed once; otherwise
+    # the compiler fuses it into several kernels with different round-off, and the event is found in one but not in another.
     error, margin = jax.lax.optimization_barrier(jnp.stack([error, stop_gradient(tried.watched)]))
-    # A step into nonsense counts as one with a huge error.
+    # A step to a non-finite state counts as one with a huge error.
     error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
     good = error <= 1.0
     # Negative in between: end the step there and look again, so that the first event of several is found.
@@ -176,7 +176,7 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     status, side, latest = _fate(problem, control, block, tried, time, hit)
     ended = running & (status == RUNNING) & moved & (time >= control.t1)
     steps = block.steps + running
-    # Written so that a length that is not a number counts as stuck.
+    # Written so that a length of NaN counts as stuck.
     tiny = 8.0 * jnp.finfo(time.dtype).eps * jnp.maximum(time, 1e-3)
     stuck = free & ~forward & ~searching & ~(length > tiny)
     stuck |= forward & (time == block.time) & (tried_length > 0.0)
@@ -203,7 +203,7 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
 def _dip(problem: AbstractProblem, block: Block, tried: Step, length: Lanes) -> Lanes:
     """Where in the step the crossing function may dip below zero and come back, as a fraction of the step; 2 if nowhere.
 
-    It is where the cubic through its values and slopes at both ends is least, if that is low against both ends.
+    That is the minimum of the cubic through its values and slopes at both ends, if it is low compared to both ends.
     """
     if problem.crossing(block.state) is None:
         return jnp.full_like(length, 2.0)
@@ -221,7 +221,7 @@ def _dip(problem: AbstractProblem, block: Block, tried: Step, length: Lanes) -> 
 
 
 def _factor(error: Lanes, good: Bool[Array, " lanes"], order: int) -> Lanes:
-    """By how much the next step is longer, as Diffrax's I controller has it."""
+    """The factor from this step's length to the next one's, as in Diffrax's I controller."""
     factor = SAFETY * inverse_root(jnp.maximum(error, 1e-30), order)
     return jnp.where(good, jnp.clip(factor, 1.0, GROW), jnp.clip(factor, SHRINK, SAFETY))
 
@@ -231,13 +231,13 @@ def _fate(
 ) -> tuple[Int[Array, " lanes"], Lanes, Lanes]:
     """Status, side and latest crossing time of the lanes, where `hit` says that an event was located."""
     crossing, guard = problem.crossing(tried.state), problem.guard(time, tried.state)
-    # The lesser of the two is what was located; by its sign it may be round-off.
+    # The lesser of the two was located; its sign may be round-off.
     by_guard = hit if crossing is None else hit & (False if guard is None else guard <= block.side * crossing)
     crossed = hit & ~by_guard
     if not control.passes:
         status = jnp.where(hit, jnp.where(by_guard, GUARD_LOST, CROSSED), block.status)
         return status, block.side, block.crossing_time
-    # Only the way from positive to negative is the event; the way back is passed in silence.
+    # Only the way from positive to negative is the event; the way back goes unnoticed.
     counts = crossed & (block.side > 0.0)
     latest = jnp.where(counts, crossing_time(problem, time, tried.state), block.crossing_time)
     return jnp.where(by_guard, GUARD_LOST, block.status), jnp.where(crossed, -block.side, block.side), latest

@@ -1,7 +1,7 @@
 """Many lanes at once: the driver for event times and end states of a whole grid.
 
 A block of lanes advances in lockstep, every lane with its own step length; cells wait in a queue for a lane (`queue.py`).
-The state is one array (components, lanes); the numbers of the problem are scalars or one per cell.
+The state is one array (components, lanes); the parameters of the problem are scalars or one per cell.
 
 Derivatives (forward mode) flow through the states alone; step lengths are held fixed. `derivatives/slopes.py` has the
 fast ways to first derivatives.
@@ -77,8 +77,8 @@ def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
     return outcome._replace(crossing_time=jnp.where(outcome.status == CROSSED, time, jnp.inf))
 
 
-#: JAX takes compiler options only for the outermost compiled function. Wide vectors pay here, although compilers shy away
-#: from them: the sums over stages are streams of multiply-adds.
+#: JAX takes compiler options only for the outermost compiled function. Wide vectors pay here, although compilers avoid
+#: them: the sums over stages are streams of multiply-adds.
 alone = eqx.filter_jit(compiler_options={"xla_cpu_prefer_vector_width": 512})
 
 #: `march`, compiled on its own, for use outside of other transformed functions.

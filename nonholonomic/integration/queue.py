@@ -1,6 +1,6 @@
 """The cells of a problem and the block of lanes that works through them.
 
-A lane whose run has ended takes the next cell of the queue, so lanes of different cost share a block without waiting for
+A lane whose run has ended takes the next cell of the queue, so cheap and expensive cells share a block without waiting for
 one another.
 """
 
@@ -88,7 +88,7 @@ class Queue(eqx.Module):
     ) -> "Queue":
         """The queue of a problem.
 
-        **Arguments:** as for `march`, and `parts`: of how many equal parts the state is made, as for `Control`.
+        **Arguments:** as for `march`, and `parts`: the number of equal parts of the state, as for `Control`.
         """
         control = Control(explicit_tableau(solver), solver.order(None), rtol, t1, max_steps, passes, parts)
         starts, scales = problem.start()
@@ -104,7 +104,7 @@ class Queue(eqx.Module):
         return self.fresh.cell.shape[0]
 
     def pick(self, tree: Any, cell: Int[Array, " lanes"]) -> Any:
-        """The numbers of some cells, scalars as they are."""
+        """The leaves of some cells; scalars stay as they are."""
         inside = jnp.minimum(cell, self.capacity - 1)
         return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., inside], tree)
 
@@ -116,7 +116,7 @@ class Queue(eqx.Module):
     def outcome(self) -> tuple[Outcome, Int[Array, ""]]:
         """Run every cell.
 
-        **Returns:** the `Outcome`, its crossing times those of events that were passed, and the number of iterations.
+        **Returns:** the `Outcome`, whose crossing times are those of events that were passed, and the number of iterations.
         """
 
         def period(carry: tuple[Progress, Outcome]) -> tuple[Progress, Outcome]:
@@ -181,22 +181,22 @@ class Queue(eqx.Module):
 
     def _load(self, cell: Int[Array, " lanes"]) -> Block:
         block = self.pick(self.fresh, cell)
-        # A lane whose cell does not exist has nothing to do.
+        # There may be fewer cells than lanes: the other lanes have nothing to do.
         return block._replace(cell=cell, status=jnp.where(cell < self.cells, block.status, REACHED_END))
 
 
 def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """A function that XLA compiles, on a CPU, into a single kernel.
 
-    Otherwise every fused operation of a loop's body is a call of its own, and for blocks that fit the first caches calling
-    costs as much as computing. XLA does so by itself for loops over very small arrays only. What the attributes do is known
-    of jaxlib 0.10 alone; with others the function is left as it is.
+    Otherwise every fused operation of a loop's body is a separate call, and for blocks that fit the first caches the calls
+    cost as much as the arithmetic. XLA does so by itself for loops over very small arrays only. What the attributes do is known
+    for jaxlib 0.10 only; with other versions the function is left as it is.
     """
     if jax.default_backend() != "cpu" or not jaxlib.__version__.startswith("0.10."):
         return function
 
     def called(argument: Any) -> Any:
-        # The attributes also keep the small functions inside, such as `where`, from being fused into all that use them.
+        # The attributes also stop small inner functions, such as `where`, from being fused into everything that uses them.
         with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
             closed, shape = jax.make_jaxpr(function, return_shape=True)(argument)
 
@@ -205,8 +205,8 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
                 look = sum(jnp.ravel(leaf)[0].astype(float) for leaf in arguments)
                 return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))(*leaves), look
 
-            # XLA 0.10.2 aborts on a call with an argument that it does not use. So each is looked at, from behind a
-            # barrier, for what is known to be constant would not be.
+            # XLA 0.10.2 aborts on a call with an argument that it does not use. So each is used, behind a
+            # barrier, because a use of a known constant would be removed.
             given = jax.lax.optimization_barrier([*closed.consts, *jax.tree.leaves(argument)])
             results, _ = jax.lax.optimization_barrier(jax.jit(looking_at_all)(*given))
         return jax.tree.unflatten(jax.tree.structure(shape), results)
@@ -221,13 +221,13 @@ def _fresh_block(
     rates: Float[Array, "components cells"],
     lengths: Float[Array, " cells"],
 ) -> Block:
-    """Every cell at its start; one that starts beyond the event or beyond the guard has ended."""
+    """Every cell at its start; one that starts beyond the event or the guard has ended."""
     zero, none = jnp.zeros_like(lengths), jnp.zeros(lengths.shape, int)
     no = jnp.zeros(lengths.shape, bool)
     crossing, guard = problem.crossing(states), problem.guard(zero, states)
     beyond = no
     if crossing is not None:
-        # On the event exactly, it is the way onwards that counts.
+        # Exactly on the event, the direction of the motion decides.
         falls = jax.jvp(problem.crossing, (states,), (rates,))[1] <= 0.0
         beyond = (crossing < 0.0) | ((crossing == 0.0) & (falls | (not control.passes)))
     side = jnp.where(beyond & control.passes, -1.0, 1.0).astype(lengths.dtype)

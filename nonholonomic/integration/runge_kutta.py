@@ -27,7 +27,7 @@ class Step(NamedTuple):
 def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
     """The tableau of an explicit, embedded Runge-Kutta solver of Diffrax.
 
-    **Raises:** `ValueError` for a solver that is not one.
+    **Raises:** `ValueError` for any other solver.
     """
     tableau = getattr(solver, "tableau", None)
     if not isinstance(solver, diffrax.AbstractERK) or not isinstance(tableau, diffrax.ButcherTableau):
@@ -55,7 +55,7 @@ def explicit_step(
     - `field`: (time [s], state) -> rate of the state.
     - `watch`: (time, state) -> a number per lane that should stay positive. It is evaluated at the end and at
       three stages between, together with `field`, so that what both need is computed once.
-      What is negative for less than a quarter of a step may pass unseen.
+      If it is negative for less than a quarter of a step, that may go unnoticed.
     - `time`, `state`, `rate`: where the step starts, and the field there.
     - `length`: length of the step [s], one per lane.
 
@@ -85,7 +85,7 @@ def explicit_step(
 
 
 def _places_to_look(fractions: Float[np.ndarray, " stages"]) -> set[int]:
-    """The stages nearest to 1/4, 1/2 and 3/4 of the step: what happens between its ends is looked for there."""
+    """The stages nearest to 1/4, 1/2 and 3/4 of the step: the places at which its inside is checked."""
     between = [stage for stage, fraction in enumerate(fractions) if 0.0 < fraction < 1.0]
     return {min(between, key=lambda stage: abs(fractions[stage] - part)) for part in (0.25, 0.5, 0.75) if between}
 
@@ -93,8 +93,8 @@ def _places_to_look(fractions: Float[np.ndarray, " stages"]) -> set[int]:
 def moved_state(state: States, length: Lanes, weights: Float[np.ndarray, " stages"], rates: list[States]) -> States:
     """The state moved along the weighted sum of the rates, joined from two halves.
 
-    Joining, with a barrier behind it, makes the compiler store the result. It would otherwise evaluate the sum anew for
-    every quantity of the field that depends on it; a barrier alone does not keep it from that.
+    Joining the halves, followed by a barrier, makes the compiler store the result. Otherwise it would evaluate the sum again
+    for every quantity of the field that depends on it; a barrier alone does not prevent that.
     """
     half = state.shape[0] // 2
     parts = [
@@ -115,7 +115,7 @@ def weighted_sum(weights: Float[np.ndarray, " stages"], rates: list[States]) -> 
 
 
 def scaled_error(error: States, before: States, after: States, rtol: float, atol: States, parts: int) -> Lanes:
-    """Error in units of the tolerance: of the parts of the state, the greatest root mean square (Diffrax's norm and scale)."""
+    """Error in units of the tolerance: the greatest root mean square over the parts of the state (Diffrax's norm and scale)."""
     ratio = error / (atol + rtol * jnp.maximum(jnp.abs(before), jnp.abs(after)))
     size = ratio.shape[0] // parts
     squares = [jnp.mean(ratio[k * size : (k + 1) * size] ** 2, axis=0) for k in range(parts)]
@@ -143,8 +143,8 @@ def first_length(
 ) -> Lanes:
     """Length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section II.4), in the motion's own unit.
 
-    They compare |y'| with |y''|, which depends on the unit of time, and Diffrax does so in seconds. Here the unit is |y|/|y'|,
-    so that motions that differ in their scale only are integrated alike. Of a state of several `parts` the first one counts.
+    Their formula compares |y'| with |y''|, which depends on the unit of time; Diffrax uses seconds. Here the unit is |y|/|y'|,
+    so that motions that differ only in scale are integrated alike. If the state has several `parts`, the first one counts.
     """
     scale = atol + jnp.abs(state) * rtol
     size = state.shape[0] // parts
@@ -154,7 +154,7 @@ def first_length(
 
     magnitude, slope = measure(state), measure(rate)
     unit = magnitude / slope
-    # Something that stands still has no unit of its own; longer ones would overflow below.
+    # A state at rest has no unit of its own; longer units would overflow below.
     still = (magnitude < 1e-5) | ~(unit < 1e15)
     unit = jnp.where(still, 1e-4, unit)
     trial = 0.01 * unit

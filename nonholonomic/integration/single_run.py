@@ -16,15 +16,15 @@ from .zeros import halved
 #: Steps that are integrated and stored at once; a longer run is made of several such pieces.
 PIECE = 2048
 
-#: Steps, rejected ones included, after which a run has failed. Their dense output takes a gigabyte and more.
+#: Steps, rejected ones included, after which a run has failed. Their dense output takes a gigabyte or more.
 MOST_STEPS = 1_000_000
 
-#: Places in every step at which the guard is looked at, besides its ends.
+#: Places in every step at which the guard is checked, besides its ends.
 LOOKS = np.arange(1, 8) / 8.0
 
 
 class Followed(NamedTuple):
-    """A run: its times and states, the pieces of its dense output, how it ended and what it took."""
+    """A run: its times and states, the pieces of its dense output, how it ended and how many steps it took."""
 
     times: Float[np.ndarray, " times"]
     states: Float[np.ndarray, "components times"]
@@ -50,7 +50,7 @@ def _evaluate(piece: diffrax.Solution, times: Float[Array, " times"]) -> Float[A
 
 
 def saved(solution: diffrax.Solution) -> tuple[Any, Any]:
-    """Times and states that a solution holds; Diffrax declares that there may be none."""
+    """Times and states that a solution holds; Diffrax's types say that there may be none."""
     return solution.ts, solution.ys
 
 
@@ -62,7 +62,7 @@ def _guard(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array,
 
 
 def _control(rtol: float | Float[Array, ""], atol: Float[Array, " components"]) -> diffrax.PIDController:
-    # The greatest error counts, not the mean: cyclic coordinates that ride along must not dilute the others' errors.
+    # The greatest error counts, not the mean: cyclic coordinates are integrated too and must not dilute the others' errors.
     return diffrax.PIDController(rtol, atol, norm=optimistix.max_norm)
 
 
@@ -126,7 +126,7 @@ def follow(
     - `rtol`, `atol`: relative tolerance, and absolute tolerance in units of the problem's magnitudes.
     - `first`: length of the first step [s], by default selected as Diffrax does.
     - `t0`: when the run starts [s].
-    - `max_steps`: a run that is still under way after so many steps, rejected ones included, has failed.
+    - `max_steps`: a run that is still running after this many steps, rejected ones included, has failed.
 
     **Returns:** a `Followed` with the accepted steps; it ends where the guard reaches zero, found on the dense output.
     """
@@ -182,7 +182,7 @@ def _loss(
 
 
 class Sampled(NamedTuple):
-    """A run at given times: its states, not a number after its end; when, where and whether by the guard it ended."""
+    """A run at given times: its states, NaN after its end; when and where it ended, and whether the guard ended it."""
 
     states: Float[Array, "components times"]
     end_time: Float[Array, ""]
@@ -205,7 +205,7 @@ def sample(
 ) -> Sampled:
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 
-    The guard is looked at where steps end, and the run ends where it is zero on the dense output.
+    The guard is checked at the ends of steps, and the run ends where it is zero on the dense output.
 
     **Arguments:** as for `follow`; `times`: growing, in [0, t1]; `adjoint`: how Diffrax differentiates, by default forwards;
     `max_steps`: bound on the steps.
@@ -235,7 +235,7 @@ def sample(
     lost = jnp.zeros((), bool) if solution.event_mask is None else solution.event_mask
     (_, ends), (states, ends_at) = saved(solution)
     end = ends[0]
-    # Not a number, rather than infinite: an angle of infinite components would look like an angle.
+    # NaN rather than infinite: an angle computed from infinite components would look like an angle.
     states = jnp.where(times <= end, states.T, jnp.nan)
     counts = solution.stats
     return Sampled(states, end, ends_at[0], lost, counts["num_accepted_steps"], counts["num_rejected_steps"])

@@ -126,7 +126,7 @@ def sweep(
 
 
 def _as_they_finish(work: Callable[[int], Any], todo: list[int]) -> Iterator[tuple[int, Any]]:
-    """Run the blocks on all cores; an exception, Ctrl-C included, waits for none that has not started."""
+    """Run the blocks on all cores; after an exception, Ctrl-C included, no further block starts."""
     pool = ThreadPoolExecutor(workers())
     try:
         pending = {pool.submit(work, index): index for index in todo}
@@ -137,7 +137,7 @@ def _as_they_finish(work: Callable[[int], Any], todo: list[int]) -> Iterator[tup
 
 
 def block_for(cells: int) -> int:
-    """Cells in a block: few sizes, so that few programs are compiled, and many blocks, to be shared out and stored.
+    """Cells in a block: few different sizes, so that few programs are compiled, but many blocks, to be shared among cores.
 
     It does not depend on the number of cores, so that a file can be resumed on another machine.
     """
