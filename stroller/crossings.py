@@ -1,6 +1,6 @@
-"""When something that a run's steps passed was zero: found between two steps by trying the step again with other lengths.
+"""When a quantity was zero during a run: found within a step by repeating that step with other lengths.
 
-So a time has the accuracy of the integration and not that of an interpolation. Only the field is compiled, and only where
+So a time has the accuracy of the integration and not that of an interpolation. Only the field is compiled, and only if
 there is something to find; the stages of the steps are summed in NumPy.
 """
 
@@ -25,7 +25,7 @@ States = Float[np.ndarray, "components lanes"]
 #: How many states the field is given at once, so that it is compiled once.
 WIDTH = 256
 
-#: Parts of a step at whose ends the sign is looked at, where there may be a crossing.
+#: Parts into which a step is divided, to look at the sign at their ends, if there may be a crossing.
 PARTS = 8
 
 #: How many times looks are added where the quantity is nearest to zero, so that two crossings close together are seen.
@@ -55,9 +55,9 @@ def watched(dynamics: Dynamics, state: State) -> tuple[Float[Array, "..."], Floa
 
 
 class Recipe(eqx.Module):
-    """What made a run: scene, input, and the solver if it was an explicit Runge-Kutta method.
+    """What made a run: scene, input, and the solver if it is an explicit Runge-Kutta method.
 
-    Its numbers are leaves and all else is static, so that a run can leave a transformation whatever its input is.
+    Its numbers are leaves and everything else is static, so that a run can leave a transformation whatever its input is.
     """
 
     numbers: Any
@@ -87,7 +87,7 @@ def _watched(recipe: Recipe, states: State) -> Float[Array, "watched lanes"]:
 
 
 def _in_blocks(function: Callable[..., Any], *columns: Any) -> Any:
-    """A compiled function of columns of any number, `WIDTH` of them at a time; the last block is filled up with its end."""
+    """A compiled function of any number of columns, `WIDTH` at a time; the last block is padded with its last column."""
     count = columns[0].shape[-1]
     found = []
     for first in range(0, count, WIDTH):
@@ -121,7 +121,7 @@ class Between(NamedTuple):
         time, start, solver = self.times[which], self.states[:, which], self.recipe.parts[2]
         rates = [field(time, start)]
         if solver is None:
-            # The cubic through states and rates at both ends; an implicit step cannot be tried again so cheaply.
+            # The cubic through states and rates at both ends; an implicit step cannot be repeated so cheaply.
             whole, end = self.times[which + 1] - time, self.states[:, which + 1]
             part, change = length / whole, end - start
             last = field(time + whole, end)
@@ -135,7 +135,7 @@ class Between(NamedTuple):
 
 
 def crossings(recipe: Recipe, watch: Watch, name: str, level: float) -> Float[np.ndarray, " times"]:
-    """Times [s] at which a watched quantity passes a level, in either direction, growing."""
+    """Times [s] at which a watched quantity passes a level, in either direction, in increasing order."""
     time, value = np.asarray(watch.time), np.asarray(getattr(watch, name)) - level
     used = np.isfinite(time)
     time, value = time[used], value[used]
@@ -157,7 +157,7 @@ def crossings(recipe: Recipe, watch: Watch, name: str, level: float) -> Float[np
 
 
 def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
-    """In which steps a quantity may be zero: where it changes its sign, or changes by more than it is, there or beside."""
+    """Steps in which a quantity may be zero: it changes sign, or it or a neighbour changes by more than its size."""
     with np.errstate(invalid="ignore"):
         change = np.abs(np.diff(value))
         largest = np.max([change, np.append(change[1:], 0.0), np.insert(change[:-1], 0, 0.0)], axis=0)
@@ -166,7 +166,7 @@ def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
 
 
 def _nearest(time: Float[np.ndarray, " looks"], value: Float[np.ndarray, " looks"]) -> Float[np.ndarray, " new"]:
-    """Where a quantity is nearest to zero between looks that do not show it change its sign: the vertices of parabolas."""
+    """Where a quantity is nearest to zero between looks that show no change of sign: the vertices of parabolas."""
     distance = np.abs(value)
     least = (distance[1:-1] < distance[:-2]) & (distance[1:-1] <= distance[2:])
     least &= (value[1:-1] > 0.0) == (value[:-2] > 0.0)

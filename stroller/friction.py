@@ -38,7 +38,7 @@ class Drag(NamedTuple):
 class AbstractFriction(Bounded):
     """A friction law."""
 
-    #: Whether the law can take energy; the work of one that cannot is not recorded.
+    #: Whether the law can dissipate energy; the work of one that cannot is not recorded.
     dissipates: ClassVar[bool] = True
 
     @abc.abstractmethod
@@ -49,7 +49,7 @@ class AbstractFriction(Bounded):
 
         - `wheels`: a `WheelMotion`.
 
-        **Returns:** a `Drag`; a part is `None` where it vanishes identically.
+        **Returns:** a `Drag`; a component is `None` where it vanishes identically.
         """
 
 
@@ -94,7 +94,7 @@ class Damping(AbstractFriction):
 class RollingResistance(AbstractFriction):
     """Rolling resistance F = -c N tanh(v / v_s) of each axle under its load N (`stroller.md`, section 7).
 
-    The regularisation creeps: a stroller on a slope too gentle to overcome the resistance does not stop, it goes on at
+    The regularisation creeps: a stroller on a slope too gentle to overcome the resistance does not stop but goes on at
     a speed of the order of v_s. An axle off the ground has no resistance.
 
     **Arguments:**

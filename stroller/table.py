@@ -1,4 +1,4 @@
-"""Many rides in one batched call: every combination of some numbers of scene, launch and input."""
+"""Many rides in one batched call: every combination of some parameters of scene, launch and input."""
 
 import dataclasses
 from typing import Any
@@ -110,14 +110,14 @@ def sweep(
     solver: diffrax.AbstractERK | None = None,
     path: Any = None,
 ) -> Table:
-    """The ends of all rides over a grid of numbers, in one batched call on all cores.
+    """The ends of all rides over a grid of parameters, in one batched call on all cores.
 
     **Arguments:**
 
     - `scene`, `launch`, `input`: as for `simulate`, every number a scalar.
     - `t1`: end of every ride [s].
-    - `axes`: full name of a number -> values, such as `{"launch.speed": [1.0, 2.0], "scene.surface.polar": [0.8, 0.9]}`; the
-      parts of the place are `"launch.place[0]"` and `"launch.place[1]"`, the numbers of an input that is a module are
+    - `axes`: full name of a parameter -> values, such as `{"launch.speed": [1.0, 2.0], "scene.surface.polar": [0.8, 0.9]}`; the
+      parts of the place are `"launch.place[0]"` and `"launch.place[1]"`, the parameters of an input that is a module are
       under `"input."`. The first axis varies slowest.
     - `tolerance`: relative tolerance of the integration.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
@@ -209,7 +209,7 @@ def named_axes(axes: dict[str, Any], flat: bool) -> list[Axis]:
 
 
 def replaced(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """Scene, launch and input with some of their numbers replaced."""
+    """Scene, launch and input with some of their parameters replaced."""
     place = [values.get(number, part) for number, part in zip(PLACES, roots["launch"].place, strict=True)]
     roots = roots | {"launch": dataclasses.replace(roots["launch"], place=tuple(place))}
     return with_numbers(roots, {number: one for number, one in values.items() if number not in PLACES})

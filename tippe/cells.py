@@ -1,4 +1,4 @@
-"""How the cells of a table are run: the kinds of runs that scenes have, and what each finds."""
+"""How the cells of a table are run: the kinds of scene, and the variables of each."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -30,7 +30,7 @@ from .sensitivities import slopes_of_cells
 
 
 class Driver(NamedTuple):
-    """A kind of runs: the words of its status, what is counted besides steps, and how the runs go.
+    """How the runs of a kind of scene are computed: the words of their status, what is counted besides steps, and a function.
 
     `ride` takes (scene, problem, t1, tolerance, last, solver, count); `None` for runs of one smooth motion.
     """
@@ -60,12 +60,12 @@ SMOOTH = Driver(WORDS, (), None)
 STICK_SLIP = Driver((*WORDS, "unresolved"), ("sticks",), ride_with_sticking)
 HYBRID = Driver((*WORDS, "unresolved"), ("hops",), ride_with_flights)
 
-#: Which word a run's status is, where it has not inverted; `not_inverted` for all others.
+#: The word for a run's status if it has not inverted; `not_inverted` for all others.
 WORD_OF_STATUS = {GUARD_LOST: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
 
 
 def driver_of(scene: Scene) -> Driver:
-    """The kind of a scene's runs."""
+    """The driver for a scene."""
     if scene.friction.set_valued:
         return STICK_SLIP
     return HYBRID if scene.contact == "hybrid" else SMOOTH
@@ -85,8 +85,8 @@ class CellRuns(NamedTuple):
     def results(self, roots: dict[str, Any], columns: dict[str, Any], tolerance: float, count: int) -> dict[str, Any]:
         """The variables of some cells.
 
-        **Arguments:** `roots`: scene and launch; `columns`: full name of a number -> its value in every cell, the first `count`
-        of which are to be run; `tolerance`: relative tolerance.
+        **Arguments:** `roots`: scene and launch; `columns`: full name of a parameter -> its value in every cell, of which the
+        first `count` are to be run; `tolerance`: relative tolerance.
         """
         cells = with_numbers(roots, columns)
         scene, launch = cells["scene"], cells["launch"]

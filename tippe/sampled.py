@@ -72,7 +72,7 @@ class TrajectoryProblem(AbstractProblem):
         return self.dynamics.contact_margin(state[: len(self.state)])
 
 
-#: How a run can end, by the codes that stand for the words inside a transformation.
+#: How a run can end; inside a transformation the index stands for the word.
 STATUS = ("reached t1", "contact_lost", "failed", "jammed", "illegal")
 
 
@@ -107,8 +107,8 @@ def sampled(
 ) -> Found:
     """Run one launch inside a transformation and sample it.
 
-    An explicit Runge-Kutta solver takes the block of lanes, of which a batch fills as many as it has runs; others run by
-    Diffrax. In both the variations of what is differentiated by take part in step control.
+    An explicit Runge-Kutta solver uses the block of lanes, one for each run of a batch; others run by Diffrax. In both, the
+    variations take part in step control.
 
     **Arguments:** as for `simulate`.
     """
@@ -117,7 +117,7 @@ def sampled(
     kind = BlockSampling if isinstance(solver, diffrax.AbstractERK) else SingleSampling
     question = kind(len(leaves), structure, rest, solver)
     found = ask(question, *leaves, jax.lax.stop_gradient(times), as_number(t1), as_number(tolerance))
-    # Later by a moment, the sample is further by as much along the field.
+    # A small delay moves the sample along the field.
     run = TrajectoryProblem.of(scene, launch)
     rates = jax.lax.stop_gradient(run.field(times, found.states.T).T)
     later = (times - jax.lax.stop_gradient(times))[:, None]

@@ -38,7 +38,7 @@ class Scene(Bounded):
     - `restitution`: Newton's coefficient e_N of impacts [1], in [0, 1], for "hybrid" only; `None` is 0.
 
     **Raises:** `ValueError` if a part is of the wrong kind, if the top does not fit into the arena, if gravity is not
-    positive, or if the contact asks for what the arena or the body does not allow.
+    positive, or if the arena, the body or the friction does not allow the contact.
     """
 
     body: Top
@@ -53,7 +53,7 @@ class Scene(Bounded):
         for name, part, kind in (*parts, ("friction", self.friction, AbstractFriction)):
             if not isinstance(part, kind):
                 raise ValueError(f"{name} = {part!r} must be a {kind.__name__.removeprefix('Abstract')}")
-        # A surface that offers a ball no room at all says so.
+        # This raises if the surface has no room for a ball at all.
         self.surface.parallel(self.body.radius)
         if self.contact not in ("stop", "hybrid"):
             raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
@@ -98,7 +98,7 @@ class Scene(Bounded):
 
         Velocities count in units of sqrt(g R), directions in units of 1, angular momenta in units of the launch's own,
         or of I1 sqrt(g / R) where that is more. For a launch within `NEARLY_UPRIGHT` of the normal, what vanishes with
-        the tilt counts in proportion to it: its growth, which decides when the top turns over, would drown in the errors.
+        the tilt counts in proportion to it; otherwise errors would hide its growth, which decides when the top turns over.
 
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
@@ -108,7 +108,7 @@ class Scene(Bounded):
         momentum = jnp.maximum(self.body.I3 * jnp.abs(launch.spin), self.body.I1 * rate)
         place = tuple(one for _ in self.surface.place(launch.eta))
         tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
-        # A top that stands exactly has no growth to resolve.
+        # A top that stands exactly upright has no growth to resolve.
         tilt = jnp.where(tilt > 0.0, jnp.clip(tilt, 1e-280, 1.0), 1.0)
         velocities, momenta = (velocity * tilt, velocity * tilt), (momentum * tilt, momentum * tilt, momentum)
         return joined(velocities, (tilt, tilt, one), momenta, place)

@@ -68,7 +68,7 @@ def slopes_of_cells(
 
     **Arguments:** as for `inversion_table`, and
 
-    - `columns`: full name of a number -> its value in every cell; `count` of the `size` cells are to be run.
+    - `columns`: full name of a parameter -> its value in every cell; `count` of the `size` cells are to be run.
     - `names`: full names of the numbers to differentiate by.
 
     **Returns:** the `Outcome`, and name of the variable -> derivatives (size,). Source: implicit function theorem at the event.

@@ -149,7 +149,7 @@ def _lever_and_inertia(scene: Scene, theta: Float[ArrayLike, "..."]):
 
 
 def tumbling(scene: Scene, theta: Float[ArrayLike, "..."]) -> Tumbling:
-    """The tumbling top at an inclination, the one of its two senses with positive phi'.
+    """The tumbling top at an inclination, the one of the two with positive phi'.
 
     phi'^2 = m g a / D, omega3 = (cos - alpha) phi', J = R G phi', with D = I3 (alpha - cos) + I1 cos and
     G = I1 sin^2 + I3 (cos - alpha)^2 (Rutstam 2012, eq. 2.8).
@@ -197,7 +197,7 @@ def tumbling_angles(scene: Scene, jellett: float, samples: int = 2001) -> list[f
 
     - `scene`: a `Scene` on the plane with concrete numbers.
     - `jellett`: Jellett's constant [kg m^3/s], of either sign.
-    - `samples`: points of the grid on which brackets are sought; each is then closed in on by halving.
+    - `samples`: points of the grid on which brackets are sought; each is then halved down to the zero.
     """
     _on_a_plane(scene)
     grid = jnp.linspace(0.0, jnp.pi, samples)

@@ -18,7 +18,7 @@ from .scene import Scene
 from .sensitivities import sensitivity_names, slope_variables
 from .time_error import COARSER, time_error
 
-#: Cells that are checked together, to bound the memory it takes.
+#: Cells that are checked together, which bounds the memory needed.
 CHECKED_AT_ONCE = 1 << 20
 
 UNITS = {"mass": "kg", "radius": "m", "offset": "m", "I1": "kg m2", "I3": "kg m2", "gravity": "m s-2"}
@@ -59,13 +59,13 @@ def inversion_table(
     - `crossing`: "first" for the first time theta reaches the angle; "last" for the up-crossing after which theta stays
       above it until `t1` (first crossings are ill-conditioned where theta oscillates about the angle).
     - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
-    - `axes`: further axes, full name of a number -> values, such as `{"scene.body.offset": [0.005, 0.006]}`.
+    - `axes`: further axes, full name of a parameter -> values, such as `{"scene.body.offset": [0.005, 0.006]}`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
-    - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which knows first
+    - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which supports first
       crossings only.
     - `errors`: whether to run every cell again at ten times the tolerance, for an estimate of the error of its time.
-    - `sensitivities`: full names of numbers to differentiate the times by, such as `["scene.friction.mu", "launch.theta"]`; the
-      end of a name will do where it fits one number only.
+    - `sensitivities`: full names of parameters to differentiate the times by, such as `["scene.friction.mu", "launch.theta"]`;
+      the end of a name will do where only one parameter fits.
     - `progress`: whether to show it, on a terminal or in a notebook; `NONHOLONOMIC_PROGRESS=0` hides it everywhere.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
@@ -95,7 +95,7 @@ def inversion_table(
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
     if axes is not None and not isinstance(axes, dict):
-        raise ValueError(f"axes = {axes!r} must be a dictionary, full name of a number -> values")
+        raise ValueError(f"axes = {axes!r} must be a dictionary, full name of a parameter -> values")
     known = numbers("scene.friction", scene.friction)
     of_mu = next((number for number in known if number.endswith(".mu")), "scene.friction.mu")
     given = {"launch.theta": theta, "launch.eta": eta, of_mu: mu, "launch.spin": spin, "launch.azimuth": azimuth}
@@ -125,7 +125,7 @@ def inversion_table(
 
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
         if method == "diffrax" and count == 0:
-            # The reference runs whole blocks: a call that is there to compile would compute the first one twice.
+            # The reference runs whole blocks: a call that is only meant to compile would compute the first one twice.
             return {}
         found = runs.results(roots, columns, tolerance, count)
         if errors:
@@ -149,7 +149,7 @@ def inversion_table(
 
 
 def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:
-    """Have the modules check every cell, before anything compiles: numbers may be impossible only together."""
+    """Have the modules check every cell, before anything compiles: numbers may be illegal only in combination."""
     shape = tuple(len(one.values) for one in grid)
     cells = int(np.prod(shape, dtype=int))
     for first in range(0, cells, CHECKED_AT_ONCE):

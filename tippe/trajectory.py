@@ -184,8 +184,8 @@ def simulate(
     - `tolerance`: relative tolerance; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
     - `solver`: any solver of Diffrax, `Dopri8()` by default.
     - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
-      number; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, a traced run goes by Diffrax, which pays where a
-      loss is differentiated by many numbers.
+      parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax integrates a traced run, which pays if a
+      loss is differentiated by many parameters.
 
     **Returns:** a `Trajectory`, for a hybrid scene a `HybridTrajectory`.
 
@@ -226,16 +226,16 @@ def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
     yield Bound(times, "times", at_least=0.0, at_most=t1)
 
 
-# Compiled as a whole also where a bare `vmap` or `grad` would take it operation by operation.
+# Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
 def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: Any, *options: Any) -> Trajectory:
     """What `_traced` gives, or NaN and the status "illegal" where a traced number is out of range."""
     if times is None:
-        # It says that there must be some.
+        # It raises the error that says so.
         return _traced(scene, launch, times, t1, tolerance, *options)
     bounds = (*all_bounds(scene), *all_bounds(launch), *run_bounds(t1, tolerance), *times_bounds(times, t1))
     may = jnp.all(legal(bounds)) & jnp.all(jnp.diff(times) > 0.0)
-    # Steps of illegal numbers might never reach the end: they are not begun.
+    # A run of illegal numbers might never reach its end, so it is given the horizon 0.
     found = _traced(scene, launch, times, jnp.where(may, t1, 0.0), tolerance, *options)
     status = jnp.where(may, found.status, STATUS.index("illegal"))
     return eqx.tree_at(lambda one: (one.t, one.status), nan_unless(may, found), (times, status))

@@ -1,4 +1,4 @@
-"""Parameters from measurements: maximum likelihood, with errors and with what the measurements leave open."""
+"""Parameters from measurements: maximum likelihood, with errors and with what the measurements do not determine."""
 
 import math
 from collections.abc import Callable
@@ -30,18 +30,18 @@ def identify(
     labels: tuple[str, ...] | None = None,
     progress: bool = True,
 ) -> Identification:
-    """Find the numbers of a model that make measurements most likely.
+    """Find the parameters of a model that make measurements most likely.
 
     Levenberg-Marquardt from every start at once, on the residuals of the data (`likelihood.py`) and of the priors. It finds
-    a minimum near each start, not the least of all; the result is the best of them and tells where the others ended.
+    a minimum near each start, not the global one; the result is the best of them and says where the others ended.
 
     **Arguments:**
 
-    - `model`: parameters, name -> (rows,), to predictions (rows, n); `jax.vmap` makes one of a function of one set. It is
-      differentiated forwards.
+    - `model`: parameters, name -> (rows,), to predictions (rows, n); `jax.vmap` turns a function of one set into
+      one. It is differentiated in forward mode.
     - `measurements`: `Measurements` of shape (n,).
-    - `free`: name -> a `Free`, or only the number from which to start.
-    - `starts`: from how many points to fit: the one given, and others drawn about it.
+    - `free`: name -> a `Free`, or only the value from which to start.
+    - `starts`: number of points from which to fit: the one given, and others drawn around it.
     - `spread`: how far they are drawn, as a factor either way, greater than 1; `seed`: of the draw.
     - `max_steps`: a fit that needs more has not converged.
     - `labels`: (n,), names of the measurements in the result.
@@ -88,13 +88,13 @@ def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...]]:
 def free_numbers(
     free: Any, roots: dict[str, Any], known: list[str], replace: Callable[[dict[str, Any], dict[str, Any]], Any]
 ) -> dict[str, Free]:
-    """The unknowns of a scene: their full names, and a lower bound of 0 for numbers that cannot be negative.
+    """The unknowns of a scene: their full names, and a lower bound of 0 for parameters that cannot be negative.
 
     **Arguments:**
 
     - `free`: name, or its unambiguous end, -> a `Free` or where to start.
-    - `roots`: name -> tree of modules, `known`: the full names of their numbers.
-    - `replace`: (roots, name -> number) -> roots; it raises `ValueError` for numbers that the modules refuse.
+    - `roots`: name -> tree of modules, `known`: the full names of their parameters.
+    - `replace`: (roots, name -> number) -> roots; it raises `ValueError` for values that the modules refuse.
 
     **Returns:** full name -> `Free`.
 

@@ -23,7 +23,7 @@ Values = Shaped[np.ndarray, "..."]
 
 
 class Axis(NamedTuple):
-    """One axis of a grid: its name in the table, the full name of the number it varies, and the unit."""
+    """One axis of a grid: its name in the table, the full name of the parameter it varies, and the unit."""
 
     name: str
     number: str
@@ -65,7 +65,7 @@ def sweep(
 
     **Arguments:**
 
-    - `run`: (full name of a number -> values of a block's cells, how many of them count) -> name -> results. It is called
+    - `run`: (full name of a parameter -> values of a block's cells, how many of them count) -> name -> results. It is called
       from several threads at once; the first call, with no cell that counts, lets it compile.
     - `axes`: the grid, the last axis varying fastest.
     - `variables`: what `run` returns.

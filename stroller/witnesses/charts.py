@@ -1,9 +1,8 @@
 """The stroller in coordinates, as data for the formulations of `nonholonomic/formulations/formulation.py`.
 
 Coordinates: q = (x, y, theta, phi) on a plane and (eta, mu, psi, phi), reduced latitude first as in the paper, on a
-sphere or spheroid, psi being the paper's theta where the heading is projected. They have poles, which the P-form has
-not; they are the independent witness that it is right (`stroller.md`, sections 2 to 4 and 6), and how the paper writes
-it.
+sphere or spheroid, psi being the paper's theta where the heading is projected. They have poles, unlike the P-form;
+they are the independent check of it (`stroller.md`, sections 2 to 4 and 6), and the paper's own form.
 """
 
 import jax
@@ -134,7 +133,7 @@ class Chart(AbstractSystem):
         return SIDES[scene.side] * (weight * equatorial * jnp.sin(q[0]) / h_eta - bend)
 
     def motion(self, q: Coordinates, wheels: WheelMotion) -> Motion:
-        """What an input sees."""
+        """The motion that an input gets."""
         place = (q[0], q[1]) if self.quadric is None else (q[1], q[0])
         position, east, north = self.scene.surface.chart(place)
         heading = self.scene.dynamics.heading.at_angle(q[2], east, north)
