@@ -29,14 +29,13 @@ class Parts(NamedTuple):
 
 def parts(state: Float[Array, "components ..."]) -> Parts:
     """The components of a state, part by part."""
-    return Parts(*(tuple(state[k] for k in range(len(state))[part]) for part in (VELOCITY, AXIS, MOMENTUM, PLACE)))
+    u1, u2, e1, e2, e3, L1, L2, L3, *place = (state[k] for k in range(len(state)))
+    return Parts((u1, u2), (e1, e2, e3), (L1, L2, L3), tuple(place))
 
 
-def joined(
-    velocity: tuple[Component, ...], axis: Vector, momentum: Vector, place: tuple[Component, ...] = ()
-) -> Float[Array, "components ..."]:
-    """The state made of these parts, each component a scalar or one per lane."""
-    return jnp.stack(jnp.broadcast_arrays(*velocity, *axis, *momentum, *place))
+def joined(*some: tuple[Component, ...]) -> Float[Array, "components ..."]:
+    """The state made of its parts, in order; a component is a scalar or one per lane."""
+    return jnp.stack(jnp.broadcast_arrays(*(component for part in some for component in part)))
 
 
 def inclination(axis: Vector) -> Float[Array, "..."]:
