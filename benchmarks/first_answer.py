@@ -159,21 +159,21 @@ def measured(program: str, launches: int, state: str, folder: Path) -> dict[str,
     if done.returncode != 0:
         print(f"{program} skipped: {done.stderr.strip().splitlines()[-1]}", file=sys.stderr)
         return None
-    told = json.loads(done.stdout.splitlines()[-1])
+    answer = json.loads(done.stdout.splitlines()[-1])
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     row = {"launches": str(launches), "program": program, "state": state, "whole [s]": f"{whole:.2f}"}
-    row |= {"CPU [s]": f"{cpu:.2f}"} | {f"{name} [s]": f"{told[name]:.2f}" for name in PHASES}
-    return row | {"last time [s]": f"{told['answer']:.7f}"}
+    row |= {"CPU [s]": f"{cpu:.2f}"} | {f"{name} [s]": f"{answer[name]:.2f}" for name in PHASES}
+    return row | {"last time [s]": f"{answer['answer']:.7f}"}
 
 
 def main() -> int:
     """Run every program cold and warm, and print the table."""
-    told = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    told.add_argument("--launches", type=int, nargs="+", default=[1, 100, 10_000, 1_000_000])
-    told.add_argument("--out", type=Path, help="CSV to write")
-    told.add_argument("--child", choices=PROGRAMS, help=argparse.SUPPRESS)
-    told.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
-    options = told.parse_args()
+    command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command.add_argument("--launches", type=int, nargs="+", default=[1, 100, 10_000, 1_000_000])
+    command.add_argument("--out", type=Path, help="CSV to write")
+    command.add_argument("--child", choices=PROGRAMS, help=argparse.SUPPRESS)
+    command.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
+    options = command.parse_args()
     if options.child is not None:
         print(json.dumps(RUNS[options.child](options.launches[0], options.folder)))
         return 0

@@ -118,10 +118,10 @@ def row_of(
 
 def main() -> None:
     """Measure, print and write."""
-    told = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    told.add_argument("--launches", type=int, default=1024)
-    told.add_argument("--out", type=Path, default=Path("gradients.csv"))
-    options = told.parse_args()
+    command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command.add_argument("--launches", type=int, default=1024)
+    command.add_argument("--out", type=Path, default=Path("gradients.csv"))
+    options = command.parse_args()
     one_core()
     grid.workers = lambda: 1
     print(machine())

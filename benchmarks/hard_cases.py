@@ -25,11 +25,11 @@ SUBJECTS = (limits, friction, hybrid, sticking, sensitive)
 
 def main() -> int:
     """Run the rows, print the table, and return the exit status."""
-    told = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     functions = {function.__name__: function for subject in SUBJECTS for function in subject.rows()}
-    told.add_argument("--only", nargs="+", choices=list(functions), metavar="name", help=", ".join(functions))
-    told.add_argument("--csv", type=Path, help="file for the same table")
-    options = told.parse_args()
+    command.add_argument("--only", nargs="+", choices=list(functions), metavar="name", help=", ".join(functions))
+    command.add_argument("--csv", type=Path, help="file for the same table")
+    options = command.parse_args()
     started = time.perf_counter()
     print(machine())
     found = {}

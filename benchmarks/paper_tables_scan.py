@@ -35,7 +35,7 @@ PARENTS, CHILDREN = 16, 24
 TABLES = {2: paper.TABLE_2, 3: paper.TABLE_3}
 
 
-class Runs(NamedTuple):
+class Rows(NamedTuple):
     """What became of every set: times [s] (sets, rows), infinite where not reversed, and three flags (sets,).
 
     `pattern`: exactly the paper's rows reversed; `contact`: and no other lost contact; `failed`: a row could not be
@@ -108,7 +108,7 @@ def inclinations_and_times(table: paper.Table) -> tuple[np.ndarray, np.ndarray]:
     return np.array([row.theta for row in table.rows]), np.array(times)
 
 
-def run(numbers: np.ndarray, table: paper.Table, options: argparse.Namespace) -> Runs:
+def run(numbers: np.ndarray, table: paper.Table, options: argparse.Namespace) -> Rows:
     """Run the rows of a table for every set; those that must reverse come first, one at a time."""
     theta, wanted = inclinations_and_times(table)
     reversing = np.isfinite(wanted)
@@ -121,10 +121,10 @@ def run(numbers: np.ndarray, table: paper.Table, options: argparse.Namespace) ->
         right = np.all(np.isfinite(time_) == reversing[group], axis=1)
         alive = alive[right & ~failed[alive]]
     pattern = np.isin(np.arange(len(numbers)), alive)
-    return Runs(found, pattern, pattern & ~np.any(lost, axis=1), failed)
+    return Rows(found, pattern, pattern & ~np.any(lost, axis=1), failed)
 
 
-def worst_error(runs: Runs, table: paper.Table, wanted_sets: np.ndarray) -> np.ndarray:
+def worst_error(runs: Rows, table: paper.Table, wanted_sets: np.ndarray) -> np.ndarray:
     """Largest error of the times of a set [s], infinite where the set is not wanted."""
     _, wanted = inclinations_and_times(table)
     reversing = np.isfinite(wanted)
@@ -155,8 +155,8 @@ def scan(table: paper.Table, options: argparse.Namespace) -> None:
 
 
 def refine(
-    rng: np.random.Generator, numbers: np.ndarray, runs: Runs, table: paper.Table, options: argparse.Namespace
-) -> tuple[np.ndarray, Runs]:
+    rng: np.random.Generator, numbers: np.ndarray, runs: Rows, table: paper.Table, options: argparse.Namespace
+) -> tuple[np.ndarray, Rows]:
     """Vary the best sets round by round, keeping those that stay best; the range shrinks by a tenth each round."""
     scale = HIGH - LOW
     for turn in range(options.rounds):
@@ -165,12 +165,12 @@ def refine(
         variation = 0.1 * 0.9**turn * scale * rng.normal(size=(PARENTS * CHILDREN, len(NAMES)))
         children = logarithms(np.repeat(parents, CHILDREN, axis=0)[: len(variation)])
         children = exponentials(np.clip(children + variation[: len(children)], LOW, HIGH))
-        kept = Runs(*(part[order] for part in runs))
+        kept = Rows(*(part[order] for part in runs))
         new = run(children, table, options)
         numbers = np.concatenate([parents, children])
-        runs = Runs(*(np.concatenate(pair) for pair in zip(kept, new, strict=True)))
+        runs = Rows(*(np.concatenate(pair) for pair in zip(kept, new, strict=True)))
     order = np.argsort(worst_error(runs, table, runs.contact))
-    return numbers[order], Runs(*(part[order] for part in runs))
+    return numbers[order], Rows(*(part[order] for part in runs))
 
 
 def show(label: str, numbers: np.ndarray, error: float, times: np.ndarray) -> None:

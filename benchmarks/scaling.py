@@ -126,9 +126,9 @@ def lanes_table(scene: tippe.Scene) -> list[dict[str, str]]:
 
 def main() -> None:
     """Measure and print."""
-    told = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    told.add_argument("--most", type=int, default=100_000, help="largest number of launches")
-    options = told.parse_args()
+    command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command.add_argument("--most", type=int, default=100_000, help="largest number of launches")
+    options = command.parse_args()
     print(machine())
     scene = tippe.Scene(tippe.Top(*TOP), tippe.Plane(), tippe.Viscous(0.3))
     started = time.perf_counter()

@@ -212,12 +212,12 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
 
 def main() -> None:
     """Measure, print, write."""
-    told = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    told.add_argument("--out", type=Path, default=Path("benchmark-out"))
-    told.add_argument("--launches", type=int, default=512)
-    told.add_argument("--quick", action="store_true", help="three tolerances, no vmapped Diffrax in large batches")
-    told.add_argument("--scenes", nargs="+", choices=list(scenes(1)), help="these scenes only")
-    options = told.parse_args()
+    command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command.add_argument("--out", type=Path, default=Path("benchmark-out"))
+    command.add_argument("--launches", type=int, default=512)
+    command.add_argument("--quick", action="store_true", help="three tolerances, no vmapped Diffrax in large batches")
+    command.add_argument("--scenes", nargs="+", choices=list(scenes(1)), help="these scenes only")
+    options = command.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     one_core()
     print(machine())
@@ -239,8 +239,8 @@ def main() -> None:
         for launches in (1024, 4096):
             measured = timed(obvious_diffrax(task, launches), 1)
             cost = measured.cpu / launches * 1e3
-            told = f"vmapped Diffrax Dopri8 as one writes it first, {launches} lanes, rtol 1e-9"
-            print(f"{told}: {cost:.2f} ms a launch, {cost / mine:.1f} times ours")
+            label = f"vmapped Diffrax Dopri8 as one writes it first, {launches} lanes, rtol 1e-9"
+            print(f"{label}: {cost:.2f} ms a launch, {cost / mine:.1f} times ours")
     if available("matplotlib"):
         draw(rows, options.out / "work_precision.png")
 

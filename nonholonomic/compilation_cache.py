@@ -1,8 +1,8 @@
 """Compiled programs kept on disk, so that a second process need not compile them again.
 
-The store is JAX's persistent compilation cache. What it lacks is done here: a folder of its own for every jaxlib, kind of
-processor and set of XLA flags, for code compiled for one processor may not run on another; and a look at the entries,
-because a process that is killed while it writes one leaves half an entry, which JAX would warn of for ever.
+The store is JAX's persistent compilation cache. This module adds two things: a separate folder for every jaxlib, kind of
+processor and set of XLA flags, because code compiled for one processor may not run on another; and a check of the entries,
+because a process that is killed while writing leaves half an entry, which JAX would warn about forever.
 """
 
 import hashlib
@@ -18,10 +18,10 @@ from typing import Any
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
-#: Empty file whose time of change tells up to when the entries have been looked at, and the one that replaces it.
+#: Empty file whose modification time says when the entries were last checked, and the file that replaces it.
 LOOKED_AT, LOOKING = ".looked_at", ".looking"
 
-#: What a file system's clock may be coarse by [s].
+#: How coarse a file system's clock may be [s].
 COARSE = 2.0
 
 _log = logging.getLogger(__name__)
@@ -31,9 +31,9 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
     """Keep compiled programs on disk, where later processes find them.
 
     Call it before the first computation. A folder that was already chosen, by JAX's own `jax_compilation_cache_dir` or by an
-    earlier call, stands unless another is given. An entry that is cut short or damaged is removed and costs a compilation
-    (entries compressed by zstandard, where that package is installed, are left for JAX to refuse). Nothing is ever removed
-    otherwise: delete the folder to get its room back. As all code, it should lie where nobody else can write.
+    earlier call, is kept unless another is given. An entry that is cut short or damaged is removed and costs a compilation
+    (entries compressed by zstandard, where that package is installed, are left for JAX to refuse). Nothing else is ever
+    removed: delete the folder to reclaim its space. It holds code, so it should be where nobody else can write.
 
     **Arguments:** `folder`: where to keep them, by default `nonholonomic` in the user's cache folder (`XDG_CACHE_HOME`, or
     `~/.cache`). In it there is a folder for every version of jaxlib, kind of processor and set of XLA flags.
@@ -56,7 +56,7 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
         _log.warning("compiled programs are not kept: %s", error)
         return None
     if chosen != str(place):
-        # JAX opens its folder once.
+        # JAX opens its folder only once.
         compilation_cache.reset_cache()
     settings.update("jax_compilation_cache_dir", str(place))
     settings.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -80,25 +80,25 @@ def user_folder() -> Path:
 
 def environment_name() -> str:
     """A name for all that compiled code depends on besides the program: jaxlib, the processor, and the flags of XLA."""
-    told = "\n".join([platform.system(), platform.machine(), processor(), os.environ.get("XLA_FLAGS", "")])
-    return f"jaxlib-{version('jaxlib')}-{hashlib.sha256(told.encode()).hexdigest()[:12]}"
+    machine = "\n".join([platform.system(), platform.machine(), processor(), os.environ.get("XLA_FLAGS", "")])
+    return f"jaxlib-{version('jaxlib')}-{hashlib.sha256(machine.encode()).hexdigest()[:12]}"
 
 
 def processor() -> str:
-    """The processor's kind and features, as far as the system tells."""
+    """The processor's kind and features, as far as the system says."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return platform.processor()
-    # One core stands for all. On ARM the features have another name.
+    # All cores are taken to be alike. On ARM the features have another name.
     kinds = ("vendor_id", "cpu family", "model", "flags", "CPU implementer", "CPU part", "Features")
-    told = dict(line.split(":", 1) for line in reversed(lines) if ":" in line)
-    told = {name.strip(): value.strip() for name, value in told.items()}
-    return "\n".join(told.get(name, "") for name in kinds)
+    lines_by_name = dict(line.split(":", 1) for line in reversed(lines) if ":" in line)
+    lines_by_name = {name.strip(): value.strip() for name, value in lines_by_name.items()}
+    return "\n".join(lines_by_name.get(name, "") for name in kinds)
 
 
 def remove_damaged(folder: Path) -> None:
-    """Remove the entries, of those changed since the last look, that do not decompress.
+    """Remove the entries that do not decompress, among those changed since the last check.
 
     **Raises:** `OSError` if the folder cannot be written.
     """
@@ -117,7 +117,7 @@ def remove_damaged(folder: Path) -> None:
 
 
 def sound(entry: bytes) -> bool:
-    """Whether an entry decompresses; zlib's checksum vouches for every byte of it."""
+    """Whether an entry decompresses; zlib's checksum covers every byte of it."""
     if entry.startswith(b"\x28\xb5\x2f\xfd"):  # zstandard's mark
         return True
     try:

@@ -12,10 +12,10 @@ INTERVAL = 0.5
 
 
 class Progress:
-    """A line that first tells what is being prepared, and then how many things are done, how fast, and what is left.
+    """A line that first says what is being prepared, then how many items are done, how fast, and how many are left.
 
-    It is a context. A thread writes the line, because compiling keeps the caller's for many seconds. Nothing is written
-    where standard error is neither a terminal nor a notebook's, nor with `NONHOLONOMIC_PROGRESS=0`.
+    It is a context. A separate thread writes the line, because compiling blocks the caller's for many seconds. Nothing is
+    written where standard error is neither a terminal nor a notebook's, nor with `NONHOLONOMIC_PROGRESS=0`.
     """
 
     def __init__(self, total: int, unit: str, preparing: str = "compiling", *, shown: bool = True):
@@ -23,7 +23,7 @@ class Progress:
 
         **Arguments:**
 
-        - `total`: how many things are to be done, `unit`: what one is called.
+        - `total`: how many items are to be done, `unit`: what one is called.
         - `preparing`: what is done before the first `advance` or `begin`.
         - `shown`: whether to show anything at all.
         """
@@ -34,14 +34,14 @@ class Progress:
         self._lock, self._ended = threading.Lock(), threading.Event()
 
     def begin(self, done: int = 0) -> None:
-        """The preparations are over; `done` things had been done before."""
+        """The preparations are over; `done` items had been done before."""
         with self._lock:
             self._done = self._first = done
             self._since = time.time()
             self._close()
 
     def advance(self, count: int, **notes: Any) -> None:
-        """So many more things are done; `notes` are shown beside their number."""
+        """`count` more items are done; `notes` are shown beside their number."""
         with self._lock:
             self._done, self._notes = self._done + count, notes
             if self._bar is not None and self._since is not None:
@@ -50,7 +50,7 @@ class Progress:
 
     def __enter__(self) -> "Progress":
         if self._shown:
-            # Imported where it is needed, and here, for importing it changes the filters of warnings for a moment.
+            # Imported here, and only if needed, because importing it changes the warning filters for a moment.
             from tqdm.auto import tqdm
 
             self._tqdm = tqdm
@@ -74,10 +74,10 @@ class Progress:
 
     def _line(self) -> Any:
         """The line in its present state."""
-        # `disable=None` leaves it to tqdm to find out whether somebody watches.
+        # `disable=None` lets tqdm find out whether anybody is watching.
         if self._since is None:
             return self._tqdm(desc=self._preparing, bar_format="{desc} [{elapsed}]", leave=False, disable=None)
-        # The rate is that of the whole run, without the preparations: things are done in blocks, some cheap, some dear.
+        # The rate is that of the whole run, without the preparations: items are done in blocks, some cheap, some expensive.
         bar = self._tqdm(total=self._total, initial=self._first, unit=self._unit, smoothing=0, disable=None)
         bar.start_t = self._since
         bar.set_postfix(self._notes, refresh=False)

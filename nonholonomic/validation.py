@@ -1,7 +1,7 @@
 """Checks of arguments, made on concrete numbers before anything compiles.
 
-Traced numbers pass them. A module says once, in its `bounds`, what its numbers may be: where they are concrete it is refused
-with a message, and where they are traced `legal` says so in the program, whose results are then not a number.
+Traced numbers pass them. A module states the ranges of its numbers once, in `bounds`: concrete numbers out of range are
+refused with a message; for traced ones `legal` is false in the program, whose results are then NaN.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 
 def as_number(value: Any) -> Float[Array, "..."]:
-    """Convert to a floating-point array of the default precision; what is no number is left for `require`."""
+    """Convert to a floating-point array of the default precision; what is not a number is left for `require`."""
     try:
         if isinstance(value, str):
             raise TypeError
@@ -34,7 +34,7 @@ def is_traced(value: Any) -> bool:
 
 
 def shown(value: Any) -> str:
-    """The value as it reads best in a message: a plain number where it is one."""
+    """The value as a message should show it: a plain number if it is one."""
     array = np.asarray(value)
     return repr(array.item()) if array.ndim == 0 and array.dtype != object else repr(value)
 
@@ -67,7 +67,7 @@ def require(
     """
     if is_traced(value):
         return
-    # NumPy would make a number of these.
+    # NumPy would convert these to numbers.
     if value is None or isinstance(value, str):
         raise ValueError(f"{name} = {value!r} is not a number")
     # A pytree rebuilt by a JAX transformation may hold placeholders; they never reach here through a constructor.
@@ -91,8 +91,8 @@ def require(
         numbers, limits = np.broadcast_arrays(numbers, np.asarray(bound, dtype=float))
         allowed = holds(numbers, limits)
         if not np.all(allowed):
-            told = f"{name} = {_first(numbers, allowed)} must be {words} {_first(limits, allowed)}"
-            raise ValueError(told + remark)
+            message = f"{name} = {_first(numbers, allowed)} must be {words} {_first(limits, allowed)}"
+            raise ValueError(message + remark)
 
 
 class Bound(NamedTuple):
@@ -125,12 +125,12 @@ class Bound(NamedTuple):
 
 
 class Bounded(eqx.Module):
-    """A module whose numbers have ranges: it cannot be made of concrete numbers outside of them."""
+    """A module whose numbers have ranges; concrete numbers outside of them are refused."""
 
     def bounds(self) -> Iterable[Bound]:
         """The ranges of the module's own numbers, in the order in which they are to be checked.
 
-        A generator, so that a range that is computed from a number is so only once that number has been checked.
+        A generator, so that a range computed from another number is computed only after that number has been checked.
         """
         return ()
 
@@ -145,7 +145,7 @@ def require_all(bounds: Iterable[Bound]) -> None:
 
 
 def all_bounds(module: Any) -> Iterator[Bound]:
-    """The ranges of the numbers of a module and of the modules in it; none for what is no `Bounded`."""
+    """The ranges of the numbers of a module and of the modules in it; none for a module that is not `Bounded`."""
     if isinstance(module, Bounded):
         yield from module.bounds()
         for field in dataclasses.fields(module):
@@ -161,7 +161,7 @@ def legal(bounds: Iterable[Bound]) -> Bool[Array, "..."]:
 
 
 def nan_unless(holds: Bool[Array, ""], tree: Any) -> Any:
-    """The tree with every floating number, and every derivative through it, not a number unless `holds`."""
+    """The tree with every floating-point number, and every derivative through it, NaN unless `holds`."""
     # A product, not a select: the derivative of what was not selected would be 0.
     factor = jnp.where(holds, 1.0, jnp.nan)
     return jax.tree.map(lambda leaf: leaf * factor if eqx.is_inexact_array(leaf) else leaf, tree)

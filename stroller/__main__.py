@@ -40,18 +40,18 @@ class Helm:
 
 def parser() -> argparse.ArgumentParser:
     """The options of the main job; the defaults are those of a light stroller."""
-    told = argparse.ArgumentParser(
+    command = argparse.ArgumentParser(
         prog="python -m stroller",
         description="Rides of a stroller on a plane and inside a spheroid, with and without friction, steered to and fro "
         "and pulled. Prints the energy audit of both integrators, writes an HDF5 file and a picture.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    body = told.add_argument_group("the stroller")
+    body = command.add_argument_group("the stroller")
     body.add_argument("--mass", type=float, default=12.0, help="mass [kg]")
     body.add_argument("--wheelbase", type=float, default=0.7, help="rear axle to front wheel [m]")
     body.add_argument("--inertia", type=float, default=1.5, help="yaw inertia about the rear axle [kg m^2]")
     body.add_argument("--steering-inertia", type=float, default=0.05, help="inertia of the fork [kg m^2]")
-    scene = told.add_argument_group("the scene")
+    scene = command.add_argument_group("the scene")
     scene.add_argument("--tilt", type=float, default=0.05, help="tilt of the plane [rad]")
     scene.add_argument("--equatorial", type=float, default=6.0, help="equatorial radius of the spheroid [m]")
     scene.add_argument("--polar", type=float, default=3.0, help="polar semi-axis of the spheroid [m]")
@@ -60,7 +60,7 @@ def parser() -> argparse.ArgumentParser:
     )
     scene.add_argument("--gravity", type=float, default=9.81, help="acceleration of free fall [m/s^2]")
     scene.add_argument("--fork", choices=list(FORKS), default="absolute", help="what the fork's inertia resists")
-    ride = told.add_argument_group("the ride")
+    ride = command.add_argument_group("the ride")
     ride.add_argument("--speed", type=float, default=2.0, help="speed at the start [m/s]")
     ride.add_argument("--force", type=float, default=1.0, help="drive force [N]")
     ride.add_argument("--steer", type=float, default=0.3, help="steering angle aimed at [rad]")
@@ -69,7 +69,7 @@ def parser() -> argparse.ArgumentParser:
     ride.add_argument("--tolerance", type=float, default=1e-9, help="relative tolerance of Dopri8")
     ride.add_argument("--step", type=float, default=0.01, help="step of the implicit midpoint rule [s]")
     ride.add_argument("--out", type=Path, default=Path("stroller-out"), help="folder for the file and the picture")
-    return told
+    return command
 
 
 def scenes(options: argparse.Namespace) -> dict[tuple[str, str], tuple[Scene, Launch]]:

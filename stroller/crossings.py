@@ -1,6 +1,6 @@
-"""When something that a run's steps passed was zero: found between two steps by trying the step again with other lengths.
+"""When a quantity was zero during a run: found within a step by repeating that step with other lengths.
 
-So a time has the accuracy of the integration and not that of an interpolation. Only the field is compiled, and only where
+So a time has the accuracy of the integration and not that of an interpolation. Only the field is compiled, and only if
 there is something to find; the stages of the steps are summed in NumPy.
 """
 
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.integration import explicit_tableau
+from nonholonomic.integration import explicit_tableau, few_trials
 
 from .dynamics import Dynamics, State
 from .input import Input
@@ -25,17 +25,14 @@ States = Float[np.ndarray, "components lanes"]
 #: How many states the field is given at once, so that it is compiled once.
 WIDTH = 256
 
-#: Parts of a step at whose ends the sign is looked at, where there may be a crossing.
+#: Parts into which a step is divided, to look at the sign at their ends, if there may be a crossing.
 PARTS = 8
 
 #: How many times looks are added where the quantity is nearest to zero, so that two crossings close together are seen.
 CLOSER_LOOKS = 3
 
-#: A crossing is located once its bracket, or the change from one trial to the next, is shorter than this part of its time.
-LOCATED = 1e-14
-
-#: Trials after which the last one is taken.
-MOST_TRIALS = 60
+#: Looks closer together than this [s] would show nothing new.
+CLOSEST = 1e-14
 
 
 class Watch(NamedTuple):
@@ -58,19 +55,19 @@ def watched(dynamics: Dynamics, state: State) -> tuple[Float[Array, "..."], Floa
 
 
 class Recipe(eqx.Module):
-    """What made a run: scene, input, and the solver if it was an explicit Runge-Kutta method.
+    """What made a run: scene, input, and the solver if it is an explicit Runge-Kutta method.
 
-    Its numbers are leaves and all else is static, so that a run can leave a transformation whatever its input is.
+    Its numbers are leaves and everything else is static, so that a run can leave a transformation whatever its input is.
     """
 
     numbers: Any
     rest: Any = eqx.field(static=True)
 
     @classmethod
-    def of(cls, scene: Scene, input: Input | None, solver: diffrax.AbstractSolver) -> "Recipe":
+    def of(cls, scene: Scene, controls: Input | None, solver: diffrax.AbstractSolver) -> "Recipe":
         """The recipe of a run."""
         explicit = solver if isinstance(solver, diffrax.AbstractERK) else None
-        return cls(*eqx.partition((scene, input, explicit), eqx.is_array_like))
+        return cls(*eqx.partition((scene, controls, explicit), eqx.is_array_like))
 
     @property
     def parts(self) -> tuple[Scene, Input | None, diffrax.AbstractERK | None]:
@@ -80,8 +77,8 @@ class Recipe(eqx.Module):
 
 @eqx.filter_jit
 def _field(recipe: Recipe, times: Float[Array, " lanes"], states: State) -> State:
-    scene, input, _ = recipe.parts
-    return scene.dynamics.field(times, states, input)
+    scene, controls, _ = recipe.parts
+    return scene.dynamics.field(times, states, controls)
 
 
 @eqx.filter_jit
@@ -90,7 +87,7 @@ def _watched(recipe: Recipe, states: State) -> Float[Array, "watched lanes"]:
 
 
 def _in_blocks(function: Callable[..., Any], *columns: Any) -> Any:
-    """A compiled function of columns of any number, `WIDTH` of them at a time; the last block is filled up with its end."""
+    """A compiled function of any number of columns, `WIDTH` at a time; the last block is padded with its last column."""
     count = columns[0].shape[-1]
     found = []
     for first in range(0, count, WIDTH):
@@ -109,7 +106,7 @@ class Between(NamedTuple):
     level: float
 
     def at(self, times: Lanes) -> Lanes:
-        """The quantity at the given times; what is no number counts as beyond the level."""
+        """The quantity at the given times; NaN counts as beyond the level."""
         which = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         found = _in_blocks(lambda at: _watched(self.recipe, at), self._states(which, times - self.times[which]))
         value = found[Watch._fields.index(self.name) - 2] - self.level
@@ -124,7 +121,7 @@ class Between(NamedTuple):
         time, start, solver = self.times[which], self.states[:, which], self.recipe.parts[2]
         rates = [field(time, start)]
         if solver is None:
-            # The cubic through states and rates at both ends; an implicit step cannot be tried again so cheaply.
+            # The cubic through states and rates at both ends; an implicit step cannot be repeated so cheaply.
             whole, end = self.times[which + 1] - time, self.states[:, which + 1]
             part, change = length / whole, end - start
             last = field(time + whole, end)
@@ -138,7 +135,7 @@ class Between(NamedTuple):
 
 
 def crossings(recipe: Recipe, watch: Watch, name: str, level: float) -> Float[np.ndarray, " times"]:
-    """Times [s] at which a watched quantity passes a level, in either direction, growing."""
+    """Times [s] at which a watched quantity passes a level, in either direction, in increasing order."""
     time, value = np.asarray(watch.time), np.asarray(getattr(watch, name)) - level
     used = np.isfinite(time)
     time, value = time[used], value[used]
@@ -156,11 +153,11 @@ def crossings(recipe: Recipe, watch: Watch, name: str, level: float) -> Float[np
         if new.size == 0:
             break
     found = np.flatnonzero((value[:-1] > 0.0) != (value[1:] > 0.0))
-    return _root(quantity.at, time[found], time[found + 1], value[found], value[found + 1])
+    return few_trials(quantity.at, time[found], time[found + 1], value[found], value[found + 1])
 
 
 def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
-    """In which steps a quantity may be zero: where it changes its sign, or changes by more than it is, there or beside."""
+    """Steps in which a quantity may be zero: it changes sign, or it or a neighbour changes by more than its size."""
     with np.errstate(invalid="ignore"):
         change = np.abs(np.diff(value))
         largest = np.max([change, np.append(change[1:], 0.0), np.insert(change[:-1], 0, 0.0)], axis=0)
@@ -169,7 +166,7 @@ def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
 
 
 def _nearest(time: Float[np.ndarray, " looks"], value: Float[np.ndarray, " looks"]) -> Float[np.ndarray, " new"]:
-    """Where a quantity is nearest to zero between looks that do not show it change its sign: the vertices of parabolas."""
+    """Where a quantity is nearest to zero between looks that show no change of sign: the vertices of parabolas."""
     distance = np.abs(value)
     least = (distance[1:-1] < distance[:-2]) & (distance[1:-1] <= distance[2:])
     least &= (value[1:-1] > 0.0) == (value[:-2] > 0.0)
@@ -180,31 +177,5 @@ def _nearest(time: Float[np.ndarray, " looks"], value: Float[np.ndarray, " looks
         fall = (distance[middle - 1] - distance[middle]) / before
         rise = (distance[middle + 1] - distance[middle]) / after
         vertex = time[middle] + 0.5 * (fall * after**2 - rise * before**2) / (fall * after + rise * before)
-    inside = (vertex > time[middle - 1]) & (vertex < time[middle + 1]) & (np.abs(vertex - time[middle]) > LOCATED)
+    inside = (vertex > time[middle - 1]) & (vertex < time[middle + 1]) & (np.abs(vertex - time[middle]) > CLOSEST)
     return vertex[inside]
-
-
-def _root(function: Callable[[Lanes], Lanes], low: Lanes, high: Lanes, at_low: Lanes, at_high: Lanes) -> Lanes:
-    """Zeros of a function of many numbers, one in each bracket (Anderson and Bjorck, BIT 13 (1973) 253).
-
-    **Arguments:** `low`, `high`: the brackets; `at_low`, `at_high`: the function there, of opposite signs.
-    """
-    guess = low
-    for trial in range(MOST_TRIALS if low.size else 0):
-        last, rise = guess, at_high - at_low
-        with np.errstate(all="ignore"):
-            guess = low - at_low * (high - low) / rise
-        # Where the function is not a number, and now and then to be sure, the bracket is halved.
-        halve = ~np.isfinite(guess) | (trial % 4 == 3)
-        guess = np.where(halve, 0.5 * (low + high), np.clip(guess, low, high))
-        if np.all(np.minimum(high - low, np.abs(guess - last)) <= LOCATED * np.maximum(high, 1.0)):
-            break
-        value = function(guess)
-        beyond = (value > 0.0) != (at_low > 0.0)
-        with np.errstate(all="ignore"):
-            fade_low, fade_high = 1.0 - value / at_high, 1.0 - value / at_low
-        fade_low, fade_high = (np.where(fade > 0.0, fade, 0.5) for fade in (fade_low, fade_high))
-        # The end that stays is given less weight, so that it moves too in the next trial.
-        at_low, at_high = np.where(beyond, at_low * fade_low, value), np.where(beyond, value, at_high * fade_high)
-        low, high = np.where(beyond, low, guess), np.where(beyond, guess, high)
-    return guess

@@ -2,12 +2,12 @@
 
 State, vectors in the ground's axes: position r of the rear axle, heading e, steering angle phi, quasi-momentum
 P = w sqrt(M_w) with w the speed of the front wheel and M_w its reduced mass, and the rate sg of the fork, phi' or, with
-a fork that turns with the frame, phi' + Omega. Then sin(phi) and cos(phi), which the field would otherwise spend four
-fifths of its time on; phi itself is for the spring, for inputs and to be read off, and goes on beyond pi. Then the work
+a fork that turns with the frame, phi' + Omega. Then sin(phi) and cos(phi), on which the field would otherwise spend four
+fifths of its time; phi itself is for the spring, for inputs and for output, and may exceed pi. Then the work
 [J] done so far by the inputs and by friction, where there are any. The energy P^2/2 + J_f sg^2/2 + V is quadratic in the
-state, V linear but for the spring, so the implicit midpoint rule keeps its balance exactly, and sin^2 + cos^2 too.
+state, V linear except for the spring, so the implicit midpoint rule keeps its balance exactly, and sin^2 + cos^2 too.
 Elsewhere that sum drifts with the errors of the steps. The velocities do not depend on it, except for the speed of the
-front wheel, so it is put right where a state is read off (`righted`), and not in the field.
+front wheel, so it is corrected where a state is read off (`righted`), and not in the field.
 """
 
 from typing import NamedTuple
@@ -30,7 +30,7 @@ from nonholonomic.geometry import (
     sum_vectors,
 )
 
-from .friction import AbstractFriction, Drag, Rolling
+from .friction import AbstractFriction, Drag, WheelMotion
 from .heading import AbstractHeading
 from .input import Input, Motion
 from .stroller import Stroller
@@ -39,7 +39,7 @@ State = Float[Array, "components ..."]
 
 
 class Geometry(NamedTuple):
-    """How a state stands and moves, before any force is known."""
+    """Position and motion of a state, before any force is known."""
 
     motion: Motion
     momentum: Float[Array, "..."]
@@ -66,7 +66,7 @@ class Forces(NamedTuple):
 
 
 class Power(NamedTuple):
-    """Power [W] through each port: of the drive and the steering torque, and of friction at each of its places."""
+    """Power [W] through each port: of the drive, of the steering torque, and of each kind of friction."""
 
     drive: Component
     steering: Component
@@ -98,7 +98,7 @@ class Dynamics(eqx.Module):
         return padded(state[:place]), padded(state[place:turned]), state[turned:]
 
     def righted(self, state: State) -> State:
-        """The state with sin^2 + cos^2 of the steering angle put right."""
+        """The state with sin^2 + cos^2 of the steering angle corrected to 1."""
         first = self.surface.axes + self.heading.axes(self.surface) + 3
         sine, cosine = state[first], state[first + 1]
         return state.at[first : first + 2].multiply(1.0 / jnp.sqrt(sine * sine + cosine * cosine))
@@ -151,13 +151,13 @@ class Dynamics(eqx.Module):
             front_load=multiply(normal_force, share),
         )
 
-    def forces(self, t: Float[Array, "..."], geometry: Geometry, input: Input | None) -> Forces:
-        """What drives and what brakes, at a time [s]."""
+    def forces(self, t: Float[Array, "..."], geometry: Geometry, controls: Input | None) -> Forces:
+        """The forces of input and friction at a time [s]."""
         motion = geometry.motion
-        drive, torque = (None, None) if input is None else input(t, motion)
+        drive, torque = (None, None) if controls is None else controls(t, motion)
         rear_load = subtract(geometry.normal_force, geometry.front_load)
         speeds = (motion.speed, motion.front_speed, motion.yaw_rate, motion.steering_rate)
-        return Forces(drive, torque, self.friction.drag(Rolling(*speeds, rear_load, geometry.front_load)))
+        return Forces(drive, torque, self.friction.drag(WheelMotion(*speeds, rear_load, geometry.front_load)))
 
     def fork_torque(self, geometry: Geometry, forces: Forces) -> Component:
         """All torque [N m] about the steering axis."""
@@ -176,10 +176,10 @@ class Dynamics(eqx.Module):
             fork=multiply(drag.steering, motion.steering_rate),
         )
 
-    def field(self, t: Float[Array, "..."], state: State, input: Input | None = None) -> State:
+    def field(self, t: Float[Array, "..."], state: State, controls: Input | None = None) -> State:
         """Rate of change of the state, (components, ...)."""
         body, g, e = self.body, self.geometry(state), self.unpack(state)[1]
-        forces = self.forces(t, g, input)
+        forces = self.forces(t, g, controls)
         drag, torque = forces.drag, self.fork_torque(g, forces)
         arm = g.sine / body.wheelbase
         weight = body.mass * self.gravity
@@ -201,7 +201,7 @@ class Dynamics(eqx.Module):
                 multiply(torque, 1.0 / body.steering_inertia),
                 multiply(g.cosine, turn),
                 multiply(-g.sine, turn),
-                *((power.drive, power.steering) if input is not None else ()),
+                *((power.drive, power.steering) if controls is not None else ()),
                 *((add(*power[2:]),) if self.friction.dissipates else ()),
             ),
             state,
@@ -225,7 +225,7 @@ class Dynamics(eqx.Module):
         return jnp.broadcast_to(multiply(1.0, self.geometry(state).normal_force), state[0].shape)
 
     def side_force(
-        self, t: Float[Array, "..."], state: State, input: Input | None
+        self, t: Float[Array, "..."], state: State, controls: Input | None
     ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Side forces [N] of the ground on the rear axle and on the front wheel, to the left of each.
 
@@ -238,10 +238,10 @@ class Dynamics(eqx.Module):
             motion = self.geometry(state).motion
             return motion.speed, motion.yaw_rate
 
-        rate = self.field(t, state, input)
+        rate = self.field(t, state, controls)
         (v, yaw), (v_rate, yaw_acceleration) = jax.jvp(speeds, (state,), (rate,))
         g = self.geometry(state)
-        forces = self.forces(t, g, input)
+        forces = self.forces(t, g, controls)
         weight, up = body.mass * self.gravity, self.up
         climb, bank = multiply(weight, dot(g.direction, up)), multiply(weight, dot(g.left, up))
         centre_along = subtract(v_rate, multiply(body.centre, yaw, yaw))
@@ -255,19 +255,19 @@ class Dynamics(eqx.Module):
             subtract(None, forces.drag.yaw),
         )
         front = g.cosine * spin / body.wheelbase - g.sine * along
-        # Curvature turns the frame as it is carried along, and the spin it has answers with a force across.
+        # Curvature turns the frame as it moves, and its spin reacts with a force across.
         carried = add(body.inertia * yaw, multiply(self.absolute, body.steering_inertia, g.fork_rate))
         gyration = multiply(self.surface.gaussian_curvature(g.motion.position), carried, v)
         across = subtract(add(body.mass * centre_across, bank), add(gyration, multiply(forces.drag.front, g.sine)))
         return across - front * g.cosine, front
 
     def projected_side_force(
-        self, t: Float[Array, "..."], state: State, input: Input | None
+        self, t: Float[Array, "..."], state: State, controls: Input | None
     ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Side forces [N] as `side_force`, for the projected heading on a curved ground: they act along the horizontal.
 
-        What the momentum lacks along d is -sin(phi) nu times the front force, what the spin lacks cos(phi) l times it;
-        together they give it without dividing by cos(phi). The rear force follows from the momentum across.
+        The missing momentum along d is -sin(phi) nu times the front force, the missing spin cos(phi) l times it; together
+        they give that force without dividing by cos(phi). The rear force follows from the momentum across.
         """
         body = self.body
 
@@ -275,9 +275,9 @@ class Dynamics(eqx.Module):
             g = self.geometry(state)
             return g.velocity, g.motion.yaw_rate
 
-        _, (acceleration, yaw_acceleration) = jax.jvp(moving, (state,), (self.field(t, state, input),))
+        _, (acceleration, yaw_acceleration) = jax.jvp(moving, (state,), (self.field(t, state, controls),))
         g = self.geometry(state)
-        forces = self.forces(t, g, input)
+        forces = self.forces(t, g, controls)
         drag, heading, arm = forces.drag, g.motion.heading, body.wheelbase
         left = cross(self.surface.up, heading)
         ahead = sum_vectors(scale(g.cosine, heading), scale(g.sine, left))
@@ -295,7 +295,7 @@ class Dynamics(eqx.Module):
 
 
 def padded(components: State) -> Vector:
-    """Components as a vector whose missing last ones vanish identically."""
+    """Components as a vector; missing last ones vanish identically."""
     vector = (*components, None, None)
     return vector[0], vector[1], vector[2]
 

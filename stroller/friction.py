@@ -12,7 +12,7 @@ from nonholonomic.geometry import Component
 from nonholonomic.validation import Bound, Bounded, as_number
 
 
-class Rolling(NamedTuple):
+class WheelMotion(NamedTuple):
     """How the stroller moves: speeds [m/s] at which the wheels roll, rates [rad/s], loads [N] on the axles.
 
     A load is `None` where it is exactly zero, as on the front axle with the centre of mass on the rear one.
@@ -38,18 +38,18 @@ class Drag(NamedTuple):
 class AbstractFriction(Bounded):
     """A friction law."""
 
-    #: Whether the law can take energy; the work of one that cannot is not recorded.
+    #: Whether the law can dissipate energy; the work of one that cannot is not recorded.
     dissipates: ClassVar[bool] = True
 
     @abc.abstractmethod
-    def drag(self, rolling: Rolling) -> Drag:
+    def drag(self, wheels: WheelMotion) -> Drag:
         """Forces and torques of friction.
 
         **Arguments:**
 
-        - `rolling`: a `Rolling`.
+        - `wheels`: a `WheelMotion`.
 
-        **Returns:** a `Drag`; a part is `None` where it vanishes identically.
+        **Returns:** a `Drag`; a component is `None` where it vanishes identically.
         """
 
 
@@ -58,7 +58,7 @@ class Frictionless(AbstractFriction):
 
     dissipates: ClassVar[bool] = False
 
-    def drag(self, rolling: Rolling) -> Drag:
+    def drag(self, wheels: WheelMotion) -> Drag:
         return Drag()
 
 
@@ -82,19 +82,19 @@ class Damping(AbstractFriction):
         for name in ("rolling", "front", "scrub", "steering"):
             yield Bound(getattr(self, name), name, at_least=0.0)
 
-    def drag(self, rolling: Rolling) -> Drag:
+    def drag(self, wheels: WheelMotion) -> Drag:
         return Drag(
-            rear=-self.rolling * rolling.rear_speed,
-            front=-self.front * rolling.front_speed,
-            yaw=-self.scrub * rolling.yaw_rate,
-            steering=-self.steering * rolling.steering_rate,
+            rear=-self.rolling * wheels.rear_speed,
+            front=-self.front * wheels.front_speed,
+            yaw=-self.scrub * wheels.yaw_rate,
+            steering=-self.steering * wheels.steering_rate,
         )
 
 
 class RollingResistance(AbstractFriction):
     """Rolling resistance F = -c N tanh(v / v_s) of each axle under its load N (`stroller.md`, section 7).
 
-    The regularisation creeps: a stroller on a slope too gentle to overcome the resistance does not stop, it goes on at
+    The regularisation creeps: a stroller on a slope too gentle to overcome the resistance does not stop but goes on at
     a speed of the order of v_s. An axle off the ground has no resistance.
 
     **Arguments:**
@@ -110,10 +110,10 @@ class RollingResistance(AbstractFriction):
         yield Bound(self.coefficient, "coefficient", at_least=0.0)
         yield Bound(self.speed, "speed", above=0.0)
 
-    def drag(self, rolling: Rolling) -> Drag:
+    def drag(self, wheels: WheelMotion) -> Drag:
         return Drag(
-            rear=self.resistance(rolling.rear_load, rolling.rear_speed),
-            front=self.resistance(rolling.front_load, rolling.front_speed),
+            rear=self.resistance(wheels.rear_load, wheels.rear_speed),
+            front=self.resistance(wheels.front_load, wheels.front_speed),
         )
 
     def resistance(self, load: Component, speed: Float[Array, "..."]) -> Component:

@@ -1,8 +1,8 @@
-"""Two readings of "the wheels do not slip sideways" on a curved ground; on a plane they are one.
+"""Two readings of "the wheels do not slip sideways" on a curved ground; on a plane they are the same.
 
 Both say that the rear axle moves with the velocity w cos(phi) d and that the heading turns at the rate
 w nu sin(phi) / l, with w the one free speed of the motion. They differ in the direction d, in the factor nu, and in
-what it is that turns.
+what turns.
 """
 
 import abc
@@ -25,9 +25,9 @@ class AbstractHeading(eqx.Module):
 
     @abc.abstractmethod
     def unit(self, heading: Vector, normal: Vector) -> Vector:
-        """The heading put right where an integration has made it drift off the ground or off unit length.
+        """The heading corrected for a drift off the ground or off unit length.
 
-        A right one stays as it is, and so does the rate at which it turns.
+        An exact one stays as it is, and so does the rate at which it turns.
         """
 
     @abc.abstractmethod
@@ -109,7 +109,7 @@ class Projected(AbstractHeading):
         return multiply(side, normal[2])
 
     def rate(self, heading: Vector, normal: Vector, normal_rate: Vector, turn: Component, side: float) -> Vector:
-        # The driver's left is to the left as seen from above on either side, as the paper's equations have it.
+        # The driver's left is to the left as seen from above on either side, as in the paper's equations.
         return cross(scale(turn, VERTICAL), heading)
 
     def at_angle(self, angle: Float[Array, "..."], east: Vector, north: Vector) -> Vector:

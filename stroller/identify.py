@@ -1,4 +1,4 @@
-"""Numbers of a stroller, its ground and its launch from a recorded ride."""
+"""Parameters of a stroller, its ground and its launch from a recorded ride."""
 
 from typing import Any
 
@@ -50,12 +50,12 @@ class Recording(eqx.Module):
 
     @property
     def measurements(self) -> Measurements:
-        """The samples as a likelihood takes them."""
+        """The samples as `Measurements`."""
         return samples(self.value, self.error)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What to call each sample."""
+        """A label for each sample."""
         return sample_labels(self.times, QUANTITIES[self.quantity])
 
     def predict(self, scene: Scene, values: dict[str, Array], tolerance: float) -> Float[Array, "rows n"]:
@@ -77,7 +77,7 @@ class Recording(eqx.Module):
 
 
 class SceneModel(eqx.Module):
-    """Predictions of all recordings of a scene, as `nonholonomic.identification.identify` wants them."""
+    """Predictions of all recordings of a scene, in the form that `nonholonomic.identification.identify` expects."""
 
     scene: Scene
     data: tuple[Recording, ...]
@@ -99,21 +99,21 @@ def identify(
     max_steps: int = 60,
     progress: bool = True,
 ) -> Identification:
-    """Numbers of a scene and its launch from recorded rides, with their errors and with what is left open.
+    """Parameters of a scene and its launch from recorded rides, with their errors and with what is not determined.
 
     **Arguments:**
 
     - `scene`: a `Scene`; what is not free is taken from it.
     - `data`: a `Recording`, or a list of several to be fitted together.
-    - `free`: path of a number -> a `Free` or only the value from which to start: `"scene.friction.rolling"`, or
-      `"rolling"` where nothing else ends so; `"launch.place[0]"` and `"launch.place[1]"` are parts of the place. A number
-      of the launch is the same in all recordings. Numbers that cannot be negative are fitted in their logarithms.
+    - `free`: full name of a parameter -> a `Free` or only the value from which to start: `"scene.friction.rolling"`, or
+      `"rolling"` where nothing else ends so; `"launch.place[0]"` and `"launch.place[1]"` are parts of the place. A parameter
+      of the launch is the same in all recordings. Parameters that cannot be negative are fitted in their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `tolerance`: relative tolerance of the integration.
 
     **Returns:** an `Identification`.
 
-    **Raises:** `ValueError` for arguments out of range or an unknown path; `ImportError` if Optimistix is not installed.
+    **Raises:** `ValueError` for arguments out of range or an unknown name.
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
@@ -124,7 +124,7 @@ def identify(
     for one in data:
         scene.check(one.launch)
     roots = {"scene": scene, "launch": data[0].launch}
-    known = [path for root, tree in roots.items() for path in numbers(root, tree)] + list(PLACES)
+    known = [name for root, tree in roots.items() for name in numbers(root, tree)] + list(PLACES)
     unknowns = generic.free_numbers(free, roots, known, replaced)
     measurements, labels = generic.joined(data)
     return generic.identify(

@@ -1,7 +1,7 @@
 """What drives the stroller: a function of time and motion that gives the drive force and the steering torque.
 
-Any function `(t, motion) -> (force, torque)` will do. It is called with arrays of any shape, one number per lane, so it
-is to be written with `jax.numpy` and without `if`. One that is an `equinox.Module` may hold numbers to differentiate.
+Any function `(t, motion) -> (force, torque)` will do. It is called with arrays of any shape, one number per lane, so
+write it with `jax.numpy` and without `if`. An `equinox.Module` may hold numbers to differentiate by.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,7 +15,7 @@ from nonholonomic.validation import Bound, Bounded, as_number
 
 
 class Motion(NamedTuple):
-    """What an input may know of the stroller's state.
+    """What an input may use of the stroller's state.
 
     `position` [m] of the rear axle and `heading` [1], a unit vector, are tuples of components in the ground's axes, the
     third `None` on a plane; `steering` [rad], `speed` [m/s] of the rear axle, `front_speed` [m/s] at which the front

@@ -10,7 +10,7 @@ from nonholonomic.validation import Bound, Bounded, as_number
 
 
 def as_pair(value: Any) -> Any:
-    """A pair of numbers as a tuple of arrays; what is not a pair is left for the check."""
+    """A pair of numbers as a tuple of arrays; anything else is left for the check."""
     try:
         first, second = value
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""One ride integrated by Diffrax, with derivatives of its own."""
+"""One ride integrated by Diffrax, with its own derivatives."""
 
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from .scene import Scene
 from .table import RideProblem
 from .trajectory import Stats
 
-#: Directions whose variations run along together with a ride.
+#: Directions whose variations are integrated together with a ride.
 TOGETHER = 4
 
 #: Scene, launch and input.
@@ -27,24 +27,24 @@ Given = tuple[Scene, Launch, Input | None]
 
 
 class Settings(NamedTuple):
-    """How a ride is integrated: the solver, the most steps, and how Diffrax differentiates, `None` if it does not."""
+    """How a ride is integrated: the solver, the maximum number of steps, and Diffrax's adjoint, if any."""
 
     solver: diffrax.AbstractSolver
     max_steps: int
     adjoint: diffrax.AbstractAdjoint | None
 
 
-def is_closed(input: Input | None, scene: Scene, launch: Launch) -> bool:
+def is_closed(controls: Input | None, scene: Scene, launch: Launch) -> bool:
     """Whether an input is a module, or a function that holds no number that is being differentiated or batched."""
-    if input is None or isinstance(input, eqx.Module):
+    if controls is None or isinstance(controls, eqx.Module):
         return True
-    closed = jax.make_jaxpr(input)(*_example(scene, launch))
+    closed = jax.make_jaxpr(controls)(*_example(scene, launch))
     return not any(is_traced(constant) for constant in closed.consts)
 
 
-def opened(input: Any, scene: Scene, launch: Launch) -> Input:
+def opened(controls: Any, scene: Scene, launch: Launch) -> Input:
     """A function as a module, whose leaves are the numbers that the function holds."""
-    return eqx.filter_closure_convert(input, *_example(scene, launch))
+    return eqx.filter_closure_convert(controls, *_example(scene, launch))
 
 
 def _example(scene: Scene, launch: Launch) -> tuple[Any, Any]:
@@ -85,7 +85,7 @@ def differentiable_ride(
     question = RideQuestion(len(leaves), structure, rest, settings, grid)
     states, watch, counts = ask(question, *leaves, jax.lax.stop_gradient(times), t1, tolerance)
     steps, rejected, finished = counts
-    # Later by a moment, the state is further by as much along the field.
+    # A small delay moves the state along the field.
     rates = jax.lax.stop_gradient(jax.vmap(RideProblem.single(*given).field, (0, 1), 1)(times, states))
     later = times - jax.lax.stop_gradient(times)
     states = states + jnp.where(jnp.isfinite(rates), rates * later, 0.0)
@@ -148,7 +148,7 @@ def _follow(
     tolerance: Float[Array, ""],
     settings: Settings,
 ) -> tuple[State, Watch, Stats]:
-    """Integrate a problem, or one made of it whose state goes on behind; of equal `parts` the one that errs most counts."""
+    """Integrate a problem, or one whose state continues its own; of equal `parts` the one with the largest error counts."""
     start, scales = whole.start()
     size = len(problem.states)
 

@@ -22,7 +22,7 @@ SIDES = {"outside": 1.0, "inside": -1.0}
 FORKS = {"relative": None, "absolute": 1.0}
 HEADINGS = {"intrinsic": Intrinsic(), "projected": Projected()}
 
-#: Cosine of the steering angle, or of the slope, below which a start cannot be told from one at a right angle.
+#: Cosine of the steering angle, or of the slope, below which a start cannot be distinguished from a right angle.
 RIGHT_ANGLE = 1e-9
 
 
@@ -33,7 +33,7 @@ def require_word(word: Any, name: str, words: dict[str, Any]) -> None:
 
 
 def _holds_somewhere(condition: Any) -> bool:
-    """Whether a condition holds anywhere; not for one that is traced."""
+    """Whether a concrete condition holds anywhere; false for a traced one."""
     return not is_traced(condition) and bool(np.any(condition))
 
 
@@ -53,7 +53,7 @@ class Scene(Bounded):
     - `fork`: "relative" if the fork's inertia resists the steering rate phi' alone, "absolute" if it resists its whole
       rate phi' + Omega about the steering axis, as a rigid fork does.
     - `heading`: "intrinsic", or "projected" to reproduce the paper, which constrains the horizontal projection of the
-      velocities (`stroller.md`, section 3, tells why that is not the default).
+      velocities (`stroller.md`, section 3, says why that is not the default).
 
     **Raises:** `ValueError` if a part is of the wrong kind, a word is not one of these, or a number is out of range.
     """
@@ -114,14 +114,14 @@ class Scene(Bounded):
             )
 
     def start_bounds(self, launch: Launch) -> Iterator[Bound]:
-        """The ranges that the scene sets to a launch."""
+        """The ranges that the scene sets for a launch."""
         if not isinstance(self.surface, Plane):
             limit = math.pi / 2.0 + 1e-12
             why = "reduced latitude, from -pi/2 to pi/2"
             yield Bound(launch.place[1], "place[1]", at_least=-limit, at_most=limit, why=why)
 
     def sideways(self, launch: Launch) -> Any:
-        """Whether a launch has speed although its front wheel stands across; concrete for a concrete launch."""
+        """Whether a launch has speed although its front wheel is at a right angle; concrete for a concrete launch."""
         steering, speed = launch.steering, launch.speed
         of = jnp if is_traced(steering) or is_traced(speed) else np
         return (of.abs(of.cos(of.asarray(steering))) < RIGHT_ANGLE) & (of.asarray(speed) != 0.0)
@@ -134,7 +134,7 @@ class Scene(Bounded):
         return of.abs(of.sin(of.asarray(launch.place[1]))) < RIGHT_ANGLE
 
     def may_start(self, launch: Launch, *others: Any) -> Bool[Array, ""]:
-        """Whether the numbers of the scene, a launch and other modules are legal, for what `check` could not look at."""
+        """Whether the numbers of the scene, a launch and other modules are legal, for those that `check` could not see."""
         own = [bound for module in (self, launch, *others) for bound in all_bounds(module)]
         stuck = jnp.asarray(self.sideways(launch) | self.level(launch))
         return jnp.all(legal([*own, *self.start_bounds(launch)]) & ~stuck)

@@ -20,7 +20,7 @@ from .ride import Settings, differentiable_ride, is_closed, opened, ride
 from .scene import Scene
 from .trajectory import Trajectory, read_off
 
-#: How many times are saved where none are asked for.
+#: How many times are saved if none are asked for.
 DEFAULT_TIMES = 201
 
 
@@ -48,10 +48,10 @@ def simulate(
     - `solver`: any Diffrax solver, by default `diffrax.Dopri8()`, or an `ImplicitMidpoint`.
     - `max_steps`: a run that needs more has failed.
     - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
-      number; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax differentiates, which pays where a loss is
-      differentiated by many numbers, as by the weights of an input.
+      parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax differentiates, which pays if a loss
+      is differentiated by many parameters, such as the weights of an input.
 
-    **Returns:** a `Trajectory`; its `status` tells whether the run came to its end and what it met on the way.
+    **Returns:** a `Trajectory`; its `status` says whether the run reached its end and what happened on the way.
 
     **Raises:** `ValueError` for a launch that the scene cannot start from, or times that are not increasing.
     """
@@ -79,13 +79,13 @@ def simulate(
     return _legal_or_nan(scene, launch, input, steering, times, end, as_number(tolerance), grid, settings, recipe)
 
 
-# Compiled as a whole also where a bare `vmap` or `grad` would take it operation by operation.
+# Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
-def _legal_or_nan(scene, launch, input, steering, times, end, tolerance, grid, settings, recipe) -> Trajectory:
-    """The run, or not a number and `finished` false where a traced number is out of range."""
-    may = scene.may_start(launch, input) & jnp.all(legal([*run_bounds(end, tolerance), *times_bounds(times, end)]))
+def _legal_or_nan(scene, launch, controls, steering, times, end, tolerance, grid, settings, recipe) -> Trajectory:
+    """The run, or NaN and `finished` false where a traced number is out of range."""
+    may = scene.may_start(launch, controls) & jnp.all(legal([*run_bounds(end, tolerance), *times_bounds(times, end)]))
     may &= jnp.all(jnp.diff(times) > 0.0)
-    # Steps of illegal numbers might never reach the end, so they are not begun; those of a given length do.
+    # A run of illegal numbers might never reach its end, so it is not begun, unless its steps have a given length.
     begins = may | (grid is not None)
     end, run_times = jnp.where(begins, end, 0.0), jnp.where(begins, times, 0.0)
     solve = differentiable_ride if settings.adjoint is None else ride

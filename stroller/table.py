@@ -1,4 +1,4 @@
-"""Many rides in one batched call: every combination of some numbers of scene, launch and input."""
+"""Many rides in one batched call: every combination of some parameters of scene, launch and input."""
 
 import dataclasses
 from typing import Any
@@ -69,22 +69,22 @@ class RideProblem(AbstractProblem):
     watched: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, scene: Scene, launch: Launch, input: Input | None, cells: int, watched: bool) -> "RideProblem":
+    def of(cls, scene: Scene, launch: Launch, controls: Input | None, cells: int, watched: bool) -> "RideProblem":
         """The problem of the given number of cells; every number is a scalar or one per cell."""
 
         def spread(states):
             return jnp.broadcast_to(states.reshape(states.shape[0], -1), (states.shape[0], cells))
 
-        one = cls.single(scene, launch, input)
+        one = cls.single(scene, launch, controls)
         watched = watched and not isinstance(scene.surface, Plane)
         return dataclasses.replace(one, states=spread(one.states), scales=spread(one.scales), watched=watched)
 
     @classmethod
-    def single(cls, scene: Scene, launch: Launch, input: Input | None) -> "RideProblem":
+    def single(cls, scene: Scene, launch: Launch, controls: Input | None) -> "RideProblem":
         """The problem of one ride, which goes on where contact is lost."""
-        driven = input is not None
+        driven = controls is not None
         press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
-        return cls(scene.dynamics, input, scene.state(launch, driven), scene.scales(launch, driven), press, False)
+        return cls(scene.dynamics, controls, scene.state(launch, driven), scene.scales(launch, driven), press, False)
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
@@ -110,14 +110,14 @@ def sweep(
     solver: diffrax.AbstractERK | None = None,
     path: Any = None,
 ) -> Table:
-    """The ends of all rides over a grid of numbers, in one batched call on all cores.
+    """The ends of all rides over a grid of parameters, in one batched call on all cores.
 
     **Arguments:**
 
     - `scene`, `launch`, `input`: as for `simulate`, every number a scalar.
     - `t1`: end of every ride [s].
-    - `axes`: path of a number -> values, such as `{"launch.speed": [1.0, 2.0], "scene.surface.polar": [0.8, 0.9]}`; the
-      parts of the place are `"launch.place[0]"` and `"launch.place[1]"`, the numbers of an input that is a module are
+    - `axes`: full name of a parameter -> values, such as `{"launch.speed": [1.0, 2.0], "scene.surface.polar": [0.8, 0.9]}`; the
+      parts of the place are `"launch.place[0]"` and `"launch.place[1]"`, the parameters of an input that is a module are
       under `"input."`. The first axis varies slowest.
     - `tolerance`: relative tolerance of the integration.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
@@ -141,7 +141,7 @@ def sweep(
     grid = named_axes(axes, isinstance(scene.surface, Plane))
     # The modules check every value of every axis here, before anything compiles.
     for one in grid:
-        changed = replaced(roots, {one.path: one.values})
+        changed = replaced(roots, {one.number: one.values})
         changed["scene"].check(changed["launch"])
 
     def march(cells: dict[str, Any], size: int, count: int, watched: bool) -> tuple[RideProblem, Any]:
@@ -169,7 +169,7 @@ def sweep(
     request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
     request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
     request |= {"solver": type(solver).__name__, "input": "none" if input is None else described(input)}
-    request |= {one.path: "an axis" for one in grid}
+    request |= {one.number: "an axis" for one in grid}
     return grids.sweep(run, grid, VARIABLES, request, path=path)
 
 
@@ -192,30 +192,30 @@ def read_ends(scene: Scene, states: State, starts: State) -> dict[str, Float[Arr
 
 
 def named_axes(axes: dict[str, Any], flat: bool) -> list[Axis]:
-    """The axes of the table, each under the last part of its path, or the last two where that is not enough."""
-    lasts = [path.rsplit(".", 1)[-1] for path in axes]
+    """The axes of the table, each under the last part of its full name, or the last two where that is not enough."""
+    lasts = [number.rsplit(".", 1)[-1] for number in axes]
     grid = []
-    for path, last in zip(axes, lasts, strict=True):
+    for number, last in zip(axes, lasts, strict=True):
         name, unit = last, UNITS.get(last, "1")
-        if path in PLACES:
-            name, unit = PLACES[path][0 if flat else 1], "m" if flat else "rad"
+        if number in PLACES:
+            name, unit = PLACES[number][0 if flat else 1], "m" if flat else "rad"
         elif lasts.count(last) > 1 or last in VARIABLES:
-            name = "_".join(path.split(".")[-2:])
-        if path.endswith("steering"):
-            unit = "N m s" if "friction" in path else "rad"
-        grid.append(axis(name, path, unit, axes[path]))
+            name = "_".join(number.split(".")[-2:])
+        if number.endswith("steering"):
+            unit = "N m s" if "friction" in number else "rad"
+        grid.append(axis(name, number, unit, axes[number]))
     return grid
 
 
 def replaced(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """Scene, launch and input with some of their numbers replaced."""
-    place = [values.get(path, part) for path, part in zip(PLACES, roots["launch"].place, strict=True)]
+    """Scene, launch and input with some of their parameters replaced."""
+    place = [values.get(number, part) for number, part in zip(PLACES, roots["launch"].place, strict=True)]
     roots = roots | {"launch": dataclasses.replace(roots["launch"], place=tuple(place))}
-    return with_numbers(roots, {path: one for path, one in values.items() if path not in PLACES})
+    return with_numbers(roots, {number: one for number, one in values.items() if number not in PLACES})
 
 
-def described(input: Any) -> Any:
-    """An input as plain data; a function can only be told by its name."""
-    if isinstance(input, eqx.Module):
-        return description("input", input)
-    return getattr(input, "__qualname__", repr(input))
+def described(controls: Any) -> Any:
+    """An input as plain data; a function has nothing but its name to show."""
+    if isinstance(controls, eqx.Module):
+        return description("input", controls)
+    return getattr(controls, "__qualname__", repr(controls))

@@ -22,7 +22,7 @@ CONTACT_ROUND_OFF = 1e-12
 
 
 class Stats(NamedTuple):
-    """Numbers of accepted and rejected steps, and whether the integration came to its end."""
+    """Numbers of accepted and rejected steps, and whether the integration reached its end."""
 
     steps: Int[Array, ""]
     rejected: Int[Array, ""]
@@ -30,7 +30,7 @@ class Stats(NamedTuple):
 
 
 class Trajectory(eqx.Module):
-    """A run, at the times asked for. Times are the first axis of every array.
+    """A run at the given times. Times are the first axis of every array.
 
     - `t` [s]; `place`: (x, y) [m] or (mu, eta) [rad], (times, 2); `position` [m] in the fixed frame, z up, (times, 3);
     - `heading` [rad], as in `Launch`; `direction`: the same as a unit vector in the fixed frame, (times, 3);
@@ -69,7 +69,7 @@ class Trajectory(eqx.Module):
 
     @property
     def energy_residual(self) -> Float[Array, " times"]:
-        """Energy less its start and the work done since [J]: zero for an exact solution."""
+        """Energy minus its start and the work done since [J]: zero for an exact solution."""
         return self.energy - self.energy[0] - (self.work - self.work[0])
 
     def grip(self) -> Float[Array, "times 2"]:
@@ -83,14 +83,14 @@ class Trajectory(eqx.Module):
 
     @property
     def contact_lost_at(self) -> float:
-        """Time [s] at which the ground first has to pull to keep the stroller on it; infinite if it never has to."""
+        """Time [s] at which the ground first has to pull to keep the stroller on it; infinite if it never does."""
         force = np.asarray(self.watch.normal_force)
         allowed = -CONTACT_ROUND_OFF * np.max(np.abs(force[np.isfinite(force)]), initial=0.0)
         return self._first_below("normal_force", allowed)
 
     @property
     def rank_lost_at(self) -> float:
-        """Time [s] at which the constraints first lose rank, which only a projected heading can do; else infinite."""
+        """Time [s] at which the constraints first lose rank, as only a projected heading can; otherwise infinite."""
         return self._first_below("rank", RANK_LOST)
 
     @property
@@ -171,12 +171,12 @@ def spread(component: Component, like: Float[Array, "..."]) -> Float[Array, "...
 
 
 def side_force(
-    scene: Scene, t: Float[Array, " times"], states: Float[Array, "components times"], input: Input | None
+    scene: Scene, t: Float[Array, " times"], states: Float[Array, "components times"], controls: Input | None
 ) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
     """Side forces [N] on the rear axle and the front wheel, to the left of each."""
     if scene.heading == "intrinsic" or isinstance(scene.surface, Plane):
-        return scene.dynamics.side_force(t, states, input)
-    return scene.dynamics.projected_side_force(t, states, input)
+        return scene.dynamics.side_force(t, states, controls)
+    return scene.dynamics.projected_side_force(t, states, controls)
 
 
 @eqx.filter_jit
@@ -188,14 +188,14 @@ def read_off(
     stats: Stats,
 ) -> Trajectory:
     """The trajectory of the given states at the given times."""
-    scene, input, _ = recipe.parts
+    scene, controls, _ = recipe.parts
     dynamics, surface = scene.dynamics, scene.surface
     integrated, states = states, scene.dynamics.righted(states)
     g = dynamics.geometry(states)
     motion, like = g.motion, states[0]
     place = surface.place_at(motion.position)
     _, east, north = surface.chart(place)
-    power = dynamics.power(g, dynamics.forces(t, g, input))
+    power = dynamics.power(g, dynamics.forces(t, g, controls))
     normal_force = spread(g.normal_force, like)
     front_load = spread(g.front_load, like)
 
@@ -216,10 +216,10 @@ def read_off(
         energy=scene.energy(states),
         work=scene.work(states),
         power=Power(*(spread(part, like) for part in power)),
-        side_force=columns(*side_force(scene, t, states, input)),
+        side_force=columns(*side_force(scene, t, states, controls)),
         normal_force=normal_force,
         load=columns(normal_force - front_load, front_load),
-        constraint=columns(*side_slip(scene, dynamics.field(t, states, input), states)),
+        constraint=columns(*side_slip(scene, dynamics.field(t, states, controls), states)),
         departure=spread(surface.departure(motion.position), like),
         state=integrated.T,
         watch=watch,

@@ -2,6 +2,8 @@
 
 import ast
 import re
+import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -163,6 +165,23 @@ def test_private_modules_and_names_stay_in_their_rooms():
         return any(part.startswith("_") and not part.endswith("__") for part in parts)
 
     assert [str(arrow) for arrow in ALL_ARROWS if private(arrow) and room(arrow.file) != room(arrow.module)] == []
+
+
+def test_what_is_imported_at_once_is_required():
+    """Extras may be imported inside functions only: without them the packages must load."""
+    required = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    known = {re.split(r"[^\w-]", requirement)[0] for requirement in required}
+    # JAX brings jaxlib along.
+    known |= {"jaxlib", *sys.stdlib_module_names, *PACKAGES}
+    imported = set()
+    for file in files(*PACKAGES):
+        for node, asked in statements(ast.parse((ROOT / file).read_text())):
+            if not asked and isinstance(node, ast.Import):
+                imported |= {name.name.split(".")[0] for name in node.names}
+            elif not asked and not node.level:
+                imported.add(node.module.split(".")[0])
+    assert {"jax", "numpy"} <= imported
+    assert imported - known == set()
 
 
 def test_no_file_is_long():

@@ -11,7 +11,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr
 import stroller
 import tippe
 from stroller.table import RideProblem
-from tippe.trajectory import Run
+from tippe.trajectory import TrajectoryProblem
 
 #: 16 to 44 ns for each number on a CPU, where a product takes one.
 SLOW = {"sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2", "expm1"}
@@ -59,7 +59,7 @@ LAWS = (
 def test_fields_of_the_top(arena, law):
     """The lean one, and that of a trajectory with its path and its spin angle."""
     scene, launch = tippe.Scene(rutstam_top(), arena, law), tippe.Launch(0.3, 100.0, eta=0.0)
-    run, dynamics = Run.of(scene, launch), scene.dynamics
+    run, dynamics = TrajectoryProblem.of(scene, launch), scene.dynamics
     assert slow_in(dynamics.field, scene.state(launch)) == set()
     assert slow_in(run.field, jnp.zeros(()), run.start()[0]) == set()
     assert slow_in(dynamics.contact_margin, scene.state(launch)) == set()
@@ -78,9 +78,9 @@ def test_fields_of_the_stroller(ground, friction, spring, heading):
     launch = stroller.Launch((0.3, 0.5), 0.5, 1.5, 0.2, 0.1)
     allowed = {"tanh"} if isinstance(friction, stroller.RollingResistance) else set()
     dynamics, pushed = scene.dynamics, stroller.Steady(1.0, 0.1)
-    for input in (None, pushed):
-        state = scene.state(launch, input is not None)
-        assert slow_in(lambda t, state, input=input: dynamics.field(t, state, input), 0.0, state) == allowed
+    for controls in (None, pushed):
+        state = scene.state(launch, controls is not None)
+        assert slow_in(lambda t, state, controls=controls: dynamics.field(t, state, controls), 0.0, state) == allowed
     problem = RideProblem.of(scene, launch, None, 1, watched=True)
     states = problem.start()[0]
     assert slow_in(problem.field, jnp.zeros(1), states) == allowed

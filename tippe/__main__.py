@@ -30,26 +30,26 @@ SAMPLES = 1500
 
 def parser() -> argparse.ArgumentParser:
     """The options of the main job; the defaults are the declared top and the papers' launches."""
-    told = argparse.ArgumentParser(
+    command = argparse.ArgumentParser(
         prog="python -m tippe",
         description="Inversion times of a tippe top inside a cylinder (the paper's Tables 2 and 3) and on the plane. "
         "Prints them beside the printed ones, writes an HDF5 table for each arena and a picture of theta(t).",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    top = told.add_argument_group("the top (the paper's Table 1 lost its numbers: these are Rutstam's)")
+    top = command.add_argument_group("the top (the paper's Table 1 lost its numbers: these are Rutstam's)")
     top.add_argument("--mass", type=float, default=0.02, help="mass [kg]")
     top.add_argument("--radius", type=float, default=0.02, help="radius R of the sphere [m]")
     top.add_argument("--offset", type=float, default=0.006, help="distance of the centre of mass from the centre [m]")
     top.add_argument("--I1", type=float, help="transverse moment of inertia [kg m^2] (default: 131/350 m R^2)")
     top.add_argument("--I3", type=float, help="axial moment of inertia [kg m^2] (default: 2/5 m R^2)")
-    scene = told.add_argument_group("the scene")
+    scene = command.add_argument_group("the scene")
     scene.add_argument("--cylinder-radius", type=float, default=0.3, help="radius of the cylinder [m]")
     scene.add_argument(
         "--mu", type=float, default=0.3, help="friction: viscous [s/m], or Coulomb [1] with --slip-speed"
     )
     scene.add_argument("--slip-speed", type=float, help="regularised Coulomb friction with this slip speed [m/s]")
     scene.add_argument("--gravity", type=float, default=9.81, help="acceleration of free fall [m/s^2]")
-    launch = told.add_argument_group("the launches")
+    launch = command.add_argument_group("the launches")
     launch.add_argument(
         "--theta", type=float, nargs="+", default=list(paper.THETAS), help="inclinations theta(0) [rad]"
     )
@@ -58,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
     launch.add_argument(
         "--spin", type=float, help="spin w3 at the start [rad/s] instead of --beta1; --spin=-100 if negative"
     )
-    run = told.add_argument_group("the run")
+    run = command.add_argument_group("the run")
     run.add_argument("--t1", type=float, default=60.0, help="horizon [s]")
     run.add_argument("--angle", type=float, default=0.95 * math.pi, help="angle that counts as inverted [rad]")
     run.add_argument("--tolerance", type=float, default=1e-9, help="relative tolerance of the integration")
@@ -68,7 +68,7 @@ def parser() -> argparse.ArgumentParser:
         default=Path("tippe-out"),
         help="folder for the tables and the picture; another run needs another",
     )
-    return told
+    return command
 
 
 def scenes(options: argparse.Namespace) -> dict[str, Scene]:

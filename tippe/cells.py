@@ -1,4 +1,4 @@
-"""How the cells of a table are run: the kinds of runs that scenes have, and what each finds."""
+"""How the cells of a table are run: the kinds of scene, and the variables of each."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -33,8 +33,8 @@ from .scene import Scene
 from .sensitivities import slopes_of_cells
 
 
-class Kind(NamedTuple):
-    """A kind of runs: the words of its status, what is counted besides steps, and through which phases the runs go.
+class Driver(NamedTuple):
+    """How the runs of a kind of scene go: the words of their status, what is counted besides steps, and the phases.
 
     `phases` takes (scene, problem, tolerance, last) and gives the phases and the number of each cell's first; `None` for runs
     of one smooth motion.
@@ -61,31 +61,31 @@ class Kind(NamedTuple):
 _jams = eqx.filter_jit(lambda dynamics, state: dynamics.jams(state))
 
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed")
-SMOOTH = Kind(WORDS, (), None)
-STICK_SLIP = Kind((*WORDS, "unresolved"), ("sticks",), stick_slip_phases)
-HYBRID = Kind((*WORDS, "unresolved"), ("hops",), hybrid_phases)
+SMOOTH = Driver(WORDS, (), None)
+STICK_SLIP = Driver((*WORDS, "unresolved"), ("sticks",), stick_slip_phases)
+HYBRID = Driver((*WORDS, "unresolved"), ("hops",), hybrid_phases)
 
-#: Which word a run's status is, where it has not inverted; `not_inverted` for all others.
+#: The word for a run's status if it has not inverted; `not_inverted` for all others.
 WORD_OF_STATUS = {GUARD_LOST: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
 
 
-def kind_of(scene: Scene) -> Kind:
-    """The kind of a scene's runs."""
+def driver_of(scene: Scene) -> Driver:
+    """The driver for a scene."""
     if scene.friction.set_valued:
         return STICK_SLIP
     return HYBRID if scene.contact == "hybrid" else SMOOTH
 
 
-class Runs(NamedTuple):
+class CellRuns(NamedTuple):
     """What is asked of every cell of a table; see `inversion_table`."""
 
-    kind: Kind
+    driver: Driver
     t1: float
     angle: float
     crossing: str
     solver: diffrax.AbstractERK
     method: str
-    paths: list[str]
+    slopes_by: list[str]
 
     @property
     def times(self) -> tuple[str, ...]:
@@ -100,37 +100,37 @@ class Runs(NamedTuple):
     @property
     def variables(self) -> dict[str, Variable]:
         """The table's variables, but errors and derivatives."""
-        return {name: Variable("s", np.float64) for name in self.times} | self.kind.variables
+        return {name: Variable("s", np.float64) for name in self.times} | self.driver.variables
 
     def results(self, roots: dict[str, Any], columns: dict[str, Any], tolerance: float, count: int) -> dict[str, Any]:
         """The variables of some cells.
 
-        **Arguments:** `roots`: scene and launch; `columns`: path of a number -> its value in every cell, the first `count`
-        of which are to be run; `tolerance`: relative tolerance.
+        **Arguments:** `roots`: scene and launch; `columns`: full name of a parameter -> its value in every cell, of which the
+        first `count` are to be run; `tolerance`: relative tolerance.
         """
         cells = with_numbers(roots, columns)
         scene, launch = cells["scene"], cells["launch"]
         size = next((len(values) for values in columns.values()), 1)
         problem = InversionProblem.of(scene, launch, self.angle, size)
-        if self.kind.phases is not None:
+        if self.driver.phases is not None:
             return self._travelled(scene, problem, tolerance, count)
-        if not self.paths:
+        if not self.slopes_by:
             return self._named(scene, problem, self._outcome(problem, tolerance, count))
         options = {"count": count, "size": size, "solver": self.solver, "last": self.last}
-        outcome, slopes = slopes_of_cells(roots, columns, self.paths, self.angle, self.t1, tolerance, **options)
+        outcome, slopes = slopes_of_cells(roots, columns, self.slopes_by, self.angle, self.t1, tolerance, **options)
         return self._named(scene, problem, outcome) | slopes
 
     def _travelled(self, scene: Scene, problem: InversionProblem, tolerance: float, count: int) -> dict[str, Any]:
         """The variables of cells whose runs have phases."""
 
         def journey(last: bool) -> Journey:
-            assert self.kind.phases is not None
-            phases, first = self.kind.phases(scene, problem, tolerance, last)
+            assert self.driver.phases is not None
+            phases, first = self.driver.phases(scene, problem, tolerance, last)
             start, settings = (np.asarray(first), np.asarray(problem.states)), Settings(tolerance, self.solver)
             return travel(phases, *start, self.t1, count, settings, kinds=1, passes=last)
 
         found = journey(self.last)
-        named = self._named(scene, problem, found) | dict(zip(self.kind.counts, found.counts, strict=True))
+        named = self._named(scene, problem, found) | dict(zip(self.driver.counts, found.counts, strict=True))
         if self.crossing == "both":
             # Through phases the first crossing takes a journey of its own, which ends there.
             first = journey(False)
@@ -150,7 +150,7 @@ class Runs(NamedTuple):
         lost = code == WORDS.index("contact_lost")
         if lost.any():
             # A hybrid run flies on where contact is lost.
-            jams = self.kind is HYBRID or np.asarray(_jams(scene.dynamics, jnp.asarray(ended.state)))
+            jams = self.driver is HYBRID or np.asarray(_jams(scene.dynamics, jnp.asarray(ended.state)))
             code = np.where(lost & jams, WORDS.index("jammed"), code)
         times = {self.times[-1]: np.where(inverted, ended.crossing_time, np.inf)}
         if isinstance(ended, Outcome) and self.crossing == "both":

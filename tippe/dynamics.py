@@ -1,8 +1,8 @@
 """The equations of motion of the tippe top, in vector form and free of trigonometry (`tippe.md`, section 2).
 
-State, in the arena's moving frame (t1, t2, n): velocity (u1, u2) of the centre of mass along the arena, axis
-(e1, e2, e3), angular momentum (L1, L2, L3) about the centre of mass, then the arena's place. The velocity along n follows
-from the axis, because the contact persists. Cyclic coordinates (position, spin angle) are not part of it.
+The state is that of `state.py`: velocity, axis and angular momentum in the arena's moving frame (t1, t2, n), and the place.
+The velocity along n follows from the axis, because the contact persists. Cyclic coordinates (position, spin angle) are not
+part of it.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,6 @@ from nonholonomic.geometry import (
     AbstractSurface,
     Component,
     Tangent,
-    Vector,
     add,
     carried,
     cross,
@@ -28,6 +27,7 @@ from nonholonomic.geometry import (
 from nonholonomic.xla_cpu import stored
 
 from .friction import AbstractFriction, ContactLoad, Slip
+from .state import parts
 from .top import Top
 
 #: Where the axis' component along n stands in the state: cos(theta).
@@ -45,8 +45,8 @@ JAMMED = 1e-4
 class Motion(NamedTuple):
     """What the equations of motion give for one state, every vector in the moving frame.
 
-    `stiffness` is the factor of N in its equation, 1 + m a A in `tippe.md`, section 2: 1 without an offset, and zero where the
-    friction that each newton of N brings along pulls the top down as hard as that newton pushes it up.
+    `stiffness` is the factor of N in its equation, 1 + m a A in `tippe.md`, section 2: 1 without an offset, and zero if the
+    friction due to each newton of N pulls the top down as hard as that newton pushes it up.
     """
 
     rate: tuple[Component, ...]
@@ -100,21 +100,18 @@ class Dynamics(eqx.Module):
         )
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
-        """Evaluate the equations of motion, the normal force solved for with friction in it.
+        """Evaluate the equations of motion, with the normal force solved for including friction.
 
         **Arguments:**
 
-        - `state`: (8 + the arena's place, ...) as the module states it.
+        - `state`: (8 + the arena's place, ...) as `state.py` describes it.
 
         **Returns:** a `Motion`; `rate` is (m/s^2, 1/s, N m, 1/s). Source: `tippe.md`, section 2 (i)-(iii).
         """
-        u1, u2 = state[0], state[1]
-        e: Vector = (state[2], state[3], state[4])
-        L: Vector = (state[5], state[6], state[7])
-        place = tuple(state[8:])
+        (u1, u2), e, L, place = parts(state)
         R, a = self.radius, self.offset
 
-        # The axis turns with the body; V is the velocity of the sphere's centre, o the turning of the frame with it.
+        # The axis turns with the body; V is the velocity of the sphere's centre, o the rate at which it turns the frame.
         e_dot = scale(self.per_transverse, cross(L, e))
         V = (u1 + a * e_dot[0], u2 + a * e_dot[1])
         o = self.parallel.turning(V)
@@ -161,16 +158,16 @@ class Dynamics(eqx.Module):
     def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Positive while the contact persists and Coulomb's law has an answer.
 
-        It is the lesser of the normal force as a fraction of the weight, plus the round-off that a start with N = 0 exactly is
-        allowed, and of what the stiffness is above `JAMMED`.
+        The lesser of two: the normal force as a fraction of the weight, plus a round-off allowance for a start with N = 0, and
+        the excess of the stiffness over `JAMMED`.
         """
         motion = self.motion(state)
         return jnp.minimum(motion.normal_force / (self.mass * self.gravity) + 1e-12, motion.stiffness - JAMMED)
 
     def jams(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
-        """Whether a contact whose margin is zero has jammed; else it is lost."""
+        """Whether a contact whose margin is zero has jammed; otherwise it is lost."""
         motion = self.motion(state)
-        # Where it is located the stiffness' excess is round-off of either sign, and N many times the weight.
+        # At the located end the excess of the stiffness is round-off of either sign, and N is many times the weight.
         return motion.stiffness - JAMMED <= jnp.maximum(motion.normal_force / (self.mass * self.gravity), 0.0)
 
 

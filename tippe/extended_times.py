@@ -16,14 +16,15 @@ from nonholonomic.validation import as_number
 from .inversion import InversionProblem, check_smooth
 from .launch import Launch
 from .scene import Scene
+from .state import inclination, parts
 
-#: A cell that needs more steps than this has failed: numbers tried on the way may be far off.
+#: A cell that needs more steps than this has failed: parameters tried by a fit may be far off.
 MOST_STEPS = 100_000
 
-#: The least angle [rad] that is told from 0 in the penalty for a top that does not invert.
+#: The least angle [rad] distinguished from 0 in the penalty for a top that does not invert.
 LEAST_ANGLE = 1e-6
 
-#: From how many cells on it pays to compile for twice as long what then runs in a third of the time.
+#: From this many cells on it pays to compile for twice as long a program that runs in a third of the time.
 MANY = 64
 
 
@@ -39,17 +40,17 @@ def extended_inversion_times(
 
     A top that has not inverted by `t1`, or has lost contact, and is then at theta counts as inverting at
     t1 (1 + log(angle / theta) / C), C = log(angle / theta at the launch), 1 at least. Where theta grows as exp(s t), as it
-    does from a small one, that is the tangent, at the rate with which it would arrive at `t1`, of the time C / s: continuous
-    with its slope where a time passes the horizon, and linear in the rate beyond. It is a penalty, no prediction. First
+    does from small angles, this is the tangent to the time C / s, taken at the rate s that arrives exactly at `t1`: continuous
+    with its slope where a time passes the horizon, and linear in the rate beyond. It is a penalty, not a prediction. First
     derivatives, forward mode, are those of the event's time (implicit function theorem) and of the penalty.
 
     **Arguments:**
 
     - `scene`, `launch`: every number a scalar or (lanes,).
     - `t1`, `angle`, `tolerance`: as for `inversion_time`.
-    - `lanes`: how many.
+    - `lanes`: how many lanes.
 
-    **Returns:** (lanes,) [s]; not a number where the integration failed.
+    **Returns:** (lanes,) [s]; NaN where the integration failed.
 
     **Raises:** `ValueError` for a scene with `contact="hybrid"` or `SetValuedCoulomb`.
     """
@@ -59,7 +60,7 @@ def extended_inversion_times(
 
 
 def _differentiable(structure: Any, t1: Float[Array, ""], tolerance: Float[Array, ""]) -> Callable[..., Array]:
-    """The extended times as a function of a problem's numbers; directions that `jax.vmap` stacks run along together."""
+    """The extended times as a function of a problem's parameters; directions that `jax.vmap` stacks are integrated together."""
 
     def run(leaves: tuple[Array, ...], moving: list[list[Array | None]]) -> tuple[Array, Array]:
         directions = tuple(jax.tree.unflatten(structure, one) for one in moving)
@@ -117,7 +118,7 @@ def _times_and_slopes(
     crossed = outcome.status == CROSSED
 
     def extended(problem: InversionProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
-        # A cell that starts beyond the angle is there at once.
+        # A cell that starts beyond the angle has reached it at once.
         time = jnp.where(outcome.end_time > 0.0, crossing_time(problem, outcome.end_time, state), 0.0)
         angle = jnp.arccos(problem.cos_angle)
         missing = _e_folds(state, angle)
@@ -135,5 +136,5 @@ def _times_and_slopes(
 
 def _e_folds(state: Float[Array, "components cells"], angle: Float[Array, "..."]) -> Float[Array, " cells"]:
     """How many times theta must still grow e-fold to reach an angle."""
-    theta = jnp.arctan2(jnp.hypot(state[2], state[3]), state[4])
+    theta = inclination(parts(state).axis)
     return jnp.log(angle / jnp.clip(theta, LEAST_ANGLE, angle))

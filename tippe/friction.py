@@ -49,8 +49,11 @@ class AbstractFriction(Bounded):
     #: The units of the law's numbers, by name.
     units: ClassVar[dict[str, str]] = {}
 
-    #: Whether the force of a contact at rest is whatever keeps it there, within limits.
+    #: Whether the force of a contact at rest is whatever keeps it at rest, within limits.
     set_valued: ClassVar[bool] = False
+
+    #: Whether the load is a force that depends on the slip velocity alone, without a torque. Impacts need such a law.
+    acts_at_point: ClassVar[bool] = False
 
     @property
     def drills(self) -> bool:
@@ -72,6 +75,8 @@ class AbstractFriction(Bounded):
 class Frictionless(AbstractFriction):
     """No friction: the arena pushes along its normal only."""
 
+    acts_at_point: ClassVar[bool] = True
+
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         return ContactLoad(force=(None, None))
 
@@ -85,6 +90,7 @@ class Viscous(AbstractFriction):
     """
 
     units: ClassVar[dict[str, str]] = {"mu": "s m-1"}
+    acts_at_point: ClassVar[bool] = True
 
     mu: Float[Array, "..."] = eqx.field(converter=as_number)
 
@@ -111,6 +117,7 @@ class Coulomb(AbstractFriction):
     """
 
     units: ClassVar[dict[str, str]] = {"mu": "1", "slip_speed": "m s-1"}
+    acts_at_point: ClassVar[bool] = True
 
     mu: Float[Array, "..."] = eqx.field(converter=as_number)
     slip_speed: Float[Array, "..."] = eqx.field(converter=as_number)
@@ -209,12 +216,12 @@ class Rolling(AbstractFriction):
 
 
 class SetValuedCoulomb(AbstractFriction):
-    """Coulomb friction as it stands, without a slip speed: F = -mu N v_s / |v_s| while the contact slips, and any force
+    """Exact Coulomb friction, without a slip speed: F = -mu N v_s / |v_s| while the contact slips, and any force
     along the arena up to mu N while it does not (`tippe.md`, section 3).
 
     The run is made of phases. In a slip the force has its full size; a slip that stops turns into rolling, with the
-    equations of `phases/rolling.py`, if the force which that takes is within the friction cone; and the top slips again
-    as soon as it is not. While it rolls the energy is constant.
+    equations of `phases/rolling.py`, if the force needed for that is within the friction cone; the top slips again as soon
+    as it is not. While it rolls the energy is constant.
 
     **Arguments:**
 
@@ -230,7 +237,7 @@ class SetValuedCoulomb(AbstractFriction):
         yield Bound(self.mu, "mu", at_least=0.0)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
-        """The load of a contact that slips; where it does not, the law alone says nothing, and the load is 0."""
+        """The load of a contact that slips; where it does not slip, the law does not define it, and the load is 0."""
         speed = length(slip.x, slip.y)
         factor = -self.mu / jnp.where(speed > 0.0, speed, 1.0)
         return ContactLoad(force=(factor * slip.x, factor * slip.y))

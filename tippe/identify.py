@@ -1,4 +1,4 @@
-"""Numbers of a top, its arena and its launches from inversion times and from recorded motion."""
+"""Parameters of a top, its arena and its launches from inversion times and from recorded motion."""
 
 import math
 from typing import Any
@@ -27,7 +27,7 @@ QUANTITIES = {"theta": ("theta",), "position": ("x", "y", "z")}
 class InversionTimes(eqx.Module):
     """Measured inversion times of some launches.
 
-    Over a nutation period the time is a staircase in every number, so its slope differs from its trend; where theta grows
+    Over a nutation period the time is a staircase in every parameter, so its slope differs from its trend; where theta grows
     without falling back it is smooth. Small angles at the launch, angles to be reached of 0.6 to 0.8 pi, and several
     launches keep the steps below the errors.
 
@@ -36,7 +36,7 @@ class InversionTimes(eqx.Module):
     - `launch`: a `Launch` whose numbers are one for all or (launches,).
     - `time`: (launches,) [s], infinite for a launch that was not seen to invert.
     - `error`: standard errors [s], one for all or (launches,).
-    - `t1`: until when the model follows a launch [s]: some times the longest time measured, as a start may be far off.
+    - `t1`: until when the model follows a launch [s]: several times the longest time measured, because a start may be far off.
     - `until`: until when a launch that did not invert was watched [s], one for all or (launches,); `t1` by default. Its
       likelihood is one-sided: the probability of a time beyond `until`.
     - `angle`: angle [rad] that counted as inverted.
@@ -69,14 +69,14 @@ class InversionTimes(eqx.Module):
 
     @property
     def measurements(self) -> Measurements:
-        """The times as a likelihood takes them."""
+        """The times as `Measurements`."""
         censored = ~np.isfinite(np.asarray(self.time))
         until = self.t1 if self.until is None else self.until
         return Measurements(np.where(censored, np.asarray(until), np.asarray(self.time)), self.error, censored)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What to call each launch."""
+        """A label for each launch."""
         columns = np.broadcast_arrays(np.asarray(self.launch.theta), np.asarray(self.launch.spin), self.time)
         return tuple(f"theta {theta:.4g}, spin {spin:.4g}" for theta, spin in zip(*columns[:2], strict=True))
 
@@ -85,7 +85,7 @@ class InversionTimes(eqx.Module):
     ) -> Float[Array, "rows launches"]:
         """Times of all launches in every row, all of them lanes of one block."""
         launches = len(self.time)
-        spread = {path: jnp.repeat(value, launches) for path, value in values.items()}
+        spread = {name: jnp.repeat(value, launches) for name, value in values.items()}
         launch = jax.tree.map(lambda leaf: jnp.tile(jnp.broadcast_to(leaf, (launches,)), rows), self.launch)
         roots = with_numbers({"scene": scene, "launch": launch}, spread)
         times = extended_inversion_times(
@@ -101,7 +101,7 @@ class Recording(eqx.Module):
 
     - `launch`: a `Launch`, every number a scalar.
     - `times`: (times,) [s], increasing from 0 or later.
-    - `value`: (times,) [rad] for "theta", (times, 3) [m] for "position" (in the fixed frame, as of `simulate`).
+    - `value`: (times,) [rad] for "theta", (times, 3) [m] for "position" (in the fixed frame, as in `simulate`).
     - `error`: standard errors, one for all or of the shape of `value`.
     - `quantity`: "theta" or "position".
 
@@ -119,16 +119,16 @@ class Recording(eqx.Module):
 
     @property
     def measurements(self) -> Measurements:
-        """The samples as a likelihood takes them."""
+        """The samples as `Measurements`."""
         return samples(self.value, self.error)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What to call each sample."""
+        """A label for each sample."""
         return sample_labels(self.times, QUANTITIES[self.quantity])
 
     def predict(self, scene: Scene, values: dict[str, Array], rows: int, tolerance: float) -> Float[Array, "rows n"]:
-        """The samples in every row; not a number after a run's end."""
+        """The samples in every row; NaN after a run's end."""
 
         def one(values):
             roots = with_numbers({"scene": scene, "launch": self.launch}, values)
@@ -145,7 +145,7 @@ class Recording(eqx.Module):
 
 
 class SceneModel(eqx.Module):
-    """Predictions of all data of a scene, as `nonholonomic.identification.identify` wants them."""
+    """Predictions of all data of a scene, in the form that `nonholonomic.identification.identify` expects."""
 
     scene: Scene
     data: tuple[Any, ...]
@@ -169,22 +169,22 @@ def identify(
     max_steps: int = 60,
     progress: bool = True,
 ) -> Identification:
-    """Numbers of a scene and its launches from measurements, with their errors and with what is left open.
+    """Parameters of a scene and its launches from measurements, with their errors and with what is not determined.
 
     **Arguments:**
 
     - `scene`: a `Scene`; what is not free is taken from it.
     - `data`: an `InversionTimes` or a `Recording`, or a list of several to be fitted together.
-    - `free`: path of a number -> a `Free` or only the value from which to start: `"scene.friction.mu"`, or `"friction.mu"`
-      where nothing else ends so; a number of the launch is the same in all launches of all data. Numbers that cannot be
-      negative are fitted in their logarithms.
+    - `free`: full name of a parameter -> a `Free` or only the value from which to start: `"scene.friction.mu"`, or
+      `"friction.mu"` where nothing else ends so; a parameter of the launch is the same in all launches of all data.
+      Parameters that cannot be negative are fitted in their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `tolerance`: relative tolerance of the integration.
 
     **Returns:** an `Identification`.
 
-    **Raises:** `ValueError` for arguments out of range, an unknown path, and a scene with `contact="hybrid"` or
-    `SetValuedCoulomb`, through whose phases the derivative does not go; `ImportError` if Optimistix is not installed.
+    **Raises:** `ValueError` for arguments out of range, an unknown name, and a scene with `contact="hybrid"` or
+    `SetValuedCoulomb`, through whose phases the derivative does not go.
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
@@ -194,7 +194,7 @@ def identify(
         raise ValueError(f"data = {data!r} must be an InversionTimes or a Recording, or a list of them")
     roots = {"scene": scene, "launch": data[0].launch}
     check_run(scene, Launch(0.0, 0.0), 1.0, tolerance)
-    known = [path for root, tree in roots.items() for path in numbers(root, tree)]
+    known = [name for root, tree in roots.items() for name in numbers(root, tree)]
     unknowns = generic.free_numbers(free, roots, known, with_numbers)
     measurements, labels = generic.joined(data)
     return generic.identify(

@@ -26,10 +26,11 @@ from nonholonomic.integration import (
 from nonholonomic.parameters import numbers
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, require_all
 
-from .dynamics import COS_THETA, Dynamics
+from .dynamics import Dynamics
 from .launch import Launch
 from .phases import Kind, StickSlip
 from .scene import Scene
+from .state import COS_THETA
 
 #: The greatest relative tolerance that is accepted.
 LOOSEST = 1e-2
@@ -77,8 +78,8 @@ def inversion_time(
     """Time at which theta reaches an angle; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
     The derivative is that of the event's time by the implicit function theorem; it is 0 where the result is infinite.
-    Differentiating by one number costs about as much again as the time itself, by any number of them four to seven times
-    as much (`nonholonomic/derivatives/slopes.py`); second derivatives take forward-mode passes.
+    Differentiating by one parameter costs about as much again as the time itself, by any number of them four to seven
+    times as much (`nonholonomic/derivatives/slopes.py`); second derivatives take forward-mode passes.
 
     **Arguments:**
 
@@ -90,8 +91,8 @@ def inversion_time(
       above it until `t1`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
 
-    **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before; not a number
-    if the integration failed, or where numbers inside a transformation are outside of their ranges.
+    **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before; NaN
+    if the integration failed, or if numbers inside a transformation are out of range.
 
     **Raises:** `ValueError` for arguments outside these ranges, and for a scene with `contact="hybrid"` or
     `SetValuedCoulomb`: the derivative does not go through impacts, nor through stick and slip. `inversion_table` gives the
@@ -104,7 +105,7 @@ def inversion_time(
     explicit_tableau(solver)
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
     unchecked = any(is_traced(leaf) for leaf in leaves)
-    # Horizon and tolerance, the last two numbers, do not move the event.
+    # The last two leaves, horizon and tolerance, do not move the event.
     return ask(InversionQuestion(len(leaves) - 2, structure, solver, crossing == "last", unchecked), *leaves)
 
 
@@ -116,7 +117,7 @@ class InversionQuestion(AbstractQuestion):
     structure: Any = eqx.field(static=True)
     solver: diffrax.AbstractERK
     last: bool = eqx.field(static=True)
-    # Whether some numbers were traced, so that the checks could not look at them.
+    # Whether some numbers were traced, so that the checks could not see them.
     unchecked: bool = eqx.field(static=True)
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
@@ -124,7 +125,7 @@ class InversionQuestion(AbstractQuestion):
 
     def problem(self, leaves: tuple[Array, ...], cells: int | None) -> InversionProblem:
         """The launches of some cells."""
-        # The numbers that do not move the event are not needed here.
+        # The leaves that do not move the event are not needed here.
         unused = (None,) * (self.structure.num_leaves - len(leaves))
         scene, launch, angle, *_ = jax.tree.unflatten(self.structure, (*leaves, *unused))
         assert cells is not None
@@ -147,7 +148,7 @@ class InversionQuestion(AbstractQuestion):
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-        # Cells do not influence one another, so moving a number in all of them at once gives each its own derivative.
+        # Cells do not influence one another, so varying a parameter in all of them at once gives each its own derivative.
         problem, directions, gather = directions_by(self.problem, active, leaves[: self.movable], cells)
         may, t1, tolerance = self._permitted(leaves)
         outcome, slopes = traced_march_with_slopes(

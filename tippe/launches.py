@@ -66,7 +66,7 @@ def launches(
 def described(roots: dict[str, Any], grid: list[Axis]) -> dict[str, Any]:
     """What is asked of which scene and launch, as plain data; the values of axes stand elsewhere."""
     found = {path: told for name, root in roots.items() for path, told in description(name, root).items()}
-    return found | {one.path: "an axis" for one in grid}
+    return found | {one.number: "an axis" for one in grid}
 
 
 def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:
@@ -75,4 +75,4 @@ def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:
     cells = int(np.prod(shape, dtype=int))
     for first in range(0, cells, CHECKED_AT_ONCE):
         places = np.unravel_index(np.arange(first, min(first + CHECKED_AT_ONCE, cells)), shape) if grid else ()
-        with_numbers(roots, {one.path: one.values[place] for one, place in zip(grid, places, strict=True)})
+        with_numbers(roots, {one.number: one.values[place] for one, place in zip(grid, places, strict=True)})

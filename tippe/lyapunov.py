@@ -1,4 +1,4 @@
-"""The Lyapunov exponent of a launch: whether nearby launches part exponentially, and how fast."""
+"""The Lyapunov exponent of a launch: whether nearby launches diverge exponentially, and how fast."""
 
 import dataclasses
 from typing import NamedTuple
@@ -14,23 +14,24 @@ from nonholonomic.geometry import cross
 from nonholonomic.integration import GUARD_LOST, REACHED_END, Settings, explicit_tableau
 from nonholonomic.validation import require
 
-from .cells import kind_of
+from .cells import driver_of
 from .inversion import InversionProblem
 from .launch import Launch
 from .scene import Scene
+from .state import joined, parts
 
-#: Stretches of time in which growth is counted; half of them give the exponent and its scatter.
+#: Stretches of time whose growth is recorded; half of them give the exponent and its scatter.
 STRETCHES = 32
 
 
 class LyapunovExponent(NamedTuple):
     """The largest Lyapunov exponent of a run, or of each of several.
 
-    - `exponent`: mean rate [1/s] of exponential parting in the second half of the run; not a number if the run ended early.
+    - `exponent`: mean rate [1/s] of exponential divergence in the second half of the run; NaN if the run ended early.
     - `error`: of the exponent [1/s]; an exponent below twice its error is no sign of chaos.
     - `status`: "reached_end", "contact_lost", "jammed" or "failed".
     - `end_time`: when the run ended [s]; `steps`: accepted and rejected ones.
-    - `times`: [s], (32,), and `running`: the mean rate of parting [1/s] from the start to each of them, (32, ...).
+    - `times`: [s], (32,), and `running`: the mean rate of divergence [1/s] from the start to each of them, (32, ...).
     """
 
     exponent: Float[np.ndarray, "..."]
@@ -51,7 +52,7 @@ def lyapunov_exponent(
 ) -> LyapunovExponent:
     """The largest Lyapunov exponent of one launch or of many at once, by the variational equation.
 
-    Positive if nearby launches part exponentially. While a top rises, it is the rate of the rise; chaos is what stays
+    Positive if nearby launches diverge exponentially. While a top rises, it is the rate of the rise; chaos is a rate that stays
     positive as `t1` grows. Source: Benettin et al., Meccanica 15 (1980) 9; see `nonholonomic/derivatives/lyapunov.py`.
 
     **Arguments:**
@@ -71,7 +72,7 @@ def lyapunov_exponent(
         raise ValueError(f"scene = {scene!r} must be a Scene")
     if not isinstance(launch, Launch):
         raise ValueError(f"launch = {launch!r} must be a Launch")
-    if not kind_of(scene).smooth:
+    if not driver_of(scene).smooth:
         raise ValueError(
             "contact = 'hybrid' and SetValuedCoulomb have no exponents: variations end at a change of phase"
         )
@@ -82,7 +83,7 @@ def lyapunov_exponent(
         raise ValueError(f"scene and launch must hold scalars or one number per launch, not arrays of shapes {shapes}")
     shape = shapes.pop() if shapes else ()
     cells = int(np.prod(shape, dtype=int))
-    # No angle has a cosine of 2: nothing but a contact that is lost or jams ends a run before the horizon.
+    # No angle has a cosine of 2, so only a contact that is lost or jams ends a run before the horizon.
     problem = dataclasses.replace(InversionProblem.of(scene, launch, jnp.pi, cells), cos_angle=jnp.asarray(-2.0))
     found = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, Settings(tolerance, solver))
     exponent, error = exponent_of(found.logarithm, float(t1))
@@ -92,7 +93,7 @@ def lyapunov_exponent(
     words = np.select([whole, found.status == GUARD_LOST], ["reached_end", lost], "failed")
     times = t1 * np.arange(1, STRETCHES + 1) / STRETCHES
     passed = np.minimum(times[:, None], found.end_time)
-    # A run that ends where it starts has not parted from anything.
+    # A run that ends where it starts has not diverged from anything.
     running = np.cumsum(found.logarithm, axis=0) / np.where(passed > 0.0, passed, 1.0)
     return LyapunovExponent(
         exponent=np.where(whole, exponent, np.nan).reshape(shape),
@@ -106,10 +107,10 @@ def lyapunov_exponent(
 
 
 def _direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, "components cells"]:
-    """A direction with nothing special about it, tangent to the states there are: axis and vertical stay of length 1."""
+    """A direction with nothing special about it, tangent to the set of states: axis and vertical keep length 1."""
     magnitudes = scene.scales(launch)
     u1, u2, r1, r2, r3, *L = (magnitudes[i] * jnp.cos(1.0 + i) for i in range(8))
-    e = tuple(scene.state(launch)[2:5])
+    e = parts(scene.state(launch)).axis
     _, place = jax.jvp(scene.surface.place, (launch.eta,), (jnp.ones_like(launch.eta),))
-    parts = (u1, u2, *cross((r1, r2, r3), e), *L, *place)
-    return jnp.stack([jnp.broadcast_to(part, (cells,)) for part in parts])
+    direction = joined((u1, u2), cross((r1, r2, r3), e), tuple(L), place)
+    return jnp.broadcast_to(direction.reshape(len(direction), -1), (len(direction), cells))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import Component, Vector, add, dot, multiply
-from nonholonomic.integration import Path, PhasedPath
+from nonholonomic.integration import Followed, PhasedPath
 from nonholonomic.validation import is_traced, require
 
 from .sampled import STATUS
@@ -46,7 +46,7 @@ class AbstractTrajectory(eqx.Module):
     t: eqx.AbstractVar[Float[Any, " times"]]
     scene: eqx.AbstractVar[Scene]
     states: eqx.AbstractVar[Float[Any, "components times"]]
-    path: eqx.AbstractVar[Float[Any, "paths times"]]
+    cyclic: eqx.AbstractVar[Float[Any, "paths times"]]
     spin_angle: eqx.AbstractVar[Float[Any, " times"]]
     work: eqx.AbstractVar[Float[Any, " times"]]
     status: eqx.AbstractVar[Any]
@@ -76,7 +76,7 @@ class AbstractTrajectory(eqx.Module):
     @of_each_run
     def eta(self) -> Float[Array, " times"]:
         """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
-        return self.scene.surface.angle(self._place, tuple(self.path))
+        return self.scene.surface.angle(self._place, tuple(self.cyclic))
 
     @of_each_run
     def azimuth(self) -> Float[Array, " times"]:
@@ -107,8 +107,8 @@ class AbstractTrajectory(eqx.Module):
     def position(self) -> Float[Array, "times 3"]:
         """Position of the sphere's centre [m]; the plane is z = 0, the cylinder's axis x = z = 0, and a run on the plane
         starts above the origin."""
-        foot = self.scene.surface.position(self._place, tuple(self.path))
-        normal = self.scene.surface.frame(self._place, tuple(self.path))[2]
+        foot = self.scene.surface.position(self._place, tuple(self.cyclic))
+        normal = self.scene.surface.frame(self._place, tuple(self.cyclic))[2]
         height = add(self.scene.body.radius, self.above[0])
         return jnp.stack([add(q, multiply(height, n)) for q, n in zip(foot, normal, strict=True)], axis=-1)
 
@@ -132,7 +132,7 @@ class AbstractTrajectory(eqx.Module):
         check_increasing(times)
         return self.resampled(times)
 
-    def with_stats(self, path: Path | PhasedPath, **more: Any) -> Self:
+    def with_stats(self, path: Followed | PhasedPath, **more: Any) -> Self:
         """The same run with what it took, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and more."""
         energy, work = np.asarray(self.energy), np.asarray(self.work)
         stats = {
@@ -148,7 +148,7 @@ class AbstractTrajectory(eqx.Module):
         return tuple(self.states[8:])
 
     def _fixed(self, vector: Vector) -> Float[Array, "times 3"]:
-        frame = self.scene.surface.frame(self._place, tuple(self.path))
+        frame = self.scene.surface.frame(self._place, tuple(self.cyclic))
         return jnp.stack([dot(vector, directions) for directions in zip(*frame, strict=True)], axis=-1)
 
     def __str__(self) -> str:

@@ -33,7 +33,7 @@ from .phases import Kind, StickSlip
 from .scene import Scene
 
 
-class Run(AbstractProblem):
+class TrajectoryProblem(AbstractProblem):
     """Launches with their cyclic coordinates: the state, the arena's path, the spin angle and the work of friction.
 
     `rest` are spin angle and work at the start, `None` where both are 0.
@@ -42,30 +42,30 @@ class Run(AbstractProblem):
     dynamics: Dynamics | StickSlip | Kind
     axial: Float[Array, "..."]
     state: Float[Array, "components ..."]
-    path: Float[Array, "components ..."]
+    cyclic: Float[Array, "components ..."]
     scales: Float[Array, "components ..."]
     rest: Float[Array, "2 ..."] | None = None
 
     @classmethod
-    def of(cls, scene: Scene, launch: Launch, cells: int | None = None) -> "Run":
+    def of(cls, scene: Scene, launch: Launch, cells: int | None = None) -> "TrajectoryProblem":
         """The run of one launch, or the runs of some cells, whose numbers are scalars or one per cell."""
         radius, weight = scene.body.radius, scene.body.mass * scene.gravity
-        path = jnp.stack(scene.surface.path(launch.eta))
-        extra = jnp.stack(jnp.broadcast_arrays(*([radius] * len(path)), jnp.ones(()), weight * radius))
-        parts = (scene.state(launch), path, scene.scales(launch), extra)
+        cyclic = jnp.stack(scene.surface.cyclic(launch.eta))
+        extra = jnp.stack(jnp.broadcast_arrays(*([radius] * len(cyclic)), jnp.ones(()), weight * radius))
+        parts = (scene.state(launch), cyclic, scene.scales(launch), extra)
         if cells is not None:
             parts = tuple(jnp.broadcast_to(part.reshape(len(part), -1), (len(part), cells)) for part in parts)
         return cls(scene.dynamics, scene.body.I3, parts[0], parts[1], jnp.concatenate(parts[2:]))
 
     def start(self) -> tuple[Float[Array, "components ..."], Float[Array, "components ..."]]:
         rest = jnp.zeros((2, *self.state.shape[1:])) if self.rest is None else self.rest
-        return jnp.concatenate([self.state, self.path, rest]), self.scales
+        return jnp.concatenate([self.state, self.cyclic, rest]), self.scales
 
     def field(self, time: Float[Array, "..."], state: Float[Array, "components ..."]) -> Any:
-        lean, path = state[: len(self.state)], tuple(state[len(self.state) : -2])
+        lean, cyclic = state[: len(self.state)], tuple(state[len(self.state) : -2])
         motion = self.dynamics.motion(lean)
-        path_rate = self.dynamics.parallel.path_rate(path, motion.velocity, motion.turning)
-        return stacked((*motion.rate, *path_rate, motion.spin_momentum / self.axial, motion.friction_power), state)
+        cyclic_rate = self.dynamics.parallel.cyclic_rate(cyclic, motion.velocity, motion.turning)
+        return stacked((*motion.rate, *cyclic_rate, motion.spin_momentum / self.axial, motion.friction_power), state)
 
     def crossing(self, state: Float[Array, "components ..."]) -> None:
         return None
@@ -74,12 +74,15 @@ class Run(AbstractProblem):
         return self.dynamics.contact_margin(state[: len(self.state)])
 
 
-#: How a run can end, by the codes that stand for the words inside a transformation.
+#: How a run can end; inside a transformation the index stands for the word.
 STATUS = ("reached t1", "contact_lost", "failed", "jammed", "illegal")
 
 
 def ended(
-    run: Run, state: Float[Array, "components ..."], guard_lost: Bool[Array, "..."], failed: Bool[Array, "..."]
+    run: TrajectoryProblem,
+    state: Float[Array, "components ..."],
+    guard_lost: Bool[Array, "..."],
+    failed: Bool[Array, "..."],
 ) -> Int[Array, "..."]:
     """The code in `STATUS` of a run that ended in some state."""
     lost = jnp.where(run.dynamics.jams(state[: len(run.state)]), STATUS.index("jammed"), STATUS.index("contact_lost"))
@@ -87,7 +90,7 @@ def ended(
 
 
 class Found(NamedTuple):
-    """What is found of a run, all floats: `states` not a number after the end, `status` a code in `STATUS`."""
+    """What is found of a run, all floats: `states` are NaN after the end, `status` a code in `STATUS`."""
 
     states: Float[Array, "*cells times components"]
     end_time: Float[Array, "*cells"]
@@ -106,8 +109,8 @@ def sampled(
 ) -> Found:
     """Run one launch inside a transformation and sample it.
 
-    An explicit Runge-Kutta solver takes the block of lanes, of which a batch fills as many as it has runs; others run by
-    Diffrax. In both the variations of what is differentiated by take part in step control.
+    An explicit Runge-Kutta solver uses the block of lanes, one for each run of a batch; others run by Diffrax. In both, the
+    variations take part in step control.
 
     **Arguments:** as for `simulate`.
     """
@@ -116,15 +119,15 @@ def sampled(
     kind = BlockSampling if isinstance(solver, diffrax.AbstractERK) else SingleSampling
     question = kind(len(leaves), structure, rest, solver)
     found = ask(question, *leaves, jax.lax.stop_gradient(times), as_number(t1), as_number(tolerance))
-    # Later by a moment, the sample is further by as much along the field.
-    run = Run.of(scene, launch)
+    # A small delay moves the sample along the field.
+    run = TrajectoryProblem.of(scene, launch)
     rates = jax.lax.stop_gradient(run.field(times, found.states.T).T)
     later = (times - jax.lax.stop_gradient(times))[:, None]
     return found._replace(states=found.states + jnp.where(jnp.isfinite(rates), rates * later, 0.0))
 
 
 def sampled_by_diffrax(
-    run: Run,
+    run: TrajectoryProblem,
     times: Float[Array, " times"],
     t1: Float[Array, ""],
     tolerance: float,
@@ -148,10 +151,10 @@ class BlockSampling(AbstractQuestion):
     rest: Any
     solver: diffrax.AbstractERK
 
-    def run(self, leaves: tuple[Array, ...], cells: int) -> Run:
+    def run(self, leaves: tuple[Array, ...], cells: int) -> TrajectoryProblem:
         """The runs of some cells."""
         numbers = jax.tree.unflatten(self.structure, leaves)
-        return Run.of(*eqx.combine(numbers, self.rest), cells)
+        return TrajectoryProblem.of(*eqx.combine(numbers, self.rest), cells)
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isnan(value)
@@ -218,7 +221,7 @@ def _found(
     states, *variations = jnp.split(samples, 1 + len(varied.directions), axis=-1)
     end, *end_variations = varied.parts(ends.state)
 
-    def end_time(problem: Run, state: Float[Array, "components *cells"]) -> Float[Array, "*cells"]:
+    def end_time(problem: TrajectoryProblem, state: Float[Array, "components *cells"]) -> Float[Array, "*cells"]:
         return event_time(problem, lambda at: problem.guard(ends.time, at), ends.time, state)
 
     def slope(direction: Any, variation: Array, at_end: Array) -> Found:
@@ -241,10 +244,10 @@ class SingleSampling(AbstractQuestion):
     rest: Any
     solver: diffrax.AbstractSolver
 
-    def run(self, leaves: tuple[Array, ...], cells: None) -> Run:
+    def run(self, leaves: tuple[Array, ...], cells: None) -> TrajectoryProblem:
         """The only run there is."""
         numbers = jax.tree.unflatten(self.structure, leaves)
-        return Run.of(*eqx.combine(numbers, self.rest))
+        return TrajectoryProblem.of(*eqx.combine(numbers, self.rest))
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isnan(value)

@@ -9,17 +9,15 @@ from jaxtyping import Array, Float
 from nonholonomic.geometry import AbstractSurface, Plane, dot, none_if_zero
 from nonholonomic.validation import Bound, Bounded, as_number
 
-from .dynamics import COS_THETA, Dynamics
-from .friction import AbstractFriction, Coulomb, Frictionless, Viscous
+from .dynamics import Dynamics
+from .friction import AbstractFriction, Frictionless
 from .launch import Launch
 from .phases import StickSlip
+from .state import inclination, joined, parts
 from .top import Top
 
 #: Tilt [rad] of a launch below which errors across the normal are measured in proportion to it.
 NEARLY_UPRIGHT = 1e-2
-
-#: Laws for impacts: those that depend on the slip velocity alone and exert no torque about the contact point.
-POINT_FRICTION = (Frictionless, Viscous, Coulomb)
 
 
 class Scene(Bounded):
@@ -36,11 +34,11 @@ class Scene(Bounded):
       `SetValuedCoulomb(mu)`.
     - `gravity`: acceleration of free fall [m/s^2], positive.
     - `contact`: "stop": a run ends where the contact is lost; "hybrid", on the plane: it goes on through flights, impacts
-      and changes to the stem and back (`hybrid/`). A top with a stem needs the latter.
+      and changes to the stem and back (`phases/`). A top with a stem needs the latter.
     - `restitution`: Newton's coefficient e_N of impacts [1], in [0, 1], for "hybrid" only; `None` is 0.
 
     **Raises:** `ValueError` if a part is of the wrong kind, if the top does not fit into the arena, if gravity is not
-    positive, or if the contact asks for what the arena or the body does not allow.
+    positive, or if the arena, the body or the friction does not allow the contact.
     """
 
     body: Top
@@ -55,13 +53,13 @@ class Scene(Bounded):
         for name, part, kind in (*parts, ("friction", self.friction, AbstractFriction)):
             if not isinstance(part, kind):
                 raise ValueError(f"{name} = {part!r} must be a {kind.__name__.removeprefix('Abstract')}")
-        # A surface that offers a ball no room at all says so.
+        # This raises if the surface has no room for a ball at all.
         self.surface.parallel(self.body.radius)
         if self.contact not in ("stop", "hybrid"):
             raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
         if self.contact == "hybrid" and not isinstance(self.surface, Plane):
             raise ValueError(f"contact = 'hybrid' must be on a Plane(), not on {self.surface!r}")
-        if self.contact == "hybrid" and not isinstance(self.friction, POINT_FRICTION):
+        if self.contact == "hybrid" and not self.friction.acts_at_point:
             raise ValueError(f"contact = 'hybrid' must be with friction at a point, not with {self.friction!r}")
         if self.contact == "stop" and self.body.stem is not None:
             raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
@@ -81,7 +79,7 @@ class Scene(Bounded):
         return equations.of(self.body, self.surface, self.friction, self.gravity)
 
     def state(self, launch: Launch) -> Float[Array, "components ..."]:
-        """The state at the start of a run (see `dynamics.py` for its components).
+        """The state at the start of a run (see `state.py` for its components).
 
         **Arguments:**
 
@@ -93,14 +91,14 @@ class Scene(Bounded):
         e = (sine * jnp.cos(launch.azimuth), sine * jnp.sin(launch.azimuth), jnp.cos(launch.theta))
         L = tuple(self.body.I3 * launch.spin * component for component in e)
         zero = jnp.zeros_like(launch.theta)
-        return jnp.stack(jnp.broadcast_arrays(zero, zero, *e, *L, *self.surface.place(launch.eta)))
+        return joined((zero, zero), e, L, self.surface.place(launch.eta))
 
     def scales(self, launch: Launch) -> Float[Array, "components ..."]:
         """Magnitudes by which absolute errors of the state are measured, component by component.
 
         Velocities count in units of sqrt(g R), directions in units of 1, angular momenta in units of the launch's own,
         or of I1 sqrt(g / R) where that is more. For a launch within `NEARLY_UPRIGHT` of the normal, what vanishes with
-        the tilt counts in proportion to it: its growth, which decides when the top turns over, would drown in the errors.
+        the tilt counts in proportion to it; otherwise errors would hide its growth, which decides when the top turns over.
 
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
@@ -108,12 +106,12 @@ class Scene(Bounded):
         rate = jnp.sqrt(self.gravity / self.body.radius)
         velocity = rate * self.body.radius
         momentum = jnp.maximum(self.body.I3 * jnp.abs(launch.spin), self.body.I1 * rate)
-        place = [one for _ in self.surface.place(launch.eta)]
+        place = tuple(one for _ in self.surface.place(launch.eta))
         tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
-        # A top that stands exactly has no growth to resolve.
+        # A top that stands exactly upright has no growth to resolve.
         tilt = jnp.where(tilt > 0.0, jnp.clip(tilt, 1e-280, 1.0), 1.0)
-        across = [velocity * tilt, velocity * tilt, tilt, tilt, one, momentum * tilt, momentum * tilt, momentum]
-        return jnp.stack(jnp.broadcast_arrays(*across, *place))
+        velocities, momenta = (velocity * tilt, velocity * tilt), (momentum * tilt, momentum * tilt, momentum)
+        return joined(velocities, (tilt, tilt, one), momenta, place)
 
     def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """Rate of change of the state: (m/s^2, 1/s, N m, 1/s) for (velocity, axis, angular momentum, place)."""
@@ -137,9 +135,9 @@ class Scene(Bounded):
     def energy(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Kinetic energy plus weight times the height of the centre of mass above the arena's lowest point [J]."""
         body, dynamics = self.body, self.dynamics
-        e, L, place = tuple(state[2:5]), tuple(state[5:8]), tuple(state[8:])
+        (u1, u2), e, L, place = parts(state)
         e3_dot = (L[0] * e[1] - L[1] * e[0]) / body.I1
-        speed2 = state[0] ** 2 + state[1] ** 2 + (body.offset * e3_dot) ** 2
+        speed2 = u1**2 + u2**2 + (body.offset * e3_dot) ** 2
         axial = dot(L, e)
         rotation = (dot(L, L) - axial**2) / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
         climb = dynamics.parallel.height(place)
@@ -153,12 +151,14 @@ class Scene(Bounded):
         On a curved arena it changes at the rate R L.n', and a contact torque N tau changes it at the rate
         N tau.(R n - a e) (`tippe.md`, section 2).
         """
-        return self.body.radius * state[7] - self.body.offset * dot(tuple(state[2:5]), tuple(state[5:8]))
+        _, e, L, _ = parts(state)
+        return self.body.radius * L[2] - self.body.offset * dot(e, L)
 
     def theta(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Angle [rad] from the arena's normal to the axis, in [0, pi]."""
-        return jnp.arctan2(jnp.hypot(state[2], state[3]), state[COS_THETA])
+        return inclination(parts(state).axis)
 
     def spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Angular velocity about the axis, w.e [rad/s]."""
-        return dot(tuple(state[2:5]), tuple(state[5:8])) / self.body.I3
+        _, e, L, _ = parts(state)
+        return dot(e, L) / self.body.I3

@@ -1,4 +1,4 @@
-"""Derivatives of the inversion times of a table's cells with respect to numbers of the scene and the launch."""
+"""Derivatives of the inversion times of a table's cells with respect to parameters of the scene and the launch."""
 
 from typing import Any
 
@@ -10,51 +10,51 @@ from jaxtyping import Array, Float
 
 from nonholonomic.derivatives import compiled_march_with_slopes, directions_of, natural_size
 from nonholonomic.integration import Outcome, Settings
-from nonholonomic.parameters import full_path, numbers, with_numbers
+from nonholonomic.parameters import full_name, numbers, with_numbers
 from nonholonomic.sweeps import Variable
 
 from .inversion import InversionProblem, is_inverted
 
 
-def sensitivity_paths(roots: dict[str, Any], names: Any) -> list[str]:
-    """The paths of the numbers to differentiate by.
+def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
+    """The full names of the numbers to differentiate by.
 
-    **Arguments:** `roots`: the table's scene and launch; `names`: paths, or the ends of paths that fit one only.
+    **Arguments:** `roots`: the table's scene and launch; `names`: full names, or the ends of them that fit one only.
 
     **Raises:** `ValueError` for something else than a list of such names.
     """
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"sensitivities = {names!r} must be a list of paths, such as ['scene.friction.mu']")
-    known = [path for root, tree in roots.items() for path, value in numbers(root, tree).items() if value is not None]
-    paths = [full_path("sensitivities", name, known) for name in names]
-    if len(set(paths)) < len(paths):
+        raise ValueError(f"sensitivities = {names!r} must be a list of names, such as ['scene.friction.mu']")
+    known = [name for root, tree in roots.items() for name, value in numbers(root, tree).items() if value is not None]
+    found = [full_name("sensitivities", name, known) for name in names]
+    if len(set(found)) < len(found):
         raise ValueError(f"sensitivities = {names!r} must name every number once")
-    return paths
+    return found
 
 
-def slope_names(paths: list[str]) -> list[str]:
-    """The table's variables: `time_by_mu` for `scene.friction.mu`, the whole path where two numbers share a name."""
-    last = [path.rsplit(".", 1)[-1] for path in paths]
+def slope_names(names: list[str]) -> list[str]:
+    """The table's variables: `time_by_mu` for `scene.friction.mu`, the full name where two numbers share a name."""
+    ends = [name.rsplit(".", 1)[-1] for name in names]
     return [
-        "time_by_" + (name if last.count(name) == 1 else path.replace(".", "_"))
-        for path, name in zip(paths, last, strict=True)
+        "time_by_" + (end if ends.count(end) == 1 else name.replace(".", "_"))
+        for name, end in zip(names, ends, strict=True)
     ]
 
 
-def slope_variables(paths: list[str], units: dict[str, str]) -> dict[str, Variable]:
+def slope_variables(names: list[str], units: dict[str, str]) -> dict[str, Variable]:
     """The table's variables, with their units."""
 
-    def unit(path: str) -> str:
-        of_number = units.get(path.rsplit(".", 1)[-1], "1")
+    def unit(name: str) -> str:
+        of_number = units.get(name.rsplit(".", 1)[-1], "1")
         return "s" if of_number == "1" else f"s ({of_number})-1"
 
-    return {name: Variable(unit(path), np.float64) for name, path in zip(slope_names(paths), paths, strict=True)}
+    return {slope: Variable(unit(name), np.float64) for slope, name in zip(slope_names(names), names, strict=True)}
 
 
 def slopes_of_cells(
     roots: dict[str, Any],
     columns: dict[str, Any],
-    paths: list[str],
+    names: list[str],
     angle: float,
     t1: float,
     tolerance: float,
@@ -68,12 +68,12 @@ def slopes_of_cells(
 
     **Arguments:** as for `inversion_table`, and
 
-    - `columns`: path of a number -> its value in every cell; `count` of the `size` cells are to be run.
-    - `paths`: of the numbers to differentiate by.
+    - `columns`: full name of a parameter -> its value in every cell; `count` of the `size` cells are to be run.
+    - `names`: full names of the numbers to differentiate by.
 
     **Returns:** the `Outcome`, and name of the variable -> derivatives (size,). Source: implicit function theorem at the event.
     """
-    problem, directions, sizes = _problem_and_directions(roots, columns, paths, jnp.asarray(angle, float), size)
+    problem, directions, sizes = _problem_and_directions(roots, columns, names, jnp.asarray(angle, float), size)
     outcome, slopes = compiled_march_with_slopes(
         problem,
         directions,
@@ -84,24 +84,24 @@ def slopes_of_cells(
     )
     inverted = is_inverted(outcome, problem, last)
     found = [np.where(inverted, slope / size, 0.0) for slope, size in zip(slopes, sizes, strict=True)]
-    return outcome, dict(zip(slope_names(paths), found, strict=True))
+    return outcome, dict(zip(slope_names(names), found, strict=True))
 
 
 @eqx.filter_jit
 def _problem_and_directions(
-    roots: dict[str, Any], columns: dict[str, Any], paths: list[str], angle: Float[Array, ""], size: int
+    roots: dict[str, Any], columns: dict[str, Any], names: list[str], angle: Float[Array, ""], size: int
 ) -> tuple[InversionProblem, tuple[Any, ...], list[Float[Array, "..."]]]:
     """The problem of the cells, its tangents along the numbers to differentiate by, and by how much these move each."""
 
     def build(*moving: Any) -> InversionProblem:
-        cells = with_numbers(roots, columns | dict(zip(paths, moving, strict=True)))
+        cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))
         return InversionProblem.of(cells["scene"], cells["launch"], angle, size)
 
     cells = with_numbers(roots, columns)
-    values = {path: value for root, tree in cells.items() for path, value in numbers(root, tree).items()}
-    point = tuple(jnp.asarray(values[path], float) for path in paths)
+    values = {name: value for root, tree in cells.items() for name, value in numbers(root, tree).items()}
+    point = tuple(jnp.asarray(values[name], float) for name in names)
     sizes = [natural_size(value) for value in point]
     tangents = [
-        tuple(size if row == k else jnp.zeros_like(size) for k, size in enumerate(sizes)) for row in range(len(paths))
+        tuple(size if row == k else jnp.zeros_like(size) for k, size in enumerate(sizes)) for row in range(len(names))
     ]
     return build(*point), directions_of(build, point, tangents), sizes

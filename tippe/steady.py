@@ -9,7 +9,6 @@ The stability matrices are Jacobians of the scene's own field, less the directio
 conservation, so that an eigenvalue with positive real part is an instability and nothing else.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,10 +18,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import Plane
+from nonholonomic.integration import sign_changes
 from nonholonomic.validation import as_number, require
 
 from .launch import Launch
 from .scene import Scene
+from .state import AXIS, joined, parts
 from .top import Top
 
 
@@ -148,7 +149,7 @@ def _lever_and_inertia(scene: Scene, theta: Float[ArrayLike, "..."]):
 
 
 def tumbling(scene: Scene, theta: Float[ArrayLike, "..."]) -> Tumbling:
-    """The tumbling top at an inclination, the one of its two senses with positive phi'.
+    """The tumbling top at an inclination, the one of the two with positive phi'.
 
     phi'^2 = m g a / D, omega3 = (cos - alpha) phi', J = R G phi', with D = I3 (alpha - cos) + I1 cos and
     G = I1 sin^2 + I3 (cos - alpha)^2 (Rutstam 2012, eq. 2.8).
@@ -196,7 +197,7 @@ def tumbling_angles(scene: Scene, jellett: float, samples: int = 2001) -> list[f
 
     - `scene`: a `Scene` on the plane with concrete numbers.
     - `jellett`: Jellett's constant [kg m^3/s], of either sign.
-    - `samples`: points of the grid on which brackets are sought; each is then closed in on by halving.
+    - `samples`: points of the grid on which brackets are sought; each is then halved down to the zero.
     """
     _on_a_plane(scene)
     grid = jnp.linspace(0.0, jnp.pi, samples)
@@ -204,19 +205,7 @@ def tumbling_angles(scene: Scene, jellett: float, samples: int = 2001) -> list[f
     def slope(theta):
         return jax.vmap(jax.grad(lambda angle: effective_energy(scene, angle, jellett)))(theta) / jnp.sin(theta)
 
-    return [float(root) for root in roots_by_halving(slope, grid[1:-1])]
-
-
-def roots_by_halving(function: Callable[[Array], Array], grid: Float[Array, " n"]) -> Float[Array, " roots"]:
-    """Zeros of a function of many numbers between neighbours of a grid where it changes sign, to rounding error."""
-    values = function(grid)
-    found = np.flatnonzero(np.sign(values[:-1]) != np.sign(values[1:]))
-    low, high, sign = grid[found], grid[found + 1], np.sign(values[found])
-    for _ in range(60 if found.size else 0):
-        middle = 0.5 * (low + high)
-        same = np.sign(function(middle)) == sign
-        low, high = jnp.where(same, middle, low), jnp.where(same, high, middle)
-    return jnp.asarray(0.5 * (low + high))
+    return [float(root) for root in sign_changes(slope, grid[1:-1])]
 
 
 def tumbling_state(scene: Scene, motion: Tumbling) -> Float[Array, " 8"]:
@@ -224,14 +213,14 @@ def tumbling_state(scene: Scene, motion: Tumbling) -> Float[Array, " 8"]:
     body, s, c = scene.body, jnp.sin(motion.theta), jnp.cos(motion.theta)
     zero = jnp.zeros_like(s)
     across, along = -body.I1 * motion.precession * s, body.I3 * motion.spin
-    return jnp.stack([zero, zero, s, zero, c, across * c + along * s, zero, -across * s + along * c])
+    return joined((zero, zero), (s, zero, c), (across * c + along * s, zero, -across * s + along * c))
 
 
 def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
     """Rate of a state of the plane when everything turns about the vertical at 1 rad/s."""
-    zero = jnp.zeros_like(state[0])
-    turned = [-state[1], state[0], -state[3], state[2], zero, -state[6], state[5], zero]
-    return jnp.stack(turned)
+    (u1, u2), (e1, e2, _), (L1, L2, _), _ = parts(state)
+    zero = jnp.zeros_like(u1)
+    return joined((-u2, u1), (-e2, e1, zero), (-L2, L1, zero))
 
 
 @eqx.filter_jit
@@ -253,7 +242,7 @@ def tumbling_matrix(scene: Scene, motion: Tumbling) -> Float[Array, "5 5"]:
         return (scene.field(whole) - motion.precession * quarter_turn(whole)) / scales
 
     scaled = state / scales
-    length = jax.grad(lambda x: jnp.sum((x * scales)[2:5] ** 2))(scaled)
+    length = jax.grad(lambda x: jnp.sum((x * scales)[AXIS] ** 2))(scaled)
     jellett = jax.grad(lambda x: scene.jellett(x * scales))(scaled)
     excluded = jnp.stack([length, jellett, quarter_turn(state) / scales], axis=1)
     basis = jnp.linalg.qr(excluded / jnp.linalg.norm(excluded, axis=0), mode="complete")[0][:, 3:]

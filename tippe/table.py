@@ -10,11 +10,11 @@ import numpy as np
 from nonholonomic.integration import explicit_tableau
 from nonholonomic.sweeps import Table, Variable, sweep
 
-from .cells import Runs, kind_of
+from .cells import CellRuns, driver_of
 from .inversion import check_event
 from .launches import described, launches
 from .scene import Scene
-from .sensitivities import sensitivity_paths, slope_variables
+from .sensitivities import sensitivity_names, slope_variables
 from .time_error import COARSER, time_error
 
 
@@ -53,13 +53,13 @@ def inversion_table(
       above it until `t1` (first crossings are ill-conditioned where theta oscillates about the angle); "both" for the two from
       one run, in the variables `first_time` and `last_time` in place of `time`, the status being that of the last.
     - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
-    - `axes`: further axes, path of a number -> values, such as `{"scene.body.offset": [0.005, 0.006]}`.
+    - `axes`: further axes, full name of a parameter -> values, such as `{"scene.body.offset": [0.005, 0.006]}`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
-    - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which knows first
+    - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which supports first
       crossings only.
     - `errors`: whether to run every cell again at ten times the tolerance, for an estimate of the error of its time.
-    - `sensitivities`: paths of numbers to differentiate the times by, such as `["scene.friction.mu", "launch.theta"]`; the end
-      of a path will do where it fits one number only.
+    - `sensitivities`: full names of parameters to differentiate the times by, such as `["scene.friction.mu", "launch.theta"]`;
+      the end of a name will do where only one parameter fits.
     - `progress`: whether to show it, on a terminal or in a notebook; `NONHOLONOMIC_PROGRESS=0` hides it everywhere.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
@@ -90,21 +90,21 @@ def inversion_table(
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     given = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
     roots, grid, units = launches(scene, given, axes, t1, tolerance)
-    paths = sensitivity_paths(roots, sensitivities)
-    kind = kind_of(scene)
-    if not kind.smooth and (method == "diffrax" or paths):
+    paths = sensitivity_names(roots, sensitivities)
+    driver = driver_of(scene)
+    if not driver.smooth and (method == "diffrax" or paths):
         what = "method = 'diffrax'" if method == "diffrax" else f"sensitivities = {sensitivities!r}"
         raise ValueError(f"{what} is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
-    runs = Runs(kind, float(t1), float(angle), crossing, solver, method, paths)
+    runs = CellRuns(driver, float(t1), float(angle), crossing, solver, method, paths)
 
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
         if method == "diffrax" and count == 0:
-            # The reference runs whole blocks: a call that is there to compile would compute the first one twice.
+            # The reference runs whole blocks: a call that is only meant to compile would compute the first one twice.
             return {}
         found = runs.results(roots, columns, tolerance, count)
         if errors:
-            coarse = runs._replace(paths=[]).results(roots, columns, COARSER * tolerance, count)
-            agreed = (found["status"] == coarse["status"]) & (found["status"] != kind.words.index("failed"))
+            coarse = runs._replace(slopes_by=[]).results(roots, columns, COARSER * tolerance, count)
+            agreed = (found["status"] == coarse["status"]) & (found["status"] != driver.words.index("failed"))
             for name in runs.times:
                 alike = agreed & (np.isfinite(found[name]) == np.isfinite(coarse[name]))
                 found[f"{name}_error"] = time_error(found[name], coarse[name], alike)

@@ -1,13 +1,13 @@
-"""How far a time of inversion can be believed, from two runs of its cell at different tolerances."""
+"""How far an inversion time can be trusted, from two runs of its cell at different tolerances."""
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-#: The second run's tolerance over the first one's. Dopri8's eighth order makes that run cost three quarters of the first.
+#: Ratio of the second run's tolerance to the first one's. With Dopri8, of eighth order, it costs three quarters of the first.
 COARSER = 10.0
 
-#: The error over the difference of the two runs. The error grows as the tolerance, so the difference is nine times the
-#: first run's error; the rest is for the cells where the errors of the two runs happen to be alike.
+#: Ratio of the estimate to the difference of the two runs. The error grows as the tolerance, so the difference is nine times
+#: the first run's error; the rest is a margin for cells where the errors of the two runs happen to be close.
 SAFETY = 2.0
 
 
@@ -27,6 +27,6 @@ def time_error(
     both = np.isfinite(time) & np.isfinite(coarse_time)
     known = np.where(both, time, 0.0)
     difference = np.abs(known - np.where(both, coarse_time, 0.0))
-    # No time is known better than to its own rounding.
+    # No time is known better than to its rounding.
     error = np.maximum(SAFETY * difference, np.finfo(time.dtype).eps * known)
     return np.where(agreed, error, np.inf)

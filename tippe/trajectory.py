@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.integration import Path, PhasedPath, Settings, follow
+from nonholonomic.integration import Followed, PhasedPath, Settings, follow
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require_all
 
 from .inversion import check_run, run_bounds
@@ -18,7 +18,7 @@ from .launch import Launch
 from .observables import AbstractTrajectory, check_increasing, of_each_run
 from .phases.flight_trajectory import HybridTrajectory, simulate_hybrid
 from .phases.stick_slip_runs import follow_stick_slip
-from .sampled import STATUS, Run, ended, sampled, sampled_by_diffrax
+from .sampled import STATUS, TrajectoryProblem, ended, sampled, sampled_by_diffrax
 from .scene import Scene
 
 
@@ -29,7 +29,7 @@ class Trajectory(AbstractTrajectory):
     (t1, t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre.
 
     `status` is "reached t1", "contact_lost", "failed" or "jammed"; inside a transformation it is a code 0, 1, 2, 3, or 4,
-    "illegal", for numbers out of range, of which everything is not a number. The run ends at `end_time`. It is jammed where the
+    "illegal", for numbers out of range, for which everything is NaN. The run ends at `end_time`. It is jammed where the
     equation for the normal force ceases to have a solution, because friction pulls the top into the arena as hard as the
     normal force pushes it out: strong friction, a large offset and a slip along the axis do that. `stats` holds accepted and
     rejected steps, the greatest drift of |e| and the greatest energy residual |E - E(0) - work of friction| [J]; with
@@ -39,7 +39,7 @@ class Trajectory(AbstractTrajectory):
     t: Float[Array, " times"]
     scene: Scene
     states: Float[Array, "components times"]
-    path: Float[Array, "paths times"]
+    cyclic: Float[Array, "cyclic times"]
     spin_angle: Float[Array, " times"]
     work: Float[Array, " times"]
     status: Any
@@ -72,7 +72,7 @@ class Trajectory(AbstractTrajectory):
         states = jnp.asarray(self.dense.at(times))
         size = len(self.states)
         found = (jnp.asarray(times), states[:size], states[size:-2], states[-2], states[-1])
-        return eqx.tree_at(lambda one: (one.t, one.states, one.path, one.spin_angle, one.work), self, found)
+        return eqx.tree_at(lambda one: (one.t, one.states, one.cyclic, one.spin_angle, one.work), self, found)
 
 
 def simulate(
@@ -86,8 +86,8 @@ def simulate(
 ) -> Trajectory | HybridTrajectory:
     """Run one launch until `t1`, or until contact is lost or jams; through flights and impacts if its contact is "hybrid".
 
-    Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run are then not a
-    number, and `status` and `end_time` say so. A batch, as `vmap` makes it, runs as the cells of one block, as tables do.
+    Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run are then
+    NaN, and `status` and `end_time` say so. A batch, as `vmap` makes it, runs as the cells of one block, as tables do.
 
     **Arguments:**
 
@@ -98,8 +98,8 @@ def simulate(
     - `tolerance`: relative tolerance; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
     - `solver`: any solver of Diffrax, `Dopri8()` by default.
     - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
-      number; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, a traced run goes by Diffrax, which pays where a
-      loss is differentiated by many numbers.
+      parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax integrates a traced run, which pays if a
+      loss is differentiated by many parameters.
 
     **Returns:** a `Trajectory`, for a hybrid scene a `HybridTrajectory`.
 
@@ -119,7 +119,7 @@ def simulate(
         return simulate_hybrid(scene, launch, float(t1), times, tolerance, solver)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
         return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
-    run = Run.of(scene, launch)
+    run = TrajectoryProblem.of(scene, launch)
     through = follow_stick_slip if scene.friction.set_valued else follow
     path = through(run, float(t1), Settings(tolerance, solver))
     trajectory = _as_trajectory(scene, run, path)
@@ -133,16 +133,16 @@ def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
     yield Bound(times, "times", at_least=0.0, at_most=t1)
 
 
-# Compiled as a whole also where a bare `vmap` or `grad` would take it operation by operation.
+# Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
 def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: Any, *options: Any) -> Trajectory:
-    """What `_traced` gives, or not a number and the status "illegal" where a traced number is out of range."""
+    """What `_traced` gives, or NaN and the status "illegal" where a traced number is out of range."""
     if times is None:
-        # It says that there must be some.
+        # It raises the error that says so.
         return _traced(scene, launch, times, t1, tolerance, *options)
     bounds = (*all_bounds(scene), *all_bounds(launch), *run_bounds(t1, tolerance), *times_bounds(times, t1))
     may = jnp.all(legal(bounds)) & jnp.all(jnp.diff(times) > 0.0)
-    # Steps of illegal numbers might never reach the end: they are not begun.
+    # A run of illegal numbers might never reach its end, so it is given the horizon 0.
     found = _traced(scene, launch, times, jnp.where(may, t1, 0.0), tolerance, *options)
     status = jnp.where(may, found.status, STATUS.index("illegal"))
     return eqx.tree_at(lambda one: (one.t, one.status), nan_unless(may, found), (times, status))
@@ -163,7 +163,7 @@ def _traced(
         )
     if times is None:
         raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
-    run = Run.of(scene, launch)
+    run = TrajectoryProblem.of(scene, launch)
     if adjoint is None:
         found = sampled(scene, launch, times, t1, tolerance, solver)
     else:
@@ -173,13 +173,13 @@ def _traced(
     return Trajectory(times, scene, *_parts(run, found.states.T), status, found.end_time, stats, None)
 
 
-def _parts(run: Run, states: Float[Array, "components times"]) -> tuple[Any, Any, Any, Any]:
-    """State, path, spin angle and work."""
+def _parts(run: TrajectoryProblem, states: Float[Array, "components times"]) -> tuple[Any, Any, Any, Any]:
+    """State, cyclic coordinates, spin angle and work."""
     lean = len(run.state)
     return states[:lean], states[lean:-2], states[-2], states[-1]
 
 
-def _as_trajectory(scene: Scene, run: Run, path: Path | PhasedPath) -> Trajectory:
+def _as_trajectory(scene: Scene, run: TrajectoryProblem, path: Followed | PhasedPath) -> Trajectory:
     states, times = jnp.asarray(path.states), jnp.asarray(path.times)
     status = STATUS[int(ended(run, states[:, -1], jnp.asarray(path.guard_lost), jnp.asarray(path.failed)))]
     sticks = {"sticks": int(path.counts[0])} if isinstance(path, PhasedPath) else {}

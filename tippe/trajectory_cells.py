@@ -12,7 +12,7 @@ from nonholonomic.integration import FAILED, GUARD_LOST, AbstractProblem, Outcom
 from nonholonomic.xla_cpu import compiled_alone
 
 from .launch import Launch
-from .sampled import Run, ended
+from .sampled import TrajectoryProblem, ended
 from .scene import Scene
 from .trajectory import Trajectory
 
@@ -46,25 +46,26 @@ COMPONENTS = {"component": ("x", "y", "z"), "tangent": ("t1", "t2")}
 OF_THE_STATE = {"theta", "azimuth", "spin", "energy", "jellett", "normal_force", "slip"}
 
 
-class Followed(AbstractProblem):
-    """Launches with as much of a `Run` as is asked for: its path only where something is read off it, no spin angle, no work.
+class SampledLaunches(AbstractProblem):
+    """Launches with as much of a `TrajectoryProblem` as is asked for: its cyclic coordinates only where something needs them,
+    no spin angle, no work.
 
-    On the plane a run without its path takes a fifth less time.
+    On the plane a run without them takes a fifth less time.
     """
 
-    run: Run
-    with_path: bool = eqx.field(static=True)
+    run: TrajectoryProblem
+    with_cyclic: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> "Followed":
+    def of(cls, scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> "SampledLaunches":
         """The runs of some cells, of which the named quantities are to be read."""
         needed = {"position"} if isinstance(scene.surface, Plane) else set(QUANTITIES) - OF_THE_STATE
-        return cls(Run.of(scene, launch, cells), not needed.isdisjoint(names))
+        return cls(TrajectoryProblem.of(scene, launch, cells), not needed.isdisjoint(names))
 
     @property
     def size(self) -> int:
         """How many components the state has."""
-        return len(self.run.state) + (len(self.run.path) if self.with_path else 0)
+        return len(self.run.state) + (len(self.run.cyclic) if self.with_cyclic else 0)
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         states, scales = self.run.start()
@@ -85,13 +86,13 @@ class Followed(AbstractProblem):
         self, scene: Scene, times: Float[Array, " times"], samples: Float[Array, "cells times components"], name: str
     ) -> Float[Array, "cells times ..."]:
         """A quantity at every sample, not a number after the end of a run."""
-        state_size, path_size = len(self.run.state), len(self.run.path)
+        state_size, cyclic_size = len(self.run.state), len(self.run.cyclic)
 
         def one(scene: Scene, states: Float[Array, "times components"]) -> Float[Array, "times ..."]:
-            state, path = jnp.split(states.T, [state_size])
-            path = path if self.with_path else jnp.zeros((path_size, len(times)))
+            state, cyclic = jnp.split(states.T, [state_size])
+            cyclic = cyclic if self.with_cyclic else jnp.zeros((cyclic_size, len(times)))
             nothing = jnp.zeros(len(times))
-            values = getattr(Trajectory(times, scene, state, path, nothing, nothing, None, times[-1], {}, None), name)
+            values = getattr(Trajectory(times, scene, state, cyclic, nothing, nothing, None, times[-1], {}, None), name)
             # What does not depend on the state would be a number after the end too.
             there = jnp.isfinite(states[:, 0]).reshape(-1, *[1] * (values.ndim - 1))
             return jnp.where(there, values, jnp.nan)
@@ -105,7 +106,7 @@ class Followed(AbstractProblem):
 # On its own, not inside other transformed functions: only so does it get the compiler's options.
 @compiled_alone
 def _followed(
-    problem: Followed,
+    problem: SampledLaunches,
     scene: Scene,
     times: Float[Array, " times"],
     count: Int[Array, ""],
@@ -130,7 +131,7 @@ def follow_cells(
     **Returns:** name -> values, the cells first.
     """
     numbers = (jnp.asarray(times, float), jnp.asarray(count), Settings(tolerance))
-    problem = Followed.of(scene, launch, cells, names)
+    problem = SampledLaunches.of(scene, launch, cells, names)
     outcome, status, values = _followed(problem, scene, *numbers, names)
     ending = {"status": status, "end_time": outcome.end_time, "steps": outcome.steps, "rejected": outcome.rejected}
     return jax.tree.map(jnp.asarray, values | ending)

@@ -15,8 +15,8 @@ import tippe
 from hard.lagrange import theta_by_lagrange
 from hard.limits import rutstam_top
 from hard.row import Row, of_runs
-from nonholonomic.integration import Path, Settings, follow
-from tippe.trajectory import Run
+from nonholonomic.integration import Followed, Settings, follow
+from tippe.trajectory import TrajectoryProblem
 
 GRAVITY = 9.81
 
@@ -74,11 +74,11 @@ def disc_by_quadrature() -> Row:
     )
 
 
-def set_going(scene: tippe.Scene, launch: tippe.Launch, velocity: float, momentum: float, end: float) -> Path:
+def set_going(scene: tippe.Scene, launch: tippe.Launch, velocity: float, momentum: float, end: float) -> Followed:
     """A run whose centre starts at a velocity along t1 and that has angular momentum about t2 [kg m^2/s]."""
-    run = Run.of(scene, launch)
+    run = TrajectoryProblem.of(scene, launch)
     state = run.state.at[0].set(velocity).at[6].add(momentum)
-    run = Run(run.dynamics, run.axial, state, run.path, run.scales)
+    run = TrajectoryProblem(run.dynamics, run.axial, state, run.path, run.scales)
     return follow(run, end, Settings(1e-12))
 
 

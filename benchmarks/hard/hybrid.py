@@ -39,8 +39,8 @@ def _against_reference(number: int, case: str, happens: str, bound: float) -> Ro
     table = run.result
     flights = int(table.hops)
     error = abs(float(table.time) - expected["time"]) if flights == int(expected["flights"]) else np.inf
-    told = f"{happens} ({flights} flights)" if flights else happens
-    return of_table(case, told, error, bound, "SciPy, time [s]", run)
+    label = f"{happens} ({flights} flights)" if flights else happens
+    return of_table(case, label, error, bound, "SciPy, time [s]", run)
 
 
 def hops() -> Row:

@@ -1,7 +1,7 @@
-"""Derivatives of what a run ends with: along with it, and back through it; and the rate at which neighbours part.
+"""Derivatives of the end of a run, forwards along it and backwards through it; and the rate at which neighbouring runs diverge.
 
-Along one direction the variation runs with the run; along several every run is taken back once. Step lengths
-are held fixed in both.
+For one direction the variation is integrated along with the run; for several, every run is differentiated backwards
+once. Step lengths are held fixed in both.
 """
 
 from .differentiable import AbstractQuestion as AbstractQuestion

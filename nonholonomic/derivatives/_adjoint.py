@@ -1,9 +1,9 @@
-"""First derivatives of event times by any number of numbers at once: the discrete adjoint of the march.
+"""First derivatives of event times by any number of parameters at once: the discrete adjoint of the march.
 
-A run is cut into periods, each with its steps recorded. Once the last one is done, the periods are taken back from the last
-to the first, the derivatives of the events' times by the states carried along; a period whose record is gone is repeated from
-the latest progress that was kept before it. The cost does not depend on how many numbers move, and the memory not on how
-long the runs are. Step lengths are held fixed, as they are by the variations (`variation.py`).
+A run is cut into periods, each with its steps recorded. Once the last one is done, the derivatives of the
+event times by the states are carried back from the last period to the first. A period whose record is gone is computed again
+from the latest progress kept before it. The cost does not depend on how many parameters are differentiated by, nor the memory
+on how long the runs are. Step lengths are held fixed, as in `variation.py`.
 """
 
 import dataclasses
@@ -35,14 +35,14 @@ from ..integration import (
 from ._shared_values import sharing_values
 from .variation import VariationalProblem
 
-#: Iterations of a period: as many as have a record that fits the caches.
+#: Iterations of a period: as many as fit the caches with their record.
 PERIOD = 128
 
-#: Periods at whose start the progress is kept; beyond that some are forgotten, and repeated from further back. With the 64
+#: Periods whose starts are kept; beyond that some are dropped, and computed again from further back. With the 64
 #: lanes of a CPU that takes 5 MB, with the 32768 of an accelerator 2 GB.
 KEPT = 256
 
-#: What is measured of a run at its end: (problem, block) -> a number per lane, with its derivative by the problem's numbers
+#: What is measured at the end of a run: (problem, block) -> a number per lane, with its derivative by the problem's parameters
 #: and the block's state.
 Measured = Callable[[Any, Block], Lanes]
 
@@ -56,9 +56,9 @@ class Record(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """Progress that was kept, the earliest first.
+    """The starts of periods that are kept, the earliest first.
 
-    `depth` of them; `index` says of which period each is the start, `slot` where in `progress` it stands.
+    There are `depth` of them; `index` says which period each one starts, `slot` where in `progress` it is stored.
     """
 
     depth: Int[Array, ""]
@@ -73,16 +73,16 @@ class Kept(NamedTuple):
         return cls(jnp.ones((), int), jnp.zeros(KEPT, int), jnp.arange(KEPT), room)
 
     def latest(self) -> tuple[Int[Array, ""], Progress]:
-        """The latest, and of which period it is the start."""
+        """The latest one, and which period it starts."""
         last = self.depth - 1
         return self.index[last], jax.tree.map(functools.partial(_read, at=self.slot[last]), self.progress)
 
     def dropped(self, drop: Bool[Array, ""]) -> "Kept":
-        """Without the latest, if it is to be dropped."""
+        """These without the latest one, if it is to be dropped."""
         return self._replace(depth=self.depth - drop)
 
     def added(self, index: Int[Array, ""], progress: Progress, add: Bool[Array, ""]) -> "Kept":
-        """With another one, if it is to be added; where there is no room, the one whose neighbours are closest is forgotten."""
+        """These and another one, if it is to be added; if there is no room, the one whose neighbours are closest is dropped."""
         position = jnp.arange(KEPT)
         full = self.depth == KEPT
         following = jnp.where(position == KEPT - 1, index, jnp.roll(self.index, -1))
@@ -93,16 +93,16 @@ class Kept(NamedTuple):
         to = jnp.minimum(self.depth, KEPT - 1)
         indices = jnp.where(moves, jnp.roll(self.index, -1), self.index).at[to].set(index)
         slots = jnp.where(moves, jnp.roll(self.slot, -1), self.slot).at[to].set(free)
-        # Written in any case: where none is added, the room is free.
+        # Written in any case: if none is added, the place stays free.
         room = jax.tree.map(functools.partial(_written, at=free), self.progress, progress)
         return Kept(jnp.minimum(self.depth + add, KEPT), indices, slots, room)
 
 
 class Backward(NamedTuple):
-    """A run on its way back: `needed` is the period behind the one to be taken back next.
+    """A run being differentiated backwards: `needed` is the period after the one that comes next.
 
-    `adjoint` has, for the cell in each lane, the derivatives of what is measured by the state, in its first rows, and by the
-    numbers that move; `gradient` those of every cell by its start.
+    `adjoint` holds, for the cell in each lane, the derivatives of what is measured: by the state in its first rows, then by
+    the parameters; `gradient` holds those of every cell by its start.
     """
 
     kept: Kept
@@ -123,20 +123,20 @@ def march_with_gradient(
     measured: Measured,
     one_kernel: bool = False,
 ) -> tuple[Outcome, Float[Array, "components cells"], Any]:
-    """Run every cell to its end, and differentiate what is measured there by the numbers of the problem.
+    """Run every cell to its end, and differentiate what is measured there by the parameters of the problem.
 
     **Arguments:** as for `march`, except `passes`, and
 
     - `problem`: without directions.
-    - `moving`: a tree like the problem of booleans: which of its numbers to differentiate by, scalars or (cells,).
-    - `probe`: a direction of the inner problem. Its variation runs along and takes part in step control, so that the steps
-      bear tangents also where the state is at rest.
+    - `moving`: a tree of booleans like the problem: which of its leaves, scalars or (cells,), to differentiate by.
+    - `probe`: a direction of the inner problem. Its variation is integrated too and takes part in step control, so that the
+      steps suit tangents even where the state is at rest.
     - `measured`: what is measured.
 
     **Returns:** the `Outcome`, with crossing times left out; the derivatives of every cell by its state at the start; and
-    those by the numbers, one per cell, in a tree like the problem with `None` for what does not move.
+    those by the parameters, one per cell, in a tree like the problem with `None` for the other leaves.
 
-    **Raises:** `ValueError` for a number that moves and has several components.
+    **Raises:** `ValueError` for a chosen leaf that has several components.
     """
     states = problem.start()[0]
     components, size = states.shape
@@ -146,7 +146,7 @@ def march_with_gradient(
             raise ValueError(f"moving: a number must be a scalar or ({size},), not of shape {jnp.shape(leaf)}")
     numbers = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (size,)), numbers)
     problem = eqx.combine(numbers, rest)
-    # Numbers that move have one value for each cell by now, and so have their rates.
+    # The chosen parameters have one value for each cell by now, and so have their rates.
     probe = jax.tree.map(
         lambda rate, number: None if rate is None else jnp.broadcast_to(rate, jnp.shape(number)),
         probe,
@@ -188,7 +188,7 @@ def march_with_gradient(
 
 
 def _recorded(queue: Queue, progress: Progress) -> tuple[Progress, Record, Int[Array, ""]]:
-    """Let the block go on for a period, with its steps recorded; and how many iterations that were."""
+    """Advance the block by a period and record its steps; also returns the number of iterations."""
     here = queue.here(progress.block)
 
     def going(carry: Any) -> Bool[Array, ""]:
@@ -217,7 +217,7 @@ def _recorded(queue: Queue, progress: Progress) -> tuple[Progress, Record, Int[A
 
 
 def _without_probe(block: Block) -> Block:
-    """A block with the states alone, of the states and the variations that run along with them."""
+    """The block with the states alone, without the variations."""
     return block._replace(state=block.state[: block.state.shape[0] // 2])
 
 
@@ -230,9 +230,9 @@ def _taken_back(
     count: Int[Array, ""],
     adjoint: Float[Array, "rows lanes"],
 ) -> Float[Array, "rows lanes"]:
-    """Carry the derivatives from the end of a period to its start; those of the lanes that have ended begin there."""
+    """Carry the derivatives from the end of a period to its start; for lanes that have ended they begin there."""
     weights = Weights.of(queue.control.tableau)
-    # Picked out here: XLA 0.10.2 aborts on a kernel that is handed all the cells' starts where these are known constants.
+    # Selected here: XLA 0.10.2 aborts on a kernel that gets all the cells' starts if these are constants.
     problem = dataclasses.replace(queue.here(block)[0], directions=())
     block = _without_probe(block)
 
@@ -253,7 +253,7 @@ def _taken_back(
 
 
 def _at_the_end(problem: AbstractProblem, moving: Any, measured: Measured, block: Block) -> Float[Array, "rows lanes"]:
-    """The derivatives of what is measured, by the state at the end and by the numbers."""
+    """The derivatives of what is measured, by the state at the end and by the parameters."""
     numbers, rest = eqx.partition(problem, moving)
 
     def value(numbers: Any, state: States) -> Lanes:
@@ -264,7 +264,7 @@ def _at_the_end(problem: AbstractProblem, moving: Any, measured: Measured, block
 
 
 class Weights(NamedTuple):
-    """A Runge-Kutta method as its adjoint sees it.
+    """The coefficients of a Runge-Kutta method that its adjoint needs.
 
     `fractions` of the step at which the stages lie, `rows` that lead to every stage but the first, and for every stage the
     `shares` of its rate in the end of the step and in the later stages.
@@ -276,7 +276,7 @@ class Weights(NamedTuple):
 
     @classmethod
     def of(cls, tableau: diffrax.ButcherTableau) -> "Weights":
-        """The weights of a method; the last stage of one that ends on it serves the next step, and is left out."""
+        """The weights of a method; a last stage that only serves the next step is left out."""
         weights, fractions, rows = tableau.b_sol, np.array([0.0, *tableau.c]), tableau.a_lower
         if tableau.fsal:
             weights, fractions, rows = rows[-1], fractions[:-1], rows[:-1]
@@ -300,17 +300,17 @@ def step_taken_back(
 ) -> tuple[Float[Array, "rows lanes"], Float[Array, "stages components lanes"]]:
     """Carry derivatives from the end of a Runge-Kutta step to its start (Hager, Numer. Math. 87 (2000) 247).
 
-    The stages are taken back in a loop: written out one by one they take a quarter less time, but thrice as long to compile.
+    The stages are done in a loop: written out one by one they take a quarter less time, but compile three times as long.
 
     **Arguments:**
 
     - `weights`: the method.
     - `problem`, `moving`: its leaves scalars or one number per lane; which of them to differentiate by.
     - `time`, `state`, `length`: where the step starts, and its length; 0 where none was made.
-    - `adjoint`: derivatives at the end of the step, by the state and by the numbers.
-    - `room`: for the derivatives by the stages, of finite numbers.
+    - `adjoint`: derivatives at the end of the step, by the state and by the parameters.
+    - `room`: working memory for the derivatives by the stages; finite.
 
-    **Returns:** those at the start; and the room, to be used again.
+    **Returns:** those at the start; and the working memory, to be used again.
     """
     numbers, rest = eqx.partition(problem, moving)
     components, stages = state.shape[0], len(weights.fractions)
@@ -341,7 +341,7 @@ def step_taken_back(
         pulled = sharing_values(pull)(
             at, numbers, tuple(jnp.unstack(_read(along, at=stage))), tuple(jnp.unstack(by_rate))
         )
-        # Where no step was made nothing is known to be finite.
+        # Where no step was made, nothing can be assumed finite.
         pulled = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(pulled), 0.0))
         return stage - 1, _written(by_stage, pulled[:components], at=stage), total + pulled
 
@@ -350,11 +350,11 @@ def step_taken_back(
     return adjoint + total, room
 
 
-def _read(all: Array, at: Int[Array, ""]) -> Array:
+def _read(whole: Array, at: Int[Array, ""]) -> Array:
     """One of the arrays that are stacked in another."""
-    return jax.lax.dynamic_index_in_dim(all, at, 0, keepdims=False)
+    return jax.lax.dynamic_index_in_dim(whole, at, 0, keepdims=False)
 
 
-def _written(all: Array, one: Array, at: Int[Array, ""]) -> Array:
-    """A stack of arrays with one of them replaced; without the look at bounds that `at[].set` has, it is done in place."""
-    return jax.lax.dynamic_update_index_in_dim(all, one, at, 0)
+def _written(whole: Array, one: Array, at: Int[Array, ""]) -> Array:
+    """A stack of arrays with one of them replaced; without the bounds check of `at[].set`, so that it is done in place."""
+    return jax.lax.dynamic_update_index_in_dim(whole, one, at, 0)

@@ -1,9 +1,9 @@
-"""Functions evaluated so that a value which several others need is computed once.
+"""Functions rewritten so that a value that several others need is computed only once.
 
-XLA fuses every result of a function over many lanes with all that leads to it, and evaluates what several results share
-anew for each. For the derivatives of a field, where nearly everything is shared, that multiplies the work. Here a function
-is taken apart into its operations, and what is needed again is stored: in levels, each joined into one array with a barrier
-behind it, as by `vector.stored`.
+XLA fuses every result of a function over many lanes with everything that leads to it, and computes what several results
+share again for each. For the derivatives of a field, where nearly everything is shared, that multiplies the work. Here a
+function is split into its operations, and values that are needed again are stored: in levels, each joined into one array
+followed by a barrier, as in `vector.stored`.
 """
 
 from collections import Counter
@@ -16,13 +16,13 @@ from jax.extend.core import Literal
 
 from ..xla_cpu import stored
 
-#: A value is stored if computing it anew for every use would cost so many operations more.
+#: A value is stored if computing it anew for every use would cost at least this many more operations.
 WORTH_STORING = 2
 
 #: Operations that compute nothing.
 FREE = ("broadcast_in_dim", "convert_element_type", "copy", "neg", "reshape", "squeeze")
 
-#: Calls, whose operations are taken for the caller's own.
+#: Calls, whose operations count as the caller's own.
 CALLS = ("closed_call", "custom_jvp_call", "custom_vjp_call", "jit", "pjit")
 
 
@@ -35,17 +35,17 @@ class Operation(NamedTuple):
 
 
 class Stack(NamedTuple):
-    """An array that is known by its parts, and the equation that would join them."""
+    """An array kept as its parts, and the equation that would join them."""
 
     parts: list[Any]
     equation: Any
 
 
 class Listing:
-    """The operations of a function: like ones listed once, stacks taken apart again left out, and barriers too.
+    """The operations of a function: equal ones listed once; barriers, and stacks that are taken apart again, left out.
 
     - `operations`: in an order in which they can be done.
-    - `given`: number of a value -> the array, for what is no operation's result.
+    - `given`: number of a value -> the array, for values that are not the result of an operation.
     - `kinds`: shape and dtype of every value.
     """
 
@@ -56,7 +56,7 @@ class Listing:
         self._known: dict[Any, Any] = {}
 
     def enter(self, value: Any, key: Any = None) -> int:
-        """The number of a value that is given; one with the same key is the same."""
+        """The number of a given value; values with the same key are the same."""
         key = ("given", id(value)) if key is None else key
         if key not in self._known:
             self._known[key] = self._new(jnp.shape(value), jnp.result_type(value))
@@ -117,7 +117,7 @@ def sharing_values(function: Callable[..., Any]) -> Callable[..., Any]:
 
     **Arguments:**
 
-    - `function`: of trees of arrays, made of operations that treat every lane alike, on arrays (lanes,) and scalars.
+    - `function`: of trees of arrays, made of operations that act lane by lane, on arrays (lanes,) and scalars.
     """
 
     def evaluated(*arguments: Any) -> Any:
@@ -156,7 +156,7 @@ def _evaluated(listing: Listing, results: list[int]) -> list[Any]:
             primitive = operation.equation.primitive
             found = primitive.bind(*(values[value] for value in operation.inputs), **operation.equation.params)
             values.update(zip(operation.outputs, found if primitive.multiple_results else [found], strict=True))
-        # Only what is alike can be joined.
+        # Only arrays of the same kind can be joined.
         for kind in dict.fromkeys(listing.kinds[value] for value in kept):
             alike = [value for value in kept if listing.kinds[value] == kind]
             values.update(zip(alike, stored(*(values[value] for value in alike)), strict=True))

@@ -1,7 +1,7 @@
-"""Answers with derivatives of their own: functions of scalars for `jit`, `vmap`, `grad`, `jvp` and their compositions.
+"""Answers with their own derivatives: functions of scalars for `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
-A run is not differentiated operation by operation. A question knows how to find its answer together with the answer's
-slopes by some of the numbers (variations that run along, or the way back), and what JAX asks for is put together from these.
+A run is not differentiated operation by operation. A question finds its answer together with the answer's
+slopes by some of the parameters (forwards or backwards), and JAX gets what it asks for from these.
 A batch of answers, as `vmap` asks for, is found as the cells of one block.
 """
 
@@ -19,21 +19,21 @@ from jaxtyping import Array, Bool, Float
 from .slopes import directions_of
 from .variation import natural_size
 
-#: What a question finds: arrays of floats, the cells along the first axis.
+#: An answer: arrays of floats, the cells along the first axis.
 Answer = Any
 
 
 class AbstractQuestion(eqx.Module):
-    """What is asked of a run, as a function of numbers: `leaves`, of which the first `movable` may move the answer."""
+    """What is asked of a run, as a function of `leaves`, of which the first `movable` can be differentiated by."""
 
-    #: Whether a batch is run as the cells of one block; else each run is one of its own, and the number of cells is 1.
+    #: Whether a batch is run as the cells of one block; otherwise each run is separate, with a single cell.
     in_blocks: ClassVar[bool] = True
 
     movable: eqx.AbstractVar[int]
 
     @abc.abstractmethod
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
-        """Where a part of the answer says that there is nothing, such as an infinite time: its derivative is 0 there."""
+        """Where an entry of the answer means "none", such as an infinite time: its derivative is 0 there."""
 
     @abc.abstractmethod
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Answer:
@@ -52,7 +52,7 @@ class AbstractQuestion(eqx.Module):
 
 
 def ask(question: AbstractQuestion, *leaves: Float[Array, "..."]) -> Answer:
-    """The answer for one run. Where it is absent its derivative is 0, whatever becomes of it afterwards.
+    """The answer for one run. Where it is absent its derivative is 0, whatever is done with it afterwards.
 
     **Arguments:** `leaves`: the numbers, as the question takes them for a single cell.
 
@@ -84,7 +84,7 @@ def _change(question: AbstractQuestion, value: Array, slopes: tuple[Any, ...], t
     none = question.absent(value)
 
     def share(slope: Array, tangent: Array) -> Array:
-        # Chosen before and after, so that an infinite tangent or cotangent of what is absent is dropped, not multiplied.
+        # Selected before and after, so that an infinite tangent or cotangent of an absent answer is dropped, not multiplied.
         kept = jnp.where(jnp.all(none), 0.0, tangent)
         return jnp.where(none, 0.0, jnp.tensordot(slope, kept, axes=jnp.ndim(tangent)))
 
@@ -108,7 +108,7 @@ def _with_slopes(question: AbstractQuestion, active: tuple[int, ...]) -> Callabl
 
 
 def _in_block(question: AbstractQuestion, function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of a number of cells and their numbers as one of a single cell's, batched as the cells of one block."""
+    """A function of (cells, leaves) as a function of a single cell's leaves; `vmap` makes it the cells of one block."""
 
     def single(*leaves):
         return _only(function(1, *leaves))
@@ -135,7 +135,7 @@ def directions_by(
     leaves: tuple[Array, ...],
     cells: int | None,
 ) -> tuple[Any, tuple[Any, ...], Callable[[list[Answer]], list[Answer]]]:
-    """A problem and its directions along leaves, each of which moves a number by its own size.
+    """A problem and its directions along leaves, each of which changes a leaf in proportion to its own size.
 
     **Arguments:**
 
@@ -143,15 +143,15 @@ def directions_by(
     - `active`, `leaves`: along which of the leaves. With `cells` they are scalars or one per cell; without, arrays of any
       shape, each of whose entries has a direction of its own.
 
-    **Returns:** the problem; its directions; and a function that makes of the slopes along the directions, trees of arrays,
-    those by each leaf, the leaf's own axes behind (with `cells` there are none, and the cells come first).
+    **Returns:** the problem; its directions; and a function that turns slopes along the directions (trees of arrays)
+    into slopes by each leaf, the leaf's own axes behind (with `cells` there are none, and the cells come first).
     """
 
     def moved(*moving: Array) -> Any:
-        all = list(leaves)
+        every = list(leaves)
         for i, leaf in zip(active, moving, strict=True):
-            all[i] = leaf
-        return build(tuple(all), cells)
+            every[i] = leaf
+        return build(tuple(every), cells)
 
     point = tuple(leaves[i] for i in active)
     sizes = [natural_size(leaf) for leaf in point]
@@ -185,10 +185,10 @@ def directions_by(
 
 
 def _by_entries(size: Array, *parts: Array) -> Array:
-    """Slopes along the entries of a leaf as those by the leaf, its axes behind."""
+    """Slopes along the entries of a leaf, as slopes by the leaf, with its axes last."""
     return jnp.stack(parts, axis=-1).reshape(*parts[0].shape, *size.shape) / size
 
 
 def _by_cells(size: Array, part: Array) -> Array:
-    """Slopes along a leaf as those by the leaf, with one of it for all cells or for each."""
+    """Slopes along a leaf, as slopes by the leaf, which is one for all cells or one for each."""
     return part / size.reshape((-1,) + (1,) * (part.ndim - 1))

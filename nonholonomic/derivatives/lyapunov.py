@@ -1,7 +1,7 @@
-"""The largest Lyapunov exponent of a problem: the mean rate at which nearby runs part, by the variational equation.
+"""The largest Lyapunov exponent of a problem: the mean rate at which nearby runs diverge, by the variational equation.
 
-A direction w rides along with the state y' = f(y). It is kept at unit length while it follows the linearised motion
-(Benettin et al., Meccanica 15 (1980) 9, with the renormalisation made continuous), and what the renormalisation takes away
+A direction w is integrated along with the state y' = f(y). It is kept at unit length while it follows the linearised motion
+(Benettin et al., Meccanica 15 (1980) 9, with the renormalisation made continuous), and what the renormalisation removes
 is added up: w' = J w - g w, g = (w . J w) / (w . w), growth' = g, where J w is a Jacobian-vector product of f. Directions
 and lengths are those of the state in units of the problem's magnitudes.
 """
@@ -18,7 +18,7 @@ from ..integration import REACHED_END, RUNNING, AbstractProblem, Settings, compi
 
 
 class VariedProblem(AbstractProblem):
-    """A problem without its event, with a direction and the logarithm of its growth riding along.
+    """A problem without its event, extended by a direction and the logarithm of its growth.
 
     **Arguments:**
 
@@ -51,10 +51,10 @@ class VariedProblem(AbstractProblem):
 
 
 def probed(problem: AbstractProblem) -> VariedProblem:
-    """A run and a direction with nothing special about it, for a derivative that takes no part in step control itself.
+    """A run and a direction with nothing special about it, for a derivative that does not take part in step control itself.
 
-    The direction follows the linearised motion and takes part in step control, so that the steps bear tangents also where
-    the state is at rest.
+    The direction follows the linearised motion and takes part in step control, so that the steps suit tangents even
+    where the state is at rest.
     """
     start, magnitudes = problem.start()
     direction = jnp.cos(1.0 + jnp.arange(len(start)))

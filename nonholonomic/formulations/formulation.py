@@ -8,8 +8,8 @@ generalised force f(t, q, q') of drives and friction. From them follow
 - `ConstrainedConnection`: geodesics, with forces, of the constrained Levi-Civita connection;
 - `ReducedBracket`: the reduced Poisson-like bracket of van der Schaft and Maschke.
 
-They use the data in different ways, so that their agreement is a check on all of them. A user chooses by handing in the
-object. They serve one state (n,); `jax.vmap` serves many. The production models are faster and do not need them.
+They use the data in different ways, so that their agreement is a check on all of them. A user chooses one by passing
+the object. They take one state (n,); use `jax.vmap` for many. The production models are faster and do not need them.
 """
 
 import abc
@@ -76,7 +76,7 @@ class AbstractSystem(eqx.Module):
 
 
 class Routhian(AbstractSystem):
-    """A system with one cyclic coordinate eliminated at a given momentum, R = L - beta psi'.
+    """A system with one cyclic coordinate eliminated, at a given momentum, R = L - beta psi'.
 
     The coordinate is cyclic if neither metric, potential nor force depends on it, and the force has no component along
     it. What remains has a Lagrangian with terms linear in the velocity, which `Hamel` takes as it is.
@@ -153,11 +153,11 @@ class AbstractFormulation(eqx.Module):
 
     @abc.abstractmethod
     def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
-        """The state that stands for coordinates and velocity, each (n,); the velocity is to obey the constraints."""
+        """The state for coordinates and velocity, each (n,); the velocity must obey the constraints."""
 
     @abc.abstractmethod
     def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
-        """Coordinates and velocity, each (n,), that a state stands for."""
+        """Coordinates and velocity, each (n,), of a state."""
 
     @abc.abstractmethod
     def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
@@ -182,8 +182,8 @@ def reduced_fields(system: AbstractSystem, q: Coordinates) -> Float[Array, "n r"
 class Multipliers(AbstractFormulation):
     """Hamilton's equations with multipliers, q' = dH/dp, p' = -dH/dq + f + W^T lambda (`stroller.md`, section 6, F1).
 
-    The state is (q, p). The multipliers keep W q' constant, whatever it is at the start, and it drifts with the
-    integrator's error; two remedies are on offer, and both leave an exact solution as it is.
+    The state is (q, p). The multipliers keep W q' constant, whatever it is at the start, but it drifts with the
+    integrator's error; there are two remedies, and both leave an exact solution as it is.
 
     **Arguments:**
 
@@ -208,7 +208,7 @@ class Multipliers(AbstractFormulation):
         return p - W.T @ solve(W @ per_mass[:, :-1], W @ per_mass[:, -1], positive=True)
 
     def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
-        """The state (q, p), with p projected on the constraints; warns where a concrete velocity violates them."""
+        """The state (q, p), with p projected on the constraints; warns if a concrete velocity violates them."""
         violation = self.system.constraints(q) @ rate
         if not is_traced(violation) and violation.size:
             worst = float(jnp.max(jnp.abs(violation)) / jnp.maximum(jnp.max(jnp.abs(rate)), 1e-300))
@@ -243,7 +243,7 @@ class Hamel(AbstractFormulation):
     """Poincare's equations in quasi-velocities u, q' = E u (`stroller.md`, section 6, F2).
 
     With l(q, u) = L(q, E u) and p = dl/du, p_i' = E_i(l) + c^k_ji u^j p_k + E_i.f. Constraints drop the equations and
-    the quasi-velocities of the frame's last fields, yet not their momenta, in which nonholonomy shows (Hamel). The
+    the quasi-velocities of the frame's last fields, but not their momenta, through which nonholonomy enters (Hamel). The
     Lagrangian may have terms linear in the velocity (`Routhian`). The state is (q, u).
 
     **Arguments:**
@@ -287,7 +287,7 @@ class ConstrainedConnection(AbstractFormulation):
 
     With Q the metric projector on the forbidden directions, nabla^D = nabla + nabla Q is a connection on all of the
     configuration space whose geodesics that start within the constraints stay within them (Lewis; Vershik and Faddeev):
-    no multiplier appears. The state is (q, q'). The Lagrangian is to be kinetic minus potential energy.
+    no multiplier appears. The state is (q, q'). The Lagrangian must be kinetic minus potential energy.
 
     **Arguments:**
 
@@ -342,7 +342,7 @@ class ReducedBracket(AbstractFormulation):
 
     With X = (X_1, ...) the allowed fields, p = G X u, and H(q, p~) = p~.(X^T G X)^-1 p~ / 2 + V,
     q' = X dH/dp~ and p~' = -X^T dH/dq - p.[X_a, X_b] dH/dp~ + X^T f. The state is (q, p~), p~ = X^T p. The
-    Lagrangian is to be kinetic minus potential energy.
+    Lagrangian must be kinetic minus potential energy.
 
     **Arguments:**
 

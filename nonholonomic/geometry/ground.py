@@ -1,9 +1,9 @@
 """Surfaces as seen from the fixed frame, for a body that drives on them.
 
-A ground has axes of its own, in which positions, headings and normals have their components: x east, y north and z
+A ground has its own axes, in which positions, headings and normals are given: x east, y north and z
 along the normal on a plane; x and y across and z along the axis of symmetry, which is vertical, on a spheroid. There is
-no pole, no edge and no angle in these components. `chart` and `place_at` turn them to the two coordinates that a person
-would give and back.
+no pole, no edge and no angle in these components. `chart` and `place_at` convert between them and the two coordinates that a
+person would give.
 """
 
 import abc
@@ -57,7 +57,7 @@ class AbstractGround(Bounded):
 
     @abc.abstractmethod
     def departure(self, position: Vector) -> Component:
-        """How far a position has left the ground, relative to the ground's size."""
+        """How far a position is off the ground, relative to the ground's size."""
 
     @abc.abstractmethod
     def in_fixed_frame(self, vector: Vector) -> tuple[Any, Any, Any]:
@@ -73,7 +73,7 @@ class AbstractQuadric(AbstractGround):
         """Equatorial radius A and polar semi-axis c [m]."""
 
     def gradient(self, vector: Vector) -> Vector:
-        """The vector N r [1/m]; N acts on any vector alike."""
+        """The vector N r [1/m]; also N times any other vector."""
         equatorial, polar = self.semi_axes
         across, along = 1.0 / (equatorial * equatorial), 1.0 / (polar * polar)
         return (multiply(across, vector[0]), multiply(across, vector[1]), multiply(along, vector[2]))
@@ -83,7 +83,7 @@ class AbstractQuadric(AbstractGround):
         return (None, None, 1.0)
 
     def outward(self, position: Vector) -> Vector:
-        # Normalised even where N r has unit length on the surface, so that a drift off it does not feed on itself.
+        # Normalised even where N r has unit length on the surface, so that a drift off it does not amplify itself.
         gradient = self.gradient(position)
         return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), gradient)
 

@@ -1,7 +1,7 @@
 """Small linear systems in plain JAX operations.
 
 LAPACK, which `jnp.linalg.solve` calls on a CPU, costs more than the elimination itself for a few unknowns, and large
-batches of it inside one compiled program can wait for one another for ever where there are few cores.
+batches of it inside one compiled program can deadlock on a machine with few cores.
 """
 
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ def solve(matrix: Float[Array, "n n"], right: Float[Array, "n ..."], positive: b
 
     - `matrix`: A, of a few rows.
     - `right`: B, a vector or the columns of a matrix.
-    - `positive`: whether A is symmetric and positive definite, so that no pivot need be sought.
+    - `positive`: whether A is symmetric and positive definite, so that no pivoting is needed.
     """
     size = matrix.shape[0]
     if size == 0:

@@ -3,11 +3,11 @@
 Every surface answers two kinds of question, and a new surface is one new class.
 
 In a frame that moves with the body, (t1, t2, n) with n the unit normal from the arena into the room where the body is:
-how the frame turns with the velocity (the shape operator), which way is up, and how the place changes. This is what a
-field that is integrated needs; components that vanish identically are `None` (see `vector.py`).
+how the frame turns with the velocity (the shape operator), which way is up, and how the place changes. This is what the
+equations of motion need; components that vanish identically are `None` (see `vector.py`).
 
-In the fixed frame (x, y, z), z up: position, normal, frame. This is what a picture needs. A model that lives in the
-fixed frame asks the surface as a ground (see `ground.py`).
+In the fixed frame (x, y, z), z up: position, normal, frame. This is what a picture needs. A model formulated in the
+fixed frame uses the surface as a ground (see `ground.py`).
 """
 
 import abc
@@ -42,7 +42,7 @@ class AbstractSurface(Bounded):
     """
 
     def room(self, distance: Float[ArrayLike, "..."]) -> Iterable[Bound]:
-        """What the surface's numbers must be for a ball whose radius is the given distance [m] to fit."""
+        """The ranges of the surface's numbers in which a ball of the given radius [m] fits."""
         return ()
 
     @abc.abstractmethod
@@ -73,28 +73,28 @@ class AbstractSurface(Bounded):
         """Height [m] above the lowest point of the surface."""
 
     @abc.abstractmethod
-    def path(self, eta: Float[ArrayLike, "..."]) -> Place:
-        """Cyclic coordinates at the start, which a field needs only if the path is to be drawn."""
+    def cyclic(self, eta: Float[ArrayLike, "..."]) -> Place:
+        """Cyclic coordinates at the start, integrated only if the position is wanted too."""
 
     @abc.abstractmethod
-    def path_rate(self, path: Place, velocity: Tangent, turning: Tangent) -> Place:
-        """Rate of change of `path`."""
+    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
+        """Rate of change of `cyclic`."""
 
     @abc.abstractmethod
-    def angle(self, place: Place, path: Place) -> Float[Array, "..."]:
+    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
         """Angle eta [rad] from the lowest point."""
 
     @abc.abstractmethod
-    def frame(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
+    def frame(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
         """The vectors t1, t2 and n in the fixed frame (x, y, z), each a tuple of three arrays."""
 
     @abc.abstractmethod
-    def position(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
+    def position(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
         """Position (x, y, z) [m] in the fixed frame; the origin is the arena's centre, or its point below the start."""
 
 
 def none_if_zero(value: Any) -> Any:
-    """A number as an array, or `None` for one that is known to be zero everywhere, which then costs nothing."""
+    """A number as an array, or `None` if it is known to be zero everywhere, so that it costs nothing."""
     if value is None:
         return None
     number = as_number(value)
@@ -102,7 +102,7 @@ def none_if_zero(value: Any) -> Any:
 
 
 class Plane(AbstractSurface, AbstractGround):
-    """A plane; its frame does not turn. A level one, which is all that a rolling ball is offered, carries no terms.
+    """A plane; its frame does not turn. A level plane, the only kind for a rolling ball, adds no terms.
 
     **Arguments:**
 
@@ -137,22 +137,22 @@ class Plane(AbstractSurface, AbstractGround):
     def height(self, place: Place) -> Component:
         return None
 
-    def path(self, eta: Float[ArrayLike, "..."]) -> Place:
+    def cyclic(self, eta: Float[ArrayLike, "..."]) -> Place:
         zero = jnp.zeros_like(as_number(eta))
         return (zero, zero)
 
-    def path_rate(self, path: Place, velocity: Tangent, turning: Tangent) -> Place:
+    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
         return velocity
 
-    def angle(self, place: Place, path: Place) -> Float[Array, "..."]:
-        return jnp.zeros_like(path[0])
+    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
+        return jnp.zeros_like(cyclic[0])
 
-    def frame(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
-        zero, one = jnp.zeros_like(path[0]), jnp.ones_like(path[0])
+    def frame(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
+        zero, one = jnp.zeros_like(cyclic[0]), jnp.ones_like(cyclic[0])
         return (one, zero, zero), (zero, one, zero), (zero, zero, one)
 
-    def position(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
-        return (path[0], path[1], jnp.zeros_like(path[0]))
+    def position(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
+        return (cyclic[0], cyclic[1], jnp.zeros_like(cyclic[0]))
 
     @property
     def up(self) -> Vector:
@@ -226,30 +226,30 @@ class Cylinder(AbstractSurface):
     def height(self, place: Place) -> Component:
         return self.radius * (1.0 - place[1])
 
-    def path(self, eta: Float[ArrayLike, "..."]) -> Place:
+    def cyclic(self, eta: Float[ArrayLike, "..."]) -> Place:
         eta = as_number(eta)
         return (eta, jnp.zeros_like(eta))
 
-    def path_rate(self, path: Place, velocity: Tangent, turning: Tangent) -> Place:
+    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
         return (turning[0], velocity[1])
 
-    def angle(self, place: Place, path: Place) -> Float[Array, "..."]:
-        return path[0]
+    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
+        return cyclic[0]
 
-    def frame(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
+    def frame(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
         sine, cosine = place
         zero, one = jnp.zeros_like(sine), jnp.ones_like(sine)
         return (cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)
 
-    def position(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
+    def position(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
         sine, cosine = place
-        return (self.radius * sine, path[1], -self.radius * cosine)
+        return (self.radius * sine, cyclic[1], -self.radius * cosine)
 
 
 class Sphere(AbstractSurface, AbstractQuadric):
-    """A sphere, for a rolling ball its inside; the frame is carried parallel to itself, so no place is singular.
+    """A sphere (its inside, for a rolling ball); the frame is carried parallel to itself, so no place is singular.
 
-    The place is the vertical seen in the moving frame; the path adds the horizontal x axis seen in it.
+    The place is the vertical seen in the moving frame; `cyclic` adds the horizontal x axis seen in it.
 
     **Arguments:**
 
@@ -284,23 +284,23 @@ class Sphere(AbstractSurface, AbstractQuadric):
     def height(self, place: Place) -> Component:
         return self.radius * (1.0 - place[2])
 
-    def path(self, eta: Float[ArrayLike, "..."]) -> Place:
+    def cyclic(self, eta: Float[ArrayLike, "..."]) -> Place:
         eta = as_number(eta)
         return (jnp.cos(eta), jnp.zeros_like(eta), -jnp.sin(eta))
 
-    def path_rate(self, path: Place, velocity: Tangent, turning: Tangent) -> Place:
-        return carried(path, turning)
+    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
+        return carried(cyclic, turning)
 
-    def angle(self, place: Place, path: Place) -> Float[Array, "..."]:
+    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
         return jnp.arctan2(jnp.hypot(place[0], place[1]), place[2])
 
-    def frame(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
-        x, z = path, place
+    def frame(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
+        x, z = cyclic, place
         y = (z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0])
         return (x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2])
 
-    def position(self, place: Place, path: Place) -> tuple[Any, Any, Any]:
-        normal = self.frame(place, path)[2]
+    def position(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
+        normal = self.frame(place, cyclic)[2]
         return tuple(-self.radius * component for component in normal)
 
     @property

@@ -1,7 +1,7 @@
-"""Finding the parameters of a model from measurements, and how well the measurements know them.
+"""Finding the parameters of a model from measurements, and how well the measurements determine them.
 
 `identify` fits the `Free` parameters from several starts; the `Identification` has standard errors, profile
-likelihoods, and the combinations that the data cannot see.
+likelihoods, and the combinations that the data do not determine.
 """
 
 from .identify import free_numbers as free_numbers

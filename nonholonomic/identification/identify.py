@@ -1,4 +1,4 @@
-"""Parameters from measurements: maximum likelihood, with errors and with what the measurements leave open."""
+"""Parameters from measurements: maximum likelihood, with errors and with what the measurements do not determine."""
 
 import math
 from collections.abc import Callable
@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..parameters import full_path
+from ..parameters import full_name
 from ..validation import require
-from .levenberg_marquardt import Problem, linearise, minimise, required
+from .levenberg_marquardt import Problem, linearise, minimise
 from .likelihood import Measurements
 from .result import Identification, summarise
 from .unknown import Free, as_free, draw_starts
@@ -30,18 +30,18 @@ def identify(
     labels: tuple[str, ...] | None = None,
     progress: bool = True,
 ) -> Identification:
-    """Find the numbers of a model that make measurements most likely.
+    """Find the parameters of a model that make measurements most likely.
 
     Levenberg-Marquardt from every start at once, on the residuals of the data (`likelihood.py`) and of the priors. It finds
-    a minimum near each start, not the least of all; the result is the best of them and tells where the others ended.
+    a minimum near each start, not the global one; the result is the best of them and says where the others ended.
 
     **Arguments:**
 
-    - `model`: parameters, name -> (rows,), to predictions (rows, n); `jax.vmap` makes one of a function of one set. It is
-      differentiated forwards.
+    - `model`: parameters, name -> (rows,), to predictions (rows, n); `jax.vmap` turns a function of one set into
+      one. It is differentiated in forward mode.
     - `measurements`: `Measurements` of shape (n,).
-    - `free`: name -> a `Free`, or only the number from which to start.
-    - `starts`: from how many points to fit: the one given, and others drawn about it.
+    - `free`: name -> a `Free`, or only the value from which to start.
+    - `starts`: number of points from which to fit: the one given, and others drawn around it.
     - `spread`: how far they are drawn, as a factor either way, greater than 1; `seed`: of the draw.
     - `max_steps`: a fit that needs more has not converged.
     - `labels`: (n,), names of the measurements in the result.
@@ -49,9 +49,8 @@ def identify(
 
     **Returns:** an `Identification`.
 
-    **Raises:** `ValueError` for arguments out of range; `ImportError` if Optimistix is not installed.
+    **Raises:** `ValueError` for arguments out of range.
     """
-    required()
     unknowns = as_free(free)
     if not isinstance(measurements, Measurements) or measurements.value.ndim != 1:
         raise ValueError(f"measurements = {measurements!r} must be Measurements of shape (n,)")
@@ -89,29 +88,29 @@ def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...]]:
 def free_numbers(
     free: Any, roots: dict[str, Any], known: list[str], replace: Callable[[dict[str, Any], dict[str, Any]], Any]
 ) -> dict[str, Free]:
-    """The unknowns of a scene: their full paths, and a lower bound of 0 for numbers that cannot be negative.
+    """The unknowns of a scene: their full names, and a lower bound of 0 for parameters that cannot be negative.
 
     **Arguments:**
 
-    - `free`: path, or its unambiguous end, -> a `Free` or where to start.
-    - `roots`: name -> tree of modules, `known`: the paths of their numbers.
-    - `replace`: (roots, path -> number) -> roots; it raises `ValueError` for numbers that the modules refuse.
+    - `free`: name, or its unambiguous end, -> a `Free` or where to start.
+    - `roots`: name -> tree of modules, `known`: the full names of their parameters.
+    - `replace`: (roots, name -> number) -> roots; it raises `ValueError` for values that the modules refuse.
 
-    **Returns:** path -> `Free`.
+    **Returns:** full name -> `Free`.
 
-    **Raises:** `ValueError` for an unknown path, or starts that the modules refuse.
+    **Raises:** `ValueError` for an unknown name, or starts that the modules refuse.
     """
     given = {}
-    for name, one in as_free(free).items():
-        path = full_path("free", name, known)
-        if path in given:
-            raise ValueError(f"free: {path!r} is named twice")
-        given[path] = one
-    replace(roots, {path: one.start for path, one in given.items()})
+    for short, one in as_free(free).items():
+        name = full_name("free", short, known)
+        if name in given:
+            raise ValueError(f"free: {name!r} is named twice")
+        given[name] = one
+    replace(roots, {name: one.start for name, one in given.items()})
     lower = {}
-    for path, one in given.items():
+    for name, one in given.items():
         try:
-            replace(roots, {path: -(abs(one.start) or 1.0)})
+            replace(roots, {name: -(abs(one.start) or 1.0)})
         except ValueError:
-            lower[path] = 0.0
+            lower[name] = 0.0
     return as_free(given, lower)

@@ -1,7 +1,7 @@
 """Nonlinear least squares from many starts, or of many data, at once: Optimistix's Levenberg-Marquardt on rows.
 
 A row is one fit. All rows advance together, and the model is evaluated for all of them, with its slopes, in one call; a
-model that runs its own cases as lanes of one block therefore runs those of every row in it.
+model that runs its own cases as lanes of one block therefore runs the cases of all rows in one block.
 """
 
 from collections.abc import Callable
@@ -11,33 +11,34 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 from jaxtyping import Array, Bool, Float, Int
 
 from ..progress import Progress
 from .likelihood import Measurements
 from .unknown import Free
 
-#: Damping of the first step, as a part of the largest squared slope (Madsen, Nielsen and Tingleff, "Methods for
+#: Damping of the first step, as a fraction of the largest squared slope (Madsen, Nielsen and Tingleff, "Methods for
 #: non-linear least squares problems", 2nd edition (2004), section 3.2).
 FIRST_DAMPING = 1e-2
 
-#: A step that gains more than this part of what it promised is followed by one with less damping, by the factor `EASED`;
-#: one that gains next to nothing is taken back, and tried again with more damping, by the factor `HARDENED`.
+#: A step that gains more than this fraction of what it promised is followed by one with less damping, by the factor `EASED`;
+#: one that gains next to nothing is undone, and tried again with more damping, by the factor `HARDENED`.
 GOOD, EASED, HARDENED = 0.5, 10.0, 4.0
 
 #: A fit has converged once a step changes no coordinate and no residual by more than this, relatively or absolutely.
 CONVERGED = 1e-6
 
-#: It has converged too where a step gains nothing, and an undamped one would lower -2 log likelihood by no more than this:
-#: it is as far as the errors of the integration allow, within a thirtieth of a standard error of the minimum.
+#: It has also converged if a step gains nothing and an undamped one would lower -2 log likelihood by no more than this: it is
+#: as close as the errors of the integration allow, within a thirtieth of a standard error of the minimum.
 NEGLIGIBLE = 1e-3
 
-#: Singular values of a row's slopes below this part of the largest are round-off.
+#: Singular values of a row's slopes below this fraction of the largest are round-off.
 ROUND_OFF = 1e-7
 
 
 class Problem(eqx.Module):
-    """A model and what is free in it.
+    """A model and its free parameters.
 
     - `model`: parameters, name -> (rows,), to predictions (rows, n).
     - `free`: name -> `Free`, as pairs.
@@ -47,7 +48,7 @@ class Problem(eqx.Module):
     free: tuple[tuple[str, Free], ...] = eqx.field(static=True)
 
     def values(self, coordinates: Float[Array, "... unknowns"]) -> Float[Array, "... unknowns"]:
-        """The numbers at their coordinates."""
+        """The parameters at given coordinates."""
         return jnp.stack([one.value(coordinates[..., k]) for k, (_, one) in enumerate(self.free)], axis=-1)
 
     def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
@@ -101,7 +102,7 @@ def predictions_and_slopes(
 ) -> tuple[Float[Array, "rows n"], Float[Array, "rows n unknowns"]]:
     """Predictions and their slopes; rows do not influence one another, so a coordinate is moved in all of them at once.
 
-    Everything that asks for a model does so here, so that it is compiled once for every number of rows.
+    Every evaluation of a model is made here, so that it is compiled once for every number of rows.
     """
 
     def along(direction):
@@ -152,7 +153,7 @@ class _Tangent(NamedTuple):
 
 
 def _residuals(moving: Float[Array, " moving"], given: tuple[Problem, Array, _Row, _Tangent]) -> Any:
-    """All residuals of one row, as Optimistix wants them, the model in its linear approximation.
+    """All residuals of one row in the form Optimistix expects, with the model linearised.
 
     A step of Levenberg-Marquardt asks for residuals and slopes at one point only, where the approximation is exact.
     """
@@ -179,15 +180,12 @@ def minimise(
     - `problem`: the `Problem`.
     - `starts`: coordinates, (rows, unknowns).
     - `measurements`: (n,), the same for all rows, or (rows, n).
-    - `held`: number of an unknown that keeps its start, or `None`.
+    - `held`: index of an unknown that keeps its start, or `None`.
     - `max_steps`: a row that needs more has not converged.
     - `progress`: whether to show, on a terminal or in a notebook, how many rows are done.
 
     **Returns:** the `Ends`.
-
-    **Raises:** `ImportError` if Optimistix is not installed.
     """
-    optimistix = required()
     starts = jnp.asarray(starts, float)
     rows, unknowns = starts.shape
     measurements = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (rows, leaf.shape[-1])), measurements)
@@ -199,7 +197,7 @@ def minimise(
         unit = jnp.sqrt(FIRST_DAMPING * jnp.where(largest > 0.0, largest, 1.0 / FIRST_DAMPING))
         moving = starts @ embedding
         row = _Row(measurements, starts - moving @ embedding.T, unit)
-        solver = _solver(optimistix)
+        solver = _solver()
         moving, state = _begin(solver, problem, embedding, row, moving)
         for step in range(max_steps):
             coordinates = row.held + state.y_eval @ embedding.T
@@ -216,20 +214,8 @@ def minimise(
     return Ends(row.held + moving @ embedding.T, jnp.asarray(done), jnp.asarray(steps))
 
 
-def required() -> Any:
-    """Optimistix.
-
-    **Raises:** `ImportError` that says how to install it.
-    """
-    try:
-        import optimistix
-    except ImportError:
-        raise ImportError("identification needs Optimistix: pip install 'nonholonomic[fit]'") from None
-    return optimistix
-
-
-def _solver(optimistix: Any) -> Any:
-    """Levenberg-Marquardt, with a damping that is eased sooner than Optimistix does it."""
+def _solver() -> Any:
+    """Levenberg-Marquardt, with a damping that is reduced sooner than Optimistix's own."""
     search = optimistix.ClassicalTrustRegion(high_cutoff=GOOD, high_constant=EASED, low_constant=1.0 / HARDENED)
     solver = optimistix.LevenbergMarquardt(rtol=CONVERGED, atol=CONVERGED)
     return eqx.tree_at(lambda solver: solver.search, solver, search)

@@ -19,9 +19,9 @@ class Measurements(eqx.Module):
 
     **Arguments:**
 
-    - `value`: (n,), what was measured; where `censored`, what the quantity was only seen to exceed, with an error of its
-      own (a clock stopped by hand is uncertain too).
-    - `error`: (n,), standard deviations, positive; a number serves all.
+    - `value`: (n,), what was measured; where `censored`, what the quantity was only seen to exceed, with its own
+      error (a clock stopped by hand is uncertain too).
+    - `error`: (n,), standard deviations, positive; a scalar serves for all.
     - `censored`: (n,), which are lower limits; none by default.
 
     **Raises:** `ValueError` for numbers that are not finite or shapes that do not fit.
@@ -62,6 +62,6 @@ class Measurements(eqx.Module):
 
 def one_sided(z: Float[Array, "..."]) -> Float[Array, "..."]:
     """The residual -sqrt(-2 log Phi(z)) of a lower limit; 0 from where it is less than 1e-9."""
-    # Beyond, the square root would have an infinite slope times a vanishing one.
+    # Beyond that, the derivative of the square root would be infinity times zero.
     near = z < 9.0
     return jnp.where(near, -jnp.sqrt(-2.0 * log_ndtr(jnp.where(near, z, 0.0))), 0.0)

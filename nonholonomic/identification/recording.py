@@ -15,7 +15,7 @@ def check_recording(times: Any, value: Any, quantity: str, quantities: dict[str,
     **Arguments:**
 
     - `times`: (times,) [s], from 0 or later; `value`: (times,), or (times, columns) for a quantity of several.
-    - `quantity`: its name; `quantities`: name -> names of its columns, of those there are.
+    - `quantity`: its name; `quantities`: name -> names of its columns, of all known ones.
     """
     if quantity not in quantities:
         raise ValueError(f"quantity = {quantity!r} must be one of {', '.join(map(repr, quantities))}")
@@ -30,10 +30,10 @@ def check_recording(times: Any, value: Any, quantity: str, quantities: dict[str,
 
 
 def samples(value: Any, error: Any) -> Measurements:
-    """The samples as a likelihood takes them, with an error for all or one for each."""
+    """The samples as `Measurements`, with one error for all or one for each."""
     return Measurements(value.reshape(-1), jnp.broadcast_to(error, jnp.shape(value)).reshape(-1))
 
 
 def sample_labels(times: Any, columns: tuple[str, ...]) -> tuple[str, ...]:
-    """What to call each sample, such as `theta(0.1 s)`."""
+    """A label for each sample, such as `theta(0.1 s)`."""
     return tuple(f"{column}({time:.4g} s)" for time in np.asarray(times) for column in columns)

@@ -1,4 +1,4 @@
-"""What a fit found: estimates, their errors, what the data cannot see, and how it went from every start."""
+"""What a fit found: estimates, their errors, what the data do not determine, and how the fit went from every start."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -11,10 +11,10 @@ from jaxtyping import Float
 from .levenberg_marquardt import Linearised, Problem, linearise, minimise
 from .likelihood import Measurements
 
-#: Singular values below this part of the largest are those of a direction that the data do not see at all.
+#: Singular values below this fraction of the largest are those of a direction that the data do not determine at all.
 NO_SLOPE = 1e-7
 
-#: A combination of numbers counts as unseen where its relative error exceeds this.
+#: A combination of parameters counts as undetermined if its relative error exceeds this.
 UNSEEN = 1.0
 
 #: Rows of the residual table and unknowns of a combination that a summary shows.
@@ -22,11 +22,11 @@ MOST_ROWS, LEAST_SHARE = 24, 0.02
 
 
 class Profile(NamedTuple):
-    """The profile likelihood of one number.
+    """The profile likelihood of one parameter.
 
     - `values`: (points,), at which it was held.
-    - `deviance`: (points,), -2 log likelihood, all other numbers fitted again, above its least value.
-    - `estimates`: name -> (points,), the other numbers there.
+    - `deviance`: (points,), -2 log likelihood, all other parameters fitted again, above its minimum.
+    - `estimates`: name -> (points,), the other parameters there.
     - `converged`: (points,), whether these fits did.
     """
 
@@ -37,13 +37,13 @@ class Profile(NamedTuple):
 
 
 class Identifiability(NamedTuple):
-    """What data fix, and what not, to first order: singular values of the slopes of the residuals, priors left out.
+    """What the data determine and what not, to first order: singular values of the slopes of the residuals, priors left out.
 
-    A slope is that by a relative change: of 1 in the logarithm of a number that cannot be negative, of `Free.unit` else.
+    Slopes are by relative changes: of 1 in the logarithm of a parameter that cannot be negative, otherwise of `Free.unit`.
 
-    - `singular_values`: (unknowns,), falling; the inverse of one is the relative error of its combination of numbers.
+    - `singular_values`: (unknowns,), falling; the inverse of one is the relative error of its combination of parameters.
     - `directions`: (unknowns, unknowns), the combinations, one a row.
-    - `words`: the combinations as text: what moves together, and by how much.
+    - `words`: the combinations as text: what changes together, and by how much.
     """
 
     singular_values: Float[np.ndarray, " unknowns"]
@@ -52,7 +52,7 @@ class Identifiability(NamedTuple):
 
     @property
     def unseen(self) -> tuple[str, ...]:
-        """The combinations that the data leave open by more than their own size."""
+        """The combinations whose errors exceed their own size."""
         least = max(1.0 / UNSEEN, NO_SLOPE * self.singular_values[0])
         return tuple(word for value, word in zip(self.singular_values, self.words, strict=True) if value < least)
 
@@ -70,15 +70,15 @@ class ResidualRow(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Identification:
-    """Numbers identified from measurements.
+    """Parameters identified from measurements.
 
     - `estimates`, `standard_errors`: name -> number. The errors are those of the Gauss-Newton matrix, of data and priors
-      together; infinite for a number that a direction without slope contains.
-    - `covariance`: (unknowns, unknowns), in the order of `estimates`. Numbers with infinite error have covariance 0.
+      together; infinite for a parameter that takes part in an undetermined direction.
+    - `covariance`: (unknowns, unknowns), in the order of `estimates`. Parameters with infinite error have covariance 0.
     - `deviance`: -2 log likelihood of data and priors at the estimate, up to a constant: the sum of squared residuals.
     - `degrees`: measurements and priors less unknowns.
     - `identifiability`: an `Identifiability`, `residuals`: a `ResidualRow` for every measurement.
-    - `status`: "converged" or why not; `starts`, `ends`: name -> (starts,), from where to where each fit went;
+    - `status`: "converged" or why not; `starts`, `ends`: name -> (starts,), where each fit began and ended;
       `end_deviances`: (starts,); `statuses`: one of "converged", "not_converged", "failed" for each start.
     - `coordinates`, `coordinate_covariance`: the same in the coordinates in which the fit was done.
     """
@@ -101,9 +101,9 @@ class Identification:
     measurements: Measurements = dataclasses.field(repr=False)
 
     def interval(self, name: str, deviations: float = 1.96) -> tuple[float, float]:
-        """The interval of a number, symmetric in its coordinate and so within its bounds.
+        """The confidence interval of a parameter, symmetric in its coordinate and so within its bounds.
 
-        **Arguments:** `name`: of the number; `deviations`: half its width in standard errors, 1.96 for 95 %.
+        **Arguments:** `name`: of the parameter; `deviations`: half its width in standard errors, 1.96 for 95 %.
 
         **Raises:** `ValueError` for a name that was not free.
         """
@@ -114,21 +114,21 @@ class Identification:
             return tuple(float(free.value(np.asarray(self.coordinates[k] + side * reach))) for side in (-1.0, 1.0))
 
     def profile(self, name: str, values: Any = None) -> Profile:
-        """The profile likelihood of a number: all others are fitted again, for all its values at once.
+        """The profile likelihood of a parameter: all others are fitted again, for all its values at once.
 
         **Arguments:**
 
-        - `name`: of the number.
+        - `name`: of the parameter.
         - `values`: at which to hold it, by default 13 within three standard errors.
 
         **Returns:** a `Profile`.
 
-        **Raises:** `ValueError` for a name that was not free, or without `values` for a number of infinite error.
+        **Raises:** `ValueError` for a name that was not free, or without `values` for a parameter of infinite error.
         """
         k = self._place(name)
         free = self.problem.free[k][1]
         if len(self.problem.free) == 1:
-            raise ValueError(f"name = {name!r} is the only free number: there is nothing to fit again")
+            raise ValueError(f"name = {name!r} is the only free parameter: there is nothing to fit again")
         if values is None:
             if not np.isfinite(self.standard_errors[name]):
                 raise ValueError(f"values must be given for {name!r}, whose standard error is infinite")
@@ -179,13 +179,13 @@ class Identification:
 
 
 def deviance_of(problem: Problem, coordinates: Any, measurements: Measurements) -> Float[np.ndarray, " rows"]:
-    """-2 log likelihood of every row; infinite where it is not a number."""
+    """-2 log likelihood of every row; infinite where it would be NaN."""
     deviance = linearise(problem, jnp.asarray(coordinates), measurements).deviance
     return np.asarray(jnp.where(jnp.isfinite(deviance), deviance, jnp.inf))
 
 
 def coordinate_covariance(jacobian: Float[np.ndarray, "residuals unknowns"]) -> Float[np.ndarray, "unknowns unknowns"]:
-    """The inverse of the Gauss-Newton matrix J^T J; of unknowns that a direction without slope contains, infinite.
+    """The inverse of the Gauss-Newton matrix J^T J; infinite for unknowns that take part in an undetermined direction.
 
     Directions are judged with every unknown in units of its own error, the others held.
     """
@@ -201,16 +201,16 @@ def coordinate_covariance(jacobian: Float[np.ndarray, "residuals unknowns"]) -> 
 
 
 def _singular(slopes: Float[np.ndarray, "n unknowns"]) -> tuple[np.ndarray, np.ndarray]:
-    """As many singular values and right singular vectors (a row each) as there are unknowns."""
+    """Singular values and right singular vectors (a row each), as many as there are unknowns."""
     unknowns = slopes.shape[1]
     _, values, directions = np.linalg.svd(slopes, full_matrices=len(slopes) < unknowns)
     return np.concatenate([values, np.zeros(unknowns - len(values))]), directions
 
 
 def identifiability(problem: Problem, estimates: Any, slopes: Any, jacobian: Any) -> Identifiability:
-    """Singular values of the slopes of the residuals by relative changes of the numbers, with their directions in words.
+    """Singular values of the slopes of the residuals by relative changes of the parameters, with their directions in words.
 
-    **Arguments:** `estimates`: (unknowns,); `slopes`: (unknowns,), of the numbers by their coordinates; `jacobian`: (n,
+    **Arguments:** `estimates`: (unknowns,); `slopes`: (unknowns,), of the parameters by their coordinates; `jacobian`: (n,
     unknowns), of the residuals by the coordinates.
     """
     units = np.array(
@@ -223,7 +223,7 @@ def identifiability(problem: Problem, estimates: Any, slopes: Any, jacobian: Any
 
 
 def _in_words(problem: Problem, direction: Float[np.ndarray, " unknowns"]) -> str:
-    """What moves together: per cent of a number that cannot be negative, hundredths of its unit of another."""
+    """What changes together: per cent of a parameter that cannot be negative, otherwise hundredths of its unit."""
     most = np.argmax(np.abs(direction))
     parts = []
     for share, (name, free) in zip(direction / direction[most], problem.free, strict=True):

@@ -1,4 +1,4 @@
-"""Unknown numbers: where a fit starts, what values they may take, and the coordinate in which they are fitted."""
+"""Unknown parameters: where a fit starts, what values they may take, and the coordinate in which they are fitted."""
 
 import math
 from typing import Any, NamedTuple
@@ -12,14 +12,14 @@ from ..validation import require
 
 
 class Free(NamedTuple):
-    """A number to be fitted.
+    """A parameter to be fitted.
 
-    One with a lower bound is fitted in the logarithm of its distance from it, so a positive number, `lower=0.0`, in its
-    own logarithm; one between two bounds in the logit of its place between them; one without bounds as it is.
+    With a lower bound it is fitted in the logarithm of its distance from it, so a positive one, `lower=0.0`, in its own
+    logarithm; between two bounds in the logit of its position between them; without bounds as it is.
 
     - `start`: value from which the fit starts, strictly within the bounds.
     - `lower`, `upper`: bounds, which a fit approaches but does not reach.
-    - `prior`: mean and standard deviation of a Gaussian prior of the number itself, or `None`.
+    - `prior`: mean and standard deviation of a Gaussian prior of the parameter itself, or `None`.
     """
 
     start: float
@@ -29,16 +29,16 @@ class Free(NamedTuple):
 
     @property
     def unit(self) -> float:
-        """What counts as a relative change of 1: e-fold for a number fitted in its logarithm, else the start's size."""
+        """What counts as a relative change of 1: e-fold for a parameter fitted in its logarithm, otherwise the start's size."""
         return abs(self.start) or (self.prior[1] if self.prior else 1.0)
 
     @property
     def positive(self) -> bool:
-        """Whether the number cannot be negative."""
+        """Whether the parameter cannot be negative."""
         return self.lower >= 0.0
 
     def value(self, coordinate: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The number at a coordinate."""
+        """The parameter at a coordinate."""
         if math.isfinite(self.lower) and math.isfinite(self.upper):
             return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(coordinate)
         if math.isfinite(self.lower):
@@ -48,7 +48,7 @@ class Free(NamedTuple):
         return self.start + self.unit * coordinate
 
     def coordinate(self, value: Any) -> Float[Array, "..."]:
-        """The coordinate of a number strictly within the bounds; the inverse of `value`."""
+        """The coordinate of a value strictly within the bounds; the inverse of `value`."""
         value = jnp.asarray(value, float)
         if math.isfinite(self.lower) and math.isfinite(self.upper):
             return jnp.log(value - self.lower) - jnp.log(self.upper - value)
@@ -64,8 +64,8 @@ def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]
 
     **Arguments:**
 
-    - `free`: name -> a `Free`, or only the number from which to start.
-    - `lower`: name -> lower bound of those that are given by a number only, or without any bounds.
+    - `free`: name -> a `Free`, or only the value from which to start.
+    - `lower`: name -> lower bound of those given by a value only, or without any bounds.
 
     **Returns:** name -> `Free`.
 
@@ -92,10 +92,10 @@ def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]
 
 
 def draw_starts(free: dict[str, Free], count: int, spread: float, seed: int) -> Float[np.ndarray, "count unknowns"]:
-    """Coordinates of several starts: the given one first, then others about it.
+    """Coordinates of several starts: the given one first, then others around it.
 
-    A number fitted in a logarithm is drawn uniformly in it, up to a factor `spread` either way; another up to as far
-    from its start as the factor would take it.
+    A parameter fitted in its logarithm is drawn uniformly in it, up to a factor `spread` either way; any other is drawn
+    within the distance by which that factor would change its start.
     """
     centre = np.array([float(one.coordinate(one.start)) for one in free.values()])
     reach = np.array(

@@ -36,7 +36,7 @@ from .samples import march_with_samples as march_with_samples
 from .settings import ABSOLUTE as ABSOLUTE
 from .settings import Settings as Settings
 from .settings import lanes_for as lanes_for
-from .single_run import Path as Path
+from .single_run import Followed as Followed
 from .single_run import follow as follow
 from .single_run import sample as sample
 from .status import CROSSED as CROSSED
@@ -45,3 +45,6 @@ from .status import GUARD_LOST as GUARD_LOST
 from .status import REACHED_END as REACHED_END
 from .status import RUNNING as RUNNING
 from .status import UNRESOLVED as UNRESOLVED
+from .zeros import few_trials as few_trials
+from .zeros import halved as halved
+from .zeros import sign_changes as sign_changes

@@ -25,7 +25,7 @@ def march_by_diffrax(
 ) -> Outcome:
     """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`.
 
-    The guard is looked at where steps end; events are located on Diffrax's dense output.
+    The guard is checked at the ends of steps; events are located on Diffrax's dense output.
 
     **Arguments:** as for `march`, but any solver of Diffrax will do.
 

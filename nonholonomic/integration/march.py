@@ -1,7 +1,7 @@
 """Many lanes at once: the driver for event times and end states of a whole grid.
 
 A block of lanes advances in lockstep, every lane with its own step length; cells wait in a queue for a lane (`queue.py`).
-The state is one array (components, lanes); the numbers of the problem are scalars or one per cell.
+The state is one array (components, lanes); the parameters of the problem are scalars or one per cell.
 
 Derivatives (forward mode) flow through the states alone; step lengths are held fixed. `derivatives/slopes.py` has the
 fast ways to first derivatives.

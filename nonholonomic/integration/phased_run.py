@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from .phases import MOST_ROUNDS, AbstractPhase, Passage
 from .problem import AbstractProblem
 from .settings import Settings
-from .single_run import Path, follow
+from .single_run import Followed, follow
 from .status import FAILED, GUARD_LOST, REACHED_END, RUNNING, UNRESOLVED
 
 #: The number of a piece on the way between two phases.
@@ -22,7 +22,7 @@ BETWEEN = -1
 class Piece(NamedTuple):
     """A part of a run: from `begin` to `end` [s], in the phase numbered `number`, or `BETWEEN` two phases.
 
-    `motion` is the `Path` in the phase, its times counted from `begin`, or one stretch of a `Record`; `shown` are the times
+    `motion` is the `Followed` in the phase, its times counted from `begin`, or one stretch of a `Record`; `shown` are the times
     [s] at which it is shown where nobody asks for others.
     """
 
@@ -172,7 +172,7 @@ def follow_phases(
     return PhasedPath(pieces, status, time, np.asarray(state), counts, accepted, rejected)
 
 
-def _stay(phase: AbstractPhase, number: int, path: Path, begin: float) -> Piece:
+def _stay(phase: AbstractPhase, number: int, path: Followed, begin: float) -> Piece:
     return Piece(begin, begin + float(path.times[-1]), number, phase, path, begin + path.times[1:])
 
 

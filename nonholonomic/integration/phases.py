@@ -1,7 +1,7 @@
 """Motion in smooth phases with jumps between them, for many cells at once.
 
 A phase has its own equations and ends where they cease to hold: a contact opens or closes, slipping ends. What follows
-there is a function, the phase's `leave`: an impact, a flight in closed form, other equations. All phases share one layout
+is a function, the phase's `leave`: an impact, a flight in closed form, other equations. All phases share one layout
 of the state. The cells advance in rounds: in each, the cells that are now in a phase are gathered and marched together
 (`march.py`) to the event, to the horizon or to the end of the phase, and those at its end are passed on.
 """
@@ -84,7 +84,7 @@ class AbstractPhase(eqx.Module):
 
 
 class Journey(NamedTuple):
-    """How every cell ended, as in `march.Outcome`, after which phase, and what happened how often on the way."""
+    """How every cell ended, as in `march.Outcome`, in which phase, and how often each kind of thing happened on the way."""
 
     status: Int[np.ndarray, " cells"]
     crossing_time: Float[np.ndarray, " cells"]
@@ -120,7 +120,7 @@ def travel(
 ) -> Journey:
     """Run every cell through its phases to its event, to `t1`, or to where the model ends.
 
-    It runs on the host, round by round, and is called with concrete numbers. All calls with as many cells in all, padding
+    It runs on the host, round by round, and is called with concrete numbers. All calls with the same number of cells, padding
     included, share their compiled programs.
 
     **Arguments:**
@@ -153,7 +153,7 @@ def travel(
             _march(one, found, np.arange(0), t1, settings, passes)
             _pass_on(one, found, np.arange(0), t1)
     for _ in range(most_rounds):
-        # Taken before the round: a cell that changes its phase in it waits for the next.
+        # Selected before the round: a cell that changes its phase during it waits for the next round.
         here = [np.flatnonzero((found.status == RUNNING) & (found.phase == number)) for number in range(len(phases))]
         for one, some in zip(phases, here, strict=True):
             if some.size:
@@ -187,7 +187,7 @@ def _march(
     outcome, _ = compiled_march(problem, left, count, settings, passes=passes)
     outcome = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], outcome)
     began = found.end_time[some]
-    # A cell that comes into a phase beyond the event has passed it before, unless it started there.
+    # A cell that enters a phase beyond the event passed it earlier, unless it started there.
     passed = np.isfinite(outcome.crossing_time) & ((outcome.crossing_time > 0.0) | np.isinf(found.crossing_time[some]))
     found.crossing_time[some] = np.where(passed, began + outcome.crossing_time, found.crossing_time[some])
     found.end_time[some] = np.where(outcome.status == REACHED_END, t1, began + outcome.end_time)
@@ -208,6 +208,6 @@ def _pass_on(phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"
     found.state[:, some] = passage.state
     found.phase[some] = passage.phase
     found.counts[:, some] += passage.counts
-    # What is not finite would be marched for ever.
+    # Non-finite states would be marched forever.
     sound = np.isfinite(passage.state).all(axis=0) & np.isfinite(passage.elapsed)
     found.status[some] = np.where(sound, passage.status, FAILED)

@@ -1,6 +1,6 @@
 """The cells of a problem and the block of lanes that works through them.
 
-A lane whose run has ended takes the next cell of the queue, so lanes of different cost share a block without waiting for
+A lane whose run has ended takes the next cell of the queue, so cheap and expensive cells share a block without waiting for
 one another.
 """
 
@@ -75,7 +75,7 @@ class Queue(eqx.Module):
     ) -> "Queue":
         """The queue of a problem.
 
-        **Arguments:** as for `march`, and `parts`: of how many equal parts the state is made, as for `Control`.
+        **Arguments:** as for `march`, and `parts`: the number of equal parts of the state, as for `Control`.
         """
         solver, rtol = settings.solver, settings.tolerance
         control = Control(explicit_tableau(solver), solver.order(None), rtol, t1, settings.max_steps, passes, parts)
@@ -92,7 +92,7 @@ class Queue(eqx.Module):
         return self.fresh.cell.shape[0]
 
     def pick(self, tree: Any, cell: Int[Array, " lanes"]) -> Any:
-        """The numbers of some cells, scalars as they are."""
+        """The leaves of some cells; scalars stay as they are."""
         inside = jnp.minimum(cell, self.capacity - 1)
         return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., inside], tree)
 
@@ -104,7 +104,7 @@ class Queue(eqx.Module):
     def outcome(self) -> tuple[Outcome, Int[Array, ""]]:
         """Run every cell.
 
-        **Returns:** the `Outcome`, its crossing times those of events that were passed, and the number of iterations.
+        **Returns:** the `Outcome`, whose crossing times are those of events that were passed, and the number of iterations.
         """
 
         def period(carry: tuple[Progress, Outcome]) -> tuple[Progress, Outcome]:
@@ -168,7 +168,7 @@ class Queue(eqx.Module):
 
     def _load(self, cell: Int[Array, " lanes"]) -> Block:
         block = self.pick(self.fresh, cell)
-        # A lane whose cell does not exist has nothing to do.
+        # There may be fewer cells than lanes: the other lanes have nothing to do.
         return block._replace(cell=cell, status=jnp.where(cell < self.cells, block.status, REACHED_END))
 
 
@@ -184,13 +184,13 @@ def _fresh_block(
     rates: Float[Array, "components cells"],
     lengths: Float[Array, " cells"],
 ) -> Block:
-    """Every cell at its start; one that starts beyond the event or beyond the guard has ended."""
+    """Every cell at its start; one that starts beyond the event or the guard has ended."""
     zero, none = jnp.zeros_like(lengths), jnp.zeros(lengths.shape, int)
     no = jnp.zeros(lengths.shape, bool)
     crossing, guard = problem.crossing(states), problem.guard(zero, states)
     beyond = no
     if crossing is not None:
-        # On the event exactly, it is the way onwards that counts.
+        # Exactly on the event, the direction of the motion decides.
         falls = jax.jvp(problem.crossing, (states,), (rates,))[1] <= 0.0
         beyond = (crossing < 0.0) | ((crossing == 0.0) & (falls | (not control.passes)))
     side = jnp.where(beyond & control.passes, -1.0, 1.0).astype(lengths.dtype)

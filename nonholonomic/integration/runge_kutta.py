@@ -30,7 +30,7 @@ class Step(NamedTuple):
 def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
     """The tableau of an explicit, embedded Runge-Kutta solver of Diffrax.
 
-    **Raises:** `ValueError` for a solver that is not one.
+    **Raises:** `ValueError` for any other solver.
     """
     tableau = getattr(solver, "tableau", None)
     if not isinstance(solver, diffrax.AbstractERK) or not isinstance(tableau, diffrax.ButcherTableau):
@@ -58,7 +58,7 @@ def explicit_step(
     - `field`: (time [s], state) -> rate of the state.
     - `watch`: (time, state) -> a number per lane that should stay positive. It is evaluated at the end and at
       three stages between, together with `field`, so that what both need is computed once.
-      What is negative for less than a quarter of a step may pass unseen.
+      If it is negative for less than a quarter of a step, that may go unnoticed.
     - `time`, `state`, `rate`: where the step starts, and the field there.
     - `length`: length of the step [s], one per lane.
 
@@ -88,7 +88,7 @@ def explicit_step(
 
 
 def _places_to_look(fractions: Float[np.ndarray, " stages"]) -> set[int]:
-    """The stages nearest to 1/4, 1/2 and 3/4 of the step: what happens between its ends is looked for there."""
+    """The stages nearest to 1/4, 1/2 and 3/4 of the step: the places at which its inside is checked."""
     between = [stage for stage, fraction in enumerate(fractions) if 0.0 < fraction < 1.0]
     return {min(between, key=lambda stage: abs(fractions[stage] - part)) for part in (0.25, 0.5, 0.75) if between}
 
@@ -146,8 +146,8 @@ def first_length(
 ) -> Lanes:
     """Length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section II.4), in the motion's own unit.
 
-    They compare |y'| with |y''|, which depends on the unit of time, and Diffrax does so in seconds. Here the unit is |y|/|y'|,
-    so that motions that differ in their scale only are integrated alike. Of a state of several `parts` the first one counts.
+    Their formula compares |y'| with |y''|, which depends on the unit of time; Diffrax uses seconds. Here the unit is |y|/|y'|,
+    so that motions that differ only in scale are integrated alike. If the state has several `parts`, the first one counts.
     """
     scale = atol + jnp.abs(state) * rtol
     size = state.shape[0] // parts
@@ -157,7 +157,7 @@ def first_length(
 
     magnitude, slope = measure(state), measure(rate)
     unit = magnitude / slope
-    # Something that stands still has no unit of its own; longer ones would overflow below.
+    # A state at rest has no unit of its own; longer units would overflow below.
     still = (magnitude < 1e-5) | ~(unit < 1e15)
     unit = jnp.where(still, 1e-4, unit)
     trial = 0.01 * unit

@@ -1,7 +1,8 @@
-"""Many runs sampled at given times, by the block of lanes that event times take.
+"""Many runs sampled at given times, by the same block of lanes that finds event times.
 
-A step ends on every time that is asked for, so a sample has the accuracy of the method; between two samples the steps are
-even. The loop works in periods: a period records what each iteration reached, and its samples are then stored together.
+Steps end on the times that are asked for, so a sample has the accuracy of the method; between two samples the steps are
+of even length. The loop works in periods: a period records what each iteration reached, and then its samples are stored
+together.
 """
 
 import functools
@@ -18,7 +19,7 @@ from .runge_kutta import Lanes
 from .settings import Settings
 from .status import REACHED_END, RUNNING
 
-#: Iterations of a period: as many as have a record that fits the caches.
+#: Iterations of a period: as many as fit the caches with their record.
 PERIOD = 64
 
 #: By how much a step is stretched to end on a sample: the error stays below the tolerance, which a step is proposed to miss
@@ -29,7 +30,7 @@ Samples = Float[Array, "cells times components"]
 
 
 class Record(NamedTuple):
-    """What the iterations of a period reached: the state, and the number of the sample that it is, if it is one."""
+    """What the iterations of a period reached: the state, and the number of the sample there, if it is one."""
 
     state: Float[Array, "iterations components lanes"]
     sample: Int[Array, "iterations lanes"]
@@ -61,8 +62,8 @@ def march_with_samples(
     - `times`: of the samples [s], increasing, from 0 or later; (times,) for all cells or (times, cells). Those after `t1` are
       not reached.
 
-    **Returns:** the `Outcome`, its crossing times left out; and the states at the times, (cells, times, components), not a
-    number after the end of a run.
+    **Returns:** the `Outcome`, without crossing times; and the states at the times, (cells, times, components), NaN after the
+    end of a run.
     """
     queue = Queue.of(problem, t1, cells, settings, parts=parts, one_kernel=one_kernel)
     count, starts = times.shape[0], queue.fresh.state
@@ -92,7 +93,7 @@ def march_with_samples(
 def _recorded(
     queue: Queue, times: Float[Array, "times ..."], progress: Progress, sample: Int[Array, " lanes"]
 ) -> tuple[Progress, Int[Array, " lanes"], Record]:
-    """Let the block go on for a period, its samples recorded."""
+    """Advance the block by a period and record its samples."""
     here, control, atol = queue.here(progress.block)
     count = times.shape[0]
     horizon = jnp.broadcast_to(control.t1, progress.block.time.shape)
@@ -133,12 +134,12 @@ def _next_time(times: Float[Array, "times ..."], sample: Int[Array, " lanes"]) -
 
 
 def _even(length: Lanes, left: Lanes, searching: Array) -> Lanes:
-    """The length of a step, changed a little where one step or two then end on the next sample."""
+    """The length of a step, changed a little if one or two steps then end on the next sample."""
     reach = STRETCH * length
     fitting = jnp.where(reach >= left, left, jnp.where(2.0 * reach >= left, 0.5 * left, length))
     return jnp.where(searching, length, fitting)
 
 
-def _written(all: Array, one: Array, at: Int[Array, ""]) -> Array:
+def _written(whole: Array, one: Array, at: Int[Array, ""]) -> Array:
     """A stack of arrays with one of them replaced, in place."""
-    return jax.lax.dynamic_update_index_in_dim(all, one, at, 0)
+    return jax.lax.dynamic_update_index_in_dim(whole, one, at, 0)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .problem import AbstractProblem
 from .settings import Settings
+from .zeros import halved
 
 #: Steps that are integrated and stored at once; a longer run is made of several such pieces.
 PIECE = 2048
@@ -20,8 +21,8 @@ PIECE = 2048
 LOOKS = np.arange(1, 8) / 8.0
 
 
-class Path(NamedTuple):
-    """A run: its times and states, the pieces of its dense output, how it ended and what it took."""
+class Followed(NamedTuple):
+    """A run: its times and states, the pieces of its dense output, how it ended and how many steps it took."""
 
     times: Float[np.ndarray, " times"]
     states: Float[np.ndarray, "components times"]
@@ -47,7 +48,7 @@ def _evaluate(piece: diffrax.Solution, times: Float[Array, " times"]) -> Float[A
 
 
 def saved(solution: diffrax.Solution) -> tuple[Any, Any]:
-    """Times and states that a solution holds; Diffrax declares that there may be none."""
+    """Times and states that a solution holds; Diffrax's types say that there may be none."""
     return solution.ts, solution.ys
 
 
@@ -115,7 +116,7 @@ def follow(
     *,
     first: float | None = None,
     t0: float = 0.0,
-) -> Path:
+) -> Followed:
     """Integrate one run step by step until `t1` or until the model ceases to hold.
 
     **Arguments:**
@@ -127,7 +128,7 @@ def follow(
     - `first`: length of the first step [s], by default selected as Diffrax does.
     - `t0`: when the run starts [s].
 
-    **Returns:** a `Path` with the accepted steps; it ends where the guard reaches zero, found on the dense output.
+    **Returns:** a `Followed` with the accepted steps; it ends where the guard reaches zero, found on the dense output.
     """
     state, scales = problem.start()
     state, scales = jnp.asarray(state), jnp.asarray(scales)
@@ -138,7 +139,7 @@ def follow(
     length = None if first is None else jnp.asarray(first, state.dtype)
     margin = problem.guard(time, state)
     if margin is not None and float(margin) <= 0.0:
-        return Path(times[0], states[0], [], True, False, 0, 0)
+        return Followed(times[0], states[0], [], True, False, 0, 0)
     while float(time) < t1 and not (lost or failed):
         solution, guards = _piece(problem, time, end, length, state, scales, settings)
         steps = int(solution.stats["num_accepted_steps"])
@@ -151,7 +152,7 @@ def follow(
             lost, steps = True, int(out[0]) + 1
             begin = float(ts[out[0] - 1]) if out[0] else float(time)
             ts, ys, finite = ts[:steps].copy(), ys[:, :steps].copy(), finite[:steps]
-            ts[-1] = _loss(problem, solution, begin, float(ts[-1]))
+            ts[-1] = float(_loss(problem, solution, jnp.asarray(begin), jnp.asarray(ts[-1])))
             ys[:, -1] = np.asarray(solution.evaluate(ts[-1]))
         failed = steps == 0 or not finite.all()
         good = int(finite.sum()) if finite.all() else int(np.argmin(finite))
@@ -163,29 +164,25 @@ def follow(
             time, state = jnp.asarray(ts[good - 1]), jnp.asarray(ys[:, good - 1])
         failed = failed or (not lost and bool(solution.result == diffrax.RESULTS.dt_min_reached))
         failed = failed or (not lost and float(time) < t1 and accepted + rejected >= settings.max_steps)
-    return Path(np.concatenate(times), np.concatenate(states, axis=1), pieces, lost, failed, accepted, rejected)
+    return Followed(np.concatenate(times), np.concatenate(states, axis=1), pieces, lost, failed, accepted, rejected)
 
 
-def _loss(problem: AbstractProblem, solution: diffrax.Solution, begin: float, end: float) -> float:
-    """The first time in a step at which the guard is zero, by bisection on the dense output."""
-    previous = begin
-    for fraction in (*LOOKS, 1.0):
-        at = begin + (end - begin) * fraction
-        if float(_guard_on(problem, solution, jnp.asarray(at))) < 0.0:
-            break
-        previous = at
-    low, high = previous, at
-    while high - low > 4.0 * np.finfo(float).eps * max(high, 1e-3):
-        middle = 0.5 * (low + high)
-        if not low < middle < high:
-            break
-        negative = float(_guard_on(problem, solution, jnp.asarray(middle))) < 0.0
-        low, high = (low, middle) if negative else (middle, high)
-    return low
+@eqx.filter_jit
+def _loss(
+    problem: AbstractProblem, solution: diffrax.Solution, begin: Float[Array, ""], end: Float[Array, ""]
+) -> Float[Array, ""]:
+    """The last time in a step at which the guard has not been negative yet, on the dense output."""
+
+    def holds(time):
+        return ~(_guard(problem, time, solution.evaluate(time)) < 0.0)
+
+    looks = begin + (end - begin) * jnp.asarray([0.0, *LOOKS, 1.0])
+    first = jnp.argmin(jax.vmap(holds)(looks[1:]))
+    return halved(holds, looks[first], looks[first + 1])[0]
 
 
 class Sampled(NamedTuple):
-    """A run at given times: its states, not a number after its end; when, where and whether by the guard it ended."""
+    """A run at given times: its states, NaN after its end; when and where it ended, and whether the guard ended it."""
 
     states: Float[Array, "components times"]
     end_time: Float[Array, ""]
@@ -204,7 +201,7 @@ def sample(
 ) -> Sampled:
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 
-    The guard is looked at where steps end, and the run ends where it is zero on the dense output.
+    The guard is checked at the ends of steps, and the run ends where it is zero on the dense output.
 
     **Arguments:** as for `follow`; `times`: growing, in [0, t1]; `adjoint`: how Diffrax differentiates, by default forwards.
 
@@ -233,7 +230,7 @@ def sample(
     lost = jnp.zeros((), bool) if solution.event_mask is None else solution.event_mask
     (_, ends), (states, ends_at) = saved(solution)
     end = ends[0]
-    # Not a number, rather than infinite: an angle of infinite components would look like an angle.
+    # NaN rather than infinite: an angle computed from infinite components would look like an angle.
     states = jnp.where(times <= end, states.T, jnp.nan)
     counts = solution.stats
     return Sampled(states, end, ends_at[0], lost, counts["num_accepted_steps"], counts["num_rejected_steps"])

@@ -25,9 +25,9 @@ class BlockFile:
     """The arrays of a file under construction.
 
     A block's numbers and their checksum are handed to the disk first and the block's mark after them, all into space the
-    file already has. So the blocks that are marked are complete, whenever the process dies; and whenever the machine does,
-    as far as its disk keeps what it confirms. It writes rather than maps the file into memory, where a full disk or a file
-    cut short by someone else would end the process.
+    file already has. So marked blocks are complete whenever the process dies, and whenever the machine does, as far as
+    its disk keeps what it confirms. The file is written, not mapped into memory, where a full disk or a file cut short by
+    someone else would kill the process.
 
     `attributes` are those in the file.
     """
@@ -77,7 +77,7 @@ class BlockFile:
             self._put(FINISHED, block, 0)
 
     def _locked(self) -> Any:
-        """Keep other processes from filling in the same file; the system lets go of it when the process ends."""
+        """Keep other processes from filling in the same file; the system releases it when the process ends."""
         if fcntl is None:
             return None
         beside = self.path.with_name(self.path.name + ".lock")
@@ -91,7 +91,7 @@ class BlockFile:
             except OSError:
                 lock.close()
                 raise OSError(f"cannot write {self.path}: another process is writing it") from None
-            # One that has just closed the file has removed its lock, perhaps after we opened it.
+            # A process that has just closed the file has removed its lock, perhaps after we opened it.
             try:
                 if os.path.samestat(os.fstat(lock.fileno()), beside.stat()):
                     return lock
@@ -142,8 +142,8 @@ class BlockFile:
             )
         others = [name for name in ours if name not in ("nonholonomic", "python") and theirs.get(name) != ours[name]]
         if others and not grid.finished.all():
-            told = ", ".join(f"{name} {theirs.get(name)}, now {ours[name]}" for name in others)
-            warnings.warn(f"{self.path} was begun with {told}: digits may differ", RuntimeWarning, stacklevel=6)
+            versions = ", ".join(f"{name} {theirs.get(name)}, now {ours[name]}" for name in others)
+            warnings.warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning, stacklevel=6)
 
     @property
     def finished(self) -> set[int]:
@@ -153,7 +153,7 @@ class BlockFile:
     def write(self, block: int, first: int, values: dict[str, Values]) -> None:
         """Write a block's values, for the cells from `first` on, and mark it finished.
 
-        **Raises:** `OSError` that names the path if that fails; the block is then not finished, and those that are stay so.
+        **Raises:** `OSError` that names the path if that fails; no block is then finished but those that were.
         """
         stored = {name: np.asarray(some, self._places[name][1]) for name, some in values.items()}
         for name, some in stored.items():
@@ -197,7 +197,7 @@ class Layout:
         firsts: Any,
         inner: dict[str, tuple[str, ...]] | None = None,
     ):
-        """State the grid.
+        """Describe the grid.
 
         **Arguments:** as for `write_grid`, with `kinds`: variable -> dtype, and `firsts`: the first cell of each block.
         """

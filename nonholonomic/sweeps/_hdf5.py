@@ -1,9 +1,9 @@
-"""The file of a table: HDF5 with dimension scales, as netCDF-4 has it, so that xarray opens it with named coordinates.
+"""The file of a table: HDF5 with dimension scales, as in netCDF-4, so that xarray opens it with named coordinates.
 
 Words, such as a cell's status, are stored as bytes with the attributes `flag_values` and `flag_meanings` (CF conventions).
-Every array lies in one piece, so that a sweep can fill in a block of cells without touching the file's structure: a process
+Every array is contiguous, so that a sweep can fill in a block of cells without touching the file's structure: a process
 killed at any moment leaves a file that opens, with every finished block in it. A finished block has a checksum, which
-vouches for the coordinates, units, words and attributes too; a table that was saved whole is one block.
+covers the coordinates, units, words and attributes too; a table that was saved whole is one block.
 """
 
 import json
@@ -35,8 +35,8 @@ INNER = "inner"
 class Grid(NamedTuple):
     """What a file holds, as it is stored: numbers for words, and nothing where a block is not finished.
 
-    `firsts` is the first cell of each block, `finished` tells which are finished and match their checksum, `damaged` which
-    are said to be finished and do not match; `header` is the `header_checksum`. The rest is as in `Table`.
+    `firsts` is the first cell of each block, `finished` says which are finished and match their checksum, `damaged` which
+    are marked as finished but do not match; `header` is the `header_checksum`. The rest is as in `Table`.
     """
 
     coords: dict[str, Values]
@@ -84,7 +84,7 @@ def write_grid(
 
     **Raises:** `OSError` that names the path if it cannot be written.
     """
-    # A tenth of a second to import, which most processes can do without.
+    # It takes a tenth of a second to import, and most processes do not need it.
     import h5py
 
     path = Path(path)
@@ -121,7 +121,7 @@ def _umask() -> int:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Have the system store the names in a folder, where it lets a folder be opened."""
+    """Flush a folder's entries to disk, on systems that let a folder be opened."""
     if os.name == "posix":
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -180,7 +180,7 @@ def _fill(
 
 
 def _set(of: Any, name: str, value: Any) -> None:
-    """Set an attribute, a text at its own length: HDF5 keeps a text of variable length where no checksum guards it."""
+    """Set an attribute; a string is stored at its own length, because no checksum covers HDF5's strings of variable length."""
     # Only files need it.
     import h5py
 
@@ -189,7 +189,7 @@ def _set(of: Any, name: str, value: Any) -> None:
 
 
 def _attribute(of: Any, name: str) -> Any:
-    """An attribute, a number or a text."""
+    """An attribute, a number or a string."""
     value = of.attrs[name]
     return value.decode() if isinstance(value, bytes) else value
 

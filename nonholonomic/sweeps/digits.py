@@ -7,7 +7,7 @@ from jaxtyping import Float, Shaped
 
 
 def concise(value: float, error: float) -> str:
-    """A number with the digits that its error leaves and, in parentheses, the error of the last of them, rounded up.
+    """A number with the digits that its error leaves and, in parentheses, the error in the last digit, rounded up.
 
     **Arguments:** `value`, `error`: finite numbers, the error at least 0; without one the number is written in full.
     """
@@ -23,7 +23,7 @@ def concise(value: float, error: float) -> str:
     return f"{value:.{-place}f}({digit})"
 
 
-def concise_texts(
+def concise_strings(
     values: Float[np.ndarray, "..."], errors: Float[np.ndarray, "..."], words: Shaped[np.ndarray, "..."]
 ) -> Shaped[np.ndarray, "..."]:
     """Concise notation for every number of an array, and a word where there is none.
@@ -32,15 +32,15 @@ def concise_texts(
 
     - `values`: numbers; not finite where there is none.
     - `errors`: their errors; infinite where it is doubtful whether there is a number at all.
-    - `words`: what to say where there is no number; with a question mark where that is doubtful.
+    - `words`: what to say where there is none; with a question mark where that is doubtful.
 
-    **Returns:** an array of texts.
+    **Returns:** an array of strings.
     """
 
-    def text(value, error, word):
+    def string(value, error, word):
         if np.isinf(error):
             return f"{word}?"
         return concise(value, error) if np.isfinite(value) else str(word)
 
-    texts = [text(*one) for one in zip(values.ravel(), errors.ravel(), words.ravel(), strict=True)]
-    return np.array(texts, dtype=str).reshape(values.shape)
+    strings = [string(*one) for one in zip(values.ravel(), errors.ravel(), words.ravel(), strict=True)]
+    return np.array(strings, dtype=str).reshape(values.shape)

@@ -23,10 +23,10 @@ Values = Shaped[np.ndarray, "..."]
 
 
 class Axis(NamedTuple):
-    """One axis of a grid: its name in the table, the path of the number it varies, and the unit."""
+    """One axis of a grid: its name in the table, the full name of the parameter it varies, and the unit."""
 
     name: str
-    path: str
+    number: str
     unit: str
     values: Values
 
@@ -43,16 +43,16 @@ class Variable(NamedTuple):
     inner: tuple[str, ...] = ()
 
 
-def axis(name: str, path: str, unit: str, values: Any) -> Axis:
+def axis(name: str, number: str, unit: str, values: Any) -> Axis:
     """An axis, checked.
 
     **Raises:** `ValueError` that names the axis if the values are not a non-empty one-dimensional array of finite numbers.
     """
     require(values, name)
-    numbers = np.asarray(values, dtype=float)
-    if numbers.ndim != 1 or numbers.size == 0:
-        raise ValueError(f"{name} must be a number or a non-empty list of numbers, not of shape {numbers.shape}")
-    return Axis(name, path, unit, numbers)
+    array = np.asarray(values, dtype=float)
+    if array.ndim != 1 or array.size == 0:
+        raise ValueError(f"{name} must be a number or a non-empty list of numbers, not of shape {array.shape}")
+    return Axis(name, number, unit, array)
 
 
 def sweep(
@@ -71,8 +71,8 @@ def sweep(
 
     **Arguments:**
 
-    - `run`: (path -> values of a block's cells, how many of them count) -> name -> results. It is called from several
-      threads at once; the first call, with no cell that counts, lets it compile.
+    - `run`: (full name of a parameter -> values of a block's cells, how many of them count) -> name -> results. It is called
+      from several threads at once; the first call, with no cell that counts, lets it compile.
     - `axes`: the grid, the last axis varying fastest.
     - `variables`: what `run` returns.
     - `request`: plain data that says what is computed; it is stored in the table and guards the file.
@@ -107,7 +107,7 @@ def sweep(
     def columns(index: int) -> dict[str, Values]:
         cell = np.minimum(np.arange(firsts[index], firsts[index] + block), cells - 1)
         places = np.unravel_index(cell, layout.shape) if axes else ()
-        return {one.path: one.values[place] for one, place in zip(axes, places, strict=True)}
+        return {one.number: one.values[place] for one, place in zip(axes, places, strict=True)}
 
     def work(index: int) -> dict[str, Values]:
         count = min(block, cells - firsts[index])
@@ -136,7 +136,7 @@ def sweep(
 
 
 def _as_they_finish(work: Callable[[int], Any], todo: list[int]) -> Iterator[tuple[int, Any]]:
-    """Run the blocks on all cores; an exception, Ctrl-C included, waits for none that has not started."""
+    """Run the blocks on all cores; after an exception, Ctrl-C included, no further block starts."""
     pool = ThreadPoolExecutor(workers())
     try:
         pending = {pool.submit(work, index): index for index in todo}
@@ -147,7 +147,7 @@ def _as_they_finish(work: Callable[[int], Any], todo: list[int]) -> Iterator[tup
 
 
 def block_for(cells: int) -> int:
-    """Cells in a block: few sizes, so that few programs are compiled, and many blocks, to be shared out and stored.
+    """Cells in a block: few different sizes, so that few programs are compiled, but many blocks, to be shared among cores.
 
     It does not depend on the number of cores, so that a file can be resumed on another machine.
     """

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from ._hdf5 import UNREACHED, axes_of, read_grid, write_grid
-from .digits import concise_texts
+from .digits import concise_strings
 
 Values = Shaped[np.ndarray, "..."]
 
@@ -84,8 +84,8 @@ class Table(eqx.Module):
 
         **Arguments:** `variable`: name of a numeric variable, such as "time", whose error the table holds as "time_error".
 
-        **Returns:** an array of texts over the grid. Where there is no number the text is the cell's status; where even that
-        is in doubt, the status with a question mark.
+        **Returns:** an array of strings over the grid. Where there is no number the string is the cell's status, with a
+        question mark if that is in doubt.
 
         **Raises:** `ValueError` if the table does not hold the variable and its error.
         """
@@ -95,7 +95,7 @@ class Table(eqx.Module):
                     f"variable = {variable!r}: the table has no {name!r}; it has {', '.join(self.variables)}"
                 )
         values, errors = self.variables[variable], self.variables[f"{variable}_error"]
-        return concise_texts(values, errors, self.variables.get("status", values))
+        return concise_strings(values, errors, self.variables.get("status", values))
 
     def plot(self, variable: str = "time") -> Any:
         """Draw a variable over the grid (needs matplotlib): lines over the first axis, or a map of the first two.
@@ -109,7 +109,7 @@ class Table(eqx.Module):
     def __str__(self) -> str:
         axes = ", ".join(f"{name} ({len(self.coords[name])})" for name in axes_of(self.coords, self.inner))
         lines = [f"Table over {axes or 'one cell'}"]
-        # What has not been computed is told by the status alone.
+        # Cells that have not been computed show in the status only.
         computed = self.variables["status"] != UNREACHED if "status" in self.variables else ...
         for name, values in self.variables.items():
             unit = f" [{self.units[name]}]" if self.units.get(name, "1") not in ("1", "") else ""

@@ -7,7 +7,7 @@ import numpy as np
 if TYPE_CHECKING:
     from ..sweeps import Table
 
-#: One colour each for what is not a number in a map: words of the status other than the first.
+#: Colours of the cells of a map that have no finite value, one for each word of their status.
 GREYS = ("0.85", "0.7", "0.55", "0.4", "0.25")
 
 
@@ -65,14 +65,14 @@ def _draw_lines(drawing: Any, table: "Table", names: list[str], shown: Any) -> N
         drawing.legend()
 
 
-def _mark_words(drawing: Any, table: "Table", names: list[str], status: Any) -> None:
+def _mark_words(drawing: Any, table: "Table", names: list[str], words: Any) -> None:
+    """Paint the cells that have a word in the grey of that word."""
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    others = [word for word in dict.fromkeys(status.ravel().tolist()) if word != "inverted"]
     patches = []
-    for word, grey in zip(others, GREYS, strict=False):
-        mask = np.where(status == word, 1.0, np.nan)
+    for word, grey in zip(filter(None, dict.fromkeys(words.ravel().tolist())), GREYS, strict=False):
+        mask = np.where(words == word, 1.0, np.nan)
         drawing.pcolormesh(
             table.coords[names[0]], table.coords[names[1]], mask.T, shading="nearest", cmap=ListedColormap([grey])
         )

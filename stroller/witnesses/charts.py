@@ -1,9 +1,8 @@
 """The stroller in coordinates, as data for the formulations of `nonholonomic/formulations/formulation.py`.
 
 Coordinates: q = (x, y, theta, phi) on a plane and (eta, mu, psi, phi), reduced latitude first as in the paper, on a
-sphere or spheroid, psi being the paper's theta where the heading is projected. They have poles, which the P-form has
-not; they are the independent witness that it is right (`stroller.md`, sections 2 to 4 and 6), and how the paper writes
-it.
+sphere or spheroid, psi being the paper's theta where the heading is projected. They have poles, unlike the P-form;
+they are the independent check of it (`stroller.md`, sections 2 to 4 and 6), and the paper's own form.
 """
 
 import jax
@@ -14,7 +13,7 @@ from nonholonomic.formulations import AbstractSystem, Coordinates
 from nonholonomic.geometry import AbstractQuadric, Plane, add, inverse, multiply, subtract
 
 from ..dynamics import State
-from ..friction import Rolling
+from ..friction import WheelMotion
 from ..input import Input, Motion
 from ..scene import FORKS, SIDES, Scene
 
@@ -109,7 +108,7 @@ class Chart(AbstractSystem):
         (long, lat), yaw, steering = level.T, jnp.zeros(4).at[2].set(1.0 / forms[2, 2]), jnp.zeros(4).at[3].set(1.0)
         return jnp.stack([cosine * long + sine / length * yaw, steering, lat, cosine * yaw - length * sine * long], 1)
 
-    def rolling(self, q: Coordinates, rate: Coordinates) -> tuple[Float[Array, "4 4"], Rolling]:
+    def wheel_motion(self, q: Coordinates, rate: Coordinates) -> tuple[Float[Array, "4 4"], WheelMotion]:
         """The one-forms of rear-wheel speed, front-wheel speed, yaw and steering rate, a row each, and their values."""
         body, (long, lat, yaw) = self.scene.body, self.forms(q)
         sine, cosine = jnp.sin(q[3]), jnp.cos(q[3])
@@ -118,7 +117,7 @@ class Chart(AbstractSystem):
         load = self.normal_force(q, rate)
         front_load = None if body.centre is None else load * body.centre / body.wheelbase
         v, w, yaw_rate, steering_rate = rows @ rate
-        return rows, Rolling(v, w, yaw_rate, steering_rate, subtract(load, front_load), front_load)
+        return rows, WheelMotion(v, w, yaw_rate, steering_rate, subtract(load, front_load), front_load)
 
     def normal_force(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
         """Normal force [N], from the principal curvatures A c / h_eta^3 and c / (A h_eta) of a spheroid."""
@@ -133,17 +132,17 @@ class Chart(AbstractSystem):
         bend = scene.body.mass * jnp.sum(curvatures * squares * rate[:2] ** 2)
         return SIDES[scene.side] * (weight * equatorial * jnp.sin(q[0]) / h_eta - bend)
 
-    def motion(self, q: Coordinates, rolling: Rolling) -> Motion:
-        """What an input sees."""
+    def motion(self, q: Coordinates, wheels: WheelMotion) -> Motion:
+        """The motion that an input gets."""
         place = (q[0], q[1]) if self.quadric is None else (q[1], q[0])
         position, east, north = self.scene.surface.chart(place)
         heading = self.scene.dynamics.heading.at_angle(q[2], east, north)
-        return Motion(position, heading, q[3], *rolling[:4])
+        return Motion(position, heading, q[3], *wheels[:4])
 
     def force(self, t: Float[Array, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
-        rows, rolling = self.rolling(q, rate)
-        drive, torque = (None, None) if self.input is None else self.input(t, self.motion(q, rolling))
-        drag = self.scene.friction.drag(rolling)
+        rows, wheels = self.wheel_motion(q, rate)
+        drive, torque = (None, None) if self.input is None else self.input(t, self.motion(q, wheels))
+        drag = self.scene.friction.drag(wheels)
         loads = (add(drive, drag.rear), drag.front, drag.yaw, add(torque, drag.steering))
         return sum((load * row for load, row in zip(loads, rows, strict=True) if load is not None), jnp.zeros(4))
 
@@ -157,7 +156,9 @@ def coordinates(scene: Scene, state: State) -> Coordinates:
     return jnp.stack([*first, scene.dynamics.heading.angle(heading, east, north), rest[0]])
 
 
-def coordinates_and_rates(scene: Scene, t, state: State, input: Input | None = None) -> tuple[Coordinates, Coordinates]:
+def coordinates_and_rates(
+    scene: Scene, t, state: State, controls: Input | None = None
+) -> tuple[Coordinates, Coordinates]:
     """Coordinates and velocity (q, q') of a state (components,) of the P-form at a time [s]."""
-    rate = scene.dynamics.field(t, state, input)
+    rate = scene.dynamics.field(t, state, controls)
     return jax.jvp(lambda state: coordinates(scene, state), (state,), (rate,))

@@ -76,8 +76,8 @@ def test_a_bad_entry_costs_a_compilation_and_nothing_else(tmp_path):
 def test_an_entry_that_is_cut_while_it_is_used_costs_a_compilation_too(tmp_path):
     run(SMALL, tmp_path)
     cut = f"import pathlib\nfor entry in pathlib.Path(folder).glob('*-cache'): entry.write_bytes(b'')\n{SMALL}"
-    told, said = run(cut, tmp_path)
-    assert (told["result"], told["found"], said) == (14.0, 0, "")
+    answer, said = run(cut, tmp_path)
+    assert (answer["result"], answer["found"], said) == (14.0, 0, "")
 
 
 def test_other_flags_have_another_folder(tmp_path):
@@ -89,8 +89,8 @@ def test_other_flags_have_another_folder(tmp_path):
 @pytest.mark.parametrize("forbidden", [False, True])
 def test_without_a_folder_everything_goes_on(forbidden, tmp_path):
     (tmp_path / "nonholonomic").write_text("this is a file")
-    told, said = run(SMALL, tmp_path, **({"NONHOLONOMIC_CACHE": "0"} if forbidden else {}))
-    assert (told["folder"], told["result"], told["found"]) == ("None", 14.0, 0)
+    answer, said = run(SMALL, tmp_path, **({"NONHOLONOMIC_CACHE": "0"} if forbidden else {}))
+    assert (answer["folder"], answer["result"], answer["found"]) == ("None", 14.0, 0)
     # One line names the folder; nobody needs to be told of what he has forbidden.
     assert len(said.splitlines()) == (0 if forbidden else 1)
     assert forbidden or str(tmp_path / "nonholonomic") in said

@@ -62,6 +62,6 @@ def test_nothing_is_written_where_nobody_watches_or_wants_it(way, monkeypatch):
 
 
 def test_what_few_processes_need_is_not_imported_with_the_package():
-    told = "import sys, tippe; print({'h5py', 'tqdm', 'matplotlib', 'pandas', 'jax.scipy.stats'} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True)
+    program = "import sys, tippe; print({'h5py', 'tqdm', 'matplotlib', 'pandas', 'jax.scipy.stats'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "set()\n"

@@ -10,15 +10,15 @@ from scipy.special import ellipk
 
 import tippe
 from nonholonomic.integration import Settings, follow
-from tippe.trajectory import Run
+from tippe.trajectory import TrajectoryProblem
 
 GRAVITY = 9.81
 
 
 def thrown(scene: tippe.Scene, velocity: float, times, tolerance: float = 1e-11):
     """A ball thrown along t1 without spin: states at the given times. A launch starts at rest, so the run is made here."""
-    run = Run.of(scene, tippe.Launch(theta=0.7, spin=0.0))
-    run = Run(run.dynamics, run.axial, run.state.at[0].set(velocity), run.path, run.scales)
+    run = TrajectoryProblem.of(scene, tippe.Launch(theta=0.7, spin=0.0))
+    run = TrajectoryProblem(run.dynamics, run.axial, run.state.at[0].set(velocity), run.path, run.scales)
     path = follow(run, float(times[-1]), Settings(tolerance))
     return jnp.asarray(path.at(np.asarray(times)))[:8]
 
@@ -53,9 +53,9 @@ def test_a_free_ball_turns_about_its_angular_momentum():
     mass, radius = 0.05, 0.02
     top = tippe.Top(mass, radius, 0.0, 0.4 * mass * radius**2, 0.5 * mass * radius**2)
     scene = tippe.Scene(top, tippe.Plane(), tippe.Frictionless())
-    run = Run.of(scene, tippe.Launch(theta=0.7, spin=0.0))
+    run = TrajectoryProblem.of(scene, tippe.Launch(theta=0.7, spin=0.0))
     momentum = np.array([1.0, -2.0, 3.0]) * 3e-4
-    run = Run(run.dynamics, run.axial, run.state.at[5:8].set(momentum), run.path, run.scales)
+    run = TrajectoryProblem(run.dynamics, run.axial, run.state.at[5:8].set(momentum), run.cyclic, run.scales)
     end = 2.0
     path = follow(run, end, Settings(1e-12))
     angle, axis = np.linalg.norm(momentum) / float(top.I1) * end, momentum / np.linalg.norm(momentum)

@@ -98,10 +98,10 @@ def test_a_frictionless_run_goes_back_to_its_start():
     from dataclasses import replace
 
     from nonholonomic.integration import follow
-    from tippe.trajectory import Run
+    from tippe.trajectory import TrajectoryProblem
 
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Frictionless())
-    run = Run.of(scene, tippe.Launch(0.3, 60.0, eta=0.5))
+    run = TrajectoryProblem.of(scene, tippe.Launch(0.3, 60.0, eta=0.5))
     there = follow(run, 1.0, Settings(1e-12)).states[:10, -1]
     sign = np.array([-1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0, 1.0])
     back = replace(run, state=jnp.asarray(there * sign))

@@ -1,4 +1,4 @@
-"""Numbers that others have published (literature.md names the sources)."""
+"""Numbers that others have published."""
 
 import math
 

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import tippe
 from nonholonomic.integration import PhasedPath, Settings
 from tippe.phases.stick_slip_runs import ROLLING, follow_stick_slip
-from tippe.trajectory import Run
+from tippe.trajectory import TrajectoryProblem
 
 
 def cohen_top() -> tippe.Top:
@@ -78,8 +78,8 @@ def test_a_top_that_sticks_and_slips_again():
 def test_a_bowling_ball_slides_and_then_rolls():
     """v = v0 - mu g t until t* = 2 v0 / (7 mu g), then 5 v0 / 7 (row 2), with no error of a slip speed."""
     scene, end = scene_of(homogeneous_ball(), 0.3), 2.0 / (7.0 * 0.3 * 9.81)
-    run = Run.of(scene, tippe.Launch(theta=0.7, spin=0.0))
-    run = Run(run.dynamics, run.axial, run.state.at[0].set(1.0), run.path, run.scales)
+    run = TrajectoryProblem.of(scene, tippe.Launch(theta=0.7, spin=0.0))
+    run = TrajectoryProblem(run.dynamics, run.axial, run.state.at[0].set(1.0), run.path, run.scales)
     path = follow_stick_slip(run, 3.0 * end, Settings(1e-11))
     assert kinds(path) == [False, True]
     assert_close(path.stays[0].end, end, atol=1e-7)

@@ -36,8 +36,8 @@ def test_damping_and_wheelbase_from_an_exact_path():
 
 def test_what_cannot_be_fitted_is_refused():
     data = stroller.Recording(LAUNCH, TIMES, np.zeros((3, 3)), 0.01)
-    for free, told in (({"drag": 1.0}, "must be one of"), ({"wheelbase": -1.0}, "wheelbase")):
-        with pytest.raises(ValueError, match=told):
+    for free, message in (({"drag": 1.0}, "must be one of"), ({"wheelbase": -1.0}, "wheelbase")):
+        with pytest.raises(ValueError, match=message):
             stroller.identify(scene(), data, free)
     with pytest.raises(ValueError, match="must be a Recording"):
         stroller.identify(scene(), 1.0, {"wheelbase": 1.0})

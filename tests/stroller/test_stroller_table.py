@@ -83,16 +83,31 @@ def test_lost_contact_is_marked_with_its_time():
     np.testing.assert_allclose(table.z[1], run.position[1, 2], atol=1e-8)
 
 
-def test_places_are_axes_too():
+@pytest.fixture(scope="module")
+def places():
+    """Rides on a level plane from many places."""
+    axes = {"launch.place[0]": [0.0, 1.0, 2.0], "launch.place[1]": np.linspace(0.0, 8.0, 9)}
+    return stroller.sweep(Scene(BODY, Plane()), Launch((0.0, 0.0), 0.5, 1.0, 0.3), 2.0, axes=axes)
+
+
+def test_places_are_axes_too(places):
     """On a level plane the ride does not depend on where it starts."""
-    scene = Scene(BODY, Plane())
-    axes = {"launch.place[0]": [0.0, 1.0, 2.0], "launch.place[1]": [0.0, 5.0]}
-    table = stroller.sweep(scene, Launch((0.0, 0.0), 0.5, 1.0, 0.3), 2.0, axes=axes)
+    table = places
     assert list(table.coords) == ["x0", "y0"]
-    moved = table.x - np.asarray(axes["launch.place[0]"])[:, None]
+    moved = table.x - table.coords["x0"][:, None]
     np.testing.assert_allclose(moved, moved[0, 0], atol=1e-12)
     R = 0.7 / np.tan(0.3)
     np.testing.assert_allclose(moved[0, 0], R * (np.sin(0.5 + 2.0 / R) - np.sin(0.5)), atol=1e-8)
+
+
+def test_a_map_shows_its_values_and_is_grey_only_where_there_is_none(places):
+    drawing = places.plot("energy").axes[0]
+    (shown,) = drawing.collections
+    np.testing.assert_array_equal(shown.get_array(), places.energy.T)
+    assert drawing.get_legend() is None
+    # The ground never has to pull, so no cell has a time at which it did.
+    drawing = places.plot("contact_time").axes[0]
+    assert [text.get_text() for text in drawing.get_legend().get_texts()] == ["completed"]
 
 
 def test_axes_of_one_name_are_told_apart():

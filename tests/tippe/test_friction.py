@@ -9,7 +9,7 @@ from conftest import assert_close, random_states, rutstam_top
 from hard.friction import hertz_disc
 
 import tippe
-from tippe.friction import Slip
+from tippe.friction import ContactLoad, Slip
 from tippe.witnesses import reduced
 
 ARENAS = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3), "sphere": tippe.Sphere(0.3)}
@@ -103,3 +103,18 @@ def test_the_reduced_forms_refuse_a_torque():
     state = scene.state(tippe.Launch(0.3, 100.0))
     with pytest.raises(ValueError, match="must act at a point, without a torque"):
         reduced.rutstam_rate(scene, reduced.rutstam_state(scene, state))
+
+
+def test_a_law_says_itself_whether_impacts_can_use_it():
+    class OwnLaw(tippe.AbstractFriction):
+        def per_normal_force(self, slip):
+            return ContactLoad((-0.1 * slip.x, -0.2 * slip.y))
+
+    class OwnLawAtPoint(OwnLaw):
+        acts_at_point = True
+
+    scene = tippe.Scene(rutstam_top(), friction=OwnLawAtPoint(), contact="hybrid")
+    state = scene.state(tippe.Launch(0.3, 100.0))
+    assert_close(scene.friction_power(state) / scene.normal_force(state), -0.2 * scene.slip_velocity(state)[1] ** 2)
+    with pytest.raises(ValueError, match=r"contact = 'hybrid' must be with friction at a point, not with .*OwnLaw"):
+        tippe.Scene(rutstam_top(), friction=OwnLaw(), contact="hybrid")

@@ -111,7 +111,7 @@ def test_recordings_are_predicted_as_simulated(rutstam_scene):
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "message"),
     [
         (lambda: tippe.InversionTimes(LAUNCH, [1.0, 2.0], 0.1, t1=5.0), "launch.theta must be one number"),
         (lambda: tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, 9.0], 0.1, t1=5.0), "time = 9.0 must be less than 5.0"),
@@ -123,13 +123,13 @@ def test_recordings_are_predicted_as_simulated(rutstam_scene):
         (lambda: tippe.Recording(tippe.Launch(0.1, 9.0), [1.0], [1.0], 0.1, quantity="phi"), "quantity = 'phi'"),
     ],
 )
-def test_bad_data_are_refused(make, told):
-    with pytest.raises(ValueError, match=told):
+def test_bad_data_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
         make()
 
 
 @pytest.mark.parametrize(
-    ("free", "told"),
+    ("free", "message"),
     [
         ({"scene.friction.nu": 0.1}, "'scene.friction.nu' must be one of"),
         ({"friction.mu": -0.1}, "mu"),
@@ -137,27 +137,27 @@ def test_bad_data_are_refused(make, told):
         ({"mu": 0.2, "friction.mu": 0.3}, "named twice"),
     ],
 )
-def test_bad_unknowns_are_refused_before_anything_runs(rutstam_scene, free, told):
+def test_bad_unknowns_are_refused_before_anything_runs(rutstam_scene, free, message):
     data = tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, 4.0], 0.1, t1=5.0)
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         tippe.identify(rutstam_scene, data, free)
     with pytest.raises(ValueError, match="must be an InversionTimes or a Recording"):
         tippe.identify(rutstam_scene, 3.0, {"mu": 0.2})
 
 
 @pytest.mark.parametrize(
-    ("phases", "told"),
+    ("phases", "message"),
     [
         ({"contact": "hybrid"}, "contact = 'hybrid' must be 'stop' for"),
         ({"friction": tippe.SetValuedCoulomb(0.3)}, "friction = SetValuedCoulomb must be a law without phases for"),
     ],
 )
-def test_scenes_with_phases_are_refused(rutstam_scene, phases, told):
+def test_scenes_with_phases_are_refused(rutstam_scene, phases, message):
     scene = dataclasses.replace(rutstam_scene, **phases)
     data = tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, 4.0], 0.1, t1=5.0)
-    with pytest.raises(ValueError, match=told + " identify"):
+    with pytest.raises(ValueError, match=message + " identify"):
         tippe.identify(scene, data, {"mu": 0.2})
-    with pytest.raises(ValueError, match=told + " extended_inversion_times"):
+    with pytest.raises(ValueError, match=message + " extended_inversion_times"):
         extended_inversion_times(scene, LAUNCH, 5.0, 3.0, 1e-8, 4)
 
 

@@ -214,7 +214,7 @@ def test_float32_works_at_its_own_tolerance():
     import subprocess
     import sys
 
-    told = subprocess.run(
+    done = subprocess.run(
         [sys.executable, "-c", FLOAT32],
         env=os.environ | {"JAX_ENABLE_X64": "0"},
         capture_output=True,
@@ -224,4 +224,4 @@ def test_float32_works_at_its_own_tolerance():
     )
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
     expected = tippe.inversion_table(scene, theta=[0.3, 0.4], spin=[155.0, 160.0], t1=8.0)
-    assert_close([float(time) for time in told.stdout.split(",")], expected.time.ravel(), rtol=2e-2)
+    assert_close([float(time) for time in done.stdout.split(",")], expected.time.ravel(), rtol=2e-2)

@@ -12,10 +12,10 @@ SMALL = ["--theta", "0.1", "0.3", "--eta", "0", "--t1", "12", "--tolerance", "1e
 
 def test_the_main_job_prints_writes_and_draws(tmp_path, capsys):
     assert main([*SMALL, "--out", str(tmp_path / "out")]) == 0
-    told = capsys.readouterr().out
-    assert "Table 1 lost its numbers" in told
-    assert "first [s]" in told
-    assert "9.98" in told
+    printed = capsys.readouterr().out
+    assert "Table 1 lost its numbers" in printed
+    assert "first [s]" in printed
+    assert "9.98" in printed
     assert (tmp_path / "out" / "theta.png").read_bytes().startswith(b"\x89PNG")
     with xarray.open_dataset(tmp_path / "out" / "cylinder.h5", engine="h5netcdf") as data:
         assert data["first_time"].dims == ("theta", "eta")
@@ -24,8 +24,8 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys):
     assert main([*SMALL, "--out", str(tmp_path / "out")]) == 0
     capsys.readouterr()
     assert main([*SMALL, "--mu", "0.2", "--out", str(tmp_path / "out")]) == 2
-    told = capsys.readouterr().err
-    assert "scene.friction.mu is 0.3 there and 0.2 here" in told
+    printed = capsys.readouterr().err
+    assert "scene.friction.mu is 0.3 there and 0.2 here" in printed
 
 
 @pytest.mark.parametrize(
@@ -43,12 +43,12 @@ def test_bad_input_is_one_clear_line(arguments, message, capsys, tmp_path):
     import re
 
     assert main([*SMALL, "--out", str(tmp_path), *arguments]) == 2
-    told = capsys.readouterr().err.strip()
-    assert re.search(message, told)
-    assert len(told.splitlines()) == 1
+    printed = capsys.readouterr().err.strip()
+    assert re.search(message, printed)
+    assert len(printed.splitlines()) == 1
 
 
 def test_every_option_is_explained():
-    told = parser().format_help()
+    printed = parser().format_help()
     for word in ("mass [kg]", "cylinder", "[rad/s]", "slip speed", "horizon", "Table 1"):
-        assert word in told
+        assert word in printed

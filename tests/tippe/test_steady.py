@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import tippe
+from nonholonomic.integration import sign_changes
 from tippe import steady
 
 RNG = np.random.default_rng(7)
@@ -124,7 +125,7 @@ def test_the_growth_rate_of_a_tumbling_top_vanishes_at_the_fold_of_jelletts_cons
     one = scene(0.3, 0.75)
     assert steady.folds(one.body)
     slope = jax.jit(jax.vmap(jax.grad(lambda theta: steady.tumbling(one, theta).jellett)))
-    folds = steady.roots_by_halving(slope, jnp.linspace(0.01, 3.13, 500))
+    folds = sign_changes(slope, jnp.linspace(0.01, 3.13, 500))
     assert folds.size > 0
     beside = jnp.concatenate([folds - 3e-8, folds + 3e-8])
     motion = steady.tumbling(one, beside)

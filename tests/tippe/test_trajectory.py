@@ -12,15 +12,15 @@ from conftest import assert_close, rutstam_top
 import tippe
 from nonholonomic.integration import Settings, follow
 from nonholonomic.integration.single_run import PIECE
-from tippe.trajectory import Run
+from tippe.trajectory import TrajectoryProblem
 
 LAUNCH = tippe.Launch(0.1, 155.0)
 
 
 def test_a_run_prints_what_it_took(rutstam_scene):
-    told = str(tippe.simulate(rutstam_scene, LAUNCH, 1.0))
+    printed = str(tippe.simulate(rutstam_scene, LAUNCH, 1.0))
     for word in ("ran to 1 s", "accepted", "rejected", "drift of |e|", "energy residual"):
-        assert word in told
+        assert word in printed
 
 
 def test_given_times_and_dense_output_agree(rutstam_scene):
@@ -68,7 +68,7 @@ def test_more_steps_than_a_piece_holds(rutstam_scene):
 
 def test_a_run_of_too_many_steps_fails(rutstam_scene):
     """It says so and ends where it is, rather than go on for ever."""
-    path = follow(Run.of(rutstam_scene, LAUNCH), 1e6, Settings(3e-14, max_steps=3000))
+    path = follow(TrajectoryProblem.of(rutstam_scene, LAUNCH), 1e6, Settings(3e-14, max_steps=3000))
     assert path.failed
     assert not path.guard_lost
     assert 3000 <= path.accepted + path.rejected < 3000 + PIECE

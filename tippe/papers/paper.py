@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from ..launch import Launch
 from ..scene import Scene
 from ..top import Top
-from ..witnesses.euler_angles import crossing
+from ..witnesses.euler_angles import across
 
 #: The paper's units in SI.
 GRAM, CENTIMETRE = 1e-3, 1e-2
@@ -106,7 +106,7 @@ def printed_normal_force(scene: Scene, state: Float[Array, " 8"], theta_2: Float
     - `state`: (8,) as in `witnesses/euler_angles.py`; r is taken as rho, the better of its two readings.
     - `theta_2`: theta'' [rad/s^2].
     """
-    metric, turns = crossing(scene)
+    metric, turns = across(scene)
     eta, theta, _, eta_dot, _, theta_dot, _, _ = state
     swing = theta_2 * jnp.sin(theta) + theta_dot**2 * jnp.cos(theta)
     pull = scene.gravity * jnp.cos(turns * eta) + metric * (turns * eta_dot) ** 2

@@ -12,14 +12,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import Vector, cross, dot, scale, subtract, sum_vectors
+from nonholonomic.integration import halved
 
 from ..top import Top
 from .free_body import Ball, FreeBody, gap, gap_rate
 
 Cells = Float[Array, " cells"]
-
-#: Bisections of a bracket: to round-off.
-BISECTIONS = 60
 
 #: Stretches between inflections that are searched for a landing; the search leaves out those where the top is too high.
 MOST_STRETCHES = 20_000
@@ -185,7 +183,7 @@ def landing(descent: Descent, most: Cells) -> tuple[Cells, Bool[Array, " cells"]
         stop = jnp.minimum(next_inflection(begin), end)
         falls = descent.value(stop) < 0.0
         dips = (descent.slope(begin) < 0.0) & (descent.slope(stop) > 0.0)
-        bottom = _bisect(lambda t: descent.slope(t) < 0.0, begin, stop)
+        bottom = halved(lambda t: descent.slope(t) < 0.0, begin, stop)[1]
         dips &= descent.value(bottom) < 0.0
         hit = falls | dips
         here = ~found & ~over
@@ -200,20 +198,8 @@ def landing(descent: Descent, most: Cells) -> tuple[Cells, Bool[Array, " cells"]
     zero, no = jnp.zeros_like(end), jnp.zeros(end.shape, bool)
     low, high, found, over, _ = jax.lax.while_loop(searching, search, (zero, zero, no, no, 0))
     # At the very start the distance is zero: what counts is that it has been above since.
-    time = _bisect(lambda t: descent.value(t) >= 0.0, low, high)
+    time = halved(lambda t: descent.value(t) >= 0.0, low, high)[1]
     return jnp.where(found, time, jnp.inf), ~found & ~over
-
-
-def _bisect(holds, low: Cells, high: Cells) -> Cells:
-    """Where a condition that holds at `low` ceases to hold before `high`."""
-
-    def halve(_, bracket):
-        low, high = bracket
-        middle = 0.5 * (low + high)
-        below = holds(middle)
-        return jnp.where(below, middle, low), jnp.where(below, high, middle)
-
-    return jax.lax.fori_loop(0, BISECTIONS, halve, (low, high))[1]
 
 
 def _roots(height: Cells, speed: Cells, gravity: Cells) -> tuple[Cells, Cells]:

@@ -47,7 +47,7 @@ class HybridTrajectory(AbstractTrajectory):
     t: Float[np.ndarray, " times"]
     scene: Scene
     states: Float[np.ndarray, "8 times"]
-    path: Float[np.ndarray, "2 times"]
+    cyclic: Float[np.ndarray, "2 times"]
     spin_angle: Float[np.ndarray, " times"]
     work: Float[np.ndarray, " times"]
     status: str
@@ -101,7 +101,9 @@ class HybridTrajectory(AbstractTrajectory):
         """The same run at other times, which are not checked."""
         found = (times, *_parts(self.dense.at(times)), self.dense.numbers(times))
         return eqx.tree_at(
-            lambda one: (one.t, one.states, one.path, one.spin_angle, one.work, one.distance, one.contact), self, found
+            lambda one: (one.t, one.states, one.cyclic, one.spin_angle, one.work, one.distance, one.contact),
+            self,
+            found,
         )
 
     def __str__(self) -> str:

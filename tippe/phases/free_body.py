@@ -6,12 +6,12 @@ In contact the velocity and the height of the centre of mass follow from the axi
 import dataclasses
 from typing import NamedTuple
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
 
 from ..dynamics import Dynamics
+from ..state import joined, parts
 from ..top import Top
 
 
@@ -49,16 +49,16 @@ def standing_on(dynamics: Dynamics, ball: Ball) -> Dynamics:
 def freed(body: Top, ball: Ball, state: Float[Array, "components ..."]) -> FreeBody:
     """A top that stands on a sphere, as a free body: the sphere's centre is at rest along the normal.
 
-    **Arguments:** `state`: (8, ...), as `tippe/dynamics.py` has it.
+    **Arguments:** `state`: (8, ...), as `tippe/state.py` has it.
     """
-    axis, momentum = tuple(state[2:5]), tuple(state[5:8])
+    velocity, axis, momentum, _ = parts(state)
     height = ball.radius - ball.offset * axis[2]
-    return FreeBody((state[0], state[1], -ball.offset * axis_rate(body, axis, momentum)[2]), height, axis, momentum)
+    return FreeBody((*velocity, -ball.offset * axis_rate(body, axis, momentum)[2]), height, axis, momentum)
 
 
 def grounded(free: FreeBody) -> Float[Array, "components ..."]:
     """The state (8, ...) of a top in contact; what is left out follows from the contact."""
-    return jnp.stack(jnp.broadcast_arrays(*free.velocity[:2], *free.axis, *free.momentum))
+    return joined(free.velocity[:2], free.axis, free.momentum)
 
 
 def shown(body: Top, free: FreeBody, riding: Float[Array, "4 ..."]) -> Float[Array, "14 ..."]:

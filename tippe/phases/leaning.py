@@ -24,10 +24,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.geometry import Component, Vector, add, dot, multiply, scale, subtract, sum_vectors
+from nonholonomic.geometry import Component, add, dot, multiply, scale, subtract, sum_vectors
 
 from ..dynamics import stacked
 from ..friction import AbstractFriction, Slip
+from ..state import parts
 from ..top import Top
 from .free_body import FreeBody, balls, grounded
 
@@ -80,9 +81,8 @@ class LeaningDynamics(eqx.Module):
         **Returns:** a `LeaningMotion`; `rate` is (m/s^2, 1/s, N m).
         """
         spheres, m, I1, I3 = balls(self.body), self.body.mass, self.body.I1, self.body.I3
-        u = (state[0], state[1])
-        e: Vector = (state[2], state[3], state[4])
-        c, p, b = e[2], state[7], dot(e, (state[5], state[6], state[7]))
+        u, e, L, _ = parts(state)
+        c, p, b = e[2], L[2], dot(e, L)
         across = (-e[1], e[0])
         sine2 = dot(across, across)
         along = (b - c * p) / sine2
@@ -106,7 +106,7 @@ class LeaningDynamics(eqx.Module):
         b_dot = dot(tuple(ball.radius for ball in spheres), tuple(turning))
         # L turns with the axis, whatever part of it is across; so b changes by its rate and by no more.
         growth = multiply(1.0 / sine2, subtract(b_dot, multiply(c, p_dot)))
-        L_dot = sum_vectors(scale(growth, e[:2]), (-precession * state[6], precession * state[5]))
+        L_dot = sum_vectors(scale(growth, e[:2]), (-precession * L[1], precession * L[0]))
         rate = (*u_dot, *scale(precession, across), None, *L_dot, p_dot)
         power = dot(normal, tuple(load.power(slip) for load, slip in zip(loads, slips, strict=True)))
         stiff = (m_1 - m_0) / ((spheres[1].offset - spheres[0].offset) * sine2)

@@ -26,6 +26,7 @@ from nonholonomic.geometry import (
 
 from ..dynamics import Motion, stacked
 from ..friction import ContactLoad, Slip, length
+from ..state import joined, parts
 from ..top import Top
 
 
@@ -85,9 +86,9 @@ class RollingDynamics(eqx.Module):
 
     def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """The state with the velocity that axis and angular momentum give the rolling top."""
-        e: Vector = (state[2], state[3], state[4])
-        u = cross(self._contact(e), self._angular_velocity(e, (state[5], state[6], state[7])))
-        return jnp.stack([u[0], u[1], *state[2:]])
+        _, e, L, place = parts(state)
+        u = cross(self._contact(e), self._angular_velocity(e, L))
+        return joined(u[:2], e, L, place)
 
     def _evaluate(self, state: Float[Array, "components ..."]) -> tuple[Motion, Vector]:
         """The motion and the reaction F (`tippe.md`, section 5 d).
@@ -95,9 +96,7 @@ class RollingDynamics(eqx.Module):
         (J + m (r^2 - r r^T)) w' = -w x L + m r x (r' x w) + m g r x z, with r' = a e' - R n'; then u' = r' x w + r x w',
         F = m (u' + g z), and L' = r x F.
         """
-        e: Vector = (state[2], state[3], state[4])
-        L: Vector = (state[5], state[6], state[7])
-        place = tuple(state[8:])
+        _, e, L, place = parts(state)
         R, a, m = self.radius, self.offset, self.mass
 
         w = self._angular_velocity(e, L)
@@ -139,18 +138,17 @@ class RollingDynamics(eqx.Module):
 
         **Returns:** the state, of the same shape.
         """
-        e: Vector = (state[2], state[3], state[4])
-        L: Vector = (state[5], state[6], state[7])
+        (u1, u2), e, L, place = parts(state)
         r = self._contact(e)
         e_dot = cross(self._angular_velocity(e, L), e)
-        u = (state[0], state[1], multiply(-self.offset, e_dot[2]))
+        u = (u1, u2, multiply(-self.offset, e_dot[2]))
         v = (slip.x, slip.y, None)
         lever = cross(r, sum_vectors(v, scale(-1.0, u)))
         w = self._over_inertia(e, r, sum_vectors(L, scale(self.mass, lever)))
         u = sum_vectors(cross(r, w), v)
         along = dot(w, e)
         L = sum_vectors(scale(self.I1, w), scale((self.I3 - self.I1) * along, e))
-        return jnp.stack([u[0], u[1], *e, *L, *state[8:]])
+        return joined(u[:2], e, L, place)
 
     def blow(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
         """The blow at the contact that changes the velocity of the contact point by 1 m/s along an axis of the arena [N s].
@@ -159,7 +157,7 @@ class RollingDynamics(eqx.Module):
 
         - `state`: (8 + the arena's place, ...); `axis`: 0 for t1, 1 for t2.
         """
-        e: Vector = (state[2], state[3], state[4])
+        e = parts(state).axis
         r, one = self._contact(e), jnp.ones_like(state[0])
         v = (one, None, None) if axis == 0 else (None, one, None)
         w = self._over_inertia(e, r, scale(self.mass, cross(r, v)))
@@ -171,7 +169,8 @@ class RollingDynamics(eqx.Module):
 
     def angular_velocity(self, state: Float[Array, "components ..."]) -> Vector:
         """Angular velocity of the body [rad/s] in the moving frame."""
-        return self._angular_velocity((state[2], state[3], state[4]), (state[5], state[6], state[7]))
+        _, e, L, _ = parts(state)
+        return self._angular_velocity(e, L)
 
     def _angular_velocity(self, e: Vector, L: Vector) -> Vector:
         """w = L / I1 + (1 / I3 - 1 / I1) (L.e) e [rad/s]."""

@@ -21,7 +21,7 @@ from nonholonomic.integration import (
 
 from ..dynamics import COS_THETA, NO_COSINE, Dynamics
 from ..inversion import InversionProblem
-from ..sampled import Run
+from ..sampled import TrajectoryProblem
 from ..scene import Scene
 from .onset import Onset
 from .stick_slip import AT_REST, Change, Kind, StickSlip
@@ -33,7 +33,7 @@ SLIPPING, ROLLING = range(2)
 class StickSlipPhase(AbstractPhase):
     """Slipping or rolling up to an angle of theta; `last` is whether the last crossing of it counts.
 
-    With a single run whose path is kept, what a `Run` carries rides along behind the first `size` components of the state:
+    With a single run whose path is kept, what a `TrajectoryProblem` carries rides along behind the first `size` components:
     `axial` is then the moment of inertia about the axis [kg m^2]. For the cells of a table both are `None`.
     """
 
@@ -90,7 +90,7 @@ class StickSlipPhase(AbstractPhase):
         if self.axial is None:
             return InversionProblem(equations, self.cos_angle, state, self.scales)
         own, path, rest = jnp.split(state, (self._size(state), len(state) - 2))
-        return Run(equations, self.axial, own, path, self.scales, rest)
+        return TrajectoryProblem(equations, self.axial, own, path, self.scales, rest)
 
 
 def _recorded(change: Change) -> Record:
@@ -124,7 +124,7 @@ def phases(
     return found, jnp.where(rests, ROLLING, SLIPPING)
 
 
-def follow_stick_slip(run: Run, t1: float, settings: Settings) -> PhasedPath:
+def follow_stick_slip(run: TrajectoryProblem, t1: float, settings: Settings) -> PhasedPath:
     """One run, phase by phase, until `t1` or until contact is lost.
 
     **Arguments:**

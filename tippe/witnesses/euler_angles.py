@@ -19,16 +19,17 @@ from nonholonomic.geometry import carried
 
 from ..friction import Slip
 from ..scene import Scene
+from ..state import AXIS, MOMENTUM, PLACE, VELOCITY
 
 
-class Crossing(NamedTuple):
+class Across(NamedTuple):
     """The coordinate across the arena: length [m] per unit of it, and turning [rad] of the frame per unit of it."""
 
     metric: Float[Array, ""] | float
     turning: float
 
 
-def crossing(scene: Scene) -> Crossing:
+def across(scene: Scene) -> Across:
     """Length and turning per unit of the coordinate across the arena: (1, 0) on a plane, (rho, 1) on a cylinder.
 
     **Arguments:**
@@ -40,7 +41,7 @@ def crossing(scene: Scene) -> Crossing:
     curvature, along = scene.surface.parallel(scene.body.radius).turning((1.0, 0.0))
     if along is not None:
         raise ValueError(f"surface = {scene.surface!r} must be a Plane or a Cylinder for these coordinates")
-    return Crossing(1.0, 0.0) if curvature is None else Crossing(1.0 / curvature, 1.0)
+    return Across(1.0, 0.0) if curvature is None else Across(1.0 / curvature, 1.0)
 
 
 def from_vector_state(scene: Scene, state: Float[Array, " components"]) -> Float[Array, " 8"]:
@@ -49,15 +50,15 @@ def from_vector_state(scene: Scene, state: Float[Array, " components"]) -> Float
     **Arguments:**
 
     - `scene`: a `Scene` on a `Plane` or a `Cylinder`.
-    - `state`: (8 or 10,) as in `tippe/dynamics.py`.
+    - `state`: (8 or 10,) as in `tippe/state.py`.
 
     **Returns:** (eta or x, theta, phi, and the rates of eta or x, y, theta, phi, psi), an array (8,) in rad, m and s; x
     is 0.
     """
-    metric, turns = crossing(scene)
-    e, L = state[2:5], state[5:8]
+    metric, turns = across(scene)
+    e, L = state[AXIS], state[MOMENTUM]
     spinning = jnp.cross(L, e) / scene.body.I1
-    velocity = state[:2] + scene.body.offset * spinning[:2]
+    velocity = state[VELOCITY] + scene.body.offset * spinning[:2]
     turning = scene.surface.parallel(scene.body.radius).turning((velocity[0], velocity[1]))
     seen = jnp.stack([a if b is None else a + b for a, b in zip(spinning, carried(tuple(e), turning), strict=True)])
 
@@ -65,7 +66,7 @@ def from_vector_state(scene: Scene, state: Float[Array, " components"]) -> Float
         return jnp.stack([jnp.arctan2(jnp.hypot(axis[0], axis[1]), axis[2]), jnp.arctan2(axis[1], axis[0])])
 
     (theta, phi), (theta_dot, phi_dot) = jax.jvp(angles, (e,), (seen,))
-    eta = jnp.arctan2(state[8], state[9]) if turns else jnp.zeros_like(theta)
+    eta = jnp.arctan2(*state[PLACE]) if turns else jnp.zeros_like(theta)
     eta_dot = velocity[0] / metric
     psi_dot = L @ e / scene.body.I3 - phi_dot * e[2] + turns * eta_dot * e[1]
     return jnp.stack([eta, theta, phi, eta_dot, velocity[1], theta_dot, phi_dot, psi_dot])
@@ -118,7 +119,7 @@ def contact_motion(
     **Returns:** O' [m/s] and e' [1/s] in the frame (t1, t2, n), and (p, q, omega3) [rad/s], the frame turning at
     -eta' t2.
     """
-    metric, turns = crossing(scene)
+    metric, turns = across(scene)
     _, _, theta, phi, _, gap = q
     eta_dot, y_dot, theta_dot, phi_dot, psi_dot, gap_dot = q_dot
     turning = turns * eta_dot
@@ -228,7 +229,7 @@ def equations(scene: Scene, state: Float[Array, " 8"]) -> tuple[Float[Array, "6 
     **Returns:** A (6, 6) and b (6,).
     """
     body = scene.body
-    metric, turns = crossing(scene)
+    metric, turns = across(scene)
     q, q_dot = spread(state)
     eta, theta, phi, eta_dot, _, theta_dot, phi_dot, psi_dot = state
     turning = turns * eta_dot
@@ -306,7 +307,7 @@ def normal_force(scene: Scene, state: Float[Array, " 8"], second_rates: Float[Ar
     - `state`: (8,) as the module states it.
     - `second_rates`: (5,) as in `Accelerations`.
     """
-    metric, turns = crossing(scene)
+    metric, turns = across(scene)
     eta, theta, phi, eta_dot, _, theta_dot, phi_dot, _ = state
     turning = turns * eta_dot
     s, c, sp, cp = jnp.sin(theta), jnp.cos(theta), jnp.sin(phi), jnp.cos(phi)

@@ -20,14 +20,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from nonholonomic.integration import halved
+
 from ..scene import Scene
+from ..state import AXIS, MOMENTUM, VELOCITY
 
 #: Gauss points for the divided difference along each direction, and cosines for the time as a function of chi.
 POINTS, COSINES = 24, 96
 #: First step of z in the search for a turning point: well above the noise of f, well below the width of a swing.
 FIRST_STEP = 1e-6
-#: Halvings of the bracket of a turning point.
-HALVINGS = 60
 
 
 class AbstractNutation(eqx.Module):
@@ -63,8 +64,8 @@ class FrictionlessNutation(AbstractNutation):
     @classmethod
     def of(cls, scene: Scene, state: Float[Array, " 8"]) -> "FrictionlessNutation":
         """The nutation that starts at a state of the vector form."""
-        drift = 0.5 * scene.body.mass * (state[0] ** 2 + state[1] ** 2)
-        return cls(scene, scene.energy(state) - drift, state[7], state[2:5] @ state[5:8])
+        drift = 0.5 * scene.body.mass * jnp.sum(state[VELOCITY] ** 2)
+        return cls(scene, scene.energy(state) - drift, state[MOMENTUM][2], state[AXIS] @ state[MOMENTUM])
 
     def inertia(self, z: Float[Array, ""]) -> Float[Array, ""]:
         body = self.scene.body
@@ -255,11 +256,5 @@ def turning_point(nutation: AbstractNutation, z: Float[Array, ""], direction: fl
 
     first = jnp.asarray(FIRST_STEP, dtype=z.dtype)
     bracket = jax.lax.while_loop(positive, double, (jnp.zeros_like(first), first))
-
-    def halve(_, bracket):
-        middle = 0.5 * (bracket[0] + bracket[1])
-        inside = nutation.drive(ahead(middle)) > 0.0
-        return jnp.where(inside, middle, bracket[0]), jnp.where(inside, bracket[1], middle)
-
-    low, high = jax.lax.fori_loop(0, HALVINGS, halve, bracket)
+    low, high = halved(lambda step: nutation.drive(ahead(step)) > 0.0, *bracket)
     return ahead(0.5 * (low + high))

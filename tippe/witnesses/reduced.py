@@ -14,13 +14,15 @@ from jaxtyping import Array, Float
 
 from ..friction import Slip
 from ..scene import Scene
+from ..state import AXIS, VELOCITY
 from .euler_angles import from_vector_state
 
 
 def nodal(state: Float[Array, " 8"], vector: Float[Array, " 2"]) -> Float[Array, " 2"]:
     """Components of a horizontal vector along tx and ty, for a state of the vector form."""
-    level = jnp.hypot(state[2], state[3])
-    c, s = state[2] / level, state[3] / level
+    e1, e2, _ = state[AXIS]
+    level = jnp.hypot(e1, e2)
+    c, s = e1 / level, e2 / level
     return jnp.stack([c * vector[0] + s * vector[1], c * vector[1] - s * vector[0]])
 
 
@@ -109,7 +111,7 @@ class JellettState(NamedTuple):
 def jellett_state(scene: Scene, state: Float[Array, " 8"]) -> JellettState:
     """The reduced state for a state of the vector form; Jellett's constant itself is `scene.jellett(state)`."""
     chart = from_vector_state(scene, state)
-    velocity = nodal(state, state[:2])
+    velocity = nodal(state, state[VELOCITY])
     return JellettState(chart[1], chart[5], scene.body.I3 * scene.spin(state), velocity[0], velocity[1])
 
 

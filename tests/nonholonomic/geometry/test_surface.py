@@ -12,12 +12,12 @@ SURFACES = {"plane": Plane(), "cylinder": Cylinder(0.3), "sphere": Sphere(0.3)}
 
 
 def moved(surface, velocity, eta, time):
-    """Place and path after moving with the given velocity components, by small Runge-Kutta steps."""
-    start = (surface.place(jnp.asarray(eta)), surface.path(jnp.asarray(eta)))
+    """Place and cyclic coordinates after moving with the given velocity components, by small Runge-Kutta steps."""
+    start = (surface.place(jnp.asarray(eta)), surface.cyclic(jnp.asarray(eta)))
 
     def rate(both):
         turning = surface.turning(velocity)
-        return surface.place_rate(both[0], turning), surface.path_rate(both[1], velocity, turning)
+        return surface.place_rate(both[0], turning), surface.cyclic_rate(both[1], velocity, turning)
 
     def step(both, _):
         k1 = rate(both)
@@ -34,15 +34,15 @@ def moved(surface, velocity, eta, time):
 def test_the_frame_is_orthonormal_and_turns_as_stated(name):
     """t1, t2, n orthonormal; position' = V1 t1 + V2 t2; n' = -(o1 t1 + o2 t2); the vertical is z."""
     surface, velocity = SURFACES[name], (jnp.asarray(0.3), jnp.asarray(-0.2))
-    place, path = moved(surface, velocity, 0.4, 0.5)
-    frame = np.array(surface.frame(place, path), dtype=float)
+    place, cyclic = moved(surface, velocity, 0.4, 0.5)
+    frame = np.array(surface.frame(place, cyclic), dtype=float)
     assert_close(frame @ frame.T, np.eye(3), atol=1e-10)
     assert_close(np.linalg.det(frame), 1.0, atol=1e-10)
     turning = surface.turning(velocity)
-    rates = (surface.place_rate(place, turning), surface.path_rate(path, velocity, turning))
-    _, position_rate = jax.jvp(lambda *both: jnp.stack(surface.position(*both)), (place, path), rates)
+    rates = (surface.place_rate(place, turning), surface.cyclic_rate(cyclic, velocity, turning))
+    _, position_rate = jax.jvp(lambda *both: jnp.stack(surface.position(*both)), (place, cyclic), rates)
     assert_close(position_rate, 0.3 * frame[0] - 0.2 * frame[1], atol=1e-10)
-    _, normal_rate = jax.jvp(lambda *both: jnp.stack(surface.frame(*both)[2]), (place, path), rates)
+    _, normal_rate = jax.jvp(lambda *both: jnp.stack(surface.frame(*both)[2]), (place, cyclic), rates)
     turns = np.array([0.0 if part is None else float(part) for part in turning])
     assert_close(normal_rate, -(turns[0] * frame[0] + turns[1] * frame[1]), atol=1e-10)
     vertical = np.array([0.0 if part is None else float(part) for part in surface.vertical(place)])
@@ -52,20 +52,20 @@ def test_the_frame_is_orthonormal_and_turns_as_stated(name):
 @pytest.mark.parametrize("name", ["cylinder", "sphere"])
 def test_height_is_the_rise_above_the_lowest_point(name):
     surface = SURFACES[name]
-    place, path = moved(surface, (jnp.asarray(0.3), jnp.asarray(-0.2)), 0.4, 0.5)
-    assert_close(surface.height(place), float(surface.position(place, path)[2]) + 0.3, atol=1e-12)
+    place, cyclic = moved(surface, (jnp.asarray(0.3), jnp.asarray(-0.2)), 0.4, 0.5)
+    assert_close(surface.height(place), float(surface.position(place, cyclic)[2]) + 0.3, atol=1e-12)
     for eta in (0.0, 0.7, -0.7, np.pi / 2.0):
-        place, path = surface.place(jnp.asarray(eta)), surface.path(jnp.asarray(eta))
-        assert_close(surface.angle(place, path), abs(eta) if name == "sphere" else eta, atol=1e-12)
+        place, cyclic = surface.place(jnp.asarray(eta)), surface.cyclic(jnp.asarray(eta))
+        assert_close(surface.angle(place, cyclic), abs(eta) if name == "sphere" else eta, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["cylinder", "sphere"])
 def test_the_parallel_surface_is_where_the_centre_runs(name):
     surface = SURFACES[name]
     inner = surface.parallel(0.02)
-    place, path = surface.place(jnp.asarray(0.4)), surface.path(jnp.asarray(0.4))
-    normal = np.array(surface.frame(place, path)[2])
-    assert_close(inner.position(place, path), np.array(surface.position(place, path)) + 0.02 * normal, atol=1e-15)
+    place, cyclic = surface.place(jnp.asarray(0.4)), surface.cyclic(jnp.asarray(0.4))
+    normal = np.array(surface.frame(place, cyclic)[2])
+    assert_close(inner.position(place, cyclic), np.array(surface.position(place, cyclic)) + 0.02 * normal, atol=1e-15)
 
 
 def test_a_fixed_vector_keeps_its_length_in_a_turning_frame():

@@ -22,4 +22,4 @@ def test_a_launch_has_its_own_angles_and_turns_about_its_axis_only(surface):
 def test_the_chart_refuses_an_arena_that_is_curved_both_ways():
     """Its coordinates run along straight lines of the arena."""
     with pytest.raises(ValueError, match="must be a Plane or a Cylinder"):
-        euler_angles.crossing(tippe.Scene(TOP, tippe.Sphere(0.3)))
+        euler_angles.across(tippe.Scene(TOP, tippe.Sphere(0.3)))

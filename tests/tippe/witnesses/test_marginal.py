@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import tippe
+from nonholonomic.integration import sign_changes
 from tippe import steady
 from tippe.witnesses import marginal
 
@@ -26,7 +27,7 @@ def critical_spins():
         return jnp.where(sign > 0.0, upright(spins), inverted(spins))
 
     def find(ratio, inverted=False):
-        return steady.roots_by_halving(lambda s: growth(0.02 * ratio, -1.0 if inverted else 1.0, s), GRID)
+        return sign_changes(lambda s: growth(0.02 * ratio, -1.0 if inverted else 1.0, s), GRID)
 
     return find
 

@@ -1,0 +1,89 @@
+"""Zeros of functions of one number, many at once. (The search for an event within a step is a part of `event.py`.)"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+Brackets = Float[np.ndarray, " zeros"]
+
+#: Halvings that take any bracket to round-off.
+HALVINGS = 60
+
+#: `few_trials` stops once a bracket, or the change from one trial to the next, is shorter than this fraction of the value.
+LOCATED = 1e-14
+
+#: Trials after which `few_trials` takes the last one.
+MOST_TRIALS = 60
+
+
+def halved(
+    holds: Callable[[Float[Array, "..."]], Bool[Array, "..."]], low: Float[Array, "..."], high: Float[Array, "..."]
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Halve brackets, inside transformations too, down to where a condition ceases to hold.
+
+    **Arguments:**
+
+    - `holds`: the condition, true at `low` and false at `high`.
+    - `low`, `high`: the brackets, of any shape.
+
+    **Returns:** the last value at which the condition held and the next one, at which it does not.
+    """
+
+    def halve(_, bracket):
+        low, high = bracket
+        middle = 0.5 * (low + high)
+        inside = holds(middle)
+        return jnp.where(inside, middle, low), jnp.where(inside, high, middle)
+
+    return jax.lax.fori_loop(0, HALVINGS, halve, (low, high))
+
+
+def sign_changes(
+    function: Callable[[Float[Array, " n"]], Float[Array, " n"]], grid: Float[Array, " n"]
+) -> Float[Array, " zeros"]:
+    """Zeros of a function between neighbours of a grid at which it has different signs, to round-off.
+
+    **Arguments:** `function`: of an array of numbers, element by element; `grid`: growing numbers.
+    """
+    values = function(grid)
+    found = np.flatnonzero(np.sign(values[:-1]) != np.sign(values[1:]))
+    if found.size == 0:
+        return jnp.zeros(0)
+    sign = jnp.sign(values[found])
+    low, high = halved(lambda middle: jnp.sign(function(middle)) == sign, grid[found], grid[found + 1])
+    return 0.5 * (low + high)
+
+
+def few_trials(
+    function: Callable[[Brackets], Any], low: Brackets, high: Brackets, at_low: Brackets, at_high: Brackets
+) -> Brackets:
+    """Zeros of a function that is expensive to evaluate, one in each bracket (Anderson and Bjorck, BIT 13 (1973) 253).
+
+    **Arguments:**
+
+    - `function`: of NumPy arrays, element by element; it is not traced.
+    - `low`, `high`: the brackets; `at_low`, `at_high`: the function there, of opposite signs.
+    """
+    guess = low
+    for trial in range(MOST_TRIALS if low.size else 0):
+        last, rise = guess, at_high - at_low
+        with np.errstate(all="ignore"):
+            guess = low - at_low * (high - low) / rise
+        # Where the function is not a number, and now and then to be sure, the bracket is halved.
+        halve = ~np.isfinite(guess) | (trial % 4 == 3)
+        guess = np.where(halve, 0.5 * (low + high), np.clip(guess, low, high))
+        if np.all(np.minimum(high - low, np.abs(guess - last)) <= LOCATED * np.maximum(high, 1.0)):
+            break
+        value = function(guess)
+        beyond = (value > 0.0) != (at_low > 0.0)
+        with np.errstate(all="ignore"):
+            fade_low, fade_high = 1.0 - value / at_high, 1.0 - value / at_low
+        fade_low, fade_high = (np.where(fade > 0.0, fade, 0.5) for fade in (fade_low, fade_high))
+        # The end that stays is given less weight, so that it moves too in the next trial.
+        at_low, at_high = np.where(beyond, at_low * fade_low, value), np.where(beyond, value, at_high * fade_high)
+        low, high = np.where(beyond, low, guess), np.where(beyond, guess, high)
+    return guess

@@ -1,0 +1,43 @@
+"""The state of a top in contact, and its parts by name.
+
+In the arena's moving frame (t1, t2, n): velocity (u1, u2) of the centre of mass along the arena [m/s], axis (e1, e2, e3) [1],
+angular momentum (L1, L2, L3) about the centre of mass [kg m^2/s], then the arena's place. The components stand along axis 0.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nonholonomic.geometry import Component, Tangent, Vector
+
+#: Where the parts stand in a state.
+VELOCITY, AXIS, MOMENTUM, PLACE = slice(0, 2), slice(2, 5), slice(5, 8), slice(8, None)
+
+#: Where the component of the axis along n stands: cos(theta).
+COS_THETA = 4
+
+
+class Parts(NamedTuple):
+    """A state, taken apart."""
+
+    velocity: Tangent
+    axis: Vector
+    momentum: Vector
+    place: tuple[Component, ...]
+
+
+def parts(state: Float[Array, "components ..."]) -> Parts:
+    """The components of a state, part by part."""
+    u1, u2, e1, e2, e3, L1, L2, L3, *place = (state[k] for k in range(len(state)))
+    return Parts((u1, u2), (e1, e2, e3), (L1, L2, L3), tuple(place))
+
+
+def joined(*some: tuple[Component, ...]) -> Float[Array, "components ..."]:
+    """The state made of its parts, in order; a component is a scalar or one per lane."""
+    return jnp.stack(jnp.broadcast_arrays(*(component for part in some for component in part)))
+
+
+def inclination(axis: Vector) -> Float[Array, "..."]:
+    """The angle theta [rad] from the arena's normal to the axis, in [0, pi]."""
+    return jnp.arctan2(jnp.hypot(axis[0], axis[1]), axis[2])
