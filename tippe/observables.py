@@ -1,8 +1,9 @@
 """What is read off a run of a tippe top, with its contact kept or through flights: one state at each time."""
 
 import abc
+import dataclasses
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,9 +19,15 @@ from .scene import Scene
 
 
 def of_each_run(function: Callable[[Any], Array]) -> property:
-    """A property of one run that is, for a batch of runs as `vmap` returns it, the property of each."""
+    """A property of one run that is, for a batch of runs as `vmap` returns it, the property of each.
+
+    Outside of transformations it is compiled for powers of two only: every run has another number of steps.
+    """
+    compiled = eqx.filter_jit(function)
 
     def get(self):
+        if not is_traced(self.t) and self.t.ndim == 1:
+            return jnp.asarray(np.asarray(compiled(self.padded()))[: len(self.t)])
         mapped = function
         for _ in range(self.t.ndim - 1):
             mapped = eqx.filter_vmap(mapped)
@@ -53,6 +60,24 @@ class AbstractTrajectory(eqx.Module):
     end_time: eqx.AbstractVar[Any]
     stats: eqx.AbstractVar[dict[str, Any]]
     dense: eqx.AbstractVar[Any]
+
+    #: The fields that no observable needs.
+    unused: ClassVar[tuple[str, ...]] = ("status", "end_time", "stats", "dense")
+
+    #: The fields with a value for each time, along the last axis.
+    by_time: ClassVar[tuple[str, ...]] = ("t", "states", "cyclic", "spin_angle", "work")
+
+    def padded(self) -> Self:
+        """The run with the last of its times repeated, up to a power of two; without what observables do not need."""
+        count = len(self.t)
+        more = (1 << (count - 1).bit_length()) - count
+
+        def longer(values: Any) -> Float[np.ndarray, "..."]:
+            values = np.asarray(values)
+            return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)], mode="edge")
+
+        unused = dict.fromkeys(self.unused, None)
+        return dataclasses.replace(self, **{name: longer(getattr(self, name)) for name in self.by_time}, **unused)
 
     @property
     @abc.abstractmethod
@@ -138,7 +163,7 @@ class AbstractTrajectory(eqx.Module):
         stats = {
             "accepted": path.accepted,
             "rejected": path.rejected,
-            "axis_drift": float(np.max(np.abs(np.linalg.norm(self.states[2:5], axis=0) - 1.0))),
+            "axis_drift": float(np.max(np.abs(np.linalg.norm(np.asarray(self.states)[2:5], axis=0) - 1.0))),
             "energy_residual": float(np.max(np.abs(energy - energy[0] - work))),
         }
         return eqx.tree_at(lambda one: one.stats, self, stats | more)

@@ -179,8 +179,15 @@ def _parts(run: TrajectoryProblem, states: Float[Array, "components times"]) -> 
     return states[:lean], states[lean:-2], states[-2], states[-1]
 
 
+_ended = eqx.filter_jit(ended)
+
+
 def _as_trajectory(scene: Scene, run: TrajectoryProblem, path: Followed | PhasedPath) -> Trajectory:
-    states, times = jnp.asarray(path.states), jnp.asarray(path.times)
-    status = STATUS[int(ended(run, states[:, -1], jnp.asarray(path.guard_lost), jnp.asarray(path.failed)))]
+    # NumPy cuts these: JAX would compile every cut anew for every number of steps.
+    states, times = np.asarray(path.states), jnp.asarray(path.times)
+    last = jnp.asarray(states[:, -1])
+    status = STATUS[int(_ended(run, last, jnp.asarray(path.guard_lost), jnp.asarray(path.failed)))]
     sticks = {"sticks": int(path.counts[0])} if isinstance(path, PhasedPath) else {}
-    return Trajectory(times, scene, *_parts(run, states), status, times[-1], {}, path).with_stats(path, **sticks)
+    return Trajectory(
+        times, scene, *map(jnp.asarray, _parts(run, states)), status, jnp.asarray(path.times[-1]), {}, path
+    ).with_stats(path, **sticks)

@@ -22,7 +22,7 @@ from nonholonomic.integration import (
 from ..dynamics import NO_COSINE
 from ..inversion import InversionProblem
 from ..launch import Launch
-from ..observables import AbstractTrajectory
+from ..observables import AbstractTrajectory, of_each_run
 from ..scene import Scene
 from .free_body import Ball, FreeBody, balls, energy, freed, standing_on
 from .impact import approach
@@ -58,6 +58,9 @@ class HybridTrajectory(AbstractTrajectory):
     contact: Int[np.ndarray, " times"]
     hops: Float[np.ndarray, "hops 2"]
 
+    unused = (*AbstractTrajectory.unused, "hops")
+    by_time = (*AbstractTrajectory.by_time, "distance", "contact")
+
     @property
     def above(self) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, " times"]]:
         """Distance of the top's own sphere from the plane [m] and its rate [m/s]."""
@@ -79,23 +82,23 @@ class HybridTrajectory(AbstractTrajectory):
             *(jnp.where(self.contact == 1, stem, own) for own, stem in zip(spheres[0], spheres[-1], strict=True))
         )
 
-    @property
+    @of_each_run
     def energy(self) -> Float[Array, " times"]:
         """Kinetic energy plus weight times the height of the centre of mass [J]."""
         return energy(self.scene.body, self.scene.gravity, self._free)
 
-    @property
-    def normal_force(self) -> Float[np.ndarray, " times"]:
+    @of_each_run
+    def normal_force(self) -> Float[Array, " times"]:
         """Normal force [N]; 0 in flight. Where both spheres touch it is their sum, the weight."""
         motion = standing_on(self.scene.dynamics, self._ball).motion(jnp.asarray(self.states))
-        both = np.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, motion.normal_force)
-        return np.where(self.contact < 0, 0.0, both)
+        both = jnp.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, motion.normal_force)
+        return jnp.where(self.contact < 0, 0.0, both)
 
-    @property
-    def slip(self) -> Float[np.ndarray, "times 2"]:
+    @of_each_run
+    def slip(self) -> Float[Array, "times 2"]:
         """Velocity along the plane of the lowest point of the sphere that touches [m/s]: of the top's own in flight too, and
         where both touch."""
-        return np.stack(approach(self.scene.body, self._ball, self._free).velocity[:2], axis=-1)
+        return jnp.stack(approach(self.scene.body, self._ball, self._free).velocity[:2], axis=-1)
 
     def resampled(self, times: Float[np.ndarray, " times"]) -> "HybridTrajectory":
         """The same run at other times, which are not checked."""
