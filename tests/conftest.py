@@ -1,7 +1,10 @@
 """What the tests share: the declared tops, and how close is close."""
 
+import gc
 import os
+from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -21,6 +24,21 @@ def pytest_configure(config: pytest.Config) -> None:
             os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
             os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
             os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
+
+
+#: Memory mappings that a process may collect before it forgets its compiled programs; Linux allows 65 530, and a compiler that
+#: gets no more of them crashes.
+MOST_MAPPINGS = 30_000
+
+
+@pytest.fixture(autouse=True)
+def forget_compiled_programs():
+    """Let go of compiled programs before they exhaust the memory mappings that a process may have."""
+    yield
+    mappings = Path("/proc/self/maps")
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > MOST_MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
 
 
 def rutstam_top(I1_factor: float = 131.0 / 350.0) -> tippe.Top:
