@@ -78,7 +78,7 @@ def set_going(scene: tippe.Scene, launch: tippe.Launch, velocity: float, momentu
     """A run whose centre starts at a velocity along t1 and that has angular momentum about t2 [kg m^2/s]."""
     run = TrajectoryProblem.of(scene, launch)
     state = run.state.at[0].set(velocity).at[6].add(momentum)
-    run = TrajectoryProblem(run.dynamics, run.axial, state, run.path, run.scales)
+    run = TrajectoryProblem(run.dynamics, run.axial, state, run.cyclic, run.scales)
     return follow(run, end, Settings(1e-12))
 
 

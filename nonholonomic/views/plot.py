@@ -52,7 +52,8 @@ def draw_table(table: "Table", variable: str = "time") -> Any:
     image = drawing.pcolormesh(table.coords[names[0]], table.coords[names[1]], shown[first].T, shading="nearest")
     figure.colorbar(image, label=label)
     if "status" in table.variables and len(dims) == cells:
-        _mark_words(drawing, table, names, table.variables["status"][first])
+        words = np.where(np.isnan(shown[first]), table.variables["status"][first], "")
+        _mark_words(drawing, table, names, words)
     return figure
 
 

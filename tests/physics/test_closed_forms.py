@@ -18,7 +18,7 @@ GRAVITY = 9.81
 def thrown(scene: tippe.Scene, velocity: float, times, tolerance: float = 1e-11):
     """A ball thrown along t1 without spin: states at the given times. A launch starts at rest, so the run is made here."""
     run = TrajectoryProblem.of(scene, tippe.Launch(theta=0.7, spin=0.0))
-    run = TrajectoryProblem(run.dynamics, run.axial, run.state.at[0].set(velocity), run.path, run.scales)
+    run = TrajectoryProblem(run.dynamics, run.axial, run.state.at[0].set(velocity), run.cyclic, run.scales)
     path = follow(run, float(times[-1]), Settings(tolerance))
     return jnp.asarray(path.at(np.asarray(times)))[:8]
 

@@ -79,7 +79,7 @@ def test_a_bowling_ball_slides_and_then_rolls():
     """v = v0 - mu g t until t* = 2 v0 / (7 mu g), then 5 v0 / 7 (row 2), with no error of a slip speed."""
     scene, end = scene_of(homogeneous_ball(), 0.3), 2.0 / (7.0 * 0.3 * 9.81)
     run = TrajectoryProblem.of(scene, tippe.Launch(theta=0.7, spin=0.0))
-    run = TrajectoryProblem(run.dynamics, run.axial, run.state.at[0].set(1.0), run.path, run.scales)
+    run = TrajectoryProblem(run.dynamics, run.axial, run.state.at[0].set(1.0), run.cyclic, run.scales)
     path = follow_stick_slip(run, 3.0 * end, Settings(1e-11))
     assert kinds(path) == [False, True]
     assert_close(path.stays[0].end, end, atol=1e-7)
@@ -137,7 +137,7 @@ def test_a_ball_that_friction_cannot_hold_slips_down_through_a_turn_of_its_slip(
     launch = tippe.Launch(np.pi / 2.0, spin, 0.8, np.pi / 2.0)
     run = tippe.simulate(scene, launch, 0.1, tolerance=1e-10)
     assert not any(kinds(run.dense))
-    found = [run.path[0, -1], run.velocity[-1] @ np.array([np.cos(state[0]), 0.0, np.sin(state[0])]), run.spin[-1]]
+    found = [run.cyclic[0, -1], run.velocity[-1] @ np.array([np.cos(state[0]), 0.0, np.sin(state[0])]), run.spin[-1]]
     assert_close(found, state, atol=1e-9)
 
 

@@ -6,6 +6,7 @@ In contact the velocity and the height of the centre of mass follow from the axi
 import dataclasses
 from typing import NamedTuple
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors

@@ -1,13 +1,12 @@
 """The generic exponent: on linear problems with known rates, and on Lorenz' system."""
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 from conftest import assert_close
 
 from nonholonomic.derivatives import exponent_of, growth
-from nonholonomic.integration import GUARD_LOST, REACHED_END, AbstractProblem
+from nonholonomic.integration import GUARD_LOST, REACHED_END, AbstractProblem, Settings
 
 
 class Shears(AbstractProblem):
@@ -53,7 +52,7 @@ class Lorenz(AbstractProblem):
 
 def follow(problem, t1, cells, stretches=32):
     directions = jnp.stack([jnp.full(cells, value) for value in (0.3, -0.7, 0.5)])
-    return growth(problem, directions, t1, stretches, 1e-9, 0.1, diffrax.Dopri8())
+    return growth(problem, directions, t1, stretches, Settings(1e-9))
 
 
 def test_known_rates_and_a_run_that_ends():

@@ -207,7 +207,7 @@ def test_a_single_ball_ends_as_it_does_in_a_table():
         path = single(BALLS[number], 1.2, 3)
         assert path.status == found.status[number]
         assert_close(path.end_time, found.end_time[number], rtol=1e-14)
-        assert_close(path.state, found.state[:, number], atol=2e-14)
+        assert_close(path.state, found.state[:, number], atol=1e-13)
         assert path.counts.tolist() == [found.counts[0, number]]
 
 
