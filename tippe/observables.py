@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -26,7 +27,7 @@ def of_each_run(function: Callable[[Any], Array]) -> property:
     compiled = eqx.filter_jit(function)
 
     def get(self):
-        if not is_traced(self.t) and self.t.ndim == 1:
+        if self.t.ndim == 1 and not any(is_traced(leaf) for leaf in jax.tree.leaves((self.t, self.states, self.scene))):
             return jnp.asarray(np.asarray(compiled(self.padded()))[: len(self.t)])
         mapped = function
         for _ in range(self.t.ndim - 1):
