@@ -154,6 +154,8 @@ def march_with_gradient(
         is_leaf=lambda rate: rate is None,
     )
     probed = dataclasses.replace(problem, directions=(probe,))
+    # As many lanes as for the run alone: on the way back, which costs most, the probe is not there.
+    settings = dataclasses.replace(settings, lanes=settings.lanes_of(size))
     queue = Queue.of(probed, t1, cells, settings, one_kernel=one_kernel, parts=2)
     rows = components + len(jax.tree.leaves(numbers))
 
