@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import jaxlib
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 #: Wide vectors, which compilers shy away from, pay for the sums over stages, streams of multiply-adds: 1.2 to 1.6 times. JAX
 #: takes compiler options only for the outermost compiled function, so it is for programs that are called on their own. It can
@@ -39,6 +39,13 @@ def stored(*values: Float[Array, "..."] | None) -> tuple[Float[Array, "..."] | N
 def stored_halves(first: Float[Array, "..."], second: Float[Array, "..."]) -> Float[Array, "..."]:
     """Two halves of a state, joined along axis 0 and stored: 1.4 times for a Runge-Kutta step, for the reason of `stored`."""
     return jax.lax.optimization_barrier(jnp.concatenate([first, second]))
+
+
+def written_in_place(
+    whole: Float[Array, "stack ..."], one: Float[Array, "..."], at: Int[Array, ""]
+) -> Float[Array, "stack ..."]:
+    """A stack of arrays with one of them replaced; without the bounds check of `at[].set`, so that it is done in place."""
+    return jax.lax.dynamic_update_index_in_dim(whole, one, at, 0)
 
 
 def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:

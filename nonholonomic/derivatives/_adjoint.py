@@ -32,6 +32,7 @@ from ..integration import (
     length_to_try,
     moved_state,
 )
+from ..xla_cpu import written_in_place
 from ._shared_values import sharing_values
 from .variation import VariationalProblem
 
@@ -94,7 +95,7 @@ class Kept(NamedTuple):
         indices = jnp.where(moves, jnp.roll(self.index, -1), self.index).at[to].set(index)
         slots = jnp.where(moves, jnp.roll(self.slot, -1), self.slot).at[to].set(free)
         # Written in any case: if none is added, the place stays free.
-        room = jax.tree.map(functools.partial(_written, at=free), self.progress, progress)
+        room = jax.tree.map(functools.partial(written_in_place, at=free), self.progress, progress)
         return Kept(jnp.minimum(self.depth + add, KEPT), indices, slots, room)
 
 
@@ -202,7 +203,7 @@ def _recorded(queue: Queue, progress: Progress) -> tuple[Progress, Record, Int[A
         after = attempt(*here, block)
         length = jnp.where(after.time > block.time, length_to_try(here[1], block), 0.0)
         made = Record(block.time, _without_probe(block).state, length)
-        record = jax.tree.map(functools.partial(_written, at=count), record, made)
+        record = jax.tree.map(functools.partial(written_in_place, at=count), record, made)
         return after, record, count + 1
 
     def loop(start: Block) -> Any:
@@ -345,7 +346,7 @@ def step_taken_back(
         )
         # Where no step was made, nothing can be assumed finite.
         pulled = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(pulled), 0.0))
-        return stage - 1, _written(by_stage, pulled[:components], at=stage), total + pulled
+        return stage - 1, written_in_place(by_stage, pulled[:components], at=stage), total + pulled
 
     carry = (jnp.asarray(stages - 1), room, jnp.zeros_like(adjoint))
     _, room, total = jax.lax.while_loop(lambda carry: carry[0] >= 0, stage_taken_back, carry)
@@ -355,8 +356,3 @@ def step_taken_back(
 def _read(whole: Array, at: Int[Array, ""]) -> Array:
     """One of the arrays that are stacked in another."""
     return jax.lax.dynamic_index_in_dim(whole, at, 0, keepdims=False)
-
-
-def _written(whole: Array, one: Array, at: Int[Array, ""]) -> Array:
-    """A stack of arrays with one of them replaced; without the bounds check of `at[].set`, so that it is done in place."""
-    return jax.lax.dynamic_update_index_in_dim(whole, one, at, 0)

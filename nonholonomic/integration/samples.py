@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ..xla_cpu import written_in_place
 from .attempt import Block, attempt
 from .problem import AbstractProblem
 from .queue import Outcome, Progress, Queue
@@ -113,7 +114,7 @@ def _recorded(
         goes_on = reached & (after.time < horizon)
         after = after._replace(status=jnp.where(goes_on, RUNNING, after.status))
         made = Record(after.state, jnp.where(is_sample, sample, count))
-        record = jax.tree.map(functools.partial(_written, at=iteration), record, made)
+        record = jax.tree.map(functools.partial(written_in_place, at=iteration), record, made)
         return after, sample + is_sample, record, iteration + 1
 
     def loop(start: tuple[Block, Int[Array, " lanes"]]) -> Any:
@@ -138,8 +139,3 @@ def _even(length: Lanes, left: Lanes, searching: Array) -> Lanes:
     reach = STRETCH * length
     fitting = jnp.where(reach >= left, left, jnp.where(2.0 * reach >= left, 0.5 * left, length))
     return jnp.where(searching, length, fitting)
-
-
-def _written(whole: Array, one: Array, at: Int[Array, ""]) -> Array:
-    """A stack of arrays with one of them replaced, in place."""
-    return jax.lax.dynamic_update_index_in_dim(whole, one, at, 0)
