@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import Plane
+from nonholonomic.geometry import AbstractSurface, Plane
 from nonholonomic.integration import (
     CROSSED,
     FAILED,
@@ -30,6 +30,9 @@ from .input import Input
 from .launch import Launch
 from .scene import Scene
 from .trajectory import CONTACT_ROUND_OFF, RANK_LOST
+
+#: What the numbers of a place in the fixed frame are called.
+FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
 
 WORDS = ("completed", "contact_lost", "rank_lost", "failed")
 
@@ -52,10 +55,8 @@ VARIABLES = {
 UNITS = {"mass": "kg", "wheelbase": "m", "inertia": "kg m2", "steering_inertia": "kg m2", "centre": "m"}
 UNITS |= {"steering_spring": "N m rad-1", "gravity": "m s-2", "tilt": "rad", "radius": "m", "equatorial": "m"}
 UNITS |= {"polar": "m", "rolling": "N s m-1", "front": "N s m-1", "scrub": "N m s", "coefficient": "1"}
+UNITS |= {"ring": "m", "tube": "m", "p": "m"}
 UNITS |= {"speed": "m s-1", "steering_rate": "rad s-1", "force": "N", "torque": "N m", "heading": "rad"}
-
-#: A place is a pair; its parts are axes under these names, with their units on a plane and elsewhere.
-PLACES = {"launch.place[0]": ("x0", "mu0"), "launch.place[1]": ("y0", "eta0")}
 
 
 class RideProblem(AbstractProblem):
@@ -138,7 +139,7 @@ def sweep(
     require(t1, "t1", above=0.0)
     require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
-    grid = named_axes(axes, isinstance(scene.surface, Plane))
+    grid = named_axes(axes, scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.
     for one in grid:
         changed = replaced(roots, {one.number: one.values})
@@ -191,14 +192,24 @@ def read_ends(scene: Scene, states: State, starts: State) -> dict[str, Float[Arr
     }
 
 
-def named_axes(axes: dict[str, Any], flat: bool) -> list[Axis]:
-    """The axes of the table, each under the last part of its full name, or the last two where that is not enough."""
+def place_numbers(launch: Launch) -> list[str]:
+    """The full names of the numbers of a launch's place."""
+    return [f"launch.place[{k}]" for k in range(len(launch.place))]
+
+
+def named_axes(axes: dict[str, Any], surface: AbstractSurface, launch: Launch) -> list[Axis]:
+    """The axes of the table, each under the last part of its full name, or the last two where that is not enough.
+
+    The numbers of a place are named as the surface names them, with a zero: `x0`.
+    """
     lasts = [number.rsplit(".", 1)[-1] for number in axes]
+    named = surface.coordinates if len(launch.place) == len(surface.coordinates) else FIXED
+    places = dict(zip(place_numbers(launch), named, strict=True))
     grid = []
     for number, last in zip(axes, lasts, strict=True):
         name, unit = last, UNITS.get(last, "1")
-        if number in PLACES:
-            name, unit = PLACES[number][0 if flat else 1], "m" if flat else "rad"
+        if number in places:
+            name, unit = places[number][0] + "0", places[number][1]
         elif lasts.count(last) > 1 or last in VARIABLES:
             name = "_".join(number.split(".")[-2:])
         if number.endswith("steering"):
@@ -209,9 +220,11 @@ def named_axes(axes: dict[str, Any], flat: bool) -> list[Axis]:
 
 def replaced(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
     """Scene, launch and input with some of their parameters replaced."""
-    place = [values.get(number, part) for number, part in zip(PLACES, roots["launch"].place, strict=True)]
-    roots = roots | {"launch": dataclasses.replace(roots["launch"], place=tuple(place))}
-    return with_numbers(roots, {number: one for number, one in values.items() if number not in PLACES})
+    launch = roots["launch"]
+    places = dict(zip(place_numbers(launch), launch.place, strict=True))
+    place = tuple(values.get(number, part) for number, part in places.items())
+    roots = roots | {"launch": dataclasses.replace(launch, place=place)}
+    return with_numbers(roots, {number: one for number, one in values.items() if number not in places})
 
 
 def described(controls: Any) -> Any:
