@@ -74,7 +74,10 @@ def _replaced(name: str, tree: Any, values: dict[str, Any]) -> Any:
 
 
 def description(root: str, tree: Any) -> dict[str, Any]:
-    """What a tree of modules is made of, as plain data: the kind of every module and the value of every number."""
+    """What a tree of modules is made of, as plain data: the kind of every module, the value of every number.
+
+    A function has nothing but its name to show.
+    """
     found = {root: type(tree).__name__}
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
@@ -82,4 +85,6 @@ def description(root: str, tree: Any) -> dict[str, Any]:
             found |= description(name, value)
         else:
             found[name] = np.asarray(value).tolist() if isinstance(value, jax.Array | np.ndarray) else value
+            if callable(value):
+                found[name] = getattr(value, "__qualname__", repr(value))
     return found

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.geometry import (
-    AbstractSurface,
+    AbstractMovingFrame,
     Component,
     Tangent,
     add,
@@ -67,7 +67,7 @@ class Motion(NamedTuple):
 class Dynamics(eqx.Module):
     """A scene with the combinations of its numbers that every evaluation needs, computed once."""
 
-    parallel: AbstractSurface
+    parallel: AbstractMovingFrame
     friction: AbstractFriction
     radius: Float[Array, "..."]
     offset: Float[Array, "..."]
@@ -80,7 +80,7 @@ class Dynamics(eqx.Module):
 
     @classmethod
     def of(
-        cls, body: Top, surface: AbstractSurface, friction: AbstractFriction, gravity: Float[Array, "..."]
+        cls, body: Top, surface: AbstractMovingFrame, friction: AbstractFriction, gravity: Float[Array, "..."]
     ) -> "Dynamics":
         """The equations for a body on an arena.
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import AbstractSurface, Plane, dot, none_if_zero
+from nonholonomic.geometry import AbstractMovingFrame, AbstractSurface, Plane, dot, none_if_zero
 from nonholonomic.validation import Bound, Bounded, as_number
 
 from .dynamics import Dynamics
@@ -53,6 +53,8 @@ class Scene(Bounded):
         for name, part, kind in (*parts, ("friction", self.friction, AbstractFriction)):
             if not isinstance(part, kind):
                 raise ValueError(f"{name} = {part!r} must be a {kind.__name__.removeprefix('Abstract')}")
+        if not isinstance(self.surface, AbstractMovingFrame):
+            raise ValueError(f"surface = {self.surface!r} must be a Plane, a Cylinder or a Sphere")
         # This raises if the surface has no room for a ball at all.
         self.surface.parallel(self.body.radius)
         if self.contact not in ("stop", "hybrid"):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import (
-    AbstractSurface,
+    AbstractMovingFrame,
     Component,
     Tangent,
     Vector,
@@ -37,7 +37,7 @@ class RollingDynamics(eqx.Module):
     (`RollingDynamics.grip`).
     """
 
-    parallel: AbstractSurface
+    parallel: AbstractMovingFrame
     radius: Float[Array, "..."]
     offset: Float[Array, "..."]
     mass: Float[Array, "..."]
@@ -46,7 +46,7 @@ class RollingDynamics(eqx.Module):
     I3: Float[Array, "..."]
 
     @classmethod
-    def of(cls, body: Top, surface: AbstractSurface, gravity: Float[Array, "..."]) -> "RollingDynamics":
+    def of(cls, body: Top, surface: AbstractMovingFrame, gravity: Float[Array, "..."]) -> "RollingDynamics":
         """The equations for a body on an arena.
 
         **Arguments:** as for `Scene`.

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.geometry import AbstractSurface
+from nonholonomic.geometry import AbstractMovingFrame
 
 from ..dynamics import Dynamics, Motion, stacked
 from ..friction import AbstractFriction, SetValuedCoulomb, Slip, length
@@ -52,7 +52,7 @@ class StickSlip(eqx.Module):
 
     @classmethod
     def of(
-        cls, body: Top, surface: AbstractSurface, friction: AbstractFriction, gravity: Float[Array, "..."]
+        cls, body: Top, surface: AbstractMovingFrame, friction: AbstractFriction, gravity: Float[Array, "..."]
     ) -> "StickSlip":
         """The equations for a body on an arena.
 
@@ -63,7 +63,7 @@ class StickSlip(eqx.Module):
         return cls(slipping, RollingDynamics.of(body, surface, gravity), friction.mu)
 
     @property
-    def parallel(self) -> AbstractSurface:
+    def parallel(self) -> AbstractMovingFrame:
         """The surface on which the sphere's centre runs."""
         return self.slipping.parallel
 
@@ -140,7 +140,7 @@ class Kind(eqx.Module):
     rolls: bool = eqx.field(static=True)
 
     @property
-    def parallel(self) -> AbstractSurface:
+    def parallel(self) -> AbstractMovingFrame:
         """The surface on which the sphere's centre runs."""
         return self.both.parallel
 
