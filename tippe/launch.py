@@ -76,6 +76,8 @@ class Launch(Bounded):
         yield Bound(self.theta, "theta", at_least=0.0, at_most=math.pi)
         yield Bound(self.spin, "spin")
         yield Bound(self.eta, "eta", at_least=-math.pi, at_most=math.pi)
+        if self.place is not None:
+            yield Bound(self.eta, "eta", at_least=0.0, at_most=0.0, why="place is given")
         yield Bound(self.azimuth, "azimuth")
         for name in ("place", "velocity", "angular_velocity"):
             for k, number in enumerate(getattr(self, name) or ()):

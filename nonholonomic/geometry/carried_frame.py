@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..validation import Bound, as_number
+from ..xla_cpu import stored
 from .cylinder import Cylinder
 from .frames import (
     AbstractFrame,
@@ -108,7 +109,9 @@ class CarriedFrame(AbstractFrame):
         n = self._normal(foot)
         # A first tangent that has drifted counts for its direction along the surface only.
         t1, t2 = tangents(n, place[3:])
-        S11, S12, S22 = self._shape(foot, t1, t2)
+        axes = stored(*t1, *t2, *n)
+        t1, t2, n = axes[:3], axes[3:6], axes[6:]
+        S11, S12, S22 = stored(*self._shape(foot, t1, t2))
         A11, A12, A22 = 1.0 - R * S11, -R * S12, 1.0 - R * S22
         determinant = A11 * A22 - A12 * A12
         q1 = (A22 * velocity[0] - A12 * velocity[1]) / determinant
