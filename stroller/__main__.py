@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from nonholonomic.compilation_cache import enable_compilation_cache
-from nonholonomic.geometry import AbstractGround, Plane, Spheroid
+from nonholonomic.geometry import AbstractSurface, Plane, Spheroid
 from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.sweeps import Table, versions
 
@@ -76,7 +76,7 @@ def scenes(options: argparse.Namespace) -> dict[tuple[str, str], tuple[Scene, La
     """The four rides: (ground, friction) -> scene and launch."""
     body = Stroller(options.mass, options.wheelbase, options.inertia, options.steering_inertia)
     spheroid = Spheroid(options.equatorial, options.polar)
-    grounds: dict[str, tuple[AbstractGround, str, Launch]] = {
+    grounds: dict[str, tuple[AbstractSurface, str, Launch]] = {
         "plane": (Plane(options.tilt), "outside", Launch((0.0, 0.0), 1.2, options.speed)),
         "inside the spheroid": (spheroid, "inside", Launch((0.0, -0.9), 0.4, options.speed)),
     }

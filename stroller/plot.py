@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from nonholonomic.geometry import AbstractGround, Plane
+from nonholonomic.geometry import AbstractSurface, Plane
 
 from .trajectory import Trajectory
 
@@ -12,7 +12,7 @@ from .trajectory import Trajectory
 COLOURS = ("tab:blue", "tab:red")
 
 
-def draw_rides(grounds: dict[str, AbstractGround], rides: dict[tuple[str, str], Trajectory]) -> Any:
+def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str], Trajectory]) -> Any:
     """Draw rides, a row of pictures for each ground.
 
     **Arguments:**
@@ -48,7 +48,7 @@ def draw_rides(grounds: dict[str, AbstractGround], rides: dict[tuple[str, str], 
     return figure
 
 
-def _draw_ground(space: Any, ground: AbstractGround, rides: dict[str, Trajectory]) -> None:
+def _draw_ground(space: Any, ground: AbstractSurface, rides: dict[str, Trajectory]) -> None:
     """A wire frame of the ground as far as the rides go."""
     places = np.concatenate([np.asarray(run.place) for run in rides.values()])
     if isinstance(ground, Plane):

@@ -40,7 +40,7 @@ class Trajectory(eqx.Module):
     - `side_force` [N] of the ground on the rear axle and the front wheel, to the left of each, (times, 2);
     - `normal_force` [N] of the ground, and `load` [N] on the rear and the front axle, (times, 2);
     - `constraint` [m/s]: speed at which the rear axle and the front wheel slip sideways, (times, 2);
-    - `departure`: how far the position is off the ground, relative to its size: an error of the integration;
+    - `departure`: how far the position is off the ground [m]: an error of the integration;
     - `watch` and `stats`: what the integration passed, step by step; `recipe`: what made the run.
     """
 
@@ -220,7 +220,7 @@ def read_off(
         normal_force=normal_force,
         load=columns(normal_force - front_load, front_load),
         constraint=columns(*side_slip(scene, dynamics.field(t, states, controls), states)),
-        departure=spread(surface.departure(motion.position), like),
+        departure=spread(surface.offset(motion.position), like),
         state=integrated.T,
         watch=watch,
         stats=stats,

@@ -41,7 +41,7 @@ NO_COSINE = -2.0
 #: with ten times the value, in `tests/physics/test_strong_friction.py`; theta errs by 5e-13 there, velocities by 1e-4.
 JAMMED = 1e-4
 
-#: Room (`Motion.room`) at which the ball no longer fits: a curvature of the arena has reached 1/R. The foot runs away there with
+#: Room (`Motion.room`) at which the ball no longer fits: a curvature of the arena has reached 1/R. The foot runs away there as
 #: the root of the time left, so a run ends too early by the square of this in units of 0.1 s or so.
 FITS = 1e-4
 

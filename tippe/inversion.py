@@ -175,7 +175,13 @@ class InversionQuestion(AbstractQuestion):
         scene, launch, angle, t1, tolerance = jax.tree.unflatten(self.structure, leaves)
         may = jnp.asarray(True)
         if self.unchecked:
-            bounds = (*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch), *event_bounds(angle), *run_bounds(t1, tolerance))
+            bounds = (
+                *all_bounds(scene),
+                *all_bounds(launch),
+                *scene.start_bounds(launch),
+                *event_bounds(angle),
+                *run_bounds(t1, tolerance),
+            )
             may = legal(bounds)
             t1, tolerance = jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
         return may, t1, jnp.min(tolerance)

@@ -35,8 +35,8 @@ class Launch(Bounded):
     - `eta`: angle [rad] of the place from the arena's lowest point, in [-pi, pi]; on arenas that count no such angle, 0.
     - `azimuth`: direction [rad] in which the axis leans, from t1 towards t2.
     - `place`: where the top touches the arena, instead of `eta`: (x, y) [m] on a plane, along it, a paraboloid and a graph;
-      (y, eta) on a cylinder; (mu, eta) [rad], azimuth and angle from the lowest point, on a sphere, spheroid or torus; or (x, y,
-      z) [m], a point of the arena but for round-off.
+      (y, eta) on a cylinder; (mu, eta) [rad], azimuth and angle from the lowest point, on a sphere, spheroid or torus;
+      or (x, y, z) [m], a point of the arena but for round-off.
     - `velocity`: (2,) [m/s] of the sphere's centre along (t1, t2); at rest by default.
     - `angular_velocity`: (3,) [rad/s] in (t1, t2, n), besides the spin about the axis; none by default.
 

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..validation import Bound, as_number
-from ..xla_cpu import stored
 from .cylinder import Cylinder
 from .frames import (
     AbstractFrame,
@@ -24,14 +23,13 @@ from .frames import (
     PlaneFrame,
     SphereFrame,
     Tangent,
-    first_tangents,
-    tangents,
+    along,
 )
 from .plane import Plane
 from .quadric import Sphere
 from .surface import AbstractSurface
 from .torus import Torus
-from .vector import Component, Vector, dot, scale, sum_vectors
+from .vector import Component, Vector, dot, scale, sum_vectors, tangents
 
 
 def place_named(surface: AbstractSurface, place: Place) -> Place:
@@ -93,7 +91,7 @@ class CarriedFrame(AbstractFrame):
 
     def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
         foot = tuple(jnp.broadcast_arrays(*(0.0 if x is None else x for x in foot)))
-        t1, _ = first_tangents(self._normal(foot))
+        t1, _ = tangents(self._normal(foot))
         return (*foot, *t1), ()
 
     def _normal(self, foot: Fixed) -> Fixed:
@@ -108,10 +106,8 @@ class CarriedFrame(AbstractFrame):
         foot, R = place[:3], self.distance
         n = self._normal(foot)
         # A first tangent that has drifted counts for its direction along the surface only.
-        t1, t2 = tangents(n, place[3:])
-        axes = stored(*t1, *t2, *n)
-        t1, t2, n = axes[:3], axes[3:6], axes[6:]
-        S11, S12, S22 = stored(*self._shape(foot, t1, t2))
+        t1, t2 = along(n, place[3:])
+        S11, S12, S22 = self._shape(foot, t1, t2)
         A11, A12, A22 = 1.0 - R * S11, -R * S12, 1.0 - R * S22
         determinant = A11 * A22 - A12 * A12
         q1 = (A22 * velocity[0] - A12 * velocity[1]) / determinant
@@ -136,7 +132,7 @@ class CarriedFrame(AbstractFrame):
 
     def _own_axes(self, place: Place) -> tuple[Fixed, Fixed, Fixed]:
         n = self._normal(place[:3])
-        return (*tangents(n, place[3:]), n)
+        return (*along(n, place[3:]), n)
 
     def vertical(self, place: Place) -> Vector:
         return self._seen(*self._own_axes(place))

@@ -1,9 +1,9 @@
 """Frames (t1, t2, n) that move with a ball on a surface, n being the surface's normal into the room where the ball is.
 
 The ball touches the surface at its foot; its centre is at a distance R from there along n, on the parallel surface. With V the
-velocity of the centre along the surface the frame turns as t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2), where (o1, o2) = S V
-and S is the shape operator of the parallel surface, positive where it is concave towards the ball. The frame does not turn about
-n, so the components of a fixed vector change as `carried` states.
+velocity of the centre the frame turns as t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2), where (o1, o2) = S V and S is the shape
+operator of the parallel surface, positive where it is concave towards the ball. The frame does not turn about n, so the
+components of a fixed vector change as `carried` states.
 
 Plane, cylinder and sphere have frames of their own, with fewer numbers than the general one (`carried_frame.py`). A sphere or
 cylinder is the same from both sides but for the sign of its radius, which is positive inside.
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..validation import as_number
-from .vector import Component, Vector, add, dot, multiply, scale, subtract, sum_vectors
+from .vector import Component, Vector, cross, dot, multiply, scale, subtract, sum_vectors, tangents
 
 #: What a frame integrates, as components along axis 0 of a state.
 Place = tuple[Component, ...]
@@ -224,7 +224,7 @@ class SphereFrame(AbstractFrame):
 
     def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
         n = scale(-self._side / jnp.sqrt(dot(foot, foot)), foot)
-        t1, t2 = first_tangents(n)
+        t1, t2 = tangents(n)
         return (t1[2], t2[2], n[2]), (t1[0], t2[0], n[0])
 
     @property
@@ -260,19 +260,8 @@ class SphereFrame(AbstractFrame):
         return scale(-self.radius, self.axes(place, cyclic)[2])
 
 
-def first_tangents(n: Fixed) -> tuple[Fixed, Fixed]:
-    """The tangents of a frame at its start: t1 is the projection of x onto the tangent plane, of y where n is along x."""
-    along_x = 1.0 - n[0] * n[0] < 1e-12
-    direction = (jnp.where(along_x, 0.0, 1.0), jnp.where(along_x, 1.0, 0.0), jnp.zeros_like(n[0]))
-    return tangents(n, direction)
-
-
-def tangents(n: Fixed, direction: Fixed) -> tuple[Fixed, Fixed]:
-    """t1 along the projection of a direction onto the tangent plane, and t2 = n x t1."""
-    along = sum_vectors(direction, scale(-1.0 * dot(n, direction), n))
-    t1 = scale(1.0 / jnp.sqrt(dot(along, along)), along)
-    return t1, (
-        subtract(multiply(n[1], t1[2]), multiply(n[2], t1[1])),
-        subtract(multiply(n[2], t1[0]), multiply(n[0], t1[2])),
-        subtract(multiply(n[0], t1[1]), multiply(n[1], t1[0])),
-    )
+def along(n: Fixed, direction: Fixed) -> tuple[Fixed, Fixed]:
+    """Unit vectors across n: t1 along the projection of a direction onto the tangent plane, and t2 = n x t1."""
+    projected = sum_vectors(direction, scale(-1.0 * dot(n, direction), n))
+    t1 = scale(1.0 / jnp.sqrt(dot(projected, projected)), projected)
+    return t1, cross(n, t1)

@@ -25,7 +25,7 @@ def test_normal_and_tangents_are_those_of_the_chart(ground):
     _, east, north = ground.chart(PLACE)
     np.testing.assert_allclose(jnp.stack(east), by_mu / jnp.linalg.norm(by_mu), atol=1e-15)
     np.testing.assert_allclose(jnp.stack(north), by_eta / jnp.linalg.norm(by_eta), atol=1e-15)
-    normal = jnp.stack(ground.outward(ground.chart(PLACE)[0]))
+    normal = jnp.stack(ground.normal(ground.chart(PLACE)[0]))
     np.testing.assert_allclose(normal, jnp.cross(jnp.stack(east), jnp.stack(north)), atol=1e-15)
 
 
@@ -37,14 +37,14 @@ def _with(k, x):
 def test_rate_of_the_normal_is_its_derivative(ground):
     r, east, north = ground.chart(PLACE)
     velocity = tuple(0.8 * a - 0.5 * b for a, b in zip(east, north, strict=True))
-    _, expected = jax.jvp(ground.outward, (r,), (velocity,))
-    np.testing.assert_allclose(ground.outward_rate(r, velocity), expected, atol=1e-15)
+    _, expected = jax.jvp(ground.normal, (r,), (velocity,))
+    np.testing.assert_allclose(ground.normal_rate(r, velocity), expected, atol=1e-15)
 
 
 @pytest.mark.parametrize("ground", GROUNDS, ids=str)
 def test_gaussian_curvature_is_the_determinant_of_the_shape_operator(ground):
     r, east, north = ground.chart(PLACE)
-    rates = [jnp.stack(ground.outward_rate(r, one)) for one in (east, north)]
+    rates = [jnp.stack(ground.normal_rate(r, one)) for one in (east, north)]
     shape = [[rate @ jnp.stack(one) for one in (east, north)] for rate in rates]
     np.testing.assert_allclose(ground.gaussian_curvature(r), np.linalg.det(np.array(shape)), rtol=1e-14)
 
@@ -62,7 +62,7 @@ def test_gaussian_curvature_of_the_oblate_spheroid():
 def test_place_and_position_go_back_and_forth(ground):
     r = ground.chart(PLACE)[0]
     np.testing.assert_allclose(ground.place_at(r), PLACE, rtol=1e-14)
-    departure = ground.departure(r)
+    departure = ground.offset(r)
     assert departure is None or abs(float(departure)) < 1e-15
 
 
@@ -79,7 +79,7 @@ def test_a_level_plane_carries_no_terms():
     assert jax.tree.structure(Plane()) == jax.tree.structure(Plane(tilt=0.0))
     assert len(jax.tree.leaves(Plane(tilt=0.1))) == 1
     assert Plane().elevation((1.0, 2.0, None)) is None
-    assert Plane(tilt=0.1).outward_rate((1.0, 2.0, None), (1.0, 0.0, None)) == (None, None, None)
+    assert Plane(tilt=0.1).normal_rate((1.0, 2.0, None), (1.0, 0.0, None)) == (None, None, None)
 
 
 def test_a_tilt_may_be_traced_through_zero():
