@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..validation import Bound, as_number
+from ..xla_cpu import stored
 from .cylinder import Cylinder
 from .frames import (
     AbstractFrame,
@@ -29,7 +30,7 @@ from .plane import Plane
 from .quadric import Sphere
 from .surface import AbstractSurface
 from .torus import Torus
-from .vector import Component, Vector, dot, scale, sum_vectors, tangents
+from .vector import Component, Vector, cross, dot, scale, sum_vectors, tangents
 
 
 def place_named(surface: AbstractSurface, place: Place) -> Place:
@@ -104,20 +105,22 @@ class CarriedFrame(AbstractFrame):
 
     def carriage(self, place: Place, velocity: Tangent) -> Carriage:
         foot, R = place[:3], self.distance
-        n = self._normal(foot)
+        # Stored: what follows, and its derivatives above all, would each compute these anew.
+        n = stored(*self._normal(foot))
         # A first tangent that has drifted counts for its direction along the surface only.
-        t1, t2 = along(n, place[3:])
-        S11, S12, S22 = self._shape(foot, t1, t2)
+        t1 = stored(*along(n, place[3:])[0])
+        t2 = cross(n, t1)
+        S11, S12, S22 = stored(*self._shape(foot, t1, t2))
         A11, A12, A22 = 1.0 - R * S11, -R * S12, 1.0 - R * S22
         determinant = A11 * A22 - A12 * A12
         q1 = (A22 * velocity[0] - A12 * velocity[1]) / determinant
         q2 = (A11 * velocity[1] - A12 * velocity[0]) / determinant
-        turning = (S11 * q1 + S12 * q2, S12 * q1 + S22 * q2)
+        o1, o2, *up = stored(S11 * q1 + S12 * q2, S12 * q1 + S22 * q2, *self._seen(t1, t2, n))
         back = -self.pull * self.side * self.surface.offset(foot)
         moved = sum_vectors(scale(q1, t1), scale(q2, t2), scale(back, n))
         # Both are positive where both of 1 - R k are; the first of them to vanish takes the determinant with it.
         room = jnp.minimum(determinant, 0.5 * (A11 + A22))
-        return Carriage(turning, self._seen(t1, t2, n), (*moved, *scale(turning[0], n)), room)
+        return Carriage((o1, o2), tuple(up), (*moved, *scale(o1, n)), room)
 
     def _shape(self, foot: Fixed, t1: Fixed, t2: Fixed) -> tuple[Component, Component, Component]:
         """The shape operator of the arena, n' = -S_a q', as (S11, S12, S22)."""
