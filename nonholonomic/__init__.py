@@ -1,6 +1,7 @@
 """The ground that the models stand on: surfaces, integration, sweeps, tables. Knows neither top nor stroller."""
 
 import os
+from importlib.metadata import PackageNotFoundError, version
 
 import jax
 
@@ -13,3 +14,9 @@ from .geometry import AbstractSurface as AbstractSurface
 from .geometry import Cylinder as Cylinder
 from .geometry import Plane as Plane
 from .geometry import Sphere as Sphere
+
+try:
+    __version__ = version("nonholonomic")
+except PackageNotFoundError:
+    # Run from a checkout that is not installed.
+    __version__ = "unknown"

@@ -1,5 +1,6 @@
 """The stroller: a three-wheeled vehicle with nonholonomic constraints, on the plane and on curved grounds."""
 
+from nonholonomic import __version__ as __version__
 from nonholonomic.geometry import Plane as Plane
 from nonholonomic.geometry import Sphere as Sphere
 from nonholonomic.geometry import Spheroid as Spheroid

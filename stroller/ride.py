@@ -13,7 +13,7 @@ from nonholonomic.validation import is_traced
 
 from .crossings import Watch, watched
 from .dynamics import State
-from .input import Input
+from .input import Input, at_start
 from .launch import Launch
 from .scene import Scene
 from .table import RideProblem
@@ -38,19 +38,13 @@ def is_closed(controls: Input | None, scene: Scene, launch: Launch) -> bool:
     """Whether an input is a module, or a function that holds no number that is being differentiated or batched."""
     if controls is None or isinstance(controls, eqx.Module):
         return True
-    closed = jax.make_jaxpr(controls)(*_example(scene, launch))
+    closed = jax.make_jaxpr(controls)(*at_start(scene, launch))
     return not any(is_traced(constant) for constant in closed.consts)
 
 
 def opened(controls: Any, scene: Scene, launch: Launch) -> Input:
     """A function as a module, whose leaves are the numbers that the function holds."""
-    return eqx.filter_closure_convert(controls, *_example(scene, launch))
-
-
-def _example(scene: Scene, launch: Launch) -> tuple[Any, Any]:
-    """What an input is called with: a time and a motion."""
-    state = scene.state(launch, True)
-    return jnp.zeros(()), scene.dynamics.geometry(state).motion
+    return eqx.filter_closure_convert(controls, *at_start(scene, launch))
 
 
 @eqx.filter_jit

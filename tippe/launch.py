@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from typing import ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -20,7 +21,18 @@ class Launch(Bounded):
     - `azimuth`: direction [rad] in which the axis leans, from growing eta towards y.
 
     **Raises:** `ValueError` for numbers outside these ranges.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> tippe.Launch(theta=0.1, spin=155.0)
+    Launch(theta=0.1 rad, spin=155 rad/s, eta=0 rad, azimuth=0 rad)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"theta": "rad", "spin": "rad s-1", "eta": "rad", "azimuth": "rad"}
 
     theta: Float[Array, "..."] = eqx.field(converter=as_number)
     spin: Float[Array, "..."] = eqx.field(converter=as_number)

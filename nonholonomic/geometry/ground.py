@@ -130,7 +130,18 @@ class Spheroid(AbstractQuadric):
 
     - `equatorial`: equatorial radius A [m], positive.
     - `polar`: polar semi-axis c [m], positive.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Spheroid(equatorial=6.0, polar=3.0)
+    Spheroid(equatorial=6 m, polar=3 m)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"equatorial": "m", "polar": "m"}
 
     equatorial: Float[Array, "..."] = eqx.field(converter=as_number)
     polar: Float[Array, "..."] = eqx.field(converter=as_number)

@@ -39,6 +39,18 @@ class AbstractSurface(Bounded):
     With V the velocity along the surface, the normal turns as n' = -(o1 t1 + o2 t2), where (o1, o2) = S V and S is the
     shape operator, positive where the surface is concave towards the room. The frame does not turn about n, so the
     components of a fixed vector change as `carried` states.
+
+    **Example:**
+
+    ```
+    >>> import nonholonomic
+    >>> bowl = nonholonomic.Sphere(radius=0.5)
+    >>> isinstance(bowl, nonholonomic.AbstractSurface)
+    True
+    >>> bowl.parallel(0.02)
+    Sphere(radius=0.48 m)
+
+    ```
     """
 
     def room(self, distance: Float[ArrayLike, "..."]) -> Iterable[Bound]:
@@ -107,9 +119,21 @@ class Plane(AbstractSurface, AbstractGround):
     **Arguments:**
 
     - `tilt`: angle [rad] by which the plane rises along its own x axis, in [-pi/2, pi/2].
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> tippe.Plane()
+    Plane()
+    >>> tippe.Plane(tilt=0.1)
+    Plane(tilt=0.1 rad)
+
+    ```
     """
 
     axes: ClassVar[int] = 2
+    units: ClassVar[dict[str, str]] = {"tilt": "rad"}
 
     tilt: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
 
@@ -195,7 +219,18 @@ class Cylinder(AbstractSurface):
     **Arguments:**
 
     - `radius`: radius of the arena [m], positive.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> tippe.Cylinder(radius=0.3)
+    Cylinder(radius=0.3 m)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"radius": "m"}
 
     radius: Float[Array, "..."] = eqx.field(converter=as_number)
 
@@ -254,7 +289,18 @@ class Sphere(AbstractSurface, AbstractQuadric):
     **Arguments:**
 
     - `radius`: radius of the arena [m], positive.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> tippe.Sphere(radius=0.5)
+    Sphere(radius=0.5 m)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"radius": "m"}
 
     radius: Float[Array, "..."] = eqx.field(converter=as_number)
 
