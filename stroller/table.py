@@ -14,7 +14,6 @@ from nonholonomic.integration import (
     CROSSED,
     FAILED,
     GUARD_LOST,
-    AbstractProblem,
     Settings,
     compiled_march,
     explicit_tableau,
@@ -24,14 +23,13 @@ from nonholonomic.sweeps import Axis, Table, Variable, axis
 from nonholonomic.sweeps import grid as grids
 from nonholonomic.validation import as_number, require
 
-from .dynamics import Dynamics, State
+from .dynamics import State
 from .friction import Damping, RollingResistance
-from .heading import Projected
 from .input import Input, Steady, check_input
 from .launch import Launch
+from .ride import RideProblem, as_module
 from .scene import Scene
 from .stroller import Stroller
-from .trajectory import CONTACT_ROUND_OFF, RANK_LOST
 
 WORDS = ("completed", "contact_lost", "rank_lost", "failed")
 
@@ -73,47 +71,6 @@ LONG_NAMES |= {
 
 #: A place is a pair; its parts are axes under these names, with their units on a plane and elsewhere.
 PLACES = {"launch.place[0]": ("x0", "mu0"), "launch.place[1]": ("y0", "eta0")}
-
-
-class RideProblem(AbstractProblem):
-    """Rides of many cells. Where contact is watched, a ride ends where the ground would have to pull."""
-
-    dynamics: Dynamics
-    input: Input | None
-    states: Float[Array, "components cells"]
-    scales: Float[Array, "components cells"]
-    press: Float[Array, "..."]
-    watched: bool = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, scene: Scene, launch: Launch, controls: Input | None, cells: int, watched: bool) -> "RideProblem":
-        """The problem of the given number of cells; every number is a scalar or one per cell."""
-
-        def spread(states):
-            return jnp.broadcast_to(states.reshape(states.shape[0], -1), (states.shape[0], cells))
-
-        one = cls.single(scene, launch, controls)
-        watched = watched and not isinstance(scene.surface, Plane)
-        return dataclasses.replace(one, states=spread(one.states), scales=spread(one.scales), watched=watched)
-
-    @classmethod
-    def single(cls, scene: Scene, launch: Launch, controls: Input | None) -> "RideProblem":
-        """The problem of one ride, which goes on where contact is lost."""
-        driven = controls is not None
-        press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
-        return cls(scene.dynamics, controls, scene.state(launch, driven), scene.scales(launch, driven), press, False)
-
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        return self.states, self.scales
-
-    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.dynamics.field(time, state, self.input)
-
-    def crossing(self, state: Float[Array, "components lanes"]) -> Any:
-        return self.dynamics.contact(state) / self.press + CONTACT_ROUND_OFF if self.watched else None
-
-    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.dynamics.rank(state) / RANK_LOST - 1.0 if isinstance(self.dynamics.heading, Projected) else None
 
 
 def sweep(
@@ -170,6 +127,7 @@ def sweep(
     require(t1, "t1", above=0.0)
     require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
     check_input(input, scene, launch)
+    controls = as_module(input, scene, launch)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
     grid = named_axes(axes, isinstance(scene.surface, Plane))
     # The modules check every value of every axis here, before anything compiles.
@@ -178,7 +136,7 @@ def sweep(
         changed["scene"].check(changed["launch"])
 
     def march(cells: dict[str, Any], size: int, count: int, watched: bool) -> tuple[RideProblem, Any]:
-        problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", input), size, watched)
+        problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", controls), size, watched)
         return problem, compiled_march(problem, as_number(t1), jnp.asarray(count), Settings(tolerance, solver))[0]
 
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:

@@ -93,7 +93,7 @@ def _piece(
         args=problem,
         stepsize_controller=_control(settings, scales),
         saveat=diffrax.SaveAt(t0=True, steps=True, dense=True),
-        max_steps=PIECE,
+        max_steps=min(PIECE, settings.max_steps),
         event=diffrax.Event(lambda t, y, args, **_: args.guard(t, y) < 0.0) if watched else None,
         throw=False,
     )
@@ -197,13 +197,17 @@ def sample(
     times: Float[Array, " times"],
     t1: Float[Array, ""],
     settings: Settings,
+    *,
+    grid: Float[Array, " steps"] | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> Sampled:
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 
-    The guard is checked at the ends of steps, and the run ends where it is zero on the dense output.
+    The guard is checked at the ends of steps, and the run ends where it is zero on the dense output. Steps end on the times
+    asked for, where interpolation would lose a digit or two.
 
-    **Arguments:** as for `follow`; `times`: growing, in [0, t1]; `adjoint`: how Diffrax differentiates, by default forwards.
+    **Arguments:** as for `follow`; `times`: growing, in [0, t1]; `grid`: the ends of the steps [s], for a solver without an
+    error estimate; `adjoint`: how Diffrax differentiates, by default forwards.
 
     **Returns:** a `Sampled`.
     """
@@ -212,6 +216,11 @@ def sample(
     event = diffrax.Event(
         lambda t, y, args, **_: args.guard(t, y), optimistix.Newton(1e-13, 1e-13) if watched else None
     )
+    times_inside = jnp.minimum(times, t1)
+    if grid is None:
+        controller = diffrax.ClipStepSizeController(_control(settings, scales), step_ts=times_inside)
+    else:
+        controller = diffrax.StepTo(grid)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
         settings.solver,
@@ -220,8 +229,8 @@ def sample(
         None,
         state,
         args=problem,
-        stepsize_controller=_control(settings, scales),
-        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=jnp.minimum(times, t1)), diffrax.SubSaveAt(t1=True)]),
+        stepsize_controller=controller,
+        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=times_inside), diffrax.SubSaveAt(t1=True)]),
         max_steps=settings.max_steps,
         event=event if watched else None,
         adjoint=diffrax.ForwardMode() if adjoint is None else adjoint,
