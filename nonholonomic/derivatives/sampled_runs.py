@@ -1,5 +1,6 @@
 """Runs sampled at given times, as functions for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -155,7 +156,7 @@ def _march(
         t1,
         jnp.asarray(varied.problem.start()[0].shape[1]),
         # One tolerance serves a block: the smallest of a batch.
-        _with_tolerance(settings, jnp.min(tolerance)),
+        dataclasses.replace(_with_tolerance(settings, jnp.min(tolerance)), looped=bool(varied.directions)),
         parts=1 + len(varied.directions),
         one_kernel=one_kernel,
     )
