@@ -11,7 +11,7 @@ import stroller
 def draw() -> Any:
     """The picture, a matplotlib figure."""
     body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
-    launch = stroller.Launch(place=(0.0, -0.8), heading=0.3, speed=3.0, steering=0.05)
+    launch = stroller.Launch(place=(0.0, -0.8), heading=0.3, speed=5.0, steering=0.1)
     figure, axes = plt.subplots(1, 2, figsize=(9.0, 4.5), layout="constrained")
     for damping, ax in zip((0.0, 1.0), axes, strict=True):
         scene = stroller.Scene(body, stroller.Spheroid(6.0, 3.0), stroller.Damping(damping), side="inside")
