@@ -35,7 +35,11 @@ autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 autodoc_class_signature = "mixed"
 
-PACKAGES = {"tippe": "The top: `tippe`", "stroller": "The vehicle: `stroller`", "nonholonomic": "The ground: `nonholonomic`"}
+PACKAGES = {
+    "tippe": "The top: `tippe`",
+    "stroller": "The vehicle: `stroller`",
+    "nonholonomic": "The ground: `nonholonomic`",
+}
 
 # Notebooks keep what they compile, and show no progress bars.
 os.environ["NONHOLONOMIC_PROGRESS"] = "0"
@@ -64,7 +68,9 @@ def write_pages() -> None:
             kind = "class" if inspect.isclass(value) else "module" if inspect.ismodule(value) else "function"
             home = getattr(value, "__module__", package)
             # What several packages hand out stands on the page of the first.
-            first = next(one for one in PACKAGES if name in public(one) and getattr(importlib.import_module(one), name) is value)
+            first = next(
+                one for one in PACKAGES if name in public(one) and getattr(importlib.import_module(one), name) is value
+            )
             if first != package:
                 lines += [f"``{package}.{name}``: as ``{first}.{name}``.", ""]
             elif kind == "module":

@@ -16,7 +16,7 @@ from .input import Input
 from .launch import Launch
 from .scene import Scene
 from .simulate import simulate
-from .table import PLACES, replaced
+from .table import place_numbers, replaced
 
 #: Columns of a sample of each quantity.
 QUANTITIES = {"position": ("x", "y", "z"), "heading": ("heading",), "speed": ("speed",), "steering": ("steering",)}
@@ -151,7 +151,7 @@ def identify(
     for one in data:
         scene.check(one.launch)
     roots = {"scene": scene, "launch": data[0].launch}
-    known = [name for root, tree in roots.items() for name in numbers(root, tree)] + list(PLACES)
+    known = [name for root, tree in roots.items() for name in numbers(root, tree)] + place_numbers(data[0].launch)
     unknowns = generic.free_numbers(free, roots, known, replaced)
     measurements, labels = generic.joined(data)
     return generic.identify(

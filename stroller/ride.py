@@ -28,7 +28,7 @@ CONTACT_ROUND_OFF = 1e-12
 class RideProblem(AbstractProblem):
     """One ride, or those of many cells.
 
-    Where `watched`, a ride ends where the ground would have to pull; where `guarded`, where the constraints lose rank.
+    Where `watched`, the event is that the ground would have to pull; where `guarded`, a ride ends where constraints lose rank.
     """
 
     dynamics: Dynamics

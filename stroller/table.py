@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import Plane
+from nonholonomic.geometry import AbstractSurface
 from nonholonomic.integration import (
-    CROSSED,
     FAILED,
     GUARD_LOST,
     Settings,
@@ -30,6 +29,9 @@ from .launch import Launch
 from .ride import RideProblem, as_module
 from .scene import Scene
 from .stroller import Stroller
+
+#: What the numbers of a place in the fixed frame are called.
+FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
 
 WORDS = ("completed", "contact_lost", "rank_lost", "failed")
 
@@ -50,9 +52,9 @@ VARIABLES = {
 }
 
 UNITS = Stroller.units | Scene.units | Damping.units | RollingResistance.units | Steady.units | Launch.units
-UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m"}
+UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m", "ring": "m", "tube": "m", "p": "m"}
 
-#: What the axes are, in words; a place is given as "x(0)".
+#: What the axes are, in words.
 LONG_NAMES = {"steering_inertia": "inertia of the fork", "steering_spring": "spring of the fork", "steering": "φ(0)"}
 LONG_NAMES |= {
     "speed": "speed v(0)",
@@ -63,14 +65,12 @@ LONG_NAMES |= {
 LONG_NAMES |= {
     "x0": "x(0)",
     "y0": "y(0)",
+    "z0": "z(0)",
     "mu0": "μ(0)",
     "eta0": "η(0)",
     "force": "drive force",
     "torque": "steering torque",
 }
-
-#: A place is a pair; its parts are axes under these names, with their units on a plane and elsewhere.
-PLACES = {"launch.place[0]": ("x0", "mu0"), "launch.place[1]": ("y0", "eta0")}
 
 
 def sweep(
@@ -129,24 +129,21 @@ def sweep(
     check_input(input, scene, launch)
     controls = as_module(input, scene, launch)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
-    grid = named_axes(axes, isinstance(scene.surface, Plane))
+    grid = named_axes(axes, scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.
     for one in grid:
         changed = replaced(roots, {one.number: one.values})
         changed["scene"].check(changed["launch"])
 
-    def march(cells: dict[str, Any], size: int, count: int, watched: bool) -> tuple[RideProblem, Any]:
-        problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", controls), size, watched)
-        return problem, compiled_march(problem, as_number(t1), jnp.asarray(count), Settings(tolerance, solver))[0]
-
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
         cells = replaced(roots, columns)
         size = next((len(values) for values in columns.values()), 1)
-        problem, outcome = march(cells, size, count, watched=True)
-        lost = np.asarray(outcome.status == CROSSED)
-        contact_time = np.where(lost, outcome.end_time, np.inf)
-        if lost.any() or (count == 0 and problem.watched):
-            problem, outcome = march(cells, size, count, watched=False)
+        problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", controls), size, watched=True)
+        horizon, settings = as_number(t1), Settings(tolerance, solver)
+        # A ride goes on where contact is lost, as if the ground could pull.
+        outcome, _ = compiled_march(problem, horizon, jnp.asarray(count), settings, passes=problem.watched)
+        contact_time = np.asarray(outcome.first_crossing)
+        lost = np.isfinite(contact_time)
         words = np.select([outcome.status == FAILED, outcome.status == GUARD_LOST, lost], [3, 2, 1], 0)
         ends = read_ends(cells["scene"], outcome.state, problem.states)
         return {name: np.asarray(values) for name, values in ends.items()} | {
@@ -182,14 +179,24 @@ def read_ends(scene: Scene, states: State, starts: State) -> dict[str, Float[Arr
     }
 
 
-def named_axes(axes: dict[str, Any], flat: bool) -> list[Axis]:
-    """The axes of the table, each under the last part of its full name, or the last two where that is not enough."""
+def place_numbers(launch: Launch) -> list[str]:
+    """The full names of the numbers of a launch's place."""
+    return [f"launch.place[{k}]" for k in range(len(launch.place))]
+
+
+def named_axes(axes: dict[str, Any], surface: AbstractSurface, launch: Launch) -> list[Axis]:
+    """The axes of the table, each under the last part of its full name, or the last two where that is not enough.
+
+    The numbers of a place are named as the surface names them, with a zero: `x0`.
+    """
     lasts = [number.rsplit(".", 1)[-1] for number in axes]
+    named = surface.coordinates if len(launch.place) == len(surface.coordinates) else FIXED
+    places = dict(zip(place_numbers(launch), named, strict=True))
     grid = []
     for number, last in zip(axes, lasts, strict=True):
         name, unit = last, UNITS.get(last, "1")
-        if number in PLACES:
-            name, unit = PLACES[number][0 if flat else 1], "m" if flat else "rad"
+        if number in places:
+            name, unit = places[number][0] + "0", places[number][1]
         elif lasts.count(last) > 1 or last in VARIABLES:
             name = "_".join(number.split(".")[-2:])
         if number.endswith("steering"):
@@ -200,9 +207,11 @@ def named_axes(axes: dict[str, Any], flat: bool) -> list[Axis]:
 
 def replaced(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
     """Scene, launch and input with some of their parameters replaced."""
-    place = [values.get(number, part) for number, part in zip(PLACES, roots["launch"].place, strict=True)]
-    roots = roots | {"launch": dataclasses.replace(roots["launch"], place=tuple(place))}
-    return with_numbers(roots, {number: one for number, one in values.items() if number not in PLACES})
+    launch = roots["launch"]
+    places = dict(zip(place_numbers(launch), launch.place, strict=True))
+    place = tuple(values.get(number, part) for number, part in places.items())
+    roots = roots | {"launch": dataclasses.replace(launch, place=place)}
+    return with_numbers(roots, {number: one for number, one in values.items() if number not in places})
 
 
 def described(controls: Any) -> Any:

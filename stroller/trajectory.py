@@ -27,7 +27,8 @@ from .steps import Steps, followed
 class Trajectory(eqx.Module):
     """A run at the given times. Times are the first axis of every array.
 
-    - `t` [s]; `place`: (x, y) [m] or (mu, eta) [rad], (times, 2); `position` [m] in the fixed frame, z up, (times, 3);
+    - `t` [s]; `place`, as the surface names it (see `Launch`), (times, 2), or (times, 3) on an implicit surface; `position`
+      [m] in the fixed frame, z up, (times, 3);
     - `heading` [rad], as in `Launch`; `direction`: the same as a unit vector in the fixed frame, (times, 3);
     - `steering` [rad], `steering_rate` [rad/s], `yaw_rate` [rad/s], `speed` of the rear axle and `front_speed` at which
       the front wheel rolls [m/s];
@@ -35,7 +36,7 @@ class Trajectory(eqx.Module):
     - `side_force` [N] of the ground on the rear axle and the front wheel, to the left of each, (times, 2);
     - `normal_force` [N] of the ground, and `load` [N] on the rear and the front axle, (times, 2);
     - `constraint` [m/s]: speed at which the rear axle and the front wheel slip sideways, (times, 2);
-    - `departure`: how far the position is off the ground, relative to its size: an error of the integration;
+    - `departure`: how far the position is off the ground [m]: an error of the integration;
     - `stats` of the integration; `recipe`: what made the run; `steps`: where its steps ended, `None` if it was made inside a
       transformation: what happened between the times is then found by running it once more, when it is asked for.
 
@@ -56,7 +57,7 @@ class Trajectory(eqx.Module):
     """
 
     t: Float[Array, " times"]
-    place: Float[Array, "times 2"]
+    place: Float[Array, "times numbers"]
     position: Float[Array, "times 3"]
     heading: Float[Array, " times"]
     direction: Float[Array, "times 3"]
@@ -82,6 +83,18 @@ class Trajectory(eqx.Module):
     def energy_residual(self) -> Float[Array, " times"]:
         """Energy minus its start and the work done since [J]: zero for an exact solution."""
         return self.energy - self.energy[0] - (self.work - self.work[0])
+
+    @property
+    def wheelbase_error(self) -> Float[Array, " times"]:
+        """Relative error |K| l^2 / 6 of taking the ground for its tangent plane as far as the wheelbase l reaches.
+
+        K is the Gaussian curvature (`stroller.md`, section 9). The model holds for a wheelbase short against the radii of
+        curvature.
+        """
+        scene = self.recipe.ride.scene
+        states = self.state.T
+        curvature = scene.surface.gaussian_curvature(scene.dynamics.unpack(states)[0])
+        return jnp.abs(spread(curvature, states[0])) * scene.body.wheelbase**2 / 6.0
 
     def grip(self) -> Float[Array, "times 2"]:
         """Coefficient of friction that each axle needs in order not to slip; infinite for a force without a load."""
@@ -192,6 +205,9 @@ class Trajectory(eqx.Module):
             f"  side forces     up to {shown(jnp.max(jnp.abs(self.side_force), axis=0))} N, rear and front",
             f"  no-slip         {float(jnp.max(jnp.abs(self.constraint))):.1e} m/s",
         ]
+        error = float(jnp.max(self.wheelbase_error))
+        if error > 0.0:
+            lines.append(f"  wheelbase       off by up to {error:.1e} of its effect: the ground curves over its length")
         if np.isfinite(self.contact_lost_at):
             lines.append(f"  contact lost    at {self.contact_lost_at:.6g} s; from there the ground pulls")
         if np.isfinite(self.rank_lost_at):
@@ -281,7 +297,7 @@ def read_off(
         normal_force=normal_force,
         load=columns(normal_force - front_load, front_load),
         constraint=columns(*side_slip(scene, dynamics.field(t, states, controls), states)),
-        departure=spread(surface.departure(motion.position), like),
+        departure=spread(surface.offset(motion.position), like),
         state=integrated.T,
         stats=stats,
         recipe=recipe,

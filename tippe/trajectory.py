@@ -171,7 +171,13 @@ def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: 
     if times is None:
         # It raises the error that says so.
         return _traced(scene, launch, times, t1, tolerance, *options)
-    bounds = (*all_bounds(scene), *all_bounds(launch), *run_bounds(t1, tolerance), *times_bounds(times, t1))
+    bounds = (
+        *all_bounds(scene),
+        *all_bounds(launch),
+        *scene.start_bounds(launch),
+        *run_bounds(t1, tolerance),
+        *times_bounds(times, t1),
+    )
     may = jnp.all(legal(bounds)) & jnp.all(jnp.diff(times) > 0.0)
     # A run of illegal numbers might never reach its end, so it is given the horizon 0.
     found = _traced(scene, launch, times, jnp.where(may, t1, 0.0), tolerance, *options)

@@ -286,7 +286,7 @@ BAD = [
     (lambda: Launch(0.3, 0.0, 1.0), r"place = 0\.3 must be a pair of numbers"),
     (lambda: Launch((0.0, 0.0), 0.0, np.inf), r"speed = inf must be finite"),
     (lambda: Scene("pram"), r"body = 'pram' must be a Stroller"),
-    (lambda: Scene(BODY, surface=3.0), r"surface = 3\.0 must be a Ground"),
+    (lambda: Scene(BODY, surface=3.0), r"surface = 3\.0 must be a Surface"),
     (lambda: Scene(BODY, friction=0.1), r"friction = 0\.1 must be a Friction"),
     (lambda: Scene(BODY, gravity=-1.0), r"gravity = -1\.0 must be at least 0\.0"),
     (lambda: Scene(BODY, side="under"), r"side = 'under' must be one of 'outside', 'inside'"),

@@ -1,12 +1,7 @@
-"""Surfaces as seen from the fixed frame, for a body that drives on them.
-
-A ground has its own axes, in which positions, headings and normals are given: x east, y north and z
-along the normal on a plane; x and y across and z along the axis of symmetry, which is vertical, on a spheroid. There is
-no pole, no edge and no angle in these components. `chart` and `place_at` convert between them and the two coordinates that a
-person would give.
-"""
+"""Sphere and spheroid: the quadrics of revolution about the vertical."""
 
 import abc
+import math
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
@@ -14,58 +9,17 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..validation import Bound, Bounded, as_number, require
+from ..validation import Bound, as_number, require
+from .level import AbstractLevel
+from .surface import AbstractSurface, Place
 from .vector import Component, Vector, dot, multiply, scale, subtract, sum_vectors
 
-Place = tuple[Float[Array, "..."], ...]
 
+class AbstractQuadric(AbstractSurface):
+    """A sphere or spheroid r.N r = 1, N = diag(1/A^2, 1/A^2, 1/c^2), about the origin, its axis vertical.
 
-class AbstractGround(Bounded):
-    """A surface to drive on. `outward` is its unit normal n away from the centre of curvature, upwards on a plane."""
-
-    #: How many of a position's three components do not vanish identically.
-    axes: ClassVar[int] = 3
-
-    @property
-    @abc.abstractmethod
-    def up(self) -> Vector:
-        """Components of the upward vertical in the ground's axes."""
-
-    @abc.abstractmethod
-    def outward(self, position: Vector) -> Vector:
-        """Unit normal n at a position [m]."""
-
-    @abc.abstractmethod
-    def outward_rate(self, position: Vector, velocity: Vector) -> Vector:
-        """Rate n' [1/s] of the normal for a velocity [m/s] along the ground."""
-
-    @abc.abstractmethod
-    def elevation(self, position: Vector) -> Component:
-        """Height [m] of a position: above the lowest point, or above the origin of a plane."""
-
-    @abc.abstractmethod
-    def gaussian_curvature(self, position: Vector) -> Component:
-        """Gaussian curvature K [1/m^2] at a position."""
-
-    @abc.abstractmethod
-    def chart(self, place: Place) -> tuple[Vector, Vector, Vector]:
-        """Position [m], and the unit vectors east and north there, at a place: (x, y) [m] or (mu, eta) [rad]."""
-
-    @abc.abstractmethod
-    def place_at(self, position: Vector) -> Place:
-        """The place of a position: (x, y) [m] on a plane, (mu, eta) [rad], azimuth and reduced latitude, otherwise."""
-
-    @abc.abstractmethod
-    def departure(self, position: Vector) -> Component:
-        """How far a position is off the ground, relative to the ground's size."""
-
-    @abc.abstractmethod
-    def in_fixed_frame(self, vector: Vector) -> tuple[Any, Any, Any]:
-        """Components of a vector in the fixed frame (x, y, z), z up."""
-
-
-class AbstractQuadric(AbstractGround):
-    """A sphere or spheroid r.N r = 1, N = diag(1/A^2, 1/A^2, 1/c^2), about the origin, its axis vertical."""
+    A place on it is (mu, eta) [rad], azimuth and reduced latitude: -pi/2 at the lowest point, pi/2 at the highest.
+    """
 
     @property
     @abc.abstractmethod
@@ -78,17 +32,13 @@ class AbstractQuadric(AbstractGround):
         across, along = 1.0 / (equatorial * equatorial), 1.0 / (polar * polar)
         return (multiply(across, vector[0]), multiply(across, vector[1]), multiply(along, vector[2]))
 
-    @property
-    def up(self) -> Vector:
-        return (None, None, 1.0)
-
-    def outward(self, position: Vector) -> Vector:
+    def normal(self, position: Vector) -> Vector:
         # Normalised even where N r has unit length on the surface, so that a drift off it does not amplify itself.
         gradient = self.gradient(position)
         return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), gradient)
 
-    def outward_rate(self, position: Vector, velocity: Vector) -> Vector:
-        gradient, normal = self.gradient(position), self.outward(position)
+    def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
+        gradient, normal = self.gradient(position), self.normal(position)
         turning = self.gradient(velocity)
         along = scale(subtract(None, dot(normal, turning)), normal)
         return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), sum_vectors(turning, along))
@@ -101,7 +51,12 @@ class AbstractQuadric(AbstractGround):
         gradient = self.gradient(position)
         return 1.0 / (equatorial**2 * polar * dot(gradient, gradient)) ** 2
 
-    def chart(self, place: Place) -> tuple[Vector, Vector, Vector]:
+    def place_at(self, position: Vector) -> Place:
+        equatorial, polar = self.semi_axes
+        x, y, z = position
+        return (jnp.arctan2(y, x), jnp.arctan2(z / polar, jnp.hypot(x, y) / equatorial))
+
+    def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
         (equatorial, polar), (mu, eta) = self.semi_axes, place
         east = (-jnp.sin(mu), jnp.cos(mu), jnp.zeros_like(mu))
         outwards, across, along = (jnp.cos(mu), jnp.sin(mu)), equatorial * jnp.cos(eta), polar * jnp.sin(eta)
@@ -110,20 +65,50 @@ class AbstractQuadric(AbstractGround):
         north = scale(per_length, (inwards * outwards[0], inwards * outwards[1], rise))
         return (across * outwards[0], across * outwards[1], along), east, north
 
-    def place_at(self, position: Vector) -> Place:
-        equatorial, polar = self.semi_axes
-        x, y, z = position
-        return (jnp.arctan2(y, x), jnp.arctan2(z / polar, jnp.hypot(x, y) / equatorial))
-
-    def departure(self, position: Vector) -> Component:
-        return jnp.sqrt(dot(position, self.gradient(position))) - 1.0
-
-    def in_fixed_frame(self, vector: Vector) -> tuple[Any, Any, Any]:
-        x, y, z = vector
-        return (x, y, jnp.zeros_like(x) if z is None else z)
+    def place_bounds(self, place: Place, size: Any) -> Iterator[Bound]:
+        yield from super().place_bounds(place, size)
+        if len(place) == 2:
+            limit = math.pi / 2.0 + 1e-12
+            why = "reduced latitude, from -pi/2 to pi/2"
+            yield Bound(place[1], "place[1]", at_least=-limit, at_most=limit, why=why)
 
 
-class Spheroid(AbstractQuadric):
+class Sphere(AbstractQuadric):
+    """A sphere about the origin.
+
+    **Arguments:**
+
+    - `radius`: radius [m], positive.
+
+    **Example:**
+
+    ```
+    >>> import nonholonomic
+    >>> nonholonomic.Sphere(radius=0.5)
+    Sphere(radius=0.5 m)
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"radius": "m"}
+
+    radius: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.radius, "surface radius", above=0.0)
+
+    @property
+    def semi_axes(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        return self.radius, self.radius
+
+    def nearest(self, position: Vector) -> Vector:
+        return scale(self.radius / jnp.sqrt(dot(position, position)), position)
+
+    def distance(self, position: Vector) -> Component:
+        return jnp.sqrt(dot(position, position)) - self.radius
+
+
+class Spheroid(AbstractQuadric, AbstractLevel):
     """An ellipsoid of revolution with a vertical axis, oblate or prolate.
 
     **Arguments:**
@@ -169,3 +154,7 @@ class Spheroid(AbstractQuadric):
     @property
     def semi_axes(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         return self.equatorial, self.polar
+
+    def offset(self, position: Vector) -> Component:
+        gradient = self.gradient(position)
+        return 0.5 * (dot(position, gradient) - 1.0) / jnp.sqrt(dot(gradient, gradient))
