@@ -1,4 +1,4 @@
-"""The numbers of a scene by name, `"scene.body.offset"`, `"launch.place[0]"` for a part of a tuple; and as people read them."""
+"""The numbers of a scene by name: `"scene.body.offset"`, `"launch.place[0]"`; and as a person reads them, with their units."""
 
 import dataclasses
 import html

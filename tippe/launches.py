@@ -84,7 +84,7 @@ def launches(
     for number, name in names.items():
         if number not in fixed:
             alone = counts[name] == 1 and name not in taken
-            unit, long_name = units.get(name, "1"), LONG_NAMES.get(name, name.replace("_", " "))
+            unit, long_name = units.get(name, "1"), LONG_NAMES.get(name, name)
             grid.append(axis(name if alone else number, number, unit, values[number], long_name))
     roots = with_numbers({"scene": scene, "launch": launch}, fixed)
     check_run(roots["scene"], roots["launch"], t1, tolerance)

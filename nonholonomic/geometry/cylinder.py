@@ -25,16 +25,16 @@ class Cylinder(AbstractSurface):
     **Example:**
 
     ```
-    >>> import nonholonomic
-    >>> nonholonomic.Cylinder(radius=0.3)
+    >>> import tippe
+    >>> tippe.Cylinder(radius=0.3)
     Cylinder(radius=0.3 m)
 
     ```
     """
 
-    coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("y", "m"), ("eta", "rad"))
-
     units: ClassVar[dict[str, str]] = {"radius": "m"}
+
+    coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("y", "m"), ("eta", "rad"))
 
     radius: Float[Array, "..."] = eqx.field(converter=as_number)
 

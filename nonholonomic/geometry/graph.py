@@ -50,8 +50,9 @@ class Paraboloid(AbstractOpen, AbstractLevel):
 
     ```
     >>> import nonholonomic
-    >>> nonholonomic.Paraboloid(p=1.0)
-    Paraboloid(p=1 m)
+    >>> bowl = nonholonomic.Paraboloid(p=0.5)
+    >>> print(bowl.elevation((0.5, 0.0, 0.25)))
+    0.25
 
     ```
     """
@@ -103,9 +104,9 @@ class Graph(AbstractOpen, AbstractDifferentiated):
     ```
     >>> import jax.numpy as jnp
     >>> import nonholonomic
-    >>> hills = nonholonomic.Graph(lambda x, y: 0.1 * jnp.sin(x) * jnp.sin(y))
-    >>> print(f"{hills.ground(1.0, 1.0):.4f} m")
-    0.0708 m
+    >>> hills = nonholonomic.Graph(lambda x, y: 0.1 * jnp.cos(x) * jnp.cos(y))
+    >>> print(hills.elevation((0.0, 0.0, 0.1)))
+    0.1
 
     ```
     """

@@ -30,9 +30,9 @@ class Implicit(AbstractDifferentiated):
 
     ```
     >>> import nonholonomic
-    >>> bowl = nonholonomic.Implicit(lambda x, y, z: 1.0 - x**2 - y**2 - z**2)
-    >>> [round(float(part), 3) for part in bowl.normal((0.0, 0.0, -1.0))]
-    [-0.0, -0.0, 1.0]
+    >>> egg = nonholonomic.Implicit(lambda x, y, z: 1.0 - x * x - y * y - 0.5 * z * z)
+    >>> float(egg.normal((1.0, 0.0, 0.0))[0])
+    -1.0
 
     ```
     """

@@ -25,21 +25,21 @@ class Plane(AbstractSurface):
     **Example:**
 
     ```
-    >>> import nonholonomic
-    >>> nonholonomic.Plane()
+    >>> import tippe
+    >>> tippe.Plane()
     Plane()
-    >>> nonholonomic.Plane(tilt=0.1)
+    >>> tippe.Plane(tilt=0.1)
     Plane(tilt=0.1 rad)
 
     ```
     """
 
+    units: ClassVar[dict[str, str]] = {"tilt": "rad"}
+
     axes: ClassVar[int] = 2
     # "outside" is what one calls the only side of a plane where grounds are compared.
     sides: ClassVar[Mapping[str, float]] = {"outside": CLOSED["outside"]} | OPEN
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("x", "m"), ("y", "m"))
-
-    units: ClassVar[dict[str, str]] = {"tilt": "rad"}
 
     tilt: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
 

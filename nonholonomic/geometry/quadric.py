@@ -83,8 +83,8 @@ class Sphere(AbstractQuadric):
     **Example:**
 
     ```
-    >>> import nonholonomic
-    >>> nonholonomic.Sphere(radius=0.5)
+    >>> import tippe
+    >>> tippe.Sphere(radius=0.5)
     Sphere(radius=0.5 m)
 
     ```

@@ -44,8 +44,8 @@ class AbstractSurface(Bounded):
     >>> bowl = nonholonomic.Sphere(radius=0.5)
     >>> isinstance(bowl, nonholonomic.AbstractSurface)
     True
-    >>> bowl.coordinates
-    (('mu', 'rad'), ('eta', 'rad'))
+    >>> print(bowl.gaussian_curvature((0.0, 0.0, -0.5)))
+    4.0
 
     ```
     """

@@ -27,8 +27,9 @@ class Torus(AbstractSurface):
 
     ```
     >>> import nonholonomic
-    >>> nonholonomic.Torus(ring=1.0, tube=0.3)
-    Torus(ring=1 m, tube=0.3 m)
+    >>> tube = nonholonomic.Torus(ring=2.0, tube=0.5)
+    >>> print(round(float(tube.gaussian_curvature((2.5, 0.0, 0.0))), 6))
+    0.8
 
     ```
     """
