@@ -23,10 +23,12 @@ from nonholonomic.sweeps import grid as grids
 from nonholonomic.validation import as_number, require
 
 from .dynamics import State
-from .input import Input
+from .friction import Damping, RollingResistance
+from .input import Input, Steady, check_input
 from .launch import Launch
 from .ride import RideProblem, as_module
 from .scene import Scene
+from .stroller import Stroller
 
 #: What the numbers of a place in the fixed frame are called.
 FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
@@ -34,26 +36,40 @@ FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
 WORDS = ("completed", "contact_lost", "rank_lost", "failed")
 
 VARIABLES = {
-    "x": Variable("m", np.float64),
-    "y": Variable("m", np.float64),
-    "z": Variable("m", np.float64),
-    "heading": Variable("rad", np.float64),
-    "end_steering": Variable("rad", np.float64),
-    "end_speed": Variable("m s-1", np.float64),
-    "energy": Variable("J", np.float64),
-    "residual": Variable("J", np.float64),
-    "contact_time": Variable("s", np.float64),
-    "end_time": Variable("s", np.float64),
-    "status": Variable("1", np.int8, WORDS),
-    "steps": Variable("1", np.int64),
-    "rejected": Variable("1", np.int64),
+    "x": Variable("m", np.float64, long_name="x"),
+    "y": Variable("m", np.float64, long_name="y"),
+    "z": Variable("m", np.float64, long_name="height z"),
+    "heading": Variable("rad", np.float64, long_name="heading ψ"),
+    "end_steering": Variable("rad", np.float64, long_name="steering angle φ at the end"),
+    "end_speed": Variable("m s-1", np.float64, long_name="speed at the end"),
+    "energy": Variable("J", np.float64, long_name="energy at the end"),
+    "residual": Variable("J", np.float64, long_name="energy less work"),
+    "contact_time": Variable("s", np.float64, long_name="loss of contact"),
+    "end_time": Variable("s", np.float64, long_name="end of the ride"),
+    "status": Variable("1", np.int8, WORDS, long_name="how the ride ended"),
+    "steps": Variable("1", np.int64, long_name="steps"),
+    "rejected": Variable("1", np.int64, long_name="rejected steps"),
 }
 
-UNITS = {"mass": "kg", "wheelbase": "m", "inertia": "kg m2", "steering_inertia": "kg m2", "centre": "m"}
-UNITS |= {"steering_spring": "N m rad-1", "gravity": "m s-2", "tilt": "rad", "radius": "m", "equatorial": "m"}
-UNITS |= {"polar": "m", "rolling": "N s m-1", "front": "N s m-1", "scrub": "N m s", "coefficient": "1"}
-UNITS |= {"ring": "m", "tube": "m", "p": "m"}
-UNITS |= {"speed": "m s-1", "steering_rate": "rad s-1", "force": "N", "torque": "N m", "heading": "rad"}
+UNITS = Stroller.units | Scene.units | Damping.units | RollingResistance.units | Steady.units | Launch.units
+UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m", "ring": "m", "tube": "m", "p": "m"}
+
+#: What the axes are, in words; a place is given as "x(0)".
+LONG_NAMES = {"steering_inertia": "inertia of the fork", "steering_spring": "spring of the fork", "steering": "φ(0)"}
+LONG_NAMES |= {
+    "speed": "speed v(0)",
+    "heading": "heading ψ(0)",
+    "steering_rate": "steering rate φ'(0)",
+    "mass": "mass m",
+}
+LONG_NAMES |= {
+    "x0": "x(0)",
+    "y0": "y(0)",
+    "mu0": "μ(0)",
+    "eta0": "η(0)",
+    "force": "drive force",
+    "torque": "steering torque",
+}
 
 
 def sweep(
@@ -86,6 +102,21 @@ def sweep(
     "rank_lost" where a projected heading ended the ride, "failed"), `steps` and `rejected`.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> axes = {"launch.speed": [1.0, 2.0], "scene.body.wheelbase": [0.6, 0.7]}
+    >>> table = stroller.sweep(scene, launch, 1.0, axes=axes, tolerance=1e-6)
+    >>> print(table.end_speed.round(3))
+    [[0.779 0.779]
+     [1.558 1.558]]
+
+    ```
     """
     solver = diffrax.Dopri8() if solver is None else solver
     explicit_tableau(solver)
@@ -94,6 +125,7 @@ def sweep(
     scene.check(launch)
     require(t1, "t1", above=0.0)
     require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+    check_input(input, scene, launch)
     controls = as_module(input, scene, launch)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
     grid = named_axes(axes, scene.surface, launch)
@@ -168,7 +200,7 @@ def named_axes(axes: dict[str, Any], surface: AbstractSurface, launch: Launch) -
             name = "_".join(number.split(".")[-2:])
         if number.endswith("steering"):
             unit = "N m s" if "friction" in number else "rad"
-        grid.append(axis(name, number, unit, axes[number]))
+        grid.append(axis(name, number, unit, axes[number], LONG_NAMES.get(name, name.replace("_", " "))))
     return grid
 
 

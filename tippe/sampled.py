@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.derivatives import sampled_run, sampled_run_by_diffrax
 from nonholonomic.integration import FAILED, GUARD_LOST, AbstractProblem, Settings
 
-from .dynamics import Dynamics, stacked
+from .dynamics import LOSSES, Dynamics, stacked
 from .launch import Launch
 from .phases import Kind, StickSlip
 from .scene import Scene
@@ -32,8 +32,9 @@ class TrajectoryProblem(AbstractProblem):
     def of(cls, scene: Scene, launch: Launch, cells: int | None = None) -> "TrajectoryProblem":
         """The run of one launch, or the runs of some cells, whose numbers are scalars or one per cell."""
         radius, weight = scene.body.radius, scene.body.mass * scene.gravity
-        cyclic = jnp.stack(scene.surface.cyclic(launch.eta))
+        cyclic = scene.start(launch)[1]
         extra = jnp.stack(jnp.broadcast_arrays(*([radius] * len(cyclic)), jnp.ones(()), weight * radius))
+        cyclic = jnp.stack(jnp.broadcast_arrays(*cyclic)) if cyclic else jnp.zeros((0, *jnp.shape(launch.theta)))
         parts = (scene.state(launch), cyclic, scene.scales(launch), extra)
         if cells is not None:
             parts = tuple(jnp.broadcast_to(part.reshape(len(part), -1), (len(part), cells)) for part in parts)
@@ -46,7 +47,7 @@ class TrajectoryProblem(AbstractProblem):
     def field(self, time: Float[Array, "..."], state: Float[Array, "components ..."]) -> Any:
         lean, cyclic = state[: len(self.state)], tuple(state[len(self.state) : -2])
         motion = self.dynamics.motion(lean)
-        cyclic_rate = self.dynamics.parallel.cyclic_rate(cyclic, motion.velocity, motion.turning)
+        cyclic_rate = self.dynamics.frame.cyclic_rate(cyclic, motion.velocity, motion.turning)
         return stacked((*motion.rate, *cyclic_rate, motion.spin_momentum / self.axial, motion.friction_power), state)
 
     def crossing(self, state: Float[Array, "components ..."]) -> None:
@@ -57,7 +58,7 @@ class TrajectoryProblem(AbstractProblem):
 
 
 #: How a run can end; inside a transformation the index stands for the word.
-STATUS = ("reached t1", "contact_lost", "failed", "jammed", "illegal")
+STATUS = ("reached t1", "contact_lost", "failed", "jammed", "illegal", "does_not_fit")
 
 
 def ended(
@@ -67,7 +68,8 @@ def ended(
     failed: Bool[Array, "..."],
 ) -> Int[Array, "..."]:
     """The code in `STATUS` of a run that ended in some state."""
-    lost = jnp.where(run.dynamics.jams(state[: len(run.state)]), STATUS.index("jammed"), STATUS.index("contact_lost"))
+    codes = jnp.asarray([STATUS.index(word) for word in LOSSES])
+    lost = codes[run.dynamics.loss(state[: len(run.state)])]
     return jnp.where(guard_lost, lost, jnp.where(failed, STATUS.index("failed"), STATUS.index("reached t1")))
 
 

@@ -35,6 +35,22 @@ class Trajectory(AbstractTrajectory):
     normal force pushes it out: strong friction, a large offset and a slip along the axis do that. `stats` holds accepted and
     rejected steps, the greatest drift of |e| and the greatest energy residual |E - E(0) - work of friction| [J]; with
     `SetValuedCoulomb` also `sticks`, how often a slip has turned into rolling.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> run = tippe.simulate(scene, tippe.Launch(0.1, 155.0), t1=1.0, tolerance=1e-6)
+    >>> later = run.at([0.25, 0.5])
+    >>> later.position.shape, later.axis.shape
+    ((2, 3), (2, 3))
+    >>> data = run.to_table()
+    >>> data.units["normal_force"], data.label("theta")
+    ('N', 'inclination θ [rad]')
+
+    ```
     """
 
     t: Float[Array, " times"]
@@ -105,6 +121,18 @@ def simulate(
     **Returns:** a `Trajectory`, for a hybrid scene a `HybridTrajectory`.
 
     **Raises:** `ValueError` for arguments out of range, and for a hybrid scene inside a transformation.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> run = tippe.simulate(scene, tippe.Launch(0.1, 155.0), t1=1.0, tolerance=1e-6)
+    >>> print(f"{run.theta[-1]:.3f} rad, {run.spin[-1]:.1f} rad/s, {run.status}")
+    0.025 rad, 154.0 rad/s, reached t1
+
+    ```
     """
     check_run(scene, launch, t1, tolerance)
     solver = diffrax.Dopri8() if solver is None else solver
@@ -143,7 +171,13 @@ def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: 
     if times is None:
         # It raises the error that says so.
         return _traced(scene, launch, times, t1, tolerance, *options)
-    bounds = (*all_bounds(scene), *all_bounds(launch), *run_bounds(t1, tolerance), *times_bounds(times, t1))
+    bounds = (
+        *all_bounds(scene),
+        *all_bounds(launch),
+        *scene.start_bounds(launch),
+        *run_bounds(t1, tolerance),
+        *times_bounds(times, t1),
+    )
     may = jnp.all(legal(bounds)) & jnp.all(jnp.diff(times) > 0.0)
     # A run of illegal numbers might never reach its end, so it is given the horizon 0.
     found = _traced(scene, launch, times, jnp.where(may, t1, 0.0), tolerance, *options)

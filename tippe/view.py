@@ -7,19 +7,34 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.views import COLOURS, DARK, PALE, Arrow, Body, Curve, Mesh, Show, Stage, Trace, arena, ball, rod, turned
+from nonholonomic.views import (
+    COLOURS,
+    DARK,
+    PALE,
+    Arrow,
+    Body,
+    Curve,
+    Mesh,
+    Show,
+    Stage,
+    Trace,
+    arena,
+    ball,
+    rod,
+    turned,
+)
 
 from .scene import Scene
 from .top import Top
 
 #: Most radians by which the top spins from one frame to the next, and most frames.
-SPIN_PER_FRAME = 0.8
+SPIN_PER_FRAME = 0.4
 MOST_FRAMES = 12_000
 LEAST_FRAMES = 400
 
 #: Lengths in units of the radius: of the axis as it is drawn from the centre, and of the arrows for the weight and for the
 #: longest slip.
-AXIS, WEIGHT, SLIP = 1.6, 1.5, 2.0
+AXIS, WEIGHT, SLIP = 1.6, 1.5, 3.0
 
 #: Slips that are greater than this part of all are not drawn longer: the first moments would hide the rest.
 COMMON_SLIP = 0.9
@@ -68,6 +83,12 @@ class Motion(NamedTuple):
 
 
 _motion = eqx.filter_jit(Motion.of)
+
+
+def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
+    """Runs as they are drawn: a stage for each, or one for all if they are to be overlaid."""
+    named = [(f"θ(0) = {float(run.theta[0]):.3g} rad", run.scene, motion(run)) for run in runs]
+    return stages([named] if overlaid else [[one] for one in named])
 
 
 def motion(run: Any) -> Motion:
@@ -149,7 +170,9 @@ def meshes(body: Top, colour: int) -> tuple[Mesh, ...]:
     return (*sphere, rod(0.8 * knob, 0.0, end, knob, DARK))
 
 
-def rotation(axis: Float[np.ndarray, "times 3"], spin_angle: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times 3 3"]:
+def rotation(
+    axis: Float[np.ndarray, "times 3"], spin_angle: Float[np.ndarray, " times"]
+) -> Float[np.ndarray, "times 3 3"]:
     """Rotations from body to fixed frame: carried along with the axis without a turn about it, then turned by the spin angle."""
     first = np.cross(axis[0], np.eye(3)[np.argmin(np.abs(axis[0]))])
     carried = [first / np.linalg.norm(first)]

@@ -8,12 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..validation import Bound, as_number
-from .moving import CylinderFrame
 from .surface import AbstractSurface, Place
 from .vector import Component, Vector, add, dot, multiply, scale, subtract
 
 
-class Cylinder(CylinderFrame, AbstractSurface):
+class Cylinder(AbstractSurface):
     """A cylinder whose axis is the y axis.
 
     A place on it is (y, eta): along the axis [m], and the angle [rad] about it from the lowest line, towards x; east is y
@@ -22,7 +21,18 @@ class Cylinder(CylinderFrame, AbstractSurface):
     **Arguments:**
 
     - `radius`: radius [m], positive.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> tippe.Cylinder(radius=0.3)
+    Cylinder(radius=0.3 m)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"radius": "m"}
 
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("y", "m"), ("eta", "rad"))
 

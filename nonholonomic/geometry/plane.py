@@ -9,12 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..validation import Bound
-from .moving import PlaneFrame
 from .surface import CLOSED, OPEN, AbstractSurface, Place
 from .vector import Component, Vector, dot, none_if_zero
 
 
-class Plane(PlaneFrame, AbstractSurface):
+class Plane(AbstractSurface):
     """A plane through the origin; its axes are x, along which it rises, y, and its normal. A level plane adds no terms.
 
     A place on it is (x, y) [m], along the plane; east is its x axis and north y.
@@ -22,7 +21,20 @@ class Plane(PlaneFrame, AbstractSurface):
     **Arguments:**
 
     - `tilt`: angle [rad] by which the plane rises along its own x axis, in [-pi/2, pi/2].
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> tippe.Plane()
+    Plane()
+    >>> tippe.Plane(tilt=0.1)
+    Plane(tilt=0.1 rad)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"tilt": "rad"}
 
     axes: ClassVar[int] = 2
     # "outside" is what one calls the only side of a plane where grounds are compared.

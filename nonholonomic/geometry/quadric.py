@@ -3,7 +3,7 @@
 import abc
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 from ..validation import Bound, as_number, require
 from .level import AbstractLevel
-from .moving import SphereFrame
 from .surface import AbstractSurface, Place
 from .vector import Component, Vector, dot, multiply, scale, subtract, sum_vectors
 
@@ -74,13 +73,24 @@ class AbstractQuadric(AbstractSurface):
             yield Bound(place[1], "place[1]", at_least=-limit, at_most=limit, why=why)
 
 
-class Sphere(SphereFrame, AbstractQuadric):
+class Sphere(AbstractQuadric):
     """A sphere about the origin.
 
     **Arguments:**
 
     - `radius`: radius [m], positive.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> tippe.Sphere(radius=0.5)
+    Sphere(radius=0.5 m)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"radius": "m"}
 
     radius: Float[Array, "..."] = eqx.field(converter=as_number)
 
@@ -105,7 +115,18 @@ class Spheroid(AbstractQuadric, AbstractLevel):
 
     - `equatorial`: equatorial radius A [m], positive.
     - `polar`: polar semi-axis c [m], positive.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Spheroid(equatorial=6.0, polar=3.0)
+    Spheroid(equatorial=6 m, polar=3 m)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"equatorial": "m", "polar": "m"}
 
     equatorial: Float[Array, "..."] = eqx.field(converter=as_number)
     polar: Float[Array, "..."] = eqx.field(converter=as_number)

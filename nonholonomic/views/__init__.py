@@ -9,7 +9,9 @@ from .meshes import wheel as wheel
 from .page import Page as Page
 from .page import can_view as can_view
 from .page import page as page
+from .plot import draw_portrait as draw_portrait
 from .plot import draw_table as draw_table
+from .plot import new_figure as new_figure
 from .stage import COLOURS as COLOURS
 from .stage import DARK as DARK
 from .stage import PALE as PALE
@@ -21,3 +23,4 @@ from .stage import Show as Show
 from .stage import Stage as Stage
 from .stage import Trace as Trace
 from .stage import turned as turned
+from .viewable import Viewable as Viewable

@@ -78,7 +78,12 @@ def wheel(radius: float, width: float, colours: tuple[int, int]) -> tuple[Mesh, 
     tyre = revolved(edge, colours[0])
     across = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     spokes = [
-        bar((-inner * np.cos(a), 0.0, -inner * np.sin(a)), (inner * np.cos(a), 0.0, inner * np.sin(a)), 0.35 * half, colour)
+        bar(
+            (-inner * np.cos(a), 0.0, -inner * np.sin(a)),
+            (inner * np.cos(a), 0.0, inner * np.sin(a)),
+            0.35 * half,
+            colour,
+        )
         for a, colour in zip(np.pi * np.arange(3) / 3.0, (colours[1], colours[0], colours[0]), strict=True)
     ]
     return tyre._replace(vertices=tyre.vertices @ across), *spokes

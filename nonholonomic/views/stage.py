@@ -125,9 +125,7 @@ def matrices(turning: Float[np.ndarray, "times 4"]) -> Float[np.ndarray, "times 
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def between(
-    times: Float[np.ndarray, " times"], values: Float[np.ndarray, "times ..."], at: Float[np.ndarray, " frames"]
-) -> Float[np.ndarray, "frames ..."]:
-    """Values between given times, on straight lines."""
-    columns = np.reshape(values, (len(times), -1)).T
-    return np.stack([np.interp(at, times, column) for column in columns], axis=-1).reshape(len(at), *values.shape[1:])
+def nearest(times: Float[np.ndarray, " times"], at: Float[np.ndarray, " frames"]) -> Int[np.ndarray, " frames"]:
+    """The numbers of the times that are nearest to given ones."""
+    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+    return after - (at - times[after - 1] < times[after] - at)
