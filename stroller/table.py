@@ -9,12 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import AbstractSurface, Plane
+from nonholonomic.geometry import AbstractSurface
 from nonholonomic.integration import (
-    CROSSED,
     FAILED,
     GUARD_LOST,
-    AbstractProblem,
     Settings,
     compiled_march,
     explicit_tableau,
@@ -24,12 +22,11 @@ from nonholonomic.sweeps import Axis, Table, Variable, axis
 from nonholonomic.sweeps import grid as grids
 from nonholonomic.validation import as_number, require
 
-from .dynamics import Dynamics, State
-from .heading import Projected
+from .dynamics import State
 from .input import Input
 from .launch import Launch
+from .ride import RideProblem, as_module
 from .scene import Scene
-from .trajectory import CONTACT_ROUND_OFF, RANK_LOST
 
 #: What the numbers of a place in the fixed frame are called.
 FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
@@ -57,47 +54,6 @@ UNITS |= {"steering_spring": "N m rad-1", "gravity": "m s-2", "tilt": "rad", "ra
 UNITS |= {"polar": "m", "rolling": "N s m-1", "front": "N s m-1", "scrub": "N m s", "coefficient": "1"}
 UNITS |= {"ring": "m", "tube": "m", "p": "m"}
 UNITS |= {"speed": "m s-1", "steering_rate": "rad s-1", "force": "N", "torque": "N m", "heading": "rad"}
-
-
-class RideProblem(AbstractProblem):
-    """Rides of many cells. Where contact is watched, a ride ends where the ground would have to pull."""
-
-    dynamics: Dynamics
-    input: Input | None
-    states: Float[Array, "components cells"]
-    scales: Float[Array, "components cells"]
-    press: Float[Array, "..."]
-    watched: bool = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, scene: Scene, launch: Launch, controls: Input | None, cells: int, watched: bool) -> "RideProblem":
-        """The problem of the given number of cells; every number is a scalar or one per cell."""
-
-        def spread(states):
-            return jnp.broadcast_to(states.reshape(states.shape[0], -1), (states.shape[0], cells))
-
-        one = cls.single(scene, launch, controls)
-        watched = watched and not isinstance(scene.surface, Plane)
-        return dataclasses.replace(one, states=spread(one.states), scales=spread(one.scales), watched=watched)
-
-    @classmethod
-    def single(cls, scene: Scene, launch: Launch, controls: Input | None) -> "RideProblem":
-        """The problem of one ride, which goes on where contact is lost."""
-        driven = controls is not None
-        press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
-        return cls(scene.dynamics, controls, scene.state(launch, driven), scene.scales(launch, driven), press, False)
-
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        return self.states, self.scales
-
-    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.dynamics.field(time, state, self.input)
-
-    def crossing(self, state: Float[Array, "components lanes"]) -> Any:
-        return self.dynamics.contact(state) / self.press + CONTACT_ROUND_OFF if self.watched else None
-
-    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.dynamics.rank(state) / RANK_LOST - 1.0 if isinstance(self.dynamics.heading, Projected) else None
 
 
 def sweep(
@@ -138,6 +94,7 @@ def sweep(
     scene.check(launch)
     require(t1, "t1", above=0.0)
     require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+    controls = as_module(input, scene, launch)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
     grid = named_axes(axes, scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.
@@ -145,18 +102,15 @@ def sweep(
         changed = replaced(roots, {one.number: one.values})
         changed["scene"].check(changed["launch"])
 
-    def march(cells: dict[str, Any], size: int, count: int, watched: bool) -> tuple[RideProblem, Any]:
-        problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", input), size, watched)
-        return problem, compiled_march(problem, as_number(t1), jnp.asarray(count), Settings(tolerance, solver))[0]
-
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
         cells = replaced(roots, columns)
         size = next((len(values) for values in columns.values()), 1)
-        problem, outcome = march(cells, size, count, watched=True)
-        lost = np.asarray(outcome.status == CROSSED)
-        contact_time = np.where(lost, outcome.end_time, np.inf)
-        if lost.any() or (count == 0 and problem.watched):
-            problem, outcome = march(cells, size, count, watched=False)
+        problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", controls), size, watched=True)
+        horizon, settings = as_number(t1), Settings(tolerance, solver)
+        # A ride goes on where contact is lost, as if the ground could pull.
+        outcome, _ = compiled_march(problem, horizon, jnp.asarray(count), settings, passes=problem.watched)
+        contact_time = np.asarray(outcome.first_crossing)
+        lost = np.isfinite(contact_time)
         words = np.select([outcome.status == FAILED, outcome.status == GUARD_LOST, lost], [3, 2, 1], 0)
         ends = read_ends(cells["scene"], outcome.state, problem.states)
         return {name: np.asarray(values) for name, values in ends.items()} | {

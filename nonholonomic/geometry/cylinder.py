@@ -8,12 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..validation import Bound, as_number
-from .moving import CylinderFrame
 from .surface import AbstractSurface, Place
 from .vector import Component, Vector, add, dot, multiply, scale, subtract
 
 
-class Cylinder(CylinderFrame, AbstractSurface):
+class Cylinder(AbstractSurface):
     """A cylinder whose axis is the y axis.
 
     A place on it is (y, eta): along the axis [m], and the angle [rad] about it from the lowest line, towards x; east is y

@@ -9,12 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..validation import Bound
-from .moving import PlaneFrame
 from .surface import CLOSED, OPEN, AbstractSurface, Place
 from .vector import Component, Vector, dot, none_if_zero
 
 
-class Plane(PlaneFrame, AbstractSurface):
+class Plane(AbstractSurface):
     """A plane through the origin; its axes are x, along which it rises, y, and its normal. A level plane adds no terms.
 
     A place on it is (x, y) [m], along the plane; east is its x axis and north y.

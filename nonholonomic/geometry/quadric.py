@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 from ..validation import Bound, as_number, require
 from .level import AbstractLevel
-from .moving import SphereFrame
 from .surface import AbstractSurface, Place
 from .vector import Component, Vector, dot, multiply, scale, subtract, sum_vectors
 
@@ -74,7 +73,7 @@ class AbstractQuadric(AbstractSurface):
             yield Bound(place[1], "place[1]", at_least=-limit, at_most=limit, why=why)
 
 
-class Sphere(SphereFrame, AbstractQuadric):
+class Sphere(AbstractQuadric):
     """A sphere about the origin.
 
     **Arguments:**

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import tippe
 from nonholonomic.geometry import (
     Cylinder,
     Graph,
@@ -277,14 +276,6 @@ def test_a_level_plane_carries_no_terms():
 def test_a_tilt_may_be_traced_through_zero():
     slope = jax.grad(lambda tilt: Plane(tilt).elevation((jnp.asarray(2.0), jnp.asarray(1.0), None)))(0.0)
     np.testing.assert_allclose(slope, 2.0)
-
-
-def test_the_tippe_top_refuses_what_has_no_moving_frame():
-    top = tippe.Top(0.01, 0.02, 0.002, 1e-6, 1e-6)
-    with pytest.raises(ValueError, match="must be level for a rolling ball"):
-        tippe.Scene(top, Plane(tilt=0.1))
-    with pytest.raises(ValueError, match="surface = Spheroid"):
-        tippe.Scene(top, Spheroid(1.0, 0.5))
 
 
 @pytest.mark.parametrize(
