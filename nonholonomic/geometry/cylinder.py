@@ -21,6 +21,12 @@ class Cylinder(AbstractSurface):
     **Arguments:**
 
     - `radius`: radius [m], positive.
+
+    **Example:**
+
+    >>> position, east, north = Cylinder(0.5).chart((2.0, 0.0))
+    >>> [float(part) for part in position]
+    [0.0, 2.0, -0.5]
     """
 
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("y", "m"), ("eta", "rad"))

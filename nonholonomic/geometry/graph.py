@@ -1,5 +1,6 @@
 """Open surfaces: the paraboloid and the graph of any smooth function."""
 
+import abc
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
@@ -34,9 +35,9 @@ class AbstractOpen(AbstractSurface):
         position = (x, y, self.ground(x, y))
         return position, *tangents(self.normal(position))
 
+    @abc.abstractmethod
     def ground(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
         """Height z [m] of the surface at (x, y) [m]."""
-        raise NotImplementedError
 
 
 class Paraboloid(AbstractOpen, AbstractLevel):
@@ -45,6 +46,12 @@ class Paraboloid(AbstractOpen, AbstractLevel):
     **Arguments:**
 
     - `p`: radius of curvature [m] at the lowest point, positive.
+
+    **Example:**
+
+    >>> position, east, north = Paraboloid(2.0).chart((2.0, 0.0))
+    >>> [float(part) for part in position]
+    [2.0, 0.0, 1.0]
     """
 
     p: Float[Array, "..."] = eqx.field(converter=as_number)
@@ -86,6 +93,13 @@ class Graph(AbstractOpen, AbstractDifferentiated):
       differentiated by.
 
     **Raises:** `ValueError` for what is not such a function.
+
+    **Example:**
+
+    >>> saddle = Graph(lambda x, y: x * y)
+    >>> position, east, north = saddle.chart((0.0, 0.0))
+    >>> float(saddle.gaussian_curvature(position))
+    -1.0
     """
 
     height: Any = eqx.field(converter=lambda given: as_function(given, "height", ("x", "y")))

@@ -25,6 +25,12 @@ class Implicit(AbstractDifferentiated):
       `equinox.Module` are numbers of the scene, to be swept and differentiated by.
 
     **Raises:** `ValueError` for what is not such a function.
+
+    **Example:**
+
+    >>> hollow = Implicit(lambda x, y, z: 1.0 - x**4 - y**4 - z**4)
+    >>> [float(part) + 0.0 for part in hollow.normal((0.0, 0.0, -1.0))]
+    [0.0, 0.0, 1.0]
     """
 
     sides: ClassVar[Mapping[str, float]] = DIVIDED

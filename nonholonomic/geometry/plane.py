@@ -21,6 +21,11 @@ class Plane(AbstractSurface):
     **Arguments:**
 
     - `tilt`: angle [rad] by which the plane rises along its own x axis, in [-pi/2, pi/2].
+
+    **Example:**
+
+    >>> float(Plane(tilt=0.5).elevation((2.0, 1.0, None)))
+    0.958851077208406
     """
 
     axes: ClassVar[int] = 2

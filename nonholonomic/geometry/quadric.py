@@ -79,6 +79,11 @@ class Sphere(AbstractQuadric):
     **Arguments:**
 
     - `radius`: radius [m], positive.
+
+    **Example:**
+
+    >>> float(Sphere(2.0).distance((0.0, 0.0, -3.0)))
+    1.0
     """
 
     radius: Float[Array, "..."] = eqx.field(converter=as_number)
@@ -104,6 +109,12 @@ class Spheroid(AbstractQuadric, AbstractLevel):
 
     - `equatorial`: equatorial radius A [m], positive.
     - `polar`: polar semi-axis c [m], positive.
+
+    **Example:**
+
+    >>> position, east, north = Spheroid(2.0, 1.0).chart((0.0, 0.0))
+    >>> float(Spheroid(2.0, 1.0).gaussian_curvature(position))
+    1.0
     """
 
     equatorial: Float[Array, "..."] = eqx.field(converter=as_number)

@@ -21,6 +21,12 @@ class Torus(AbstractSurface):
 
     - `ring`: radius [m] of the circle along the middle of the tube, positive.
     - `tube`: radius [m] of the tube, positive and less than `ring`.
+
+    **Example:**
+
+    >>> position, east, north = Torus(3.0, 1.0).chart((0.0, 0.0))
+    >>> [float(part) for part in position]
+    [4.0, 0.0, 0.0]
     """
 
     ring: Float[Array, "..."] = eqx.field(converter=as_number)
