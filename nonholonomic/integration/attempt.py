@@ -26,8 +26,8 @@ class Control(NamedTuple):
 
     `tableau` and `order` are the method's; `rtol` the relative tolerance; `t1` the horizon [s], one for all or one per lane;
     a lane that needs more than `max_steps` has failed; `passes` says whether a run goes on through its event; `parts` is of how
-    many equal parts the state is made, such as a state and its variations: a step is judged by the part that errs most; `looped`
-    says whether the stages of a step are done in a loop.
+    many equal parts the state is made, such as a state and its variations: a step is judged by the part that errs most;
+    `looped` says whether the stages of a step are done in a loop.
     """
 
     tableau: diffrax.ButcherTableau
