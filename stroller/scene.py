@@ -1,14 +1,14 @@
 """The scene: what rolls, on what ground, with what friction, under what gravity."""
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.geometry import AbstractSurface, Plane
+from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane
 from nonholonomic.validation import Bound, Bounded, all_bounds, as_number, is_traced, legal, require_all
 
 from .dynamics import Dynamics, State, stacked
@@ -54,11 +54,30 @@ class Scene(Bounded):
       paraboloid or graph, on the "positive" side of an implicit surface.
     - `fork`: "relative" if the fork's inertia resists the steering rate phi' alone, "absolute" if it resists its whole
       rate phi' + Omega about the steering axis, as a rigid fork does.
-    - `heading`: "intrinsic", or "projected" to reproduce the paper, which constrains the horizontal projection of the
-      velocities (`stroller.md`, section 3, says why that is not the default).
+    - `heading`: "intrinsic", or "projected" to reproduce the paper on a plane, sphere or spheroid, which constrains the
+      horizontal projection of the velocities (`stroller.md`, section 3, says why that is not the default).
 
     **Raises:** `ValueError` if a part is of the wrong kind, a word is not one of these, or a number is out of range.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> print(scene)
+    Scene
+      body      Stroller(mass=12 kg, wheelbase=0.7 m, inertia=1.5 kg m², steering_inertia=0.05 kg m²)
+      surface   Plane()
+      friction  Damping(rolling=2 N s/m, front=1 N s/m, scrub=0.2 N m s, steering=0.05 N m s)
+      gravity   9.81 m/s²
+      fork      'relative'
+      heading   'intrinsic'
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"gravity": "m s-2"}
 
     body: Stroller
     surface: AbstractSurface = Plane()
@@ -78,6 +97,8 @@ class Scene(Bounded):
         self.surface.sign(self.side, DRIVES)
         if not isinstance(self.surface, Plane) and self.body.centre is not None:
             raise ValueError(f"centre = {self.body.centre!r} must be 0.0 on a curved surface, where it is not exact")
+        if self.heading == "projected" and not isinstance(self.surface, Plane | AbstractQuadric):
+            raise ValueError(f"heading = 'projected' must be 'intrinsic' on a {type(self.surface).__name__}")
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.gravity, "gravity", at_least=0.0)
@@ -124,10 +145,12 @@ class Scene(Bounded):
 
     def level(self, launch: Launch) -> Any:
         """Whether a launch with a projected heading is on the equator; concrete for a concrete launch."""
-        if self.heading != "projected" or isinstance(self.surface, Plane):
+        if self.heading != "projected" or not isinstance(self.surface, AbstractQuadric):
             return False
-        of = jnp if is_traced(launch.place[1]) else np
-        return of.abs(of.sin(of.asarray(launch.place[1]))) < RIGHT_ANGLE
+        polar, last = self.surface.semi_axes[1], launch.place[-1]
+        of = jnp if is_traced(last) or is_traced(polar) else np
+        sine = of.sin(of.asarray(last)) if len(launch.place) == 2 else of.asarray(last) / of.asarray(polar)
+        return of.abs(sine) < RIGHT_ANGLE
 
     def may_start(self, launch: Launch, *others: Any) -> Bool[Array, ""]:
         """Whether the numbers of the scene, a launch and other modules are legal, for those that `check` could not see."""

@@ -12,12 +12,29 @@ from nonholonomic.sweeps import Axis, axis
 from .inversion import check_run
 from .launch import Launch
 from .scene import Scene
+from .top import Top
 
 #: Cells that are checked together, to bound the memory it takes.
 CHECKED_AT_ONCE = 1 << 20
 
-UNITS = {"mass": "kg", "radius": "m", "offset": "m", "I1": "kg m2", "I3": "kg m2", "gravity": "m s-2"}
-UNITS |= {"theta": "rad", "eta": "rad", "azimuth": "rad", "spin": "rad s-1"}
+UNITS = Top.units | Scene.units | Launch.units
+
+#: What the axes are, in words.
+LONG_NAMES = {
+    "theta": "θ(0)",
+    "eta": "η(0)",
+    "azimuth": "φ(0)",
+    "spin": "spin ω₃(0)",
+    "mu": "friction μ",
+    "mass": "mass m",
+    "radius": "radius",
+    "offset": "offset a",
+    "I1": "moment of inertia I₁",
+    "I3": "moment of inertia I₃",
+    "gravity": "gravity g",
+    "slip_speed": "slip speed",
+    "restitution": "restitution e_N",
+}
 
 #: The parts of a launch that are several numbers: what an axis along each is called, and its unit.
 SEVERAL = {
@@ -67,7 +84,8 @@ def launches(
     for number, name in names.items():
         if number not in fixed:
             alone = counts[name] == 1 and name not in taken
-            grid.append(axis(name if alone else number, number, units.get(name, "1"), values[number]))
+            unit, long_name = units.get(name, "1"), LONG_NAMES.get(name, name)
+            grid.append(axis(name if alone else number, number, unit, values[number], long_name))
     roots = with_numbers({"scene": scene, "launch": launch}, fixed)
     check_run(roots["scene"], roots["launch"], t1, tolerance)
     _check_cells(roots, grid)

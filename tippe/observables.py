@@ -13,8 +13,12 @@ from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import Component, Vector, dot, scale, sum_vectors
 from nonholonomic.integration import Followed, PhasedPath
+from nonholonomic.parameters import text_as_html
+from nonholonomic.sweeps import Table
 from nonholonomic.validation import is_traced, require
+from nonholonomic.views import draw_portrait
 
+from .quantities import table_of
 from .sampled import STATUS
 from .scene import Scene
 from .state import parts
@@ -101,6 +105,11 @@ class AbstractTrajectory(eqx.Module):
         return self.scene.theta(self.states)
 
     @of_each_run
+    def theta_rate(self) -> Float[Array, " times"]:
+        """Rate of change of theta [rad/s]."""
+        return jax.jvp(self.scene.theta, (self.states,), (self.scene.field(self.states),))[1]
+
+    @of_each_run
     def eta(self) -> Float[Array, " times"]:
         """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
         return self.scene.frame.angle(self._place, self._path)
@@ -158,6 +167,41 @@ class AbstractTrajectory(eqx.Module):
         check_increasing(times)
         return self.resampled(times)
 
+    def to_table(self) -> Table:
+        """All that can be read off the run, as a `Table` over its times.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        return table_of(self)
+
+    def to_xarray(self) -> Any:
+        """The run as an `xarray.Dataset` over "time" (needs xarray), with units and names.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        return self.to_table().to_xarray()
+
+    def save(self, path: Any) -> None:
+        """Write the run to an HDF5 file that `tippe.Table.load` and xarray (`engine="h5netcdf"`) read.
+
+        **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for a batch of runs.
+        """
+        self.to_table().save(path)
+
+    def portrait(self, x: str = "theta", y: str = "theta_rate", ax: Any = None) -> Any:
+        """Draw one quantity over another, a phase portrait (needs matplotlib).
+
+        **Arguments:**
+
+        - `x`, `y`: variables of `to_table()`, such as "theta", or one component, such as "position.x".
+        - `ax`: axes of matplotlib to draw in, instead of a new figure.
+
+        **Returns:** the matplotlib figure, or `ax`.
+
+        **Raises:** `ValueError` for an unknown variable.
+        """
+        return draw_portrait(self.to_table(), x, y, ax)
+
     def with_stats(self, path: Followed | PhasedPath, **more: Any) -> Self:
         """The same run with what it took, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and more."""
         energy, work = np.asarray(self.energy), np.asarray(self.work)
@@ -211,3 +255,6 @@ class AbstractTrajectory(eqx.Module):
 
     def __repr__(self) -> str:
         return str(self)
+
+    def _repr_html_(self) -> str:
+        return text_as_html(str(self))

@@ -26,6 +26,7 @@ from .plane import Plane as Plane
 from .quadric import AbstractQuadric as AbstractQuadric
 from .quadric import Sphere as Sphere
 from .quadric import Spheroid as Spheroid
+from .surface import CLOSED as CLOSED
 from .surface import AbstractSurface as AbstractSurface
 from .surface import Place as Place
 from .torus import Torus as Torus

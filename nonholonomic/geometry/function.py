@@ -6,9 +6,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from ..validation import is_traced
+from ..validation import as_number, is_traced
 
 
 class Plain(eqx.Module):
@@ -37,7 +38,7 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
     if not callable(value):
         raise ValueError(f"{name} = {value!r} must be a function of ({', '.join(arguments)})")
     if isinstance(value, eqx.Module):
-        value = jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array_like(leaf) else leaf, value)
+        value = jax.tree.map(lambda leaf: as_number(leaf) if isinstance(leaf, float | np.ndarray) else leaf, value)
     zeros = (jnp.zeros(()),) * len(arguments)
     try:
         traced = jax.make_jaxpr(value)(*zeros)

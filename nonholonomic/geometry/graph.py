@@ -45,7 +45,19 @@ class Paraboloid(AbstractOpen, AbstractLevel):
     **Arguments:**
 
     - `p`: radius of curvature [m] at the lowest point, positive.
+
+    **Example:**
+
+    ```
+    >>> import nonholonomic
+    >>> bowl = nonholonomic.Paraboloid(p=0.5)
+    >>> print(bowl.elevation((0.5, 0.0, 0.25)))
+    0.25
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"p": "m"}
 
     p: Float[Array, "..."] = eqx.field(converter=as_number)
 
@@ -86,6 +98,17 @@ class Graph(AbstractOpen, AbstractDifferentiated):
       differentiated by.
 
     **Raises:** `ValueError` for what is not such a function.
+
+    **Example:**
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> hills = nonholonomic.Graph(lambda x, y: 0.1 * jnp.cos(x) * jnp.cos(y))
+    >>> print(hills.elevation((0.0, 0.0, 0.1)))
+    0.1
+
+    ```
     """
 
     height: Any = eqx.field(converter=lambda given: as_function(given, "height", ("x", "y")))

@@ -25,8 +25,14 @@ Values = Shaped[np.ndarray, "..."]
 #: Stored for a cell that has not been computed, and the word for it.
 PENDING, UNREACHED = -1, "pending"
 
+#: The group of what the sweep itself needs, apart from the variables that a reader sees.
+SWEEP = "sweep"
+
 #: The blocks: the first cell of each, whether it is finished, and its checksum.
-FIRSTS, FINISHED, CHECKSUMS = "block", "block_finished", "block_checksum"
+FIRSTS, FINISHED, CHECKSUMS = f"{SWEEP}/block", f"{SWEEP}/block_finished", f"{SWEEP}/block_checksum"
+
+#: The attribute of a table that names its variables in words; in a file each variable has its own, as in CF.
+LONG_NAMES, LONG_NAME = "long_names", "long_name"
 
 #: The file's attribute that names the dimensions which variables have besides the grid's.
 INNER = "inner"
@@ -145,8 +151,14 @@ def _fill(
     attributes = {
         name: value if isinstance(value, str | int | float) else json.dumps(value) for name, value in attributes.items()
     }
+    long_names = json.loads(attributes.get(LONG_NAMES, "{}"))
+    if long_names:
+        # As they will be read, for the checksum.
+        long_names = {name: text for name, text in long_names.items() if name in coords | variables}
+        attributes[LONG_NAMES] = json.dumps(long_names, sort_keys=True)
     for name, value in attributes.items():
-        _set(file, name, value)
+        if name != LONG_NAMES:
+            _set(file, name, value)
     known, words, stored = words, {}, {}
     for name, values in (coords | variables).items():
         stored[name], meanings = _coded(np.asarray(values), known.get(name))
@@ -167,6 +179,8 @@ def _fill(
             _set(array, "flag_meanings", " ".join(words[name]))
         else:
             _set(array, "units", units[name])
+        if name in long_names:
+            _set(array, LONG_NAME, long_names[name])
     whole = len(pending) == 0
     header = header_checksum(coords, units, attributes, words)
     checksum = block_checksum(header, {name: values.reshape(-1) for name, values in stored.items()}) if whole else 0
@@ -184,8 +198,11 @@ def _set(of: Any, name: str, value: Any) -> None:
     # Only files need it.
     import h5py
 
-    kind = h5py.string_dtype("utf-8", max(1, len(value.encode()))) if isinstance(value, str) else None
-    of.attrs.create(name, value, dtype=kind)
+    if isinstance(value, str):
+        stored = value.encode()
+        of.attrs.create(name, stored, dtype=h5py.string_dtype("utf-8", max(1, len(stored))))
+    else:
+        of.attrs.create(name, value)
 
 
 def _attribute(of: Any, name: str) -> Any:
@@ -260,7 +277,7 @@ def stored_array(file: "h5py.File", name: str) -> "h5py.Dataset":
 
 
 def _contents(file: "h5py.File") -> Grid:
-    coords, variables, units, words = {}, {}, {}, {}
+    coords, variables, units, words, long_names = {}, {}, {}, {}, {}
     if "request" not in file.attrs:
         raise ValueError("it names no request")
     # The marks come first: what is marked by now is complete, even if another process is writing the file.
@@ -269,7 +286,7 @@ def _contents(file: "h5py.File") -> Grid:
     axes = json.loads(attributes["axes"])
     inner = {name: tuple(dims) for name, dims in json.loads(attributes.get(INNER, "{}")).items()}
     dims = dict.fromkeys((*axes, *(dim for dims in inner.values() for dim in dims)))
-    for name in (*dims, *(name for name in file if name not in (*dims, FIRSTS, FINISHED, CHECKSUMS))):
+    for name in (*dims, *(name for name in file if name not in (*dims, SWEEP))):
         stored = stored_array(file, name)
         if name in dims:
             coords[name] = stored[()]
@@ -277,10 +294,14 @@ def _contents(file: "h5py.File") -> Grid:
             variables[name] = np.asarray(stored[()])
         else:
             raise ValueError(f"{name} has the wrong shape")
+        if LONG_NAME in stored.attrs:
+            long_names[name] = _attribute(stored, LONG_NAME)
         if "flag_meanings" in stored.attrs:
             words[name] = tuple(_attribute(stored, "flag_meanings").split())
         else:
             units[name] = _attribute(stored, "units")
+    if long_names:
+        attributes[LONG_NAMES] = json.dumps(long_names, sort_keys=True)
     cells = int(np.prod([len(coords[name]) for name in axes], dtype=int))
     ends = np.append(firsts[1:], cells)
     if not (len(firsts) == len(marks) == len(checksums) > 0 == firsts[0]) or np.any(ends < firsts):

@@ -16,34 +16,36 @@ from jaxtyping import Shaped
 from ..progress import Progress
 from ..validation import require
 from ._blockfile import BlockFile, Layout
-from ._hdf5 import UNREACHED
+from ._hdf5 import LONG_NAMES, UNREACHED
 from .table import Table
 
 Values = Shaped[np.ndarray, "..."]
 
 
 class Axis(NamedTuple):
-    """One axis of a grid: its name in the table, the full name of the parameter it varies, and the unit."""
+    """One axis of a grid: its name in the table, the full name of the parameter it varies, the unit, and a name in words."""
 
     name: str
     number: str
     unit: str
     values: Values
+    long_name: str = ""
 
 
 class Variable(NamedTuple):
     """One result of every cell: its unit and dtype, and, if it is a code, the words it stands for.
 
-    `inner` names the dimensions of a result that is an array, in order.
+    `inner` names the dimensions of a result that is an array, in order; `long_name` says what it is.
     """
 
     unit: str
     kind: Any
     words: tuple[str, ...] | None = None
     inner: tuple[str, ...] = ()
+    long_name: str = ""
 
 
-def axis(name: str, number: str, unit: str, values: Any) -> Axis:
+def axis(name: str, number: str, unit: str, values: Any, long_name: str = "") -> Axis:
     """An axis, checked.
 
     **Raises:** `ValueError` that names the axis if the values are not a non-empty one-dimensional array of finite numbers.
@@ -52,7 +54,7 @@ def axis(name: str, number: str, unit: str, values: Any) -> Axis:
     array = np.asarray(values, dtype=float)
     if array.ndim != 1 or array.size == 0:
         raise ValueError(f"{name} must be a number or a non-empty list of numbers, not of shape {array.shape}")
-    return Axis(name, number, unit, array)
+    return Axis(name, number, unit, array, long_name)
 
 
 def sweep(
@@ -99,6 +101,11 @@ def sweep(
         "axes": json.dumps([one.name for one in axes]),
         "versions": json.dumps(versions()),
     }
+    long_names = {one.name: one.long_name for one in (*axes, *inner)}
+    long_names |= {name: one.long_name for name, one in variables.items()}
+    if any(long_names.values()):
+        named = {name: long_name for name, long_name in long_names.items() if long_name}
+        attributes[LONG_NAMES] = json.dumps(named, sort_keys=True)
     words = {name: one.words for name, one in variables.items() if one.words is not None}
     kinds = {name: one.kind for name, one in variables.items()}
     dims = {name: one.inner for name, one in variables.items() if one.inner}

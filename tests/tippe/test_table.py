@@ -203,12 +203,12 @@ def test_a_killed_sweep_leaves_a_file_that_opens_and_resumes(tmp_path):
         time.sleep(0.02)
         if path.exists():
             with h5py.File(path, "r") as file:
-                finished = int(file["block_finished"][()].sum())
+                finished = int(file["sweep/block_finished"][()].sum())
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
     part = tippe.Table.load(path)
     with h5py.File(path, "r") as file:
-        marks = file["block_finished"][()].astype(bool)
+        marks = file["sweep/block_finished"][()].astype(bool)
     assert 3 <= marks.sum() < 200
     cells = part.status.ravel().reshape(200, 4)
     assert (cells[marks] != "pending").all()
@@ -230,7 +230,7 @@ def test_a_table_killed_again_and_again_is_the_one_that_was_not(tmp_path, monkey
             time.sleep(random.uniform(0.0, 0.02))
             if path.exists():
                 with h5py.File(path, "r") as file:
-                    found = set(np.flatnonzero(file["block_finished"]).tolist())
+                    found = set(np.flatnonzero(file["sweep/block_finished"]).tolist())
         os.kill(process.pid, signal.SIGKILL)
         process.communicate()
         cells = tippe.Table.load(path).status.reshape(200, 4)
@@ -383,7 +383,8 @@ def test_a_table_prints_and_draws(table):
     assert "theta (3), spin (2)" in str(table)
     assert "6 inverted" in str(table)
     figure = table.plot()
-    assert figure.axes[0].get_xlabel() == "theta [rad]"
+    assert figure.axes[0].get_xlabel() == "θ(0) [rad]"
+    assert figure.axes[0].get_ylabel() == "inversion time [s]"
     with pytest.raises(ValueError, match="variable = 'status' must be a numeric variable"):
         table.plot("status")
     with pytest.raises(AttributeError, match="no variable 'tme'; it has time"):
