@@ -21,6 +21,7 @@ from nonholonomic.views import Stage, Viewable, draw_portrait
 from .quantities import table_of
 from .sampled import STATUS
 from .scene import Scene
+from .state import parts
 from .view import as_stages
 
 
@@ -112,7 +113,7 @@ class AbstractTrajectory(eqx.Module, Viewable):
     @of_each_run
     def eta(self) -> Float[Array, " times"]:
         """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
-        return self.scene.frame.angle(self._place, tuple(self.cyclic))
+        return self.scene.frame.angle(self._place, self._path)
 
     @of_each_run
     def azimuth(self) -> Float[Array, " times"]:
@@ -143,7 +144,7 @@ class AbstractTrajectory(eqx.Module, Viewable):
     def position(self) -> Float[Array, "times 3"]:
         """Position of the sphere's centre [m]; the plane is z = 0, the cylinder's axis x = z = 0, and a run on the plane
         starts above the origin."""
-        frame, where = self.scene.frame, (self._place, tuple(self.cyclic))
+        frame, where = self.scene.frame, (self._place, self._path)
         centre = sum_vectors(frame.position(*where), scale(self.above[0], frame.axes(*where)[2]))
         return jnp.stack(centre, axis=-1)
 
@@ -216,12 +217,29 @@ class AbstractTrajectory(eqx.Module, Viewable):
         }
         return eqx.tree_at(lambda one: one.stats, self, stats | more)
 
+    @of_each_run
+    def normal(self) -> Float[Array, "times 3"]:
+        """The arena's unit normal n where the top is, from the arena to the sphere's centre."""
+        return jnp.stack(self.scene.frame.axes(self._place, self._path)[2], axis=-1)
+
+    @of_each_run
+    def angular_velocity(self) -> Float[Array, "times 3"]:
+        """Angular velocity of the body [rad/s]."""
+        body, (_, e, L, _) = self.scene.body, parts(self.states)
+        along = (1.0 / body.I3 - 1.0 / body.I1) * dot(L, e)
+        return self._fixed(sum_vectors(scale(1.0 / body.I1, L), scale(along, e)))
+
+    @property
+    def _path(self) -> tuple[Array, ...]:
+        """The cyclic coordinates of the arena's frame."""
+        return tuple(self.cyclic)
+
     @property
     def _place(self) -> tuple[Array, ...]:
         return tuple(self.states[8:])
 
     def _fixed(self, vector: Vector) -> Float[Array, "times 3"]:
-        axes = self.scene.frame.axes(self._place, tuple(self.cyclic))
+        axes = self.scene.frame.axes(self._place, self._path)
         return jnp.stack([dot(vector, directions) for directions in zip(*axes, strict=True)], axis=-1)
 
     def __str__(self) -> str:
