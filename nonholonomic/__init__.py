@@ -13,3 +13,4 @@ from .geometry import AbstractSurface as AbstractSurface
 from .geometry import Cylinder as Cylinder
 from .geometry import Plane as Plane
 from .geometry import Sphere as Sphere
+from .sweeps import local_processes as local_processes

@@ -1,7 +1,8 @@
 """Many rides in one batched call: every combination of some parameters of scene, launch and input."""
 
 import dataclasses
-from typing import Any
+from concurrent.futures import Executor
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -20,8 +21,8 @@ from nonholonomic.integration import (
     explicit_tableau,
 )
 from nonholonomic.parameters import description, with_numbers
-from nonholonomic.sweeps import Axis, Table, Variable, axis
-from nonholonomic.sweeps import grid as grids
+from nonholonomic.sweeps import Axis, Table, Variable, axis, cells_to_check
+from nonholonomic.sweeps import sweep as computed
 from nonholonomic.validation import as_number, require
 
 from .dynamics import Dynamics, State
@@ -109,6 +110,8 @@ def sweep(
     tolerance: float = 1e-9,
     solver: diffrax.AbstractERK | None = None,
     path: Any = None,
+    progress: bool = True,
+    executor: Executor | None = None,
 ) -> Table:
     """The ends of all rides over a grid of parameters, in one batched call on all cores.
 
@@ -122,13 +125,18 @@ def sweep(
     - `tolerance`: relative tolerance of the integration.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
     - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
+    - `progress`: whether to show it, on a terminal or in a notebook.
+    - `executor`: who computes: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a
+      Dask client, to which blocks are handed as its workers become free; by default a thread for each core. The numbers
+      are the same, to the bit on the same kind of processor.
 
     **Returns:** a `Table` of the rides' ends: position `x`, `y`, `z` [m] in the fixed frame, `heading`, `end_steering`
     [rad], `end_speed` [m/s], `energy` [J], `residual` [J] of energy against work, `contact_time` [s] at which the ground
     first had to pull (infinite if never; the ride goes on), `end_time` [s], `status` ("completed", "contact_lost",
     "rank_lost" where a projected heading ended the ride, "failed"), `steps` and `rejected`.
 
-    **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
+    **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
+    `RuntimeError` for an executor that breaks down, or a worker with other versions.
     """
     solver = diffrax.Dopri8() if solver is None else solver
     explicit_tableau(solver)
@@ -140,22 +148,36 @@ def sweep(
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
     grid = named_axes(axes, isinstance(scene.surface, Plane))
     # The modules check every value of every axis here, before anything compiles.
-    for one in grid:
-        changed = replaced(roots, {one.number: one.values})
+    for cells in cells_to_check(grid):
+        changed = replaced(roots, cells)
         changed["scene"].check(changed["launch"])
 
-    def march(cells: dict[str, Any], size: int, count: int, watched: bool) -> tuple[RideProblem, Any]:
-        problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", input), size, watched)
-        return problem, compiled_march(problem, as_number(t1), jnp.asarray(count), Settings(tolerance, solver))[0]
+    request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
+    request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
+    request |= {"solver": type(solver).__name__, "input": "none" if input is None else described(input)}
+    request |= {one.number: "an axis" for one in grid}
+    job = RideJob(roots, input, float(t1), float(tolerance), solver)
+    return computed(job, grid, VARIABLES, request, path=path, progress=progress, executor=executor)
 
-    def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
-        cells = replaced(roots, columns)
+
+class RideJob(NamedTuple):
+    """What is asked of every cell, as data that can be sent to another process; see `sweep`."""
+
+    roots: dict[str, Any]
+    input: Input | None
+    t1: float
+    tolerance: float
+    solver: diffrax.AbstractERK
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which the first `count` are to be run."""
+        cells = replaced(self.roots, columns)
         size = next((len(values) for values in columns.values()), 1)
-        problem, outcome = march(cells, size, count, watched=True)
+        problem, outcome = self._march(cells, size, count, watched=True)
         lost = np.asarray(outcome.status == CROSSED)
         contact_time = np.where(lost, outcome.end_time, np.inf)
         if lost.any() or (count == 0 and problem.watched):
-            problem, outcome = march(cells, size, count, watched=False)
+            problem, outcome = self._march(cells, size, count, watched=False)
         words = np.select([outcome.status == FAILED, outcome.status == GUARD_LOST, lost], [3, 2, 1], 0)
         ends = read_ends(cells["scene"], outcome.state, problem.states)
         return {name: np.asarray(values) for name, values in ends.items()} | {
@@ -166,11 +188,10 @@ def sweep(
             "rejected": np.asarray(outcome.rejected),
         }
 
-    request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
-    request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
-    request |= {"solver": type(solver).__name__, "input": "none" if input is None else described(input)}
-    request |= {one.number: "an axis" for one in grid}
-    return grids.sweep(run, grid, VARIABLES, request, path=path)
+    def _march(self, cells: dict[str, Any], size: int, count: int, watched: bool) -> tuple[RideProblem, Any]:
+        problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", self.input), size, watched)
+        settings = Settings(self.tolerance, self.solver)
+        return problem, compiled_march(problem, as_number(self.t1), jnp.asarray(count), settings)[0]
 
 
 @eqx.filter_jit

@@ -17,7 +17,7 @@ import xarray
 from conftest import assert_close, rutstam_top
 
 import tippe
-from nonholonomic.sweeps import grid as sweeping
+from nonholonomic.sweeps import running as sweeping
 
 THETA, SPIN = [0.08, 0.1, 0.12], [90.0, 110.0]
 
@@ -182,7 +182,7 @@ def test_an_interrupted_sweep_resumes_and_recomputes_no_finished_block(rutstam_s
 
 KILLED = """
 import sys, numpy as np, tippe
-from nonholonomic.sweeps import grid as sweep
+from nonholonomic.sweeps import running as sweep
 sweep.block_for = lambda cells: 4
 sweep.workers = lambda: 1
 mass, radius = 0.02, 0.02

@@ -13,7 +13,7 @@ import xarray
 from conftest import assert_close, rutstam_top
 
 import tippe
-from nonholonomic.sweeps import grid as sweeping
+from nonholonomic.sweeps import running as sweeping
 
 # The same number of times, the same quantities and one size of block wherever it can be, so that one program serves.
 TIMES = np.linspace(0.0, 1.5, 31)

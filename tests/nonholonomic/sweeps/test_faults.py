@@ -17,7 +17,7 @@ import pytest
 from cheap_sweep import BLOCK, cheap_sweep, finished_blocks, resumed
 
 from nonholonomic.sweeps import Table
-from nonholonomic.sweeps import grid as sweeping
+from nonholonomic.sweeps import running as sweeping
 from nonholonomic.sweeps._blockfile import BlockFile
 
 pytestmark = pytest.mark.newest
