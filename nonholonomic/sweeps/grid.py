@@ -5,11 +5,9 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Shaped
 
 from ..validation import require
-
-Values = Shaped[np.ndarray, "..."]
+from .layout import Values
 
 #: Grids of at most this many cells are checked cell by cell before anything runs.
 CHECKED_WHOLE = 1 << 20

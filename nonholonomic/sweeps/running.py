@@ -3,11 +3,10 @@
 import contextlib
 import functools
 import json
-import math
 import os
 import uuid
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Any
 
@@ -16,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..progress import Progress
-from ._blockfile import BlockFile, Layout
-from ._hdf5 import UNREACHED, blank
-from .grid import Axis, Values, Variable, columns, size_of
+from ._blocks import Blocks
+from ._file import Stored
+from .grid import Axis, Variable, columns, size_of
 from .handing import DEATHS, Lost, handed_out
+from .layout import Layout, Values
 from .table import Table
 from .tasks import Job, Work, packed, remote_results, stamp, versions
 
@@ -27,7 +27,7 @@ from .tasks import Job, Work, packed, remote_results, stamp, versions
 HANDED_OUT = 512
 
 #: Blocks of a large grid, about, and what the results of one may take [bytes].
-BLOCKS, MOST_BYTES = 8192, 1 << 21
+BLOCKS, MOST_BYTES = 1024, 1 << 21
 
 
 def sweep(
@@ -65,65 +65,87 @@ def sweep(
     **Raises:** `OSError` or `ValueError` if the file cannot be written or holds another request; `RuntimeError` if the executor
     breaks down or a worker has other versions: what had finished is in the file.
     """
-    coords = {one.name: one.values for one in (*axes, *inner)}
-    units = {one.name: one.unit for one in (*axes, *inner) if one.values.dtype.kind != "U"}
-    units |= {name: one.unit for name, one in variables.items() if one.words is None}
     cells = size_of(axes)
     given = block_for(cells) if block is None else block
     given = given if most is None else min(given, most)
-    size = given * blocks_together(cells, given, variables, coords)
-    firsts = range(0, cells, size)
-    request = request | {"float": str(np.dtype(jnp.result_type(float)))}
-    attributes = {
-        "request": json.dumps(request),
-        "axes": json.dumps([one.name for one in axes]),
-        "versions": json.dumps(versions()),
-    }
-    words = {name: one.words for name, one in variables.items() if one.words is not None}
-    kinds = {name: one.kind for name, one in variables.items()}
-    dims = {name: one.inner for name, one in variables.items() if one.inner}
-    layout = Layout(coords, kinds, units, words, attributes, firsts, dims)
+    layout = layout_of(axes, inner, variables, request, given)
+    layout = layout._replace(block=given * blocks_together(layout, given))
     work = Work(job, axes, given)
-
-    file = None if path is None else BlockFile(path, layout)
+    store = Held(layout) if path is None else Blocks(path, layout)
     try:
-        found = layout.rows(layout.empty()) if file is None else file.values()
-        todo = [index for index in range(len(firsts)) if file is None or index not in file.finished]
-        counts = [min(size, cells - first) for first in firsts]
-        done = cells - sum(counts[index] for index in todo)
-        with Progress(cells, "cell", shown=progress) as shown, workforce(work, executor) as submit:
-            begun = executor is None
-            if begun:
-                if todo:
-                    work.compile()
-                shown.begin(done)
-            for index, values in handed_out(lambda index: submit(firsts[index], counts[index]), todo, HANDED_OUT):
-                if values is None:
-                    values = given_up(axes, variables, coords, firsts[index], counts[index])
-                for name, some in values.items():
-                    found[name][firsts[index] : firsts[index] + len(some)] = some
-                if file is not None:
-                    file.write(index, firsts[index], values)
-                done += counts[index]
+        found = store.filled(computed(work, layout, store.finished, executor, progress))
+        return Table.of(found) if isinstance(found, Stored) else Table.laid_out(layout, found)
+    except Lost as error:
+        kept = (
+            "nothing is kept without path=" if path is None else f"{path} has what is done; the same call does the rest"
+        )
+        raise RuntimeError(f"{error}, {kept}") from error.__cause__
+    finally:
+        store.close()
+
+
+def computed(
+    work: Work, layout: Layout, finished: set[int], executor: Executor | None, progress: bool
+) -> Iterator[tuple[int, dict[str, Values]]]:
+    """The blocks that are not finished, each as it is computed; see `sweep`."""
+    todo = [block for block in range(layout.blocks) if block not in finished]
+    done = layout.cells - sum(map(layout.size, todo))
+    with Progress(layout.cells, "cell", shown=progress) as shown, workforce(work, executor) as submit:
+        begun = executor is None
+        if begun:
+            if todo:
+                work.compile()
+            shown.begin(done)
+        try:
+            for block, values in handed_out(lambda block: submit(block * layout.block, layout.block), todo, HANDED_OUT):
+                yield block, given_up(work.axes, layout, block) if values is None else values
+                done += layout.size(block)
                 # Where others compute, nobody tells when the first of them has compiled.
                 if begun:
-                    shown.advance(counts[index])
+                    shown.advance(layout.size(block))
                 else:
                     shown.begin(done)
                 begun = True
-    except Lost as error:
-        kept = (
-            "nothing is kept without path="
-            if file is None
-            else f"{file.path} has what is done; the same call does the rest"
-        )
-        raise RuntimeError(f"{error}; {done} of {cells} cells are done, {kept}") from error.__cause__
-    finally:
-        if file is not None:
-            file.close()
-    shaped = {name: values.reshape((*layout.shape, *values.shape[1:])) for name, values in found.items()}
-    shaped |= {name: np.array([*words[name], UNREACHED])[shaped[name]] for name in words}
-    return Table(coords, shaped, units, attributes if file is None else file.attributes, words, dims)
+        except Lost as error:
+            raise Lost(f"{error}; {done} of {layout.cells} cells are done") from error.__cause__
+
+
+def layout_of(
+    axes: list[Axis], inner: Sequence[Axis], variables: dict[str, Variable], request: dict[str, Any], block: int
+) -> Layout:
+    """What a sweep's table is made of; see `sweep`."""
+    coords = {one.name: one.values for one in (*axes, *inner)}
+    units = {one.name: one.unit for one in (*axes, *inner) if one.values.dtype.kind != "U"}
+    units |= {name: one.unit for name, one in variables.items() if one.words is None}
+    attributes = {
+        "request": json.dumps(request | {"float": str(np.dtype(jnp.result_type(float)))}),
+        "axes": json.dumps([one.name for one in axes]),
+        "versions": json.dumps(versions()),
+    }
+    kinds = {name: np.dtype(one.kind) for name, one in variables.items()}
+    words = {name: one.words for name, one in variables.items() if one.words is not None}
+    dims = {name: one.inner for name, one in variables.items() if one.inner}
+    return Layout(coords, kinds, units, attributes, words, dims, block)
+
+
+class Held:
+    """The blocks of a table that is not to be stored: the same as `Blocks`, in memory."""
+
+    def __init__(self, layout: Layout):
+        """State what the table is made of."""
+        self.finished: set[int] = set()
+        self._layout, self._found = layout, layout.empty(layout.cells)
+
+    def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> dict[str, Values]:
+        """Keep the blocks that are computed; the variables, with all cells along the first axis."""
+        for block, values in computed:
+            first, end = self._layout.ends(block)
+            for name, some in values.items():
+                self._found[name][first:end] = some
+        return self._found
+
+    def close(self) -> None:
+        """Nothing is to be closed."""
 
 
 @contextlib.contextmanager
@@ -145,22 +167,18 @@ def workforce(work: Work, executor: Executor | None) -> Iterator[Callable[[int, 
         yield lambda first, count: executor.submit(remote_results, sent, needed, first, count, uuid.uuid4().hex)
 
 
-def given_up(
-    axes: list[Axis], variables: dict[str, Variable], coords: dict[str, Values], first: int, count: int
-) -> dict[str, Values]:
+def given_up(axes: list[Axis], layout: Layout, block: int) -> dict[str, Values]:
     """The results of a block that is given up: `failed`, and no numbers; a warning names its cells."""
-    ends = [columns(axes, cell, 1) for cell in (first, first + count - 1)]
+    first, end = layout.ends(block)
+    ends = [columns(axes, cell, 1) for cell in (first, end - 1)]
     named = ", ".join(f"{name} {ends[0][name].item():.6g} to {ends[1][name].item():.6g}" for name in ends[0])
     warnings.warn(
-        f"cells {first} to {first + count - 1} ({named}) are given up as failed: {DEATHS} workers or more died of them",
+        f"cells {first} to {end - 1} ({named}) are given up as failed: {DEATHS} workers or more died of them",
         RuntimeWarning,
         stacklevel=4,
     )
-    found = {}
-    for name, one in variables.items():
-        value = one.words.index("failed") if one.words is not None else blank(one.kind)
-        found[name] = np.full((count, *(len(coords[dim]) for dim in one.inner)), value, one.kind)
-    return found
+    (words,) = layout.words.values()
+    return layout.empty(end - first, words.index("failed"))
 
 
 def block_for(cells: int) -> int:
@@ -174,12 +192,9 @@ def block_for(cells: int) -> int:
     return 64 if cells <= 64 else 128 if cells <= 4096 else 512
 
 
-def blocks_together(cells: int, block: int, variables: dict[str, Variable], coords: dict[str, Values]) -> int:
+def blocks_together(layout: Layout, block: int) -> int:
     """How many blocks are handed out and stored as one, a power of two: more than one where the grid is large."""
-    bytes_of_cell = sum(
-        np.dtype(one.kind).itemsize * math.prod(len(coords[dim]) for dim in one.inner) for one in variables.values()
-    )
-    wanted = min(cells // (BLOCKS * block), MOST_BYTES // (block * bytes_of_cell))
+    wanted = min(layout.cells // (BLOCKS * block), MOST_BYTES // layout.bytes_of_cells(block))
     return 1 << max(wanted, 1).bit_length() - 1
 
 

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from .grid import Axis, Values, columns, size_of
+from .grid import Axis, columns, size_of
+from .layout import Values
 
 #: (full name of a parameter -> values of some cells, how many of them count) -> name -> results.
 Job = Callable[[dict[str, Values], int], dict[str, Values]]

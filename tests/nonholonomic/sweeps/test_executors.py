@@ -35,8 +35,8 @@ def processes():
 @pytest.fixture(scope="module")
 def dask():
     """A cluster of two worker processes, which tells of every worker that dies."""
-    import distributed
     import dask
+    import distributed
 
     settings = {"distributed.scheduler.allowed-failures": 0, "distributed.comm.timeouts.connect": "30s"}
     quiet = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
@@ -131,6 +131,7 @@ def test_a_pool_that_breaks_ends_the_sweep_and_another_goes_on(processes, tmp_pa
 
 def test_a_scheduler_that_dies_ends_the_sweep_and_threads_go_on(tmp_path):
     import distributed
+
     address, path = tmp_path / "scheduler.json", tmp_path / "table.h5"
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(HERE.parents[2]), str(HERE)]),
