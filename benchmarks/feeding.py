@@ -117,7 +117,7 @@ def main() -> None:
         running.blocks_together = once
         print(
             f"{few:.3g} cells in {blocks} blocks, {options.workers} workers that sleep: "
-            f"{busy:.1f} s for {ideal:.1f} s of work, {100 * (busy / ideal - 1):.1f} % more; after the last block: {made:.1f} s, {100 * made / ideal:.1f} %"
+            f"{busy:.1f} s for {ideal:.1f} s of work, {100 * (busy / ideal - 1):.1f} % more; after the last block: {made:.1f} s"
         )
 
 

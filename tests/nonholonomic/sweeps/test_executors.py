@@ -3,6 +3,7 @@
 import logging
 import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -80,6 +81,22 @@ def test_whoever_computes_a_table_gets_the_same_bits(way, many_blocks, by_thread
         table = tippe.inversion_table(TOP, executor=request.getfixturevalue(way), **TIMES)
     assert {"inverted", "not_inverted", "contact_lost"} == set(np.unique(table.status))
     assert_same_bits(table, by_threads)
+
+
+def test_mpi_gives_the_same_bits_too(tmp_path, by_threads):
+    pytest.importorskip("mpi4py", reason="no MPI is installed", exc_type=ImportError)
+    mpirun = shutil.which("mpirun")
+    if mpirun is None:
+        pytest.skip("no MPI is installed")
+    tests = HERE.parents[1]
+    path = os.pathsep.join(str(folder) for folder in (tests.parent, tests, HERE))
+    environment = os.environ | {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu", "OMPI_MCA_rmaps_base_oversubscribe": "1"}
+    environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
+    environment |= {"PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
+    program = [mpirun, "-n", "3", sys.executable, "-m", "mpi4py.futures", HERE / "mpi_sweep.py", tmp_path]
+    done = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert_same_bits(Table.load(tmp_path / "table.h5"), by_threads)
 
 
 def test_trajectories_and_rides_from_other_processes_have_the_same_bits(processes, many_blocks):
