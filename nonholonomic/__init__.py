@@ -1,6 +1,7 @@
 """The ground that the models stand on: surfaces, integration, sweeps, tables. Knows neither top nor stroller."""
 
 import os
+from importlib.metadata import PackageNotFoundError, version
 
 import jax
 
@@ -11,6 +12,17 @@ if "JAX_ENABLE_X64" not in os.environ:
 from .compilation_cache import enable_compilation_cache as enable_compilation_cache
 from .geometry import AbstractSurface as AbstractSurface
 from .geometry import Cylinder as Cylinder
+from .geometry import Graph as Graph
+from .geometry import Implicit as Implicit
+from .geometry import Paraboloid as Paraboloid
 from .geometry import Plane as Plane
 from .geometry import Sphere as Sphere
+from .geometry import Spheroid as Spheroid
+from .geometry import Torus as Torus
 from .sweeps import local_processes as local_processes
+
+try:
+    __version__ = version("nonholonomic")
+except PackageNotFoundError:
+    # Run from a checkout that is not installed.
+    __version__ = "unknown"

@@ -1,8 +1,14 @@
 """The stroller: a three-wheeled vehicle with nonholonomic constraints, on the plane and on curved grounds."""
 
+from nonholonomic import __version__ as __version__
+from nonholonomic.geometry import Cylinder as Cylinder
+from nonholonomic.geometry import Graph as Graph
+from nonholonomic.geometry import Implicit as Implicit
+from nonholonomic.geometry import Paraboloid as Paraboloid
 from nonholonomic.geometry import Plane as Plane
 from nonholonomic.geometry import Sphere as Sphere
 from nonholonomic.geometry import Spheroid as Spheroid
+from nonholonomic.geometry import Torus as Torus
 from nonholonomic.identification import Free as Free
 from nonholonomic.integration import ImplicitMidpoint as ImplicitMidpoint
 

@@ -1,24 +1,35 @@
-"""The main job, `python -m stroller`: rides on a plane and inside a spheroid, with and without friction, and their audit."""
+"""The main job, `python -m stroller`: rides on some surfaces, with and without friction, and their audit."""
 
 import argparse
-import json
 import sys
 import time
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 
+from nonholonomic import __version__
 from nonholonomic.compilation_cache import enable_compilation_cache
-from nonholonomic.geometry import AbstractGround, Plane, Spheroid
+from nonholonomic.geometry import (
+    CLOSED,
+    AbstractSurface,
+    Cylinder,
+    Paraboloid,
+    Plane,
+    Sphere,
+    Spheroid,
+    Torus,
+)
 from nonholonomic.integration import ImplicitMidpoint
-from nonholonomic.sweeps import Table, versions
+from nonholonomic.sweeps import Table
+from nonholonomic.validation import require, require_folder
 
 from .friction import Damping, Frictionless
 from .launch import Launch
 from .plot import draw_rides
+from .quantities import table_of
 from .scene import FORKS, Scene
 from .simulate import simulate
 from .stroller import Stroller
@@ -27,10 +38,30 @@ from .trajectory import Trajectory
 RIDES = ("without friction", "with friction")
 
 
+class Ground(NamedTuple):
+    """A surface to ride on: how options make it, and where a ride starts, near the bottom or, outside, near the top."""
+
+    build: Callable[[argparse.Namespace], AbstractSurface]
+    place: tuple[float, float]
+    heading: float
+    top: tuple[float, float] = (0.0, 0.0)
+
+
+GROUNDS = {
+    "plane": Ground(lambda options: Plane(options.tilt), (0.0, 0.0), 1.2),
+    "cylinder": Ground(lambda options: Cylinder(options.radius), (0.0, 0.6), 0.4, (0.0, 3.0)),
+    "sphere": Ground(lambda options: Sphere(options.radius), (0.0, -0.9), 0.4, (0.0, 1.5)),
+    "spheroid": Ground(lambda options: Spheroid(options.equatorial, options.polar), (0.0, -0.9), 0.4, (0.0, 1.5)),
+    "torus": Ground(lambda options: Torus(options.ring, options.tube), (0.0, -1.2), 0.4, (0.0, 1.5)),
+    "paraboloid": Ground(lambda options: Paraboloid(options.p), (2.0, 0.0), 1.2),
+}
+
+
 class Helm:
     """Steer to and fro about straight ahead, and pull with a constant force: a torque towards a moving angle."""
 
     def __init__(self, force: float, angle: float, period: float):
+        require(period, "period", above=0.0)
         self.force, self.angle, self.period = force, angle, period
 
     def __call__(self, t: Any, motion: Any) -> tuple[Any, Any]:
@@ -42,19 +73,29 @@ def parser() -> argparse.ArgumentParser:
     """The options of the main job; the defaults are those of a light stroller."""
     command = argparse.ArgumentParser(
         prog="python -m stroller",
-        description="Rides of a stroller on a plane and inside a spheroid, with and without friction, steered to and fro "
-        "and pulled. Prints the energy audit of both integrators, writes an HDF5 file and a picture.",
+        description="Rides of a stroller on a plane and inside a spheroid, or on the surfaces named, with and without "
+        "friction, steered to and fro and pulled. Prints the energy audit of both integrators, writes an HDF5 file and a "
+        "picture.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
+    command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
     body = command.add_argument_group("the stroller")
     body.add_argument("--mass", type=float, default=12.0, help="mass [kg]")
     body.add_argument("--wheelbase", type=float, default=0.7, help="rear axle to front wheel [m]")
     body.add_argument("--inertia", type=float, default=1.5, help="yaw inertia about the rear axle [kg m^2]")
     body.add_argument("--steering-inertia", type=float, default=0.05, help="inertia of the fork [kg m^2]")
     scene = command.add_argument_group("the scene")
+    scene.add_argument(
+        "--surface", nargs="+", choices=list(GROUNDS), default=["plane", "spheroid"], help="what to ride on"
+    )
+    scene.add_argument("--side", choices=list(CLOSED), default="inside", help="side of those that have two")
     scene.add_argument("--tilt", type=float, default=0.05, help="tilt of the plane [rad]")
+    scene.add_argument("--radius", type=float, default=6.0, help="radius of the cylinder and of the sphere [m]")
     scene.add_argument("--equatorial", type=float, default=6.0, help="equatorial radius of the spheroid [m]")
     scene.add_argument("--polar", type=float, default=3.0, help="polar semi-axis of the spheroid [m]")
+    scene.add_argument("--ring", type=float, default=8.0, help="radius of the ring of the torus [m]")
+    scene.add_argument("--tube", type=float, default=3.0, help="radius of the tube of the torus [m]")
+    scene.add_argument("--p", type=float, default=4.0, help="radius of curvature at the bottom of the paraboloid [m]")
     scene.add_argument(
         "--damping", type=float, nargs=4, default=[2.0, 1.0, 0.2, 0.05], help="rolling, front, scrub, steering"
     )
@@ -73,19 +114,20 @@ def parser() -> argparse.ArgumentParser:
 
 
 def scenes(options: argparse.Namespace) -> dict[tuple[str, str], tuple[Scene, Launch]]:
-    """The four rides: (ground, friction) -> scene and launch."""
+    """The rides, without and with friction on each surface: (ground, friction) -> scene and launch."""
     body = Stroller(options.mass, options.wheelbase, options.inertia, options.steering_inertia)
-    spheroid = Spheroid(options.equatorial, options.polar)
-    grounds: dict[str, tuple[AbstractGround, str, Launch]] = {
-        "plane": (Plane(options.tilt), "outside", Launch((0.0, 0.0), 1.2, options.speed)),
-        "inside the spheroid": (spheroid, "inside", Launch((0.0, -0.9), 0.4, options.speed)),
-    }
     laws = dict(zip(RIDES, (Frictionless(), Damping(*options.damping)), strict=True))
-    return {
-        (ground, ride): (Scene(body, surface, law, options.gravity, side=side, fork=options.fork), launch)
-        for ground, (surface, side, launch) in grounds.items()
-        for ride, law in laws.items()
-    }
+    found = {}
+    for name in dict.fromkeys(options.surface):
+        ground = GROUNDS[name]
+        surface = ground.build(options)
+        two_sided = "inside" in surface.sides
+        side = options.side if two_sided else None
+        where = f"{side} the {name}" if two_sided else name
+        launch = Launch(ground.top if side == "outside" else ground.place, ground.heading, options.speed)
+        for ride, law in laws.items():
+            found[where, ride] = (Scene(body, surface, law, options.gravity, side=side, fork=options.fork), launch)
+    return found
 
 
 def audit(name: str, runs: dict[str, Trajectory]) -> list[str]:
@@ -105,8 +147,8 @@ def audit(name: str, runs: dict[str, Trajectory]) -> list[str]:
 
 def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
     """The largest residual of energy against work over the tolerance of Dopri8, for the last ride."""
-    scene, launch = list(scenes(options).values())[-1]
-    lines = ["Dopri8 inside the spheroid, with friction: residual [J] of energy against work over the tolerance"]
+    (ground, ride), (scene, launch) = list(scenes(options).items())[-1]
+    lines = [f"Dopri8 {ground}, {ride}: residual [J] of energy against work over the tolerance"]
     for tolerance in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12):
         # Few times of output, so that the tolerance alone chooses the steps.
         run = simulate(scene, launch, options.t1, helm, times=jnp.linspace(0.0, options.t1, 3), tolerance=tolerance)
@@ -117,31 +159,9 @@ def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
 
 def table(options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory]) -> Table:
     """The rides as a table over ride and time."""
-    runs = list(rides.values())
-    columns: dict[str, tuple[str, Any]] = {
-        **{f"place_{k + 1}": ("m or rad", lambda run, k=k: run.place[:, k]) for k in range(2)},
-        **{axis: ("m", lambda run, k=k: run.position[:, k]) for k, axis in enumerate("xyz")},
-        "heading": ("rad", lambda run: run.heading),
-        "steering": ("rad", lambda run: run.steering),
-        "steering_rate": ("rad s-1", lambda run: run.steering_rate),
-        "speed": ("m s-1", lambda run: run.speed),
-        "yaw_rate": ("rad s-1", lambda run: run.yaw_rate),
-        "energy": ("J", lambda run: run.energy),
-        "work": ("J", lambda run: run.work),
-        "drive_power": ("W", lambda run: run.power.drive),
-        "steering_power": ("W", lambda run: run.power.steering),
-        "friction_power": ("W", lambda run: sum(run.power[2:])),
-        "rear_side_force": ("N", lambda run: run.side_force[:, 0]),
-        "front_side_force": ("N", lambda run: run.side_force[:, 1]),
-        "normal_force": ("N", lambda run: run.normal_force),
-    }
-    coords = {"ride": np.arange(len(runs)), "t": np.asarray(runs[0].t)}
-    variables = {name: np.stack([np.asarray(read(run)) for run in runs]) for name, (_, read) in columns.items()}
-    units = {"ride": "1", "t": "s"} | {name: unit for name, (unit, _) in columns.items()}
     request = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
-    request["ride"] = [", ".join(name) for name in rides]
-    attributes = {"request": json.dumps(request), "axes": json.dumps(list(coords)), "versions": json.dumps(versions())}
-    return Table(coords, variables, units, attributes)
+    names = ["_".join(name).replace(" ", "_") for name in rides]
+    return table_of(list(rides.values()), names, request | {"ride": names})
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -155,11 +175,12 @@ def main(arguments: list[str] | None = None) -> int:
     enable_compilation_cache()
     started = time.perf_counter()
     try:
+        require_folder(options.out, "--out")
+        rides, helm = {}, Helm(options.force, options.steer, options.period)
         print(
             f"{'ride':38s} {'solver':10s} {'E start [J]':>12s} {'E end [J]':>12s} {'work [J]':>12s} "
             f"{'residual':>10s} {'slip [m/s]':>10s} {'N min [N]':>10s} {'steps':>6s}  status"
         )
-        rides, helm = {}, Helm(options.force, options.steer, options.period)
         for name, (scene, launch) in scenes(options).items():
             runs = {
                 "Dopri8": simulate(scene, launch, options.t1, helm, tolerance=options.tolerance),
@@ -168,7 +189,6 @@ def main(arguments: list[str] | None = None) -> int:
             rides[name] = runs["Dopri8"]
             print("\n".join(audit(", ".join(name), runs)), flush=True)
         print("\n" + "\n".join(tolerance_curve(options, helm)))
-        options.out.mkdir(parents=True, exist_ok=True)
         written = [options.out / "rides.h5"]
         table(options, rides).save(written[0])
         if find_spec("matplotlib") is None:

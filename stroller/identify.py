@@ -16,7 +16,7 @@ from .input import Input
 from .launch import Launch
 from .scene import Scene
 from .simulate import simulate
-from .table import PLACES, replaced
+from .table import place_numbers, replaced
 
 #: Columns of a sample of each quantity.
 QUANTITIES = {"position": ("x", "y", "z"), "heading": ("heading",), "speed": ("speed",), "steering": ("steering",)}
@@ -36,6 +36,19 @@ class Recording(eqx.Module):
     - `input`: what drove the stroller, as for `simulate`.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> data = stroller.Recording(launch, times=[0.5, 1.0], value=[1.87, 1.74], error=0.01, quantity="speed")
+    >>> data.labels
+    ('speed(0.5 s)', 'speed(1 s)')
+
+    ```
     """
 
     launch: Launch
@@ -114,6 +127,20 @@ def identify(
     **Returns:** an `Identification`.
 
     **Raises:** `ValueError` for arguments out of range or an unknown name.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> data = stroller.Recording(launch, times=[0.5, 1.0], value=[1.765, 1.557], error=0.01, quantity="speed")
+    >>> found = stroller.identify(scene, data, {"rolling": 1.5}, progress=False)
+    >>> print(f"{found.estimates['scene.friction.rolling']:.2f} N s/m, {found.status}")
+    2.00 N s/m, converged
+
+    ```
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
@@ -124,7 +151,7 @@ def identify(
     for one in data:
         scene.check(one.launch)
     roots = {"scene": scene, "launch": data[0].launch}
-    known = [name for root, tree in roots.items() for name in numbers(root, tree)] + list(PLACES)
+    known = [name for root, tree in roots.items() for name in numbers(root, tree)] + place_numbers(data[0].launch)
     unknowns = generic.free_numbers(free, roots, known, replaced)
     measurements, labels = generic.joined(data)
     return generic.identify(

@@ -10,12 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import Plane
+from nonholonomic.geometry import AbstractSurface
 from nonholonomic.integration import (
-    CROSSED,
     FAILED,
     GUARD_LOST,
-    AbstractProblem,
     Settings,
     compiled_march,
     explicit_tableau,
@@ -25,79 +23,54 @@ from nonholonomic.sweeps import Axis, Table, Variable, axis, cells_to_check
 from nonholonomic.sweeps import sweep as computed
 from nonholonomic.validation import as_number, require
 
-from .dynamics import Dynamics, State
-from .heading import Projected
-from .input import Input
+from .dynamics import State
+from .friction import Damping, RollingResistance
+from .input import Input, Steady, check_input
 from .launch import Launch
+from .ride import RideProblem, as_module
 from .scene import Scene
-from .trajectory import CONTACT_ROUND_OFF, RANK_LOST
+from .stroller import Stroller
+
+#: What the numbers of a place in the fixed frame are called.
+FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
 
 WORDS = ("completed", "contact_lost", "rank_lost", "failed")
 
 VARIABLES = {
-    "x": Variable("m", np.float64),
-    "y": Variable("m", np.float64),
-    "z": Variable("m", np.float64),
-    "heading": Variable("rad", np.float64),
-    "end_steering": Variable("rad", np.float64),
-    "end_speed": Variable("m s-1", np.float64),
-    "energy": Variable("J", np.float64),
-    "residual": Variable("J", np.float64),
-    "contact_time": Variable("s", np.float64),
-    "end_time": Variable("s", np.float64),
-    "status": Variable("1", np.int8, WORDS),
-    "steps": Variable("1", np.int64),
-    "rejected": Variable("1", np.int64),
+    "x": Variable("m", np.float64, long_name="x"),
+    "y": Variable("m", np.float64, long_name="y"),
+    "z": Variable("m", np.float64, long_name="height z"),
+    "heading": Variable("rad", np.float64, long_name="heading ψ"),
+    "end_steering": Variable("rad", np.float64, long_name="steering angle φ at the end"),
+    "end_speed": Variable("m s-1", np.float64, long_name="speed at the end"),
+    "energy": Variable("J", np.float64, long_name="energy at the end"),
+    "residual": Variable("J", np.float64, long_name="energy less work"),
+    "contact_time": Variable("s", np.float64, long_name="loss of contact"),
+    "end_time": Variable("s", np.float64, long_name="end of the ride"),
+    "status": Variable("1", np.int8, WORDS, long_name="how the ride ended"),
+    "steps": Variable("1", np.int64, long_name="steps"),
+    "rejected": Variable("1", np.int64, long_name="rejected steps"),
 }
 
-UNITS = {"mass": "kg", "wheelbase": "m", "inertia": "kg m2", "steering_inertia": "kg m2", "centre": "m"}
-UNITS |= {"steering_spring": "N m rad-1", "gravity": "m s-2", "tilt": "rad", "radius": "m", "equatorial": "m"}
-UNITS |= {"polar": "m", "rolling": "N s m-1", "front": "N s m-1", "scrub": "N m s", "coefficient": "1"}
-UNITS |= {"speed": "m s-1", "steering_rate": "rad s-1", "force": "N", "torque": "N m", "heading": "rad"}
+UNITS = Stroller.units | Scene.units | Damping.units | RollingResistance.units | Steady.units | Launch.units
+UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m", "ring": "m", "tube": "m", "p": "m"}
 
-#: A place is a pair; its parts are axes under these names, with their units on a plane and elsewhere.
-PLACES = {"launch.place[0]": ("x0", "mu0"), "launch.place[1]": ("y0", "eta0")}
-
-
-class RideProblem(AbstractProblem):
-    """Rides of many cells. Where contact is watched, a ride ends where the ground would have to pull."""
-
-    dynamics: Dynamics
-    input: Input | None
-    states: Float[Array, "components cells"]
-    scales: Float[Array, "components cells"]
-    press: Float[Array, "..."]
-    watched: bool = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, scene: Scene, launch: Launch, controls: Input | None, cells: int, watched: bool) -> "RideProblem":
-        """The problem of the given number of cells; every number is a scalar or one per cell."""
-
-        def spread(states):
-            return jnp.broadcast_to(states.reshape(states.shape[0], -1), (states.shape[0], cells))
-
-        one = cls.single(scene, launch, controls)
-        watched = watched and not isinstance(scene.surface, Plane)
-        return dataclasses.replace(one, states=spread(one.states), scales=spread(one.scales), watched=watched)
-
-    @classmethod
-    def single(cls, scene: Scene, launch: Launch, controls: Input | None) -> "RideProblem":
-        """The problem of one ride, which goes on where contact is lost."""
-        driven = controls is not None
-        press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
-        return cls(scene.dynamics, controls, scene.state(launch, driven), scene.scales(launch, driven), press, False)
-
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        return self.states, self.scales
-
-    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.dynamics.field(time, state, self.input)
-
-    def crossing(self, state: Float[Array, "components lanes"]) -> Any:
-        return self.dynamics.contact(state) / self.press + CONTACT_ROUND_OFF if self.watched else None
-
-    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.dynamics.rank(state) / RANK_LOST - 1.0 if isinstance(self.dynamics.heading, Projected) else None
+#: What the axes are, in words; a place is given as "x(0)".
+LONG_NAMES = {"steering_inertia": "inertia of the fork", "steering_spring": "spring of the fork", "steering": "φ(0)"}
+LONG_NAMES |= {
+    "speed": "speed v(0)",
+    "heading": "heading ψ(0)",
+    "steering_rate": "steering rate φ'(0)",
+    "mass": "mass m",
+}
+LONG_NAMES |= {
+    "x0": "x(0)",
+    "y0": "y(0)",
+    "mu0": "μ(0)",
+    "eta0": "η(0)",
+    "force": "drive force",
+    "torque": "steering torque",
+}
 
 
 def sweep(
@@ -137,6 +110,21 @@ def sweep(
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
     `RuntimeError` for an executor that breaks down, or a worker with other versions.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> axes = {"launch.speed": [1.0, 2.0], "scene.body.wheelbase": [0.6, 0.7]}
+    >>> table = stroller.sweep(scene, launch, 1.0, axes=axes, tolerance=1e-6)
+    >>> print(table.end_speed.round(3))
+    [[0.779 0.779]
+     [1.558 1.558]]
+
+    ```
     """
     solver = diffrax.Dopri8() if solver is None else solver
     explicit_tableau(solver)
@@ -145,8 +133,9 @@ def sweep(
     scene.check(launch)
     require(t1, "t1", above=0.0)
     require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+    check_input(input, scene, launch)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
-    grid = named_axes(axes, isinstance(scene.surface, Plane))
+    grid = named_axes(axes, scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.
     for cells in cells_to_check(grid):
         changed = replaced(roots, cells)
@@ -156,28 +145,42 @@ def sweep(
     request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
     request |= {"solver": type(solver).__name__, "input": "none" if input is None else described(input)}
     request |= {one.number: "an axis" for one in grid}
-    job = RideJob(roots, input, float(t1), float(tolerance), solver)
+    job = RideJob.of(roots, input, float(t1), float(tolerance), solver)
     return computed(job, grid, VARIABLES, request, path=path, progress=progress, executor=executor)
 
 
 class RideJob(NamedTuple):
-    """What is asked of every cell, as data that can be sent to another process; see `sweep`."""
+    """What is asked of every cell, as data that can be sent to another process; see `sweep`.
+
+    `controls`: the input as a module, which each process makes for itself.
+    """
 
     roots: dict[str, Any]
     input: Input | None
     t1: float
     tolerance: float
     solver: diffrax.AbstractERK
+    controls: eqx.Module | None
+
+    @classmethod
+    def of(cls, roots: dict[str, Any], input: Input | None, *rest: Any) -> "RideJob":
+        """The job, in this process."""
+        return cls(roots, input, *rest, as_module(input, roots["scene"], roots["launch"]))
+
+    def __reduce__(self) -> Any:
+        return RideJob.of, tuple(self[:-1])
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which the first `count` are to be run."""
         cells = replaced(self.roots, columns)
         size = next((len(values) for values in columns.values()), 1)
-        problem, outcome = self._march(cells, size, count, watched=True)
-        lost = np.asarray(outcome.status == CROSSED)
-        contact_time = np.where(lost, outcome.end_time, np.inf)
-        if lost.any() or (count == 0 and problem.watched):
-            problem, outcome = self._march(cells, size, count, watched=False)
+        controls = cells.get("input", self.controls)
+        problem = RideProblem.of(cells["scene"], cells["launch"], controls, size, watched=True)
+        horizon, settings = as_number(self.t1), Settings(self.tolerance, self.solver)
+        # A ride goes on where contact is lost, as if the ground could pull.
+        outcome, _ = compiled_march(problem, horizon, jnp.asarray(count), settings, passes=problem.watched)
+        contact_time = np.asarray(outcome.first_crossing)
+        lost = np.isfinite(contact_time)
         words = np.select([outcome.status == FAILED, outcome.status == GUARD_LOST, lost], [3, 2, 1], 0)
         ends = read_ends(cells["scene"], outcome.state, problem.states)
         return {name: np.asarray(values) for name, values in ends.items()} | {
@@ -187,11 +190,6 @@ class RideJob(NamedTuple):
             "steps": np.asarray(outcome.steps),
             "rejected": np.asarray(outcome.rejected),
         }
-
-    def _march(self, cells: dict[str, Any], size: int, count: int, watched: bool) -> tuple[RideProblem, Any]:
-        problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", self.input), size, watched)
-        settings = Settings(self.tolerance, self.solver)
-        return problem, compiled_march(problem, as_number(self.t1), jnp.asarray(count), settings)[0]
 
 
 @eqx.filter_jit
@@ -212,27 +210,39 @@ def read_ends(scene: Scene, states: State, starts: State) -> dict[str, Float[Arr
     }
 
 
-def named_axes(axes: dict[str, Any], flat: bool) -> list[Axis]:
-    """The axes of the table, each under the last part of its full name, or the last two where that is not enough."""
+def place_numbers(launch: Launch) -> list[str]:
+    """The full names of the numbers of a launch's place."""
+    return [f"launch.place[{k}]" for k in range(len(launch.place))]
+
+
+def named_axes(axes: dict[str, Any], surface: AbstractSurface, launch: Launch) -> list[Axis]:
+    """The axes of the table, each under the last part of its full name, or the last two where that is not enough.
+
+    The numbers of a place are named as the surface names them, with a zero: `x0`.
+    """
     lasts = [number.rsplit(".", 1)[-1] for number in axes]
+    named = surface.coordinates if len(launch.place) == len(surface.coordinates) else FIXED
+    places = dict(zip(place_numbers(launch), named, strict=True))
     grid = []
     for number, last in zip(axes, lasts, strict=True):
         name, unit = last, UNITS.get(last, "1")
-        if number in PLACES:
-            name, unit = PLACES[number][0 if flat else 1], "m" if flat else "rad"
+        if number in places:
+            name, unit = places[number][0] + "0", places[number][1]
         elif lasts.count(last) > 1 or last in VARIABLES:
             name = "_".join(number.split(".")[-2:])
         if number.endswith("steering"):
             unit = "N m s" if "friction" in number else "rad"
-        grid.append(axis(name, number, unit, axes[number]))
+        grid.append(axis(name, number, unit, axes[number], LONG_NAMES.get(name, name.replace("_", " "))))
     return grid
 
 
 def replaced(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
     """Scene, launch and input with some of their parameters replaced."""
-    place = [values.get(number, part) for number, part in zip(PLACES, roots["launch"].place, strict=True)]
-    roots = roots | {"launch": dataclasses.replace(roots["launch"], place=tuple(place))}
-    return with_numbers(roots, {number: one for number, one in values.items() if number not in PLACES})
+    launch = roots["launch"]
+    places = dict(zip(place_numbers(launch), launch.place, strict=True))
+    place = tuple(values.get(number, part) for number, part in places.items())
+    roots = roots | {"launch": dataclasses.replace(launch, place=place)}
+    return with_numbers(roots, {number: one for number, one in values.items() if number not in places})
 
 
 def described(controls: Any) -> Any:

@@ -26,6 +26,7 @@ from nonholonomic.integration import (
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Variable
 
+from .dynamics import LOSSES
 from .inversion import InversionProblem, is_inverted
 from .phases.sliding import phases as hybrid_phases
 from .phases.stick_slip_runs import phases as stick_slip_phases
@@ -52,15 +53,21 @@ class Driver(NamedTuple):
     @property
     def variables(self) -> dict[str, Variable]:
         """The table's variables besides the times."""
-        found = {"status": Variable("1", np.int8, self.words)}
-        found |= {"end_time": Variable("s", np.float64), "end_theta": Variable("rad", np.float64)}
-        return found | {name: Variable("1", np.int64) for name in ("steps", "rejected", *self.counts)}
+        found = {"status": Variable("1", np.int8, self.words, long_name="how the run ended")}
+        found |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
+        found |= {"end_theta": Variable("rad", np.float64, long_name="θ at the end of the run")}
+        counts = ("steps", "rejected", *self.counts)
+        return found | {name: Variable("1", np.int64, long_name=COUNTED[name]) for name in counts}
 
+
+#: What is counted in a run, and the times that are found, in words.
+COUNTED = {"steps": "steps", "rejected": "rejected steps", "hops": "flights", "sticks": "changes from slip to rolling"}
+TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_time": "last inversion time"}
 
 # Compiled once for all blocks.
-_jams = eqx.filter_jit(lambda dynamics, state: dynamics.jams(state))
+_loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
 
-WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed")
+WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit")
 SMOOTH = Driver(WORDS, (), None)
 STICK_SLIP = Driver((*WORDS, "unresolved"), ("sticks",), stick_slip_phases)
 HYBRID = Driver((*WORDS, "unresolved"), ("hops",), hybrid_phases)
@@ -100,7 +107,8 @@ class CellRuns(NamedTuple):
     @property
     def variables(self) -> dict[str, Variable]:
         """The table's variables, but errors and derivatives."""
-        return {name: Variable("s", np.float64) for name in self.times} | self.driver.variables
+        times = {name: Variable("s", np.float64, long_name=TIMES[name]) for name in self.times}
+        return times | self.driver.variables
 
     def results(self, roots: dict[str, Any], columns: dict[str, Any], tolerance: float, count: int) -> dict[str, Any]:
         """The variables of some cells.
@@ -150,8 +158,9 @@ class CellRuns(NamedTuple):
         lost = code == WORDS.index("contact_lost")
         if lost.any():
             # A hybrid run flies on where contact is lost.
-            jams = self.driver is HYBRID or np.asarray(_jams(scene.dynamics, jnp.asarray(ended.state)))
-            code = np.where(lost & jams, WORDS.index("jammed"), code)
+            losses = ("jammed",) if self.driver is HYBRID else LOSSES
+            loss = 0 if self.driver is HYBRID else np.asarray(_loss(scene.dynamics, jnp.asarray(ended.state)))
+            code = np.where(lost, np.array([WORDS.index(word) for word in losses])[loss], code)
         times = {self.times[-1]: np.where(inverted, ended.crossing_time, np.inf)}
         if isinstance(ended, Outcome) and self.crossing == "both":
             times["first_time"] = np.asarray(ended.first_crossing)

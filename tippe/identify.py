@@ -42,6 +42,18 @@ class InversionTimes(eqx.Module):
     - `angle`: angle [rad] that counted as inverted.
 
     **Raises:** `ValueError` for numbers out of range or shapes that do not fit.
+
+    **Example:**
+
+    ```
+    >>> import numpy as np
+    >>> import tippe
+    >>> launch = tippe.Launch(theta=[0.1, 0.1, 0.2], spin=[155.0, 140.0, 120.0])
+    >>> data = tippe.InversionTimes(launch, time=[5.97, 6.9, np.inf], error=0.02, t1=20.0)
+    >>> data.labels
+    ('theta 0.1, spin 155', 'theta 0.1, spin 140', 'theta 0.2, spin 120')
+
+    ```
     """
 
     launch: Launch
@@ -106,6 +118,16 @@ class Recording(eqx.Module):
     - `quantity`: "theta" or "position".
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> data = tippe.Recording(tippe.Launch(0.1, 155.0), times=[0.5, 1.0], value=[0.09, 0.11], error=0.01)
+    >>> data.labels
+    ('theta(0.5 s)', 'theta(1 s)')
+
+    ```
     """
 
     launch: Launch
@@ -185,6 +207,20 @@ def identify(
 
     **Raises:** `ValueError` for arguments out of range, an unknown name, and a scene with `contact="hybrid"` or
     `SetValuedCoulomb`, through whose phases the derivative does not go.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> launch = tippe.Launch(theta=[0.2, 0.2, 0.3, 0.2], spin=[155.0, 140.0, 110.0, 60.0])
+    >>> data = tippe.InversionTimes(launch, time=[5.60, 5.53, 5.52, float("inf")], error=0.05, t1=8.0)
+    >>> found = tippe.identify(scene, data, {"friction.mu": 0.25}, progress=False)
+    >>> print(f"{found.estimates['scene.friction.mu']:.3f} s/m, {found.status}")
+    0.300 s/m, converged
+
+    ```
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")

@@ -97,6 +97,18 @@ def inversion_time(
     **Raises:** `ValueError` for arguments outside these ranges, and for a scene with `contact="hybrid"` or
     `SetValuedCoulomb`: the derivative does not go through impacts, nor through stick and slip. `inversion_table` gives the
     time.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> time = tippe.inversion_time(scene, tippe.Launch(0.1, 155.0), t1=8.0, tolerance=1e-6)
+    >>> print(f"{time:.2f} s")
+    5.97 s
+
+    ```
     """
     solver = diffrax.Dopri8() if solver is None else solver
     check_run(scene, launch, t1, tolerance)
@@ -175,7 +187,13 @@ class InversionQuestion(AbstractQuestion):
         scene, launch, angle, t1, tolerance = jax.tree.unflatten(self.structure, leaves)
         may = jnp.asarray(True)
         if self.unchecked:
-            bounds = (*all_bounds(scene), *all_bounds(launch), *event_bounds(angle), *run_bounds(t1, tolerance))
+            bounds = (
+                *all_bounds(scene),
+                *all_bounds(launch),
+                *scene.start_bounds(launch),
+                *event_bounds(angle),
+                *run_bounds(t1, tolerance),
+            )
             may = legal(bounds)
             t1, tolerance = jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
         return may, t1, jnp.min(tolerance)
@@ -200,6 +218,7 @@ def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any) -> None:
     for name, value in values.items():
         if value is not None and np.ndim(value) != 0:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; inversion_table takes lists")
+    scene.check_start(launch)
 
 
 def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:

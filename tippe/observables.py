@@ -11,10 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.geometry import Component, Vector, add, dot, multiply
+from nonholonomic.geometry import Component, Vector, dot, scale, sum_vectors
 from nonholonomic.integration import Followed, PhasedPath
+from nonholonomic.parameters import text_as_html
+from nonholonomic.sweeps import Table
 from nonholonomic.validation import is_traced, require
+from nonholonomic.views import draw_portrait
 
+from .quantities import table_of
 from .sampled import STATUS
 from .scene import Scene
 
@@ -100,9 +104,14 @@ class AbstractTrajectory(eqx.Module):
         return self.scene.theta(self.states)
 
     @of_each_run
+    def theta_rate(self) -> Float[Array, " times"]:
+        """Rate of change of theta [rad/s]."""
+        return jax.jvp(self.scene.theta, (self.states,), (self.scene.field(self.states),))[1]
+
+    @of_each_run
     def eta(self) -> Float[Array, " times"]:
         """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
-        return self.scene.surface.angle(self._place, tuple(self.cyclic))
+        return self.scene.frame.angle(self._place, tuple(self.cyclic))
 
     @of_each_run
     def azimuth(self) -> Float[Array, " times"]:
@@ -133,10 +142,9 @@ class AbstractTrajectory(eqx.Module):
     def position(self) -> Float[Array, "times 3"]:
         """Position of the sphere's centre [m]; the plane is z = 0, the cylinder's axis x = z = 0, and a run on the plane
         starts above the origin."""
-        foot = self.scene.surface.position(self._place, tuple(self.cyclic))
-        normal = self.scene.surface.frame(self._place, tuple(self.cyclic))[2]
-        height = add(self.scene.body.radius, self.above[0])
-        return jnp.stack([add(q, multiply(height, n)) for q, n in zip(foot, normal, strict=True)], axis=-1)
+        frame, where = self.scene.frame, (self._place, tuple(self.cyclic))
+        centre = sum_vectors(frame.position(*where), scale(self.above[0], frame.axes(*where)[2]))
+        return jnp.stack(centre, axis=-1)
 
     @of_each_run
     def jellett(self) -> Float[Array, " times"]:
@@ -158,6 +166,41 @@ class AbstractTrajectory(eqx.Module):
         check_increasing(times)
         return self.resampled(times)
 
+    def to_table(self) -> Table:
+        """All that can be read off the run, as a `Table` over its times.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        return table_of(self)
+
+    def to_xarray(self) -> Any:
+        """The run as an `xarray.Dataset` over "time" (needs xarray), with units and names.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        return self.to_table().to_xarray()
+
+    def save(self, path: Any) -> None:
+        """Write the run to an HDF5 file that `tippe.Table.load` and xarray (`engine="h5netcdf"`) read.
+
+        **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for a batch of runs.
+        """
+        self.to_table().save(path)
+
+    def portrait(self, x: str = "theta", y: str = "theta_rate", ax: Any = None) -> Any:
+        """Draw one quantity over another, a phase portrait (needs matplotlib).
+
+        **Arguments:**
+
+        - `x`, `y`: variables of `to_table()`, such as "theta", or one component, such as "position.x".
+        - `ax`: axes of matplotlib to draw in, instead of a new figure.
+
+        **Returns:** the matplotlib figure, or `ax`.
+
+        **Raises:** `ValueError` for an unknown variable.
+        """
+        return draw_portrait(self.to_table(), x, y, ax)
+
     def with_stats(self, path: Followed | PhasedPath, **more: Any) -> Self:
         """The same run with what it took, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and more."""
         energy, work = np.asarray(self.energy), np.asarray(self.work)
@@ -174,8 +217,8 @@ class AbstractTrajectory(eqx.Module):
         return tuple(self.states[8:])
 
     def _fixed(self, vector: Vector) -> Float[Array, "times 3"]:
-        frame = self.scene.surface.frame(self._place, tuple(self.cyclic))
-        return jnp.stack([dot(vector, directions) for directions in zip(*frame, strict=True)], axis=-1)
+        axes = self.scene.frame.axes(self._place, tuple(self.cyclic))
+        return jnp.stack([dot(vector, directions) for directions in zip(*axes, strict=True)], axis=-1)
 
     def __str__(self) -> str:
         if is_traced(self.t) or self.t.ndim > 1:
@@ -194,3 +237,6 @@ class AbstractTrajectory(eqx.Module):
 
     def __repr__(self) -> str:
         return str(self)
+
+    def _repr_html_(self) -> str:
+        return text_as_html(str(self))

@@ -11,7 +11,7 @@ import numpy as np
 from nonholonomic.integration import explicit_tableau
 from nonholonomic.sweeps import Table, Variable, sweep
 
-from .cells import CellRuns, driver_of
+from .cells import TIMES, CellRuns, driver_of
 from .inversion import check_event
 from .launches import described, launches
 from .scene import Scene
@@ -80,6 +80,23 @@ def inversion_table(
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
     `RuntimeError` for an executor that breaks down, or a worker with other versions.
+
+    **Example:**
+
+    ```
+    >>> import numpy as np
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> table = tippe.inversion_table(scene, theta=[0.1, 0.2], spin=[100.0, 155.0], t1=8.0, tolerance=1e-6)
+    >>> print(table.time.round(2))
+    [[6.36 5.97]
+     [5.86 5.59]]
+    >>> print(table.status)
+    [['inverted' 'inverted']
+     ['inverted' 'inverted']]
+
+    ```
     """
     solver = diffrax.Dopri8() if solver is None else solver
     check_event(angle, crossing, ("first", "last", "both"))
@@ -109,7 +126,9 @@ def inversion_table(
     variables = runs.variables
     if errors:
         request |= {"errors": True}
-        variables = variables | {f"{name}_error": Variable("s", np.float64) for name in runs.times}
+        variables = variables | {
+            f"{name}_error": Variable("s", np.float64, long_name=f"error of the {TIMES[name]}") for name in runs.times
+        }
     if paths:
         request |= {"sensitivities": paths}
         variables = variables | slope_variables(paths, units)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.integration import Followed, PhasedPath, Settings, follow
+from nonholonomic.progress import Progress
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require_all
 
 from .inversion import check_run, run_bounds
@@ -18,7 +19,7 @@ from .launch import Launch
 from .observables import AbstractTrajectory, check_increasing, of_each_run
 from .phases.flight_trajectory import HybridTrajectory, simulate_hybrid
 from .phases.stick_slip_runs import follow_stick_slip
-from .sampled import STATUS, TrajectoryProblem, ended, sampled, sampled_by_diffrax
+from .sampled import STATUS, TrajectoryProblem, ended, sampled
 from .scene import Scene
 
 
@@ -34,6 +35,22 @@ class Trajectory(AbstractTrajectory):
     normal force pushes it out: strong friction, a large offset and a slip along the axis do that. `stats` holds accepted and
     rejected steps, the greatest drift of |e| and the greatest energy residual |E - E(0) - work of friction| [J]; with
     `SetValuedCoulomb` also `sticks`, how often a slip has turned into rolling.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> run = tippe.simulate(scene, tippe.Launch(0.1, 155.0), t1=1.0, tolerance=1e-6)
+    >>> later = run.at([0.25, 0.5])
+    >>> later.position.shape, later.axis.shape
+    ((2, 3), (2, 3))
+    >>> data = run.to_table()
+    >>> data.units["normal_force"], data.label("theta")
+    ('N', 'inclination θ [rad]')
+
+    ```
     """
 
     t: Float[Array, " times"]
@@ -104,6 +121,18 @@ def simulate(
     **Returns:** a `Trajectory`, for a hybrid scene a `HybridTrajectory`.
 
     **Raises:** `ValueError` for arguments out of range, and for a hybrid scene inside a transformation.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> run = tippe.simulate(scene, tippe.Launch(0.1, 155.0), t1=1.0, tolerance=1e-6)
+    >>> print(f"{run.theta[-1]:.3f} rad, {run.spin[-1]:.1f} rad/s, {run.status}")
+    0.025 rad, 154.0 rad/s, reached t1
+
+    ```
     """
     check_run(scene, launch, t1, tolerance)
     solver = diffrax.Dopri8() if solver is None else solver
@@ -116,13 +145,15 @@ def simulate(
     if scene.contact == "hybrid":
         if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1))):
             raise ValueError("contact = 'hybrid' must be 'stop' inside jit, vmap and grad")
-        return simulate_hybrid(scene, launch, float(t1), times, tolerance, solver)
+        with Progress(1, "run", "simulating"):
+            return simulate_hybrid(scene, launch, float(t1), times, tolerance, solver)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
         return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
-    run = TrajectoryProblem.of(scene, launch)
-    through = follow_stick_slip if scene.friction.set_valued else follow
-    path = through(run, float(t1), Settings(tolerance, solver))
-    trajectory = _as_trajectory(scene, run, path)
+    with Progress(1, "run", "simulating"):
+        run = TrajectoryProblem.of(scene, launch)
+        through = follow_stick_slip if scene.friction.set_valued else follow
+        path = through(run, float(t1), Settings(tolerance, solver))
+        trajectory = _as_trajectory(scene, run, path)
     if times is None:
         return trajectory
     return trajectory.at(np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)])
@@ -140,7 +171,13 @@ def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: 
     if times is None:
         # It raises the error that says so.
         return _traced(scene, launch, times, t1, tolerance, *options)
-    bounds = (*all_bounds(scene), *all_bounds(launch), *run_bounds(t1, tolerance), *times_bounds(times, t1))
+    bounds = (
+        *all_bounds(scene),
+        *all_bounds(launch),
+        *scene.start_bounds(launch),
+        *run_bounds(t1, tolerance),
+        *times_bounds(times, t1),
+    )
     may = jnp.all(legal(bounds)) & jnp.all(jnp.diff(times) > 0.0)
     # A run of illegal numbers might never reach its end, so it is given the horizon 0.
     found = _traced(scene, launch, times, jnp.where(may, t1, 0.0), tolerance, *options)
@@ -163,14 +200,12 @@ def _traced(
         )
     if times is None:
         raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
-    run = TrajectoryProblem.of(scene, launch)
-    if adjoint is None:
-        found = sampled(scene, launch, times, t1, tolerance, solver)
-    else:
-        found = sampled_by_diffrax(run, times, as_number(t1), tolerance, solver, adjoint)
+    found = sampled(scene, launch, times, t1, Settings(tolerance, solver), adjoint)
     status = found.status.astype(int)
-    stats = {"accepted": found.steps.astype(int), "rejected": found.rejected.astype(int)}
-    return Trajectory(times, scene, *_parts(run, found.states.T), status, found.end_time, stats, None)
+    stats = {"accepted": found.accepted.astype(int), "rejected": found.rejected.astype(int)}
+    return Trajectory(
+        times, scene, *_parts(TrajectoryProblem.of(scene, launch), found.states), status, found.end_time, stats, None
+    )
 
 
 def _parts(run: TrajectoryProblem, states: Float[Array, "components times"]) -> tuple[Any, Any, Any, Any]:

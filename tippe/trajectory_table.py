@@ -11,11 +11,13 @@ from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
 from nonholonomic.validation import as_number, require, require_all
 
+from .cells import COUNTED
 from .launches import described, launches
 from .observables import check_increasing
+from .quantities import COMPONENTS, QUANTITIES
 from .scene import Scene
 from .trajectory import times_bounds
-from .trajectory_cells import COMPONENTS, QUANTITIES, follow_cells
+from .trajectory_cells import follow_cells
 
 #: The status of a run, in the order of `sampled.STATUS`; a word has no space in it, so that a file can list them.
 WORDS = ("reached_end", "contact_lost", "failed", "jammed")
@@ -53,8 +55,8 @@ def trajectory_table(
       of it.
     - `times`: of the samples [s], increasing, from 0 or later; the last is the horizon.
     - `axes`: further axes, path of a number -> values, such as `{"launch.azimuth": [0.0, 1.0]}`.
-    - `quantities`: what to sample: any of "theta", "eta", "azimuth" [rad], "spin" [rad/s], "energy" [J], "jellett"
-      [kg m^3/s], "normal_force" [N], and the vectors "axis" [1], "position" [m], "velocity" [m/s], "angular_momentum"
+    - `quantities`: what to sample: any of "theta", "eta", "azimuth" [rad], "theta_rate", "spin" [rad/s], "energy" [J],
+      "jellett" [kg m^3/s], "normal_force" [N], and the vectors "axis" [1], "position" [m], "velocity" [m/s], "angular_momentum"
       [kg m^2/s] and "slip" [m/s]; all as in `Trajectory`.
     - `tolerance`: relative tolerance of the integration.
     - `path`: HDF5 file to write, block by block. A call that was interrupted resumes from it.
@@ -97,15 +99,17 @@ def trajectory_table(
     if scene.friction.set_valued:
         raise ValueError(f"friction = {type(scene.friction).__name__} must be a law without phases {why}")
 
-    inner = [axis("time", "time", "s", times)]
+    inner = [axis("time", "time", "s", times, "time")]
     variables = {}
     for name in names:
-        unit, components = QUANTITIES[name]
-        variables[name] = Variable(unit, np.float64, inner=("time",) if components is None else ("time", components))
+        unit, components, long_name = QUANTITIES[name]
+        dims = ("time",) if components is None else ("time", components)
+        variables[name] = Variable(unit, np.float64, inner=dims, long_name=long_name)
     for dim in dict.fromkeys(QUANTITIES[name].components for name in names):
         inner += [] if dim is None else [Axis(dim, dim, "1", np.array(COMPONENTS[dim]))]
-    variables |= {"status": Variable("1", np.int8, WORDS), "end_time": Variable("s", np.float64)}
-    variables |= {name: Variable("1", np.int64) for name in ("steps", "rejected")}
+    variables |= {"status": Variable("1", np.int8, WORDS, long_name="how the run ended")}
+    variables |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
+    variables |= {name: Variable("1", np.int64, long_name=COUNTED[name]) for name in ("steps", "rejected")}
     request = described(roots, grid) | {"quantities": list(names), "tolerance": float(tolerance)}
     # A run has a dozen components or so.
     most = max(16, 1 << (MOST_SAMPLED // (12 * len(times))).bit_length() - 1)

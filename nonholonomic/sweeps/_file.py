@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 #: The group of the checksums.
 CHECKSUMS = "checksums"
 
+#: The attribute of a table that names its variables in words; in a file each variable has its own, as in CF.
+LONG_NAMES, LONG_NAME = "long_names", "long_name"
+
 #: The file's attribute that names the dimensions which variables have besides the grid's.
 INNER = "inner"
 
@@ -160,6 +163,7 @@ def _put(array: "h5py.Dataset", values: Values, shape: tuple[int, ...], first: i
 def _describe(file: "h5py.File", layout: Layout) -> None:
     """All of a table but the numbers of its variables."""
     attributes = layout.attributes | ({INNER: layout.inner} if layout.inner else {}) | {"Conventions": "CF-1.10"}
+    long_names = json.loads(attributes.pop(LONG_NAMES, "{}"))
     for name, value in attributes.items():
         _set(file, name, value if isinstance(value, str | int | float) else json.dumps(value))
     meanings = dict(layout.words)
@@ -177,6 +181,8 @@ def _describe(file: "h5py.File", layout: Layout) -> None:
             _set(file[name], "flag_meanings", " ".join(meanings[name]))
         else:
             _set(file[name], "units", layout.units.get(name, "1"))
+        if name in long_names:
+            _set(file[name], LONG_NAME, long_names[name])
 
 
 def _set(of: Any, name: str, value: Any) -> None:
@@ -184,8 +190,11 @@ def _set(of: Any, name: str, value: Any) -> None:
     # Only files need it.
     import h5py
 
-    kind = h5py.string_dtype("utf-8", max(1, len(value.encode()))) if isinstance(value, str) else None
-    of.attrs.create(name, value, dtype=kind)
+    if isinstance(value, str):
+        stored = value.encode()
+        of.attrs.create(name, stored, dtype=h5py.string_dtype("utf-8", max(1, len(stored))))
+    else:
+        of.attrs.create(name, value)
 
 
 def _attribute(of: Any, name: str) -> Any:
@@ -260,7 +269,7 @@ class Stored:
 
 def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
     """A file's layout, and its checksums by variable."""
-    coords, kinds, units, words, shapes = {}, {}, {}, {}, {}
+    coords, kinds, units, words, shapes, long_names = {}, {}, {}, {}, {}, {}
     if "request" not in file.attrs:
         raise ValueError("it names no request")
     attributes = {name: _attribute(file, name) for name in file.attrs if name != "Conventions"}
@@ -269,6 +278,8 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
     sums = {name: array[()] for name, array in file[CHECKSUMS].items()}
     for name in (*dict.fromkeys(dims), *(name for name in file if name not in (*dims, CHECKSUMS))):
         array = file[name]
+        if LONG_NAME in array.attrs:
+            long_names[name] = _attribute(array, LONG_NAME)
         if "flag_meanings" in array.attrs:
             words[name] = tuple(_attribute(array, "flag_meanings").split())
         else:
@@ -279,6 +290,8 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
                 raise ValueError(f"{name} does not match its checksum")
         else:
             kinds[name], shapes[name] = array.dtype, array.shape
+    if long_names:
+        attributes[LONG_NAMES] = json.dumps(long_names, sort_keys=True)
     coords = {name: np.array(words.pop(name))[values] if name in words else values for name, values in coords.items()}
     layout = Layout(coords, kinds, units, attributes, words, inner, int(file[CHECKSUMS].attrs["block"]))
     for name, shape in shapes.items():
@@ -298,6 +311,9 @@ class StoredVariables(Mapping[str, Values]):
         if name not in self.stored.layout.kinds:
             raise KeyError(name)
         return self.stored.layout.shaped(name, self.stored.whole(name))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.stored.layout.kinds
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.stored.layout.kinds)

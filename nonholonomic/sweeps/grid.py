@@ -14,27 +14,29 @@ CHECKED_WHOLE = 1 << 20
 
 
 class Axis(NamedTuple):
-    """One axis of a grid: its name in the table, the full name of the parameter it varies, and the unit."""
+    """One axis of a grid: its name in the table, the full name of the parameter it varies, the unit, and a name in words."""
 
     name: str
     number: str
     unit: str
     values: Values
+    long_name: str = ""
 
 
 class Variable(NamedTuple):
     """One result of every cell: its unit and dtype, and, if it is a code, the words it stands for.
 
-    `inner` names the dimensions of a result that is an array, in order.
+    `inner` names the dimensions of a result that is an array, in order; `long_name` says what it is.
     """
 
     unit: str
     kind: Any
     words: tuple[str, ...] | None = None
     inner: tuple[str, ...] = ()
+    long_name: str = ""
 
 
-def axis(name: str, number: str, unit: str, values: Any) -> Axis:
+def axis(name: str, number: str, unit: str, values: Any, long_name: str = "") -> Axis:
     """An axis, checked.
 
     **Raises:** `ValueError` that names the axis if the values are not a non-empty one-dimensional array of finite numbers.
@@ -43,7 +45,7 @@ def axis(name: str, number: str, unit: str, values: Any) -> Axis:
     array = np.asarray(values, dtype=float)
     if array.ndim != 1 or array.size == 0:
         raise ValueError(f"{name} must be a number or a non-empty list of numbers, not of shape {array.shape}")
-    return Axis(name, number, unit, array)
+    return Axis(name, number, unit, array, long_name)
 
 
 def size_of(axes: list[Axis]) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..progress import Progress
 from ._blocks import Blocks
-from ._file import Stored
+from ._file import LONG_NAMES, Stored
 from .grid import Axis, Variable, columns, size_of
 from .handing import DEATHS, Lost, handed_out
 from .layout import Layout, Values
@@ -122,6 +122,11 @@ def layout_of(
         "axes": json.dumps([one.name for one in axes]),
         "versions": json.dumps(versions()),
     }
+    long_names = {one.name: one.long_name for one in (*axes, *inner)}
+    long_names |= {name: one.long_name for name, one in variables.items()}
+    if any(long_names.values()):
+        named = {name: long_name for name, long_name in long_names.items() if long_name}
+        attributes[LONG_NAMES] = json.dumps(named, sort_keys=True)
     kinds = {name: np.dtype(one.kind) for name, one in variables.items()}
     words = {name: one.words for name, one in variables.items() if one.words is not None}
     dims = {name: one.inner for name, one in variables.items() if one.inner}

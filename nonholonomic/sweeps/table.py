@@ -1,5 +1,6 @@
 """A labelled result over a grid, and its file."""
 
+import json
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,8 +9,9 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from ..parameters import as_html, readable_unit
 from ._blocks import unfinished
-from ._file import HELD, Stored, StoredVariables, coded, replacing, write_file
+from ._file import HELD, LONG_NAMES, Stored, StoredVariables, coded, replacing, write_file
 from .digits import concise_strings
 from .layout import UNREACHED, Layout, Values, axes_of
 
@@ -18,7 +20,7 @@ BLOCK = 1 << 15
 
 
 class Table(eqx.Module):
-    """Variables over a grid of named coordinates; each variable is also an attribute, such as `table.time`.
+    """Variables over a grid of named coordinates; `table.time` and `table["time"]` are one of them.
 
     **Arguments:**
 
@@ -30,6 +32,21 @@ class Table(eqx.Module):
     - `attributes`: what was computed, with what versions: plain data.
     - `words`: variable that consists of words -> the words, in the order of the numbers that stand for them in a file.
     - `inner`: variable -> the names of its dimensions after those of the grid, for variables that have such.
+
+    **Example:**
+
+    ```
+    >>> import numpy as np
+    >>> import tippe
+    >>> speed = np.array([1.0, 2.0, 3.0])
+    >>> table = tippe.Table({"speed": speed}, {"energy": 0.5 * speed**2}, {"speed": "m s-1", "energy": "J"}, {})
+    >>> print(table)
+    Table over speed (3)
+      energy [J]: 0.5 to 4.5
+    >>> table["energy"], table.label("speed")
+    (array([0.5, 2. , 4.5]), 'speed [m/s]')
+
+    ```
     """
 
     coords: dict[str, Values]
@@ -45,6 +62,28 @@ class Table(eqx.Module):
         if name in variables:
             return variables[name]
         raise AttributeError(f"the table has no variable {name!r}; it has {', '.join(variables)}")
+
+    def __getitem__(self, name: str) -> Values:
+        for known in (self.variables, self.coords):
+            if name in known:
+                return known[name]
+        raise KeyError(f"the table has no {name!r}; it has {', '.join([*self.variables, *self.coords])}")
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return [*self.variables, *self.coords]
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self.variables]
+
+    @property
+    def long_names(self) -> dict[str, str]:
+        """What coordinates and variables are, in words, by name."""
+        return json.loads(self.attributes.get(LONG_NAMES, "{}"))
+
+    def label(self, name: str) -> str:
+        """A coordinate or variable in words with its unit, as an axis of a picture says it: "inversion time [s]"."""
+        unit = readable_unit(self.units.get(name, "1"))
+        return self.long_names.get(name, name) + (f" [{unit}]" if unit else "")
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -77,11 +116,13 @@ class Table(eqx.Module):
             return dataset
 
         def described(name: str, dims: tuple[str, ...], values: Values) -> tuple[Any, ...]:
-            return dims, values, {"units": self.units[name]} if name in self.units else {}
+            long_name = {"long_name": self.long_names[name]} if name in self.long_names else {}
+            return dims, values, long_name | ({"units": self.units[name]} if name in self.units else {})
 
         variables = {name: described(name, self.dims(name), values) for name, values in self.variables.items()}
         coords = {name: described(name, (name,), values) for name, values in self.coords.items()}
-        dataset = xarray.Dataset(variables, coords, self.attributes)
+        attributes = {name: value for name, value in self.attributes.items() if name != LONG_NAMES}
+        dataset = xarray.Dataset(variables, coords, attributes)
         return dataset if chunks is None else dataset.chunk(chunks)
 
     def save(self, path: Any) -> None:
@@ -148,30 +189,59 @@ class Table(eqx.Module):
         values, errors = self.variables[variable], self.variables[f"{variable}_error"]
         return concise_strings(values, errors, self.variables.get("status", values))
 
-    def plot(self, variable: str = "time") -> Any:
+    def plot(
+        self, variable: str | None = None, *, at: dict[str, float] | None = None, log: bool = False, ax: Any = None
+    ) -> Any:
         """Draw a variable over the grid (needs matplotlib): lines over the first axis, or a map of the first two.
 
-        **Arguments:** `variable`: name of a numeric variable. **Returns:** a matplotlib figure.
+        Of every further axis one value is taken, the first unless `at` says otherwise; the title says which. The colours of a
+        map reach from the 2 % to the 98 % quantile.
+
+        **Arguments:**
+
+        - `variable`: name of a numeric variable, the first by default.
+        - `at`: name of an axis -> the value at which to cut it; the nearest of the grid is taken.
+        - `log`: whether the variable's scale is logarithmic.
+        - `ax`: axes of matplotlib to draw in, instead of a new figure.
+
+        **Returns:** the matplotlib figure, or `ax`.
+
+        **Raises:** `ValueError` for a variable that is not numeric, an unknown axis, or a table of one cell.
         """
         from ..views import draw_table
 
-        return draw_table(self, variable)
+        return draw_table(self, variable, at or {}, log, ax)
 
-    def __str__(self) -> str:
+    @property
+    def _title(self) -> str:
         axes = ", ".join(f"{name} ({len(self.coords[name])})" for name in axes_of(self.coords, self.inner))
-        lines = [f"Table over {axes or 'one cell'}"]
+        return f"Table over {axes or 'one cell'}"
+
+    @property
+    def _rows(self) -> list[tuple[str, str, str]]:
+        """Each variable in a few words: its name with its dimensions, its range, and what it is."""
         if isinstance(self.variables, StoredVariables):
-            return "\n".join([*lines, f"  {', '.join(self.variables)}: in {self.variables.stored.path}"])
+            place = f"in {self.variables.stored.path}"
+            return [(name, place, self.long_names.get(name, "")) for name in self.variables]
         # Cells that have not been computed show in the status only.
         computed = self.variables["status"] != UNREACHED if "status" in self.variables else ...
+        rows = []
         for name, values in self.variables.items():
-            unit = f" [{self.units[name]}]" if self.units.get(name, "1") not in ("1", "") else ""
+            unit = readable_unit(self.units.get(name, "1"))
             dims = "".join(f" x {dim} ({len(self.coords[dim])})" for dim in self.inner.get(name, ()))
-            lines.append(f"  {name}{unit}{dims}: {_summary(values if name == 'status' else values[computed])}")
-        return "\n".join(lines)
+            summary = _summary(values if name == "status" else values[computed])
+            rows.append((f"{name}{f' [{unit}]' if unit else ''}{dims}", summary, self.long_names.get(name, "")))
+        return rows
+
+    def __str__(self) -> str:
+        return "\n".join([self._title, *(f"  {name}: {summary}" for name, summary, _ in self._rows)])
 
     def __repr__(self) -> str:
         return str(self)
+
+    def _repr_html_(self) -> str:
+        axes = [(name, _summary(self.coords[name]), self.label(name)) for name in self.coords]
+        return as_html(self._title, [*axes, *self._rows])
 
 
 def _summary(values: Values) -> str:

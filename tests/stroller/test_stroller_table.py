@@ -111,7 +111,7 @@ def test_a_map_shows_its_values_and_is_grey_only_where_there_is_none(places):
 
 
 def test_axes_of_one_name_are_told_apart():
-    grid = named_axes({"launch.steering": [0.1], "scene.friction.steering": [0.2]}, False)
+    grid = named_axes({"launch.steering": [0.1], "scene.friction.steering": [0.2]}, stroller.Plane(), LAUNCH)
     assert [(one.name, one.unit) for one in grid] == [("launch_steering", "rad"), ("friction_steering", "N m s")]
 
 
@@ -139,7 +139,7 @@ def test_main_job(tmp_path, capsys):
     assert all(float(columns[-5]) < 1e-11 for columns in audit)
     assert (tmp_path / "rides.png").stat().st_size > 10_000
     with xarray.open_dataset(tmp_path / "rides.h5", engine="h5netcdf") as stored:
-        assert {"ride": 4, "t": 201}.items() <= dict(stored.sizes).items()
+        assert {"ride": 4, "time": 201}.items() <= dict(stored.sizes).items()
         energy = stored["energy"].values
         np.testing.assert_allclose(energy, energy[:, :1] + stored["work"].values, atol=1e-8)
         assert float(jnp.max(stored["friction_power"].values[[1, 3]])) < 0.0

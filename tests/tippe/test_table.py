@@ -382,7 +382,8 @@ def test_a_table_prints_and_draws(table):
     assert "theta (3), spin (2)" in str(table)
     assert "6 inverted" in str(table)
     figure = table.plot()
-    assert figure.axes[0].get_xlabel() == "theta [rad]"
+    assert figure.axes[0].get_xlabel() == "θ(0) [rad]"
+    assert figure.axes[0].get_ylabel() == "inversion time [s]"
     with pytest.raises(ValueError, match="variable = 'status' must be a numeric variable"):
         table.plot("status")
     with pytest.raises(AttributeError, match="no variable 'tme'; it has time"):

@@ -363,7 +363,7 @@ def test_foreign_files_and_folders_are_left_alone(images, tmp_path):
     half = tmp_path / "half.h5"
     with h5py.File(half, "w") as file:
         file.attrs["request"] = file.attrs["axes"] = "{}"
-        file.create_group("block")
+        file.create_group("checksums")
     for path in (text, empty, foreign, half):
         before = path.read_bytes()
         assert contents(path) is None

@@ -58,7 +58,8 @@ def test_a_table_in_its_file_takes_the_memory_of_some_blocks(tmp_path, monkeypat
 
 def test_a_table_in_its_file_is_read_piece_by_piece(tmp_path, monkeypatch, in_its_file):
     table = large_sweep(tmp_path / "table.h5")
-    assert str(table).endswith(f"value, pair, status: in {tmp_path / 'table.h5'}")
+    assert str(table).splitlines()[1:] == [f"  {name}: in {tmp_path / 'table.h5'}" for name in VARIABLES]
+    assert "status" in table._repr_html_()
     assert list(table.variables) == ["value", "pair", "status"]
     with pytest.raises(AttributeError, match="no variable 'tme'; it has value, pair, status"):
         _ = table.tme
