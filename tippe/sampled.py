@@ -74,6 +74,9 @@ class TrajectoryProblem(AbstractProblem):
         return self.dynamics.contact_margin(state[: len(self.state)])
 
 
+#: From this many cells on two directions run along together: that takes 0.8 times as long, but 18 s more to compile.
+MANY, TOGETHER = 64, 2
+
 #: How a run can end; inside a transformation the index stands for the word.
 STATUS = ("reached t1", "contact_lost", "failed", "jammed", "illegal")
 
@@ -172,7 +175,7 @@ class BlockSampling(AbstractQuestion):
             varied = VariationalProblem(problem, some, False)
             return _march(varied, leaves[self.movable :], self.solver, not again)
 
-        found, slopes = in_groups(run, directions)
+        found, slopes = in_groups(run, directions, TOGETHER if cells >= MANY else 1)
         return found, gather(slopes)
 
 
