@@ -11,5 +11,10 @@ if "JAX_ENABLE_X64" not in os.environ:
 from .compilation_cache import enable_compilation_cache as enable_compilation_cache
 from .geometry import AbstractSurface as AbstractSurface
 from .geometry import Cylinder as Cylinder
+from .geometry import Graph as Graph
+from .geometry import Implicit as Implicit
+from .geometry import Paraboloid as Paraboloid
 from .geometry import Plane as Plane
 from .geometry import Sphere as Sphere
+from .geometry import Spheroid as Spheroid
+from .geometry import Torus as Torus

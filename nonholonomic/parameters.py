@@ -1,4 +1,4 @@
-"""The numbers of a scene by name: `"scene.body.offset"`, `"launch.spin"`."""
+"""The numbers of a scene by name: `"scene.body.offset"`, `"launch.spin"`, `"launch.place[0]"` for the parts of a tuple."""
 
 import dataclasses
 from typing import Any
@@ -23,9 +23,15 @@ def numbers(root: str, tree: Any) -> dict[str, Any]:
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
         if isinstance(value, eqx.Module):
             found |= numbers(name, value)
-        elif value is None or isinstance(value, jax.Array | np.ndarray | float):
+        elif isinstance(value, tuple):
+            found |= {f"{name}[{k}]": part for k, part in enumerate(value) if _is_number(part)}
+        elif value is None or _is_number(value):
             found[name] = value
     return found
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, jax.Array | np.ndarray | float)
 
 
 def with_numbers(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
@@ -68,18 +74,29 @@ def _replaced(name: str, tree: Any, values: dict[str, Any]) -> Any:
         below, value = f"{name}.{field.name}", getattr(tree, field.name)
         if below in values:
             changes[field.name] = values[below]
+        elif isinstance(value, tuple):
+            parts = tuple(values.get(f"{below}[{k}]", part) for k, part in enumerate(value))
+            if any(f"{below}[{k}]" in values for k in range(len(value))):
+                changes[field.name] = parts
         elif isinstance(value, eqx.Module) and any(one.startswith(below + ".") for one in values):
             changes[field.name] = _replaced(below, value, values)
     return dataclasses.replace(tree, **changes) if changes else tree
 
 
 def description(root: str, tree: Any) -> dict[str, Any]:
-    """What a tree of modules is made of, as plain data: the kind of every module and the value of every number."""
+    """What a tree of modules is made of, as plain data: the kind of every module, the value of every number.
+
+    A function has nothing but its name to show.
+    """
     found = {root: type(tree).__name__}
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
         if isinstance(value, eqx.Module):
             found |= description(name, value)
+        elif isinstance(value, tuple):
+            found[name] = [np.asarray(part).tolist() for part in value]
         else:
             found[name] = np.asarray(value).tolist() if isinstance(value, jax.Array | np.ndarray) else value
+            if callable(value):
+                found[name] = getattr(value, "__qualname__", repr(value))
     return found

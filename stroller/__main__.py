@@ -1,18 +1,28 @@
-"""The main job, `python -m stroller`: rides on a plane and inside a spheroid, with and without friction, and their audit."""
+"""The main job, `python -m stroller`: rides on some surfaces, with and without friction, and their audit."""
 
 import argparse
 import json
 import sys
 import time
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from nonholonomic.compilation_cache import enable_compilation_cache
-from nonholonomic.geometry import AbstractGround, Plane, Spheroid
+from nonholonomic.geometry import (
+    CLOSED,
+    AbstractSurface,
+    Cylinder,
+    Paraboloid,
+    Plane,
+    Sphere,
+    Spheroid,
+    Torus,
+)
 from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.sweeps import Table, versions
 
@@ -25,6 +35,25 @@ from .stroller import Stroller
 from .trajectory import Trajectory
 
 RIDES = ("without friction", "with friction")
+
+
+class Ground(NamedTuple):
+    """A surface to ride on: how options make it, and where a ride starts, near the bottom or, outside, near the top."""
+
+    build: Callable[[argparse.Namespace], AbstractSurface]
+    place: tuple[float, float]
+    heading: float
+    top: tuple[float, float] = (0.0, 0.0)
+
+
+GROUNDS = {
+    "plane": Ground(lambda options: Plane(options.tilt), (0.0, 0.0), 1.2),
+    "cylinder": Ground(lambda options: Cylinder(options.radius), (0.0, 0.6), 0.4, (0.0, 3.0)),
+    "sphere": Ground(lambda options: Sphere(options.radius), (0.0, -0.9), 0.4, (0.0, 1.5)),
+    "spheroid": Ground(lambda options: Spheroid(options.equatorial, options.polar), (0.0, -0.9), 0.4, (0.0, 1.5)),
+    "torus": Ground(lambda options: Torus(options.ring, options.tube), (0.0, -1.2), 0.4, (0.0, 1.5)),
+    "paraboloid": Ground(lambda options: Paraboloid(options.p), (2.0, 0.0), 1.2),
+}
 
 
 class Helm:
@@ -42,8 +71,9 @@ def parser() -> argparse.ArgumentParser:
     """The options of the main job; the defaults are those of a light stroller."""
     command = argparse.ArgumentParser(
         prog="python -m stroller",
-        description="Rides of a stroller on a plane and inside a spheroid, with and without friction, steered to and fro "
-        "and pulled. Prints the energy audit of both integrators, writes an HDF5 file and a picture.",
+        description="Rides of a stroller on a plane and inside a spheroid, or on the surfaces named, with and without "
+        "friction, steered to and fro and pulled. Prints the energy audit of both integrators, writes an HDF5 file and a "
+        "picture.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     body = command.add_argument_group("the stroller")
@@ -52,9 +82,17 @@ def parser() -> argparse.ArgumentParser:
     body.add_argument("--inertia", type=float, default=1.5, help="yaw inertia about the rear axle [kg m^2]")
     body.add_argument("--steering-inertia", type=float, default=0.05, help="inertia of the fork [kg m^2]")
     scene = command.add_argument_group("the scene")
+    scene.add_argument(
+        "--surface", nargs="+", choices=list(GROUNDS), default=["plane", "spheroid"], help="what to ride on"
+    )
+    scene.add_argument("--side", choices=list(CLOSED), default="inside", help="side of those that have two")
     scene.add_argument("--tilt", type=float, default=0.05, help="tilt of the plane [rad]")
+    scene.add_argument("--radius", type=float, default=6.0, help="radius of the cylinder and of the sphere [m]")
     scene.add_argument("--equatorial", type=float, default=6.0, help="equatorial radius of the spheroid [m]")
     scene.add_argument("--polar", type=float, default=3.0, help="polar semi-axis of the spheroid [m]")
+    scene.add_argument("--ring", type=float, default=8.0, help="radius of the ring of the torus [m]")
+    scene.add_argument("--tube", type=float, default=3.0, help="radius of the tube of the torus [m]")
+    scene.add_argument("--p", type=float, default=4.0, help="radius of curvature at the bottom of the paraboloid [m]")
     scene.add_argument(
         "--damping", type=float, nargs=4, default=[2.0, 1.0, 0.2, 0.05], help="rolling, front, scrub, steering"
     )
@@ -73,19 +111,20 @@ def parser() -> argparse.ArgumentParser:
 
 
 def scenes(options: argparse.Namespace) -> dict[tuple[str, str], tuple[Scene, Launch]]:
-    """The four rides: (ground, friction) -> scene and launch."""
+    """The rides, without and with friction on each surface: (ground, friction) -> scene and launch."""
     body = Stroller(options.mass, options.wheelbase, options.inertia, options.steering_inertia)
-    spheroid = Spheroid(options.equatorial, options.polar)
-    grounds: dict[str, tuple[AbstractGround, str, Launch]] = {
-        "plane": (Plane(options.tilt), "outside", Launch((0.0, 0.0), 1.2, options.speed)),
-        "inside the spheroid": (spheroid, "inside", Launch((0.0, -0.9), 0.4, options.speed)),
-    }
     laws = dict(zip(RIDES, (Frictionless(), Damping(*options.damping)), strict=True))
-    return {
-        (ground, ride): (Scene(body, surface, law, options.gravity, side=side, fork=options.fork), launch)
-        for ground, (surface, side, launch) in grounds.items()
-        for ride, law in laws.items()
-    }
+    found = {}
+    for name in dict.fromkeys(options.surface):
+        ground = GROUNDS[name]
+        surface = ground.build(options)
+        two_sided = "inside" in surface.sides
+        side = options.side if two_sided else None
+        where = f"{side} the {name}" if two_sided else name
+        launch = Launch(ground.top if side == "outside" else ground.place, ground.heading, options.speed)
+        for ride, law in laws.items():
+            found[where, ride] = (Scene(body, surface, law, options.gravity, side=side, fork=options.fork), launch)
+    return found
 
 
 def audit(name: str, runs: dict[str, Trajectory]) -> list[str]:
@@ -105,8 +144,8 @@ def audit(name: str, runs: dict[str, Trajectory]) -> list[str]:
 
 def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
     """The largest residual of energy against work over the tolerance of Dopri8, for the last ride."""
-    scene, launch = list(scenes(options).values())[-1]
-    lines = ["Dopri8 inside the spheroid, with friction: residual [J] of energy against work over the tolerance"]
+    (ground, ride), (scene, launch) = list(scenes(options).items())[-1]
+    lines = [f"Dopri8 {ground}, {ride}: residual [J] of energy against work over the tolerance"]
     for tolerance in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12):
         # Few times of output, so that the tolerance alone chooses the steps.
         run = simulate(scene, launch, options.t1, helm, times=jnp.linspace(0.0, options.t1, 3), tolerance=tolerance)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import (
-    AbstractGround,
+    AbstractSurface,
     Component,
     Vector,
     add,
@@ -84,7 +84,7 @@ class Dynamics(eqx.Module):
     """
 
     body: Stroller
-    surface: AbstractGround
+    surface: AbstractSurface
     friction: AbstractFriction
     gravity: Float[Array, "..."]
     heading: AbstractHeading
@@ -113,13 +113,13 @@ class Dynamics(eqx.Module):
         """Velocities, rates and normal force at a state (components, ...)."""
         body, surface, side = self.body, self.surface, self.side
         r, e, (phi, P, fork_rate, sine, cosine) = (*self.unpack(state)[:2], self.unpack(state)[2][:5])
-        n = surface.outward(r)
+        n = surface.normal(r)
         unit = self.heading.unit(e, n)
         d, lead = self.heading.direction(unit, n, side), self.heading.lead(n, side)
         gauge = 1.0 / jnp.sqrt(self.inertia(d, lead, sine, cosine))
         wheel = P * gauge
         velocity = scale(wheel * cosine, d)
-        turning = surface.outward_rate(r, velocity)
+        turning = surface.normal_rate(r, velocity)
         front_speed = multiply(wheel, lead)
         yaw_rate = front_speed * sine / body.wheelbase
         motion = Motion(

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import AbstractGround, Component, Vector, cross, dot, multiply, scale, subtract, sum_vectors
+from nonholonomic.geometry import AbstractSurface, Component, Vector, cross, dot, multiply, scale, subtract, sum_vectors
 
 VERTICAL: Vector = (None, None, 1.0)
 
@@ -20,7 +20,7 @@ class AbstractHeading(eqx.Module):
     """What a heading is, and how it directs and turns the stroller. Vectors are in the ground's axes."""
 
     @abc.abstractmethod
-    def axes(self, ground: AbstractGround) -> int:
+    def axes(self, ground: AbstractSurface) -> int:
         """How many components of the heading do not vanish identically."""
 
     @abc.abstractmethod
@@ -58,7 +58,7 @@ class AbstractHeading(eqx.Module):
 class Intrinsic(AbstractHeading):
     """The heading is a unit vector e along the ground that turns about the normal: d = e, nu = 1 (section 4)."""
 
-    def axes(self, ground: AbstractGround) -> int:
+    def axes(self, ground: AbstractSurface) -> int:
         return ground.axes
 
     def unit(self, heading: Vector, normal: Vector) -> Vector:
@@ -92,7 +92,7 @@ class Projected(AbstractHeading):
     through zero at the equator. Where d = 0 the constraints lose rank.
     """
 
-    def axes(self, ground: AbstractGround) -> int:
+    def axes(self, ground: AbstractSurface) -> int:
         return 2
 
     def unit(self, heading: Vector, normal: Vector) -> Vector:

@@ -5,9 +5,12 @@ write it with `jax.numpy` and without `if`. An `equinox.Module` may hold numbers
 """
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
+import jax
+import jax.extend
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector
@@ -52,3 +55,41 @@ class Steady(Bounded):
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         return self.force, self.torque
+
+
+class Program:
+    """The operations of a function; two programs are equal if they read the same, so that neither is compiled twice."""
+
+    def __init__(self, jaxpr: Any):
+        self.jaxpr = jaxpr
+        self.text = str(jaxpr)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Program) and self.text == other.text
+
+    def __hash__(self) -> int:
+        return hash(self.text)
+
+
+class Formula(eqx.Module):
+    """A function as an input that is a module: the arrays it holds are leaves, and its operations are compared as such.
+
+    So a function that is defined again, as in a notebook's cell, does not compile again.
+    """
+
+    held: tuple[Array, ...]
+    program: Program = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, controls: Input, t: Any, motion: Any) -> "Formula":
+        """The formula of a function that can be called with scalars such as these, of which only the types count."""
+        closed = jax.make_jaxpr(lambda *at: tuple(map(as_number, controls(*at))))(t, motion)
+        return cls(tuple(closed.consts), Program(closed.jaxpr))
+
+    def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        leaves = jnp.broadcast_arrays(*jax.tree.leaves((t, motion)))
+        run = jax.extend.core.jaxpr_as_fun(jax.extend.core.ClosedJaxpr(self.program.jaxpr, self.held))
+        for _ in range(leaves[0].ndim):
+            run = jax.vmap(run)
+        force, torque = run(*leaves)
+        return force, torque

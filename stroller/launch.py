@@ -9,13 +9,13 @@ from jaxtyping import Array, Float
 from nonholonomic.validation import Bound, Bounded, as_number
 
 
-def as_pair(value: Any) -> Any:
-    """A pair of numbers as a tuple of arrays; anything else is left for the check."""
+def as_place(value: Any) -> Any:
+    """Two or three numbers as a tuple of arrays; anything else is left for the check."""
     try:
-        first, second = value
-    except (TypeError, ValueError):
+        numbers = tuple(value)
+    except TypeError:
         return value
-    return (as_number(first), as_number(second))
+    return tuple(as_number(number) for number in numbers)
 
 
 class Launch(Bounded):
@@ -23,30 +23,31 @@ class Launch(Bounded):
 
     **Arguments:**
 
-    - `place`: (x, y) [m] on a plane, along the plane; (mu, eta) [rad], azimuth and reduced latitude, on a sphere or
-      spheroid.
-    - `heading`: angle psi [rad] of the heading from x towards y on a plane, from east towards north on a spheroid; the
-      paper's projected heading is the angle theta [rad] of its horizontal projection from x towards y.
+    - `place`: (x, y) [m] on a plane (along it), paraboloid or graph; (mu, eta) [rad], azimuth and reduced latitude, on a
+      sphere or spheroid, azimuth and angle about the tube on a torus; (y, eta), along the axis [m] and from the lowest line
+      [rad], on a cylinder. On any surface also (x, y, z) [m] in the fixed frame.
+    - `heading`: angle psi [rad] of the heading from east towards north as the surface has them: from x towards y on a plane;
+      the paper's projected heading is the angle theta [rad] of its horizontal projection from x towards y.
     - `speed`: speed v [m/s] of the rear axle along the heading, negative in reverse; the horizontal speed where the
       heading is projected.
     - `steering`: angle phi [rad] of the front wheel, positive to the driver's left.
     - `steering_rate`: its rate phi' [rad/s].
 
-    **Raises:** `ValueError` for numbers that are not finite, or a place that is not a pair.
+    **Raises:** `ValueError` for numbers that are not finite, or a place that is not two or three of them.
     """
 
-    place: tuple[Float[Array, "..."], Float[Array, "..."]] = eqx.field(converter=as_pair)
+    place: tuple[Float[Array, "..."], ...] = eqx.field(converter=as_place)
     heading: Float[Array, "..."] = eqx.field(converter=as_number)
     speed: Float[Array, "..."] = eqx.field(converter=as_number)
     steering: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
     steering_rate: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
 
     def __check_init__(self):
-        if not (isinstance(self.place, tuple) and len(self.place) == 2):
-            raise ValueError(f"place = {self.place!r} must be a pair of numbers, (x, y) [m] or (mu, eta) [rad]")
+        if not (isinstance(self.place, tuple) and len(self.place) in (2, 3)):
+            raise ValueError(f"place = {self.place!r} must be a pair of numbers, or (x, y, z) [m]")
 
     def bounds(self) -> Iterator[Bound]:
-        for number, name in zip(self.place, ("place[0]", "place[1]"), strict=True):
-            yield Bound(number, name)
+        for k, number in enumerate(self.place):
+            yield Bound(number, f"place[{k}]")
         for name in ("heading", "speed", "steering", "steering_rate"):
             yield Bound(getattr(self, name), name)

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from nonholonomic.geometry import AbstractGround, Plane
+from nonholonomic.geometry import AbstractQuadric, AbstractSurface
 
 from .trajectory import Trajectory
 
@@ -12,7 +12,7 @@ from .trajectory import Trajectory
 COLOURS = ("tab:blue", "tab:red")
 
 
-def draw_rides(grounds: dict[str, AbstractGround], rides: dict[tuple[str, str], Trajectory]) -> Any:
+def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str], Trajectory]) -> Any:
     """Draw rides, a row of pictures for each ground.
 
     **Arguments:**
@@ -48,13 +48,14 @@ def draw_rides(grounds: dict[str, AbstractGround], rides: dict[tuple[str, str], 
     return figure
 
 
-def _draw_ground(space: Any, ground: AbstractGround, rides: dict[str, Trajectory]) -> None:
+def _draw_ground(space: Any, ground: AbstractSurface, rides: dict[str, Trajectory]) -> None:
     """A wire frame of the ground as far as the rides go."""
     places = np.concatenate([np.asarray(run.place) for run in rides.values()])
-    if isinstance(ground, Plane):
-        first, second = (np.linspace(part.min() - 0.3, part.max() + 0.3, 12) for part in places.T)
-    else:
-        first = np.linspace(-np.pi, np.pi, 49)
+    first, second = (
+        np.linspace(part.min() - 0.3, part.max() + 0.3, 13) if unit == "m" else np.linspace(-np.pi, np.pi, 49)
+        for part, (_, unit) in zip(places.T, ground.coordinates, strict=True)
+    )
+    if isinstance(ground, AbstractQuadric):
         second = np.linspace(-np.pi / 2, min(places[:, 1].max() + 0.1, np.pi / 2), 13)
     grid = tuple(np.meshgrid(first, second, indexing="ij"))
     x, y, z = (np.asarray(part) for part in ground.in_fixed_frame(ground.chart(grid)[0]))

@@ -1,184 +1,143 @@
-"""One ride integrated by Diffrax, with its own derivatives."""
+"""Rides as problems, what made a run, and runs inside transformations."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.derivatives import AbstractQuestion, VariationalProblem, ask, directions_by, in_groups, probed
-from nonholonomic.validation import is_traced
+from nonholonomic.derivatives import SampledRun, sampled_run, sampled_run_by_diffrax
+from nonholonomic.geometry import Plane
+from nonholonomic.integration import REACHED_END, AbstractProblem, Settings
 
-from .crossings import Watch, watched
-from .dynamics import State
-from .input import Input
+from .dynamics import Dynamics, State
+from .heading import Projected
+from .input import Formula, Input
 from .launch import Launch
 from .scene import Scene
-from .table import RideProblem
-from .trajectory import Stats
 
-#: Directions whose variations are integrated together with a ride.
-TOGETHER = 4
-
-#: Scene, launch and input.
-Given = tuple[Scene, Launch, Input | None]
+#: Reduced mass, relative to its largest, below which the constraints count as having lost rank.
+RANK_LOST = 1e-8
+#: Pull on the ground, relative to the weight, that still counts as round-off.
+CONTACT_ROUND_OFF = 1e-12
 
 
-class Settings(NamedTuple):
-    """How a ride is integrated: the solver, the maximum number of steps, and Diffrax's adjoint, if any."""
+class RideProblem(AbstractProblem):
+    """One ride, or those of many cells.
 
-    solver: diffrax.AbstractSolver
-    max_steps: int
-    adjoint: diffrax.AbstractAdjoint | None
+    Where `watched`, the event is that the ground would have to pull; where `guarded`, a ride ends where constraints lose rank.
+    """
 
+    dynamics: Dynamics
+    input: Input | None
+    states: Float[Array, "components *cells"]
+    scales: Float[Array, "components *cells"]
+    press: Float[Array, "..."]
+    watched: bool = eqx.field(static=True)
+    guarded: bool = eqx.field(static=True)
 
-def is_closed(controls: Input | None, scene: Scene, launch: Launch) -> bool:
-    """Whether an input is a module, or a function that holds no number that is being differentiated or batched."""
-    if controls is None or isinstance(controls, eqx.Module):
-        return True
-    closed = jax.make_jaxpr(controls)(*_example(scene, launch))
-    return not any(is_traced(constant) for constant in closed.consts)
+    @classmethod
+    def single(cls, scene: Scene, launch: Launch, controls: Input | None) -> "RideProblem":
+        """The problem of one ride, which goes on where contact or rank is lost."""
+        driven = controls is not None
+        press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
+        start = (scene.state(launch, driven), scene.scales(launch, driven))
+        return cls(scene.dynamics, controls, *start, press, False, False)
 
+    @classmethod
+    def of(cls, scene: Scene, launch: Launch, controls: Input | None, cells: int, watched: bool) -> "RideProblem":
+        """The problem of the given number of cells; every number is a scalar or one per cell."""
 
-def opened(controls: Any, scene: Scene, launch: Launch) -> Input:
-    """A function as a module, whose leaves are the numbers that the function holds."""
-    return eqx.filter_closure_convert(controls, *_example(scene, launch))
+        def spread(states):
+            return jnp.broadcast_to(states.reshape(states.shape[0], -1), (states.shape[0], cells))
 
+        one = cls.single(scene, launch, controls)
+        guarded, watched = isinstance(one.dynamics.heading, Projected), watched and not isinstance(scene.surface, Plane)
+        columns = {"states": spread(one.states), "scales": spread(one.scales)}
+        return dataclasses.replace(one, **columns, watched=watched, guarded=guarded)
 
-def _example(scene: Scene, launch: Launch) -> tuple[Any, Any]:
-    """What an input is called with: a time and a motion."""
-    state = scene.state(launch, True)
-    return jnp.zeros(()), scene.dynamics.geometry(state).motion
+    def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
+        return self.states, self.scales
 
+    def field(self, time: Float[Array, "..."], state: State) -> Any:
+        return self.dynamics.field(time, state, self.input)
 
-@eqx.filter_jit
-def ride(
-    given: Given,
-    times: Float[Array, " times"],
-    t1: Float[Array, ""],
-    grid: Float[Array, " steps"] | None,
-    tolerance: Float[Array, ""],
-    settings: Settings,
-) -> tuple[State, Watch, Stats]:
-    """The states at `times`, what a `Watch` follows at every step, and statistics."""
-    problem = RideProblem.single(*given)
-    size = len(problem.states)
-    adaptive = grid is None
-    whole = problem if settings.adjoint is None or not adaptive else probed(problem)
-    states, watch, stats = _follow(whole, problem, 1, times, t1, grid, tolerance, settings)
-    return states[:size], watch, stats
+    def crossing(self, state: State) -> Any:
+        return self.dynamics.contact(state) / self.press + CONTACT_ROUND_OFF if self.watched else None
 
-
-def differentiable_ride(
-    given: Given,
-    times: Float[Array, " times"],
-    t1: Float[Array, ""],
-    grid: Float[Array, " steps"] | None,
-    tolerance: Float[Array, ""],
-    settings: Settings,
-) -> tuple[State, Watch, Stats]:
-    """What `ride` gives, as a function whose derivatives take part in step control."""
-    numbers, rest = eqx.partition(given, eqx.is_inexact_array)
-    leaves, structure = jax.tree.flatten(numbers)
-    question = RideQuestion(len(leaves), structure, rest, settings, grid)
-    states, watch, counts = ask(question, *leaves, jax.lax.stop_gradient(times), t1, tolerance)
-    steps, rejected, finished = counts
-    # A small delay moves the state along the field.
-    rates = jax.lax.stop_gradient(jax.vmap(RideProblem.single(*given).field, (0, 1), 1)(times, states))
-    later = times - jax.lax.stop_gradient(times)
-    states = states + jnp.where(jnp.isfinite(rates), rates * later, 0.0)
-    return states, Watch(*watch), Stats(steps.astype(int), rejected.astype(int), finished > 0.0)
+    def guard(self, time: Float[Array, "..."], state: State) -> Any:
+        return self.dynamics.rank(state) / RANK_LOST - 1.0 if self.guarded else None
 
 
-class RideQuestion(AbstractQuestion):
-    """States and watch of a ride; the leaves are those of scene, launch and input, the times, the end, the tolerance."""
+class Stats(NamedTuple):
+    """Numbers of accepted and rejected steps, and whether the integration reached its end."""
 
-    in_blocks = False
+    steps: Int[Array, ""]
+    rejected: Int[Array, ""]
+    finished: Bool[Array, ""]
 
-    movable: int
-    # JAX's PyTreeDef, which type checkers take for a variable.
-    structure: Any = eqx.field(static=True)
-    rest: Any
+
+class Ride(NamedTuple):
+    """What is run and how: until `t1` [s]; `grid` are the ends of the steps [s] of a solver without an error estimate."""
+
+    scene: Scene
+    launch: Launch
+    input: Input | None
+    t1: Float[Array, ""]
     settings: Settings
     grid: Float[Array, " steps"] | None
 
-    def problem(self, leaves: tuple[Array, ...], cells: int) -> RideProblem:
-        """The only ride there is."""
-        numbers = jax.tree.unflatten(self.structure, leaves)
-        return RideProblem.single(*eqx.combine(numbers, self.rest))
 
-    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
-        return jnp.isnan(value)
+class Recipe(eqx.Module):
+    """A `Ride` as it can leave a transformation: its numbers are leaves and everything else is static."""
 
-    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Any:
-        problem = self.problem(leaves[: self.movable], 1)
-        found, _ = self._found(VariationalProblem(problem, (), False), leaves[self.movable :])
-        return jax.tree.map(lambda part: part[None], found)
+    numbers: Any
+    rest: Any = eqx.field(static=True)
 
-    def with_slopes(self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]) -> Any:
-        problem, directions, gather = directions_by(self.problem, active, leaves[: self.movable], None)
+    @classmethod
+    def of(cls, ride: Ride) -> "Recipe":
+        """The recipe of a ride."""
+        return cls(*eqx.partition(ride, eqx.is_array_like))
 
-        def run(some: tuple[Any, ...]) -> Any:
-            return self._found(VariationalProblem(problem, some, False), leaves[self.movable :])
-
-        found, slopes = in_groups(run, directions, TOGETHER)
-        return jax.tree.map(lambda part: part[None], (found, gather(slopes)))
-
-    def _found(self, varied: VariationalProblem, given: tuple[Array, Array, Array]) -> Any:
-        """States, watch and statistics as floats, and their slopes in each direction."""
-        parts = 1 + len(varied.directions)
-        times, t1, tolerance = given
-        states, watch, stats = _follow(varied, varied.problem, parts, times, t1, self.grid, tolerance, self.settings)
-        states, *variations = varied.parts(states)
-        rest = (tuple(watch), tuple(jnp.asarray(count, float) for count in stats))
-        slopes = [(variation, *jax.tree.map(lambda _: None, rest)) for variation in variations]
-        return (states, *rest), slopes
+    @property
+    def ride(self) -> Ride:
+        """What is run and how."""
+        return eqx.combine(self.numbers, self.rest)
 
 
-@eqx.filter_jit
-def _follow(
-    whole: Any,
-    problem: RideProblem,
-    parts: int,
-    times: Float[Array, " times"],
-    t1: Float[Array, ""],
-    grid: Float[Array, " steps"] | None,
-    tolerance: Float[Array, ""],
-    settings: Settings,
-) -> tuple[State, Watch, Stats]:
-    """Integrate a problem, or one whose state continues its own; of equal `parts` the one with the largest error counts."""
-    start, scales = whole.start()
-    size = len(problem.states)
+def as_module(controls: Input | None, scene: Scene, launch: Launch) -> eqx.Module | None:
+    """An input as a module, whose numbers are leaves; a function is read once, as it is called with scalars."""
+    if controls is None or isinstance(controls, eqx.Module):
+        return controls
 
-    def norm(error: Float[Array, " components"]) -> Float[Array, ""]:
-        return jnp.max(jnp.sqrt(jnp.mean(error.reshape(parts, -1) ** 2, axis=1)))
+    def motion(scene: Scene, launch: Launch) -> Any:
+        return scene.dynamics.geometry(scene.state(launch, True)).motion
 
-    if grid is None:
-        controller = diffrax.PIDController(rtol=tolerance, atol=tolerance * jax.lax.stop_gradient(scales), norm=norm)
-        # Steps end on the times of output, where interpolation would lose a digit or two.
-        controller = diffrax.ClipStepSizeController(controller, step_ts=times)
+    return Formula.of(controls, jnp.zeros(()), eqx.filter_eval_shape(motion, scene, launch))
+
+
+def ride_problem(modules: tuple[Scene, Launch, Input | None], cells: int | None) -> RideProblem:
+    """The problem of scene, launch and input, whose numbers are scalars or one per cell."""
+    return RideProblem.single(*modules) if cells is None else RideProblem.of(*modules, cells, False)
+
+
+def traced_ride(
+    ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None
+) -> tuple[State, Stats]:
+    """The states of a ride at `times`, inside a transformation, and statistics."""
+    modules = (ride.scene, ride.launch, ride.input)
+    if adjoint is None:
+        found = sampled_run(ride_problem, modules, times, ride.t1, ride.settings, ride.grid)
     else:
-        controller = diffrax.StepTo(grid)
-    subs = (
-        diffrax.SubSaveAt(ts=times),
-        diffrax.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: (y[:size], *watched(problem.dynamics, y[:size]))),
-    )
-    solution: Any = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, y, args: whole.field(t, y)),
-        settings.solver,
-        t0=jnp.zeros_like(t1),
-        t1=t1,
-        dt0=None,
-        y0=start,
-        saveat=diffrax.SaveAt(subs=subs),
-        stepsize_controller=controller,
-        max_steps=settings.max_steps,
-        adjoint=diffrax.ForwardMode() if settings.adjoint is None else settings.adjoint,
-        throw=False,
-    )
-    counts, finished = solution.stats, solution.result == diffrax.RESULTS.successful
-    stats = Stats(counts["num_accepted_steps"], counts["num_rejected_steps"], finished)
-    states, followed = solution.ys
-    return states.T, Watch(solution.ts[1], *followed), stats
+        found = sampled_run_by_diffrax(ride_problem(modules, None), times, ride.t1, ride.settings, adjoint)
+    return found.states.T, stats_of(found)
+
+
+def stats_of(found: SampledRun) -> Stats:
+    """The statistics of a run."""
+    counts = (jax.lax.stop_gradient(part) for part in (found.accepted, found.rejected, found.status))
+    accepted, rejected, status = counts
+    return Stats(accepted.astype(int), rejected.astype(int), status == REACHED_END)

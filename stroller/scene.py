@@ -1,6 +1,5 @@
 """The scene: what rolls, on what ground, with what friction, under what gravity."""
 
-import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.geometry import AbstractGround, Plane
+from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane
 from nonholonomic.validation import Bound, Bounded, all_bounds, as_number, is_traced, legal, require_all
 
 from .dynamics import Dynamics, State, stacked
@@ -18,7 +17,8 @@ from .heading import Intrinsic, Projected
 from .launch import Launch
 from .stroller import Stroller
 
-SIDES = {"outside": 1.0, "inside": -1.0}
+#: The side of a closed surface on which a stroller drives if nothing is said.
+DRIVES = "outside"
 FORKS = {"relative": None, "absolute": 1.0}
 HEADINGS = {"intrinsic": Intrinsic(), "projected": Projected()}
 
@@ -45,40 +45,41 @@ class Scene(Bounded):
     **Arguments:**
 
     - `body`: a `Stroller`.
-    - `surface`: the ground: `Plane(tilt)`, `Sphere(radius)` or `Spheroid(equatorial, polar)`.
+    - `surface`: the ground: `Plane(tilt)`, `Cylinder(radius)`, `Sphere(radius)`, `Spheroid(equatorial, polar)`,
+      `Torus(ring, tube)`, `Paraboloid(p)`, `Graph(height)` or `Implicit(function)`.
     - `friction`: `Frictionless()`, `Damping(rolling, front, scrub, steering)` or
       `RollingResistance(coefficient, speed)`.
     - `gravity`: acceleration of free fall [m/s^2], at least 0.
-    - `side`: "outside" or "inside" of a sphere or spheroid.
+    - `side`: "outside", as if nothing is said, or "inside" of a cylinder, sphere, spheroid or torus, "above" a plane,
+      paraboloid or graph, on the "positive" side of an implicit surface.
     - `fork`: "relative" if the fork's inertia resists the steering rate phi' alone, "absolute" if it resists its whole
       rate phi' + Omega about the steering axis, as a rigid fork does.
-    - `heading`: "intrinsic", or "projected" to reproduce the paper, which constrains the horizontal projection of the
-      velocities (`stroller.md`, section 3, says why that is not the default).
+    - `heading`: "intrinsic", or "projected" to reproduce the paper on a plane, sphere or spheroid, which constrains the
+      horizontal projection of the velocities (`stroller.md`, section 3, says why that is not the default).
 
     **Raises:** `ValueError` if a part is of the wrong kind, a word is not one of these, or a number is out of range.
     """
 
     body: Stroller
-    surface: AbstractGround = Plane()
+    surface: AbstractSurface = Plane()
     friction: AbstractFriction = Frictionless()
     gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81)
-    side: str = eqx.field(static=True, default="outside")
+    side: str | None = eqx.field(static=True, default=None)
     fork: str = eqx.field(static=True, default="relative")
     heading: str = eqx.field(static=True, default="intrinsic")
 
     def __check_init__(self):
-        parts = (("body", self.body, Stroller), ("surface", self.surface, AbstractGround))
+        parts = (("body", self.body, Stroller), ("surface", self.surface, AbstractSurface))
         for name, part, kind in (*parts, ("friction", self.friction, AbstractFriction)):
             if not isinstance(part, kind):
                 raise ValueError(f"{name} = {part!r} must be a {kind.__name__.removeprefix('Abstract')}")
-        require_word(self.side, "side", SIDES)
         require_word(self.fork, "fork", FORKS)
         require_word(self.heading, "heading", HEADINGS)
-        flat = isinstance(self.surface, Plane)
-        if flat and self.side == "inside":
-            raise ValueError("side = 'inside' must be 'outside' on a Plane")
-        if not flat and self.body.centre is not None:
+        self.surface.sign(self.side, DRIVES)
+        if not isinstance(self.surface, Plane) and self.body.centre is not None:
             raise ValueError(f"centre = {self.body.centre!r} must be 0.0 on a curved surface, where it is not exact")
+        if self.heading == "projected" and not isinstance(self.surface, Plane | AbstractQuadric):
+            raise ValueError(f"heading = 'projected' must be 'intrinsic' on a {type(self.surface).__name__}")
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.gravity, "gravity", at_least=0.0)
@@ -93,7 +94,7 @@ class Scene(Bounded):
             gravity=self.gravity,
             heading=HEADINGS[self.heading],
             up=self.surface.up,
-            side=SIDES[self.side],
+            side=self.surface.sign(self.side, DRIVES),
             absolute=FORKS[self.fork],
         )
 
@@ -115,10 +116,7 @@ class Scene(Bounded):
 
     def start_bounds(self, launch: Launch) -> Iterator[Bound]:
         """The ranges that the scene sets for a launch."""
-        if not isinstance(self.surface, Plane):
-            limit = math.pi / 2.0 + 1e-12
-            why = "reduced latitude, from -pi/2 to pi/2"
-            yield Bound(launch.place[1], "place[1]", at_least=-limit, at_most=limit, why=why)
+        yield from self.surface.place_bounds(launch.place, self.body.wheelbase)
 
     def sideways(self, launch: Launch) -> Any:
         """Whether a launch has speed although its front wheel is at a right angle; concrete for a concrete launch."""
@@ -128,10 +126,12 @@ class Scene(Bounded):
 
     def level(self, launch: Launch) -> Any:
         """Whether a launch with a projected heading is on the equator; concrete for a concrete launch."""
-        if self.heading != "projected" or isinstance(self.surface, Plane):
+        if self.heading != "projected" or not isinstance(self.surface, AbstractQuadric):
             return False
-        of = jnp if is_traced(launch.place[1]) else np
-        return of.abs(of.sin(of.asarray(launch.place[1]))) < RIGHT_ANGLE
+        polar, last = self.surface.semi_axes[1], launch.place[-1]
+        of = jnp if is_traced(last) or is_traced(polar) else np
+        sine = of.sin(of.asarray(last)) if len(launch.place) == 2 else of.asarray(last) / of.asarray(polar)
+        return of.abs(sine) < RIGHT_ANGLE
 
     def may_start(self, launch: Launch, *others: Any) -> Bool[Array, ""]:
         """Whether the numbers of the scene, a launch and other modules are legal, for those that `check` could not see."""
@@ -152,7 +152,7 @@ class Scene(Bounded):
         dynamics = self.dynamics
         position, east, north = self.surface.chart(launch.place)
         heading = dynamics.heading.at_angle(launch.heading, east, north)
-        normal = self.surface.outward(position)
+        normal = self.surface.normal(position)
         direction = dynamics.heading.direction(heading, normal, dynamics.side)
         lead = dynamics.heading.lead(normal, dynamics.side)
         sine, cosine = jnp.sin(launch.steering), jnp.cos(launch.steering)

@@ -1,5 +1,7 @@
 """Run the stroller from a launch."""
 
+import dataclasses
+import functools
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,14 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.integration import ImplicitMidpoint
+from nonholonomic.integration import ImplicitMidpoint, Settings
+from nonholonomic.progress import Progress
 from nonholonomic.validation import Bound, as_number, is_traced, legal, nan_unless, require_all
 
-from .crossings import Recipe
 from .input import Input
 from .launch import Launch
-from .ride import Settings, differentiable_ride, is_closed, opened, ride
+from .ride import Recipe, Ride, as_module, traced_ride
 from .scene import Scene
+from .steps import followed
 from .trajectory import Trajectory, read_off
 
 #: How many times are saved if none are asked for.
@@ -70,26 +73,40 @@ def simulate(
     if isinstance(solver, ImplicitMidpoint):
         grid = even_steps(times, end, solver.step_length)
         max_steps = grid.size
-    steering = input if is_closed(input, scene, launch) else opened(input, scene, launch)
-    settings = Settings(solver, max_steps, adjoint)
-    numbers = (scene, launch, steering, end, times, tolerance)
-    recipe = Recipe.of(scene, input, solver)
-    if not any(is_traced(leaf) for leaf in jax.tree.leaves(numbers)):
-        return read_off(recipe, times, *ride(numbers[:3], times, end, grid, as_number(tolerance), settings))
-    return _legal_or_nan(scene, launch, input, steering, times, end, as_number(tolerance), grid, settings, recipe)
+    settings = Settings(tolerance, solver, max_steps=max_steps)
+    ride = Ride(scene, launch, as_module(input, scene, launch), end, settings, grid)
+    if any(is_traced(leaf) for leaf in jax.tree.leaves((ride, times))):
+        return _legal_or_nan(ride, times, adjoint)
+    with Progress(1, "ride", "simulating"):
+        return _concrete(ride, times)
+
+
+def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
+    """The run of concrete numbers."""
+    recipe = Recipe.of(ride)
+    if not isinstance(ride.settings.solver, diffrax.AbstractERK | ImplicitMidpoint):
+        return _read_off(recipe, times, *_sampled(ride, times))
+    steps, stats = followed(recipe)
+    return dataclasses.replace(_read_off(recipe, times, steps.at(recipe, np.asarray(times)), stats), steps=steps)
+
+
+_read_off = eqx.filter_jit(read_off)
+
+# Steps of other implicit solvers cannot be repeated cheaply, so they end on the times.
+_sampled = eqx.filter_jit(functools.partial(traced_ride, adjoint=None))
 
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
-def _legal_or_nan(scene, launch, controls, steering, times, end, tolerance, grid, settings, recipe) -> Trajectory:
+def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
     """The run, or NaN and `finished` false where a traced number is out of range."""
-    may = scene.may_start(launch, controls) & jnp.all(legal([*run_bounds(end, tolerance), *times_bounds(times, end)]))
-    may &= jnp.all(jnp.diff(times) > 0.0)
+    bounds = [*run_bounds(ride.t1, ride.settings.tolerance), *times_bounds(times, ride.t1)]
+    may = ride.scene.may_start(ride.launch, ride.input) & jnp.all(legal(bounds)) & jnp.all(jnp.diff(times) > 0.0)
     # A run of illegal numbers might never reach its end, so it is not begun, unless its steps have a given length.
-    begins = may | (grid is not None)
-    end, run_times = jnp.where(begins, end, 0.0), jnp.where(begins, times, 0.0)
-    solve = differentiable_ride if settings.adjoint is None else ride
-    run = read_off(recipe, run_times, *solve((scene, launch, steering), run_times, end, grid, tolerance, settings))
+    begins = may | (ride.grid is not None)
+    run_times = jnp.where(begins, times, 0.0)
+    begun = ride._replace(t1=jnp.where(begins, ride.t1, 0.0))
+    run = read_off(Recipe.of(ride), run_times, *traced_ride(begun, run_times, adjoint))
     stats = run.stats._replace(finished=run.stats.finished & may)
     return eqx.tree_at(lambda one: (one.t, one.stats), nan_unless(may, run), (times, stats))
 

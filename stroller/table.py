@@ -9,12 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import Plane
+from nonholonomic.geometry import AbstractSurface
 from nonholonomic.integration import (
-    CROSSED,
     FAILED,
     GUARD_LOST,
-    AbstractProblem,
     Settings,
     compiled_march,
     explicit_tableau,
@@ -24,12 +22,14 @@ from nonholonomic.sweeps import Axis, Table, Variable, axis
 from nonholonomic.sweeps import grid as grids
 from nonholonomic.validation import as_number, require
 
-from .dynamics import Dynamics, State
-from .heading import Projected
+from .dynamics import State
 from .input import Input
 from .launch import Launch
+from .ride import RideProblem, as_module
 from .scene import Scene
-from .trajectory import CONTACT_ROUND_OFF, RANK_LOST
+
+#: What the numbers of a place in the fixed frame are called.
+FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
 
 WORDS = ("completed", "contact_lost", "rank_lost", "failed")
 
@@ -52,51 +52,8 @@ VARIABLES = {
 UNITS = {"mass": "kg", "wheelbase": "m", "inertia": "kg m2", "steering_inertia": "kg m2", "centre": "m"}
 UNITS |= {"steering_spring": "N m rad-1", "gravity": "m s-2", "tilt": "rad", "radius": "m", "equatorial": "m"}
 UNITS |= {"polar": "m", "rolling": "N s m-1", "front": "N s m-1", "scrub": "N m s", "coefficient": "1"}
+UNITS |= {"ring": "m", "tube": "m", "p": "m"}
 UNITS |= {"speed": "m s-1", "steering_rate": "rad s-1", "force": "N", "torque": "N m", "heading": "rad"}
-
-#: A place is a pair; its parts are axes under these names, with their units on a plane and elsewhere.
-PLACES = {"launch.place[0]": ("x0", "mu0"), "launch.place[1]": ("y0", "eta0")}
-
-
-class RideProblem(AbstractProblem):
-    """Rides of many cells. Where contact is watched, a ride ends where the ground would have to pull."""
-
-    dynamics: Dynamics
-    input: Input | None
-    states: Float[Array, "components cells"]
-    scales: Float[Array, "components cells"]
-    press: Float[Array, "..."]
-    watched: bool = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, scene: Scene, launch: Launch, controls: Input | None, cells: int, watched: bool) -> "RideProblem":
-        """The problem of the given number of cells; every number is a scalar or one per cell."""
-
-        def spread(states):
-            return jnp.broadcast_to(states.reshape(states.shape[0], -1), (states.shape[0], cells))
-
-        one = cls.single(scene, launch, controls)
-        watched = watched and not isinstance(scene.surface, Plane)
-        return dataclasses.replace(one, states=spread(one.states), scales=spread(one.scales), watched=watched)
-
-    @classmethod
-    def single(cls, scene: Scene, launch: Launch, controls: Input | None) -> "RideProblem":
-        """The problem of one ride, which goes on where contact is lost."""
-        driven = controls is not None
-        press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
-        return cls(scene.dynamics, controls, scene.state(launch, driven), scene.scales(launch, driven), press, False)
-
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        return self.states, self.scales
-
-    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.dynamics.field(time, state, self.input)
-
-    def crossing(self, state: Float[Array, "components lanes"]) -> Any:
-        return self.dynamics.contact(state) / self.press + CONTACT_ROUND_OFF if self.watched else None
-
-    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.dynamics.rank(state) / RANK_LOST - 1.0 if isinstance(self.dynamics.heading, Projected) else None
 
 
 def sweep(
@@ -137,25 +94,23 @@ def sweep(
     scene.check(launch)
     require(t1, "t1", above=0.0)
     require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+    controls = as_module(input, scene, launch)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
-    grid = named_axes(axes, isinstance(scene.surface, Plane))
+    grid = named_axes(axes, scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.
     for one in grid:
         changed = replaced(roots, {one.number: one.values})
         changed["scene"].check(changed["launch"])
 
-    def march(cells: dict[str, Any], size: int, count: int, watched: bool) -> tuple[RideProblem, Any]:
-        problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", input), size, watched)
-        return problem, compiled_march(problem, as_number(t1), jnp.asarray(count), Settings(tolerance, solver))[0]
-
     def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
         cells = replaced(roots, columns)
         size = next((len(values) for values in columns.values()), 1)
-        problem, outcome = march(cells, size, count, watched=True)
-        lost = np.asarray(outcome.status == CROSSED)
-        contact_time = np.where(lost, outcome.end_time, np.inf)
-        if lost.any() or (count == 0 and problem.watched):
-            problem, outcome = march(cells, size, count, watched=False)
+        problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", controls), size, watched=True)
+        horizon, settings = as_number(t1), Settings(tolerance, solver)
+        # A ride goes on where contact is lost, as if the ground could pull.
+        outcome, _ = compiled_march(problem, horizon, jnp.asarray(count), settings, passes=problem.watched)
+        contact_time = np.asarray(outcome.first_crossing)
+        lost = np.isfinite(contact_time)
         words = np.select([outcome.status == FAILED, outcome.status == GUARD_LOST, lost], [3, 2, 1], 0)
         ends = read_ends(cells["scene"], outcome.state, problem.states)
         return {name: np.asarray(values) for name, values in ends.items()} | {
@@ -191,14 +146,24 @@ def read_ends(scene: Scene, states: State, starts: State) -> dict[str, Float[Arr
     }
 
 
-def named_axes(axes: dict[str, Any], flat: bool) -> list[Axis]:
-    """The axes of the table, each under the last part of its full name, or the last two where that is not enough."""
+def place_numbers(launch: Launch) -> list[str]:
+    """The full names of the numbers of a launch's place."""
+    return [f"launch.place[{k}]" for k in range(len(launch.place))]
+
+
+def named_axes(axes: dict[str, Any], surface: AbstractSurface, launch: Launch) -> list[Axis]:
+    """The axes of the table, each under the last part of its full name, or the last two where that is not enough.
+
+    The numbers of a place are named as the surface names them, with a zero: `x0`.
+    """
     lasts = [number.rsplit(".", 1)[-1] for number in axes]
+    named = surface.coordinates if len(launch.place) == len(surface.coordinates) else FIXED
+    places = dict(zip(place_numbers(launch), named, strict=True))
     grid = []
     for number, last in zip(axes, lasts, strict=True):
         name, unit = last, UNITS.get(last, "1")
-        if number in PLACES:
-            name, unit = PLACES[number][0 if flat else 1], "m" if flat else "rad"
+        if number in places:
+            name, unit = places[number][0] + "0", places[number][1]
         elif lasts.count(last) > 1 or last in VARIABLES:
             name = "_".join(number.split(".")[-2:])
         if number.endswith("steering"):
@@ -209,9 +174,11 @@ def named_axes(axes: dict[str, Any], flat: bool) -> list[Axis]:
 
 def replaced(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
     """Scene, launch and input with some of their parameters replaced."""
-    place = [values.get(number, part) for number, part in zip(PLACES, roots["launch"].place, strict=True)]
-    roots = roots | {"launch": dataclasses.replace(roots["launch"], place=tuple(place))}
-    return with_numbers(roots, {number: one for number, one in values.items() if number not in PLACES})
+    launch = roots["launch"]
+    places = dict(zip(place_numbers(launch), launch.place, strict=True))
+    place = tuple(values.get(number, part) for number, part in places.items())
+    roots = roots | {"launch": dataclasses.replace(launch, place=place)}
+    return with_numbers(roots, {number: one for number, one in values.items() if number not in places})
 
 
 def described(controls: Any) -> Any:

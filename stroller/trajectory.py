@@ -1,38 +1,28 @@
 """One run of the stroller, and what can be read off it."""
 
-from typing import NamedTuple
+import dataclasses
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
 
-from .crossings import Recipe, Watch, crossings
+from .crossings import crossings, watched
 from .dynamics import Power, State, padded
 from .input import Input
+from .ride import CONTACT_ROUND_OFF, RANK_LOST, Recipe, Stats
 from .scene import Scene
-
-#: Reduced mass, relative to its largest, below which the constraints count as having lost rank.
-RANK_LOST = 1e-8
-#: Pull on the ground, relative to the weight, that still counts as round-off.
-CONTACT_ROUND_OFF = 1e-12
-
-
-class Stats(NamedTuple):
-    """Numbers of accepted and rejected steps, and whether the integration reached its end."""
-
-    steps: Int[Array, ""]
-    rejected: Int[Array, ""]
-    finished: Bool[Array, ""]
+from .steps import Steps, followed
 
 
 class Trajectory(eqx.Module):
     """A run at the given times. Times are the first axis of every array.
 
-    - `t` [s]; `place`: (x, y) [m] or (mu, eta) [rad], (times, 2); `position` [m] in the fixed frame, z up, (times, 3);
+    - `t` [s]; `place`, as the surface names it (see `Launch`), (times, 2), or (times, 3) on an implicit surface; `position`
+      [m] in the fixed frame, z up, (times, 3);
     - `heading` [rad], as in `Launch`; `direction`: the same as a unit vector in the fixed frame, (times, 3);
     - `steering` [rad], `steering_rate` [rad/s], `yaw_rate` [rad/s], `speed` of the rear axle and `front_speed` at which
       the front wheel rolls [m/s];
@@ -40,12 +30,13 @@ class Trajectory(eqx.Module):
     - `side_force` [N] of the ground on the rear axle and the front wheel, to the left of each, (times, 2);
     - `normal_force` [N] of the ground, and `load` [N] on the rear and the front axle, (times, 2);
     - `constraint` [m/s]: speed at which the rear axle and the front wheel slip sideways, (times, 2);
-    - `departure`: how far the position is off the ground, relative to its size: an error of the integration;
-    - `watch` and `stats`: what the integration passed, step by step; `recipe`: what made the run.
+    - `departure`: how far the position is off the ground [m]: an error of the integration;
+    - `stats` of the integration; `recipe`: what made the run; `steps`: where its steps ended, `None` if it was made inside a
+      transformation: what happened between the times is then found by running it once more, when it is asked for.
     """
 
     t: Float[Array, " times"]
-    place: Float[Array, "times 2"]
+    place: Float[Array, "times numbers"]
     position: Float[Array, "times 3"]
     heading: Float[Array, " times"]
     direction: Float[Array, "times 3"]
@@ -63,14 +54,26 @@ class Trajectory(eqx.Module):
     constraint: Float[Array, "times 2"]
     departure: Float[Array, " times"]
     state: Float[Array, "times components"]
-    watch: Watch
     stats: Stats
     recipe: Recipe
+    steps: Steps | None
 
     @property
     def energy_residual(self) -> Float[Array, " times"]:
         """Energy minus its start and the work done since [J]: zero for an exact solution."""
         return self.energy - self.energy[0] - (self.work - self.work[0])
+
+    @property
+    def wheelbase_error(self) -> Float[Array, " times"]:
+        """Relative error |K| l^2 / 6 of taking the ground for its tangent plane as far as the wheelbase l reaches.
+
+        K is the Gaussian curvature (`stroller.md`, section 9). The model holds for a wheelbase short against the radii of
+        curvature.
+        """
+        scene = self.recipe.ride.scene
+        states = self.state.T
+        curvature = scene.surface.gaussian_curvature(scene.dynamics.unpack(states)[0])
+        return jnp.abs(spread(curvature, states[0])) * scene.body.wheelbase**2 / 6.0
 
     def grip(self) -> Float[Array, "times 2"]:
         """Coefficient of friction that each axle needs in order not to slip; infinite for a force without a load."""
@@ -81,28 +84,34 @@ class Trajectory(eqx.Module):
         """Side force [N] that each axle has left before it slips, given a coefficient of friction [1]."""
         return coefficient * jnp.maximum(self.load, 0.0) - jnp.abs(self.side_force)
 
+    def with_steps(self) -> "Trajectory":
+        """The same run with its steps."""
+        return self if self.steps is not None else dataclasses.replace(self, steps=followed(self.recipe)[0])
+
     @property
     def contact_lost_at(self) -> float:
         """Time [s] at which the ground first has to pull to keep the stroller on it; infinite if it never does."""
-        force = np.asarray(self.watch.normal_force)
+        run = self.with_steps()
+        force = watched(run.recipe, run.steps.states, "normal_force")
         allowed = -CONTACT_ROUND_OFF * np.max(np.abs(force[np.isfinite(force)]), initial=0.0)
-        return self._first_below("normal_force", allowed)
+        return run._first_below("normal_force", allowed)
 
     @property
     def rank_lost_at(self) -> float:
         """Time [s] at which the constraints first lose rank, as only a projected heading can; otherwise infinite."""
-        return self._first_below("rank", RANK_LOST)
+        return self.with_steps()._first_below("rank", RANK_LOST)
 
     @property
     def jackknifed_at(self) -> Float[np.ndarray, " times"]:
         """Times [s] at which the steering angle passes a right angle, where the rear axle reverses."""
-        return crossings(self.recipe, self.watch, "steering_cosine", 0.0)
+        return crossings(self.recipe, self.with_steps().steps, "steering_cosine", 0.0)
 
     def _first_below(self, name: str, level: float) -> float:
         """Time [s] at which a watched quantity first is below a level; infinite if it never is."""
-        if float(getattr(self.watch, name)[0]) < level:
-            return float(self.watch.time[0])
-        return float(min(crossings(self.recipe, self.watch, name, level), default=np.inf))
+        assert self.steps is not None
+        if watched(self.recipe, self.steps.states[:, :1], name)[0] < level:
+            return float(self.steps.times[0])
+        return float(min(crossings(self.recipe, self.steps, name, level), default=np.inf))
 
     @property
     def status(self) -> str:
@@ -112,11 +121,13 @@ class Trajectory(eqx.Module):
         """
         if not (bool(self.stats.finished) and np.all(np.isfinite(self.state))):
             return "failed"
-        if np.isfinite(self.rank_lost_at):
+        run = self.with_steps()
+        if np.isfinite(run.rank_lost_at):
             return "rank_lost"
-        return "contact_lost" if np.isfinite(self.contact_lost_at) else "completed"
+        return "contact_lost" if np.isfinite(run.contact_lost_at) else "completed"
 
     def __str__(self) -> str:
+        self = self.with_steps()
         jackknives = self.jackknifed_at
         lines = [
             f"Trajectory of {self.t.size} times, {float(self.t[0]):g} s to {float(self.t[-1]):g} s: {self.status}",
@@ -129,6 +140,9 @@ class Trajectory(eqx.Module):
             f"  side forces     up to {shown(jnp.max(jnp.abs(self.side_force), axis=0))} N, rear and front",
             f"  no-slip         {float(jnp.max(jnp.abs(self.constraint))):.1e} m/s",
         ]
+        error = float(jnp.max(self.wheelbase_error))
+        if error > 0.0:
+            lines.append(f"  wheelbase       off by up to {error:.1e} of its effect: the ground curves over its length")
         if np.isfinite(self.contact_lost_at):
             lines.append(f"  contact lost    at {self.contact_lost_at:.6g} s; from there the ground pulls")
         if np.isfinite(self.rank_lost_at):
@@ -179,16 +193,14 @@ def side_force(
     return scene.dynamics.projected_side_force(t, states, controls)
 
 
-@eqx.filter_jit
 def read_off(
     recipe: Recipe,
     t: Float[Array, " times"],
     states: Float[Array, "components times"],
-    watch: Watch,
     stats: Stats,
 ) -> Trajectory:
     """The trajectory of the given states at the given times."""
-    scene, controls, _ = recipe.parts
+    scene, controls = recipe.ride.scene, recipe.ride.input
     dynamics, surface = scene.dynamics, scene.surface
     integrated, states = states, scene.dynamics.righted(states)
     g = dynamics.geometry(states)
@@ -220,9 +232,9 @@ def read_off(
         normal_force=normal_force,
         load=columns(normal_force - front_load, front_load),
         constraint=columns(*side_slip(scene, dynamics.field(t, states, controls), states)),
-        departure=spread(surface.departure(motion.position), like),
+        departure=spread(surface.offset(motion.position), like),
         state=integrated.T,
-        watch=watch,
         stats=stats,
         recipe=recipe,
+        steps=None,
     )

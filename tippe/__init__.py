@@ -1,8 +1,13 @@
 """The tippe top: scenes, trajectories and inversion tables."""
 
 from nonholonomic.geometry import Cylinder as Cylinder
+from nonholonomic.geometry import Graph as Graph
+from nonholonomic.geometry import Implicit as Implicit
+from nonholonomic.geometry import Paraboloid as Paraboloid
 from nonholonomic.geometry import Plane as Plane
 from nonholonomic.geometry import Sphere as Sphere
+from nonholonomic.geometry import Spheroid as Spheroid
+from nonholonomic.geometry import Torus as Torus
 from nonholonomic.identification import FitWarning as FitWarning
 from nonholonomic.identification import Free as Free
 from nonholonomic.sweeps import Table as Table
@@ -24,6 +29,7 @@ from .lyapunov import lyapunov_exponent as lyapunov_exponent
 from .measured import InversionTimes as InversionTimes
 from .measured import Recording as Recording
 from .phases.flight_trajectory import HybridTrajectory as HybridTrajectory
+from .posterior import log_density as log_density
 from .read import read_recording as read_recording
 from .scene import Scene as Scene
 from .table import inversion_table as inversion_table

@@ -26,6 +26,7 @@ from nonholonomic.integration import (
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Variable
 
+from .dynamics import LOSSES
 from .inversion import InversionProblem, is_inverted
 from .phases.sliding import phases as hybrid_phases
 from .phases.stick_slip_runs import phases as stick_slip_phases
@@ -58,9 +59,9 @@ class Driver(NamedTuple):
 
 
 # Compiled once for all blocks.
-_jams = eqx.filter_jit(lambda dynamics, state: dynamics.jams(state))
+_loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
 
-WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed")
+WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit")
 SMOOTH = Driver(WORDS, (), None)
 STICK_SLIP = Driver((*WORDS, "unresolved"), ("sticks",), stick_slip_phases)
 HYBRID = Driver((*WORDS, "unresolved"), ("hops",), hybrid_phases)
@@ -150,8 +151,9 @@ class CellRuns(NamedTuple):
         lost = code == WORDS.index("contact_lost")
         if lost.any():
             # A hybrid run flies on where contact is lost.
-            jams = self.driver is HYBRID or np.asarray(_jams(scene.dynamics, jnp.asarray(ended.state)))
-            code = np.where(lost & jams, WORDS.index("jammed"), code)
+            losses = ("jammed",) if self.driver is HYBRID else LOSSES
+            loss = 0 if self.driver is HYBRID else np.asarray(_loss(scene.dynamics, jnp.asarray(ended.state)))
+            code = np.where(lost, np.array([WORDS.index(word) for word in losses])[loss], code)
         times = {self.times[-1]: np.where(inverted, ended.crossing_time, np.inf)}
         if isinstance(ended, Outcome) and self.crossing == "both":
             times["first_time"] = np.asarray(ended.first_crossing)

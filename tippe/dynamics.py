@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import (
-    AbstractSurface,
+    AbstractFrame,
     Component,
     Tangent,
     add,
@@ -41,12 +41,20 @@ NO_COSINE = -2.0
 #: with ten times the value, in `tests/physics/test_strong_friction.py`; theta errs by 5e-13 there, velocities by 1e-4.
 JAMMED = 1e-4
 
+#: Room (`Motion.room`) at which the ball no longer fits: a curvature of the arena has reached 1/R. The foot runs away there as
+#: the root of the time left, so a run ends too early by the square of this in units of 0.1 s or so.
+FITS = 1e-4
+
+#: How a contact can end; the index stands for the word.
+LOSSES = ("contact_lost", "jammed", "does_not_fit")
+
 
 class Motion(NamedTuple):
     """What the equations of motion give for one state, every vector in the moving frame.
 
     `stiffness` is the factor of N in its equation, 1 + m a A in `tippe.md`, section 2: 1 without an offset, and zero if the
-    friction due to each newton of N pulls the top down as hard as that newton pushes it up.
+    friction due to each newton of N pulls the top down as hard as that newton pushes it up. `room` is positive where the ball
+    fits, `None` where it does everywhere.
     """
 
     rate: tuple[Component, ...]
@@ -57,6 +65,7 @@ class Motion(NamedTuple):
     turning: Tangent
     spin_momentum: Float[Array, "..."]
     stiffness: Float[Array, "..."]
+    room: Component
 
     @property
     def friction_power(self) -> Component:
@@ -67,7 +76,7 @@ class Motion(NamedTuple):
 class Dynamics(eqx.Module):
     """A scene with the combinations of its numbers that every evaluation needs, computed once."""
 
-    parallel: AbstractSurface
+    frame: AbstractFrame
     friction: AbstractFriction
     radius: Float[Array, "..."]
     offset: Float[Array, "..."]
@@ -80,14 +89,14 @@ class Dynamics(eqx.Module):
 
     @classmethod
     def of(
-        cls, body: Top, surface: AbstractSurface, friction: AbstractFriction, gravity: Float[Array, "..."]
+        cls, body: Top, frame: AbstractFrame, friction: AbstractFriction, gravity: Float[Array, "..."]
     ) -> "Dynamics":
         """The equations for a body on an arena.
 
-        **Arguments:** as for `Scene`.
+        **Arguments:** `frame`: that of the body's sphere on the arena; the others as for `Scene`.
         """
         return cls(
-            parallel=surface.parallel(body.radius),
+            frame=frame,
             friction=friction,
             radius=body.radius,
             offset=body.offset,
@@ -114,8 +123,7 @@ class Dynamics(eqx.Module):
         # The axis turns with the body; V is the velocity of the sphere's centre, o the rate at which it turns the frame.
         e_dot = scale(self.per_transverse, cross(L, e))
         V = (u1 + a * e_dot[0], u2 + a * e_dot[1])
-        o = self.parallel.turning(V)
-        up = self.parallel.vertical(place)
+        o, up, place_rate, room = self.frame.carriage(place, V)
 
         spin_momentum = dot(L, e)
         along_axis = self.axial_excess * spin_momentum
@@ -148,8 +156,8 @@ class Dynamics(eqx.Module):
         u2_dot = add(multiply(thrust, f2), multiply(-self.gravity, up[1]), multiply(o[1], u3))
         e_dot = sum_vectors(e_dot, carried(e, o))
         L_dot = sum_vectors(scale(N, (M1, M2, M3)), carried(L, o))
-        rate = (u1_dot, u2_dot, *e_dot, *L_dot, *self.parallel.place_rate(place, o))
-        return Motion(rate, N, friction, slip, V, o, spin_momentum, stiffness)
+        rate = (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate)
+        return Motion(rate, N, friction, slip, V, o, spin_momentum, stiffness, room)
 
     def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """Rate of change of the state, (components, ...)."""
@@ -158,17 +166,22 @@ class Dynamics(eqx.Module):
     def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Positive while the contact persists and Coulomb's law has an answer.
 
-        The lesser of two: the normal force as a fraction of the weight, plus a round-off allowance for a start with N = 0, and
-        the excess of the stiffness over `JAMMED`.
+        The least of what `_margins` says.
         """
-        motion = self.motion(state)
-        return jnp.minimum(motion.normal_force / (self.mass * self.gravity) + 1e-12, motion.stiffness - JAMMED)
+        return jnp.stack(self._margins(state)).min(axis=0)
 
-    def jams(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
-        """Whether a contact whose margin is zero has jammed; otherwise it is lost."""
+    def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+        """How a contact has ended whose margin is zero: a code in `LOSSES`."""
+        lost, *others = self._margins(state)
+        # At the located end a margin is round-off of either sign; where another has vanished N is many times the weight.
+        return len(others) - jnp.argmin(jnp.stack([*others[::-1], jnp.maximum(lost, 0.0)]), axis=0)
+
+    def _margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
+        """For each of `LOSSES` what is left: the normal force as a fraction of the weight, plus a round-off allowance for a
+        start with N = 0; the excess of the stiffness over `JAMMED`; that of the room over `FITS`, if the room may end."""
         motion = self.motion(state)
-        # At the located end the excess of the stiffness is round-off of either sign, and N is many times the weight.
-        return motion.stiffness - JAMMED <= jnp.maximum(motion.normal_force / (self.mass * self.gravity), 0.0)
+        lost, jammed = motion.normal_force / (self.mass * self.gravity) + 1e-12, motion.stiffness - JAMMED
+        return (lost, jammed) if motion.room is None else (lost, jammed, motion.room - FITS)
 
 
 def stacked(rate: tuple[Component, ...], state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:

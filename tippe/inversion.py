@@ -179,7 +179,13 @@ def permitted(
     scene, launch, angle, t1, tolerance = jax.tree.unflatten(structure, leaves)
     may = jnp.asarray(True)
     if unchecked:
-        bounds = (*all_bounds(scene), *all_bounds(launch), *event_bounds(angle), *run_bounds(t1, tolerance))
+        bounds = (
+            *all_bounds(scene),
+            *all_bounds(launch),
+            *scene.start_bounds(launch),
+            *event_bounds(angle),
+            *run_bounds(t1, tolerance),
+        )
         may = legal(bounds)
         t1, tolerance = jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
     return may, t1, jnp.min(tolerance)
@@ -204,6 +210,7 @@ def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any) -> None:
     for name, value in values.items():
         if value is not None and np.ndim(value) != 0:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; inversion_table takes lists")
+    scene.check_start(launch)
 
 
 def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -9,26 +10,75 @@ from jaxtyping import Array, Float
 from nonholonomic.validation import Bound, Bounded, as_number
 
 
+def as_numbers(value: Any) -> Any:
+    """Several numbers as a tuple of arrays; `None`, and what is not several, is left for the check."""
+    if value is None or isinstance(value, str) or getattr(value, "ndim", 1) == 0:
+        return value
+    try:
+        return tuple(as_number(part) for part in value)
+    except TypeError:
+        return value
+
+
 class Launch(Bounded):
-    """A start with the angular velocity along the axis, w = spin e, and the centre at rest.
+    """A start: where the top stands on the arena, how it leans, how it spins and moves.
+
+    The axis is e = cos(theta) n + sin(theta) (cos(azimuth) t1 + sin(azimuth) t2), with n the arena's normal into the room where
+    the top is. In a cylinder t1 points along growing eta and t2 along y. On other arenas t1 is the projection of the x axis
+    onto the tangent plane, of the y axis where n is along x, and t2 = n x t1; inside a sphere, where the place is given by
+    `eta`, t1 points along growing eta.
 
     **Arguments:**
 
     - `theta`: angle [rad] from the arena's normal to the axis, in [0, pi]; 0 is stem out, pi is stem in.
     - `spin`: angular velocity about the axis [rad/s].
-    - `eta`: angle [rad] of the place from the arena's lowest point, in [-pi, pi].
-    - `azimuth`: direction [rad] in which the axis leans, from growing eta towards y.
+    - `eta`: angle [rad] of the place from the arena's lowest point, in [-pi, pi]; on arenas that count no such angle, 0.
+    - `azimuth`: direction [rad] in which the axis leans, from t1 towards t2.
+    - `place`: where the top touches the arena, instead of `eta`: (x, y) [m] on a plane, along it, a paraboloid and a graph;
+      (y, eta) on a cylinder; (mu, eta) [rad], azimuth and angle from the lowest point, on a sphere, spheroid or torus;
+      or (x, y, z) [m], a point of the arena but for round-off.
+    - `velocity`: (2,) [m/s] of the sphere's centre along (t1, t2); at rest by default.
+    - `angular_velocity`: (3,) [rad/s] in (t1, t2, n), besides the spin about the axis; none by default.
 
     **Raises:** `ValueError` for numbers outside these ranges.
+
+    **Example:** half a metre up the x side of a bowl, moving across at 0.2 m/s.
+
+        >>> import tippe
+        >>> launch = tippe.Launch(0.1, 100.0, place=(0.5, 0.0), velocity=(0.0, 0.2))
+        >>> scene = tippe.Scene(tippe.Top(0.02, 0.02, 0.006, 3e-6, 3.2e-6), tippe.Paraboloid(1.0), tippe.Viscous(0.3))
+        >>> tippe.simulate(scene, launch, t1=0.1).status
+        'reached t1'
     """
 
     theta: Float[Array, "..."] = eqx.field(converter=as_number)
     spin: Float[Array, "..."] = eqx.field(converter=as_number)
     eta: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
     azimuth: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
+    place: tuple[Float[Array, "..."], ...] | None = eqx.field(converter=as_numbers, default=None, kw_only=True)
+    velocity: tuple[Float[Array, "..."], ...] | None = eqx.field(converter=as_numbers, default=None, kw_only=True)
+    angular_velocity: tuple[Float[Array, "..."], ...] | None = eqx.field(
+        converter=as_numbers, default=None, kw_only=True
+    )
+
+    def __check_init__(self):
+        allowed = {
+            "place": ((2, 3), "(x, y), (mu, eta) or (x, y, z)"),
+            "velocity": ((2,), "two numbers, along t1 and t2"),
+            "angular_velocity": ((3,), "three numbers, along t1, t2 and n"),
+        }
+        for name, (counts, words) in allowed.items():
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, tuple) and len(value) in counts):
+                raise ValueError(f"{name} = {value!r} must be {words}")
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.theta, "theta", at_least=0.0, at_most=math.pi)
         yield Bound(self.spin, "spin")
         yield Bound(self.eta, "eta", at_least=-math.pi, at_most=math.pi)
+        if self.place is not None:
+            yield Bound(self.eta, "eta", at_least=0.0, at_most=0.0, why="place is given")
         yield Bound(self.azimuth, "azimuth")
+        for name in ("place", "velocity", "angular_velocity"):
+            for k, number in enumerate(getattr(self, name) or ()):
+                yield Bound(number, f"{name}[{k}]")

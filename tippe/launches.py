@@ -1,5 +1,6 @@
 """The grid of launches and scenes that a table is asked for, made of its arguments and checked."""
 
+from collections import Counter
 from collections.abc import Collection
 from typing import Any
 
@@ -18,6 +19,12 @@ CHECKED_AT_ONCE = 1 << 20
 UNITS = {"mass": "kg", "radius": "m", "offset": "m", "I1": "kg m2", "I3": "kg m2", "gravity": "m s-2"}
 UNITS |= {"theta": "rad", "eta": "rad", "azimuth": "rad", "spin": "rad s-1"}
 
+#: The parts of a launch that are several numbers: what an axis along each is called, and its unit.
+SEVERAL = {
+    "velocity": [(f"velocity_{axis}", "m s-1") for axis in ("t1", "t2")],
+    "angular_velocity": [(f"angular_velocity_{axis}", "rad s-1") for axis in ("t1", "t2", "n")],
+}
+
 
 def launches(
     scene: Any, given: dict[str, Any], axes: Any, t1: Any, tolerance: Any, taken: Collection[str] = ()
@@ -28,7 +35,8 @@ def launches(
 
     - `scene`: the scene, every number a scalar.
     - `given`: number of the launch, or "mu" for the scene's friction, its own if `None` -> a number or a list.
-    - `axes`: path of a number -> values, or `None`.
+    - `axes`: path of a number -> values, or `None`; those of a launch's several numbers are `"launch.place[0]"` and so on, and
+      what is left out of them is 0.
     - `t1`, `tolerance`: as for `inversion_table`.
     - `taken`: names that no axis may have; it then goes by its path, as do axes that would share a name.
 
@@ -50,17 +58,35 @@ def launches(
             raise ValueError(f"axes: {number!r} is an argument of its own")
     values |= axes or {}
     fixed = {number: value for number, value in values.items() if np.ndim(value) == 0}
-    names = [number.rsplit(".", 1)[-1] for number in values]
-    units = UNITS | scene.friction.units
+    launch, several = _with_room(scene, values)
+    units = UNITS | scene.friction.units | dict(several.values())
+    names = {number: several.get(number, (number.rsplit(".", 1)[-1],))[0] for number in values}
+    # A place that is given takes the place of the argument eta.
+    counts = Counter(name for number, name in names.items() if number != "launch.eta" or launch.place is None)
     grid = []
-    for number, name in zip(values, names, strict=True):
+    for number, name in names.items():
         if number not in fixed:
-            alone = names.count(name) == 1 and name not in taken
+            alone = counts[name] == 1 and name not in taken
             grid.append(axis(name if alone else number, number, units.get(name, "1"), values[number]))
-    roots = with_numbers({"scene": scene, "launch": Launch(theta=0.0, spin=0.0)}, fixed)
+    roots = with_numbers({"scene": scene, "launch": launch}, fixed)
     check_run(roots["scene"], roots["launch"], t1, tolerance)
     _check_cells(roots, grid)
     return roots, grid, units
+
+
+def _with_room(scene: Scene, values: Collection[str]) -> tuple[Launch, dict[str, tuple[str, str]]]:
+    """A launch with room for all numbers that are given, and the name and unit of each that is one of several."""
+    found: dict[str, tuple[str, str]] = {}
+    parts: dict[str, Any] = {}
+    coordinates = list(scene.surface.coordinates)
+    if "launch.place[2]" in values and len(coordinates) == 2:
+        coordinates = [("x", "m"), ("y", "m"), ("z", "m")]
+    for name, labels in {"place": coordinates, **SEVERAL}.items():
+        here = {f"launch.{name}[{k}]": label for k, label in enumerate(labels)}
+        if not here.keys().isdisjoint(values):
+            parts[name] = (0.0,) * len(labels)
+            found |= here
+    return Launch(theta=0.0, spin=0.0, **parts), found
 
 
 def described(roots: dict[str, Any], grid: list[Axis]) -> dict[str, Any]:
@@ -75,4 +101,5 @@ def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:
     cells = int(np.prod(shape, dtype=int))
     for first in range(0, cells, CHECKED_AT_ONCE):
         places = np.unravel_index(np.arange(first, min(first + CHECKED_AT_ONCE, cells)), shape) if grid else ()
-        with_numbers(roots, {one.number: one.values[place] for one, place in zip(grid, places, strict=True)})
+        cells = with_numbers(roots, {one.number: one.values[place] for one, place in zip(grid, places, strict=True)})
+        cells["scene"].check_start(cells["launch"])

@@ -15,6 +15,7 @@ from nonholonomic.integration import GUARD_LOST, REACHED_END, Settings, explicit
 from nonholonomic.validation import require
 
 from .cells import driver_of
+from .dynamics import LOSSES
 from .inversion import InversionProblem
 from .launch import Launch
 from .scene import Scene
@@ -29,7 +30,7 @@ class LyapunovExponent(NamedTuple):
 
     - `exponent`: mean rate [1/s] of exponential divergence in the second half of the run; NaN if the run ended early.
     - `error`: of the exponent [1/s]; an exponent below twice its error is no sign of chaos.
-    - `status`: "reached_end", "contact_lost", "jammed" or "failed".
+    - `status`: "reached_end", "contact_lost", "jammed", "does_not_fit" or "failed".
     - `end_time`: when the run ended [s]; `steps`: accepted and rejected ones.
     - `times`: [s], (32,), and `running`: the mean rate of divergence [1/s] from the start to each of them, (32, ...).
     """
@@ -88,8 +89,7 @@ def lyapunov_exponent(
     found = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, Settings(tolerance, solver))
     exponent, error = exponent_of(found.logarithm, float(t1))
     whole = found.status == REACHED_END
-    jams = np.asarray(problem.dynamics.jams(jnp.asarray(found.state)))
-    lost = np.where(jams, "jammed", "contact_lost")
+    lost = np.asarray(LOSSES)[np.asarray(problem.dynamics.loss(jnp.asarray(found.state)))]
     words = np.select([whole, found.status == GUARD_LOST], ["reached_end", lost], "failed")
     times = t1 * np.arange(1, STRETCHES + 1) / STRETCHES
     passed = np.minimum(times[:, None], found.end_time)
@@ -111,6 +111,7 @@ def _direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, "compon
     magnitudes = scene.scales(launch)
     u1, u2, r1, r2, r3, *L = (magnitudes[i] * jnp.cos(1.0 + i) for i in range(8))
     e = parts(scene.state(launch)).axis
-    _, place = jax.jvp(scene.surface.place, (launch.eta,), (jnp.ones_like(launch.eta),))
+    frame, (place, _) = scene.frame, scene.start(launch)
+    place = frame.carriage(place, (scene.body.radius, scene.body.radius)).place_rate
     direction = joined((u1, u2), cross((r1, r2, r3), e), tuple(L), place)
     return jnp.broadcast_to(direction.reshape(len(direction), -1), (len(direction), cells))

@@ -13,7 +13,7 @@ from nonholonomic.identification import (
     Measurements,
     Quantities,
     check_recording,
-    model_times,
+    predicted,
     sample_labels,
     samples,
     seen_samples,
@@ -35,9 +35,6 @@ QUANTITIES = Quantities(
     | dict.fromkeys(("axis_x", "axis_y", "axis_z"), "1"),
     angles=frozenset({"azimuth", "eta"}),
 )
-
-#: Between times that are added so that recordings are of one length [s].
-AT_ONCE = 1e-6
 
 #: Parameters by name, one value a row.
 Values = dict[str, Float[Array, " rows"]]
@@ -221,48 +218,16 @@ class Recording(eqx.Module):
 def predict_recordings(
     scene: Scene, recordings: list[tuple[Recording, Values]], rows: int, tolerance: float
 ) -> list[Float[Array, "rows samples"]]:
-    """What is recorded of several runs, in every row; all runs with launches of one kind are lanes of one block.
+    """What is recorded of several runs, in every row, as for `nonholonomic.identification.predicted`."""
 
-    **Arguments:** `recordings`: each with its parameters; a name is given for all recordings, or for none.
-
-    **Returns:** for each recording its samples, a time after the other, missing ones included; NaN after the end of a run.
-    """
-    longest = max(len(one.times) for one, _ in recordings)
-    columns = tuple(dict.fromkeys(name for one, _ in recordings for name in one.columns))
-    count = len(recordings)
-
-    def lanes(of_each: list[Array]) -> Array:
-        """The numbers of all runs, one row after the other; each is a scalar or has one number a row."""
-        return jnp.stack([jnp.broadcast_to(one, (rows,)) for one in of_each], axis=1).reshape(-1)
-
-    known = [numbers("launch", one.launch) for one, _ in recordings]
-    given = {name: lanes([one[name] for one in known]) for name, value in known[0].items() if value is not None}
-    given |= {"t0": lanes([one.t0 for one, _ in recordings])}
-    given |= {name: lanes([values[name] for _, values in recordings]) for name in recordings[0][1]}
-    # Shorter recordings go on for an instant, so that all have as many times.
-    clock = jnp.stack([_lengthened(one.times, longest) for one, _ in recordings])
-
-    def one(lane: Values, times: Float[Array, " times"]) -> Float[Array, "times columns"]:
-        lane = dict(lane)
-        since = model_times(times, lane.pop("t0"))
+    def run(lane: Values, times: Float[Array, " times"]) -> Any:
         roots = with_numbers({"scene": scene, "launch": recordings[0][0].launch}, lane)
-        run = simulate(roots["scene"], roots["launch"], since[-1], since, tolerance)
-        return jnp.stack([_column(run, name) for name in columns], axis=-1)
+        return simulate(roots["scene"], roots["launch"], times[-1], times, tolerance)
 
-    found = jax.vmap(one)(given, jnp.tile(clock, (rows, 1))).reshape(rows, count, longest, len(columns))
-    parts = []
-    for k, (recording, _) in enumerate(recordings):
-        places = np.array([columns.index(name) for name in recording.columns])
-        parts.append(found[:, k, : len(recording.times)][..., places].reshape(rows, -1))
-    return parts
+    return predicted(recordings, rows, run, column_of)
 
 
-def _lengthened(times: Float[Array, " times"], count: int) -> Float[Array, " count"]:
-    """The times, and after the last one others that follow at once."""
-    return jnp.concatenate([times, times[-1] + AT_ONCE * jnp.arange(1, 1 + count - len(times))])
-
-
-def _column(run: Any, name: str) -> Float[Array, " times"]:
+def column_of(run: Any, name: str) -> Float[Array, " times"]:
     """A column of a trajectory."""
     for quantity, columns in QUANTITIES.columns.items():
         if name in columns:

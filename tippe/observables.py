@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.geometry import Component, Vector, add, dot, multiply
+from nonholonomic.geometry import Component, Vector, dot, scale, sum_vectors
 from nonholonomic.integration import Followed, PhasedPath
 from nonholonomic.validation import is_traced, require
 
@@ -102,7 +102,7 @@ class AbstractTrajectory(eqx.Module):
     @of_each_run
     def eta(self) -> Float[Array, " times"]:
         """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
-        return self.scene.surface.angle(self._place, tuple(self.cyclic))
+        return self.scene.frame.angle(self._place, tuple(self.cyclic))
 
     @of_each_run
     def azimuth(self) -> Float[Array, " times"]:
@@ -133,10 +133,9 @@ class AbstractTrajectory(eqx.Module):
     def position(self) -> Float[Array, "times 3"]:
         """Position of the sphere's centre [m]; the plane is z = 0, the cylinder's axis x = z = 0, and a run on the plane
         starts above the origin."""
-        foot = self.scene.surface.position(self._place, tuple(self.cyclic))
-        normal = self.scene.surface.frame(self._place, tuple(self.cyclic))[2]
-        height = add(self.scene.body.radius, self.above[0])
-        return jnp.stack([add(q, multiply(height, n)) for q, n in zip(foot, normal, strict=True)], axis=-1)
+        frame, where = self.scene.frame, (self._place, tuple(self.cyclic))
+        centre = sum_vectors(frame.position(*where), scale(self.above[0], frame.axes(*where)[2]))
+        return jnp.stack(centre, axis=-1)
 
     @of_each_run
     def jellett(self) -> Float[Array, " times"]:
@@ -174,8 +173,8 @@ class AbstractTrajectory(eqx.Module):
         return tuple(self.states[8:])
 
     def _fixed(self, vector: Vector) -> Float[Array, "times 3"]:
-        frame = self.scene.surface.frame(self._place, tuple(self.cyclic))
-        return jnp.stack([dot(vector, directions) for directions in zip(*frame, strict=True)], axis=-1)
+        axes = self.scene.frame.axes(self._place, tuple(self.cyclic))
+        return jnp.stack([dot(vector, directions) for directions in zip(*axes, strict=True)], axis=-1)
 
     def __str__(self) -> str:
         if is_traced(self.t) or self.t.ndim > 1:

@@ -1,13 +1,28 @@
 """The scene: what moves, on what arena, with what friction, under what gravity."""
 
+import math
 from collections.abc import Iterator
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import AbstractSurface, Plane, dot, none_if_zero
-from nonholonomic.validation import Bound, Bounded, as_number
+from nonholonomic.geometry import (
+    AbstractFrame,
+    AbstractSurface,
+    Component,
+    Plane,
+    PlaneFrame,
+    cross,
+    dot,
+    frame_of,
+    none_if_zero,
+    place_named,
+    room_bounds,
+    scale,
+    sum_vectors,
+)
+from nonholonomic.validation import Bound, Bounded, as_number, require_all
 
 from .dynamics import Dynamics
 from .friction import AbstractFriction, Frictionless
@@ -19,6 +34,9 @@ from .top import Top
 #: Tilt [rad] of a launch below which errors across the normal are measured in proportion to it.
 NEARLY_UPRIGHT = 1e-2
 
+#: How fast the foot of a top on a general arena is drawn back to it, over sqrt(g / R); `docs/tippe.md` has the drift.
+PULL = 1.0
+
 
 class Scene(Bounded):
     """A tippe top on an arena.
@@ -28,7 +46,8 @@ class Scene(Bounded):
     **Arguments:**
 
     - `body`: a `Top`.
-    - `surface`: the arena: `Plane()`, `Cylinder(radius)` or `Sphere(radius)`; the top runs inside the last two.
+    - `surface`: the arena: `Plane(tilt)`, `Cylinder(radius)`, `Sphere(radius)`, `Spheroid(equatorial, polar)`, `Torus(ring,
+      tube)`, `Paraboloid(p)`, `Graph(height)` or `Implicit(function)`.
     - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
       or `Rolling(resistance, turning_speed, sliding)` with one of them, or, with `contact="stop"`,
       `SetValuedCoulomb(mu)`.
@@ -36,6 +55,7 @@ class Scene(Bounded):
     - `contact`: "stop": a run ends where the contact is lost; "hybrid", on the plane: it goes on through flights, impacts
       and changes to the stem and back (`phases/`). A top with a stem needs the latter.
     - `restitution`: Newton's coefficient e_N of impacts [1], in [0, 1], for "hybrid" only; `None` is 0.
+    - `side`: "inside" or "outside" of a closed surface, "above" an open one; `None` is inside, or above.
 
     **Raises:** `ValueError` if a part is of the wrong kind, if the top does not fit into the arena, if gravity is not
     positive, or if the arena, the body or the friction does not allow the contact.
@@ -47,14 +67,15 @@ class Scene(Bounded):
     gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81)
     contact: str = eqx.field(static=True, default="stop")
     restitution: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
+    side: str | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         parts = (("body", self.body, Top), ("surface", self.surface, AbstractSurface))
         for name, part, kind in (*parts, ("friction", self.friction, AbstractFriction)):
             if not isinstance(part, kind):
                 raise ValueError(f"{name} = {part!r} must be a {kind.__name__.removeprefix('Abstract')}")
-        # This raises if the surface has no room for a ball at all.
-        self.surface.parallel(self.body.radius)
+        # This raises if the surface has no such side.
+        self.surface.sign(self.side, "inside")
         if self.contact not in ("stop", "hybrid"):
             raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
         if self.contact == "hybrid" and not isinstance(self.surface, Plane):
@@ -68,15 +89,51 @@ class Scene(Bounded):
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.gravity, "gravity", above=0.0)
-        yield from self.surface.room(self.body.radius)
+        yield from room_bounds(self.surface, self.surface.sign(self.side, "inside"), self.body.radius)
         if self.restitution is not None:
             yield Bound(self.restitution, "restitution", at_least=0.0, at_most=1.0)
+
+    @property
+    def frame(self) -> AbstractFrame:
+        """The moving frame of the top's sphere on the arena."""
+        side, pull = self.surface.sign(self.side, "inside"), PULL * jnp.sqrt(self.gravity / self.body.radius)
+        return frame_of(self.surface, side, self.body.radius, pull)
 
     @property
     def dynamics(self) -> Dynamics | StickSlip:
         """The equations of motion, with the combinations of the scene's numbers that they need."""
         equations = StickSlip if self.friction.set_valued else Dynamics
-        return equations.of(self.body, self.surface, self.friction, self.gravity)
+        return equations.of(self.body, self.frame, self.friction, self.gravity)
+
+    def check_start(self, launch: Launch) -> None:
+        """Raise `ValueError` if a launch has no place on this arena."""
+        require_all(self.start_bounds(launch))
+
+    def start_bounds(self, launch: Launch) -> Iterator[Bound]:
+        """The ranges that the arena sets for a launch.
+
+        **Raises:** `ValueError` for a place with the wrong number of numbers.
+        """
+        surface = self.surface
+        names, kind = [name for name, _ in surface.coordinates], type(surface).__name__
+        if launch.place is None:
+            if len(names) == 3:
+                raise ValueError(f"place = None must be (x, y, z) on a {kind}, which names no place by eta")
+            if "eta" not in names and not isinstance(self.frame, PlaneFrame):
+                yield Bound(launch.eta, "eta", at_least=0.0, at_most=0.0, why=f"a place on a {kind} is given by place")
+            return
+        counts_from_below = len(launch.place) == 2 and names[0] == "mu"
+        for bound in surface.place_bounds(place_named(surface, launch.place), self.body.radius):
+            if counts_from_below and bound.name == "place[1]":
+                yield Bound(launch.place[1], "place[1]", at_least=0.0, at_most=math.pi, why="from the lowest point")
+            else:
+                yield bound
+
+    def start(self, launch: Launch) -> tuple[tuple[Component, ...], tuple[Component, ...]]:
+        """Place and cyclic coordinates of the frame at the start of a run."""
+        if launch.place is None:
+            return self.frame.at_angle(launch.eta)
+        return self.frame.at_foot(self.surface.chart(place_named(self.surface, launch.place))[0])
 
     def state(self, launch: Launch) -> Float[Array, "components ..."]:
         """The state at the start of a run (see `state.py` for its components).
@@ -87,11 +144,15 @@ class Scene(Bounded):
 
         **Returns:** an array (components, ...) in SI units.
         """
-        sine = jnp.sin(launch.theta)
+        body, sine, zero = self.body, jnp.sin(launch.theta), jnp.zeros_like(launch.theta)
         e = (sine * jnp.cos(launch.azimuth), sine * jnp.sin(launch.azimuth), jnp.cos(launch.theta))
-        L = tuple(self.body.I3 * launch.spin * component for component in e)
-        zero = jnp.zeros_like(launch.theta)
-        return joined((zero, zero), e, L, self.surface.place(launch.eta))
+        L, u = scale(body.I3 * launch.spin, e), launch.velocity or (zero, zero)
+        if launch.angular_velocity is not None:
+            turning = launch.angular_velocity
+            along = dot(turning, e)
+            L = sum_vectors(L, scale(body.I1, turning), scale((body.I3 - body.I1) * along, e))
+            u = sum_vectors(u, scale(-body.offset, cross(turning, e)[:2]))
+        return joined(u, e, L, self.start(launch)[0])
 
     def scales(self, launch: Launch) -> Float[Array, "components ..."]:
         """Magnitudes by which absolute errors of the state are measured, component by component.
@@ -106,7 +167,10 @@ class Scene(Bounded):
         rate = jnp.sqrt(self.gravity / self.body.radius)
         velocity = rate * self.body.radius
         momentum = jnp.maximum(self.body.I3 * jnp.abs(launch.spin), self.body.I1 * rate)
-        place = tuple(one for _ in self.surface.place(launch.eta))
+        if launch.angular_velocity is not None:
+            turning = launch.angular_velocity
+            momentum = jnp.maximum(momentum, self.body.I1 * jnp.sqrt(dot(turning, turning)))
+        place = scale(one, self.frame.place_scales)
         tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
         # A top that stands exactly upright has no growth to resolve.
         tilt = jnp.where(tilt > 0.0, jnp.clip(tilt, 1e-280, 1.0), 1.0)
@@ -140,9 +204,7 @@ class Scene(Bounded):
         speed2 = u1**2 + u2**2 + (body.offset * e3_dot) ** 2
         axial = dot(L, e)
         rotation = (dot(L, L) - axial**2) / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
-        climb = dynamics.parallel.height(place)
-        height = body.radius - body.offset * dot(e, dynamics.parallel.vertical(place))
-        height = height if climb is None else height + climb
+        height = dynamics.frame.height(place) - body.offset * dot(e, dynamics.frame.vertical(place))
         return 0.5 * body.mass * speed2 + rotation + body.mass * self.gravity * height
 
     def jellett(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:

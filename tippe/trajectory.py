@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.integration import Followed, PhasedPath, Settings, follow
+from nonholonomic.progress import Progress
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require_all
 
 from .inversion import check_run, run_bounds
@@ -18,7 +19,7 @@ from .launch import Launch
 from .observables import AbstractTrajectory, check_increasing, of_each_run
 from .phases.flight_trajectory import HybridTrajectory, simulate_hybrid
 from .phases.stick_slip_runs import follow_stick_slip
-from .sampled import STATUS, TrajectoryProblem, ended, sampled, sampled_by_diffrax
+from .sampled import STATUS, TrajectoryProblem, ended, sampled
 from .scene import Scene
 
 
@@ -116,13 +117,15 @@ def simulate(
     if scene.contact == "hybrid":
         if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1))):
             raise ValueError("contact = 'hybrid' must be 'stop' inside jit, vmap and grad")
-        return simulate_hybrid(scene, launch, float(t1), times, tolerance, solver)
+        with Progress(1, "run", "simulating"):
+            return simulate_hybrid(scene, launch, float(t1), times, tolerance, solver)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
         return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
-    run = TrajectoryProblem.of(scene, launch)
-    through = follow_stick_slip if scene.friction.set_valued else follow
-    path = through(run, float(t1), Settings(tolerance, solver))
-    trajectory = _as_trajectory(scene, run, path)
+    with Progress(1, "run", "simulating"):
+        run = TrajectoryProblem.of(scene, launch)
+        through = follow_stick_slip if scene.friction.set_valued else follow
+        path = through(run, float(t1), Settings(tolerance, solver))
+        trajectory = _as_trajectory(scene, run, path)
     if times is None:
         return trajectory
     return trajectory.at(np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)])
@@ -140,7 +143,13 @@ def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: 
     if times is None:
         # It raises the error that says so.
         return _traced(scene, launch, times, t1, tolerance, *options)
-    bounds = (*all_bounds(scene), *all_bounds(launch), *run_bounds(t1, tolerance), *times_bounds(times, t1))
+    bounds = (
+        *all_bounds(scene),
+        *all_bounds(launch),
+        *scene.start_bounds(launch),
+        *run_bounds(t1, tolerance),
+        *times_bounds(times, t1),
+    )
     may = jnp.all(legal(bounds)) & jnp.all(jnp.diff(times) > 0.0)
     # A run of illegal numbers might never reach its end, so it is given the horizon 0.
     found = _traced(scene, launch, times, jnp.where(may, t1, 0.0), tolerance, *options)
@@ -163,14 +172,12 @@ def _traced(
         )
     if times is None:
         raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
-    run = TrajectoryProblem.of(scene, launch)
-    if adjoint is None:
-        found = sampled(scene, launch, times, t1, tolerance, solver)
-    else:
-        found = sampled_by_diffrax(run, times, as_number(t1), tolerance, solver, adjoint)
+    found = sampled(scene, launch, times, t1, Settings(tolerance, solver), adjoint)
     status = found.status.astype(int)
-    stats = {"accepted": found.steps.astype(int), "rejected": found.rejected.astype(int)}
-    return Trajectory(times, scene, *_parts(run, found.states.T), status, found.end_time, stats, None)
+    stats = {"accepted": found.accepted.astype(int), "rejected": found.rejected.astype(int)}
+    return Trajectory(
+        times, scene, *_parts(TrajectoryProblem.of(scene, launch), found.states), status, found.end_time, stats, None
+    )
 
 
 def _parts(run: TrajectoryProblem, states: Float[Array, "components times"]) -> tuple[Any, Any, Any, Any]:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..integration import REACHED_END, RUNNING, AbstractProblem, Settings, compiled_march
+from ..progress import Progress
 
 
 class VariedProblem(AbstractProblem):
@@ -103,17 +104,19 @@ def growth(
     stretch, direction = jnp.asarray(t1 / stretches), directions / magnitudes
     logarithms, end_time, status = [], np.zeros(cells), np.full(cells, RUNNING)
     steps, state = np.zeros(cells, int), np.asarray(start)
-    for _ in range(stretches):
-        unit = direction / jnp.linalg.norm(direction, axis=0)
-        varied = VariedProblem(problem, jnp.concatenate([start, unit, jnp.zeros((1, cells))]), magnitudes)
-        outcome, _ = compiled_march(varied, stretch, jnp.asarray(cells), settings)
-        alive = (status == RUNNING) | (status == REACHED_END)
-        logarithms.append(np.where(alive, outcome.state[-1], 0.0))
-        end_time += np.where(alive, outcome.end_time, 0.0)
-        steps += np.where(alive, outcome.steps, 0)
-        status = np.where(alive, outcome.status, status)
-        start, direction = outcome.state[:size], outcome.state[size:-1]
-        state = np.where(alive, start, state)
+    with Progress(stretches, "stretch") as shown:
+        for _ in range(stretches):
+            unit = direction / jnp.linalg.norm(direction, axis=0)
+            varied = VariedProblem(problem, jnp.concatenate([start, unit, jnp.zeros((1, cells))]), magnitudes)
+            outcome, _ = compiled_march(varied, stretch, jnp.asarray(cells), settings)
+            alive = (status == RUNNING) | (status == REACHED_END)
+            logarithms.append(np.where(alive, outcome.state[-1], 0.0))
+            end_time += np.where(alive, outcome.end_time, 0.0)
+            steps += np.where(alive, outcome.steps, 0)
+            status = np.where(alive, outcome.status, status)
+            start, direction = outcome.state[:size], outcome.state[size:-1]
+            state = np.where(alive, start, state)
+            shown.advance(1)
     return Growth(np.stack(logarithms), status, end_time, state, steps)
 
 

@@ -1,27 +1,43 @@
 """The surfaces that bodies move on, vectors in their frames, and small linear systems.
 
-A surface answers, for a place on it: the unit normal, how the frame turns with the velocity, the height and the
-Gaussian curvature. Components that vanish identically are `None`, so that nothing is computed for them.
+A surface answers, for a position on it: the unit normal and its rate for a velocity, the height and the Gaussian curvature,
+and how a person names a place. A frame moves along one with a ball; `frame_of` says which. Components that vanish identically
+are `None`, so that nothing is computed for them.
 """
 
-from .ground import AbstractGround as AbstractGround
-from .ground import AbstractQuadric as AbstractQuadric
-from .ground import Spheroid as Spheroid
+from .carried_frame import CarriedFrame as CarriedFrame
+from .carried_frame import frame_of as frame_of
+from .carried_frame import place_named as place_named
+from .carried_frame import room_bounds as room_bounds
+from .cylinder import Cylinder as Cylinder
+from .frames import AbstractFrame as AbstractFrame
+from .frames import Carriage as Carriage
+from .frames import CylinderFrame as CylinderFrame
+from .frames import PlaneFrame as PlaneFrame
+from .frames import SphereFrame as SphereFrame
+from .frames import Tangent as Tangent
+from .frames import carried as carried
+from .graph import Graph as Graph
+from .graph import Paraboloid as Paraboloid
+from .implicit import Implicit as Implicit
 from .linear import inverse as inverse
 from .linear import solve as solve
+from .plane import Plane as Plane
+from .quadric import AbstractQuadric as AbstractQuadric
+from .quadric import Sphere as Sphere
+from .quadric import Spheroid as Spheroid
+from .surface import CLOSED as CLOSED
 from .surface import AbstractSurface as AbstractSurface
-from .surface import Cylinder as Cylinder
-from .surface import Plane as Plane
-from .surface import Sphere as Sphere
-from .surface import Tangent as Tangent
-from .surface import carried as carried
-from .surface import none_if_zero as none_if_zero
+from .surface import Place as Place
+from .torus import Torus as Torus
 from .vector import Component as Component
 from .vector import Vector as Vector
 from .vector import add as add
 from .vector import cross as cross
 from .vector import dot as dot
 from .vector import multiply as multiply
+from .vector import none_if_zero as none_if_zero
 from .vector import scale as scale
 from .vector import subtract as subtract
 from .vector import sum_vectors as sum_vectors
+from .vector import tangents as tangents

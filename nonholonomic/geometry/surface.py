@@ -1,308 +1,144 @@
-"""Arenas: the surfaces on which a body slides, rolls or drives.
+"""What a surface answers to whoever moves on it: the one interface of all of them.
 
-Every surface answers two kinds of question, and a new surface is one new class.
+A surface has axes of its own, in which positions, velocities and normals are given. They are those of the fixed frame
+(x, y, z), z up, everywhere but on a tilted plane, whose third axis is its normal; `up` is the vertical in them. No
+component has a pole, an edge or an angle in it. `chart` and `place_at` convert between positions and the few numbers with
+which a person would name a place.
 
-In a frame that moves with the body, (t1, t2, n) with n the unit normal from the arena into the room where the body is:
-how the frame turns with the velocity (the shape operator), which way is up, and how the place changes. This is what the
-equations of motion need; components that vanish identically are `None` (see `vector.py`).
+The unit normal points outward on a closed surface (sphere, spheroid, torus, cylinder), upward on an open one (plane,
+paraboloid, graph) and to positive values of an implicit surface's function. On which side of it the body is, is the
+scene's business: `sign` reads the word.
 
-In the fixed frame (x, y, z), z up: position, normal, frame. This is what a picture needs. A model formulated in the
-fixed frame uses the surface as a ground (see `ground.py`).
+Vectors are tuples of three components, each a number or an array over lanes, or `None` where it vanishes identically.
 """
 
 import abc
-import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from ..validation import Bound, Bounded, as_number, is_traced, require_all
-from .ground import AbstractGround, AbstractQuadric, Place
-from .vector import Component, Vector, dot, multiply, subtract
+from ..validation import Bound, Bounded
+from .vector import Component, Vector, dot, subtract
 
-Tangent = tuple[Component, Component]
+Place = tuple[Float[Array, "..."], ...]
 
+#: Distance of a place given as (x, y, z) from its surface, relative to its size, up to which it is round-off.
+ROUND_OFF = 1e-9
 
-def carried(vector: tuple[Component, ...], turning: Tangent) -> tuple[Component, ...]:
-    """Rate of the components of a fixed vector in a moving frame with t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2)."""
-    along_normal = dot(turning, vector[:2])
-    return (multiply(turning[0], vector[2]), multiply(turning[1], vector[2]), subtract(None, along_normal))
+#: The words for the sides of a surface that encloses a room, of one with a room above it only, and of one that a function
+#: divides from the rest; with each the sign of the normal that points into the room.
+CLOSED: Mapping[str, float] = {"outside": 1.0, "inside": -1.0}
+OPEN: Mapping[str, float] = {"above": 1.0}
+DIVIDED: Mapping[str, float] = {"positive": 1.0}
 
 
 class AbstractSurface(Bounded):
-    """A surface described by a moving frame (t1, t2, n), with n pointing into the room where the body is.
+    """A smooth surface in space, with a unit normal n."""
 
-    With V the velocity along the surface, the normal turns as n' = -(o1 t1 + o2 t2), where (o1, o2) = S V and S is the
-    shape operator, positive where the surface is concave towards the room. The frame does not turn about n, so the
-    components of a fixed vector change as `carried` states.
-    """
+    #: How many of a position's three components do not vanish identically.
+    axes: ClassVar[int] = 3
 
-    def room(self, distance: Float[ArrayLike, "..."]) -> Iterable[Bound]:
-        """The ranges of the surface's numbers in which a ball of the given radius [m] fits."""
-        return ()
+    #: The words for the side on which a body is, and the sign of n that points to it.
+    sides: ClassVar[Mapping[str, float]] = CLOSED
 
-    @abc.abstractmethod
-    def parallel(self, distance: Float[ArrayLike, "..."]) -> "AbstractSurface":
-        """The surface at the given distance [m] into the room, on which the centre of a ball of that radius runs.
-
-        **Raises:** `ValueError` if such a ball does not fit.
-        """
-
-    @abc.abstractmethod
-    def place(self, eta: Float[ArrayLike, "..."]) -> Place:
-        """The integrated coordinates at the angle `eta` [rad] from the lowest point, in the x-z plane."""
-
-    @abc.abstractmethod
-    def place_rate(self, place: Place, turning: Tangent) -> Place:
-        """Rate of change [1/s] of `place` when the frame turns at the given rates [rad/s]."""
-
-    @abc.abstractmethod
-    def turning(self, velocity: Tangent) -> Tangent:
-        """Rates (o1, o2) = S V [rad/s] at which the normal turns for the velocity (V1, V2) [m/s]."""
-
-    @abc.abstractmethod
-    def vertical(self, place: Place) -> Vector:
-        """Components of the upward vertical in the moving frame."""
-
-    @abc.abstractmethod
-    def height(self, place: Place) -> Component:
-        """Height [m] above the lowest point of the surface."""
-
-    @abc.abstractmethod
-    def cyclic(self, eta: Float[ArrayLike, "..."]) -> Place:
-        """Cyclic coordinates at the start, integrated only if the position is wanted too."""
-
-    @abc.abstractmethod
-    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
-        """Rate of change of `cyclic`."""
-
-    @abc.abstractmethod
-    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
-        """Angle eta [rad] from the lowest point."""
-
-    @abc.abstractmethod
-    def frame(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
-        """The vectors t1, t2 and n in the fixed frame (x, y, z), each a tuple of three arrays."""
-
-    @abc.abstractmethod
-    def position(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
-        """Position (x, y, z) [m] in the fixed frame; the origin is the arena's centre, or its point below the start."""
-
-
-def none_if_zero(value: Any) -> Any:
-    """A number as an array, or `None` if it is known to be zero everywhere, so that it costs nothing."""
-    if value is None:
-        return None
-    number = as_number(value)
-    return number if is_traced(number) or np.any(np.asarray(number) != 0.0) else None
-
-
-class Plane(AbstractSurface, AbstractGround):
-    """A plane; its frame does not turn. A level plane, the only kind for a rolling ball, adds no terms.
-
-    **Arguments:**
-
-    - `tilt`: angle [rad] by which the plane rises along its own x axis, in [-pi/2, pi/2].
-    """
-
-    axes: ClassVar[int] = 2
-
-    tilt: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
-
-    def bounds(self) -> Iterator[Bound]:
-        if self.tilt is not None:
-            yield Bound(self.tilt, "tilt", at_least=-math.pi / 2.0, at_most=math.pi / 2.0)
-
-    def parallel(self, distance: Float[ArrayLike, "..."]) -> "Plane":
-        if self.tilt is not None:
-            raise ValueError(f"surface = {self!r} must be level for a rolling ball")
-        return self
-
-    def place(self, eta: Float[ArrayLike, "..."]) -> Place:
-        return ()
-
-    def place_rate(self, place: Place, turning: Tangent) -> Place:
-        return ()
-
-    def turning(self, velocity: Tangent) -> Tangent:
-        return (None, None)
-
-    def vertical(self, place: Place) -> Vector:
-        return (None, None, 1.0)
-
-    def height(self, place: Place) -> Component:
-        return None
-
-    def cyclic(self, eta: Float[ArrayLike, "..."]) -> Place:
-        zero = jnp.zeros_like(as_number(eta))
-        return (zero, zero)
-
-    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
-        return velocity
-
-    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
-        return jnp.zeros_like(cyclic[0])
-
-    def frame(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
-        zero, one = jnp.zeros_like(cyclic[0]), jnp.ones_like(cyclic[0])
-        return (one, zero, zero), (zero, one, zero), (zero, zero, one)
-
-    def position(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
-        return (cyclic[0], cyclic[1], jnp.zeros_like(cyclic[0]))
+    #: Names and units of the numbers of a place.
+    coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("mu", "rad"), ("eta", "rad"))
 
     @property
     def up(self) -> Vector:
-        return (None, None, 1.0) if self.tilt is None else (jnp.sin(self.tilt), None, jnp.cos(self.tilt))
-
-    def outward(self, position: Vector) -> Vector:
+        """Components of the upward vertical in the surface's axes."""
         return (None, None, 1.0)
 
-    def outward_rate(self, position: Vector, velocity: Vector) -> Vector:
-        return (None, None, None)
+    @abc.abstractmethod
+    def normal(self, position: Vector) -> Vector:
+        """Unit normal n at a position [m]; off the surface, that of a surface alongside."""
 
+    @abc.abstractmethod
+    def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
+        """Rate n' [1/s] of the normal at a position [m] that moves with a velocity [m/s]: minus the shape operator times it."""
+
+    @abc.abstractmethod
     def elevation(self, position: Vector) -> Component:
-        return dot(position, self.up)
+        """Height [m] of a position: above the lowest point, or above the origin of a surface that has none."""
 
+    @abc.abstractmethod
     def gaussian_curvature(self, position: Vector) -> Component:
-        return None
+        """Gaussian curvature K [1/m^2] at a position [m] on the surface."""
+
+    @abc.abstractmethod
+    def nearest(self, position: Vector) -> Vector:
+        """The nearest point [m] of the surface to a position [m] closer to it than its least radius of curvature."""
+
+    def offset(self, position: Vector) -> Component:
+        """`distance` [m], to first order where that is cheaper: for positions next to the surface."""
+        return self.distance(position)
+
+    def distance(self, position: Vector) -> Component:
+        """Distance [m] of a position from the surface, positive on the side to which n points; as far as for `nearest`."""
+        foot = self.nearest(position)
+        away = (subtract(position[0], foot[0]), subtract(position[1], foot[1]), subtract(position[2], foot[2]))
+        return dot(away, self.normal(foot))
+
+    @abc.abstractmethod
+    def place_at(self, position: Vector) -> Place:
+        """The place of a position [m] on the surface, named by `coordinates`."""
+
+    @abc.abstractmethod
+    def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
+        """`chart`, for a place that is named by `coordinates`."""
 
     def chart(self, place: Place) -> tuple[Vector, Vector, Vector]:
-        one = jnp.ones_like(place[0])
-        return (place[0], place[1], None), (one, jnp.zeros_like(one), None), (jnp.zeros_like(one), one, None)
+        """Position [m] of a place, and two unit vectors along the surface there, east and north; n = east x north.
 
-    def place_at(self, position: Vector) -> Place:
-        return position[:2]
+        **Arguments:**
 
-    def departure(self, position: Vector) -> Component:
-        return None
+        - `place`: numbers named by `coordinates`, or (x, y, z) [m] in the fixed frame, which is moved to the nearest point.
+        """
+        if len(place) > len(self.coordinates):
+            place = self.place_at(self.nearest(self.in_own_axes((place[0], place[1], place[2]))))
+        return self.charted(place)
+
+    def place_bounds(self, place: Place, size: Any) -> Iterator[Bound]:
+        """The ranges of the numbers of a place.
+
+        **Arguments:** `place`: as for `chart`; `size`: a length [m] of the body, against which round-off is seen.
+
+        **Raises:** `ValueError` for a wrong number of numbers.
+        """
+        count = len(self.coordinates)
+        if len(place) not in (count, 3):
+            names = ", ".join(f"{name} [{unit}]" for name, unit in self.coordinates)
+            three = "" if count == 3 else " or (x [m], y [m], z [m])"
+            raise ValueError(f"place = {place!r} must be ({names}){three} on a {type(self).__name__}")
+        if len(place) == 3:
+            off = self.offset(self.in_own_axes((place[0], place[1], place[2])))
+            most = ROUND_OFF * (size + jnp.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2))
+            why = "of a place from the surface, in metres: it must be on it but for round-off"
+            yield Bound(0.0 if off is None else off, "distance", at_least=-most, at_most=most, why=why)
+
+    def sign(self, side: str | None, closed: str) -> float:
+        """1.0 if n points into the room where the body is, -1.0 if it points out of it.
+
+        **Arguments:** `side`: one of `sides`, or `None`; `closed`: what `None` means where there are two sides.
+
+        **Raises:** `ValueError` for another word.
+        """
+        if side is None:
+            return self.sides.get(closed, next(iter(self.sides.values())))
+        if not isinstance(side, str) or side not in CLOSED | OPEN | DIVIDED:
+            raise ValueError(f"side = {side!r} must be one of {', '.join(map(repr, CLOSED | OPEN | DIVIDED))}, or None")
+        if side not in self.sides:
+            # All words that a surface without this side has mean the same.
+            raise ValueError(f"side = {side!r} must be {next(iter(self.sides))!r} on a {type(self).__name__}")
+        return self.sides[side]
 
     def in_fixed_frame(self, vector: Vector) -> tuple[Any, Any, Any]:
+        """Components of a vector in the fixed frame (x, y, z), z up."""
         x, y, z = vector
-        z = jnp.zeros_like(x) if z is None else z
-        if self.tilt is None:
-            return (x, y, z)
-        sine, cosine = jnp.sin(self.tilt), jnp.cos(self.tilt)
-        return (x * cosine - z * sine, y, x * sine + z * cosine)
+        return (x, y, jnp.zeros_like(x) if z is None else z)
 
-
-class Cylinder(AbstractSurface):
-    """The inside of a cylinder with a horizontal axis along y; t1 points along growing eta, t2 along y.
-
-    **Arguments:**
-
-    - `radius`: radius of the arena [m], positive.
-    """
-
-    radius: Float[Array, "..."] = eqx.field(converter=as_number)
-
-    def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.radius, "surface radius", above=0.0)
-
-    def room(self, distance: Float[ArrayLike, "..."]) -> Iterator[Bound]:
-        yield Bound(self.radius, "surface radius", above=distance, why="the body must fit inside")
-
-    def parallel(self, distance: Float[ArrayLike, "..."]) -> "Cylinder":
-        require_all(self.room(distance))
-        return Cylinder(self.radius - distance)
-
-    def place(self, eta: Float[ArrayLike, "..."]) -> Place:
-        return (jnp.sin(eta), jnp.cos(eta))
-
-    def place_rate(self, place: Place, turning: Tangent) -> Place:
-        sine, cosine = place
-        return (multiply(turning[0], cosine), -multiply(turning[0], sine))
-
-    def turning(self, velocity: Tangent) -> Tangent:
-        return (velocity[0] / self.radius, None)
-
-    def vertical(self, place: Place) -> Vector:
-        sine, cosine = place
-        return (sine, None, cosine)
-
-    def height(self, place: Place) -> Component:
-        return self.radius * (1.0 - place[1])
-
-    def cyclic(self, eta: Float[ArrayLike, "..."]) -> Place:
-        eta = as_number(eta)
-        return (eta, jnp.zeros_like(eta))
-
-    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
-        return (turning[0], velocity[1])
-
-    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
-        return cyclic[0]
-
-    def frame(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
-        sine, cosine = place
-        zero, one = jnp.zeros_like(sine), jnp.ones_like(sine)
-        return (cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)
-
-    def position(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
-        sine, cosine = place
-        return (self.radius * sine, cyclic[1], -self.radius * cosine)
-
-
-class Sphere(AbstractSurface, AbstractQuadric):
-    """A sphere (its inside, for a rolling ball); the frame is carried parallel to itself, so no place is singular.
-
-    The place is the vertical seen in the moving frame; `cyclic` adds the horizontal x axis seen in it.
-
-    **Arguments:**
-
-    - `radius`: radius of the arena [m], positive.
-    """
-
-    radius: Float[Array, "..."] = eqx.field(converter=as_number)
-
-    def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.radius, "surface radius", above=0.0)
-
-    def room(self, distance: Float[ArrayLike, "..."]) -> Iterator[Bound]:
-        yield Bound(self.radius, "surface radius", above=distance, why="the body must fit inside")
-
-    def parallel(self, distance: Float[ArrayLike, "..."]) -> "Sphere":
-        require_all(self.room(distance))
-        return Sphere(self.radius - distance)
-
-    def place(self, eta: Float[ArrayLike, "..."]) -> Place:
-        eta = as_number(eta)
-        return (jnp.sin(eta), jnp.zeros_like(eta), jnp.cos(eta))
-
-    def place_rate(self, place: Place, turning: Tangent) -> Place:
-        return carried(place, turning)
-
-    def turning(self, velocity: Tangent) -> Tangent:
-        return (velocity[0] / self.radius, velocity[1] / self.radius)
-
-    def vertical(self, place: Place) -> Vector:
-        return (place[0], place[1], place[2])
-
-    def height(self, place: Place) -> Component:
-        return self.radius * (1.0 - place[2])
-
-    def cyclic(self, eta: Float[ArrayLike, "..."]) -> Place:
-        eta = as_number(eta)
-        return (jnp.cos(eta), jnp.zeros_like(eta), -jnp.sin(eta))
-
-    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
-        return carried(cyclic, turning)
-
-    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
-        return jnp.arctan2(jnp.hypot(place[0], place[1]), place[2])
-
-    def frame(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
-        x, z = cyclic, place
-        y = (z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0])
-        return (x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2])
-
-    def position(self, place: Place, cyclic: Place) -> tuple[Any, Any, Any]:
-        normal = self.frame(place, cyclic)[2]
-        return tuple(-self.radius * component for component in normal)
-
-    @property
-    def semi_axes(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        return self.radius, self.radius
+    def in_own_axes(self, vector: Vector) -> Vector:
+        """Components in the surface's axes of a vector in the fixed frame."""
+        return vector

@@ -7,9 +7,25 @@ vanishes identically (no curvature on a plane, no force without friction). Sums 
 
 from typing import Any, TypeAlias
 
+import jax.numpy as jnp
+import numpy as np
+
+from ..validation import as_number, is_traced
+
 #: An array over the lanes, a number, or `None` where the component vanishes identically.
 Component: TypeAlias = Any
 Vector: TypeAlias = tuple[Component, Component, Component]
+
+#: Square of the sine of the angle to x below which a normal counts as along x.
+ALONG = 1e-12
+
+
+def none_if_zero(value: Any) -> Any:
+    """A number as an array, or `None` if it is known to be zero everywhere, so that it costs nothing."""
+    if value is None:
+        return None
+    number = as_number(value)
+    return number if is_traced(number) or np.any(np.asarray(number) != 0.0) else None
 
 
 def add(*terms: Component) -> Component:
@@ -61,3 +77,19 @@ def cross(left: Vector, right: Vector) -> Vector:
 def sum_vectors(*vectors: tuple[Component, ...]) -> tuple[Component, ...]:
     """Sum of vectors of the same length."""
     return tuple(add(*components) for components in zip(*vectors, strict=True))
+
+
+def tangents(normal: Vector) -> tuple[Vector, Vector]:
+    """Two unit vectors across a unit normal n: t1, the projection of x (of y where n is along x), and t2 = n x t1."""
+    nx, ny, nz = normal
+    along_x = 1.0 - nx * nx < ALONG
+    first = _projected((1.0 - nx * nx, -nx * ny, -nx * nz), ~along_x)
+    second = _projected((-ny * nx, 1.0 - ny * ny, -ny * nz), along_x)
+    t1 = tuple(jnp.where(along_x, b, a) for a, b in zip(first, second, strict=True))
+    return (t1[0], t1[1], t1[2]), cross(normal, (t1[0], t1[1], t1[2]))
+
+
+def _projected(vector: Vector, used: Component) -> Vector:
+    """The vector at unit length; where it is not used, something finite with finite derivatives."""
+    square = jnp.where(used, dot(vector, vector), 1.0)
+    return scale(1.0 / jnp.sqrt(square), vector)

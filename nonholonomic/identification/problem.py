@@ -21,7 +21,7 @@ class Problem(eqx.Module):
     - `model`: parameters, name -> (rows,), to predictions (rows, n).
     - `free`: name -> `Free`, as pairs.
     - `step`: `None` for derivatives by automatic differentiation, forwards; otherwise the coordinates are moved by so much
-      either way, and the model need not be differentiable, nor even traceable.
+      either way, and the model need not be differentiable; nor traceable, if it has `on_host = True`.
     """
 
     model: Callable[[dict[str, Float[Array, " rows"]]], Float[Array, "rows n"]]
@@ -97,11 +97,15 @@ def _differentiated(
     return values[0], jnp.where(jnp.isfinite(slopes), slopes, 0.0)
 
 
+_predicted = eqx.filter_jit(Problem.predict)
+
+
 def _differences(problem: Problem, step: float, coordinates: Rows) -> tuple[np.ndarray, np.ndarray]:
     """Predictions and central differences; where a side has no prediction, its slope is 0."""
     rows, unknowns = coordinates.shape
     moves = step * np.concatenate([np.zeros((1, unknowns)), np.eye(unknowns), -np.eye(unknowns)])
-    found = np.asarray(problem.predict(jnp.asarray((coordinates[:, None] + moves).reshape(-1, unknowns))))
+    predict = Problem.predict if getattr(problem.model, "on_host", False) else _predicted
+    found = np.asarray(predict(problem, jnp.asarray((coordinates[:, None] + moves).reshape(-1, unknowns))))
     values, ahead, behind = np.split(found.reshape(rows, len(moves), -1), [1, 1 + unknowns], axis=1)
     with np.errstate(invalid="ignore"):
         slopes = np.moveaxis(ahead - behind, 1, -1) / (2.0 * step)
@@ -117,13 +121,11 @@ def predictions_and_slopes(problem: Problem, coordinates: Rows, asked: Any = Non
     """
     coordinates = np.asarray(coordinates, float)
     asked = np.ones(len(coordinates), bool) if asked is None else np.asarray(asked)
+    # The program is compiled for a number of rows; where a parameter is not a number, a run is not even begun.
+    needed = np.where(asked[:, None], coordinates, np.nan)
     if problem.step is None:
-        # The program is compiled for a number of rows; where a parameter is not a number, a run is not even begun.
-        return tuple(map(np.asarray, _differentiated(problem, np.where(asked[:, None], coordinates, np.nan))))
-    values, slopes = _differences(problem, problem.step, coordinates[asked])
-    whole = np.full((len(coordinates), values.shape[1]), np.nan), np.zeros((len(coordinates), *slopes.shape[1:]))
-    whole[0][asked], whole[1][asked] = values, slopes
-    return whole
+        return tuple(map(np.asarray, _differentiated(problem, needed)))
+    return _differences(problem, problem.step, needed)
 
 
 def linearise(problem: Problem, coordinates: Any, measurements: Measurements, asked: Any = None) -> Linearised:

@@ -2,18 +2,26 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..parameters import numbers
 from ..validation import require
 from .likelihood import Measurements
 
 #: Model times of samples before the launch: so close to it, and to one another [s], that nothing moves.
 INSTANT = 1e-9
+
+#: Between times that are added so that recordings are of one length [s].
+AT_ONCE = 1e-6
+
+#: Parameters by name.
+Values = dict[str, Float[Array, "..."]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,3 +134,51 @@ def sample_labels(recording: Any, columns: tuple[str, ...]) -> tuple[str, ...]:
 def model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Array, " times"]:
     """The times of the samples since the launch [s]; those before it are moved to it."""
     return jnp.maximum(times - t0, INSTANT * jnp.arange(times.shape[0]))
+
+
+def predicted(
+    recordings: list[tuple[Any, Values]],
+    rows: int,
+    run: Callable[[Values, Float[Array, " times"]], Any],
+    column: Callable[[Any, str], Float[Array, " times"]],
+) -> list[Float[Array, "rows samples"]]:
+    """What is recorded of several runs, in every row; all runs are lanes of one block.
+
+    **Arguments:**
+
+    - `recordings`: each with its parameters, name -> (rows,), the same names for all; their launches hold the same numbers.
+    - `run`: parameters, name -> number, those of the launch among them, and times since the launch [s] -> a trajectory.
+    - `column`: (trajectory, name of a column) -> its samples.
+
+    **Returns:** for each recording its samples, a time after the other, missing ones included; NaN after the end of a run.
+    """
+    longest = max(len(one.times) for one, _ in recordings)
+    columns = tuple(dict.fromkeys(name for one, _ in recordings for name in one.columns))
+
+    def lanes(of_each: list[Array]) -> Array:
+        """The numbers of all runs, one row after the other; each is a scalar or has one number a row."""
+        return jnp.stack([jnp.broadcast_to(one, (rows,)) for one in of_each], axis=1).reshape(-1)
+
+    known = [numbers("launch", one.launch) for one, _ in recordings]
+    given = {name: lanes([one[name] for one in known]) for name, value in known[0].items() if value is not None}
+    given |= {"t0": lanes([one.t0 for one, _ in recordings])}
+    given |= {name: lanes([values[name] for _, values in recordings]) for name in recordings[0][1]}
+    # Shorter recordings go on for an instant, so that all have as many times.
+    clock = jnp.stack([_lengthened(one.times, longest) for one, _ in recordings])
+
+    def one(lane: Values, times: Float[Array, " times"]) -> Float[Array, "times columns"]:
+        rest = {name: value for name, value in lane.items() if name != "t0"}
+        found = run(rest, model_times(times, lane["t0"]))
+        return jnp.stack([column(found, name) for name in columns], axis=-1)
+
+    found = jax.vmap(one)(given, jnp.tile(clock, (rows, 1))).reshape(rows, len(recordings), longest, len(columns))
+    parts = []
+    for k, (recording, _) in enumerate(recordings):
+        places = np.array([columns.index(name) for name in recording.columns])
+        parts.append(found[:, k, : len(recording.times)][..., places].reshape(rows, -1))
+    return parts
+
+
+def _lengthened(times: Float[Array, " times"], count: int) -> Float[Array, " count"]:
+    """The times, and after the last one others that follow at once."""
+    return jnp.concatenate([times, times[-1] + AT_ONCE * jnp.arange(1, 1 + count - len(times))])

@@ -164,5 +164,5 @@ def runs_of_signs(values: Float[np.ndarray, " n"]) -> Series:
     counts = np.arange(2, runs + 1)
     less, more = counts // 2 - 1, counts - counts // 2 - 1
     whole = log_choose(positive + negative, np.array(positive))
-    ways = [log_choose(a, less) + log_choose(b, more) for a, b in ((positive, negative), (negative, positive))]
+    ways = [log_choose(a - 1, less) + log_choose(b - 1, more) for a, b in ((positive, negative), (negative, positive))]
     return Series(len(signs), runs, min(1.0, float(np.sum(np.exp(np.array(ways) - whole)))))

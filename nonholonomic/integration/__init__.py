@@ -37,6 +37,7 @@ from .settings import ABSOLUTE as ABSOLUTE
 from .settings import Settings as Settings
 from .settings import lanes_for as lanes_for
 from .single_run import Followed as Followed
+from .single_run import Sampled as Sampled
 from .single_run import follow as follow
 from .single_run import sample as sample
 from .status import CROSSED as CROSSED

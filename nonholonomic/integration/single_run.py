@@ -1,5 +1,6 @@
 """One trajectory with Diffrax: any of its solvers, dense output or given times, and the end of the model's validity."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import diffrax
@@ -81,7 +82,7 @@ def _piece(
     scales: Float[Array, " components"],
     settings: Settings,
 ) -> tuple[diffrax.Solution, Float[Array, " steps"]]:
-    """At most `PIECE` steps, and the least value of the guard seen in each."""
+    """As many steps as the settings allow, and the least value of the guard seen in each."""
     watched = problem.guard(t0, state) is not None
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
@@ -93,7 +94,7 @@ def _piece(
         args=problem,
         stepsize_controller=_control(settings, scales),
         saveat=diffrax.SaveAt(t0=True, steps=True, dense=True),
-        max_steps=PIECE,
+        max_steps=settings.max_steps,
         event=diffrax.Event(lambda t, y, args, **_: args.guard(t, y) < 0.0) if watched else None,
         throw=False,
     )
@@ -137,11 +138,13 @@ def follow(
     accepted = rejected = 0
     end, lost, failed = jnp.asarray(t1, state.dtype), False, False
     length = None if first is None else jnp.asarray(first, state.dtype)
+    # Compiled for the number of steps, so that it must not change with what is left of them.
+    each = dataclasses.replace(settings, max_steps=min(PIECE, settings.max_steps))
     margin = problem.guard(time, state)
     if margin is not None and float(margin) <= 0.0:
         return Followed(times[0], states[0], [], True, False, 0, 0)
     while float(time) < t1 and not (lost or failed):
-        solution, guards = _piece(problem, time, end, length, state, scales, settings)
+        solution, guards = _piece(problem, time, end, length, state, scales, each)
         steps = int(solution.stats["num_accepted_steps"])
         accepted, rejected = accepted + steps, rejected + int(solution.stats["num_rejected_steps"])
         ts, ys = saved(solution)
@@ -197,13 +200,17 @@ def sample(
     times: Float[Array, " times"],
     t1: Float[Array, ""],
     settings: Settings,
+    *,
+    grid: Float[Array, " steps"] | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> Sampled:
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 
-    The guard is checked at the ends of steps, and the run ends where it is zero on the dense output.
+    The guard is checked at the ends of steps, and the run ends where it is zero on the dense output. Steps end on the times
+    asked for, where interpolation would lose a digit or two.
 
-    **Arguments:** as for `follow`; `times`: growing, in [0, t1]; `adjoint`: how Diffrax differentiates, by default forwards.
+    **Arguments:** as for `follow`; `times`: growing, in [0, t1]; `grid`: the ends of the steps [s], for a solver without an
+    error estimate; `adjoint`: how Diffrax differentiates, by default forwards.
 
     **Returns:** a `Sampled`.
     """
@@ -212,6 +219,11 @@ def sample(
     event = diffrax.Event(
         lambda t, y, args, **_: args.guard(t, y), optimistix.Newton(1e-13, 1e-13) if watched else None
     )
+    times_inside = jnp.minimum(times, t1)
+    if grid is None:
+        controller = diffrax.ClipStepSizeController(_control(settings, scales), step_ts=times_inside)
+    else:
+        controller = diffrax.StepTo(grid)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
         settings.solver,
@@ -220,8 +232,8 @@ def sample(
         None,
         state,
         args=problem,
-        stepsize_controller=_control(settings, scales),
-        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=jnp.minimum(times, t1)), diffrax.SubSaveAt(t1=True)]),
+        stepsize_controller=controller,
+        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=times_inside), diffrax.SubSaveAt(t1=True)]),
         max_steps=settings.max_steps,
         event=event if watched else None,
         adjoint=diffrax.ForwardMode() if adjoint is None else adjoint,

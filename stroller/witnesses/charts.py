@@ -15,7 +15,7 @@ from nonholonomic.geometry import AbstractQuadric, Plane, add, inverse, multiply
 from ..dynamics import State
 from ..friction import WheelMotion
 from ..input import Input, Motion
-from ..scene import FORKS, SIDES, Scene
+from ..scene import FORKS, Scene
 
 
 class Chart(AbstractSystem):
@@ -66,7 +66,7 @@ class Chart(AbstractSystem):
             return jnp.array([long, lat, [zero, zero, one, zero]])
         h_eta, h_mu = jnp.sqrt(self.ground_metric(q))
         connection = equatorial * jnp.sin(q[0]) / h_eta
-        side = SIDES[self.scene.side]
+        side = self.scene.dynamics.side
         lat = [side * h_eta * cosine, -side * h_mu * sine, zero, zero]
         return jnp.array([[h_eta * sine, h_mu * cosine, zero, zero], lat, [zero, side * connection, side * one, zero]])
 
@@ -130,7 +130,7 @@ class Chart(AbstractSystem):
         h_eta = jnp.sqrt(squares[0])
         curvatures = jnp.array([equatorial * polar / h_eta**3, polar / (equatorial * h_eta)])
         bend = scene.body.mass * jnp.sum(curvatures * squares * rate[:2] ** 2)
-        return SIDES[scene.side] * (weight * equatorial * jnp.sin(q[0]) / h_eta - bend)
+        return scene.dynamics.side * (weight * equatorial * jnp.sin(q[0]) / h_eta - bend)
 
     def motion(self, q: Coordinates, wheels: WheelMotion) -> Motion:
         """The motion that an input gets."""

@@ -20,7 +20,7 @@ ARENAS = [tippe.Plane(), tippe.Cylinder(0.1), tippe.Sphere(0.1)]
 def rolling_top(arena, body=None) -> tuple[tippe.Scene, RollingDynamics]:
     """A scene and its rolling motion."""
     scene = tippe.Scene(rutstam_top() if body is None else body, arena)
-    return scene, RollingDynamics.of(scene.body, scene.surface, scene.gravity)
+    return scene, RollingDynamics.of(scene.body, scene.frame, scene.gravity)
 
 
 def rolling_states(scene: tippe.Scene, rolling: RollingDynamics, count: int):

@@ -193,9 +193,9 @@ def first_integrals(scene: Scene, states):
     length = jnp.sqrt(sum(part * part for part in heading if part is not None))
     along, off = jnp.zeros_like(length), jnp.zeros_like(length)
     if not isinstance(scene.surface, Plane):
-        off = scene.surface.departure(position)
+        off = scene.surface.offset(position)
         if scene.heading == "intrinsic":
-            along = sum(a * b for a, b in zip(heading, scene.surface.outward(position), strict=True))
+            along = sum(a * b for a, b in zip(heading, scene.surface.normal(position), strict=True))
     steering = jnp.sqrt(sine * sine + cosine * cosine) - 1.0
     return jnp.stack([length - 1.0, along, off, steering, scene.energy(states) - work])
 

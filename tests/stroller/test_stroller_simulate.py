@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from terminal import Terminal
 
 import stroller
 from stroller import (
@@ -231,6 +232,41 @@ def test_a_run_that_cannot_finish_says_so():
     assert "failed" in str(run)
 
 
+def test_a_function_that_is_defined_again_does_not_compile_again(reference, caplog):
+    """Only what it does counts, and the numbers it holds may differ."""
+
+    def ride(strength):
+        def push(t, motion):
+            return strength * jnp.cos(t), -0.2 * motion.steering
+
+        return stroller.simulate(FULL, LAUNCH, 1.0, push, times=[0.0, 1.0], tolerance=1e-6)
+
+    first = ride(jnp.array(2.0))
+    with jax.log_compiles():
+        again, other = ride(jnp.array(2.0)), ride(jnp.array(3.0))
+    assert not [text for text in caplog.messages if "Finished XLA compilation" in text]
+    np.testing.assert_array_equal(again.position, first.position)
+    assert abs(float(other.speed[1] - first.speed[1])) > 0.1
+
+
+def test_a_ride_says_what_it_does(monkeypatch, reference):
+    monkeypatch.setattr("nonholonomic.progress.INTERVAL", 0.001)
+    monkeypatch.setattr("sys.stderr", stream := Terminal())
+    stroller.simulate(FULL, LAUNCH, 10.0, push, times=jnp.linspace(0.0, 10.0, 11), tolerance=1e-12)
+    assert stream.lines[0][1].startswith("simulating")
+
+
+def test_what_happened_in_a_traced_ride_is_found_by_riding_again():
+    """Contact at the top of a sphere is lost at the same time, whichever way the ride was run."""
+    scene, launch = Scene(BODY, Sphere(3.0)), Launch((0.0, 1.2), 0.5, 2.0)
+    times = jnp.array([0.0, 1.0, 2.0])
+    traced = jax.jit(lambda speed: stroller.simulate(scene, Launch(launch.place, 0.5, speed), 2.0, times=times))(2.0)
+    alone = stroller.simulate(scene, launch, 2.0, times=times)
+    assert alone.status == traced.status == "contact_lost"
+    np.testing.assert_allclose(traced.contact_lost_at, alone.contact_lost_at, rtol=1e-12)
+    np.testing.assert_allclose(traced.position, alone.position, atol=1e-8)
+
+
 def test_trajectory_reads_well():
     text = str(stroller.simulate(FULL, LAUNCH, 10.0, push))
     for words in ("201 times, 0 s to 10 s: completed", "energy", "residual", "normal force", "side forces", "no-slip"):
@@ -250,7 +286,7 @@ BAD = [
     (lambda: Launch(0.3, 0.0, 1.0), r"place = 0\.3 must be a pair of numbers"),
     (lambda: Launch((0.0, 0.0), 0.0, np.inf), r"speed = inf must be finite"),
     (lambda: Scene("pram"), r"body = 'pram' must be a Stroller"),
-    (lambda: Scene(BODY, surface=3.0), r"surface = 3\.0 must be a Ground"),
+    (lambda: Scene(BODY, surface=3.0), r"surface = 3\.0 must be a Surface"),
     (lambda: Scene(BODY, friction=0.1), r"friction = 0\.1 must be a Friction"),
     (lambda: Scene(BODY, gravity=-1.0), r"gravity = -1\.0 must be at least 0\.0"),
     (lambda: Scene(BODY, side="under"), r"side = 'under' must be one of 'outside', 'inside'"),

@@ -111,7 +111,7 @@ def test_a_map_shows_its_values_and_is_grey_only_where_there_is_none(places):
 
 
 def test_axes_of_one_name_are_told_apart():
-    grid = named_axes({"launch.steering": [0.1], "scene.friction.steering": [0.2]}, False)
+    grid = named_axes({"launch.steering": [0.1], "scene.friction.steering": [0.2]}, stroller.Plane(), LAUNCH)
     assert [(one.name, one.unit) for one in grid] == [("launch_steering", "rad"), ("friction_steering", "N m s")]
 
 

@@ -71,7 +71,7 @@ def check_a_batch(scene: tippe.Scene, launch: tippe.Launch):
     outcome = ends(scene, launch)
     assert np.isfinite(outcome.state).all()
     assert np.all(np.asarray(outcome.status) != FAILED)
-    jammed = (np.asarray(outcome.status) == GUARD_LOST) & np.asarray(scene.dynamics.jams(outcome.state))
+    jammed = (np.asarray(outcome.status) == GUARD_LOST) & (np.asarray(scene.dynamics.loss(outcome.state)) == 1)
     assert np.all(may_jam(scene) | ~jammed)
     start, end = scene.state(launch), outcome.state
     turns = 1.0 + np.abs(np.asarray(launch.spin)) * HORIZON

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import (
-    AbstractSurface,
+    AbstractFrame,
     Component,
     Tangent,
     Vector,
@@ -37,7 +37,7 @@ class RollingDynamics(eqx.Module):
     (`RollingDynamics.grip`).
     """
 
-    parallel: AbstractSurface
+    frame: AbstractFrame
     radius: Float[Array, "..."]
     offset: Float[Array, "..."]
     mass: Float[Array, "..."]
@@ -46,13 +46,12 @@ class RollingDynamics(eqx.Module):
     I3: Float[Array, "..."]
 
     @classmethod
-    def of(cls, body: Top, surface: AbstractSurface, gravity: Float[Array, "..."]) -> "RollingDynamics":
+    def of(cls, body: Top, frame: AbstractFrame, gravity: Float[Array, "..."]) -> "RollingDynamics":
         """The equations for a body on an arena.
 
-        **Arguments:** as for `Scene`.
+        **Arguments:** as for `Dynamics.of`.
         """
-        parallel = surface.parallel(body.radius)
-        return cls(parallel, body.radius, body.offset, body.mass, gravity, body.I1, body.I3)
+        return cls(frame, body.radius, body.offset, body.mass, gravity, body.I1, body.I3)
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
         """Evaluate the equations of motion and the reaction.
@@ -102,8 +101,7 @@ class RollingDynamics(eqx.Module):
         w = self._angular_velocity(e, L)
         e_dot = cross(w, e)
         V: Tangent = (R * w[1], -R * w[0])
-        o = self.parallel.turning(V)
-        up = self.parallel.vertical(place)
+        o, up, place_rate, room = self.frame.carriage(place, V)
         r = self._contact(e)
         # n' = -(o1 t1 + o2 t2), and r' as a vector, not as the rate of its components.
         r_dot = sum_vectors(scale(a, e_dot), scale(R, (*o, None)))
@@ -119,10 +117,11 @@ class RollingDynamics(eqx.Module):
         F = scale(m, push)
         e_dot = sum_vectors(e_dot, carried(e, o))
         L_dot = sum_vectors(cross(r, F), carried(L, o))
-        rate = (u1_dot, u2_dot, *e_dot, *L_dot, *self.parallel.place_rate(place, o))
+        rate = (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate)
         still = jnp.zeros_like(F[2])
         load = ContactLoad((F[0] / F[2], F[1] / F[2]))
-        return Motion(rate, F[2], load, Slip(still, still, (w[0], w[1], None)), V, o, dot(L, e), 1.0 + still), F
+        slip = Slip(still, still, (w[0], w[1], None))
+        return Motion(rate, F[2], load, slip, V, o, dot(L, e), 1.0 + still, room), F
 
     def with_slip(self, state: Float[Array, "components ..."], slip: Slip) -> Float[Array, "components ..."]:
         """The state after the blow at the contact that gives the contact point the stated velocity along the arena.

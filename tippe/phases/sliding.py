@@ -237,7 +237,7 @@ def lost_contact(scene: Scene, number: Int[Array, ""], state: Float[Array, "comp
     own, other = _own_and_other(balls(scene.body), number)
     zero = jnp.zeros_like(state[0])
     dynamics = standing_on(scene.dynamics, own)
-    falls, ball, jams = None, jnp.broadcast_to(number, zero.shape), dynamics.jams(state)
+    falls, ball, jams = None, jnp.broadcast_to(number, zero.shape), dynamics.loss(state) > 0
     if other is not None:
         falls = clearance(own, other, state) <= dynamics.contact_margin(state)
         ball, jams = jnp.where(falls, 1 - number, number), jams & ~falls

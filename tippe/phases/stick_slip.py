@@ -14,11 +14,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.geometry import AbstractSurface
+from nonholonomic.geometry import AbstractFrame
 
-from ..dynamics import Dynamics, Motion, stacked
+from ..dynamics import FITS, Dynamics, Motion, stacked
 from ..friction import AbstractFriction, SetValuedCoulomb, Slip, length
 from ..top import Top
 from .onset import Onset, begin
@@ -52,20 +52,20 @@ class StickSlip(eqx.Module):
 
     @classmethod
     def of(
-        cls, body: Top, surface: AbstractSurface, friction: AbstractFriction, gravity: Float[Array, "..."]
+        cls, body: Top, frame: AbstractFrame, friction: AbstractFriction, gravity: Float[Array, "..."]
     ) -> "StickSlip":
         """The equations for a body on an arena.
 
-        **Arguments:** as for `Scene`, with a `SetValuedCoulomb`.
+        **Arguments:** as for `Dynamics.of`, with a `SetValuedCoulomb`.
         """
         assert isinstance(friction, SetValuedCoulomb)
-        slipping = Dynamics.of(body, surface, friction, gravity)
-        return cls(slipping, RollingDynamics.of(body, surface, gravity), friction.mu)
+        slipping = Dynamics.of(body, frame, friction, gravity)
+        return cls(slipping, RollingDynamics.of(body, frame, gravity), friction.mu)
 
     @property
-    def parallel(self) -> AbstractSurface:
-        """The surface on which the sphere's centre runs."""
-        return self.slipping.parallel
+    def frame(self) -> AbstractFrame:
+        """The frame of the sphere on the arena."""
+        return self.slipping.frame
 
     @property
     def speed(self) -> Float[Array, "..."]:
@@ -90,12 +90,15 @@ class StickSlip(eqx.Module):
         return stacked(self.motion(state).rate, state)
 
     def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Normal force as a fraction of the weight, plus the round-off that a start with N = 0 exactly is allowed."""
-        return self.motion(state).normal_force / (self.slipping.mass * self.slipping.gravity) + 1e-12
+        """Normal force as a fraction of the weight, plus the round-off that a start with N = 0 exactly is allowed; or the
+        room that is left, if that is less."""
+        motion = self.motion(state)
+        margin = motion.normal_force / (self.slipping.mass * self.slipping.gravity) + 1e-12
+        return margin if motion.room is None else jnp.minimum(margin, motion.room - FITS)
 
-    def jams(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
-        """Whether a contact whose margin is zero has jammed, which only one that slips can do; else it is lost."""
-        return self.slipping.jams(state)
+    def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+        """How a contact has ended whose margin is zero: a code in `LOSSES`. Only one that slips can jam."""
+        return self.slipping.loss(state)
 
     def slip_speed(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Speed of the contact point along the arena [m/s]."""
@@ -140,9 +143,9 @@ class Kind(eqx.Module):
     rolls: bool = eqx.field(static=True)
 
     @property
-    def parallel(self) -> AbstractSurface:
-        """The surface on which the sphere's centre runs."""
-        return self.both.parallel
+    def frame(self) -> AbstractFrame:
+        """The frame of the sphere on the arena."""
+        return self.both.frame
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
         """The equations of motion of this kind."""
@@ -155,7 +158,8 @@ class Kind(eqx.Module):
     def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Positive while this kind of motion lasts. Rolling leaves the friction cone before the normal force is zero."""
         if self.rolls:
-            return self.both.grip_left(state)
+            grip, room = self.both.grip_left(state), self.both.rolling.motion(state).room
+            return grip if room is None else jnp.minimum(grip, room - FITS)
         return jnp.minimum(self.both.slipping.contact_margin(state), self.slip_left(state))
 
     def slip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
@@ -168,9 +172,9 @@ class Kind(eqx.Module):
         """The slip's speed [m/s] and its rate."""
         return jax.jvp(self.both.slip_speed, (state,), (self.both.slipping.field(state),))
 
-    def jams(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
-        """Whether a contact whose margin is zero has jammed; a rolling one does not."""
-        return self.both.jams(state) & (not self.rolls)
+    def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+        """How a contact has ended whose margin is zero: a code in `LOSSES`."""
+        return self.both.loss(state)
 
     def ended(
         self,
@@ -192,7 +196,10 @@ class Kind(eqx.Module):
         still = both.stopped(own)
         nothing = jnp.zeros_like(own[0])
         if self.rolls:
-            holds = lost = nothing > 0.0
+            holds = nothing > 0.0
+            # What ended is either the grip or the room.
+            room = both.rolling.motion(own).room
+            lost = holds if room is None else room - FITS <= both.grip_left(own)
             wait = nothing
         else:
             holds = both.rolling.grip(still, both.mu) >= 0.0

@@ -38,7 +38,7 @@ def across(scene: Scene) -> Across:
 
     **Raises:** `ValueError` for an arena that is curved in both directions.
     """
-    curvature, along = scene.surface.parallel(scene.body.radius).turning((1.0, 0.0))
+    curvature, along = scene.frame.carriage(scene.frame.at_angle(0.0)[0], (1.0, 0.0)).turning
     if along is not None:
         raise ValueError(f"surface = {scene.surface!r} must be a Plane or a Cylinder for these coordinates")
     return Across(1.0, 0.0) if curvature is None else Across(1.0 / curvature, 1.0)
@@ -59,7 +59,7 @@ def from_vector_state(scene: Scene, state: Float[Array, " components"]) -> Float
     e, L = state[AXIS], state[MOMENTUM]
     spinning = jnp.cross(L, e) / scene.body.I1
     velocity = state[VELOCITY] + scene.body.offset * spinning[:2]
-    turning = scene.surface.parallel(scene.body.radius).turning((velocity[0], velocity[1]))
+    turning = scene.frame.carriage(tuple(state[PLACE]), (velocity[0], velocity[1])).turning
     seen = jnp.stack([a if b is None else a + b for a, b in zip(spinning, carried(tuple(e), turning), strict=True)])
 
     def angles(axis):
@@ -93,13 +93,11 @@ def metric(scene: Scene, q: Float[Array, " 6"]) -> Float[Array, "6 6"]:
 
 def potential(scene: Scene, q: Float[Array, " 6"]) -> Float[Array, ""]:
     """Potential energy [J], up to a constant: weight times the height of the centre of mass; `q` as for `metric`."""
-    parallel = scene.surface.parallel(scene.body.radius)
-    place = parallel.place(q[0])
-    parts = (jnp.zeros(()) if part is None else jnp.asarray(part) for part in parallel.vertical(place))
+    place, _ = scene.frame.at_angle(q[0])
+    parts = (jnp.zeros(()) if part is None else jnp.asarray(part) for part in scene.frame.vertical(place))
     vertical = jnp.stack(list(parts))
-    climb = parallel.height(place)
     height = q[5] * vertical[2] - scene.body.offset * axes(q[2], q[3])[2] @ vertical
-    return scene.body.mass * scene.gravity * (height if climb is None else height + climb)
+    return scene.body.mass * scene.gravity * (height + scene.frame.height(place))
 
 
 def axes(theta: Float[Array, ""], phi: Float[Array, ""]) -> Float[Array, "3 3"]:

@@ -1,0 +1,232 @@
+"""Runs sampled at given times, as functions for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ..integration import (
+    FAILED,
+    GUARD_LOST,
+    REACHED_END,
+    AbstractProblem,
+    Sampled,
+    Settings,
+    event_time,
+    march_with_samples,
+    sample,
+)
+from ..validation import as_number
+from .differentiable import AbstractQuestion, ask, directions_by
+from .lyapunov import probed
+from .variation import VariationalProblem, in_groups
+
+#: From some modules (scene, launch, ...) and a number of cells, `None` for a single run, to the problem.
+Build = Callable[[Any, int | None], AbstractProblem]
+
+
+class SampledRun(NamedTuple):
+    """A run at given times, all floats: its states, NaN after its end; when and where it ended, the code of how
+    (`REACHED_END`, `GUARD_LOST` or `FAILED`), and how many steps were accepted and rejected."""
+
+    states: Float[Array, "*cells times components"]
+    end_time: Float[Array, "*cells"]
+    end_state: Float[Array, "*cells components"]
+    status: Float[Array, "*cells"]
+    accepted: Float[Array, "*cells"]
+    rejected: Float[Array, "*cells"]
+
+
+def sampled_run(
+    build: Build,
+    modules: Any,
+    times: Float[Array, " times"],
+    t1: Float[Array, ""],
+    settings: Settings,
+    grid: Float[Array, " steps"] | None = None,
+) -> SampledRun:
+    """Run a problem inside a transformation and sample it, with derivatives that take part in step control.
+
+    An explicit Runge-Kutta solver uses the block of lanes, one for each run of a batch, if every number of the modules is a
+    scalar; all else runs by Diffrax.
+
+    **Arguments:**
+
+    - `build`: makes the problem from the modules; compared by identity, so it should not be made anew for each call.
+    - `modules`: the tree whose numbers can be differentiated by.
+    - `times`: of the samples [s], growing; `t1`: horizon [s].
+    - `settings`: the tolerance may be traced.
+    - `grid`: the ends of the steps [s], concrete, for a solver without an error estimate.
+
+    **Returns:** a `SampledRun`; its states and the time of its end have derivatives.
+    """
+    numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(numbers)
+    in_block = isinstance(settings.solver, diffrax.AbstractERK) and all(leaf.ndim == 0 for leaf in leaves)
+    recipe = Recipe(build, structure, rest, _with_tolerance(settings, None), grid)
+    question = (BlockSampling if in_block else SingleSampling)(len(leaves), recipe)
+    found = ask(question, *leaves, jax.lax.stop_gradient(times), as_number(t1), settings.tolerance)
+    # A small delay moves the sample along the field.
+    rates = jax.lax.stop_gradient(jax.vmap(build(modules, None).field)(times, found.states))
+    later = (times - jax.lax.stop_gradient(times))[:, None]
+    return found._replace(states=found.states + jnp.where(jnp.isfinite(rates), rates * later, 0.0))
+
+
+def sampled_run_by_diffrax(
+    problem: AbstractProblem,
+    times: Float[Array, " times"],
+    t1: Float[Array, ""],
+    settings: Settings,
+    adjoint: diffrax.AbstractAdjoint,
+) -> SampledRun:
+    """Run a problem and let Diffrax differentiate its steps, which a probe keeps short enough for tangents.
+
+    **Arguments:** as for `sampled_run`; `adjoint`: how Diffrax differentiates.
+    """
+    size = len(problem.start()[0])
+    path = sample(probed(problem), times, t1, settings, adjoint=adjoint)
+    status, *counts = (part.astype(float) for part in (_status(path, t1), path.accepted, path.rejected))
+    return SampledRun(path.states[:size].T, path.end_time, path.end_state[:size], status, *counts)
+
+
+def _with_tolerance(settings: Settings, tolerance: Float[Array, ""] | None) -> Settings:
+    return eqx.tree_at(lambda one: one.tolerance, settings, tolerance, is_leaf=lambda leaf: leaf is None)
+
+
+def _status(path: Sampled, t1: Float[Array, ""]) -> Int[Array, ""]:
+    """The code of how a single run ended."""
+    return jnp.where(path.lost, GUARD_LOST, jnp.where(path.end_time < t1, FAILED, REACHED_END))
+
+
+class Recipe(eqx.Module):
+    """How a problem is made of leaves, and how it is integrated, all but the tolerance."""
+
+    build: Build = eqx.field(static=True)
+    # JAX's PyTreeDef, which type checkers take for a variable.
+    structure: Any = eqx.field(static=True)
+    rest: Any
+    settings: Settings
+    grid: Float[Array, " steps"] | None
+
+    def problem(self, leaves: tuple[Array, ...], cells: int | None) -> AbstractProblem:
+        """The problem of some cells, or of a single run."""
+        return self.build(eqx.combine(jax.tree.unflatten(self.structure, leaves), self.rest), cells)
+
+
+#: From this many cells on two directions run along together: that takes 0.8 times as long, but twice as long to compile.
+MANY, TOGETHER = 64, 2
+
+
+class BlockSampling(AbstractQuestion):
+    """Samples by the block of lanes; the leaves are the modules' numbers, the times, the horizon and the tolerance."""
+
+    movable: int
+    recipe: Recipe
+
+    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
+        return jnp.isnan(value)
+
+    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
+        problem = self.recipe.problem(leaves[: self.movable], cells)
+        return _march(VariationalProblem(problem, (), False), leaves[self.movable :], self.recipe.settings)[0]
+
+    def with_slopes(
+        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[SampledRun, list[SampledRun]]:
+        problem, directions, gather = directions_by(self.recipe.problem, active, leaves[: self.movable], cells)
+
+        def run(some: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
+            varied = VariationalProblem(problem, some, False)
+            return _march(varied, leaves[self.movable :], self.recipe.settings, not again)
+
+        found, slopes = in_groups(run, directions, TOGETHER if cells >= MANY else 1)
+        return found, gather(slopes)
+
+
+@eqx.filter_jit
+def _march(
+    varied: VariationalProblem, given: tuple[Array, Array, Array], settings: Settings, one_kernel: bool = True
+) -> tuple[SampledRun, list[SampledRun]]:
+    """What is found of the cells, and its slope along each of the directions."""
+    times, t1, tolerance = given
+    outcome, samples = march_with_samples(
+        varied,
+        times if times.ndim == 1 else times.T,
+        t1,
+        jnp.asarray(varied.problem.start()[0].shape[1]),
+        # One tolerance serves a block: the smallest of a batch.
+        _with_tolerance(settings, jnp.min(tolerance)),
+        parts=1 + len(varied.directions),
+        one_kernel=one_kernel,
+    )
+    counts = (outcome.steps - outcome.rejected, outcome.rejected)
+    return _found(varied, samples, (outcome.end_time, outcome.state, outcome.status), counts)
+
+
+def _found(
+    varied: VariationalProblem,
+    samples: Float[Array, "*cells times components"],
+    ends: tuple[Float[Array, "*cells"], Float[Array, "components *cells"], Int[Array, "*cells"]],
+    counts: tuple[Int[Array, "*cells"], Int[Array, "*cells"]],
+) -> tuple[SampledRun, list[SampledRun]]:
+    """What is found, and its slope along each of the directions, given when, where and how the runs ended."""
+    states, *variations = jnp.split(samples, 1 + len(varied.directions), axis=-1)
+    time, end, status = ends
+    end, *end_variations = varied.parts(end)
+
+    def end_time(problem: AbstractProblem, state: Float[Array, "components *cells"]) -> Float[Array, "*cells"]:
+        return event_time(problem, lambda at: problem.guard(time, at), time, state)
+
+    def slope(direction: Any, variation: Array, at_end: Array) -> SampledRun:
+        if varied.problem.guard(time, end) is None:
+            later = jnp.zeros_like(time)
+        else:
+            later = eqx.filter_jvp(end_time, (varied.problem, end), (direction, at_end))[1]
+            later = jnp.where((status == GUARD_LOST) & (time > 0.0), later, 0.0)
+        return SampledRun(jnp.where(jnp.isnan(states), 0.0, variation), later, None, None, None, None)
+
+    slopes = [slope(*one) for one in zip(varied.directions, variations, end_variations, strict=True)]
+    numbers = (part.astype(float) for part in (status, *counts))
+    return SampledRun(states, time, jnp.moveaxis(end, 0, -1), *numbers), slopes
+
+
+class SingleSampling(AbstractQuestion):
+    """Samples by Diffrax, with any of its solvers; the leaves are those of `BlockSampling`."""
+
+    in_blocks = False
+
+    movable: int
+    recipe: Recipe
+
+    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
+        return jnp.isnan(value)
+
+    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
+        problem = self.recipe.problem(leaves[: self.movable], None)
+        found, _ = _follow(VariationalProblem(problem, (), False), leaves[self.movable :], self.recipe)
+        return jax.tree.map(lambda part: part[None], found)
+
+    def with_slopes(
+        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[SampledRun, list[SampledRun]]:
+        problem, directions, gather = directions_by(self.recipe.problem, active, leaves[: self.movable], None)
+
+        def run(some: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
+            return _follow(VariationalProblem(problem, some, False), leaves[self.movable :], self.recipe)
+
+        found, slopes = in_groups(run, directions)
+        return jax.tree.map(lambda part: part[None], (found, gather(slopes)))
+
+
+def _follow(
+    varied: VariationalProblem, given: tuple[Array, Array, Array], recipe: Recipe
+) -> tuple[SampledRun, list[SampledRun]]:
+    """What is found of a run, and its slope along each of the directions."""
+    times, t1, tolerance = given
+    path = sample(varied, times, t1, _with_tolerance(recipe.settings, tolerance), grid=recipe.grid)
+    ends = (path.end_time, path.end_state, _status(path, t1))
+    return _found(varied, path.states.T, ends, (path.accepted, path.rejected))

@@ -1,0 +1,163 @@
+"""The moving frame of a ball on any smooth surface, without a chart and without a pole; and which surface has which frame.
+
+The place is the foot, the point at which the ball touches the surface, and the first tangent, both in the surface's axes. The
+surface says which way its normal n points and how that changes, n' = -S_a q' for a velocity q' along it. The centre is at
+O = q + R n, so that its velocity is V = (1 - R S_a) q', and with S = S_a (1 - R S_a)^-1 it is n' = -S V (`tippe.md`, section 2
+(iv)). The ball fits while no principal curvature reaches 1/R.
+"""
+
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from ..validation import Bound, as_number
+from ..xla_cpu import stored
+from .cylinder import Cylinder
+from .frames import (
+    AbstractFrame,
+    Carriage,
+    CylinderFrame,
+    Fixed,
+    Place,
+    PlaneFrame,
+    SphereFrame,
+    Tangent,
+    along,
+)
+from .plane import Plane
+from .quadric import Sphere
+from .surface import AbstractSurface
+from .torus import Torus
+from .vector import Component, Vector, cross, dot, scale, sum_vectors, tangents
+
+
+def place_named(surface: AbstractSurface, place: Place) -> Place:
+    """A place as `surface.chart` takes it, of one in which a closed surface's eta counts from the lowest point.
+
+    **Arguments:** `place`: numbers named by `surface.coordinates`, or (x, y, z).
+    """
+    if len(place) == 2 and surface.coordinates[0][0] == "mu":
+        return (place[0], place[1] - 0.5 * jnp.pi)
+    return place
+
+
+def frame_of(
+    surface: AbstractSurface, side: float, distance: Float[Array, "..."], pull: Float[Array, "..."]
+) -> AbstractFrame:
+    """The frame of a ball on a surface: the surface's own if it has one, else a `CarriedFrame`.
+
+    **Arguments:** as for `CarriedFrame`.
+    """
+    if isinstance(surface, Plane):
+        slope = None if surface.tilt is None else (jnp.sin(surface.tilt), jnp.cos(surface.tilt))
+        return PlaneFrame(distance, slope)
+    if isinstance(surface, Cylinder | Sphere):
+        own = CylinderFrame if isinstance(surface, Cylinder) else SphereFrame
+        return own(-side * surface.radius - distance, distance, side < 0.0)
+    return CarriedFrame(surface, distance, pull, side)
+
+
+def room_bounds(surface: AbstractSurface, side: float, distance: Float[Array, "..."]) -> Iterator[Bound]:
+    """The ranges of a surface's numbers in which a ball fits anywhere at all.
+
+    **Arguments:** as for `CarriedFrame`.
+    """
+    if side < 0.0 and isinstance(surface, Cylinder | Sphere):
+        yield Bound(surface.radius, "surface radius", above=distance, why="the body must fit inside")
+    if side < 0.0 and isinstance(surface, Torus):
+        yield Bound(surface.tube, "surface tube", above=distance, why="the body must fit inside")
+
+
+class CarriedFrame(AbstractFrame):
+    """A frame that is carried along any surface.
+
+    - `surface`: what the ball touches; `side`: 1 where the room is on the side of the surface's normal, else -1.
+    - `distance`: R [m].
+    - `pull`: rate [1/s] at which the foot is drawn back to the surface, should round-off and step errors take it off.
+    """
+
+    surface: AbstractSurface
+    distance: Float[Array, "..."]
+    pull: Float[Array, "..."]
+    side: float = eqx.field(static=True, default=1.0)
+
+    def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
+        eta = as_number(eta)
+        zero = jnp.zeros_like(eta)
+        names = [name for name, _ in self.surface.coordinates]
+        place = tuple(eta if name == "eta" else zero for name in names)
+        return self.at_foot(self.surface.chart(place_named(self.surface, place))[0])
+
+    def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
+        foot = tuple(jnp.broadcast_arrays(*(0.0 if x is None else x for x in foot)))
+        t1, _ = tangents(self._normal(foot))
+        return (*foot, *t1), ()
+
+    def _normal(self, foot: Fixed) -> Fixed:
+        normal = scale(self.side, self.surface.normal(foot))
+        return tuple(jnp.broadcast_to(0.0 if x is None else x, jnp.shape(foot[0])) for x in normal)
+
+    @property
+    def place_scales(self) -> tuple[Component, ...]:
+        return (self.distance,) * 3 + (1.0,) * 3
+
+    def carriage(self, place: Place, velocity: Tangent) -> Carriage:
+        foot, R = place[:3], self.distance
+        # Stored: what follows, and its derivatives above all, would each compute these anew.
+        n = stored(*self._normal(foot))
+        # A first tangent that has drifted counts for its direction along the surface only.
+        t1 = stored(*along(n, place[3:])[0])
+        t2 = cross(n, t1)
+        S11, S12, S22 = stored(*self._shape(foot, t1, t2))
+        A11, A12, A22 = 1.0 - R * S11, -R * S12, 1.0 - R * S22
+        determinant = A11 * A22 - A12 * A12
+        q1 = (A22 * velocity[0] - A12 * velocity[1]) / determinant
+        q2 = (A11 * velocity[1] - A12 * velocity[0]) / determinant
+        o1, o2, *up = stored(S11 * q1 + S12 * q2, S12 * q1 + S22 * q2, *self._seen(t1, t2, n))
+        back = -self.pull * self.side * self.surface.offset(foot)
+        moved = sum_vectors(scale(q1, t1), scale(q2, t2), scale(back, n))
+        # Both are positive where both of 1 - R k are; the first of them to vanish takes the determinant with it.
+        room = jnp.minimum(determinant, 0.5 * (A11 + A22))
+        return Carriage((o1, o2), tuple(up), (*moved, *scale(o1, n)), room)
+
+    def _shape(self, foot: Fixed, t1: Fixed, t2: Fixed) -> tuple[Component, Component, Component]:
+        """The shape operator of the arena, n' = -S_a q', as (S11, S12, S22)."""
+        first, second = (scale(-self.side, self.surface.normal_rate(foot, t)) for t in (t1, t2))
+        S11, S12, S22 = dot(first, t1), dot(first, t2), dot(second, t2)
+        zero = jnp.zeros_like(foot[0])
+        return tuple(zero if S is None else S for S in (S11, S12, S22))
+
+    def _seen(self, *axes: Fixed) -> Vector:
+        """The upward vertical in the frame."""
+        return tuple(dot(axis, self.surface.up) for axis in axes)
+
+    def _own_axes(self, place: Place) -> tuple[Fixed, Fixed, Fixed]:
+        n = self._normal(place[:3])
+        return (*along(n, place[3:]), n)
+
+    def vertical(self, place: Place) -> Vector:
+        return self._seen(*self._own_axes(place))
+
+    def height(self, place: Place) -> Component:
+        return self.surface.elevation(place[:3]) + self.distance * dot(self._normal(place[:3]), self.surface.up)
+
+    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
+        return ()
+
+    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
+        """As the surface counts it, or the slope of the ground where no coordinate of the surface is one."""
+        foot, names = place[:3], [name for name, _ in self.surface.coordinates]
+        if "eta" not in names:
+            t1_up, t2_up, n_up = self.vertical(place)
+            return jnp.arctan2(jnp.hypot(t1_up, t2_up), n_up)
+        eta = self.surface.place_at(foot)[names.index("eta")]
+        return eta + 0.5 * jnp.pi if names[0] == "mu" else eta
+
+    def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
+        return tuple(self.surface.in_fixed_frame(axis) for axis in self._own_axes(place))
+
+    def position(self, place: Place, cyclic: Place) -> Fixed:
+        centre = sum_vectors(place[:3], scale(self.distance, self._normal(place[:3])))
+        return self.surface.in_fixed_frame(centre)

@@ -1,0 +1,267 @@
+"""Frames (t1, t2, n) that move with a ball on a surface, n being the surface's normal into the room where the ball is.
+
+The ball touches the surface at its foot; its centre is at a distance R from there along n, on the parallel surface. With V the
+velocity of the centre the frame turns as t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2), where (o1, o2) = S V and S is the shape
+operator of the parallel surface, positive where it is concave towards the ball. The frame does not turn about n, so the
+components of a fixed vector change as `carried` states.
+
+Plane, cylinder and sphere have frames of their own, with fewer numbers than the general one (`carried_frame.py`). A sphere or
+cylinder is the same from both sides but for the sign of its radius, which is positive inside.
+"""
+
+import abc
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from ..validation import as_number
+from .vector import Component, Vector, cross, dot, multiply, scale, subtract, sum_vectors, tangents
+
+#: What a frame integrates, as components along axis 0 of a state.
+Place = tuple[Component, ...]
+Tangent = tuple[Component, Component]
+#: A vector's three components in the fixed frame (x, y, z), z up.
+Fixed = tuple[Any, Any, Any]
+
+
+def carried(vector: tuple[Component, ...], turning: Tangent) -> tuple[Component, ...]:
+    """Rate of the components of a fixed vector in a moving frame with t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2)."""
+    along_normal = dot(turning, vector[:2])
+    return (multiply(turning[0], vector[2]), multiply(turning[1], vector[2]), subtract(None, along_normal))
+
+
+class Carriage(NamedTuple):
+    """What a frame does while the ball moves.
+
+    - `turning`: (o1, o2) = S V [rad/s]; `vertical`: the upward vertical in the frame.
+    - `place_rate`: rate of the place.
+    - `room`: positive where the ball fits, 1 where the surface is flat; `None` if it fits everywhere.
+    """
+
+    turning: Tangent
+    vertical: Vector
+    place_rate: Place
+    room: Component = None
+
+
+class AbstractFrame(eqx.Module):
+    """A moving frame of a ball on a surface.
+
+    The place is what the frame must integrate to know where it is; `cyclic` is what else it takes to draw it.
+    """
+
+    @abc.abstractmethod
+    def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
+        """Place and cyclic coordinates at the angle `eta` [rad] from the lowest point, in the x-z plane."""
+
+    @abc.abstractmethod
+    def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
+        """Place and cyclic coordinates of a ball that touches the surface at a point [m], given in the surface's axes."""
+
+    @property
+    @abc.abstractmethod
+    def place_scales(self) -> tuple[Component, ...]:
+        """Magnitudes of the place's components."""
+
+    @abc.abstractmethod
+    def carriage(self, place: Place, velocity: Tangent) -> Carriage:
+        """What the frame does while the centre moves with the velocity (V1, V2) [m/s]."""
+
+    @abc.abstractmethod
+    def vertical(self, place: Place) -> Vector:
+        """Components of the upward vertical in the frame."""
+
+    @abc.abstractmethod
+    def height(self, place: Place) -> Component:
+        """Height [m] of the centre above the lowest point of the surface, or above z = 0 where it has none."""
+
+    @abc.abstractmethod
+    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
+        """Rate of change of `cyclic`."""
+
+    @abc.abstractmethod
+    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
+        """Angle eta [rad] from the lowest point."""
+
+    @abc.abstractmethod
+    def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
+        """The vectors t1, t2 and n in the fixed frame."""
+
+    @abc.abstractmethod
+    def position(self, place: Place, cyclic: Place) -> Fixed:
+        """Position of the centre [m] in the fixed frame."""
+
+
+class PlaneFrame(AbstractFrame):
+    """On a plane the frame does not turn, and a level one has no place; on a tilted one it is x, the way up the plane [m].
+
+    - `distance`: R [m]; `slope`: sine and cosine of the tilt, `None` for a level plane.
+    """
+
+    distance: Float[Array, "..."]
+    slope: tuple[Float[Array, "..."], Float[Array, "..."]] | None = None
+
+    def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
+        zero = jnp.zeros_like(as_number(eta))
+        return self._along(zero, zero)
+
+    def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
+        return self._along(foot[0], foot[1])
+
+    def _along(self, x: Component, y: Component) -> tuple[Place, Place]:
+        return ((), (x, y)) if self.slope is None else ((x,), (y,))
+
+    @property
+    def place_scales(self) -> tuple[Component, ...]:
+        return () if self.slope is None else (self.distance,)
+
+    def carriage(self, place: Place, velocity: Tangent) -> Carriage:
+        return Carriage((None, None), self.vertical(place), velocity[: len(place)])
+
+    def vertical(self, place: Place) -> Vector:
+        return (None, None, 1.0) if self.slope is None else (self.slope[0], None, self.slope[1])
+
+    def height(self, place: Place) -> Component:
+        if self.slope is None:
+            return self.distance
+        return self.slope[0] * place[0] + self.slope[1] * self.distance
+
+    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
+        return velocity[2 - len(cyclic) :]
+
+    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
+        return jnp.zeros_like(cyclic[0])
+
+    def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
+        zero, one = jnp.zeros_like(cyclic[0]), jnp.ones_like(cyclic[0])
+        if self.slope is None:
+            return (one, zero, zero), (zero, one, zero), (zero, zero, one)
+        sine, cosine = one * self.slope[0], one * self.slope[1]
+        return (cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)
+
+    def position(self, place: Place, cyclic: Place) -> Fixed:
+        x, y = (*place, *cyclic)
+        along, across, normal = self.axes(place, cyclic)
+        return sum_vectors(scale(x, along), scale(y, across), scale(self.distance, normal))
+
+
+class CylinderFrame(AbstractFrame):
+    """Inside or outside of a cylinder whose axis is y: t2 along y, n = (-sin c, 0, cos c), and the place is (sin c, cos c).
+
+    Inside, c is eta and t1 points along growing eta; outside, c = eta - pi.
+
+    - `radius`: of the path of the centre [m], negative outside; `distance`: R [m].
+    """
+
+    radius: Float[Array, "..."]
+    distance: Float[Array, "..."]
+    inside: bool = eqx.field(static=True, default=True)
+
+    def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
+        eta = as_number(eta)
+        place = (jnp.sin(eta), jnp.cos(eta))
+        return scale(self._side, place), (eta, jnp.zeros_like(eta))
+
+    def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
+        x, y, z = foot
+        place, (eta, _) = self.at_angle(jnp.arctan2(x, -z))
+        return place, (eta, y)
+
+    @property
+    def _side(self) -> float:
+        return 1.0 if self.inside else -1.0
+
+    @property
+    def place_scales(self) -> tuple[Component, ...]:
+        return (1.0, 1.0)
+
+    def carriage(self, place: Place, velocity: Tangent) -> Carriage:
+        sine, cosine = place
+        rate = velocity[0] / self.radius
+        return Carriage((rate, None), self.vertical(place), (multiply(rate, cosine), -multiply(rate, sine)))
+
+    def vertical(self, place: Place) -> Vector:
+        sine, cosine = place
+        return (sine, None, cosine)
+
+    def height(self, place: Place) -> Component:
+        # The lowest point is at the distance of the radius below the axis, on either side.
+        return self._side * (self.radius + self.distance) - self.radius * place[1]
+
+    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
+        return (turning[0], velocity[1])
+
+    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
+        return cyclic[0]
+
+    def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
+        sine, cosine = place
+        zero, one = jnp.zeros_like(sine), jnp.ones_like(sine)
+        return (cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)
+
+    def position(self, place: Place, cyclic: Place) -> Fixed:
+        sine, cosine = place
+        return (self.radius * sine, cyclic[1], -self.radius * cosine)
+
+
+class SphereFrame(AbstractFrame):
+    """Inside or outside of a sphere; the frame is carried parallel to itself, so no place is singular.
+
+    The place is the vertical z seen in the frame; `cyclic` adds the horizontal x axis seen in it. Fields as of `CylinderFrame`.
+    """
+
+    radius: Float[Array, "..."]
+    distance: Float[Array, "..."]
+    inside: bool = eqx.field(static=True, default=True)
+
+    def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
+        eta = as_number(eta)
+        zero, side = jnp.zeros_like(eta), self._side
+        sine, cosine = side * jnp.sin(eta), side * jnp.cos(eta)
+        return (sine, zero, cosine), (cosine, zero, -sine)
+
+    def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
+        n = scale(-self._side / jnp.sqrt(dot(foot, foot)), foot)
+        t1, t2 = tangents(n)
+        return (t1[2], t2[2], n[2]), (t1[0], t2[0], n[0])
+
+    @property
+    def _side(self) -> float:
+        return 1.0 if self.inside else -1.0
+
+    @property
+    def place_scales(self) -> tuple[Component, ...]:
+        return (1.0, 1.0, 1.0)
+
+    def carriage(self, place: Place, velocity: Tangent) -> Carriage:
+        turning = (velocity[0] / self.radius, velocity[1] / self.radius)
+        return Carriage(turning, self.vertical(place), carried(place, turning))
+
+    def vertical(self, place: Place) -> Vector:
+        return (place[0], place[1], place[2])
+
+    def height(self, place: Place) -> Component:
+        return self._side * (self.radius + self.distance) - self.radius * place[2]
+
+    def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
+        return carried(cyclic, turning)
+
+    def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
+        return jnp.arctan2(jnp.hypot(place[0], place[1]), self._side * place[2])
+
+    def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
+        x, z = cyclic, place
+        y = (z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0])
+        return (x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2])
+
+    def position(self, place: Place, cyclic: Place) -> Fixed:
+        return scale(-self.radius, self.axes(place, cyclic)[2])
+
+
+def along(n: Fixed, direction: Fixed) -> tuple[Fixed, Fixed]:
+    """Unit vectors across n: t1 along the projection of a direction onto the tangent plane, and t2 = n x t1."""
+    projected = sum_vectors(direction, scale(-1.0 * dot(n, direction), n))
+    t1 = scale(1.0 / jnp.sqrt(dot(projected, projected)), projected)
+    return t1, cross(n, t1)

@@ -1,0 +1,65 @@
+"""Functions that a user gives a surface: made into modules whose numbers a program sees, checked, differentiated."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..validation import as_number, is_traced
+
+
+class Plain(eqx.Module):
+    """A function that holds no number of interest; the same function is the same program."""
+
+    function: Callable[..., Any] = eqx.field(static=True)
+
+    def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
+        return self.function(*at)
+
+
+class Closure(eqx.Module):
+    """A function with the traced numbers that it closes over as leaves; it was traced with single numbers."""
+
+    traced: Any
+
+    def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
+        return jnp.vectorize(self.traced)(*at)
+
+
+def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module:
+    """A function of some lengths [m] as a module, its numbers as arrays.
+
+    **Raises:** `ValueError` unless it gives one number for numbers.
+    """
+    if not callable(value):
+        raise ValueError(f"{name} = {value!r} must be a function of ({', '.join(arguments)})")
+    if isinstance(value, eqx.Module):
+        value = jax.tree.map(lambda leaf: as_number(leaf) if isinstance(leaf, float | np.ndarray) else leaf, value)
+    zeros = (jnp.zeros(()),) * len(arguments)
+    try:
+        traced = jax.make_jaxpr(value)(*zeros)
+    except TypeError as error:
+        raise ValueError(f"{name} = {value!r} must be a function of ({', '.join(arguments)}): {error}") from error
+    # The numbers of a module may be one for each lane.
+    shapes = {(), *(leaf.shape for leaf in jax.tree.leaves(value) if eqx.is_array(leaf))}
+    given = traced.out_avals
+    if len(given) != 1 or given[0].shape not in shapes or not jnp.issubdtype(given[0].dtype, jnp.floating):
+        shown = ", ".join(map(str, given))
+        raise ValueError(f"{name} = {value!r} must give one number for numbers {', '.join(arguments)}, not {shown}")
+    if isinstance(value, eqx.Module):
+        return value
+    closes_over = any(is_traced(constant) for constant in traced.consts)
+    return Closure(eqx.filter_closure_convert(value, *zeros)) if closes_over else Plain(value)
+
+
+def partials(function: Callable[..., Any], at: tuple[Any, ...]) -> tuple[Float[Array, "..."], ...]:
+    """Partial derivatives of a function of several numbers, each a number or an array over lanes."""
+
+    def along(k: int) -> Float[Array, "..."]:
+        return jax.jvp(lambda one: function(*at[:k], one, *at[k + 1 :]), (at[k],), (jnp.ones_like(at[k]),))[1]
+
+    return tuple(along(k) for k in range(len(at)))

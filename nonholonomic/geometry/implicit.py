@@ -1,0 +1,51 @@
+"""The surface on which any smooth function of three coordinates is zero."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .function import as_function, partials
+from .level import AbstractDifferentiated
+from .surface import DIVIDED, Place
+from .vector import Component, Vector, dot, tangents
+
+
+class Implicit(AbstractDifferentiated):
+    """The surface function(x, y, z) = 0 in the fixed frame; the room where bodies are is where the function is positive.
+
+    A place on it is (x, y, z) [m]; east is the projection of x on the surface, or of y where the normal is along x, and
+    north is to the left of it.
+
+    **Arguments:**
+
+    - `function`: a smooth function of x, y and z [m] whose gradient does not vanish on the surface. It is called with arrays
+      of any shape, a number for each lane, so it is written with `jax.numpy` and without `if`. The numbers of an
+      `equinox.Module` are numbers of the scene, to be swept and differentiated by.
+
+    **Raises:** `ValueError` for what is not such a function.
+    """
+
+    sides: ClassVar[Mapping[str, float]] = DIVIDED
+    coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("x", "m"), ("y", "m"), ("z", "m"))
+
+    function: Any = eqx.field(converter=lambda given: as_function(given, "function", ("x", "y", "z")))
+
+    def gradient(self, position: Vector) -> Vector:
+        slope = partials(self.function, position)
+        return (slope[0], slope[1], slope[2])
+
+    def offset(self, position: Vector) -> Component:
+        gradient = self.gradient(position)
+        return self.function(*position) / jnp.sqrt(dot(gradient, gradient))
+
+    def elevation(self, position: Vector) -> Component:
+        return position[2]
+
+    def place_at(self, position: Vector) -> Place:
+        return (position[0], position[1], position[2])
+
+    def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
+        position = self.nearest((place[0], place[1], place[2]))
+        return position, *tangents(self.normal(position))

@@ -1,0 +1,138 @@
+"""Sphere and spheroid: the quadrics of revolution about the vertical."""
+
+import abc
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..validation import Bound, as_number, require
+from .level import AbstractLevel
+from .surface import AbstractSurface, Place
+from .vector import Component, Vector, dot, multiply, scale, subtract, sum_vectors
+
+
+class AbstractQuadric(AbstractSurface):
+    """A sphere or spheroid r.N r = 1, N = diag(1/A^2, 1/A^2, 1/c^2), about the origin, its axis vertical.
+
+    A place on it is (mu, eta) [rad], azimuth and reduced latitude: -pi/2 at the lowest point, pi/2 at the highest.
+    """
+
+    @property
+    @abc.abstractmethod
+    def semi_axes(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Equatorial radius A and polar semi-axis c [m]."""
+
+    def gradient(self, vector: Vector) -> Vector:
+        """The vector N r [1/m]; also N times any other vector."""
+        equatorial, polar = self.semi_axes
+        across, along = 1.0 / (equatorial * equatorial), 1.0 / (polar * polar)
+        return (multiply(across, vector[0]), multiply(across, vector[1]), multiply(along, vector[2]))
+
+    def normal(self, position: Vector) -> Vector:
+        # Normalised even where N r has unit length on the surface, so that a drift off it does not amplify itself.
+        gradient = self.gradient(position)
+        return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), gradient)
+
+    def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
+        gradient, normal = self.gradient(position), self.normal(position)
+        turning = self.gradient(velocity)
+        along = scale(subtract(None, dot(normal, turning)), normal)
+        return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), sum_vectors(turning, along))
+
+    def elevation(self, position: Vector) -> Component:
+        return position[2] + self.semi_axes[1]
+
+    def gaussian_curvature(self, position: Vector) -> Component:
+        equatorial, polar = self.semi_axes
+        gradient = self.gradient(position)
+        return 1.0 / (equatorial**2 * polar * dot(gradient, gradient)) ** 2
+
+    def place_at(self, position: Vector) -> Place:
+        equatorial, polar = self.semi_axes
+        x, y, z = position
+        return (jnp.arctan2(y, x), jnp.arctan2(z / polar, jnp.hypot(x, y) / equatorial))
+
+    def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
+        (equatorial, polar), (mu, eta) = self.semi_axes, place
+        east = (-jnp.sin(mu), jnp.cos(mu), jnp.zeros_like(mu))
+        outwards, across, along = (jnp.cos(mu), jnp.sin(mu)), equatorial * jnp.cos(eta), polar * jnp.sin(eta)
+        inwards, rise = -equatorial * jnp.sin(eta), polar * jnp.cos(eta)
+        per_length = 1.0 / jnp.sqrt(inwards**2 + rise**2)
+        north = scale(per_length, (inwards * outwards[0], inwards * outwards[1], rise))
+        return (across * outwards[0], across * outwards[1], along), east, north
+
+    def place_bounds(self, place: Place, size: Any) -> Iterator[Bound]:
+        yield from super().place_bounds(place, size)
+        if len(place) == 2:
+            limit = math.pi / 2.0 + 1e-12
+            why = "reduced latitude, from -pi/2 to pi/2"
+            yield Bound(place[1], "place[1]", at_least=-limit, at_most=limit, why=why)
+
+
+class Sphere(AbstractQuadric):
+    """A sphere about the origin.
+
+    **Arguments:**
+
+    - `radius`: radius [m], positive.
+    """
+
+    radius: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.radius, "surface radius", above=0.0)
+
+    @property
+    def semi_axes(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        return self.radius, self.radius
+
+    def nearest(self, position: Vector) -> Vector:
+        return scale(self.radius / jnp.sqrt(dot(position, position)), position)
+
+    def distance(self, position: Vector) -> Component:
+        return jnp.sqrt(dot(position, position)) - self.radius
+
+
+class Spheroid(AbstractQuadric, AbstractLevel):
+    """An ellipsoid of revolution with a vertical axis, oblate or prolate.
+
+    **Arguments:**
+
+    - `equatorial`: equatorial radius A [m], positive.
+    - `polar`: polar semi-axis c [m], positive.
+    """
+
+    equatorial: Float[Array, "..."] = eqx.field(converter=as_number)
+    polar: Float[Array, "..."] = eqx.field(converter=as_number)
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.equatorial, "equatorial", above=0.0)
+        yield Bound(self.polar, "polar", above=0.0)
+
+    @classmethod
+    def from_oblate(cls, a: Float[Array, "..."], xi: Float[Array, "..."]) -> "Spheroid":
+        """The spheroid of constant xi in oblate spheroidal coordinates: A = a cosh xi, c = a sinh xi.
+
+        **Arguments:**
+
+        - `a`: focal radius [m], positive.
+        - `xi`: coordinate [1], positive.
+
+        **Raises:** `ValueError` for numbers outside these ranges.
+        """
+        a, xi = as_number(a), as_number(xi)
+        require(a, "a", above=0.0)
+        require(xi, "xi", above=0.0)
+        return cls(equatorial=a * jnp.cosh(xi), polar=a * jnp.sinh(xi))
+
+    @property
+    def semi_axes(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        return self.equatorial, self.polar
+
+    def offset(self, position: Vector) -> Component:
+        gradient = self.gradient(position)
+        return 0.5 * (dot(position, gradient) - 1.0) / jnp.sqrt(dot(gradient, gradient))

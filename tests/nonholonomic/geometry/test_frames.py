@@ -1,0 +1,191 @@
+"""Moving frames as a body feels them: axes, shape operators, heights, against finite differences of the position."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import assert_close
+
+from nonholonomic.geometry import (
+    CarriedFrame,
+    Cylinder,
+    Graph,
+    Implicit,
+    Paraboloid,
+    Plane,
+    Sphere,
+    Spheroid,
+    Torus,
+    add,
+    carried,
+    cross,
+    dot,
+    frame_of,
+    multiply,
+    scale,
+    subtract,
+)
+
+DISTANCE, PULL = jnp.asarray(0.02), jnp.asarray(20.0)
+SURFACES = {
+    "plane": (Plane(), 1.0),
+    "tilted": (Plane(0.3), 1.0),
+    "cylinder": (Cylinder(0.3), -1.0),
+    "outside of a cylinder": (Cylinder(0.3), 1.0),
+    "sphere": (Sphere(0.3), -1.0),
+    "outside of a sphere": (Sphere(0.3), 1.0),
+    "spheroid": (Spheroid(0.4, 0.3), -1.0),
+    "torus": (Torus(0.5, 0.2), -1.0),
+    "outside of a torus": (Torus(0.5, 0.2), 1.0),
+    "paraboloid": (Paraboloid(0.3), 1.0),
+    "graph": (Graph(lambda x, y: 0.1 * jnp.sin(3.0 * x) * jnp.cos(2.0 * y)), 1.0),
+    "implicit": (Implicit(lambda x, y, z: 0.1 - x**4 - 2.0 * y**4 - z**2), 1.0),
+}
+OWN = {name: SURFACES[name] for name in list(SURFACES)[:6]}
+FOOT = (0.11, -0.07)
+
+
+def carried_frame(surface, side):
+    return CarriedFrame(surface, DISTANCE, PULL, side)
+
+
+def foot_of(name):
+    """A point of the surface with nothing special about it, in the surface's axes."""
+    surface, _ = SURFACES[name]
+    x, y = FOOT
+    near = (jnp.asarray(x), jnp.asarray(y), jnp.asarray(-0.29))
+    if name.endswith("torus"):
+        near = (jnp.asarray(x + 0.4), jnp.asarray(y), jnp.asarray(-0.16))
+    found = surface.nearest(near)
+    return tuple(jnp.zeros(()) if part is None else part for part in found)
+
+
+def moved(frame, start, velocity, time, steps=200):
+    """Place and cyclic coordinates after moving with the given velocity components, by small Runge-Kutta steps."""
+
+    def rate(both):
+        carriage = frame.carriage(both[0], velocity)
+        return carriage.place_rate, frame.cyclic_rate(both[1], velocity, carriage.turning)
+
+    def step(both, _):
+        k1 = rate(both)
+        k2 = rate(jax.tree.map(lambda x, k: x + 0.5 * dt * k, both, k1))
+        k3 = rate(jax.tree.map(lambda x, k: x + 0.5 * dt * k, both, k2))
+        k4 = rate(jax.tree.map(lambda x, k: x + dt * k, both, k3))
+        return jax.tree.map(lambda x, a, b, c, d: x + dt / 6.0 * (a + 2 * b + 2 * c + d), both, k1, k2, k3, k4), None
+
+    dt = time / steps
+    return jax.jit(lambda: jax.lax.scan(step, start, length=steps)[0])()
+
+
+def numbers(parts):
+    return np.array([0.0 if part is None else float(part) for part in parts])
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_the_frame_is_orthonormal_and_turns_as_stated(name):
+    """t1, t2, n orthonormal; position' = V1 t1 + V2 t2; n' = -(o1 t1 + o2 t2); the vertical is z, the height its component."""
+    frame, velocity = frame_of(*SURFACES[name], DISTANCE, PULL), (jnp.asarray(0.3), jnp.asarray(-0.2))
+    place, cyclic = moved(frame, frame.at_foot(foot_of(name)), velocity, 0.2)
+    axes = np.array(frame.axes(place, cyclic), dtype=float)
+    assert_close(axes @ axes.T, np.eye(3), atol=1e-10)
+    assert_close(np.linalg.det(axes), 1.0, atol=1e-10)
+    carriage = frame.carriage(place, velocity)
+    rates = (carriage.place_rate, frame.cyclic_rate(cyclic, velocity, carriage.turning))
+    _, position_rate = jax.jvp(lambda *both: jnp.stack(frame.position(*both)), (place, cyclic), rates)
+    assert_close(position_rate, 0.3 * axes[0] - 0.2 * axes[1], atol=1e-9)
+    o1, o2 = numbers(carriage.turning)
+    for axis, expected in enumerate((o1 * axes[2], o2 * axes[2], -(o1 * axes[0] + o2 * axes[1]))):
+        _, rate = jax.jvp(lambda *both, axis=axis: jnp.stack(frame.axes(*both)[axis]), (place, cyclic), rates)
+        assert_close(rate, expected, atol=1e-9)
+    assert_close(numbers(frame.vertical(place)), axes[:, 2], atol=1e-10)
+    assert_close(numbers(carriage.vertical), axes[:, 2], atol=1e-10)
+    _, climb = jax.jvp(lambda place: jnp.asarray(frame.height(place)) * 1.0, (place,), (carriage.place_rate,))
+    assert_close(climb, position_rate[2], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_a_frame_of_its_own_is_the_carried_one_in_fewer_numbers(name):
+    """From the same foot, and t1 along it, both are at the same place with the same axes later, and say the same rates."""
+    velocity, found = (jnp.asarray(0.3), jnp.asarray(-0.2)), []
+    own, general = frame_of(*SURFACES[name], DISTANCE, PULL), carried_frame(*SURFACES[name])
+    start = own.at_foot(foot_of(name))
+    place, _ = general.at_foot(foot_of(name))
+    first = SURFACES[name][0].in_own_axes(own.axes(*start)[0])
+    for frame, begin in ((own, start), (general, ((*place[:3], *first), ()))):
+        here = moved(frame, begin, velocity, 0.2)
+        carriage = frame.carriage(here[0], velocity)
+        height = float(frame.height(here[0]) - frame.height(begin[0]))
+        found.append(
+            np.concatenate(
+                [
+                    np.ravel(np.array(frame.axes(*here), dtype=float)),
+                    np.ravel(np.array(frame.position(*here), dtype=float)),
+                    numbers(carriage.turning),
+                    numbers(carriage.vertical),
+                    [height],
+                ]
+            )
+        )
+    assert_close(found[0], found[1], atol=1e-10)
+
+
+def test_the_foot_is_drawn_back_to_the_surface():
+    """A drift decays at the stated rate, and the surface is reached where the foot came from."""
+    frame = carried_frame(*SURFACES["graph"])
+    place, _ = frame.at_foot(foot_of("graph"))
+    off = (place[0], place[1], place[2] + 1e-4, *place[3:])
+    before = float(frame.surface.distance(off[:3]))
+    later, _ = moved(frame, (off, ()), (jnp.asarray(0.3), jnp.asarray(-0.2)), 0.1)
+    assert_close(frame.surface.distance(later[:3]), before * np.exp(-2.0), rtol=0.05)
+
+
+def test_room_is_left_where_the_ball_fits_and_ends_at_the_curvature_of_the_ball():
+    """On a paraboloid the curvature is greatest at the bottom, 1/p."""
+    for p, fits in ((0.021, True), (0.019, False)):
+        frame = CarriedFrame(Paraboloid(p), DISTANCE, PULL)
+        place, _ = frame.at_foot((jnp.zeros(()),) * 3)
+        room = float(frame.carriage(place, (jnp.asarray(0.1), jnp.asarray(0.0))).room)
+        assert (room > 0.0) is fits
+    assert_close(room, 1.0 - 0.02 / 0.019, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["cylinder", "sphere", "outside of a cylinder", "outside of a sphere"])
+def test_the_angle_counts_from_the_lowest_point(name):
+    frame = frame_of(*SURFACES[name], DISTANCE, PULL)
+    radius = 0.3 - 0.02 if frame.inside else 0.32
+    for eta in (0.0, 0.7, -0.7, np.pi / 2.0, 2.0):
+        where = frame.at_angle(jnp.asarray(eta))
+        assert_close(frame.angle(*where), abs(eta) if "sphere" in name else eta, atol=1e-12)
+        assert_close(frame.position(*where), (radius * np.sin(eta), 0.0, -radius * np.cos(eta)), atol=1e-12)
+        assert_close(frame.height(where[0]), 0.3 - radius * np.cos(eta), atol=1e-12)
+
+
+def test_a_cylinder_turns_as_the_conventions_say():
+    """Inside n = (-sin eta, 0, cos eta) and t1 = (cos eta, 0, sin eta); outside, on top, t1 is x."""
+    frame = frame_of(Cylinder(0.3), -1.0, DISTANCE, PULL)
+    t1, t2, n = frame.axes(*frame.at_angle(jnp.asarray(0.4)))
+    assert_close(
+        np.array([t1, t2, n]), [(np.cos(0.4), 0, np.sin(0.4)), (0, 1, 0), (-np.sin(0.4), 0, np.cos(0.4))], atol=1e-15
+    )
+    frame = frame_of(Cylinder(0.3), 1.0, DISTANCE, PULL)
+    assert_close(np.array(frame.axes(*frame.at_angle(jnp.asarray(np.pi)))), np.eye(3), atol=1e-15)
+
+
+def test_a_fixed_vector_keeps_its_length_in_a_turning_frame():
+    vector, turning = (1.0, 2.0, 3.0), (0.4, -0.7)
+    assert_close(dot(carried(vector, turning), vector), 0.0, atol=1e-15)
+
+
+def test_exact_zeros_cost_nothing():
+    """`None` is zero: sums skip it, products with it are it."""
+    assert add(None, None) is None
+    assert add(1.0, None, 2.0) == 3.0
+    assert subtract(None, 2.0) == -2.0
+    assert subtract(2.0, None) == 2.0
+    assert subtract(None, None) is None
+    assert multiply(2.0, None) is None
+    assert multiply(2.0, 3.0) == 6.0
+    assert scale(2.0, (1.0, None)) == (2.0, None)
+    assert cross((1.0, None, None), (None, 1.0, None)) == (None, None, 1.0)
+    assert dot((None, None), (1.0, 2.0)) is None
