@@ -168,7 +168,7 @@ class InversionQuestion(AbstractQuestion):
             directions,
             t1,
             jnp.asarray(cells),
-            Settings(tolerance, self.solver),
+            Settings(tolerance, self.solver, looped=True),
             passes=self.last,
             one_kernel=not again,
         )
