@@ -173,7 +173,7 @@ def meshes(body: Top, colour: int) -> tuple[Mesh, ...]:
 def rotation(
     axis: Float[np.ndarray, "times 3"], spin_angle: Float[np.ndarray, " times"]
 ) -> Float[np.ndarray, "times 3 3"]:
-    """Rotations from body to fixed frame: carried along with the axis without a turn about it, then turned by the spin angle."""
+    """Rotations from body to fixed frame: carried along with the axis without turning about it, then turned by the spin."""
     first = np.cross(axis[0], np.eye(3)[np.argmin(np.abs(axis[0]))])
     carried = [first / np.linalg.norm(first)]
     for old, new in zip(axis[:-1], axis[1:], strict=True):

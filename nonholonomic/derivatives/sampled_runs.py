@@ -133,6 +133,10 @@ class Recipe(eqx.Module):
         return self.build(eqx.combine(jax.tree.unflatten(self.structure, leaves), self.rest), cells)
 
 
+#: From this many cells on two directions run along together: that takes 0.8 times as long, but twice as long to compile.
+MANY, TOGETHER = 64, 2
+
+
 class BlockSampling(AbstractQuestion):
     """Samples by the block of lanes; the leaves are the modules' numbers, the times, the horizon and the tolerance."""
 
@@ -155,7 +159,7 @@ class BlockSampling(AbstractQuestion):
             varied = VariationalProblem(problem, some, False)
             return _march(varied, leaves[self.movable :], self.recipe.settings, not again)
 
-        found, slopes = in_groups(run, directions)
+        found, slopes = in_groups(run, directions, TOGETHER if cells >= MANY else 1)
         return found, gather(slopes)
 
 

@@ -1,6 +1,7 @@
 """Pictures, animations and pages of what the other rooms compute. No other room needs this one to compute anything."""
 
 from .arena import arena as arena
+from .fit import draw_fit as draw_fit
 from .meshes import ball as ball
 from .meshes import bar as bar
 from .meshes import box as box
