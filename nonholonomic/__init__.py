@@ -1,6 +1,7 @@
 """The ground that the models stand on: surfaces, integration, sweeps, tables. Knows neither top nor stroller."""
 
 import os
+from importlib.metadata import PackageNotFoundError, version
 
 import jax
 
@@ -18,3 +19,10 @@ from .geometry import Plane as Plane
 from .geometry import Sphere as Sphere
 from .geometry import Spheroid as Spheroid
 from .geometry import Torus as Torus
+from .sweeps import local_processes as local_processes
+
+try:
+    __version__ = version("nonholonomic")
+except PackageNotFoundError:
+    # Run from a checkout that is not installed.
+    __version__ = "unknown"

@@ -40,6 +40,15 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
 
     **Returns:** the folder in use; `None` if `NONHOLONOMIC_CACHE=0` forbids it or it cannot be written, which is logged as a
     warning.
+
+    **Example:**
+
+    ```
+    >>> import tempfile
+    >>> import nonholonomic
+    >>> folder = nonholonomic.enable_compilation_cache(tempfile.mkdtemp())  # doctest: +SKIP
+
+    ```
     """
     if os.environ.get("NONHOLONOMIC_CACHE") == "0":
         return None

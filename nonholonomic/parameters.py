@@ -1,6 +1,8 @@
-"""The numbers of a scene by name: `"scene.body.offset"`, `"launch.spin"`, `"launch.place[0]"` for the parts of a tuple."""
+"""The numbers of a scene by name: `"scene.body.offset"`, `"launch.place[0]"`; and as a person reads them, with their units."""
 
 import dataclasses
+import html
+import re
 from typing import Any
 
 import equinox as eqx
@@ -100,3 +102,75 @@ def description(root: str, tree: Any) -> dict[str, Any]:
             if callable(value):
                 found[name] = getattr(value, "__qualname__", repr(value))
     return found
+
+
+#: Numbers of an array that are shown; of a longer one the first and the last.
+SHOWN = 4
+
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def readable_unit(unit: str) -> str:
+    """A unit as a person writes it, "kg m²/s" for "kg m2 s-1"; an empty string for "1"."""
+    above, below = [], []
+    for part in unit.split():
+        found = re.fullmatch(r"([A-Za-z]+)(-?\d+)?", part)
+        if found is not None:
+            name, power = found[1], int(found[2] or 1)
+            (above if power > 0 else below).append(name + (str(abs(power)) if abs(power) > 1 else ""))
+    text = " ".join(above) or ("1" if below else "")
+    if below:
+        text += "/" + (below[0] if len(below) == 1 else f"({' '.join(below)})")
+    return re.sub(r"(?<=[A-Za-z])\d+", lambda power: power[0].translate(_SUPERSCRIPTS), text)
+
+
+def told(value: Any, unit: str = "1") -> str:
+    """A value as text: a number to six digits with its unit, an array by its first and last numbers."""
+    if isinstance(value, eqx.Module):
+        return repr(value)
+    if isinstance(value, jax.core.Tracer):
+        return f"traced {value.aval.str_short()}"
+    behind = readable_unit(unit)
+    behind = f" {behind}" if behind else ""
+    if isinstance(value, tuple):
+        return f"({', '.join(told(part) for part in value)}){behind}"
+    if isinstance(value, jax.Array | np.ndarray | float) and np.asarray(value).dtype.kind in "fiu":
+        numbers = np.asarray(value)
+        some = numbers.ravel()
+        if some.size <= SHOWN:
+            text = ", ".join(f"{number:.6g}" for number in some)
+        else:
+            text = f"{some[0]:.6g}, {some[1]:.6g}, ..., {some[-1]:.6g}, {some.size} numbers"
+        return (text if numbers.ndim == 0 else f"[{text}]") + behind
+    return getattr(value, "__qualname__", None) or repr(value)
+
+
+def contents(module: Any) -> list[tuple[str, str]]:
+    """What a module holds, field by field: (name, value as text); what is left out is left out."""
+    found = [(field.name, getattr(module, field.name, None)) for field in dataclasses.fields(module)]
+    units = getattr(module, "units", {})
+    return [(name, told(value, units.get(name, "1"))) for name, value in found if value is not None]
+
+
+def one_line(module: Any) -> str:
+    """A module in one line: `Plane(tilt=0.05 rad)`."""
+    return f"{type(module).__name__}({', '.join(f'{name}={text}' for name, text in contents(module))})"
+
+
+def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
+    """A title, and a line for each row."""
+    width = max((len(name) for name, _ in rows), default=0)
+    return "\n".join([title, *(f"  {name:{width}}  {text}" for name, text in rows)])
+
+
+def as_html(title: str, rows: list[tuple[str, ...]]) -> str:
+    """A title and a table of rows, as a notebook shows them."""
+    style = "text-align: left; vertical-align: top"
+    cells = ("".join(f'<td style="{style}">{html.escape(text)}</td>' for text in row) for row in rows)
+    return f"<div><b>{html.escape(title)}</b><table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table></div>"
+
+
+def text_as_html(text: str) -> str:
+    """A text whose first line is a title, as a notebook shows it."""
+    title, _, rest = text.partition("\n")
+    return f"<div><b>{html.escape(title)}</b><pre>{html.escape(rest)}</pre></div>"

@@ -7,8 +7,11 @@ refused with a message; for traced ones `legal` is false in the program, whose r
 import dataclasses
 import functools
 import operator
+import tempfile
+import warnings
 from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,6 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
+
+from .parameters import as_html, contents, in_lines, one_line, told
 
 
 def as_number(value: Any) -> Float[Array, "..."]:
@@ -36,7 +41,7 @@ def is_traced(value: Any) -> bool:
 def shown(value: Any) -> str:
     """The value as a message should show it: a plain number if it is one."""
     array = np.asarray(value)
-    return repr(array.item()) if array.ndim == 0 and array.dtype != object else repr(value)
+    return repr(array.item()) if array.ndim == 0 and array.dtype != object else told(value)
 
 
 def _first(numbers: np.ndarray, holds: np.ndarray) -> str:
@@ -95,6 +100,16 @@ def require(
             raise ValueError(message + remark)
 
 
+def require_folder(path: Path, name: str) -> None:
+    """Make a folder if it is not there, and raise `OSError` unless files can be written in it."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise OSError(f"{name} = {path}: nothing can be written there: {error.strerror}") from None
+
+
 class Bound(NamedTuple):
     """A number, what to call it, and the range in which it is legal; as for `require`."""
 
@@ -125,7 +140,10 @@ class Bound(NamedTuple):
 
 
 class Bounded(eqx.Module):
-    """A module whose numbers have ranges; concrete numbers outside of them are refused."""
+    """A module whose numbers have ranges and units; concrete numbers out of range are refused."""
+
+    #: The units of the module's own numbers, by name.
+    units: ClassVar[dict[str, str]] = {}
 
     def bounds(self) -> Iterable[Bound]:
         """The ranges of the module's own numbers, in the order in which they are to be checked.
@@ -134,8 +152,26 @@ class Bounded(eqx.Module):
         """
         return ()
 
+    def suspicion(self) -> str | None:
+        """What legal numbers make one suspect, such as another unit; `None` if nothing."""
+        return None
+
     def __check_init__(self):
         require_all(self.bounds())
+        suspicion = self.suspicion()
+        if suspicion is not None:
+            # From one place of the code, so that Python shows each of them once.
+            warnings.warn(suspicion, UserWarning, stacklevel=1)
+
+    def __repr__(self) -> str:
+        return one_line(self)
+
+    def __str__(self) -> str:
+        parts = any(isinstance(getattr(self, field.name, None), eqx.Module) for field in dataclasses.fields(self))
+        return in_lines(type(self).__name__, contents(self)) if parts else one_line(self)
+
+    def _repr_html_(self) -> str:
+        return as_html(type(self).__name__, contents(self))
 
 
 def require_all(bounds: Iterable[Bound]) -> None:

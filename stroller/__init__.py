@@ -1,5 +1,6 @@
 """The stroller: a three-wheeled vehicle with nonholonomic constraints, on the plane and on curved grounds."""
 
+from nonholonomic import __version__ as __version__
 from nonholonomic.geometry import Cylinder as Cylinder
 from nonholonomic.geometry import Graph as Graph
 from nonholonomic.geometry import Implicit as Implicit

@@ -1,7 +1,6 @@
 """The main job, `python -m stroller`: rides on some surfaces, with and without friction, and their audit."""
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -10,8 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 
+from nonholonomic import __version__
 from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.geometry import (
     CLOSED,
@@ -24,11 +23,13 @@ from nonholonomic.geometry import (
     Torus,
 )
 from nonholonomic.integration import ImplicitMidpoint
-from nonholonomic.sweeps import Table, versions
+from nonholonomic.sweeps import Table
+from nonholonomic.validation import require, require_folder
 
 from .friction import Damping, Frictionless
 from .launch import Launch
 from .plot import draw_rides
+from .quantities import table_of
 from .scene import FORKS, Scene
 from .simulate import simulate
 from .stroller import Stroller
@@ -60,6 +61,7 @@ class Helm:
     """Steer to and fro about straight ahead, and pull with a constant force: a torque towards a moving angle."""
 
     def __init__(self, force: float, angle: float, period: float):
+        require(period, "period", above=0.0)
         self.force, self.angle, self.period = force, angle, period
 
     def __call__(self, t: Any, motion: Any) -> tuple[Any, Any]:
@@ -76,6 +78,7 @@ def parser() -> argparse.ArgumentParser:
         "picture.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
+    command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
     body = command.add_argument_group("the stroller")
     body.add_argument("--mass", type=float, default=12.0, help="mass [kg]")
     body.add_argument("--wheelbase", type=float, default=0.7, help="rear axle to front wheel [m]")
@@ -156,31 +159,9 @@ def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
 
 def table(options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory]) -> Table:
     """The rides as a table over ride and time."""
-    runs = list(rides.values())
-    columns: dict[str, tuple[str, Any]] = {
-        **{f"place_{k + 1}": ("m or rad", lambda run, k=k: run.place[:, k]) for k in range(2)},
-        **{axis: ("m", lambda run, k=k: run.position[:, k]) for k, axis in enumerate("xyz")},
-        "heading": ("rad", lambda run: run.heading),
-        "steering": ("rad", lambda run: run.steering),
-        "steering_rate": ("rad s-1", lambda run: run.steering_rate),
-        "speed": ("m s-1", lambda run: run.speed),
-        "yaw_rate": ("rad s-1", lambda run: run.yaw_rate),
-        "energy": ("J", lambda run: run.energy),
-        "work": ("J", lambda run: run.work),
-        "drive_power": ("W", lambda run: run.power.drive),
-        "steering_power": ("W", lambda run: run.power.steering),
-        "friction_power": ("W", lambda run: sum(run.power[2:])),
-        "rear_side_force": ("N", lambda run: run.side_force[:, 0]),
-        "front_side_force": ("N", lambda run: run.side_force[:, 1]),
-        "normal_force": ("N", lambda run: run.normal_force),
-    }
-    coords = {"ride": np.arange(len(runs)), "t": np.asarray(runs[0].t)}
-    variables = {name: np.stack([np.asarray(read(run)) for run in runs]) for name, (_, read) in columns.items()}
-    units = {"ride": "1", "t": "s"} | {name: unit for name, (unit, _) in columns.items()}
     request = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
-    request["ride"] = [", ".join(name) for name in rides]
-    attributes = {"request": json.dumps(request), "axes": json.dumps(list(coords)), "versions": json.dumps(versions())}
-    return Table(coords, variables, units, attributes)
+    names = ["_".join(name).replace(" ", "_") for name in rides]
+    return table_of(list(rides.values()), names, request | {"ride": names})
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -194,11 +175,12 @@ def main(arguments: list[str] | None = None) -> int:
     enable_compilation_cache()
     started = time.perf_counter()
     try:
+        require_folder(options.out, "--out")
+        rides, helm = {}, Helm(options.force, options.steer, options.period)
         print(
             f"{'ride':38s} {'solver':10s} {'E start [J]':>12s} {'E end [J]':>12s} {'work [J]':>12s} "
             f"{'residual':>10s} {'slip [m/s]':>10s} {'N min [N]':>10s} {'steps':>6s}  status"
         )
-        rides, helm = {}, Helm(options.force, options.steer, options.period)
         for name, (scene, launch) in scenes(options).items():
             runs = {
                 "Dopri8": simulate(scene, launch, options.t1, helm, tolerance=options.tolerance),
@@ -207,7 +189,6 @@ def main(arguments: list[str] | None = None) -> int:
             rides[name] = runs["Dopri8"]
             print("\n".join(audit(", ".join(name), runs)), flush=True)
         print("\n" + "\n".join(tolerance_curve(options, helm)))
-        options.out.mkdir(parents=True, exist_ok=True)
         written = [options.out / "rides.h5"]
         table(options, rides).save(written[0])
         if find_spec("matplotlib") is None:

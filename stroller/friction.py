@@ -36,7 +36,23 @@ class Drag(NamedTuple):
 
 
 class AbstractFriction(Bounded):
-    """A friction law."""
+    """A friction law.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> from stroller.friction import Drag
+    >>> class AirDrag(stroller.AbstractFriction):
+    ...     def drag(self, wheels):
+    ...         return Drag(rear=-0.3 * wheels.rear_speed * abs(wheels.rear_speed))
+    ...
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> print(stroller.Scene(body, friction=AirDrag()).friction)
+    AirDrag()
+
+    ```
+    """
 
     #: Whether the law can dissipate energy; the work of one that cannot is not recorded.
     dissipates: ClassVar[bool] = True
@@ -54,7 +70,17 @@ class AbstractFriction(Bounded):
 
 
 class Frictionless(AbstractFriction):
-    """No friction: the wheels roll freely and do not slip sideways."""
+    """No friction: the wheels roll freely and do not slip sideways.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Frictionless().dissipates
+    False
+
+    ```
+    """
 
     dissipates: ClassVar[bool] = False
 
@@ -71,7 +97,18 @@ class Damping(AbstractFriction):
     - `front`: c_w [N s/m] of the front wheel's speed, at least 0.
     - `scrub`: c_O [N m s] of the yaw rate, at least 0.
     - `steering`: c_s [N m s] of the steering rate, at least 0.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Damping(rolling=2.0, front=1.0, scrub=0.2, steering=0.05)
+    Damping(rolling=2 N s/m, front=1 N s/m, scrub=0.2 N m s, steering=0.05 N m s)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"rolling": "N s m-1", "front": "N s m-1", "scrub": "N m s", "steering": "N m s"}
 
     rolling: Float[Array, "..."] = eqx.field(converter=as_number)
     front: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
@@ -101,7 +138,19 @@ class RollingResistance(AbstractFriction):
 
     - `coefficient`: c [1], at least 0.
     - `speed`: v_s [m/s] at which 76 % of the resistance is reached, positive.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> law = stroller.RollingResistance(coefficient=0.01, speed=0.05)
+    >>> print(f"{law.resistance(100.0, 1.0):.2f} N")
+    -1.00 N
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"coefficient": "1", "speed": "m s-1"}
 
     coefficient: Float[Array, "..."] = eqx.field(converter=as_number)
     speed: Float[Array, "..."] = eqx.field(converter=as_number)

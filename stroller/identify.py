@@ -83,6 +83,20 @@ def identify(
     **Returns:** an `Identification`, with its `verdict`; of which it warns (`FitWarning`) if it is not good.
 
     **Raises:** `ValueError` for arguments out of range or an unknown name.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> data = stroller.Recording(launch, times=[0.5, 1.0], value=[1.765, 1.557], error=0.01, quantity="speed")
+    >>> found = stroller.identify(scene, data, {"rolling": 1.5}, progress=False)
+    >>> print(f"{found.estimates['scene.friction.rolling']:.2f} N s/m, {found.status}")
+    2.00 N s/m, converged
+
+    ```
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")

@@ -4,17 +4,19 @@ Any function `(t, motion) -> (force, torque)` will do. It is called with arrays 
 write it with `jax.numpy` and without `if`. An `equinox.Module` may hold numbers to differentiate by.
 """
 
+import inspect
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.extend
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector
-from nonholonomic.validation import Bound, Bounded, as_number
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced
 
 
 class Motion(NamedTuple):
@@ -23,6 +25,22 @@ class Motion(NamedTuple):
     `position` [m] of the rear axle and `heading` [1], a unit vector, are tuples of components in the ground's axes, the
     third `None` on a plane; `steering` [rad], `speed` [m/s] of the rear axle, `front_speed` [m/s] at which the front
     wheel rolls, `yaw_rate` [rad/s] and `steering_rate` [rad/s], positive to the driver's left.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> def cruise(t, motion):
+    ...     return 5.0 * (2.0 - motion.speed), -motion.steering - 0.3 * motion.steering_rate
+    ...
+    >>> run = stroller.simulate(scene, launch, 1.0, cruise, times=[0.5, 1.0], tolerance=1e-6)
+    >>> print(f"{run.speed[-1]:.2f} m/s")
+    1.64 m/s
+
+    ```
     """
 
     position: Vector
@@ -44,7 +62,18 @@ class Steady(Bounded):
 
     - `force`: drive force [N] along the heading at the rear axle.
     - `torque`: torque [N m] of the frame on the fork, positive to the driver's left.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Steady(force=1.0, torque=0.1)
+    Steady(force=1 N, torque=0.1 N m)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"force": "N", "torque": "N m"}
 
     force: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
     torque: Float[Array, "..."] = eqx.field(converter=as_number, default=0.0)
@@ -55,6 +84,57 @@ class Steady(Bounded):
 
     def __call__(self, t: Float[Array, "..."], motion: Motion) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         return self.force, self.torque
+
+
+#: What an input has to be.
+WANTED = "a function (t, motion) -> (drive force [N], steering torque [N m])"
+
+
+@eqx.filter_jit
+def at_start(scene: Any, launch: Any) -> tuple[Float[Array, ""], Motion]:
+    """What an input is called with at the start of a ride: a time and a motion."""
+    state = scene.state(launch, True)
+    return jnp.zeros(()), scene.dynamics.geometry(state).motion
+
+
+def check_input(controls: Any, scene: Any, launch: Any) -> None:
+    """Raise `ValueError` unless an input can be called, traced by JAX, and is finite at the start of a run.
+
+    **Arguments:**
+
+    - `controls`: an input, or `None`.
+    - `scene`, `launch`: where it is used, their numbers concrete or traced.
+    """
+    if controls is None:
+        return
+    if not callable(controls):
+        raise ValueError(f"input = {controls!r} must be {WANTED}, or None")
+    t, motion = at_start(scene, launch)
+    name = f"input = {getattr(controls, '__qualname__', None) or repr(controls)}"
+    try:
+        inspect.signature(controls).bind(t, motion)
+    except TypeError as error:
+        raise ValueError(f"{name} must be {WANTED}: {error}") from None
+    try:
+        shapes = [np.shape(part) for part in jax.eval_shape(controls, t, motion)]
+    except jax.errors.JAXTypeError as error:
+        raise ValueError(
+            f"{name} cannot be traced by JAX: write it with jax.numpy, and jnp.where in place of `if` ({_first_line(error)})"
+        ) from error
+    except (TypeError, IndexError) as error:
+        raise ValueError(
+            f"{name} must return (drive force [N], steering torque [N m]) ({_first_line(error)})"
+        ) from error
+    if shapes != [(), ()]:
+        raise ValueError(f"{name} must return one drive force [N] and one steering torque [N m], not shapes {shapes}")
+    given = controls(t, motion)
+    if not any(is_traced(part) for part in given) and not np.all(np.isfinite([float(part) for part in given])):
+        told = ", ".join(f"{float(part):g}" for part in given)
+        raise ValueError(f"{name} must be finite: at the start it gives ({told})")
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0]
 
 
 class Program:

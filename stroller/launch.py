@@ -1,7 +1,7 @@
 """How a run starts."""
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -34,7 +34,24 @@ class Launch(Bounded):
     - `steering_rate`: its rate phi' [rad/s].
 
     **Raises:** `ValueError` for numbers that are not finite, or a place that is not two or three of them.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    Launch(place=(0, 0) m or rad, heading=0.3 rad, speed=2 m/s, steering=0 rad, steering_rate=0 rad/s)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {
+        "place": "m or rad",
+        "heading": "rad",
+        "speed": "m s-1",
+        "steering": "rad",
+        "steering_rate": "rad s-1",
+    }
 
     place: tuple[Float[Array, "..."], ...] = eqx.field(converter=as_place)
     heading: Float[Array, "..."] = eqx.field(converter=as_number)

@@ -1,7 +1,7 @@
 """The scene: what rolls, on what ground, with what friction, under what gravity."""
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -58,7 +58,26 @@ class Scene(Bounded):
       horizontal projection of the velocities (`stroller.md`, section 3, says why that is not the default).
 
     **Raises:** `ValueError` if a part is of the wrong kind, a word is not one of these, or a number is out of range.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> print(scene)
+    Scene
+      body      Stroller(mass=12 kg, wheelbase=0.7 m, inertia=1.5 kg m², steering_inertia=0.05 kg m²)
+      surface   Plane()
+      friction  Damping(rolling=2 N s/m, front=1 N s/m, scrub=0.2 N m s, steering=0.05 N m s)
+      gravity   9.81 m/s²
+      fork      'relative'
+      heading   'intrinsic'
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"gravity": "m s-2"}
 
     body: Stroller
     surface: AbstractSurface = Plane()

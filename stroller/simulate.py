@@ -16,7 +16,7 @@ from nonholonomic.integration import ImplicitMidpoint, Settings
 from nonholonomic.progress import Progress
 from nonholonomic.validation import Bound, as_number, is_traced, legal, nan_unless, require_all
 
-from .input import Input
+from .input import Input, check_input
 from .launch import Launch
 from .ride import Recipe, Ride, as_module, traced_ride
 from .scene import Scene
@@ -56,7 +56,21 @@ def simulate(
 
     **Returns:** a `Trajectory`; its `status` says whether the run reached its end and what happened on the way.
 
-    **Raises:** `ValueError` for a launch that the scene cannot start from, or times that are not increasing.
+    **Raises:** `ValueError` for a launch that the scene cannot start from, times that are not increasing, and an input that is
+    no function, cannot be traced, or is not finite at the start.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> run = stroller.simulate(scene, launch, 1.0, stroller.Steady(1.0, 0.1), times=[0.5, 1.0], tolerance=1e-6)
+    >>> print(f"{run.speed[-1]:.3f} m/s, {run.heading[-1]:.3f} rad, {run.status}")
+    1.472 m/s, 0.980 rad, completed
+
+    ```
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
@@ -68,6 +82,7 @@ def simulate(
     require_all(times_bounds(times, t1))
     if not is_traced(times) and np.any(np.diff(np.asarray(times)) <= 0.0):
         raise ValueError(f"times = {times!r} must be increasing")
+    check_input(input, scene, launch)
     solver = diffrax.Dopri8() if solver is None else solver
     end, grid = as_number(t1), None
     if isinstance(solver, ImplicitMidpoint):

@@ -1,6 +1,7 @@
 """The body: a rigid frame on two rear wheels, with one front wheel in a fork that steers."""
 
 from collections.abc import Iterator
+from typing import ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -23,7 +24,25 @@ class Stroller(Bounded):
       `mass` b^2. It puts load on the front wheel. The equations hold for b > 0 on a plane.
 
     **Raises:** `ValueError` for numbers outside these ranges.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    Stroller(mass=12 kg, wheelbase=0.7 m, inertia=1.5 kg m², steering_inertia=0.05 kg m²)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {
+        "mass": "kg",
+        "wheelbase": "m",
+        "inertia": "kg m2",
+        "steering_inertia": "kg m2",
+        "steering_spring": "N m rad-1",
+        "centre": "m",
+    }
 
     mass: Float[Array, "..."] = eqx.field(converter=as_number)
     wheelbase: Float[Array, "..."] = eqx.field(converter=as_number)

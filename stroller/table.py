@@ -1,7 +1,8 @@
 """Many rides in one batched call: every combination of some parameters of scene, launch and input."""
 
 import dataclasses
-from typing import Any
+from concurrent.futures import Executor
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -18,15 +19,17 @@ from nonholonomic.integration import (
     explicit_tableau,
 )
 from nonholonomic.parameters import description, with_numbers
-from nonholonomic.sweeps import Axis, Table, Variable, axis
-from nonholonomic.sweeps import grid as grids
+from nonholonomic.sweeps import Axis, Table, Variable, axis, cells_to_check
+from nonholonomic.sweeps import sweep as computed
 from nonholonomic.validation import as_number, require
 
 from .dynamics import State
-from .input import Input
+from .friction import Damping, RollingResistance
+from .input import Input, Steady, check_input
 from .launch import Launch
 from .ride import RideProblem, as_module
 from .scene import Scene
+from .stroller import Stroller
 
 #: What the numbers of a place in the fixed frame are called.
 FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
@@ -34,26 +37,41 @@ FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
 WORDS = ("completed", "contact_lost", "rank_lost", "failed")
 
 VARIABLES = {
-    "x": Variable("m", np.float64),
-    "y": Variable("m", np.float64),
-    "z": Variable("m", np.float64),
-    "heading": Variable("rad", np.float64),
-    "end_steering": Variable("rad", np.float64),
-    "end_speed": Variable("m s-1", np.float64),
-    "energy": Variable("J", np.float64),
-    "residual": Variable("J", np.float64),
-    "contact_time": Variable("s", np.float64),
-    "end_time": Variable("s", np.float64),
-    "status": Variable("1", np.int8, WORDS),
-    "steps": Variable("1", np.int64),
-    "rejected": Variable("1", np.int64),
+    "x": Variable("m", np.float64, long_name="x"),
+    "y": Variable("m", np.float64, long_name="y"),
+    "z": Variable("m", np.float64, long_name="height z"),
+    "heading": Variable("rad", np.float64, long_name="heading ψ"),
+    "end_steering": Variable("rad", np.float64, long_name="steering angle φ at the end"),
+    "end_speed": Variable("m s-1", np.float64, long_name="speed at the end"),
+    "energy": Variable("J", np.float64, long_name="energy at the end"),
+    "residual": Variable("J", np.float64, long_name="energy less work"),
+    "contact_time": Variable("s", np.float64, long_name="loss of contact"),
+    "end_time": Variable("s", np.float64, long_name="end of the ride"),
+    "status": Variable("1", np.int8, WORDS, long_name="how the ride ended"),
+    "steps": Variable("1", np.int64, long_name="steps"),
+    "rejected": Variable("1", np.int64, long_name="rejected steps"),
 }
 
-UNITS = {"mass": "kg", "wheelbase": "m", "inertia": "kg m2", "steering_inertia": "kg m2", "centre": "m"}
-UNITS |= {"steering_spring": "N m rad-1", "gravity": "m s-2", "tilt": "rad", "radius": "m", "equatorial": "m"}
-UNITS |= {"polar": "m", "rolling": "N s m-1", "front": "N s m-1", "scrub": "N m s", "coefficient": "1"}
-UNITS |= {"ring": "m", "tube": "m", "p": "m"}
-UNITS |= {"speed": "m s-1", "steering_rate": "rad s-1", "force": "N", "torque": "N m", "heading": "rad"}
+UNITS = Stroller.units | Scene.units | Damping.units | RollingResistance.units | Steady.units | Launch.units
+UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m", "ring": "m", "tube": "m", "p": "m"}
+
+#: What the axes are, in words.
+LONG_NAMES = {"steering_inertia": "inertia of the fork", "steering_spring": "spring of the fork", "steering": "φ(0)"}
+LONG_NAMES |= {
+    "speed": "speed v(0)",
+    "heading": "heading ψ(0)",
+    "steering_rate": "steering rate φ'(0)",
+    "mass": "mass m",
+}
+LONG_NAMES |= {
+    "x0": "x(0)",
+    "y0": "y(0)",
+    "z0": "z(0)",
+    "mu0": "μ(0)",
+    "eta0": "η(0)",
+    "force": "drive force",
+    "torque": "steering torque",
+}
 
 
 def sweep(
@@ -66,6 +84,8 @@ def sweep(
     tolerance: float = 1e-9,
     solver: diffrax.AbstractERK | None = None,
     path: Any = None,
+    progress: bool = True,
+    executor: Executor | None = None,
 ) -> Table:
     """The ends of all rides over a grid of parameters, in one batched call on all cores.
 
@@ -79,13 +99,33 @@ def sweep(
     - `tolerance`: relative tolerance of the integration.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
     - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
+    - `progress`: whether to show it, on a terminal or in a notebook.
+    - `executor`: who computes: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a
+      Dask client, to which blocks are handed as its workers become free; by default a thread for each core. The numbers
+      are the same, to the bit on the same kind of processor.
 
     **Returns:** a `Table` of the rides' ends: position `x`, `y`, `z` [m] in the fixed frame, `heading`, `end_steering`
     [rad], `end_speed` [m/s], `energy` [J], `residual` [J] of energy against work, `contact_time` [s] at which the ground
     first had to pull (infinite if never; the ride goes on), `end_time` [s], `status` ("completed", "contact_lost",
     "rank_lost" where a projected heading ended the ride, "failed"), `steps` and `rejected`.
 
-    **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
+    **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
+    `RuntimeError` for an executor that breaks down, or a worker with other versions.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> axes = {"launch.speed": [1.0, 2.0], "scene.body.wheelbase": [0.6, 0.7]}
+    >>> table = stroller.sweep(scene, launch, 1.0, axes=axes, tolerance=1e-6)
+    >>> print(table.end_speed.round(3))
+    [[0.779 0.779]
+     [1.558 1.558]]
+
+    ```
     """
     solver = diffrax.Dopri8() if solver is None else solver
     explicit_tableau(solver)
@@ -94,19 +134,50 @@ def sweep(
     scene.check(launch)
     require(t1, "t1", above=0.0)
     require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
-    controls = as_module(input, scene, launch)
+    check_input(input, scene, launch)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
     grid = named_axes(axes, scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.
-    for one in grid:
-        changed = replaced(roots, {one.number: one.values})
+    for cells in cells_to_check(grid):
+        changed = replaced(roots, cells)
         changed["scene"].check(changed["launch"])
 
-    def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
-        cells = replaced(roots, columns)
+    request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
+    request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
+    request |= {"solver": type(solver).__name__, "input": "none" if input is None else described(input)}
+    request |= {one.number: "an axis" for one in grid}
+    job = RideJob.of(roots, input, float(t1), float(tolerance), solver)
+    return computed(job, grid, VARIABLES, request, path=path, progress=progress, executor=executor)
+
+
+class RideJob(NamedTuple):
+    """What is asked of every cell, as data that can be sent to another process; see `sweep`.
+
+    `controls`: the input as a module, which each process makes for itself.
+    """
+
+    roots: dict[str, Any]
+    input: Input | None
+    t1: float
+    tolerance: float
+    solver: diffrax.AbstractERK
+    controls: eqx.Module | None
+
+    @classmethod
+    def of(cls, roots: dict[str, Any], input: Input | None, *rest: Any) -> "RideJob":
+        """The job, in this process."""
+        return cls(roots, input, *rest, as_module(input, roots["scene"], roots["launch"]))
+
+    def __reduce__(self) -> Any:
+        return RideJob.of, tuple(self[:-1])
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which the first `count` are to be run."""
+        cells = replaced(self.roots, columns)
         size = next((len(values) for values in columns.values()), 1)
-        problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", controls), size, watched=True)
-        horizon, settings = as_number(t1), Settings(tolerance, solver)
+        controls = cells.get("input", self.controls)
+        problem = RideProblem.of(cells["scene"], cells["launch"], controls, size, watched=True)
+        horizon, settings = as_number(self.t1), Settings(self.tolerance, self.solver)
         # A ride goes on where contact is lost, as if the ground could pull.
         outcome, _ = compiled_march(problem, horizon, jnp.asarray(count), settings, passes=problem.watched)
         contact_time = np.asarray(outcome.first_crossing)
@@ -120,12 +191,6 @@ def sweep(
             "steps": np.asarray(outcome.steps),
             "rejected": np.asarray(outcome.rejected),
         }
-
-    request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
-    request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
-    request |= {"solver": type(solver).__name__, "input": "none" if input is None else described(input)}
-    request |= {one.number: "an axis" for one in grid}
-    return grids.sweep(run, grid, VARIABLES, request, path=path)
 
 
 @eqx.filter_jit
@@ -168,7 +233,7 @@ def named_axes(axes: dict[str, Any], surface: AbstractSurface, launch: Launch) -
             name = "_".join(number.split(".")[-2:])
         if number.endswith("steering"):
             unit = "N m s" if "friction" in number else "rad"
-        grid.append(axis(name, number, unit, axes[number]))
+        grid.append(axis(name, number, unit, axes[number], LONG_NAMES.get(name, name.replace("_", " "))))
     return grid
 
 

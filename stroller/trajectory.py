@@ -1,6 +1,8 @@
 """One run of the stroller, and what can be read off it."""
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,16 +11,22 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
+from nonholonomic.parameters import text_as_html
+from nonholonomic.sweeps import Table
+from nonholonomic.validation import is_traced
+from nonholonomic.views import Stage, Viewable, draw_portrait
 
 from .crossings import crossings, watched
 from .dynamics import Power, State, padded
 from .input import Input
+from .quantities import table_of_one
 from .ride import CONTACT_ROUND_OFF, RANK_LOST, Recipe, Stats
 from .scene import Scene
 from .steps import Steps, followed
+from .view import as_stages
 
 
-class Trajectory(eqx.Module):
+class Trajectory(eqx.Module, Viewable):
     """A run at the given times. Times are the first axis of every array.
 
     - `t` [s]; `place`, as the surface names it (see `Launch`), (times, 2), or (times, 3) on an implicit surface; `position`
@@ -33,6 +41,21 @@ class Trajectory(eqx.Module):
     - `departure`: how far the position is off the ground [m]: an error of the integration;
     - `stats` of the integration; `recipe`: what made the run; `steps`: where its steps ended, `None` if it was made inside a
       transformation: what happened between the times is then found by running it once more, when it is asked for.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> run = stroller.simulate(scene, launch, 1.0, stroller.Steady(1.0, 0.1), times=[0.5, 1.0], tolerance=1e-6)
+    >>> run.position.shape, run.side_force.shape
+    ((2, 3), (2, 2))
+    >>> print(f"{run.work[-1]:.2f} J of work")
+    -8.25 J of work
+
+    ```
     """
 
     t: Float[Array, " times"]
@@ -126,7 +149,54 @@ class Trajectory(eqx.Module):
             return "rank_lost"
         return "contact_lost" if np.isfinite(run.contact_lost_at) else "completed"
 
+    def to_table(self) -> Table:
+        """All that can be read off the run, as a `Table` over its times.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        return table_of_one(self)
+
+    def to_xarray(self) -> Any:
+        """The run as an `xarray.Dataset` over "time" (needs xarray), with units and names.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        return self.to_table().to_xarray()
+
+    def save(self, path: Any) -> None:
+        """Write the run to an HDF5 file that `stroller.Table.load` and xarray (`engine="h5netcdf"`) read.
+
+        **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for a batch of runs.
+        """
+        self.to_table().save(path)
+
+    def portrait(self, x: str = "steering", y: str = "yaw_rate", ax: Any = None) -> Any:
+        """Draw one quantity over another, a phase portrait (needs matplotlib).
+
+        **Arguments:**
+
+        - `x`, `y`: variables of `to_table()`, such as "steering", or one component, such as "position.x".
+        - `ax`: axes of matplotlib to draw in, instead of a new figure.
+
+        **Returns:** the matplotlib figure, or `ax`.
+
+        **Raises:** `ValueError` for an unknown variable.
+        """
+        return draw_portrait(self.to_table(), x, y, ax)
+
+    def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
+        return as_stages([self, *others], overlaid)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        return text_as_html(str(self))
+
     def __str__(self) -> str:
+        # A batch, or a run inside a transformation, has no numbers to show.
+        if is_traced(self.t) or self.t.ndim > 1:
+            return f"Trajectory of {self.t.shape} times"
         self = self.with_steps()
         jackknives = self.jackknifed_at
         lines = [

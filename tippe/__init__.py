@@ -1,5 +1,6 @@
 """The tippe top: scenes, trajectories and inversion tables."""
 
+from nonholonomic import __version__ as __version__
 from nonholonomic.geometry import Cylinder as Cylinder
 from nonholonomic.geometry import Graph as Graph
 from nonholonomic.geometry import Implicit as Implicit

@@ -11,9 +11,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from nonholonomic import __version__
 from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.sweeps import Table
+from nonholonomic.validation import require_folder
 
 from .friction import AbstractFriction, Coulomb, Viscous
 from .launch import Launch
@@ -28,14 +30,22 @@ from .trajectory import simulate
 SAMPLES = 1500
 
 
+class Help(argparse.ArgumentDefaultsHelpFormatter):
+    """Shows the default of every option that has one."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        return action.help if action.default is None else super()._get_help_string(action)
+
+
 def parser() -> argparse.ArgumentParser:
     """The options of the main job; the defaults are the declared top and the papers' launches."""
     command = argparse.ArgumentParser(
         prog="python -m tippe",
         description="Inversion times of a tippe top inside a cylinder (the paper's Tables 2 and 3) and on the plane. "
         "Prints them beside the printed ones, writes an HDF5 table for each arena and a picture of theta(t).",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=Help,
     )
+    command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
     top = command.add_argument_group("the top (the paper's Table 1 lost its numbers: these are Rutstam's)")
     top.add_argument("--mass", type=float, default=0.02, help="mass [kg]")
     top.add_argument("--radius", type=float, default=0.02, help="radius R of the sphere [m]")
@@ -92,7 +102,7 @@ def spin_of(options: argparse.Namespace, scene: Scene) -> float:
 def tables(options: argparse.Namespace) -> dict[str, Table]:
     """The table of each arena, first and last crossing of the angle, written to its file."""
     arenas, found = scenes(options), {}
-    options.out.mkdir(parents=True, exist_ok=True)
+    require_folder(options.out, "--out")
     for name, scene in arenas.items():
         found[name] = inversion_table(
             scene,

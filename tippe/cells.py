@@ -53,10 +53,16 @@ class Driver(NamedTuple):
     @property
     def variables(self) -> dict[str, Variable]:
         """The table's variables besides the times."""
-        found = {"status": Variable("1", np.int8, self.words)}
-        found |= {"end_time": Variable("s", np.float64), "end_theta": Variable("rad", np.float64)}
-        return found | {name: Variable("1", np.int64) for name in ("steps", "rejected", *self.counts)}
+        found = {"status": Variable("1", np.int8, self.words, long_name="how the run ended")}
+        found |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
+        found |= {"end_theta": Variable("rad", np.float64, long_name="θ at the end of the run")}
+        counts = ("steps", "rejected", *self.counts)
+        return found | {name: Variable("1", np.int64, long_name=COUNTED[name]) for name in counts}
 
+
+#: What is counted in a run, and the times that are found, in words.
+COUNTED = {"steps": "steps", "rejected": "rejected steps", "hops": "flights", "sticks": "changes from slip to rolling"}
+TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_time": "last inversion time"}
 
 # Compiled once for all blocks.
 _loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
@@ -101,7 +107,8 @@ class CellRuns(NamedTuple):
     @property
     def variables(self) -> dict[str, Variable]:
         """The table's variables, but errors and derivatives."""
-        return {name: Variable("s", np.float64) for name in self.times} | self.driver.variables
+        times = {name: Variable("s", np.float64, long_name=TIMES[name]) for name in self.times}
+        return times | self.driver.variables
 
     def results(self, roots: dict[str, Any], columns: dict[str, Any], tolerance: float, count: int) -> dict[str, Any]:
         """The variables of some cells.

@@ -44,10 +44,24 @@ class ContactLoad(NamedTuple):
 
 
 class AbstractFriction(Bounded):
-    """A friction law whose force and torque are proportional to the normal force."""
+    """A friction law whose force and torque are proportional to the normal force.
 
-    #: The units of the law's numbers, by name.
-    units: ClassVar[dict[str, str]] = {}
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> from tippe.friction import ContactLoad
+    >>> class Quadratic(tippe.AbstractFriction):
+    ...     def per_normal_force(self, slip):
+    ...         speed = (slip.x**2 + slip.y**2) ** 0.5
+    ...         return ContactLoad(force=(-0.5 * speed * slip.x, -0.5 * speed * slip.y))
+    ...
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> print(tippe.Scene(top, friction=Quadratic()).friction)
+    Quadratic()
+
+    ```
+    """
 
     #: Whether the force of a contact at rest is whatever keeps it at rest, within limits.
     set_valued: ClassVar[bool] = False
@@ -73,7 +87,18 @@ class AbstractFriction(Bounded):
 
 
 class Frictionless(AbstractFriction):
-    """No friction: the arena pushes along its normal only."""
+    """No friction: the arena pushes along its normal only.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> from tippe.friction import Slip
+    >>> tippe.Frictionless().per_normal_force(Slip(0.1, 0.0)).force
+    (None, None)
+
+    ```
+    """
 
     acts_at_point: ClassVar[bool] = True
 
@@ -87,6 +112,17 @@ class Viscous(AbstractFriction):
     **Arguments:**
 
     - `mu`: coefficient [s/m], at least 0.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> from tippe.friction import Slip
+    >>> load = tippe.Viscous(mu=0.3).per_normal_force(Slip(0.1, 0.0))
+    >>> print(f"{load.force[0]:.4f} of the normal force")
+    -0.0300 of the normal force
+
+    ```
     """
 
     units: ClassVar[dict[str, str]] = {"mu": "s m-1"}
@@ -114,6 +150,17 @@ class Coulomb(AbstractFriction):
 
     - `mu`: coefficient of friction [1], at least 0.
     - `slip_speed`: speed [m/s] at which the force reaches 71 % of its limit, positive.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> from tippe.friction import Slip
+    >>> load = tippe.Coulomb(mu=0.3, slip_speed=0.01).per_normal_force(Slip(0.1, 0.0))
+    >>> print(f"{load.force[0]:.4f} of the normal force")
+    -0.2985 of the normal force
+
+    ```
     """
 
     units: ClassVar[dict[str, str]] = {"mu": "1", "slip_speed": "m s-1"}
@@ -146,6 +193,18 @@ class Contensou(AbstractFriction):
     - `mu`: coefficient of friction [1], at least 0.
     - `contact_radius`: radius [m] of the disc of contact, at least 0.
     - `slip_speed`: speed [m/s] at which the force without drilling reaches 71 % of its limit, positive.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> from tippe.friction import Slip
+    >>> law = tippe.Contensou(mu=0.3, contact_radius=5e-4, slip_speed=0.01)
+    >>> load = law.per_normal_force(Slip(0.1, 0.0, (0.0, 0.0, 100.0)))
+    >>> print(f"{load.force[0]:.4f} of the normal force, and {load.torque[2]:.2e} m times it")
+    -0.2865 of the normal force, and -2.48e-05 m times it
+
+    ```
     """
 
     units: ClassVar[dict[str, str]] = {"mu": "1", "contact_radius": "m", "slip_speed": "m s-1"}
@@ -182,6 +241,18 @@ class Rolling(AbstractFriction):
     - `resistance`: lever [m] of the normal force, at least 0.
     - `turning_speed`: angular velocity [rad/s] at which the torque reaches 71 % of its limit, positive.
     - `sliding`: the law of the force, such as `Coulomb(mu, slip_speed)`.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> from tippe.friction import Slip
+    >>> law = tippe.Rolling(resistance=1e-4, turning_speed=1.0, sliding=tippe.Coulomb(0.3, 0.01))
+    >>> load = law.per_normal_force(Slip(0.1, 0.0, (10.0, 0.0, 0.0)))
+    >>> print(f"{load.force[0]:.4f} of the normal force, and {load.torque[0]:.2e} m times it")
+    -0.2985 of the normal force, and -9.95e-05 m times it
+
+    ```
     """
 
     resistance: Float[Array, "..."] = eqx.field(converter=as_number)
@@ -226,6 +297,17 @@ class SetValuedCoulomb(AbstractFriction):
     **Arguments:**
 
     - `mu`: coefficient of friction [1], at least 0.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> from tippe.friction import Slip
+    >>> load = tippe.SetValuedCoulomb(mu=0.3).per_normal_force(Slip(0.1, 0.0))
+    >>> print(f"{load.force[0]:.4f} of the normal force")
+    -0.3000 of the normal force
+
+    ```
     """
 
     units: ClassVar[dict[str, str]] = {"mu": "1"}

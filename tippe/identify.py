@@ -79,6 +79,20 @@ def identify(
 
     **Raises:** `ValueError` for arguments out of range, an unknown name, and, with exact slopes, a scene with
     `contact="hybrid"` or `SetValuedCoulomb`, through whose phases the derivative does not go.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> launch = tippe.Launch(theta=[0.2, 0.2, 0.3, 0.2], spin=[155.0, 140.0, 110.0, 60.0])
+    >>> data = tippe.InversionTimes(launch, time=[5.60, 5.53, 5.52, float("inf")], error=0.05, t1=8.0)
+    >>> found = tippe.identify(scene, data, {"friction.mu": 0.25}, progress=False)
+    >>> print(f"{found.estimates['scene.friction.mu']:.3f} s/m, {found.status}")
+    0.300 s/m, converged
+
+    ```
     """
     exact = None if slopes == "differences" else "identify with slopes = 'exact'"
     data = checked_data(scene, data, tolerance, exact)

@@ -97,6 +97,18 @@ def inversion_time(
     **Raises:** `ValueError` for arguments outside these ranges, and for a scene with `contact="hybrid"` or
     `SetValuedCoulomb`: the derivative does not go through impacts, nor through stick and slip. `inversion_table` gives the
     time.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> time = tippe.inversion_time(scene, tippe.Launch(0.1, 155.0), t1=8.0, tolerance=1e-6)
+    >>> print(f"{time:.2f} s")
+    5.97 s
+
+    ```
     """
     solver = diffrax.Dopri8() if solver is None else solver
     check_run(scene, launch, t1, tolerance)
@@ -156,7 +168,7 @@ class InversionQuestion(AbstractQuestion):
             directions,
             t1,
             jnp.asarray(cells),
-            Settings(tolerance, self.solver),
+            Settings(tolerance, self.solver, looped=True),
             passes=self.last,
             one_kernel=not again,
         )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -44,12 +44,20 @@ class Launch(Bounded):
 
     **Example:** half a metre up the x side of a bowl, moving across at 0.2 m/s.
 
-        >>> import tippe
-        >>> launch = tippe.Launch(0.1, 100.0, place=(0.5, 0.0), velocity=(0.0, 0.2))
-        >>> scene = tippe.Scene(tippe.Top(0.02, 0.02, 0.006, 3e-6, 3.2e-6), tippe.Paraboloid(1.0), tippe.Viscous(0.3))
-        >>> tippe.simulate(scene, launch, t1=0.1).status
-        'reached t1'
+    ```
+    >>> import tippe
+    >>> tippe.Launch(theta=0.1, spin=155.0)
+    Launch(theta=0.1 rad, spin=155 rad/s, eta=0 rad, azimuth=0 rad)
+    >>> launch = tippe.Launch(0.1, 100.0, place=(0.5, 0.0), velocity=(0.0, 0.2))
+    >>> scene = tippe.Scene(tippe.Top(0.02, 0.02, 0.006, 3e-6, 3.2e-6), tippe.Paraboloid(1.0), tippe.Viscous(0.3))
+    >>> tippe.simulate(scene, launch, t1=0.1).status
+    'reached t1'
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"theta": "rad", "spin": "rad s-1", "eta": "rad", "azimuth": "rad"}
+    units |= {"place": "m or rad", "velocity": "m s-1", "angular_velocity": "rad s-1"}
 
     theta: Float[Array, "..."] = eqx.field(converter=as_number)
     spin: Float[Array, "..."] = eqx.field(converter=as_number)

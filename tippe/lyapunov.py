@@ -33,6 +33,18 @@ class LyapunovExponent(NamedTuple):
     - `status`: "reached_end", "contact_lost", "jammed", "does_not_fit" or "failed".
     - `end_time`: when the run ended [s]; `steps`: accepted and rejected ones.
     - `times`: [s], (32,), and `running`: the mean rate of divergence [1/s] from the start to each of them, (32, ...).
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> found = tippe.lyapunov_exponent(scene, tippe.Launch(1e-3, [155.0, 120.0]), t1=4.0, tolerance=1e-6)
+    >>> print(found.status, found.running.shape)
+    ['reached_end' 'reached_end'] (32, 2)
+
+    ```
     """
 
     exponent: Float[np.ndarray, "..."]
@@ -66,6 +78,18 @@ def lyapunov_exponent(
     **Returns:** a `LyapunovExponent`, its arrays of shape () or (n,).
 
     **Raises:** `ValueError` for arguments outside these ranges, and for a scene with `contact="hybrid"` or `SetValuedCoulomb`.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> found = tippe.lyapunov_exponent(scene, tippe.Launch(1e-3, [155.0, 120.0]), t1=4.0, tolerance=1e-6)
+    >>> print(found.exponent.round(1))  # 1/s, while the top rises
+    [1.2 1.2]
+
+    ```
     """
     solver = diffrax.Dopri8() if solver is None else solver
     explicit_tableau(solver)

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -13,10 +13,16 @@ from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import Component, Vector, dot, scale, sum_vectors
 from nonholonomic.integration import Followed, PhasedPath
+from nonholonomic.parameters import text_as_html
+from nonholonomic.sweeps import Table
 from nonholonomic.validation import is_traced, require
+from nonholonomic.views import Stage, Viewable, draw_portrait
 
+from .quantities import table_of
 from .sampled import STATUS
 from .scene import Scene
+from .state import parts
+from .view import as_stages
 
 
 def of_each_run(function: Callable[[Any], Array]) -> property:
@@ -45,7 +51,7 @@ def check_increasing(times: Any) -> None:
         raise ValueError("times must increase")
 
 
-class AbstractTrajectory(eqx.Module):
+class AbstractTrajectory(eqx.Module, Viewable):
     """A run at its times `t`: states as in `tippe/dynamics.py`, the path on the arena, spin angle [rad] and work [J].
 
     Vectors are arrays (times, 3) in the fixed frame (x, y, z); `Trajectory` says more.
@@ -100,9 +106,14 @@ class AbstractTrajectory(eqx.Module):
         return self.scene.theta(self.states)
 
     @of_each_run
+    def theta_rate(self) -> Float[Array, " times"]:
+        """Rate of change of theta [rad/s]."""
+        return jax.jvp(self.scene.theta, (self.states,), (self.scene.field(self.states),))[1]
+
+    @of_each_run
     def eta(self) -> Float[Array, " times"]:
         """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
-        return self.scene.frame.angle(self._place, tuple(self.cyclic))
+        return self.scene.frame.angle(self._place, self._path)
 
     @of_each_run
     def azimuth(self) -> Float[Array, " times"]:
@@ -133,7 +144,7 @@ class AbstractTrajectory(eqx.Module):
     def position(self) -> Float[Array, "times 3"]:
         """Position of the sphere's centre [m]; the plane is z = 0, the cylinder's axis x = z = 0, and a run on the plane
         starts above the origin."""
-        frame, where = self.scene.frame, (self._place, tuple(self.cyclic))
+        frame, where = self.scene.frame, (self._place, self._path)
         centre = sum_vectors(frame.position(*where), scale(self.above[0], frame.axes(*where)[2]))
         return jnp.stack(centre, axis=-1)
 
@@ -157,6 +168,44 @@ class AbstractTrajectory(eqx.Module):
         check_increasing(times)
         return self.resampled(times)
 
+    def to_table(self) -> Table:
+        """All that can be read off the run, as a `Table` over its times.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        return table_of(self)
+
+    def to_xarray(self) -> Any:
+        """The run as an `xarray.Dataset` over "time" (needs xarray), with units and names.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        return self.to_table().to_xarray()
+
+    def save(self, path: Any) -> None:
+        """Write the run to an HDF5 file that `tippe.Table.load` and xarray (`engine="h5netcdf"`) read.
+
+        **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for a batch of runs.
+        """
+        self.to_table().save(path)
+
+    def portrait(self, x: str = "theta", y: str = "theta_rate", ax: Any = None) -> Any:
+        """Draw one quantity over another, a phase portrait (needs matplotlib).
+
+        **Arguments:**
+
+        - `x`, `y`: variables of `to_table()`, such as "theta", or one component, such as "position.x".
+        - `ax`: axes of matplotlib to draw in, instead of a new figure.
+
+        **Returns:** the matplotlib figure, or `ax`.
+
+        **Raises:** `ValueError` for an unknown variable.
+        """
+        return draw_portrait(self.to_table(), x, y, ax)
+
+    def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
+        return as_stages([self, *others], overlaid)
+
     def with_stats(self, path: Followed | PhasedPath, **more: Any) -> Self:
         """The same run with what it took, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and more."""
         energy, work = np.asarray(self.energy), np.asarray(self.work)
@@ -168,12 +217,29 @@ class AbstractTrajectory(eqx.Module):
         }
         return eqx.tree_at(lambda one: one.stats, self, stats | more)
 
+    @of_each_run
+    def normal(self) -> Float[Array, "times 3"]:
+        """The arena's unit normal n where the top is, from the arena to the sphere's centre."""
+        return jnp.stack(self.scene.frame.axes(self._place, self._path)[2], axis=-1)
+
+    @of_each_run
+    def angular_velocity(self) -> Float[Array, "times 3"]:
+        """Angular velocity of the body [rad/s]."""
+        body, (_, e, L, _) = self.scene.body, parts(self.states)
+        along = (1.0 / body.I3 - 1.0 / body.I1) * dot(L, e)
+        return self._fixed(sum_vectors(scale(1.0 / body.I1, L), scale(along, e)))
+
+    @property
+    def _path(self) -> tuple[Array, ...]:
+        """The cyclic coordinates of the arena's frame."""
+        return tuple(self.cyclic)
+
     @property
     def _place(self) -> tuple[Array, ...]:
         return tuple(self.states[8:])
 
     def _fixed(self, vector: Vector) -> Float[Array, "times 3"]:
-        axes = self.scene.frame.axes(self._place, tuple(self.cyclic))
+        axes = self.scene.frame.axes(self._place, self._path)
         return jnp.stack([dot(vector, directions) for directions in zip(*axes, strict=True)], axis=-1)
 
     def __str__(self) -> str:
@@ -193,3 +259,6 @@ class AbstractTrajectory(eqx.Module):
 
     def __repr__(self) -> str:
         return str(self)
+
+    def _repr_html_(self) -> str:
+        return text_as_html(str(self))

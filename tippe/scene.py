@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -59,7 +60,25 @@ class Scene(Bounded):
 
     **Raises:** `ValueError` if a part is of the wrong kind, if the top does not fit into the arena, if gravity is not
     positive, or if the arena, the body or the friction does not allow the contact.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, surface=tippe.Cylinder(0.3), friction=tippe.Viscous(0.3))
+    >>> print(scene)
+    Scene
+      body      Top(mass=0.02 kg, radius=0.02 m, offset=0.006 m, I1=2.994e-06 kg m², I3=3.2e-06 kg m²)
+      surface   Cylinder(radius=0.3 m)
+      friction  Viscous(mu=0.3 s/m)
+      gravity   9.81 m/s²
+      contact   'stop'
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"gravity": "m s-2", "restitution": "1"}
 
     body: Top
     surface: AbstractSurface = Plane()

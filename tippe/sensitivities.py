@@ -48,7 +48,10 @@ def slope_variables(names: list[str], units: dict[str, str]) -> dict[str, Variab
         of_number = units.get(name.rsplit(".", 1)[-1], "1")
         return "s" if of_number == "1" else f"s ({of_number})-1"
 
-    return {slope: Variable(unit(name), np.float64) for slope, name in zip(slope_names(names), names, strict=True)}
+    return {
+        slope: Variable(unit(name), np.float64, long_name=f"inversion time by {name}")
+        for slope, name in zip(slope_names(names), names, strict=True)
+    }
 
 
 def slopes_of_cells(

@@ -7,6 +7,22 @@ without slip. The formulas hold for every friction law that vanishes with the sl
 
 The stability matrices are Jacobians of the scene's own field, less the directions that are neutral by symmetry or by
 conservation, so that an eigenvalue with positive real part is an instability and nothing else.
+
+**Example:**
+
+```
+>>> import tippe
+>>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+>>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+>>> from tippe import steady
+>>> steady.group(top)
+'II'
+>>> print(f"an inverted top is stable above {steady.inverted_critical_spin(scene):.2f} rad/s")
+an inverted top is stable above 41.31 rad/s
+>>> print(f"{steady.tumbling(scene, 1.0).precession:.2f} rad/s")
+37.24 rad/s
+
+```
 """
 
 from typing import NamedTuple

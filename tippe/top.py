@@ -1,12 +1,22 @@
 """The body: an eccentric sphere whose mass is symmetric about the axis through its two centres."""
 
 from collections.abc import Iterator
+from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import Bound, Bounded, as_number
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced
+
+#: Units in which moments of inertia are given by mistake, in kg m^2.
+INERTIAS = {"kg cm^2": 1e-4, "kg mm^2": 1e-6, "g cm^2": 1e-7, "g mm^2": 1e-9}
+
+#: The greatest radius [m] that is not taken for one in another unit, and the range of I1 / (m R^2) of bodies.
+GREATEST_RADIUS = 1.0
+RATIOS = (0.1, 2.0)
 
 
 class Stem(Bounded):
@@ -18,7 +28,20 @@ class Stem(Bounded):
     - `offset`: distance of its centre from the centre of mass, along e [m], positive.
 
     **Raises:** `ValueError` for numbers outside these ranges.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> stem = tippe.Stem(radius=0.005, offset=0.016)
+    >>> top = tippe.Top(mass=0.006, radius=0.015, offset=0.003, I1=8e-7, I3=7e-7, stem=stem)
+    >>> top.stem
+    Stem(radius=0.005 m, offset=0.016 m)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"radius": "m", "offset": "m"}
 
     radius: Float[Array, "..."] = eqx.field(converter=as_number)
     offset: Float[Array, "..."] = eqx.field(converter=as_number)
@@ -43,7 +66,21 @@ class Top(Bounded):
     - `stem`: a `Stem`, its centre farther along e than the sphere's and neither sphere within the other, or `None`.
 
     **Raises:** `ValueError` for numbers outside these ranges.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> top
+    Top(mass=0.02 kg, radius=0.02 m, offset=0.006 m, I1=2.994e-06 kg m², I3=3.2e-06 kg m²)
+    >>> float(top.offset / top.radius)
+    0.3
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"mass": "kg", "radius": "m", "offset": "m", "I1": "kg m2", "I3": "kg m2"}
 
     mass: Float[Array, "..."] = eqx.field(converter=as_number)
     radius: Float[Array, "..."] = eqx.field(converter=as_number)
@@ -67,3 +104,22 @@ class Top(Bounded):
         if self.stem is not None:
             reach = self.offset + jnp.abs(self.radius - self.stem.radius)
             yield Bound(self.stem.offset, "stem offset", above=reach, why="neither sphere lies within the other")
+
+    def suspicion(self) -> str | None:
+        numbers = (self.mass, self.radius, self.I1)
+        if any(is_traced(number) or not isinstance(number, jax.Array) for number in numbers):
+            return None
+        mass, radius, I1 = (np.asarray(number, dtype=float) for number in numbers)
+        largest = float(np.max(radius))
+        if largest > GREATEST_RADIUS:
+            unit = "mm" if largest > 10.0 else "cm"
+            return f"radius = {largest:g} m is large for a top: was it in {unit}?"
+        ratios = I1 / (mass * radius**2)
+        strange = np.ravel(ratios[(ratios < RATIOS[0]) | (ratios > RATIOS[1])])
+        if strange.size == 0:
+            return None
+        ratio = float(strange[0])
+        likely = {f"I1 in {unit}": factor for unit, factor in INERTIAS.items()} | {"the mass in g": 1e3}
+        found = [what for what, factor in likely.items() if RATIOS[0] <= ratio * factor <= RATIOS[1]]
+        question = f"was {found[0]}?" if found else "are mass, radius and I1 in kg, m and kg m^2?"
+        return f"I1 = {ratio:.3g} m R^2 is out of the range {RATIOS} of bodies like a top: {question}"

@@ -1,6 +1,6 @@
 """How the cells of a table of trajectories are run and read: samples of many launches, and what is observed at them."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,38 +12,13 @@ from nonholonomic.integration import FAILED, GUARD_LOST, AbstractProblem, Outcom
 from nonholonomic.xla_cpu import compiled_alone
 
 from .launch import Launch
+from .quantities import QUANTITIES
 from .sampled import TrajectoryProblem, ended
 from .scene import Scene
 from .trajectory import Trajectory
 
-
-class Quantity(NamedTuple):
-    """A property of `Trajectory` that a table can hold: its unit, and the dimension of its components if it is a vector."""
-
-    unit: str
-    components: str | None = None
-
-
-QUANTITIES = {
-    "theta": Quantity("rad"),
-    "eta": Quantity("rad"),
-    "azimuth": Quantity("rad"),
-    "spin": Quantity("rad s-1"),
-    "energy": Quantity("J"),
-    "jellett": Quantity("kg m3 s-1"),
-    "normal_force": Quantity("N"),
-    "axis": Quantity("1", "component"),
-    "position": Quantity("m", "component"),
-    "velocity": Quantity("m s-1", "component"),
-    "angular_momentum": Quantity("kg m2 s-1", "component"),
-    "slip": Quantity("m s-1", "tangent"),
-}
-
-#: The directions that components belong to: of the fixed frame, and of the moving one.
-COMPONENTS = {"component": ("x", "y", "z"), "tangent": ("t1", "t2")}
-
 #: What can be read off the state alone; all else needs the path, except on the plane, where only the position does.
-OF_THE_STATE = {"theta", "azimuth", "spin", "energy", "jellett", "normal_force", "slip"}
+OF_THE_STATE = {"theta", "azimuth", "spin", "energy", "jellett", "normal_force", "slip", "theta_rate"}
 
 
 class SampledLaunches(AbstractProblem):

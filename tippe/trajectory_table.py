@@ -1,19 +1,23 @@
 """Tables of trajectories over the grid of launches and friction."""
 
 from collections.abc import Sequence
-from typing import Any
+from concurrent.futures import Executor
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
 from nonholonomic.validation import as_number, require, require_all
 
+from .cells import COUNTED
 from .launches import described, launches
 from .observables import check_increasing
+from .quantities import COMPONENTS, QUANTITIES
 from .scene import Scene
 from .trajectory import times_bounds
-from .trajectory_cells import COMPONENTS, QUANTITIES, follow_cells
+from .trajectory_cells import follow_cells
 
 #: The status of a run, in the order of `sampled.STATUS`; a word has no space in it, so that a file can list them.
 WORDS = ("reached_end", "contact_lost", "failed", "jammed")
@@ -34,6 +38,8 @@ def trajectory_table(
     quantities: Sequence[str] = ("theta", "eta"),
     tolerance: float = 1e-9,
     path: Any = None,
+    progress: bool = True,
+    executor: Executor | None = None,
 ) -> Table:
     """Trajectories over a grid of launches and scenes, sampled at given times, in one batched call on all cores.
 
@@ -49,11 +55,12 @@ def trajectory_table(
       of it.
     - `times`: of the samples [s], increasing, from 0 or later; the last is the horizon.
     - `axes`: further axes, path of a number -> values, such as `{"launch.azimuth": [0.0, 1.0]}`.
-    - `quantities`: what to sample: any of "theta", "eta", "azimuth" [rad], "spin" [rad/s], "energy" [J], "jellett"
-      [kg m^3/s], "normal_force" [N], and the vectors "axis" [1], "position" [m], "velocity" [m/s], "angular_momentum"
+    - `quantities`: what to sample: any of "theta", "eta", "azimuth" [rad], "theta_rate", "spin" [rad/s], "energy" [J],
+      "jellett" [kg m^3/s], "normal_force" [N], and the vectors "axis" [1], "position" [m], "velocity" [m/s], "angular_momentum"
       [kg m^2/s] and "slip" [m/s]; all as in `Trajectory`.
     - `tolerance`: relative tolerance of the integration.
     - `path`: HDF5 file to write, block by block. A call that was interrupted resumes from it.
+    - `progress`, `executor`: as for `inversion_table`.
 
     **Returns:** a `Table` with a variable for each quantity, which has the axes' dimensions and a last dimension "time"; a
     vector has one more behind it, "component" (x, y, z), for "slip" "tangent" (t1, t2). They are not a number after the end of
@@ -62,7 +69,7 @@ def trajectory_table(
 
     **Raises:** `ValueError` for arguments out of range, an unknown axis or quantity, and for a scene with
     `contact="hybrid"` or `SetValuedCoulomb`, whose runs `simulate` samples one by one; `OSError` for a path that cannot be
-    used.
+    used; `RuntimeError` for an executor that breaks down, or a worker with other versions.
 
     **Example:**
 
@@ -92,25 +99,39 @@ def trajectory_table(
     if scene.friction.set_valued:
         raise ValueError(f"friction = {type(scene.friction).__name__} must be a law without phases {why}")
 
-    def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
-        cells = with_numbers(roots, columns)
-        size = next((len(values) for values in columns.values()), 1)
-        found = follow_cells(cells["scene"], cells["launch"], size, times, tolerance, names, count)
-        return {name: np.asarray(values, variables[name].kind) for name, values in found.items()}
-
-    inner = [axis("time", "time", "s", times)]
+    inner = [axis("time", "time", "s", times, "time")]
     variables = {}
     for name in names:
-        unit, components = QUANTITIES[name]
-        variables[name] = Variable(unit, np.float64, inner=("time",) if components is None else ("time", components))
+        unit, components, long_name = QUANTITIES[name]
+        dims = ("time",) if components is None else ("time", components)
+        variables[name] = Variable(unit, np.float64, inner=dims, long_name=long_name)
     for dim in dict.fromkeys(QUANTITIES[name].components for name in names):
         inner += [] if dim is None else [Axis(dim, dim, "1", np.array(COMPONENTS[dim]))]
-    variables |= {"status": Variable("1", np.int8, WORDS), "end_time": Variable("s", np.float64)}
-    variables |= {name: Variable("1", np.int64) for name in ("steps", "rejected")}
+    variables |= {"status": Variable("1", np.int8, WORDS, long_name="how the run ended")}
+    variables |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
+    variables |= {name: Variable("1", np.int64, long_name=COUNTED[name]) for name in ("steps", "rejected")}
     request = described(roots, grid) | {"quantities": list(names), "tolerance": float(tolerance)}
     # A run has a dozen components or so.
     most = max(16, 1 << (MOST_SAMPLED // (12 * len(times))).bit_length() - 1)
-    return sweep(run, grid, variables, request, path=path, most=most, inner=inner)
+    job = SamplingJob(roots, times, float(tolerance), names)
+    options = {"path": path, "most": most, "inner": inner, "progress": progress, "executor": executor}
+    return sweep(job, grid, variables, request, **options)
+
+
+class SamplingJob(NamedTuple):
+    """What is asked of every cell, as data that can be sent to another process."""
+
+    roots: dict[str, Any]
+    times: Float[np.ndarray, " times"]
+    tolerance: float
+    names: tuple[str, ...]
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which the first `count` are to be run."""
+        cells = with_numbers(self.roots, columns)
+        size = next((len(values) for values in columns.values()), 1)
+        found = follow_cells(cells["scene"], cells["launch"], size, self.times, self.tolerance, self.names, count)
+        return {name: np.asarray(values, np.int8 if name == "status" else None) for name, values in found.items()}
 
 
 def _names(quantities: Any) -> tuple[str, ...]:

@@ -21,7 +21,18 @@ class Cylinder(AbstractSurface):
     **Arguments:**
 
     - `radius`: radius [m], positive.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> tippe.Cylinder(radius=0.3)
+    Cylinder(radius=0.3 m)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"radius": "m"}
 
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("y", "m"), ("eta", "rad"))
 

@@ -118,7 +118,7 @@ class PlaneFrame(AbstractFrame):
         return () if self.slope is None else (self.distance,)
 
     def carriage(self, place: Place, velocity: Tangent) -> Carriage:
-        return Carriage((None, None), self.vertical(place), velocity[: len(place)])
+        return Carriage((None, None), self.vertical(place), () if self.slope is None else velocity[:1])
 
     def vertical(self, place: Place) -> Vector:
         return (None, None, 1.0) if self.slope is None else (self.slope[0], None, self.slope[1])

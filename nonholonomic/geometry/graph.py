@@ -1,5 +1,6 @@
 """Open surfaces: the paraboloid and the graph of any smooth function."""
 
+import abc
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
@@ -34,9 +35,9 @@ class AbstractOpen(AbstractSurface):
         position = (x, y, self.ground(x, y))
         return position, *tangents(self.normal(position))
 
+    @abc.abstractmethod
     def ground(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
         """Height z [m] of the surface at (x, y) [m]."""
-        raise NotImplementedError
 
 
 class Paraboloid(AbstractOpen, AbstractLevel):
@@ -45,7 +46,19 @@ class Paraboloid(AbstractOpen, AbstractLevel):
     **Arguments:**
 
     - `p`: radius of curvature [m] at the lowest point, positive.
+
+    **Example:**
+
+    ```
+    >>> import nonholonomic
+    >>> bowl = nonholonomic.Paraboloid(p=0.5)
+    >>> print(bowl.elevation((0.5, 0.0, 0.25)))
+    0.25
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"p": "m"}
 
     p: Float[Array, "..."] = eqx.field(converter=as_number)
 
@@ -86,6 +99,17 @@ class Graph(AbstractOpen, AbstractDifferentiated):
       differentiated by.
 
     **Raises:** `ValueError` for what is not such a function.
+
+    **Example:**
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> hills = nonholonomic.Graph(lambda x, y: 0.1 * jnp.cos(x) * jnp.cos(y))
+    >>> print(hills.elevation((0.0, 0.0, 0.1)))
+    0.1
+
+    ```
     """
 
     height: Any = eqx.field(converter=lambda given: as_function(given, "height", ("x", "y")))

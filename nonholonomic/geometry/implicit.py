@@ -25,6 +25,16 @@ class Implicit(AbstractDifferentiated):
       `equinox.Module` are numbers of the scene, to be swept and differentiated by.
 
     **Raises:** `ValueError` for what is not such a function.
+
+    **Example:**
+
+    ```
+    >>> import nonholonomic
+    >>> egg = nonholonomic.Implicit(lambda x, y, z: 1.0 - x * x - y * y - 0.5 * z * z)
+    >>> float(egg.normal((1.0, 0.0, 0.0))[0])
+    -1.0
+
+    ```
     """
 
     sides: ClassVar[Mapping[str, float]] = DIVIDED

@@ -21,7 +21,20 @@ class Plane(AbstractSurface):
     **Arguments:**
 
     - `tilt`: angle [rad] by which the plane rises along its own x axis, in [-pi/2, pi/2].
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> tippe.Plane()
+    Plane()
+    >>> tippe.Plane(tilt=0.1)
+    Plane(tilt=0.1 rad)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"tilt": "rad"}
 
     axes: ClassVar[int] = 2
     # "outside" is what one calls the only side of a plane where grounds are compared.

@@ -3,7 +3,7 @@
 import abc
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -79,7 +79,18 @@ class Sphere(AbstractQuadric):
     **Arguments:**
 
     - `radius`: radius [m], positive.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> tippe.Sphere(radius=0.5)
+    Sphere(radius=0.5 m)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"radius": "m"}
 
     radius: Float[Array, "..."] = eqx.field(converter=as_number)
 
@@ -104,7 +115,18 @@ class Spheroid(AbstractQuadric, AbstractLevel):
 
     - `equatorial`: equatorial radius A [m], positive.
     - `polar`: polar semi-axis c [m], positive.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> stroller.Spheroid(equatorial=6.0, polar=3.0)
+    Spheroid(equatorial=6 m, polar=3 m)
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"equatorial": "m", "polar": "m"}
 
     equatorial: Float[Array, "..."] = eqx.field(converter=as_number)
     polar: Float[Array, "..."] = eqx.field(converter=as_number)

@@ -35,7 +35,20 @@ DIVIDED: Mapping[str, float] = {"positive": 1.0}
 
 
 class AbstractSurface(Bounded):
-    """A smooth surface in space, with a unit normal n."""
+    """A smooth surface in space, with a unit normal n.
+
+    **Example:**
+
+    ```
+    >>> import nonholonomic
+    >>> bowl = nonholonomic.Sphere(radius=0.5)
+    >>> isinstance(bowl, nonholonomic.AbstractSurface)
+    True
+    >>> print(bowl.gaussian_curvature((0.0, 0.0, -0.5)))
+    4.0
+
+    ```
+    """
 
     #: How many of a position's three components do not vanish identically.
     axes: ClassVar[int] = 3

@@ -1,6 +1,7 @@
 """The torus with a vertical axis."""
 
 from collections.abc import Iterator
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,7 +22,19 @@ class Torus(AbstractSurface):
 
     - `ring`: radius [m] of the circle along the middle of the tube, positive.
     - `tube`: radius [m] of the tube, positive and less than `ring`.
+
+    **Example:**
+
+    ```
+    >>> import nonholonomic
+    >>> tube = nonholonomic.Torus(ring=2.0, tube=0.5)
+    >>> print(round(float(tube.gaussian_curvature((2.5, 0.0, 0.0))), 6))
+    0.8
+
+    ```
     """
+
+    units: ClassVar[dict[str, str]] = {"ring": "m", "tube": "m"}
 
     ring: Float[Array, "..."] = eqx.field(converter=as_number)
     tube: Float[Array, "..."] = eqx.field(converter=as_number)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..parameters import text_as_html
 from .levenberg_marquardt import minimise
 from .likelihood import Measurements
 from .problem import Linearised, Problem, linearise
@@ -186,6 +187,9 @@ class Identification:
         if name not in self.estimates:
             raise ValueError(f"name = {name!r} must be one of {', '.join(self.estimates)}")
         return list(self.estimates).index(name)
+
+    def _repr_html_(self) -> str:
+        return text_as_html(str(self))
 
     def __str__(self) -> str:
         lines = [

@@ -20,6 +20,16 @@ class Free(NamedTuple):
     - `start`: value from which the fit starts, strictly within the bounds.
     - `lower`, `upper`: bounds, which a fit approaches but does not reach.
     - `prior`: mean and standard deviation of a Gaussian prior of the parameter itself, or `None`.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> mu = tippe.Free(0.3, lower=0.0, prior=(0.3, 0.1))
+    >>> mu.start, mu.positive
+    (0.3, True)
+
+    ```
     """
 
     start: float

@@ -23,7 +23,18 @@ CLOSE = 0.5
 
 
 class FitWarning(UserWarning):
-    """A fit that should not be believed as it stands."""
+    """A fit that should not be believed as it stands.
+
+    **Example:** fits that must be good, or else fail.
+
+    ```
+    >>> import warnings
+    >>> import tippe
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", tippe.FitWarning)
+
+    ```
+    """
 
 
 class Series(NamedTuple):

@@ -26,6 +26,19 @@ class ImplicitMidpoint(diffrax.AbstractSolver):
     - `step_length`: longest step [s], positive. The steps between two times of output are equal and end on them.
 
     **Raises:** `ValueError` if the step is not positive.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> run = stroller.simulate(scene, launch, 1.0, solver=stroller.ImplicitMidpoint(0.02), times=[0.5, 1.0])
+    >>> bool(abs(run.energy_residual[-1]) < 1e-12)
+    True
+
+    ```
     """
 
     step_length: Float[Array, ""] = eqx.field(converter=as_number)

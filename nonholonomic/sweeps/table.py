@@ -1,34 +1,56 @@
 """A labelled result over a grid, and its file."""
 
 import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Shaped
 
-from ._hdf5 import UNREACHED, axes_of, read_grid, write_grid
+from ..parameters import as_html, readable_unit
+from ._blocks import unfinished
+from ._file import HELD, LONG_NAMES, Stored, StoredVariables, coded, replacing, write_file
 from .digits import concise_strings
+from .layout import UNREACHED, Layout, Values, axes_of
 
-Values = Shaped[np.ndarray, "..."]
+#: Cells under one checksum in the file of a table that is saved.
+BLOCK = 1 << 15
 
 
 class Table(eqx.Module):
-    """Variables over a grid of named coordinates; each variable is also an attribute, such as `table.time`.
+    """Variables over a grid of named coordinates; `table.time` and `table["time"]` are one of them.
 
     **Arguments:**
 
     - `coords`: name -> values, one for each axis of the grid, in order, and then for the dimensions that some variables have
       besides, such as "time".
-    - `variables`: name -> array over the grid; `status` is an array of words.
+    - `variables`: name -> array over the grid; `status` is an array of words. Those of a table of more than 128 MB that
+      has a file stay there: each is read, and held against its checksums, whenever it is asked for.
     - `units`: name of a coordinate or variable -> its unit.
     - `attributes`: what was computed, with what versions: plain data.
     - `words`: variable that consists of words -> the words, in the order of the numbers that stand for them in a file.
     - `inner`: variable -> the names of its dimensions after those of the grid, for variables that have such.
+
+    **Example:**
+
+    ```
+    >>> import numpy as np
+    >>> import tippe
+    >>> speed = np.array([1.0, 2.0, 3.0])
+    >>> table = tippe.Table({"speed": speed}, {"energy": 0.5 * speed**2}, {"speed": "m s-1", "energy": "J"}, {})
+    >>> print(table)
+    Table over speed (3)
+      energy [J]: 0.5 to 4.5
+    >>> table["energy"], table.label("speed")
+    (array([0.5, 2. , 4.5]), 'speed [m/s]')
+
+    ```
     """
 
     coords: dict[str, Values]
-    variables: dict[str, Values]
+    variables: Mapping[str, Values]
     units: dict[str, str]
     attributes: dict[str, Any]
     words: dict[str, tuple[str, ...]] = eqx.field(default_factory=dict)
@@ -41,6 +63,28 @@ class Table(eqx.Module):
             return variables[name]
         raise AttributeError(f"the table has no variable {name!r}; it has {', '.join(variables)}")
 
+    def __getitem__(self, name: str) -> Values:
+        for known in (self.variables, self.coords):
+            if name in known:
+                return known[name]
+        raise KeyError(f"the table has no {name!r}; it has {', '.join([*self.variables, *self.coords])}")
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return [*self.variables, *self.coords]
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self.variables]
+
+    @property
+    def long_names(self) -> dict[str, str]:
+        """What coordinates and variables are, in words, by name."""
+        return json.loads(self.attributes.get(LONG_NAMES, "{}"))
+
+    def label(self, name: str) -> str:
+        """A coordinate or variable in words with its unit, as an axis of a picture says it: "inversion time [s]"."""
+        unit = readable_unit(self.units.get(name, "1"))
+        return self.long_names.get(name, name) + (f" [{unit}]" if unit else "")
+
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of the grid."""
@@ -50,34 +94,82 @@ class Table(eqx.Module):
         """The names of a variable's dimensions: the axes of the grid, and its own."""
         return (*axes_of(self.coords, self.inner), *self.inner.get(variable, ()))
 
-    def to_xarray(self) -> Any:
+    def to_xarray(self, chunks: Any = None) -> Any:
         """The table as an `xarray.Dataset` (needs xarray), with named dimensions and units; words stay words.
+
+        **Arguments:** `chunks`: sizes of the pieces along each dimension, such as `{"theta": 100}`, or "auto", if its numbers
+        are to be read piece by piece when something is computed from them (needs dask, and h5netcdf for a table that
+        stays in its file, which is then read without its checksums).
 
         **Returns:** the dataset; `Table.save` and a sweep's file hold the same.
         """
         import xarray
 
+        if chunks is not None and isinstance(self.variables, StoredVariables):
+            stored = self.variables.stored
+            dataset = xarray.open_dataset(stored.path, engine="h5netcdf", chunks=chunks)
+            for name, words in self.words.items():
+                known = np.array([*words, UNREACHED])
+                dataset[name] = dataset[name].copy(
+                    data=dataset[name].data.map_blocks(known.__getitem__, dtype=known.dtype)
+                )
+            return dataset
+
         def described(name: str, dims: tuple[str, ...], values: Values) -> tuple[Any, ...]:
-            return dims, values, {"units": self.units[name]} if name in self.units else {}
+            long_name = {"long_name": self.long_names[name]} if name in self.long_names else {}
+            return dims, values, long_name | ({"units": self.units[name]} if name in self.units else {})
 
         variables = {name: described(name, self.dims(name), values) for name, values in self.variables.items()}
         coords = {name: described(name, (name,), values) for name, values in self.coords.items()}
-        return xarray.Dataset(variables, coords, self.attributes)
+        attributes = {name: value for name, value in self.attributes.items() if name != LONG_NAMES}
+        dataset = xarray.Dataset(variables, coords, attributes)
+        return dataset if chunks is None else dataset.chunk(chunks)
 
     def save(self, path: Any) -> None:
         """Write the table to an HDF5 file that `xarray.open_dataset(path, engine="h5netcdf")` opens as it is.
 
         **Raises:** `OSError` that names the path if it cannot be written.
         """
-        write_grid(path, self.coords, self.variables, self.units, self.attributes, self.words, inner=self.inner)
+        if isinstance(self.variables, StoredVariables):
+            with replacing(Path(path)) as scratch:
+                shutil.copyfile(self.variables.stored.path, scratch)
+            return
+        words, stored = {}, {}
+        for name, values in self.variables.items():
+            stored[name] = np.asarray(values)
+            if stored[name].dtype.kind == "U":
+                stored[name], words[name] = coded(stored[name], self.words.get(name, ()))
+        kinds = {name: values.dtype for name, values in stored.items()}
+        layout = Layout(self.coords, kinds, self.units, self.attributes, words, self.inner, BLOCK)
+        flat = {name: values.reshape(-1, *layout.inner_shape(name)) for name, values in stored.items()}
+        ends = enumerate(map(layout.ends, range(layout.blocks)))
+        cut = ((block, {name: some[first:end] for name, some in flat.items()}) for block, (first, end) in ends)
+        write_file(Path(path), layout, cut)
 
     @classmethod
     def load(cls, path: Any) -> "Table":
-        """Read a table from a file that `save` or a sweep wrote; a cell that a sweep has not reached is `pending`.
+        """Read a table from a file that `save` or a sweep wrote, or that a sweep is still to write; a cell that it has not
+        reached is `pending`.
 
         **Raises:** `OSError` that names the path if it cannot be read or holds no table.
         """
-        return cls(*read_grid(path))
+        begun = unfinished(Path(path))
+        return cls.of(Stored(Path(path))) if begun is None else cls.laid_out(*begun)
+
+    @classmethod
+    def of(cls, stored: Stored) -> "Table":
+        """A table in its file; a small one is read at once."""
+        layout = stored.layout
+        if layout.bytes_of_cells(layout.cells) <= HELD:
+            return cls.laid_out(layout, {name: stored.whole(name) for name in layout.kinds})
+        variables = StoredVariables(stored)
+        return cls(layout.coords, variables, layout.units, layout.attributes, layout.words, layout.inner)
+
+    @classmethod
+    def laid_out(cls, layout: Layout, values: dict[str, Values]) -> "Table":
+        """A table of numbers with all cells along the first axis, codes for words."""
+        variables = {name: layout.shaped(name, some) for name, some in values.items()}
+        return cls(layout.coords, variables, layout.units, layout.attributes, layout.words, layout.inner)
 
     def digits(self, variable: str = "time") -> Values:
         """A variable with the digits that its error leaves: "5.01142(3)" is 5.01142 with an error of 0.00003.
@@ -97,28 +189,59 @@ class Table(eqx.Module):
         values, errors = self.variables[variable], self.variables[f"{variable}_error"]
         return concise_strings(values, errors, self.variables.get("status", values))
 
-    def plot(self, variable: str = "time") -> Any:
+    def plot(
+        self, variable: str | None = None, *, at: dict[str, float] | None = None, log: bool = False, ax: Any = None
+    ) -> Any:
         """Draw a variable over the grid (needs matplotlib): lines over the first axis, or a map of the first two.
 
-        **Arguments:** `variable`: name of a numeric variable. **Returns:** a matplotlib figure.
+        Of every further axis one value is taken, the first unless `at` says otherwise; the title says which. The colours of a
+        map reach from the 2 % to the 98 % quantile.
+
+        **Arguments:**
+
+        - `variable`: name of a numeric variable, the first by default.
+        - `at`: name of an axis -> the value at which to cut it; the nearest of the grid is taken.
+        - `log`: whether the variable's scale is logarithmic.
+        - `ax`: axes of matplotlib to draw in, instead of a new figure.
+
+        **Returns:** the matplotlib figure, or `ax`.
+
+        **Raises:** `ValueError` for a variable that is not numeric, an unknown axis, or a table of one cell.
         """
         from ..views import draw_table
 
-        return draw_table(self, variable)
+        return draw_table(self, variable, at or {}, log, ax)
 
-    def __str__(self) -> str:
+    @property
+    def _title(self) -> str:
         axes = ", ".join(f"{name} ({len(self.coords[name])})" for name in axes_of(self.coords, self.inner))
-        lines = [f"Table over {axes or 'one cell'}"]
+        return f"Table over {axes or 'one cell'}"
+
+    @property
+    def _rows(self) -> list[tuple[str, str, str]]:
+        """Each variable in a few words: its name with its dimensions, its range, and what it is."""
+        if isinstance(self.variables, StoredVariables):
+            place = f"in {self.variables.stored.path}"
+            return [(name, place, self.long_names.get(name, "")) for name in self.variables]
         # Cells that have not been computed show in the status only.
         computed = self.variables["status"] != UNREACHED if "status" in self.variables else ...
+        rows = []
         for name, values in self.variables.items():
-            unit = f" [{self.units[name]}]" if self.units.get(name, "1") not in ("1", "") else ""
+            unit = readable_unit(self.units.get(name, "1"))
             dims = "".join(f" x {dim} ({len(self.coords[dim])})" for dim in self.inner.get(name, ()))
-            lines.append(f"  {name}{unit}{dims}: {_summary(values if name == 'status' else values[computed])}")
-        return "\n".join(lines)
+            summary = _summary(values if name == "status" else values[computed])
+            rows.append((f"{name}{f' [{unit}]' if unit else ''}{dims}", summary, self.long_names.get(name, "")))
+        return rows
+
+    def __str__(self) -> str:
+        return "\n".join([self._title, *(f"  {name}: {summary}" for name, summary, _ in self._rows)])
 
     def __repr__(self) -> str:
         return str(self)
+
+    def _repr_html_(self) -> str:
+        axes = [(name, _summary(self.coords[name]), self.label(name)) for name in self.coords]
+        return as_html(self._title, [*axes, *self._rows])
 
 
 def _summary(values: Values) -> str:
@@ -131,12 +254,3 @@ def _summary(values: Values) -> str:
         return "none finite"
     missing = values.size - finite.size
     return f"{finite.min():.6g} to {finite.max():.6g}" + (f", {missing} not finite" if missing else "")
-
-
-def same_request(left: str, right: str) -> str | None:
-    """The first difference between two requests (JSON), in words; `None` if they are the same."""
-    one, other = json.loads(left), json.loads(right)
-    for name in [*one, *(name for name in other if name not in one)]:
-        if one.get(name) != other.get(name):
-            return f"{name} is {one.get(name)!r} there and {other.get(name)!r} here"
-    return None

@@ -1,8 +1,12 @@
 """Pictures of tables (needs matplotlib)."""
 
+import functools
+import io
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from ..parameters import readable_unit
 
 if TYPE_CHECKING:
     from ..sweeps import Table
@@ -10,60 +14,135 @@ if TYPE_CHECKING:
 #: Colours of the cells of a map that have no finite value, one for each word of their status.
 GREYS = ("0.85", "0.7", "0.55", "0.4", "0.25")
 
+#: The quantiles of the values between which the colours of a map lie.
+QUANTILES = (0.02, 0.98)
 
-def draw_table(table: "Table", variable: str = "time") -> Any:
-    """Draw a variable over the grid of a table: lines over the first axis, or a map of the first two.
+#: An axis of at most so many values is drawn as a line for each.
+MOST_LINES = 8
 
-    Cells without a finite value are left out of lines and marked by their status in maps. With three axes or more, the
-    first value of the others is drawn.
 
-    **Arguments:**
-
-    - `table`: a `Table` with at least one axis.
-    - `variable`: name of a numeric variable.
-
-    **Returns:** a matplotlib figure.
-
-    **Raises:** `ValueError` for a table without axes or for a variable that is not numeric.
-    """
+@functools.cache
+def _kind_of_figure() -> Any:
     from matplotlib.figure import Figure
 
+    class Picture(Figure):
+        """A figure that a notebook shows even if nobody has told it to show figures."""
+
+        def _repr_png_(self) -> bytes:
+            image = io.BytesIO()
+            self.savefig(image, format="png")
+            return image.getvalue()
+
+    return Picture
+
+
+def new_figure(width: float = 7.0, height: float = 4.5) -> Any:
+    """An empty matplotlib figure of a size in inches that a notebook shows by itself."""
+    return _kind_of_figure()(figsize=(width, height), layout="constrained")
+
+
+def draw_table(
+    table: "Table", variable: str | None = None, at: dict[str, float] | None = None, log: bool = False, ax: Any = None
+) -> Any:
+    """Draw a variable over the grid of a table: lines over the first axis, or a map of the first two.
+
+    Cells without a finite value are left out of lines and marked by their status in maps.
+
+    **Arguments:** as for `Table.plot`.
+
+    **Returns:** a matplotlib figure, or `ax`.
+
+    **Raises:** `ValueError` as `Table.plot`.
+    """
+    variable = _first_number(table) if variable is None else variable
     values = table.variables.get(variable)
     if values is None or values.dtype.kind == "U":
         raise ValueError(f"variable = {variable!r} must be a numeric variable of the table")
     dims = table.dims(variable)
     if not dims:
         raise ValueError("a table of one cell has nothing to draw")
-    # What runs along a dimension of its own, such as time, is drawn over that.
+    names, cut = _drawn(table, variable, at or {})
+    shown = _slice(np.where(np.isfinite(values), values, np.nan), dims, names, cut)
+    figure = new_figure() if ax is None else None
+    drawing = ax if figure is None else figure.add_subplot()
+    drawing.set_xlabel(table.label(names[0]))
+    drawing.set_title(", ".join(_told(table, name, place) for name, place in cut.items()), fontsize="medium")
+    if len(names) == 1 or len(table.coords[names[1]]) <= MOST_LINES:
+        _draw_lines(drawing, table, names, shown.reshape(len(shown), -1))
+        drawing.set_ylabel(table.label(variable))
+        if log:
+            drawing.set_yscale("log")
+    else:
+        drawing.set_ylabel(table.label(names[1]))
+        _draw_map(drawing, table, names, shown, table.label(variable), log)
+        if "status" in table.variables and not table.inner.get(variable):
+            words = _slice(table.variables["status"], dims, names, cut)
+            _mark_words(drawing, table, names, np.where(np.isnan(shown), words, ""))
+    return drawing if figure is None else figure
+
+
+def _first_number(table: "Table") -> str:
+    names = [name for name, values in table.variables.items() if values.dtype.kind != "U"]
+    if not names:
+        raise ValueError("the table has no numeric variable to draw")
+    return names[0]
+
+
+def _drawn(table: "Table", variable: str, at: dict[str, float]) -> tuple[list[str], dict[str, int]]:
+    """The one or two dimensions to draw over, and the places at which the others are cut."""
+    dims = table.dims(variable)
+    cut = {}
+    for name, value in at.items():
+        if name not in dims:
+            raise ValueError(f"at: {name!r} must be one of {', '.join(dims)}")
+        known = table.coords[name]
+        if known.dtype.kind == "U":
+            if value not in known:
+                raise ValueError(f"at: {name} = {value!r} must be one of {', '.join(known)}")
+            cut[name] = int(np.flatnonzero(known == value)[0])
+        else:
+            cut[name] = int(np.argmin(np.abs(known - value)))
     cells = len(table.shape)
-    names = [*dims[cells:], *dims[:cells]]
-    values = np.moveaxis(values, range(cells), range(-cells, 0))
-    figure = Figure(figsize=(7.0, 4.5), layout="constrained")
-    drawing = figure.add_subplot()
-    label = f"{variable} [{table.units.get(variable, '1')}]"
-    drawing.set_xlabel(f"{names[0]} [{table.units.get(names[0], '1')}]")
-    shown = np.where(np.isfinite(values), values, np.nan)
-    if len(names) == 1 or len(table.coords[names[1]]) <= 8:
-        _draw_lines(drawing, table, names, shown)
-        drawing.set_ylabel(label)
-        return figure
-    first = (slice(None), slice(None), *([0] * (len(names) - 2)))
-    drawing.set_ylabel(f"{names[1]} [{table.units.get(names[1], '1')}]")
-    image = drawing.pcolormesh(table.coords[names[0]], table.coords[names[1]], shown[first].T, shading="nearest")
-    figure.colorbar(image, label=label)
-    if "status" in table.variables and len(dims) == cells:
-        words = np.where(np.isnan(shown[first]), table.variables["status"][first], "")
-        _mark_words(drawing, table, names, words)
-    return figure
+    # What runs along a dimension of its own, such as time, is drawn over that.
+    left = [name for name in (*dims[cells:], *dims[:cells]) if name not in cut]
+    if not left:
+        raise ValueError(f"at = {at!r} leaves no axis to draw over")
+    return left[:2], cut | {name: 0 for name in left[2:]}
 
 
-def _draw_lines(drawing: Any, table: "Table", names: list[str], shown: Any) -> None:
-    lines = shown.reshape(shown.shape[0], shown.shape[1] if shown.ndim > 1 else 1, -1)[:, :, 0]
+def _slice(values: Any, dims: tuple[str, ...], names: list[str], cut: dict[str, int]) -> Any:
+    """The values over the dimensions that are drawn, in their order."""
+    left = [name for name in dims if name not in cut]
+    return values[tuple(cut.get(name, slice(None)) for name in dims)].transpose([left.index(name) for name in names])
+
+
+def _told(table: "Table", name: str, place: int) -> str:
+    """A coordinate's value as text: "θ(0) = 0.1 rad"."""
+    value = table.coords[name][place]
+    text = str(value) if isinstance(value, str) else f"{value:.4g}"
+    return f"{table.long_names.get(name, name)} = {text} {readable_unit(table.units.get(name, '1'))}".rstrip()
+
+
+def _draw_lines(drawing: Any, table: "Table", names: list[str], lines: Any) -> None:
+    marker = "o-" if len(lines) <= 100 else "-"
     for column, line in enumerate(lines.T):
-        label = f"{names[1]} = {table.coords[names[1]][column]:.4g}" if len(names) > 1 else None
-        drawing.plot(table.coords[names[0]], line, "o-", markersize=3, label=label)
+        label = _told(table, names[1], column) if len(names) > 1 else None
+        drawing.plot(table.coords[names[0]], line, marker, markersize=3, label=label)
     if len(names) > 1:
         drawing.legend()
+
+
+def _draw_map(drawing: Any, table: "Table", names: list[str], shown: Any, label: str, log: bool) -> None:
+    from matplotlib.colors import LogNorm, Normalize
+
+    known = shown[np.isfinite(shown) & (shown > 0.0)] if log else shown[np.isfinite(shown)]
+    low, high = np.quantile(known, QUANTILES) if known.size else (0.0, 1.0)
+    scale = (LogNorm if log else Normalize)(low, high)
+    x, y = table.coords[names[0]], table.coords[names[1]]
+    image = drawing.pcolormesh(x, y, shown.T, shading="nearest", norm=scale)
+    beyond = known.size and (known.min() < low, known.max() > high)
+    extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
+    drawing.figure.colorbar(image, ax=drawing, label=label, extend=extend)
 
 
 def _mark_words(drawing: Any, table: "Table", names: list[str], words: Any) -> None:
@@ -77,6 +156,43 @@ def _mark_words(drawing: Any, table: "Table", names: list[str], words: Any) -> N
         drawing.pcolormesh(
             table.coords[names[0]], table.coords[names[1]], mask.T, shading="nearest", cmap=ListedColormap([grey])
         )
-        patches.append(Patch(color=grey, label=word))
+        patches.append(Patch(color=grey, label=word.replace("_", " ")))
     if patches:
         drawing.legend(handles=patches, loc="upper right")
+
+
+def draw_portrait(table: "Table", x: str, y: str, ax: Any = None) -> Any:
+    """Draw one variable of a run's table over another, with a dot at the start.
+
+    **Arguments:**
+
+    - `table`: a `Table` over "time".
+    - `x`, `y`: names of variables, of a component as "position.x".
+    - `ax`: axes of matplotlib to draw in, instead of a new figure.
+
+    **Returns:** a matplotlib figure, or `ax`.
+
+    **Raises:** `ValueError` for an unknown variable or component.
+    """
+    (across, across_label), (up, up_label) = _column(table, "x", x), _column(table, "y", y)
+    figure = new_figure(5.0, 4.5) if ax is None else None
+    drawing = ax if figure is None else figure.add_subplot()
+    (line,) = drawing.plot(across, up, linewidth=1.0)
+    drawing.plot(across[:1], up[:1], "o", color=line.get_color())
+    drawing.set_xlabel(across_label)
+    drawing.set_ylabel(up_label)
+    return drawing if figure is None else figure
+
+
+def _column(table: "Table", argument: str, name: str) -> tuple[Any, str]:
+    """A variable, or one of its components, with its label."""
+    variable, _, component = name.partition(".")
+    dims = table.inner.get(variable, ())
+    if variable in table.variables and not component and not dims:
+        return table[variable], table.label(variable)
+    if variable in table.variables and len(dims) == 1 and component in table.coords[dims[0]]:
+        place = int(np.flatnonzero(table.coords[dims[0]] == component)[0])
+        return table[variable][:, place], f"{component} of {table.label(variable)}"
+    known = [one for one in table.variables if one not in table.inner]
+    known += [f"{one}.{part}" for one, dims in table.inner.items() for part in table.coords[dims[0]]]
+    raise ValueError(f"{argument} = {name!r} must be one of {', '.join(known)}")

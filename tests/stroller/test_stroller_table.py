@@ -139,7 +139,7 @@ def test_main_job(tmp_path, capsys):
     assert all(float(columns[-5]) < 1e-11 for columns in audit)
     assert (tmp_path / "rides.png").stat().st_size > 10_000
     with xarray.open_dataset(tmp_path / "rides.h5", engine="h5netcdf") as stored:
-        assert {"ride": 4, "t": 201}.items() <= dict(stored.sizes).items()
+        assert {"ride": 4, "time": 201}.items() <= dict(stored.sizes).items()
         energy = stored["energy"].values
         np.testing.assert_allclose(energy, energy[:, :1] + stored["work"].values, atol=1e-8)
         assert float(jnp.max(stored["friction_power"].values[[1, 3]])) < 0.0

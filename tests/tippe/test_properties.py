@@ -15,6 +15,9 @@ import tippe
 from nonholonomic.integration import FAILED, GUARD_LOST, REACHED_END, Settings, compiled_march
 from tippe.inversion import InversionProblem
 
+# Scenes are scaled beyond the size of any top.
+pytestmark = pytest.mark.filterwarnings("ignore:radius = .* is large for a top:UserWarning")
+
 #: Examples are drawn in batches of this many lanes, so that one compiled program runs them all.
 LANES = 16
 HORIZON = 0.5

@@ -42,6 +42,18 @@ class HybridTrajectory(AbstractTrajectory):
     its rate [m/s]. `hops` has a row for each flight until `end_time`, its begin and its end [s]; a table counts those before
     the inversion. `work` is that of friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest
     drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J].
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3), contact="hybrid")
+    >>> run = tippe.simulate(scene, tippe.Launch(0.1, 155.0), t1=0.1, tolerance=1e-6)
+    >>> int(run.contact[0]), len(run.hops)
+    (0, 0)
+
+    ```
     """
 
     t: Float[np.ndarray, " times"]

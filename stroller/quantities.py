@@ -1,0 +1,87 @@
+"""What is read off a run of the stroller, with units and names, and the labelled table of it."""
+
+import json
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nonholonomic.geometry import Plane
+from nonholonomic.parameters import description
+from nonholonomic.sweeps import Table, versions
+
+
+class Quantity(NamedTuple):
+    """What can be read off a run: its unit, what it is in words, how to read it, and the dimension of a vector's components."""
+
+    unit: str
+    long_name: str
+    read: Callable[[Any], Any]
+    components: str | None = None
+
+
+QUANTITIES = {
+    "place": Quantity("m or rad", "place", lambda run: run.place, "coordinate"),
+    "position": Quantity("m", "position of the rear axle", lambda run: run.position, "component"),
+    "direction": Quantity("1", "direction of the heading", lambda run: run.direction, "component"),
+    "heading": Quantity("rad", "heading ψ", lambda run: run.heading),
+    "steering": Quantity("rad", "steering angle φ", lambda run: run.steering),
+    "steering_rate": Quantity("rad s-1", "φ'", lambda run: run.steering_rate),
+    "speed": Quantity("m s-1", "speed v", lambda run: run.speed),
+    "front_speed": Quantity("m s-1", "speed of the front wheel", lambda run: run.front_speed),
+    "yaw_rate": Quantity("rad s-1", "yaw rate", lambda run: run.yaw_rate),
+    "energy": Quantity("J", "energy", lambda run: run.energy),
+    "work": Quantity("J", "work of inputs and friction", lambda run: run.work),
+    "drive_power": Quantity("W", "power of the drive", lambda run: run.power.drive),
+    "steering_power": Quantity("W", "power of the steering", lambda run: run.power.steering),
+    "friction_power": Quantity("W", "power of friction", lambda run: sum(run.power[2:])),
+    "side_force": Quantity("N", "side force", lambda run: run.side_force, "axle"),
+    "load": Quantity("N", "load", lambda run: run.load, "axle"),
+    "normal_force": Quantity("N", "normal force", lambda run: run.normal_force),
+}
+
+
+def table_of(runs: list[Any], names: list[str], request: dict[str, Any]) -> Table:
+    """Everything that is read off some runs over their times, which are the same for all.
+
+    **Arguments:**
+
+    - `runs`: a `Trajectory` each.
+    - `names`: of the runs, without spaces, which become an axis "ride"; none for the only run.
+    - `request`: plain data that says what was computed.
+    """
+    flat = {isinstance(run.recipe.ride.scene.surface, Plane) for run in runs}
+    # On grounds of both kinds a place has no common unit.
+    places, unit = {True: (("x", "y"), "m"), False: (("mu", "eta"), "rad")}[flat.pop()]
+    places, unit = (("first", "second"), "m or rad") if flat else (places, unit)
+    coords = {"ride": np.array(names)} if names else {}
+    coords |= {"time": np.asarray(runs[0].t), "coordinate": np.array(places)}
+    coords |= {"component": np.array(("x", "y", "z")), "axle": np.array(("rear", "front"))}
+    found = {name: [np.asarray(one.read(run)) for run in runs] for name, one in QUANTITIES.items()}
+    units = {"time": "s"} | {name: one.unit for name, one in QUANTITIES.items()}
+    units["place"] = unit
+    long_names = {"time": "time"} | {name: one.long_name for name, one in QUANTITIES.items()}
+    attributes = {
+        "request": json.dumps(request, default=repr),
+        "axes": json.dumps([*(["ride"] if names else []), "time"]),
+        "versions": json.dumps(versions()),
+        "long_names": json.dumps(long_names, sort_keys=True),
+    }
+    return Table(
+        coords,
+        {name: np.stack(values) if names else values[0] for name, values in found.items()},
+        units,
+        attributes,
+        inner={name: (one.components,) for name, one in QUANTITIES.items() if one.components is not None},
+    )
+
+
+def table_of_one(run: Any) -> Table:
+    """Everything that is read off a run, over its times.
+
+    **Raises:** `ValueError` for a batch of runs.
+    """
+    if np.ndim(run.t) != 1:
+        raise ValueError("a batch of runs is no table of one: stroller.sweep makes a table of many")
+    request = description("scene", run.recipe.ride.scene) | {"status": run.status}
+    return table_of([run], [], request)

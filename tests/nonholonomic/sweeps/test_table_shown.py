@@ -1,0 +1,109 @@
+"""Tables show themselves: by name, in pictures, in xarray, and in files without what a sweep needs for itself."""
+
+import io
+import json
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import xarray
+from cheap_sweep import cheap_sweep
+
+from nonholonomic.sweeps import Table
+
+THETA, SPIN, MU = np.linspace(0.1, 0.4, 4), np.linspace(60.0, 160.0, 11), np.array([0.1, 0.2, 0.3])
+
+
+@pytest.fixture(scope="module")
+def table():
+    """Times 1 + theta + mu spin, one of them far off, one not there."""
+    time = 1.0 + THETA[:, None, None] + MU[:, None] * SPIN
+    time[0, 0, 0], time[1, 0, 1] = 1e4, np.inf
+    status = np.where(np.isfinite(time), "inverted", "not_inverted")
+    units = {"theta": "rad", "mu": "s m-1", "spin": "rad s-1", "time": "s"}
+    names = {"theta": "θ(0)", "mu": "friction μ", "time": "inversion time"}
+    attributes = {"request": "{}", "axes": json.dumps(["theta", "mu", "spin"]), "long_names": json.dumps(names)}
+    return Table({"theta": THETA, "mu": MU, "spin": SPIN}, {"time": time, "status": status}, units, attributes)
+
+
+def test_names_are_found_and_completed(table):
+    assert table["time"] is table.time
+    assert table["spin"] is SPIN
+    assert {"time", "status", "theta"} <= set(table._ipython_key_completions_())
+    assert "time" in dir(table)
+    with pytest.raises(KeyError, match="no 'tme'; it has time, status, theta"):
+        table["tme"]
+
+
+def test_it_says_what_it_holds(table):
+    assert table.label("time") == "inversion time [s]"
+    assert table.label("theta") == "θ(0) [rad]"
+    assert table.label("spin") == "spin [rad/s]"
+    assert "time [s]: 7.2 to 10000, 1 not finite" in str(table)
+    html = table._repr_html_()
+    assert "θ(0) [rad]" in html
+    assert "131 inverted, 1 not_inverted" in html
+
+
+def test_a_picture_is_cut_where_it_says(table):
+    figure = table.plot()
+    drawing = figure.axes[0]
+    # Three values of mu are lines over theta; the spin is cut at its first value.
+    assert drawing.get_title() == "spin = 60 rad/s"
+    assert [text.get_text() for text in drawing.get_legend().get_texts()] == [f"friction μ = {mu:g} s/m" for mu in MU]
+    figure = table.plot("time", at={"mu": 0.19})
+    drawing = figure.axes[0]
+    assert drawing.get_title() == "friction μ = 0.2 s/m"
+    assert (drawing.get_xlabel(), drawing.get_ylabel()) == ("θ(0) [rad]", "spin [rad/s]")
+    assert figure.axes[1].get_ylabel() == "inversion time [s]"
+    np.testing.assert_array_equal(np.asarray(drawing.collections[0].get_array()), table.time[:, 1].T)
+
+
+def test_colours_lie_between_quantiles_and_may_be_logarithmic(table):
+    shown = table.time[:, 0]
+    shown = shown[np.isfinite(shown)]
+    image = table.plot(at={"mu": 0.1}).axes[0].collections[0]
+    assert image.get_clim() == pytest.approx(np.quantile(shown, (0.02, 0.98)))
+    assert image.get_clim()[1] < 1e4
+    assert type(table.plot(at={"mu": 0.1}, log=True).axes[0].collections[0].norm).__name__ == "LogNorm"
+    assert table.plot(log=True).axes[0].get_yscale() == "log"
+
+
+def test_it_draws_in_given_axes_and_shows_itself(table):
+    _, ax = plt.subplots()
+    assert table.plot(ax=ax) is ax
+    plt.close()
+    assert table.plot()._repr_png_().startswith(b"\x89PNG")
+    table.plot().savefig(io.BytesIO())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"at": {"colour": 1.0}}, "at: 'colour' must be one of theta, mu, spin"),
+        ({"at": {"theta": 0.1, "mu": 0.1, "spin": 60.0}}, "leaves no axis to draw over"),
+        ({"variable": "status"}, "variable = 'status' must be a numeric variable"),
+    ],
+)
+def test_bad_pictures_are_refused(table, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        table.plot(**arguments)
+
+
+def test_a_file_names_its_variables_and_shows_nothing_else(table, tmp_path):
+    table.save(tmp_path / "table.h5")
+    with xarray.open_dataset(tmp_path / "table.h5", engine="h5netcdf") as data:
+        assert set(data.variables) == {"theta", "mu", "spin", "time", "status"}
+        assert data["time"].attrs["long_name"] == "inversion time"
+        assert data["theta"].attrs == {"units": "rad", "long_name": "θ(0)"}
+    again = Table.load(tmp_path / "table.h5")
+    assert again.long_names == table.long_names
+    assert again.to_xarray()["time"].attrs == {"units": "s", "long_name": "inversion time"}
+    assert "long_names" not in again.to_xarray().attrs
+
+
+def test_a_sweeps_file_too(tmp_path):
+    path = tmp_path / "sweep.h5"
+    found = cheap_sweep(path)
+    with xarray.open_dataset(path, engine="h5netcdf") as data:
+        assert set(data.variables) == {*found.coords, *found.variables}

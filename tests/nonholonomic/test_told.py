@@ -1,0 +1,51 @@
+"""Numbers, units and modules as a person reads them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import tippe
+from nonholonomic.parameters import as_html, in_lines, readable_unit, text_as_html, told
+
+
+@pytest.mark.parametrize(
+    ("unit", "shown"),
+    [
+        ("1", ""),
+        ("s", "s"),
+        ("kg m2", "kg m²"),
+        ("rad s-1", "rad/s"),
+        ("m s-2", "m/s²"),
+        ("kg m3 s-1", "kg m³/s"),
+        ("s m-1", "s/m"),
+        ("s-1", "1/s"),
+        ("J kg-1 K-1", "J/(kg K)"),
+    ],
+)
+def test_units_are_written_as_people_write_them(unit, shown):
+    assert readable_unit(unit) == shown
+
+
+def test_values_are_told():
+    assert told(0.02, "kg") == "0.02 kg"
+    assert told(jnp.asarray(1 / 3), "m s-1") == "0.333333 m/s"
+    assert told(np.array([1.0, 2.0])) == "[1, 2]"
+    assert told(np.arange(6.0), "s") == "[0, 1, ..., 5, 6 numbers] s"
+    assert told((0.0, 1.0), "m") == "(0, 1) m"
+    assert told(readable_unit) == "readable_unit"
+    assert told("stop") == "'stop'"
+
+
+def test_traced_numbers_say_that_they_are():
+    seen = []
+    jax.jit(lambda mu: seen.append(repr(tippe.Viscous(mu))) or mu)(0.3)
+    assert seen == ["Viscous(mu=traced float64[])"]
+
+
+def test_html_escapes_and_lines_are_aligned():
+    assert "<td" in as_html("a < b", [("x", "<1>")])
+    assert "a &lt; b" in as_html("a < b", [("x", "<1>")])
+    assert "&lt;1&gt;" in as_html("a", [("x", "<1>")])
+    assert text_as_html("title\nx < 1").count("<pre>x &lt; 1</pre>") == 1
+    assert in_lines("T", [("a", "1"), ("long", "2")]) == "T\n  a     1\n  long  2"

@@ -1,0 +1,110 @@
+"""Scenes and runs show themselves; numbers in another unit are suspected; a run goes to xarray, a file and a picture."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+import xarray
+from conftest import assert_close, rutstam_top
+
+import tippe
+from tippe.__main__ import main
+
+GOOD = {"mass": 0.02, "radius": 0.02, "offset": 0.006, "I1": 2.994e-6, "I3": 3.2e-6}
+
+
+@pytest.fixture(scope="module")
+def run():
+    scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
+    return tippe.simulate(scene, tippe.Launch(0.1, 155.0), 1.0, tolerance=1e-6)
+
+
+def test_a_scene_tells_its_numbers_with_units():
+    scene = tippe.Scene(tippe.Top(**GOOD), tippe.Cylinder(0.3), tippe.Coulomb(0.3, 0.01))
+    printed = str(scene)
+    assert "Top(mass=0.02 kg, radius=0.02 m, offset=0.006 m, I1=2.994e-06 kg m², I3=3.2e-06 kg m²)" in printed
+    assert "Cylinder(radius=0.3 m)" in printed
+    assert "Coulomb(mu=0.3, slip_speed=0.01 m/s)" in printed
+    assert "gravity   9.81 m/s²" in printed
+    assert "Cylinder(radius=0.3 m)" in scene._repr_html_()
+    with pytest.raises(ValueError, match=re.escape("not on Cylinder(radius=0.3 m)")):
+        tippe.Scene(tippe.Top(**GOOD), tippe.Cylinder(0.3), contact="hybrid")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"radius": 20.0}, "radius = 20 m is large for a top: was it in mm?"),
+        ({"radius": 2.0}, "radius = 2 m is large for a top: was it in cm?"),
+        ({"I1": 29.94, "I3": 32.0}, "I1 = 3.74e+06 m R^2 .* was I1 in g cm.2"),
+        ({"mass": 20.0}, "I1 = 0.000374 m R^2 .* was the mass in g"),
+        ({"I1": [2.994e-6, 1e-3], "I3": 3.2e-6}, "are mass, radius and I1 in kg, m and kg m.2"),
+    ],
+)
+def test_another_unit_is_suspected(change, message):
+    with pytest.warns(UserWarning, match=message.replace("+", r"\+").replace("R^2", r"R\^2").replace("?", r"\?")):
+        tippe.Top(**GOOD | change)
+
+
+def test_a_suspicion_is_told_once():
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("default")
+        for _ in range(3):
+            tippe.Top(**GOOD | {"mass": 21.0})
+    assert len(told) == 1
+
+
+def test_theta_changes_at_its_rate(run):
+    times = np.linspace(0.2, 0.8, 601)
+    fine = run.at(times)
+    slopes = np.gradient(np.asarray(fine.theta), times)
+    assert_close(fine.theta_rate[1:-1], slopes[1:-1], atol=0.02 * np.abs(slopes).max())
+
+
+def test_a_run_goes_to_xarray_and_to_a_file(run, tmp_path):
+    data = run.to_xarray()
+    assert data["theta"].dims == ("time",)
+    assert data["position"].dims == ("time", "component")
+    assert data["theta"].attrs == {"units": "rad", "long_name": "inclination θ"}
+    np.testing.assert_array_equal(data["normal_force"], run.normal_force)
+    run.save(tmp_path / "run.h5")
+    with xarray.open_dataset(tmp_path / "run.h5", engine="h5netcdf") as stored:
+        assert set(stored.variables) == set(data.variables)
+        np.testing.assert_array_equal(stored["axis"], run.axis)
+    table = tippe.Table.load(tmp_path / "run.h5")
+    np.testing.assert_array_equal(table["work"], run.work)
+    assert '"status": "reached t1"' in table.attributes["request"]
+
+
+def test_a_portrait_draws_one_quantity_over_another(run):
+    drawing = run.portrait().axes[0]
+    assert_close(drawing.get_lines()[0].get_xdata(), run.theta)
+    assert_close(drawing.get_lines()[0].get_ydata(), run.theta_rate)
+    assert drawing.get_xlabel() == "inclination θ [rad]"
+    path = run.portrait("position.x", "position.y").axes[0]
+    assert_close(path.get_lines()[0].get_ydata(), run.position[:, 1])
+    with pytest.raises(ValueError, match=r"y = 'position' must be one of theta, .*position\.x"):
+        run.portrait("theta", "position")
+
+
+def test_a_run_shows_itself(run):
+    assert "reached t1" not in repr(run)
+    assert "ran to 1 s" in run._repr_html_()
+
+
+@pytest.mark.parametrize(("command", "package"), [(main, tippe)])
+def test_the_command_tells_its_version(command, package, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        command(["--version"])
+    assert capsys.readouterr().out.strip() == f"nonholonomic {package.__version__}"
+    with pytest.raises(SystemExit, match="0"):
+        command(["--help"])
+    assert "default: None" not in capsys.readouterr().out
+
+
+def test_a_folder_that_cannot_be_written_is_refused_first(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("tippe.__main__.inversion_table", lambda *arguments, **options: pytest.fail("it ran"))
+    (tmp_path / "file").write_text("")
+    assert main(["--out", str(tmp_path / "file")]) == 2
+    assert "--out = " in capsys.readouterr().err

@@ -1,0 +1,73 @@
+"""What can be read off a run of a tippe top, with units and names, and the labelled table of it."""
+
+import json
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nonholonomic.parameters import description
+from nonholonomic.sweeps import Table, versions
+
+
+class Quantity(NamedTuple):
+    """A property of `Trajectory`: its unit, the dimension of its components if it is a vector, and what it is in words."""
+
+    unit: str
+    components: str | None = None
+    long_name: str = ""
+
+
+QUANTITIES = {
+    "theta": Quantity("rad", long_name="inclination θ"),
+    "eta": Quantity("rad", long_name="place η"),
+    "azimuth": Quantity("rad", long_name="azimuth φ"),
+    "spin": Quantity("rad s-1", long_name="spin ω₃"),
+    "theta_rate": Quantity("rad s-1", long_name="θ'"),
+    "energy": Quantity("J", long_name="energy"),
+    "jellett": Quantity("kg m3 s-1", long_name="Jellett's quantity"),
+    "normal_force": Quantity("N", long_name="normal force"),
+    "axis": Quantity("1", "component", "axis e"),
+    "position": Quantity("m", "component", "position of the sphere's centre"),
+    "velocity": Quantity("m s-1", "component", "velocity of the sphere's centre"),
+    "angular_momentum": Quantity("kg m2 s-1", "component", "angular momentum"),
+    "slip": Quantity("m s-1", "tangent", "slip velocity"),
+}
+
+#: The directions that components belong to: of the fixed frame, and of the moving one.
+COMPONENTS = {"component": ("x", "y", "z"), "tangent": ("t1", "t2")}
+
+#: Of one run only: what has no place among the variables of a table of many.
+OF_ONE_RUN = {
+    "spin_angle": Quantity("rad", long_name="spin angle"),
+    "work": Quantity("J", long_name="work of friction"),
+}
+
+
+def table_of(run: Any) -> Table:
+    """Everything that is read off a run, over its times.
+
+    **Arguments:** `run`: a `Trajectory` or a `HybridTrajectory`, one and not a batch.
+
+    **Raises:** `ValueError` for a batch of runs.
+    """
+    if np.ndim(run.t) != 1:
+        raise ValueError("a batch of runs is no table of one: trajectory_table makes a table of many")
+    known = QUANTITIES | OF_ONE_RUN
+    dims = [one.components for one in known.values() if one.components is not None]
+    coords = {"time": np.asarray(run.t)} | {dim: np.array(COMPONENTS[dim]) for dim in dict.fromkeys(dims)}
+    request = description("scene", run.scene) | {"status": str(run.status), "end_time": float(run.end_time)}
+    attributes = {
+        "request": json.dumps(request, default=repr),
+        "axes": json.dumps(["time"]),
+        "versions": json.dumps(versions()),
+        "long_names": json.dumps(
+            {"time": "time"} | {name: one.long_name for name, one in known.items()}, sort_keys=True
+        ),
+    }
+    return Table(
+        coords,
+        {name: np.asarray(getattr(run, name)) for name in known},
+        {"time": "s"} | {name: one.unit for name, one in known.items()},
+        attributes,
+        inner={name: (one.components,) for name, one in known.items() if one.components is not None},
+    )
