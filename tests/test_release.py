@@ -1,4 +1,4 @@
-"""What a release needs: one version everywhere, typed packages, and a law of friction that is written as CONTRIBUTING.md says."""
+"""What a release needs: one version everywhere, typed packages, and a law of friction written as CONTRIBUTING.md says."""
 
 import re
 import tomllib
