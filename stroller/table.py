@@ -55,7 +55,7 @@ VARIABLES = {
 UNITS = Stroller.units | Scene.units | Damping.units | RollingResistance.units | Steady.units | Launch.units
 UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m", "ring": "m", "tube": "m", "p": "m"}
 
-#: What the axes are, in words; a place is given as "x(0)".
+#: What the axes are, in words.
 LONG_NAMES = {"steering_inertia": "inertia of the fork", "steering_spring": "spring of the fork", "steering": "φ(0)"}
 LONG_NAMES |= {
     "speed": "speed v(0)",
@@ -66,6 +66,7 @@ LONG_NAMES |= {
 LONG_NAMES |= {
     "x0": "x(0)",
     "y0": "y(0)",
+    "z0": "z(0)",
     "mu0": "μ(0)",
     "eta0": "η(0)",
     "force": "drive force",

@@ -10,7 +10,9 @@ EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
 
 #: What an example must find, as a pattern of its output.
 FINDS = {
+    "a_page": r"Page of \d\.\d\d MB(?s:.*)wrote tops.html, top.gif and curves.png into page-out",
     "fastest_top": r"leaves 0\.\d% of the time's slope open;\s+of 64 tops around it 0 are faster",
+    "hilly_ride": r"end speed \d\.\d+ m/s;.*\n.*\n.*\ncontact lost in \d+ of 12 rides",
     "mu_and_offset": r"2 numbers from 10 measurements: converged\n  4 of 4 starts converged, 4 ended here",
     "stroller_damping": r"2 numbers from 90 measurements: converged\n  4 of 4 starts converged, 4 ended here",
     "lost_numbers": r"(?s)likelihood 29\.[45]\d* at 11 degrees.*\n\[29\.[45]\d* 31\.2\d* 30\.[23]\d* 32\.3\d*\]",
@@ -20,11 +22,26 @@ FINDS = {
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_example_is_short_and_can_be_read(path):
     assert len(path.read_text().splitlines()) <= 60
-    assert callable(runpy.run_path(str(path))["main"])
+    names = runpy.run_path(str(path))
+    assert callable(names["draw" if "draw" in names else "main"])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_example_runs(path, capsys):
-    runpy.run_path(str(path), run_name="__main__")
-    assert re.search(FINDS[path.stem], capsys.readouterr().out)
+def test_example_runs(path, capsys, tmp_path, monkeypatch):
+    # Some write files.
+    monkeypatch.chdir(tmp_path)
+    names = runpy.run_path(str(path))
+    if "draw" in names:
+        # A picture of the manual's gallery.
+        assert names["draw"]().axes
+    else:
+        names["main"]()
+        assert re.search(FINDS[path.stem], capsys.readouterr().out)
+
+
+def test_the_gallery_shows_every_picture():
+    """Each script that draws is on the page, and each on the page is a script."""
+    page = (EXAMPLES[0].parents[1] / "docs" / "gallery.md").read_text()
+    shown = re.findall(r'^draw\("(\w+)"\)$', page, re.M)
+    assert sorted(shown) == sorted({path.stem for path in EXAMPLES if "def draw(" in path.read_text()})

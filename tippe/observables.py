@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -16,11 +16,13 @@ from nonholonomic.integration import Followed, PhasedPath
 from nonholonomic.parameters import text_as_html
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import is_traced, require
-from nonholonomic.views import draw_portrait
+from nonholonomic.views import Stage, Viewable, draw_portrait
 
 from .quantities import table_of
 from .sampled import STATUS
 from .scene import Scene
+from .state import parts
+from .view import as_stages
 
 
 def of_each_run(function: Callable[[Any], Array]) -> property:
@@ -49,7 +51,7 @@ def check_increasing(times: Any) -> None:
         raise ValueError("times must increase")
 
 
-class AbstractTrajectory(eqx.Module):
+class AbstractTrajectory(eqx.Module, Viewable):
     """A run at its times `t`: states as in `tippe/dynamics.py`, the path on the arena, spin angle [rad] and work [J].
 
     Vectors are arrays (times, 3) in the fixed frame (x, y, z); `Trajectory` says more.
@@ -111,7 +113,7 @@ class AbstractTrajectory(eqx.Module):
     @of_each_run
     def eta(self) -> Float[Array, " times"]:
         """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
-        return self.scene.frame.angle(self._place, tuple(self.cyclic))
+        return self.scene.frame.angle(self._place, self._path)
 
     @of_each_run
     def azimuth(self) -> Float[Array, " times"]:
@@ -142,7 +144,7 @@ class AbstractTrajectory(eqx.Module):
     def position(self) -> Float[Array, "times 3"]:
         """Position of the sphere's centre [m]; the plane is z = 0, the cylinder's axis x = z = 0, and a run on the plane
         starts above the origin."""
-        frame, where = self.scene.frame, (self._place, tuple(self.cyclic))
+        frame, where = self.scene.frame, (self._place, self._path)
         centre = sum_vectors(frame.position(*where), scale(self.above[0], frame.axes(*where)[2]))
         return jnp.stack(centre, axis=-1)
 
@@ -201,6 +203,9 @@ class AbstractTrajectory(eqx.Module):
         """
         return draw_portrait(self.to_table(), x, y, ax)
 
+    def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
+        return as_stages([self, *others], overlaid)
+
     def with_stats(self, path: Followed | PhasedPath, **more: Any) -> Self:
         """The same run with what it took, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and more."""
         energy, work = np.asarray(self.energy), np.asarray(self.work)
@@ -212,12 +217,29 @@ class AbstractTrajectory(eqx.Module):
         }
         return eqx.tree_at(lambda one: one.stats, self, stats | more)
 
+    @of_each_run
+    def normal(self) -> Float[Array, "times 3"]:
+        """The arena's unit normal n where the top is, from the arena to the sphere's centre."""
+        return jnp.stack(self.scene.frame.axes(self._place, self._path)[2], axis=-1)
+
+    @of_each_run
+    def angular_velocity(self) -> Float[Array, "times 3"]:
+        """Angular velocity of the body [rad/s]."""
+        body, (_, e, L, _) = self.scene.body, parts(self.states)
+        along = (1.0 / body.I3 - 1.0 / body.I1) * dot(L, e)
+        return self._fixed(sum_vectors(scale(1.0 / body.I1, L), scale(along, e)))
+
+    @property
+    def _path(self) -> tuple[Array, ...]:
+        """The cyclic coordinates of the arena's frame."""
+        return tuple(self.cyclic)
+
     @property
     def _place(self) -> tuple[Array, ...]:
         return tuple(self.states[8:])
 
     def _fixed(self, vector: Vector) -> Float[Array, "times 3"]:
-        axes = self.scene.frame.axes(self._place, tuple(self.cyclic))
+        axes = self.scene.frame.axes(self._place, self._path)
         return jnp.stack([dot(vector, directions) for directions in zip(*axes, strict=True)], axis=-1)
 
     def __str__(self) -> str:

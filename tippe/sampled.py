@@ -7,16 +7,22 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.derivatives import sampled_run, sampled_run_by_diffrax
+from nonholonomic.geometry import carried, cross, dot, scale, sum_vectors
 from nonholonomic.integration import FAILED, GUARD_LOST, AbstractProblem, Settings
 
 from .dynamics import LOSSES, Dynamics, stacked
 from .launch import Launch
 from .phases import Kind, StickSlip
 from .scene import Scene
+from .state import parts
 
 
 class TrajectoryProblem(AbstractProblem):
     """Launches with their cyclic coordinates: the state, the arena's path, the spin angle and the work of friction.
+
+    Behind the coordinates of the arena's frame stand the three components of a unit vector c across the axis that turns with
+    it and not about it, c' = (e x e') x c. The body's first axis is c turned about e by the spin angle: like this all that is
+    integrated changes as slowly as the axis does.
 
     `rest` are spin angle and work at the start, `None` where both are 0.
     """
@@ -32,13 +38,16 @@ class TrajectoryProblem(AbstractProblem):
     def of(cls, scene: Scene, launch: Launch, cells: int | None = None) -> "TrajectoryProblem":
         """The run of one launch, or the runs of some cells, whose numbers are scalars or one per cell."""
         radius, weight = scene.body.radius, scene.body.mass * scene.gravity
-        cyclic = scene.start(launch)[1]
-        extra = jnp.stack(jnp.broadcast_arrays(*([radius] * len(cyclic)), jnp.ones(()), weight * radius))
-        cyclic = jnp.stack(jnp.broadcast_arrays(*cyclic)) if cyclic else jnp.zeros((0, *jnp.shape(launch.theta)))
-        parts = (scene.state(launch), cyclic, scene.scales(launch), extra)
+        sine, cosine = jnp.sin(launch.theta), jnp.cos(launch.theta)
+        across = (cosine * jnp.cos(launch.azimuth), cosine * jnp.sin(launch.azimuth), -sine)
+        cyclic = (*scene.start(launch)[1], *across)
+        one = jnp.ones(())
+        extra = jnp.stack(jnp.broadcast_arrays(*[radius] * (len(cyclic) - 3), one, one, one, one, weight * radius))
+        cyclic = jnp.stack(jnp.broadcast_arrays(*cyclic))
+        rows = (scene.state(launch), cyclic, scene.scales(launch), extra)
         if cells is not None:
-            parts = tuple(jnp.broadcast_to(part.reshape(len(part), -1), (len(part), cells)) for part in parts)
-        return cls(scene.dynamics, scene.body.I3, parts[0], parts[1], jnp.concatenate(parts[2:]))
+            rows = tuple(jnp.broadcast_to(row.reshape(len(row), -1), (len(row), cells)) for row in rows)
+        return cls(scene.dynamics, scene.body.I3, rows[0], rows[1], jnp.concatenate(rows[2:]))
 
     def start(self) -> tuple[Float[Array, "components ..."], Float[Array, "components ..."]]:
         rest = jnp.zeros((2, *self.state.shape[1:])) if self.rest is None else self.rest
@@ -47,8 +56,13 @@ class TrajectoryProblem(AbstractProblem):
     def field(self, time: Float[Array, "..."], state: Float[Array, "components ..."]) -> Any:
         lean, cyclic = state[: len(self.state)], tuple(state[len(self.state) : -2])
         motion = self.dynamics.motion(lean)
-        cyclic_rate = self.dynamics.frame.cyclic_rate(cyclic, motion.velocity, motion.turning)
-        return stacked((*motion.rate, *cyclic_rate, motion.spin_momentum / self.axial, motion.friction_power), state)
+        path, across = cyclic[:-3], cyclic[-3:]
+        _, e, L, _ = parts(lean)
+        path_rate = self.dynamics.frame.cyclic_rate(path, motion.velocity, motion.turning)
+        falls = -dot(cross(L, e), across) * self.dynamics.per_transverse
+        across_rate = sum_vectors(scale(falls, e), carried(across, motion.turning))
+        riding = (*path_rate, *across_rate, motion.spin_momentum / self.axial, motion.friction_power)
+        return stacked((*motion.rate, *riding), state)
 
     def crossing(self, state: Float[Array, "components ..."]) -> None:
         return None

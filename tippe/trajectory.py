@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from nonholonomic.geometry import scale, sum_vectors
 from nonholonomic.integration import Followed, PhasedPath, Settings, follow
 from nonholonomic.progress import Progress
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require_all
@@ -27,10 +28,13 @@ class Trajectory(AbstractTrajectory):
     """A run of a tippe top, or a batch of runs, with the batch first.
 
     Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame
-    (t1, t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre.
+    (t1, t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre; `contact` is where it
+    touches the arena, `normal` the arena's normal there. `rotation` (times, 3, 3) takes the body's axes to the fixed frame, and
+    `angular_velocity` is the rate at which it turns.
 
-    `status` is "reached t1", "contact_lost", "failed" or "jammed"; inside a transformation it is a code 0, 1, 2, 3, or 4,
-    "illegal", for numbers out of range, for which everything is NaN. The run ends at `end_time`. It is jammed where the
+    `status` is "reached t1", "contact_lost", "failed", "jammed" or "does_not_fit"; inside a transformation it is a code 0, 1,
+    2, 3, 5, or 4, "illegal", for numbers out of range, for which everything is NaN. The run ends at `end_time`. The top does
+    not fit where a curvature of the arena reaches that of its sphere, which then touches elsewhere too. It is jammed where the
     equation for the normal force ceases to have a solution, because friction pulls the top into the arena as hard as the
     normal force pushes it out: strong friction, a large offset and a slip along the axis do that. `stats` holds accepted and
     rejected steps, the greatest drift of |e| and the greatest energy residual |E - E(0) - work of friction| [J]; with
@@ -78,6 +82,26 @@ class Trajectory(AbstractTrajectory):
     def normal_force(self) -> Float[Array, " times"]:
         """Normal force [N]."""
         return self.scene.normal_force(self.states)
+
+    @of_each_run
+    def contact(self) -> Float[Array, "times 3"]:
+        """The point at which the top touches the arena [m]."""
+        frame, where = self.scene.frame, (self._place, self._path)
+        foot = sum_vectors(frame.position(*where), scale(-self.scene.body.radius, frame.axes(*where)[2]))
+        return jnp.stack(foot, axis=-1)
+
+    @of_each_run
+    def rotation(self) -> Float[Array, "times 3 3"]:
+        """From the body to the fixed frame: its columns are the body's axes, the third of them e. At the start the first is
+        de/dtheta: it leans from e away from the arena's normal."""
+        e, across, angle = self.axis, self._fixed(tuple(self.cyclic[-3:])), self.spin_angle[:, None]
+        aside = jnp.cross(e, across)
+        first = jnp.cos(angle) * across + jnp.sin(angle) * aside
+        return jnp.stack([first, jnp.cross(e, first), e], axis=-1)
+
+    @property
+    def _path(self) -> tuple[Array, ...]:
+        return tuple(self.cyclic[:-3])
 
     @of_each_run
     def slip(self) -> Float[Array, "times 2"]:

@@ -329,14 +329,13 @@ QUICK = (0, 10, 17)
 def test_every_scene_compiles(arena, law):
     """XLA aborts on calls with arguments that they do not use: arenas and laws go through its single kernel here."""
     scene = tippe.Scene(rutstam_top(), arena, law)
-    for crossing, by in (("first", []), ("last", []), ("first", ["offset", "spin"])):
+    for crossing, by in (("both", []), ("last", ["offset", "spin"])):
         table = tippe.inversion_table(
             scene, theta=[0.1, 0.2], spin=[90.0, 95.0], t1=0.02, crossing=crossing, sensitivities=by
         )
         assert (table.status == "not_inverted").all()
-    for solver in (diffrax.Dopri5(), diffrax.Tsit5()):
-        table = tippe.inversion_table(scene, theta=[0.1, 0.2], spin=[90.0, 95.0], t1=0.02, solver=solver)
-        assert (table.status == "not_inverted").all()
+    table = tippe.inversion_table(scene, theta=[0.1, 0.2], spin=[90.0, 95.0], t1=0.02, solver=diffrax.Tsit5())
+    assert (table.status == "not_inverted").all()
 
 
 @pytest.mark.parametrize(

@@ -72,6 +72,11 @@ class StickSlip(eqx.Module):
         """The speed sqrt(g R) [m/s]."""
         return jnp.sqrt(self.slipping.gravity * self.slipping.radius)
 
+    @property
+    def per_transverse(self) -> Float[Array, "..."]:
+        """1 / I1 [1/(kg m^2)]."""
+        return self.slipping.per_transverse
+
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
         """Evaluate the equations of the kind of motion that the state is in.
 
@@ -146,6 +151,11 @@ class Kind(eqx.Module):
     def frame(self) -> AbstractFrame:
         """The frame of the sphere on the arena."""
         return self.both.frame
+
+    @property
+    def per_transverse(self) -> Float[Array, "..."]:
+        """1 / I1 [1/(kg m^2)]."""
+        return self.both.per_transverse
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
         """The equations of motion of this kind."""

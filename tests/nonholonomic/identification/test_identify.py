@@ -12,7 +12,7 @@ import scipy.stats
 from conftest import assert_close
 from terminal import Terminal
 
-from nonholonomic.identification import Free, Measurements, identify, levenberg_marquardt
+from nonholonomic.identification import FitWarning, Free, Measurements, identify, levenberg_marquardt
 from nonholonomic.identification.likelihood import MISSING, one_sided
 from nonholonomic.identification.result import coordinate_covariance
 from nonholonomic.parameters import full_name
@@ -63,6 +63,25 @@ def test_it_says_on_a_terminal_what_it_does(regression, monkeypatch):
         assert [text.startswith("compiling") for _, text in stream.lines[:1]] == [True] * progress
 
 
+def test_a_model_without_derivatives_is_fitted_by_differences(regression):
+    """In NumPy, with a step in it that is far below the errors and far above round-off."""
+    value, found = regression
+
+    class Model:
+        on_host = True
+
+        def __call__(self, numbers):
+            return np.round(line({name: np.asarray(one) for name, one in numbers.items()}), 4)
+
+    free = {"height": 0.5, "slope": -1.0}
+    again = identify(Model(), Measurements(value, ERROR), free, slopes="differences")
+    for name, expected in found.estimates.items():
+        assert abs(again.estimates[name] - expected) < 0.05 * found.standard_errors[name]
+    assert_close(list(again.standard_errors.values()), list(found.standard_errors.values()), rtol=0.05)
+    with pytest.raises(ValueError, match="slopes = 'none' must be one of 'exact', 'differences'"):
+        identify(line, Measurements(value, ERROR), free, slopes="none")
+
+
 def test_profile_of_a_linear_model_is_a_parabola(regression):
     _, found = regression
     profile = found.profile("slope")
@@ -111,7 +130,8 @@ def test_missing_predictions_are_a_penalty_without_slope():
 
 def test_bounds_are_kept_and_positive_numbers_are_fitted_in_logarithms():
     data = Measurements(np.array([4.0, 4.1]), 0.1)
-    found = identify(lambda p: jnp.repeat(p["x"][:, None], 2, axis=1), data, {"x": Free(1.0, 0.0, 3.0)})
+    with pytest.warns(FitWarning, match="residuals are too large"):
+        found = identify(lambda p: jnp.repeat(p["x"][:, None], 2, axis=1), data, {"x": Free(1.0, 0.0, 3.0)})
     assert 2.99 < found.estimates["x"] < 3.0
     for free in (Free(2.0), Free(2.0, 0.0), Free(2.0, -1.0, 3.0), Free(2.0, upper=5.0)):
         assert_close(free.value(free.coordinate(2.5)), 2.5, rtol=1e-12)
@@ -136,7 +156,8 @@ def test_a_direction_that_the_data_cannot_see_is_named():
         return (p["a"] * p["b"])[:, None] * jnp.exp(-p["c"][:, None] * t)
 
     data = Measurements(6.0 * np.exp(-0.5 * t), 0.01)
-    found = identify(model, data, {"a": Free(1.0, 0.0), "b": Free(2.0, 0.0), "c": 0.4})
+    with pytest.warns(FitWarning, match="the data do not determine a [+-]1 %, b [+-]1 %"):
+        found = identify(model, data, {"a": Free(1.0, 0.0), "b": Free(2.0, 0.0), "c": 0.4})
     assert found.identifiability.singular_values[2] < 1e-6 * found.identifiability.singular_values[0]
     assert_close(np.abs(found.identifiability.directions[2]), [0.5**0.5, 0.5**0.5, 0.0], atol=1e-6)
     assert len(found.identifiability.unseen) == 1

@@ -42,7 +42,7 @@ def dask():
     settings = {"distributed.scheduler.allowed-failures": 0, "distributed.comm.timeouts.connect": "60s"}
     # A worker that takes long to start again must not be given up.
     settings |= {"distributed.deploy.lost-worker-timeout": "300s"}
-    quiet = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
+    quiet = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0", "silence_logs": logging.CRITICAL}
     with dask.config.set(settings), distributed.LocalCluster(**quiet) as cluster, distributed.Client(cluster) as client:
         yield client.get_executor()
 
