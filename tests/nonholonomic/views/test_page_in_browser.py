@@ -62,6 +62,10 @@ def wait(driver, script: str) -> None:
         time.sleep(0.05)
 
 
+def set_speed(driver, factor: float) -> None:
+    driver.execute_script(f"document.getElementById('speed').value = {factor}")
+
+
 def poses(driver, at: float, stage: int, body: int = 0) -> np.ndarray:
     """The matrix that takes a body to its place at a time, as the page's scene has it."""
     script = f"player.seek({at!r}); return player.matrix({stage}, 0, {body})"
@@ -120,13 +124,16 @@ def test_the_slider_sets_the_time(browser):
 
 
 def test_play_runs_to_the_end_and_pause_stops(browser):
+    # So slow that a busy machine does not reach the end meanwhile.
+    set_speed(browser, 0.05)
     browser.execute_script("player.seek(0.2); document.getElementById('play').click()")
-    wait(browser, "return player.time() > 0.25")
+    wait(browser, "return player.time() > 0.21")
     browser.execute_script("document.getElementById('play').click()")
     stopped = browser.execute_script("return player.time()")
     assert stopped < 1.0
     time.sleep(0.3)
     assert browser.execute_script("return [player.time(), player.playing()]") == [stopped, False]
+    set_speed(browser, 1)
     browser.execute_script("player.seek(0.95); player.play(true)")
     wait(browser, "return !player.playing()")
     assert browser.execute_script("return player.time()") == 1.0
