@@ -7,6 +7,7 @@ The figure is said to be Coulomb friction with mu = 0.3. With exact Coulomb fric
 import warnings
 
 import tippe
+from nonholonomic.identification import Identification
 
 TIMES, THETA, READING = [0.5, 1.0, 1.5, 2.0], [0.40, 1.66, 2.74, 3.04], 0.025
 
@@ -17,7 +18,7 @@ def scene(mu: float, slip_speed: float) -> tippe.Scene:
     return tippe.Scene(tippe.Top(mass, radius, 0.005, inertia, inertia), friction=tippe.Coulomb(mu, slip_speed))
 
 
-def shown(fit: tippe.Identification, title: str) -> None:
+def shown(fit: Identification, title: str) -> None:
     print(title)
     for name in fit.estimates:
         low, high = fit.interval(name)
