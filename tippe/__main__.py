@@ -13,7 +13,7 @@ import numpy as np
 
 from nonholonomic import __version__
 from nonholonomic.compilation_cache import enable_compilation_cache
-from nonholonomic.geometry import Cylinder, Plane
+from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require_folder
 
@@ -25,6 +25,15 @@ from .scene import Scene
 from .table import inversion_table
 from .top import Top
 from .trajectory import simulate
+
+#: The arenas that have names, and what their numbers are.
+SURFACES = {
+    "sphere RADIUS": Sphere,
+    "spheroid EQUATORIAL POLAR": Spheroid,
+    "torus RING TUBE": Torus,
+    "paraboloid P": Paraboloid,
+    "plane TILT": Plane,
+}
 
 #: Times at which theta is drawn.
 SAMPLES = 1500
@@ -58,6 +67,12 @@ def parser() -> argparse.ArgumentParser:
         "--mu", type=float, default=0.3, help="friction: viscous [s/m], or Coulomb [1] with --slip-speed"
     )
     scene.add_argument("--slip-speed", type=float, help="regularised Coulomb friction with this slip speed [m/s]")
+    scene.add_argument(
+        "--surface",
+        nargs="+",
+        metavar=("NAME", "NUMBER"),
+        help="another arena, by its name and numbers [m, rad]: " + ", ".join(SURFACES),
+    )
     scene.add_argument("--gravity", type=float, default=9.81, help="acceleration of free fall [m/s^2]")
     launch = command.add_argument_group("the launches")
     launch.add_argument(
@@ -82,7 +97,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def scenes(options: argparse.Namespace) -> dict[str, Scene]:
-    """The two arenas with the declared top."""
+    """The two arenas with the declared top, and the one that is asked for."""
     inertia = options.mass * options.radius**2
     I1 = 131.0 / 350.0 * inertia if options.I1 is None else options.I1
     I3 = 0.4 * inertia if options.I3 is None else options.I3
@@ -91,7 +106,26 @@ def scenes(options: argparse.Namespace) -> dict[str, Scene]:
     if options.slip_speed is not None:
         friction = Coulomb(options.mu, options.slip_speed)
     arenas = {"cylinder": Cylinder(options.cylinder_radius), "plane": Plane()}
+    if options.surface is not None:
+        arenas["surface"] = surface_of(options.surface)
     return {name: Scene(top, arena, friction, options.gravity) for name, arena in arenas.items()}
+
+
+def surface_of(words: list[str]) -> AbstractSurface:
+    """An arena by its name and numbers.
+
+    **Raises:** `ValueError` for a name or numbers that no arena has.
+    """
+    name, *numbers = words
+    for known, kind in SURFACES.items():
+        if known.split()[0] == name and len(numbers) == len(known.split()) - 1:
+            return kind(*map(float, numbers))
+    raise ValueError(f"--surface {' '.join(words)} must be one of: {', '.join(SURFACES)}")
+
+
+def counts_eta(scene: Scene) -> bool:
+    """Whether an arena has places by eta; on others every launch starts at the origin."""
+    return any(name == "eta" for name, _ in scene.surface.coordinates)
 
 
 def spin_of(options: argparse.Namespace, scene: Scene) -> float:
@@ -107,8 +141,7 @@ def tables(options: argparse.Namespace) -> dict[str, Table]:
         found[name] = inversion_table(
             scene,
             theta=options.theta,
-            # On the plane every place is alike.
-            eta=options.eta if name == "cylinder" else 0.0,
+            eta=options.eta if counts_eta(scene) else 0.0,
             spin=spin_of(options, scene),
             t1=options.t1,
             angle=options.angle,
@@ -130,8 +163,11 @@ def printed_times(options: argparse.Namespace, eta: float) -> list[str] | None:
 def columns(options: argparse.Namespace, found: dict[str, Table]) -> list[tuple[str, list[str]]]:
     """The columns of the report: a heading of two words or more, and an entry for every theta(0)."""
     shown = [("theta(0)|[rad]", [f"{theta:.4g}" for theta in options.theta])]
-    places = [("cylinder", f"eta={eta:.4g}", (slice(None), i)) for i, eta in enumerate(options.eta)]
-    for arena, place, cells in [*places, ("plane", "", (slice(None),))]:
+    places = []
+    for arena, scene in scenes(options).items():
+        etas = [(f"eta={eta:.4g}", (slice(None), i)) for i, eta in enumerate(options.eta)]
+        places += [(arena, *place) for place in (etas if counts_eta(scene) else [("", (slice(None),))])]
+    for arena, place, cells in places:
         table = found[arena]
         for crossing, times in (("first", table.first_time), ("last", table.last_time)):
             entries = [_entry(t, word) for t, word in zip(times[cells], table.status[cells], strict=True)]
@@ -145,7 +181,8 @@ def columns(options: argparse.Namespace, found: dict[str, Table]) -> list[tuple[
 def _entry(seconds: float, word: str) -> str:
     if math.isfinite(seconds):
         return f"{seconds:.4f}"
-    return {"not_inverted": "-", "contact_lost": "lost contact", "failed": "failed", "jammed": "jammed"}[word]
+    words = {"not_inverted": "-", "contact_lost": "lost contact", "does_not_fit": "no room"}
+    return words.get(word, word)
 
 
 def report(options: argparse.Namespace, found: dict[str, Table]) -> str:
@@ -189,13 +226,14 @@ def picture(options: argparse.Namespace, found: dict[str, Table]) -> Any:
         return run(launches)
 
     for arena, scene in scenes(options).items():
-        etas = options.eta if arena == "cylinder" else [0.0]
+        etas = options.eta if counts_eta(scene) else [0.0]
         eta, theta = (values.ravel() for values in np.meshgrid(etas, thetas, indexing="ij"))
         launches = Launch(theta, np.full_like(theta, spin_of(options, scene)), eta, np.zeros_like(theta))
         shown = np.asarray(theta_of(scene, launches)).reshape(len(etas), len(thetas), -1)
         ends = found[arena].last_time.reshape(len(thetas), len(etas))
         for i, eta in enumerate(etas):
-            title = f"cylinder, η(0) = {eta:.4g}" if arena == "cylinder" else "plane"
+            name = " ".join(options.surface) if arena == "surface" else arena
+            title = f"{name}, η(0) = {eta:.4g}" if counts_eta(scene) else name
             panels.append(Panel(title, times, shown[i], thetas, ends[:, i]))
     return draw_launches(panels, options.angle)
 
