@@ -24,7 +24,7 @@ from scenes import TOP
 
 import tippe
 from nonholonomic.parameters import with_numbers
-from nonholonomic.sweeps import grid
+from nonholonomic.sweeps import running
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "physics"))
 from make_gradient_reference import RATIO, extrapolated
@@ -123,7 +123,7 @@ def main() -> None:
     command.add_argument("--out", type=Path, default=Path("gradients.csv"))
     options = command.parse_args()
     one_core()
-    grid.workers = lambda: 1
+    running.workers = lambda: 1
     print(machine())
     top = tippe.Top(*TOP)
     scenes = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3)}

@@ -19,7 +19,6 @@ from scipy.optimize import differential_evolution
 
 import tippe
 from nonholonomic.identification import Measurements
-from tippe.extended_times import extended_inversion_times
 from tippe.papers import paper
 
 HORIZON, ANGLE = 30.0, 0.95 * np.pi
@@ -38,14 +37,18 @@ LARGE = 4.0
 def times(numbers: jax.Array, law: str) -> jax.Array:
     """Times of all rows [s], (sets, rows), for numbers (unknowns, sets) in the order of `NAMES`."""
     sets = numbers.shape[1]
-    mass, radius, alpha, ratio, inertia, cylinder, azimuth, mu, *slip_speed = jnp.repeat(numbers, len(ROWS), axis=1)
-    mass, radius = mass * paper.GRAM, radius * 1e-3
-    I3 = inertia * mass * radius**2
-    top = tippe.Top(mass, radius, alpha * radius, ratio * I3, I3)
-    friction = tippe.Coulomb(mu, jnp.exp(slip_speed[0])) if law == "coulomb" else tippe.Viscous(mu)
-    scene = tippe.Scene(top, tippe.Cylinder(jnp.exp(cylinder) * radius), friction)
-    launch = tippe.Launch(np.tile(THETA, sets), paper.BETA1 / I3, eta=np.tile(ETA, sets), azimuth=azimuth)
-    return extended_inversion_times(scene, launch, HORIZON, ANGLE, 1e-6, len(ROWS) * sets).reshape(sets, -1)
+
+    def one(theta, eta, mass, radius, alpha, ratio, inertia, cylinder, azimuth, mu, slip_speed=None):
+        mass, radius = mass * paper.GRAM, radius * 1e-3
+        I3 = inertia * mass * radius**2
+        top = tippe.Top(mass, radius, alpha * radius, ratio * I3, I3)
+        friction = tippe.Coulomb(mu, jnp.exp(slip_speed)) if law == "coulomb" else tippe.Viscous(mu)
+        scene = tippe.Scene(top, tippe.Cylinder(jnp.exp(cylinder) * radius), friction)
+        launch = tippe.Launch(theta, paper.BETA1 / I3, eta=eta, azimuth=azimuth)
+        return tippe.extended_inversion_time(scene, launch, HORIZON, ANGLE, 1e-6)
+
+    cells = jnp.repeat(numbers, len(ROWS), axis=1)
+    return jax.vmap(one)(np.tile(THETA, sets), np.tile(ETA, sets), *cells).reshape(sets, -1)
 
 
 def deviances(numbers: np.ndarray, law: str, run) -> tuple[np.ndarray, np.ndarray]:

@@ -30,7 +30,7 @@ from scenes import TOP
 
 import tippe
 from nonholonomic.integration import Settings, compiled_march, lanes_for
-from nonholonomic.sweeps import grid
+from nonholonomic.sweeps import running
 from tippe.inversion import InversionProblem
 
 ON_CPU = jax.default_backend() == "cpu"
@@ -40,7 +40,7 @@ TOLERANCE = 1e-9 if DOUBLE else 1e-5
 
 def with_workers(count: int) -> None:
     """Let sweeps use this many threads."""
-    grid.workers = lambda: count
+    running.workers = lambda: count
 
 
 def times_of(scene: tippe.Scene, launches: int) -> tippe.Table:
@@ -138,7 +138,7 @@ def main() -> None:
     print(
         f"{device}: {operations:.0f} operations a step, at most {most:.3g} a second{' on one core' if ON_CPU else ''}"
     )
-    cores = grid.workers()
+    cores = running.workers()
     counts = [10**power for power in range(8) if 10**power <= options.most]
     rows = [
         cpu_row(scene, count, cores, operations, most) if ON_CPU else device_row(scene, count, operations, most)

@@ -16,11 +16,12 @@ from .friction import AbstractFriction as AbstractFriction
 from .friction import Damping as Damping
 from .friction import Frictionless as Frictionless
 from .friction import RollingResistance as RollingResistance
-from .identify import Recording as Recording
 from .identify import identify as identify
 from .input import Motion as Motion
 from .input import Steady as Steady
 from .launch import Launch as Launch
+from .recording import Recording as Recording
+from .recording import read_recording as read_recording
 from .scene import Scene as Scene
 from .simulate import simulate as simulate
 from .stroller import Stroller as Stroller

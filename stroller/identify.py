@@ -1,103 +1,57 @@
-"""Parameters of a stroller, its ground and its launch from a recorded ride."""
+"""Parameters of a stroller, its ground and its launch from recorded rides."""
 
+import itertools
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from nonholonomic import identification as generic
-from nonholonomic.identification import Identification, Measurements, check_recording, sample_labels, samples
-from nonholonomic.parameters import numbers
-from nonholonomic.validation import as_number, require
+from nonholonomic.identification import Free, Identification, of_data, predicted
+from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.validation import require
 
-from .input import Input
-from .launch import Launch
+from .recording import Recording
 from .scene import Scene
 from .simulate import simulate
-from .table import place_numbers, replaced
-
-#: Columns of a sample of each quantity.
-QUANTITIES = {"position": ("x", "y", "z"), "heading": ("heading",), "speed": ("speed",), "steering": ("steering",)}
-
-
-class Recording(eqx.Module):
-    """A recorded ride: one quantity at some times.
-
-    **Arguments:**
-
-    - `launch`: a `Launch`, every number a scalar.
-    - `times`: (times,) [s], increasing from 0 or later.
-    - `value`: (times, 3) [m] for "position" (in the fixed frame), (times,) for "heading" [rad], "speed" [m/s] and
-      "steering" [rad], all as in `Trajectory`.
-    - `error`: standard errors, one for all or of the shape of `value`.
-    - `quantity`: one of these words.
-    - `input`: what drove the stroller, as for `simulate`.
-
-    **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
-
-    **Example:**
-
-    ```
-    >>> import stroller
-    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
-    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
-    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
-    >>> data = stroller.Recording(launch, times=[0.5, 1.0], value=[1.87, 1.74], error=0.01, quantity="speed")
-    >>> data.labels
-    ('speed(0.5 s)', 'speed(1 s)')
-
-    ```
-    """
-
-    launch: Launch
-    times: Float[Array, " times"] = eqx.field(converter=as_number)
-    value: Float[Array, "..."] = eqx.field(converter=as_number)
-    error: Float[Array, "..."] = eqx.field(converter=as_number)
-    quantity: str = eqx.field(static=True, default="position")
-    input: Input | None = None
-
-    def __check_init__(self):
-        check_recording(self.times, self.value, self.quantity, QUANTITIES)
-
-    @property
-    def measurements(self) -> Measurements:
-        """The samples as `Measurements`."""
-        return samples(self.value, self.error)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """A label for each sample."""
-        return sample_labels(self.times, QUANTITIES[self.quantity])
-
-    def predict(self, scene: Scene, values: dict[str, Array], tolerance: float) -> Float[Array, "rows n"]:
-        """The samples in every row."""
-
-        def one(values):
-            roots = replaced({"scene": scene, "launch": self.launch}, values)
-            run = simulate(
-                roots["scene"],
-                roots["launch"],
-                self.times[-1],
-                self.input,
-                self.times,
-                tolerance,
-            )
-            return getattr(run, self.quantity).reshape(-1)
-
-        return jax.vmap(one)(values)
 
 
 class SceneModel(eqx.Module):
-    """Predictions of all recordings of a scene, in the form that `nonholonomic.identification.identify` expects."""
+    """Predictions of all recordings of a scene, in the form that `nonholonomic.identification.identify` expects.
+
+    `seen` says which of the predictions were measured.
+    """
 
     scene: Scene
     data: tuple[Recording, ...]
+    seen: Int[Array, " n"]
     tolerance: float = eqx.field(static=True)
 
     def __call__(self, parameters: dict[str, Float[Array, " rows"]]) -> Float[Array, "rows n"]:
-        return jnp.concatenate([one.predict(self.scene, parameters, self.tolerance) for one in self.data], axis=1)
+        rows = len(next(iter(parameters.values())))
+        values = [of_data(parameters, k) for k in range(len(self.data))]
+        parts: dict[int, Array] = {}
+        rides: dict[Any, list[int]] = {}
+        for k, one in enumerate(self.data):
+            rides.setdefault((id(one.input), tuple(numbers("launch", one.launch)), tuple(values[k])), []).append(k)
+        for alike in rides.values():
+            found = self._predict([(self.data[k], values[k]) for k in alike], rows)
+            parts |= dict(zip(alike, found, strict=True))
+        return jnp.concatenate([parts[k] for k in range(len(self.data))], axis=1)[:, self.seen]
+
+    def _predict(self, recordings: list[tuple[Recording, Any]], rows: int) -> list[Float[Array, "rows samples"]]:
+        """What is recorded of rides with one input."""
+        first = recordings[0][0]
+
+        def run(lane: dict[str, Array], times: Float[Array, " times"]) -> Any:
+            roots = with_numbers({"scene": self.scene, "launch": first.launch}, lane)
+            return simulate(roots["scene"], roots["launch"], times[-1], first.input, times, self.tolerance)
+
+        def column(run: Any, name: str) -> Float[Array, " times"]:
+            return run.position[:, "xyz".index(name)] if name in ("x", "y", "z") else getattr(run, name)
+
+        return predicted(recordings, rows, run, column)
 
 
 def identify(
@@ -120,11 +74,13 @@ def identify(
     - `data`: a `Recording`, or a list of several to be fitted together.
     - `free`: full name of a parameter -> a `Free` or only the value from which to start: `"scene.friction.rolling"`, or
       `"rolling"` where nothing else ends so; `"launch.place[0]"` and `"launch.place[1]"` are parts of the place. A parameter
-      of the launch is the same in all recordings. Parameters that cannot be negative are fitted in their logarithms.
+      of the launch, or `"t0"`, the reading of a recording's clock at the launch, is the same in all recordings;
+      `"data[1].launch.heading"` is that of the second, and `"data[*].t0"` stands for one of each. Parameters that cannot be
+      negative are fitted in their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `tolerance`: relative tolerance of the integration.
 
-    **Returns:** an `Identification`.
+    **Returns:** an `Identification`, with its `verdict`; of which it warns (`FitWarning`) if it is not good.
 
     **Raises:** `ValueError` for arguments out of range or an unknown name.
 
@@ -150,12 +106,10 @@ def identify(
     require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
     for one in data:
         scene.check(one.launch)
-    roots = {"scene": scene, "launch": data[0].launch}
-    known = [name for root, tree in roots.items() for name in numbers(root, tree)] + place_numbers(data[0].launch)
-    unknowns = generic.free_numbers(free, roots, known, replaced)
-    measurements, labels = generic.joined(data)
+    unknowns = _unknowns_of(scene, data, free)
+    measurements, labels, seen = generic.joined(data)
     return generic.identify(
-        SceneModel(scene, data, tolerance),
+        SceneModel(scene, data, seen, tolerance),
         measurements,
         unknowns,
         starts=starts,
@@ -165,3 +119,15 @@ def identify(
         labels=labels,
         progress=progress,
     )
+
+
+def _unknowns_of(scene: Scene, data: tuple[Recording, ...], free: Any) -> dict[str, Free]:
+    """The unknowns of a scene and its data by their full names, checked."""
+    roots = {"scene": scene, "launch": data[0].launch}
+    own = [[*numbers("launch", one.launch), "t0"] for one in data]
+
+    def check(values: dict[str, float]) -> None:
+        with_numbers(roots, {name: value for name, value in values.items() if name != "t0"})
+
+    known = [*numbers("scene", scene), *dict.fromkeys(itertools.chain(*own))]
+    return generic.free_numbers(free, known, own, check)

@@ -1,7 +1,8 @@
 """Many rides in one batched call: every combination of some parameters of scene, launch and input."""
 
 import dataclasses
-from typing import Any
+from concurrent.futures import Executor
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -18,8 +19,8 @@ from nonholonomic.integration import (
     explicit_tableau,
 )
 from nonholonomic.parameters import description, with_numbers
-from nonholonomic.sweeps import Axis, Table, Variable, axis
-from nonholonomic.sweeps import grid as grids
+from nonholonomic.sweeps import Axis, Table, Variable, axis, cells_to_check
+from nonholonomic.sweeps import sweep as computed
 from nonholonomic.validation import as_number, require
 
 from .dynamics import State
@@ -54,7 +55,7 @@ VARIABLES = {
 UNITS = Stroller.units | Scene.units | Damping.units | RollingResistance.units | Steady.units | Launch.units
 UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m", "ring": "m", "tube": "m", "p": "m"}
 
-#: What the axes are, in words; a place is given as "x(0)".
+#: What the axes are, in words.
 LONG_NAMES = {"steering_inertia": "inertia of the fork", "steering_spring": "spring of the fork", "steering": "φ(0)"}
 LONG_NAMES |= {
     "speed": "speed v(0)",
@@ -65,6 +66,7 @@ LONG_NAMES |= {
 LONG_NAMES |= {
     "x0": "x(0)",
     "y0": "y(0)",
+    "z0": "z(0)",
     "mu0": "μ(0)",
     "eta0": "η(0)",
     "force": "drive force",
@@ -82,6 +84,8 @@ def sweep(
     tolerance: float = 1e-9,
     solver: diffrax.AbstractERK | None = None,
     path: Any = None,
+    progress: bool = True,
+    executor: Executor | None = None,
 ) -> Table:
     """The ends of all rides over a grid of parameters, in one batched call on all cores.
 
@@ -95,13 +99,18 @@ def sweep(
     - `tolerance`: relative tolerance of the integration.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
     - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
+    - `progress`: whether to show it, on a terminal or in a notebook.
+    - `executor`: who computes: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a
+      Dask client, to which blocks are handed as its workers become free; by default a thread for each core. The numbers
+      are the same, to the bit on the same kind of processor.
 
     **Returns:** a `Table` of the rides' ends: position `x`, `y`, `z` [m] in the fixed frame, `heading`, `end_steering`
     [rad], `end_speed` [m/s], `energy` [J], `residual` [J] of energy against work, `contact_time` [s] at which the ground
     first had to pull (infinite if never; the ride goes on), `end_time` [s], `status` ("completed", "contact_lost",
     "rank_lost" where a projected heading ended the ride, "failed"), `steps` and `rejected`.
 
-    **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
+    **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
+    `RuntimeError` for an executor that breaks down, or a worker with other versions.
 
     **Example:**
 
@@ -126,19 +135,49 @@ def sweep(
     require(t1, "t1", above=0.0)
     require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
     check_input(input, scene, launch)
-    controls = as_module(input, scene, launch)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
     grid = named_axes(axes, scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.
-    for one in grid:
-        changed = replaced(roots, {one.number: one.values})
+    for cells in cells_to_check(grid):
+        changed = replaced(roots, cells)
         changed["scene"].check(changed["launch"])
 
-    def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
-        cells = replaced(roots, columns)
+    request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
+    request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
+    request |= {"solver": type(solver).__name__, "input": "none" if input is None else described(input)}
+    request |= {one.number: "an axis" for one in grid}
+    job = RideJob.of(roots, input, float(t1), float(tolerance), solver)
+    return computed(job, grid, VARIABLES, request, path=path, progress=progress, executor=executor)
+
+
+class RideJob(NamedTuple):
+    """What is asked of every cell, as data that can be sent to another process; see `sweep`.
+
+    `controls`: the input as a module, which each process makes for itself.
+    """
+
+    roots: dict[str, Any]
+    input: Input | None
+    t1: float
+    tolerance: float
+    solver: diffrax.AbstractERK
+    controls: eqx.Module | None
+
+    @classmethod
+    def of(cls, roots: dict[str, Any], input: Input | None, *rest: Any) -> "RideJob":
+        """The job, in this process."""
+        return cls(roots, input, *rest, as_module(input, roots["scene"], roots["launch"]))
+
+    def __reduce__(self) -> Any:
+        return RideJob.of, tuple(self[:-1])
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which the first `count` are to be run."""
+        cells = replaced(self.roots, columns)
         size = next((len(values) for values in columns.values()), 1)
-        problem = RideProblem.of(cells["scene"], cells["launch"], cells.get("input", controls), size, watched=True)
-        horizon, settings = as_number(t1), Settings(tolerance, solver)
+        controls = cells.get("input", self.controls)
+        problem = RideProblem.of(cells["scene"], cells["launch"], controls, size, watched=True)
+        horizon, settings = as_number(self.t1), Settings(self.tolerance, self.solver)
         # A ride goes on where contact is lost, as if the ground could pull.
         outcome, _ = compiled_march(problem, horizon, jnp.asarray(count), settings, passes=problem.watched)
         contact_time = np.asarray(outcome.first_crossing)
@@ -152,12 +191,6 @@ def sweep(
             "steps": np.asarray(outcome.steps),
             "rejected": np.asarray(outcome.rejected),
         }
-
-    request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
-    request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
-    request |= {"solver": type(solver).__name__, "input": "none" if input is None else described(input)}
-    request |= {one.number: "an axis" for one in grid}
-    return grids.sweep(run, grid, VARIABLES, request, path=path)
 
 
 @eqx.filter_jit

@@ -1,6 +1,7 @@
 """One run of the stroller, and what can be read off it."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -13,7 +14,7 @@ from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_ve
 from nonholonomic.parameters import text_as_html
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import is_traced
-from nonholonomic.views import draw_portrait
+from nonholonomic.views import Stage, Viewable, draw_portrait
 
 from .crossings import crossings, watched
 from .dynamics import Power, State, padded
@@ -22,9 +23,10 @@ from .quantities import table_of_one
 from .ride import CONTACT_ROUND_OFF, RANK_LOST, Recipe, Stats
 from .scene import Scene
 from .steps import Steps, followed
+from .view import as_stages
 
 
-class Trajectory(eqx.Module):
+class Trajectory(eqx.Module, Viewable):
     """A run at the given times. Times are the first axis of every array.
 
     - `t` [s]; `place`, as the surface names it (see `Launch`), (times, 2), or (times, 3) on an implicit surface; `position`
@@ -181,6 +183,9 @@ class Trajectory(eqx.Module):
         **Raises:** `ValueError` for an unknown variable.
         """
         return draw_portrait(self.to_table(), x, y, ax)
+
+    def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
+        return as_stages([self, *others], overlaid)
 
     def __repr__(self) -> str:
         return str(self)

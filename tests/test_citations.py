@@ -13,7 +13,7 @@ CITED = re.compile(r"(?<![\w./<])(?:[\w.-]+/)*[\w-]+\.(?:py|md)\b|(?<=`)(?:[\w.-
 FOLDERS = ("nonholonomic", "tippe", "stroller", "tests", "benchmarks", "examples", "docs")
 
 TEXTS = [
-    ROOT / "README.md",
+    *ROOT.glob("*.md"),
     *(path for one in FOLDERS for path in (ROOT / one).rglob("*") if path.suffix in (".py", ".md")),
 ]
 

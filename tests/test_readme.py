@@ -13,26 +13,39 @@ pytestmark = pytest.mark.newest
 README = (Path(__file__).parents[1] / "README.md").read_text()
 
 
-def test_the_ten_lines_run(tmp_path, monkeypatch, capsys):
+SNIPPETS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+def test_the_map_and_the_gradient_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    code, _ = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     # A coarser grid of the same shape: the example's own takes longer than a test should.
-    exec(code.replace("36", "4").replace("51", "10"), {})
+    exec("".join(SNIPPETS[:2]).replace("36", "4").replace("51", "10"), {})
     assert (tmp_path / "table.h5").exists()
     assert (tmp_path / "table.png").exists()
-    assert "5.96" in capsys.readouterr().out
+    # What it prints is what stands below it.
+    printed = [float(number) for number in re.findall(r"-?\d+\.\d+", capsys.readouterr().out)]
+    said = [float(number) for number in re.findall(r"-?\d+\.\d+", re.findall(r"^# (\d.*)$", SNIPPETS[1], re.M)[0])]
+    assert len(said) == 5
+    assert said == pytest.approx(printed, rel=2e-3)
 
 
 def test_the_ride_runs(capsys):
-    _, code = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     names = {}
-    exec(code, names)
-    assert names["table"].shape == (3, 2)
+    exec(SNIPPETS[2], names)
     assert names["ride"].position.shape[1] == 3
+    assert "completed" in capsys.readouterr().out
+
+
+def test_it_is_short_and_its_links_lead_somewhere():
+    assert len(README.splitlines()) <= 90
+    for link in re.findall(r"\]\(((?!http)[^)]*)\)", README):
+        assert (Path(__file__).parents[1] / link).exists(), link
+    assert "pip install '.[test]' && pytest" in README
+    assert "NONHOLONOMIC_CACHE=0" in README
 
 
 def test_every_file_it_names_exists():
-    for name in re.findall(r"`((?:tests|tippe|nonholonomic|stroller|benchmarks|docs)/[\w/.]*)`", README):
+    for name in re.findall(r"`((?:tests|tippe|nonholonomic|stroller|benchmarks|docs|examples)/[\w/.]*)`", README):
         assert (Path(__file__).parents[1] / name).exists(), name
 
 

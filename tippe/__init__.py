@@ -9,10 +9,12 @@ from nonholonomic.geometry import Plane as Plane
 from nonholonomic.geometry import Sphere as Sphere
 from nonholonomic.geometry import Spheroid as Spheroid
 from nonholonomic.geometry import Torus as Torus
+from nonholonomic.identification import FitWarning as FitWarning
 from nonholonomic.identification import Free as Free
 from nonholonomic.sweeps import Table as Table
 
 from . import steady as steady
+from .extended_times import extended_inversion_time as extended_inversion_time
 from .friction import AbstractFriction as AbstractFriction
 from .friction import Contensou as Contensou
 from .friction import Coulomb as Coulomb
@@ -20,14 +22,16 @@ from .friction import Frictionless as Frictionless
 from .friction import Rolling as Rolling
 from .friction import SetValuedCoulomb as SetValuedCoulomb
 from .friction import Viscous as Viscous
-from .identify import InversionTimes as InversionTimes
-from .identify import Recording as Recording
 from .identify import identify as identify
 from .inversion import inversion_time as inversion_time
 from .launch import Launch as Launch
 from .lyapunov import LyapunovExponent as LyapunovExponent
 from .lyapunov import lyapunov_exponent as lyapunov_exponent
+from .measured import InversionTimes as InversionTimes
+from .measured import Recording as Recording
 from .phases.flight_trajectory import HybridTrajectory as HybridTrajectory
+from .posterior import log_density as log_density
+from .read import read_recording as read_recording
 from .scene import Scene as Scene
 from .table import inversion_table as inversion_table
 from .top import Stem as Stem

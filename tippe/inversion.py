@@ -145,7 +145,7 @@ class InversionQuestion(AbstractQuestion):
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         problem = self.problem(leaves[: self.movable], cells)
-        may, t1, tolerance = self._permitted(leaves)
+        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         outcome, _ = traced_march(
             problem,
             t1,
@@ -162,13 +162,13 @@ class InversionQuestion(AbstractQuestion):
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         # Cells do not influence one another, so varying a parameter in all of them at once gives each its own derivative.
         problem, directions, gather = directions_by(self.problem, active, leaves[: self.movable], cells)
-        may, t1, tolerance = self._permitted(leaves)
+        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         outcome, slopes = traced_march_with_slopes(
             problem,
             directions,
             t1,
             jnp.asarray(cells),
-            Settings(tolerance, self.solver),
+            Settings(tolerance, self.solver, looped=True),
             passes=self.last,
             one_kernel=not again,
         )
@@ -176,27 +176,31 @@ class InversionQuestion(AbstractQuestion):
         time = jnp.where(good, jnp.where(inverted, outcome.crossing_time, jnp.inf), jnp.nan)
         return time, [jnp.where(good, jnp.where(inverted, slope, 0.0), jnp.nan) for slope in gather(slopes)]
 
-    @eqx.filter_jit
-    def _permitted(
-        self, leaves: tuple[Float[Array, "..."], ...]
-    ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, ""]]:
-        """Which cells have legal numbers; the horizons, 0 for the others; and the tolerance of the block.
 
-        One tolerance serves a block: the smallest of a batch.
-        """
-        scene, launch, angle, t1, tolerance = jax.tree.unflatten(self.structure, leaves)
-        may = jnp.asarray(True)
-        if self.unchecked:
-            bounds = (
-                *all_bounds(scene),
-                *all_bounds(launch),
-                *scene.start_bounds(launch),
-                *event_bounds(angle),
-                *run_bounds(t1, tolerance),
-            )
-            may = legal(bounds)
-            t1, tolerance = jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
-        return may, t1, jnp.min(tolerance)
+@eqx.filter_jit
+def permitted(
+    structure: Any, unchecked: bool, leaves: tuple[Float[Array, "..."], ...]
+) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, ""]]:
+    """Which cells have legal numbers; the horizons, 0 for the others; and the tolerance of the block.
+
+    One tolerance serves a block: the smallest of a batch.
+
+    **Arguments:** `structure`, `leaves`: of scene, launch, angle, horizon and tolerance; `unchecked`: whether some of them
+    were traced when they were checked.
+    """
+    scene, launch, angle, t1, tolerance = jax.tree.unflatten(structure, leaves)
+    may = jnp.asarray(True)
+    if unchecked:
+        bounds = (
+            *all_bounds(scene),
+            *all_bounds(launch),
+            *scene.start_bounds(launch),
+            *event_bounds(angle),
+            *run_bounds(t1, tolerance),
+        )
+        may = legal(bounds)
+        t1, tolerance = jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
+    return may, t1, jnp.min(tolerance)
 
 
 def is_inverted(outcome: Outcome | Journey, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:

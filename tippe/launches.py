@@ -7,15 +7,12 @@ from typing import Any
 import numpy as np
 
 from nonholonomic.parameters import description, numbers, with_numbers
-from nonholonomic.sweeps import Axis, axis
+from nonholonomic.sweeps import Axis, axis, cells_to_check
 
 from .inversion import check_run
 from .launch import Launch
 from .scene import Scene
 from .top import Top
-
-#: Cells that are checked together, to bound the memory it takes.
-CHECKED_AT_ONCE = 1 << 20
 
 UNITS = Top.units | Scene.units | Launch.units
 
@@ -46,7 +43,7 @@ SEVERAL = {
 def launches(
     scene: Any, given: dict[str, Any], axes: Any, t1: Any, tolerance: Any, taken: Collection[str] = ()
 ) -> tuple[dict[str, Any], list[Axis], dict[str, str]]:
-    """The scene and launch that all cells share, and the axes of the grid, every cell checked before anything compiles.
+    """The scene and launch that all cells share, and the axes of the grid, its cells checked before anything compiles.
 
     **Arguments:**
 
@@ -88,7 +85,10 @@ def launches(
             grid.append(axis(name if alone else number, number, unit, values[number], long_name))
     roots = with_numbers({"scene": scene, "launch": launch}, fixed)
     check_run(roots["scene"], roots["launch"], t1, tolerance)
-    _check_cells(roots, grid)
+    # The modules check their numbers, which may be impossible only together.
+    for cells in cells_to_check(grid):
+        looked_at = with_numbers(roots, cells)
+        looked_at["scene"].check_start(looked_at["launch"])
     return roots, grid, units
 
 
@@ -111,13 +111,3 @@ def described(roots: dict[str, Any], grid: list[Axis]) -> dict[str, Any]:
     """What is asked of which scene and launch, as plain data; the values of axes stand elsewhere."""
     found = {path: told for name, root in roots.items() for path, told in description(name, root).items()}
     return found | {one.number: "an axis" for one in grid}
-
-
-def _check_cells(roots: dict[str, Any], grid: list[Axis]) -> None:
-    """Have the modules check every cell: numbers may be impossible only together."""
-    shape = tuple(len(one.values) for one in grid)
-    cells = int(np.prod(shape, dtype=int))
-    for first in range(0, cells, CHECKED_AT_ONCE):
-        places = np.unravel_index(np.arange(first, min(first + CHECKED_AT_ONCE, cells)), shape) if grid else ()
-        cells = with_numbers(roots, {one.number: one.values[place] for one, place in zip(grid, places, strict=True)})
-        cells["scene"].check_start(cells["launch"])

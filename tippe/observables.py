@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -16,12 +16,13 @@ from nonholonomic.integration import Followed, PhasedPath
 from nonholonomic.parameters import text_as_html
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import is_traced, require
-from nonholonomic.views import draw_portrait
+from nonholonomic.views import Stage, Viewable, draw_portrait
 
 from .quantities import table_of
 from .sampled import STATUS
 from .scene import Scene
 from .state import parts
+from .view import as_stages
 
 
 def of_each_run(function: Callable[[Any], Array]) -> property:
@@ -50,7 +51,7 @@ def check_increasing(times: Any) -> None:
         raise ValueError("times must increase")
 
 
-class AbstractTrajectory(eqx.Module):
+class AbstractTrajectory(eqx.Module, Viewable):
     """A run at its times `t`: states as in `tippe/dynamics.py`, the path on the arena, spin angle [rad] and work [J].
 
     Vectors are arrays (times, 3) in the fixed frame (x, y, z); `Trajectory` says more.
@@ -201,6 +202,9 @@ class AbstractTrajectory(eqx.Module):
         **Raises:** `ValueError` for an unknown variable.
         """
         return draw_portrait(self.to_table(), x, y, ax)
+
+    def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
+        return as_stages([self, *others], overlaid)
 
     def with_stats(self, path: Followed | PhasedPath, **more: Any) -> Self:
         """The same run with what it took, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and more."""

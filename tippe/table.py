@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from concurrent.futures import Executor
+from typing import Any, NamedTuple
 
 import diffrax
 import numpy as np
@@ -37,6 +38,7 @@ def inversion_table(
     errors: bool = False,
     sensitivities: Sequence[str] = (),
     progress: bool = True,
+    executor: Executor | None = None,
 ) -> Table:
     """Inversion times over a grid of launches and scenes, in one batched call on all cores.
 
@@ -61,6 +63,9 @@ def inversion_table(
     - `sensitivities`: full names of parameters to differentiate the times by, such as `["scene.friction.mu", "launch.theta"]`;
       the end of a name will do where only one parameter fits.
     - `progress`: whether to show it, on a terminal or in a notebook; `NONHOLONOMIC_PROGRESS=0` hides it everywhere.
+    - `executor`: who computes: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a
+      Dask client, to which blocks are handed as its workers become free; by default a thread for each core. The numbers
+      are the same, to the bit on the same kind of processor.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
     "contact_lost", "failed", "jammed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was lost
@@ -73,7 +78,8 @@ def inversion_table(
     `SetValuedCoulomb`, `sticks` is how often a slip has turned into rolling, and `status` may be "unresolved" (too many
     changes).
 
-    **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used.
+    **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
+    `RuntimeError` for an executor that breaks down, or a worker with other versions.
 
     **Example:**
 
@@ -113,19 +119,7 @@ def inversion_table(
         what = "method = 'diffrax'" if method == "diffrax" else f"sensitivities = {sensitivities!r}"
         raise ValueError(f"{what} is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
     runs = CellRuns(driver, float(t1), float(angle), crossing, solver, method, paths)
-
-    def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
-        if method == "diffrax" and count == 0:
-            # The reference runs whole blocks: a call that is only meant to compile would compute the first one twice.
-            return {}
-        found = runs.results(roots, columns, tolerance, count)
-        if errors:
-            coarse = runs._replace(slopes_by=[]).results(roots, columns, COARSER * tolerance, count)
-            agreed = (found["status"] == coarse["status"]) & (found["status"] != driver.words.index("failed"))
-            for name in runs.times:
-                alike = agreed & (np.isfinite(found[name]) == np.isfinite(coarse[name]))
-                found[f"{name}_error"] = time_error(found[name], coarse[name], alike)
-        return found
+    job = InversionJob(runs, roots, float(tolerance), errors)
 
     request = {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
     request = described(roots, grid) | request | {"solver": type(solver).__name__, "method": method}
@@ -138,4 +132,31 @@ def inversion_table(
     if paths:
         request |= {"sensitivities": paths}
         variables = variables | slope_variables(paths, units)
-    return sweep(run, grid, variables, request, path=path, progress=progress)
+    return sweep(job, grid, variables, request, path=path, progress=progress, executor=executor)
+
+
+class InversionJob(NamedTuple):
+    """What is asked of every cell, as data that can be sent to another process.
+
+    `errors`: whether to run every cell again at ten times the tolerance.
+    """
+
+    runs: CellRuns
+    roots: dict[str, Any]
+    tolerance: float
+    errors: bool
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which the first `count` are to be run."""
+        runs, words = self.runs, self.runs.driver.words
+        if runs.method == "diffrax" and count == 0:
+            # The reference runs whole blocks: a call that is only meant to compile would compute the first one twice.
+            return {}
+        found = runs.results(self.roots, columns, self.tolerance, count)
+        if self.errors:
+            coarse = runs._replace(slopes_by=[]).results(self.roots, columns, COARSER * self.tolerance, count)
+            agreed = (found["status"] == coarse["status"]) & (found["status"] != words.index("failed"))
+            for name in runs.times:
+                alike = agreed & (np.isfinite(found[name]) == np.isfinite(coarse[name]))
+                found[f"{name}_error"] = time_error(found[name], coarse[name], alike)
+        return found

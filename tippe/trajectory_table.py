@@ -1,9 +1,11 @@
 """Tables of trajectories over the grid of launches and friction."""
 
 from collections.abc import Sequence
-from typing import Any
+from concurrent.futures import Executor
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
@@ -36,6 +38,8 @@ def trajectory_table(
     quantities: Sequence[str] = ("theta", "eta"),
     tolerance: float = 1e-9,
     path: Any = None,
+    progress: bool = True,
+    executor: Executor | None = None,
 ) -> Table:
     """Trajectories over a grid of launches and scenes, sampled at given times, in one batched call on all cores.
 
@@ -56,6 +60,7 @@ def trajectory_table(
       [kg m^2/s] and "slip" [m/s]; all as in `Trajectory`.
     - `tolerance`: relative tolerance of the integration.
     - `path`: HDF5 file to write, block by block. A call that was interrupted resumes from it.
+    - `progress`, `executor`: as for `inversion_table`.
 
     **Returns:** a `Table` with a variable for each quantity, which has the axes' dimensions and a last dimension "time"; a
     vector has one more behind it, "component" (x, y, z), for "slip" "tangent" (t1, t2). They are not a number after the end of
@@ -64,7 +69,7 @@ def trajectory_table(
 
     **Raises:** `ValueError` for arguments out of range, an unknown axis or quantity, and for a scene with
     `contact="hybrid"` or `SetValuedCoulomb`, whose runs `simulate` samples one by one; `OSError` for a path that cannot be
-    used.
+    used; `RuntimeError` for an executor that breaks down, or a worker with other versions.
 
     **Example:**
 
@@ -94,12 +99,6 @@ def trajectory_table(
     if scene.friction.set_valued:
         raise ValueError(f"friction = {type(scene.friction).__name__} must be a law without phases {why}")
 
-    def run(columns: dict[str, Any], count: int) -> dict[str, Any]:
-        cells = with_numbers(roots, columns)
-        size = next((len(values) for values in columns.values()), 1)
-        found = follow_cells(cells["scene"], cells["launch"], size, times, tolerance, names, count)
-        return {name: np.asarray(values, variables[name].kind) for name, values in found.items()}
-
     inner = [axis("time", "time", "s", times, "time")]
     variables = {}
     for name in names:
@@ -114,7 +113,25 @@ def trajectory_table(
     request = described(roots, grid) | {"quantities": list(names), "tolerance": float(tolerance)}
     # A run has a dozen components or so.
     most = max(16, 1 << (MOST_SAMPLED // (12 * len(times))).bit_length() - 1)
-    return sweep(run, grid, variables, request, path=path, most=most, inner=inner)
+    job = SamplingJob(roots, times, float(tolerance), names)
+    options = {"path": path, "most": most, "inner": inner, "progress": progress, "executor": executor}
+    return sweep(job, grid, variables, request, **options)
+
+
+class SamplingJob(NamedTuple):
+    """What is asked of every cell, as data that can be sent to another process."""
+
+    roots: dict[str, Any]
+    times: Float[np.ndarray, " times"]
+    tolerance: float
+    names: tuple[str, ...]
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which the first `count` are to be run."""
+        cells = with_numbers(self.roots, columns)
+        size = next((len(values) for values in columns.values()), 1)
+        found = follow_cells(cells["scene"], cells["launch"], size, self.times, self.tolerance, self.names, count)
+        return {name: np.asarray(values, np.int8 if name == "status" else None) for name, values in found.items()}
 
 
 def _names(quantities: Any) -> tuple[str, ...]:

@@ -119,10 +119,29 @@ def _in_block(question: AbstractQuestion, function: Callable[..., Any]) -> Calla
 
     @one.def_vmap
     def many(size, batched, *leaves):
-        results = function(size, *leaves)
+        results = _block(function, size, tuple(batched))(*leaves)
         return results, jax.tree.map(lambda _: True, results)
 
     return one
+
+
+def _block(function: Callable[..., Any], cells: int, own: tuple[bool, ...]) -> Callable[..., Any]:
+    """A function of a block's leaves, of which some have their `own` value in every cell; a batch of blocks is one block."""
+    block = jax.custom_batching.custom_vmap(functools.partial(function, cells))
+
+    @block.def_vmap
+    def blocks(size, batched, *leaves):
+        def joined(leaf: Array, has_own: bool, is_batched: bool) -> Array:
+            if is_batched:
+                return leaf.reshape(size * cells, *leaf.shape[2:]) if has_own else jnp.repeat(leaf, cells, axis=0)
+            return jnp.tile(leaf, (size,) + (1,) * (leaf.ndim - 1)) if has_own else leaf
+
+        either = tuple(a or b for a, b in zip(own, batched, strict=True))
+        results = _block(function, size * cells, either)(*map(joined, leaves, own, batched))
+        apart = jax.tree.map(lambda result: result.reshape(size, cells, *result.shape[1:]), results)
+        return apart, jax.tree.map(lambda _: True, apart)
+
+    return block
 
 
 def _only(results: Any) -> Any:

@@ -1,5 +1,6 @@
 """Open surfaces: the paraboloid and the graph of any smooth function."""
 
+import abc
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
@@ -34,9 +35,9 @@ class AbstractOpen(AbstractSurface):
         position = (x, y, self.ground(x, y))
         return position, *tangents(self.normal(position))
 
+    @abc.abstractmethod
     def ground(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
         """Height z [m] of the surface at (x, y) [m]."""
-        raise NotImplementedError
 
 
 class Paraboloid(AbstractOpen, AbstractLevel):

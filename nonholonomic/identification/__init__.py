@@ -1,15 +1,26 @@
 """Finding the parameters of a model from measurements, and how well the measurements determine them.
 
 `identify` fits the `Free` parameters from several starts; the `Identification` has standard errors, profile
-likelihoods, and the combinations that the data do not determine.
+likelihoods, the combinations that the data do not determine, and a `Verdict`. `Measurements` are what is fitted; recordings of
+both models are checked, read from files and turned into them here.
 """
 
-from .identify import free_numbers as free_numbers
+from .data import free_numbers as free_numbers
+from .data import joined as joined
+from .data import of_data as of_data
 from .identify import identify as identify
-from .identify import joined as joined
 from .likelihood import Measurements as Measurements
+from .posterior import LogDensity as LogDensity
+from .reading import read_columns as read_columns
+from .recording import Quantities as Quantities
 from .recording import check_recording as check_recording
+from .recording import predicted as predicted
 from .recording import sample_labels as sample_labels
 from .recording import samples as samples
+from .recording import seen_samples as seen_samples
 from .result import Identification as Identification
+from .sampling import Draws as Draws
+from .sampling import sample as sample
 from .unknown import Free as Free
+from .verdict import FitWarning as FitWarning
+from .verdict import Verdict as Verdict

@@ -1,21 +1,29 @@
 """Parameters from measurements: maximum likelihood, with errors and with what the measurements do not determine."""
 
-import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..parameters import full_name
 from ..validation import require
-from .levenberg_marquardt import Problem, linearise, minimise
-from .likelihood import Measurements
+from .levenberg_marquardt import Ends, minimise
+from .likelihood import Measurements, estimated_errors, muted
+from .problem import Linearised, Problem, linearise
 from .result import Identification, summarise
-from .unknown import Free, as_free, draw_starts
+from .unknown import as_free, draw_starts
+from .verdict import FitWarning
+
+#: Errors that are estimated are found together with the parameters, in turns, until none changes by more than this fraction.
+ROUNDS, SETTLED = 10, 0.01
+
+#: The parts of a recording that are fitted before the whole.
+PARTS = (0.1, 0.25, 0.5)
+
+#: By how much differences move the coordinates: 1 % of a positive parameter. It smooths what is less wide.
+DIFFERENCE = 0.01
 
 
 def identify(
@@ -27,6 +35,7 @@ def identify(
     spread: float = 2.0,
     seed: int = 0,
     max_steps: int = 60,
+    slopes: str = "exact",
     labels: tuple[str, ...] | None = None,
     progress: bool = True,
 ) -> Identification:
@@ -38,18 +47,32 @@ def identify(
     **Arguments:**
 
     - `model`: parameters, name -> (rows,), to predictions (rows, n); `jax.vmap` turns a function of one set into
-      one. It is differentiated in forward mode.
+      one. It is differentiated in forward mode, or not at all (see `slopes`).
     - `measurements`: `Measurements` of shape (n,).
     - `free`: name -> a `Free`, or only the value from which to start.
     - `starts`: number of points from which to fit: the one given, and others drawn around it.
     - `spread`: how far they are drawn, as a factor either way, greater than 1; `seed`: of the draw.
     - `max_steps`: a fit that needs more has not converged.
+    - `slopes`: "exact", by automatic differentiation; or "differences", central ones of 1 % in every parameter, for a
+      model that has no derivative, or a rough one: twice as many runs as parameters, and one more.
     - `labels`: (n,), names of the measurements in the result.
     - `progress`: whether to show it, on a terminal or in a notebook.
 
-    **Returns:** an `Identification`.
+    **Returns:** an `Identification`, with its `verdict`; of which it warns (`FitWarning`) if it is not good.
 
     **Raises:** `ValueError` for arguments out of range.
+
+    **Example:** the half-life of a decay.
+
+    >>> import numpy as np
+    >>> from nonholonomic.identification import Measurements, identify
+    >>> times = np.array([1.0, 2.0, 3.0, 4.0])
+    >>> counts = Measurements([505.0, 248.0, 127.0, 61.0], [22.0, 16.0, 11.0, 8.0])
+    >>> def model(p):
+    ...     return p["start"][:, None] * 0.5 ** (times / p["half_life"][:, None])
+    >>> fit = identify(model, counts, {"start": 800.0, "half_life": 1.5}, progress=False)
+    >>> print(f"{fit.estimates['half_life']:.2f} +- {fit.standard_errors['half_life']:.2f}, good: {fit.verdict.good}")
+    0.99 +- 0.03, good: True
     """
     unknowns = as_free(free)
     if not isinstance(measurements, Measurements) or measurements.value.ndim != 1:
@@ -62,55 +85,59 @@ def identify(
     labels = tuple(f"#{i + 1}" for i in range(count)) if labels is None else tuple(labels)
     if len(labels) != count:
         raise ValueError(f"labels must be {count}, one for each measurement, not {len(labels)}")
-    problem = Problem(model, tuple(unknowns.items()))
+    problem = Problem(model, tuple(unknowns.items()), step_of(slopes))
     begins = draw_starts(unknowns, starts, spread, seed)
-    shape = eqx.filter_eval_shape(problem.predict, jnp.asarray(begins)).shape
-    if shape != (starts, count):
-        raise ValueError(f"model must predict {(starts, count)} for {starts} sets, not {shape}")
-    ends = minimise(problem, jnp.asarray(begins), measurements, max_steps=max_steps, progress=progress)
-    there = linearise(problem, ends.coordinates, measurements)
-    if not math.isfinite(float(jnp.min(there.deviance))):
+    ends, there = _fitted(problem, begins, measurements, max_steps, progress)
+    for _ in range(ROUNDS if np.any(np.asarray(measurements.estimated)) else 0):
+        best = int(np.argmin(there.deviance))
+        errors = estimated_errors(measurements, there.prediction[best], len(unknowns))
+        change = np.max(np.abs(np.log(errors / np.asarray(measurements.error))))
+        measurements = measurements.with_errors(errors)
+        if change > SETTLED:
+            ends = minimise(problem, ends.coordinates, measurements, max_steps=max_steps, progress=progress)
+        there = linearise(problem, ends.coordinates, measurements)
+        if change <= SETTLED:
+            break
+    if not np.any(np.isfinite(there.prediction)):
         raise ValueError("model: no start led to finite predictions")
-    return summarise(
-        problem, measurements, labels, begins, np.asarray(ends.coordinates), np.asarray(ends.converged), there
-    )
+    found = summarise(problem, measurements, labels, begins, ends.coordinates, ends.converged, there)
+    if not found.verdict.good:
+        warnings.warn("; ".join(found.verdict.concerns), FitWarning, stacklevel=2)
+    return found
 
 
-def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...]]:
-    """The measurements of several data sets, each with `measurements` and `labels`, one after the other, and their labels."""
-    measurements = [one.measurements for one in data]
-    labels = tuple(
-        f"{i + 1}: {label}" if len(data) > 1 else label for i, one in enumerate(data) for label in one.labels
-    )
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *measurements), labels
+def _fitted(
+    problem: Problem, begins: Any, measurements: Measurements, max_steps: int, progress: bool
+) -> tuple[Ends, Linearised]:
+    """Where the fits end. Those of recordings also go by way of longer and longer parts of them; the better end counts.
 
-
-def free_numbers(
-    free: Any, roots: dict[str, Any], known: list[str], replace: Callable[[dict[str, Any], dict[str, Any]], Any]
-) -> dict[str, Free]:
-    """The unknowns of a scene: their full names, and a lower bound of 0 for parameters that cannot be negative.
-
-    **Arguments:**
-
-    - `free`: name, or its unambiguous end, -> a `Free` or where to start.
-    - `roots`: name -> tree of modules, `known`: the full names of their parameters.
-    - `replace`: (roots, name -> number) -> roots; it raises `ValueError` for values that the modules refuse.
-
-    **Returns:** full name -> `Free`.
-
-    **Raises:** `ValueError` for an unknown name, or starts that the modules refuse.
+    A run is followed from its start on: late samples, whole turns off, would lead to a minimum of their own.
     """
-    given = {}
-    for short, one in as_free(free).items():
-        name = full_name("free", short, known)
-        if name in given:
-            raise ValueError(f"free: {name!r} is named twice")
-        given[name] = one
-    replace(roots, {name: one.start for name, one in given.items()})
-    lower = {}
-    for name, one in given.items():
-        try:
-            replace(roots, {name: -(abs(one.start) or 1.0)})
-        except ValueError:
-            lower[name] = 0.0
-    return as_free(given, lower)
+    ends = minimise(problem, begins, measurements, max_steps=max_steps, progress=progress)
+    there = linearise(problem, ends.coordinates, measurements)
+    longest = float(np.max(np.asarray(measurements.time)))
+    if not longest > 0.0:
+        return ends, there
+    at = begins
+    for part in PARTS:
+        some = muted(measurements, part * longest)
+        at = minimise(problem, at, some, max_steps=max_steps, progress=progress).coordinates
+    others = minimise(problem, at, measurements, max_steps=max_steps, progress=progress)
+    by_parts = linearise(problem, others.coordinates, measurements)
+    better = by_parts.deviance < there.deviance
+
+    def chosen(new: Any, old: Any) -> Any:
+        return np.where(better.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+
+    return jax.tree.map(chosen, others, ends), jax.tree.map(chosen, by_parts, there)
+
+
+def step_of(slopes: str) -> float | None:
+    """By how much coordinates are moved for slopes found in a way, `None` for automatic differentiation.
+
+    **Raises:** `ValueError` for an unknown way.
+    """
+    ways = {"exact": None, "differences": DIFFERENCE}
+    if slopes not in ways:
+        raise ValueError(f"slopes = {slopes!r} must be one of {', '.join(map(repr, ways))}")
+    return ways[slopes]

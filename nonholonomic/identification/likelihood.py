@@ -1,63 +1,171 @@
 """What measurements say about predictions: residuals whose squares add up to -2 log likelihood."""
 
+import math
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import log_ndtr
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..validation import require
 
 #: Residual of a measurement for which the model has no prediction: a penalty without a slope.
 MISSING = 1e4
 
+#: By how much an error grows where a measurement is to count for nothing, yet.
+MUTED = 1e6
+
 
 class Measurements(eqx.Module):
-    """Measured numbers with independent Gaussian errors.
+    """Measured numbers with independent errors.
 
     **Arguments:**
 
     - `value`: (n,), what was measured; where `censored`, what the quantity was only seen to exceed, with its own
-      error (a clock stopped by hand is uncertain too).
+      error (a clock stopped by hand is uncertain too). -inf where it was only seen to stay below `upper`.
     - `error`: (n,), standard deviations, positive; a scalar serves for all.
     - `censored`: (n,), which are lower limits; none by default.
+    - `upper`: (n,), what the quantity was seen not to exceed: infinite for lower limits, `value` itself for what was
+      measured, which is the default.
+    - `period`: (n,), by which a quantity may be moved without a change, such as 2 pi for an azimuth; infinite by default.
+    - `student`: (n,), degrees of freedom of Student's t distribution of the errors, whose scale `error` is then; infinite
+      by default, for Gaussian errors. Limits have Gaussian errors in any case.
+    - `series`: (n,), numbers of the series, each in the order in which it was measured; 0 by default.
+    - `time`: (n,) [s], of a sample since the start of its recording; 0 by default. Fits follow a recording from its start on.
+    - `estimated`: (n,), where `error` is only where to start, to be found from the scatter of the series.
 
     **Raises:** `ValueError` for numbers that are not finite or shapes that do not fit.
     """
 
     value: Float[Array, "... n"]
     error: Float[Array, "... n"]
-    censored: Bool[Array, "... n"]
+    upper: Float[Array, "... n"]
+    period: Float[Array, "... n"]
+    student: Float[Array, "... n"]
+    series: Int[Array, "... n"]
+    time: Float[Array, "... n"]
+    estimated: Bool[Array, "... n"]
 
-    def __init__(self, value: Any, error: Any, censored: Any = False):
-        require(value, "value")
+    def __init__(
+        self,
+        value: Any,
+        error: Any,
+        censored: Any = False,
+        *,
+        upper: Any = None,
+        period: Any = math.inf,
+        student: Any = math.inf,
+        series: Any = 0,
+        time: Any = 0.0,
+        estimated: Any = False,
+    ):
         require(error, "error", above=0.0)
         if np.ndim(value) == 0 or np.size(value) == 0:
             raise ValueError(f"value must be a non-empty list, not of shape {np.shape(value)}")
         shape = np.shape(value)
-        for name, given in (("error", error), ("censored", censored)):
-            if np.shape(given) not in ((), shape):
-                raise ValueError(f"{name} must be one number or of the shape {shape} of value, not {np.shape(given)}")
-        self.value = jnp.asarray(value, float)
-        self.error = jnp.broadcast_to(jnp.asarray(error, float), shape)
-        self.censored = jnp.broadcast_to(jnp.asarray(censored, bool), shape)
+        given = {"error": error, "censored": censored, "period": period, "student": student}
+        for name, one in (given | {"upper": 0.0 if upper is None else upper}).items():
+            if np.shape(one) not in ((), shape):
+                raise ValueError(f"{name} must be one number or of the shape {shape} of value, not {np.shape(one)}")
+        value = np.asarray(value, float)
+        upper = np.where(censored, np.inf, value) if upper is None else np.broadcast_to(upper, shape)
+        require(value[~(np.isneginf(value) & np.isfinite(upper))], "value")
+        if np.any(np.isnan(upper)) or np.any(upper < value):
+            raise ValueError(f"upper = {upper!r} must be at least value")
+        for name in ("period", "student"):
+            if not np.all(np.asarray(given[name]) > 0.0):
+                raise ValueError(f"{name} = {given[name]!r} must be positive, or infinite")
+
+        def each(one: Any, kind: Any) -> Any:
+            return jnp.broadcast_to(jnp.asarray(one, kind), shape)
+
+        self.value, self.upper, self.error = each(value, float), each(upper, float), each(error, float)
+        self.period, self.student = each(period, float), each(student, float)
+        self.series, self.time = each(series, int), each(time, float)
+        self.estimated = each(estimated, bool)
+
+    @property
+    def censored(self) -> Bool[Array, "... n"]:
+        """Which are limits, or pairs of them."""
+        return self.upper > self.value
 
     def residuals(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
         """Residuals whose squares are -2 log likelihood, up to a constant.
 
-        For a measurement it is (prediction - value) / error; for a lower limit the one-sided
-        r = -sqrt(-2 log Phi(z)), z = (prediction - value) / error, Phi being the normal distribution: close to z where the
-        prediction is far below the limit, to 0 where it is above. A prediction that is not finite counts as `MISSING`,
-        except for an infinite one of a lower limit, which exceeds it.
+        For a measurement it is z = (prediction - value) / error, or with Student's t of nu degrees of freedom
+        r = sign(z) sqrt((nu + 1) log(1 + z^2 / nu)). For a lower limit it is the one-sided r = -sqrt(-2 log Phi(z)), Phi being
+        the normal distribution: close to z where the prediction is far below the limit, to 0 where it is above; for an upper
+        limit the mirror image. Between two limits it is that of `between`. A prediction that is not finite counts as
+        `MISSING`, except for an infinite one of a lower limit, which exceeds it.
 
         **Arguments:** `prediction`: (..., n). **Returns:** (..., n).
         """
         known = jnp.isfinite(prediction)
-        z = (jnp.where(known, prediction, self.value) - self.value) / self.error
-        beyond = self.censored & (prediction == jnp.inf)
-        return jnp.where(known, jnp.where(self.censored, one_sided(z), z), jnp.where(beyond, 0.0, MISSING))
+        at = jnp.where(known, prediction, 0.0)
+        low, high = jnp.isfinite(self.value), jnp.isfinite(self.upper)
+        above = (at - jnp.where(low, self.value, 0.0)) / self.error
+        below = (jnp.where(high, self.upper, 0.0) - at) / self.error
+        both = low & high & self.censored
+        middle = jnp.where(both, 0.5 * (self.value + self.upper), 0.0)
+        half = jnp.where(both, 0.5 * (self.upper - self.value) / self.error, 1.0)
+        found = jnp.select(
+            [~self.censored, both, low],
+            [self._of_value(at), between((at - middle) / self.error, half), one_sided(above)],
+            -one_sided(below),
+        )
+        beyond = low & ~high & (prediction == jnp.inf)
+        return jnp.where(known, found, jnp.where(beyond, 0.0, MISSING))
+
+    def _of_value(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """The residual of what was measured itself."""
+        z = self.standardised(prediction)
+        heavy = jnp.isfinite(self.student)
+        freedom = jnp.where(heavy, self.student, 1.0)
+        share = z**2 / freedom
+        # log(1 + q) / q without 0 / 0; it is divided before the root, whose slope at 0 is infinite.
+        small = share < 1e-8
+        flat = jnp.where(small, 1.0 - 0.5 * share, jnp.log1p(share) / jnp.where(small, 1.0, share))
+        return jnp.where(heavy, z * jnp.sqrt((freedom + 1.0) / freedom * flat), z)
+
+    def standardised(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """(prediction - value) / error, moved by whole periods to the least; 0 for limits."""
+        wraps = jnp.isfinite(self.period)
+        period = jnp.where(wraps, self.period, 1.0)
+        off = jnp.where(self.censored, 0.0, prediction - self.value)
+        off = jnp.where(wraps, off - period * jax.lax.stop_gradient(jnp.round(off / period)), off)
+        return off / self.error
+
+    def information(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """Roots of Fisher's information about the predictions: those of expected curvature, for standard errors.
+
+        1 / error for Gaussian errors, sqrt((nu + 1) / (nu + 3)) / error for Student's t; for limits the slope of the residual.
+        """
+        _, slope = jax.jvp(self.residuals, (prediction,), (jnp.ones_like(prediction),))
+        heavy = jnp.isfinite(self.student)
+        freedom = jnp.where(heavy, self.student, 1.0)
+        expected = jnp.where(heavy, jnp.sqrt((freedom + 1.0) / (freedom + 3.0)), 1.0) / self.error
+        return jnp.where(self.censored | ~jnp.isfinite(prediction), slope, expected)
+
+    def log_likelihood(self, prediction: Float[Array, "... n"]) -> Float[Array, "..."]:
+        """The log likelihood up to a constant that depends on neither predictions nor errors."""
+        measured = jnp.where(self.censored, 0.0, jnp.log(self.error))
+        return -jnp.sum(0.5 * self.residuals(prediction) ** 2 + measured, axis=-1)
+
+    def with_errors(self, error: Float[Array, "... n"]) -> "Measurements":
+        """The same with other errors."""
+        return eqx.tree_at(lambda one: one.error, self, jnp.broadcast_to(error, self.error.shape))
+
+
+def joined(parts: list[Measurements]) -> Measurements:
+    """The measurements of several sets, one after the other; their series are numbered on."""
+    first, whole = 0, []
+    for one in parts:
+        whole.append(eqx.tree_at(lambda part: part.series, one, one.series + first))
+        first += int(np.max(one.series)) + 1
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *whole)
 
 
 def one_sided(z: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -65,3 +173,51 @@ def one_sided(z: Float[Array, "..."]) -> Float[Array, "..."]:
     # Beyond that, the derivative of the square root would be infinity times zero.
     near = z < 9.0
     return jnp.where(near, -jnp.sqrt(-2.0 * log_ndtr(jnp.where(near, z, 0.0))), 0.0)
+
+
+def between(z: Float[Array, "..."], half: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The residual of two limits: sign(z) sqrt(2 log(P(0) / P(z))), P(z) = Phi(half - z) - Phi(-half - z).
+
+    **Arguments:** `z`: by how many errors the prediction is above the middle; `half`: half their distance in errors.
+    """
+
+    def log_probability(off: Float[Array, "..."]) -> Float[Array, "..."]:
+        upper, lower = log_ndtr(half - off), log_ndtr(-half - off)
+        return upper + jnp.log(-jnp.expm1(lower - upper))
+
+    # Near the middle it is z times the root of the curvature, 2 half phi(half) / P(0): the difference of logarithms is lost.
+    off = jnp.abs(z)
+    lost = 2.0 * (log_probability(jnp.zeros_like(off)) - log_probability(off))
+    near = lost < 1e-9
+    density = jnp.exp(-0.5 * half**2) / math.sqrt(2.0 * math.pi)
+    curvature = 2.0 * half * density / jnp.exp(log_probability(jnp.zeros_like(off)))
+    return jnp.where(near, z * jnp.sqrt(curvature), jnp.sign(z) * jnp.sqrt(jnp.where(near, 1.0, lost)))
+
+
+def estimated_errors(measurements: Measurements, prediction: Any, unknowns: int) -> Float[np.ndarray, " n"]:
+    """The errors, where they are to be estimated those of the scatter of their series.
+
+    With n values in the series and k unknowns shared by N values in all, it is the root of the sum of squares / (n - k n / N);
+    for Student's t the scale is found such that the mean weight of the squares is 1 (maximum likelihood).
+    """
+    errors = np.array(measurements.error)
+    series, open_ = np.asarray(measurements.series), np.asarray(measurements.estimated)
+    off = np.asarray(measurements.standardised(jnp.asarray(prediction))) * errors
+    for one in np.unique(series[open_]):
+        here = (series == one) & open_ & np.isfinite(off)
+        n = np.sum(here)
+        share = max(1.0 - unknowns / off.size, 1.0 / off.size)
+        freedom = np.asarray(measurements.student)[here]
+        scale = math.sqrt(np.sum(off[here] ** 2) / (n * share)) if n else 1.0
+        if n and np.all(np.isfinite(freedom)):
+            for _ in range(50):
+                weight = (freedom + 1.0) / (freedom + (off[here] / scale) ** 2)
+                scale = math.sqrt(np.sum(weight * off[here] ** 2) / (n * share))
+        errors[(series == one) & open_] = max(scale, 1e-300)
+    return errors
+
+
+def muted(measurements: Measurements, horizon: float) -> Measurements:
+    """The same with what was measured after a time next to meaningless."""
+    late = measurements.time > horizon
+    return measurements.with_errors(jnp.where(late, measurements.error * MUTED, measurements.error))

@@ -1,39 +1,184 @@
-"""Recorded runs: samples of a quantity at some times, as measurements."""
+"""Recorded runs: samples of some quantities at the readings of a clock, as measurements."""
 
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
+from ..parameters import numbers
 from ..validation import require
 from .likelihood import Measurements
 
+#: Model times of samples before the launch: so close to it, and to one another [s], that nothing moves.
+INSTANT = 1e-9
 
-def check_recording(times: Any, value: Any, quantity: str, quantities: dict[str, tuple[str, ...]]) -> None:
-    """Raise `ValueError` unless a recording has a known quantity, increasing times and as many samples.
+#: Between times that are added so that recordings are of one length [s].
+AT_ONCE = 1e-6
+
+#: Parameters by name.
+Values = dict[str, Float[Array, "..."]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Quantities:
+    """What can be recorded of a run.
+
+    - `columns`: name of a quantity -> names of its columns.
+    - `units`: name of a column -> its SI unit.
+    - `angles`: columns that come back to where they were after a whole turn.
+    """
+
+    columns: Mapping[str, tuple[str, ...]]
+    units: Mapping[str, str]
+    angles: frozenset[str]
+
+    def of(self, quantity: Any) -> tuple[str, ...]:
+        """The columns of a quantity, of a column, or of a tuple of them.
+
+        **Raises:** `ValueError` for an unknown one, or one that is named twice.
+        """
+        words = quantity if isinstance(quantity, tuple) else (quantity,)
+        found: list[str] = []
+        for word in words:
+            known = self.columns | {name: (name,) for name in self.units}
+            if not isinstance(word, str) or word not in known:
+                raise ValueError(f"quantity = {word!r} must be one of {', '.join(map(repr, known))}")
+            found += known[word]
+        if not found or len(set(found)) < len(found):
+            raise ValueError(f"quantity = {quantity!r} must name at least one column, and each once")
+        return tuple(found)
+
+
+def check_recording(recording: Any, columns: tuple[str, ...]) -> None:
+    """Raise `ValueError` unless a recording has increasing times and as many samples, errors and degrees of freedom.
+
+    **Arguments:** `recording`: with `times`, `value`, `error`, `t0` and `student`; `columns`: of its samples.
+    """
+    require(recording.times, "times")
+    times = np.asarray(recording.times, dtype=float)
+    if times.ndim != 1 or not len(times) or np.any(np.diff(times) <= 0.0):
+        raise ValueError(f"times = {recording.times!r} must be an increasing list")
+    require(recording.t0, "t0", below=times[-1], why="the last time")
+    shape = (len(times), len(columns)) if len(columns) > 1 else (len(times),)
+    if np.shape(recording.value) != shape:
+        raise ValueError(f"value must be of shape {shape} for {', '.join(columns)}, not {np.shape(recording.value)}")
+    seen = ~np.isnan(np.asarray(recording.value))
+    if not np.any(seen):
+        raise ValueError("value must have at least one number; missing samples are NaN")
+    require(np.asarray(recording.value)[seen], "value")
+    if recording.error is not None:
+        if np.shape(recording.error) not in ((), shape[1:], shape):
+            raise ValueError(f"error must be one number, one for each column, or of shape {shape}")
+        require(np.broadcast_to(recording.error, shape)[seen], "error", above=0.0)
+    if recording.student is not None:
+        require(recording.student, "student", above=0.0)
+        if np.ndim(recording.student) != 0:
+            raise ValueError(f"student must be one number, not of shape {np.shape(recording.student)}")
+
+
+def seen_samples(recording: Any) -> np.ndarray:
+    """Where in the samples, a time after the other, there are numbers."""
+    return np.flatnonzero(~np.isnan(np.asarray(recording.value).reshape(-1)))
+
+
+def samples(recording: Any, columns: tuple[str, ...], angles: frozenset[str]) -> Measurements:
+    """The samples of a recording as `Measurements`, a series for each column; missing ones are left out."""
+    value = np.asarray(recording.value).reshape(len(recording.times), len(columns))
+    keep = seen_samples(recording)
+    if recording.error is None:
+        error = np.broadcast_to(noise(value), value.shape)
+    else:
+        given = np.asarray(recording.error)
+        error = np.broadcast_to(
+            given.reshape(value.shape) if given.ndim == np.ndim(recording.value) else given, value.shape
+        )
+    period = [2.0 * math.pi if name in angles else math.inf for name in columns]
+
+    def each(one: Any) -> np.ndarray:
+        return np.broadcast_to(one, value.shape).reshape(-1)[keep]
+
+    return Measurements(
+        each(value),
+        each(error),
+        period=each(period),
+        student=math.inf if recording.student is None else float(recording.student),
+        series=each(np.arange(len(columns))),
+        time=each((np.asarray(recording.times) - float(recording.times[0]))[:, None]),
+        estimated=recording.error is None,
+    )
+
+
+def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " columns"]:
+    """A first guess of the errors: the scatter of the second differences, or of the values where there are too few of them."""
+
+    def of(column: np.ndarray) -> float:
+        there = column[np.isfinite(column)]
+        second = np.diff(there, 2)
+        guess = np.median(np.abs(second)) / 0.6745 / math.sqrt(6.0) if len(second) > 2 else 0.0
+        return guess or 0.1 * float(np.ptp(there)) or 1.0
+
+    return np.array([of(column) for column in value.T])
+
+
+def sample_labels(recording: Any, columns: tuple[str, ...]) -> tuple[str, ...]:
+    """A label for each sample, such as `theta(0.1 s)`; missing ones are left out."""
+    every = [f"{column}({time:.4g} s)" for time in np.asarray(recording.times) for column in columns]
+    return tuple(every[i] for i in seen_samples(recording))
+
+
+def model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Array, " times"]:
+    """The times of the samples since the launch [s]; those before it are moved to it."""
+    return jnp.maximum(times - t0, INSTANT * jnp.arange(times.shape[0]))
+
+
+def predicted(
+    recordings: list[tuple[Any, Values]],
+    rows: int,
+    run: Callable[[Values, Float[Array, " times"]], Any],
+    column: Callable[[Any, str], Float[Array, " times"]],
+) -> list[Float[Array, "rows samples"]]:
+    """What is recorded of several runs, in every row; all runs are lanes of one block.
 
     **Arguments:**
 
-    - `times`: (times,) [s], from 0 or later; `value`: (times,), or (times, columns) for a quantity of several.
-    - `quantity`: its name; `quantities`: name -> names of its columns, of all known ones.
+    - `recordings`: each with its parameters, name -> (rows,), the same names for all; their launches hold the same numbers.
+    - `run`: parameters, name -> number, those of the launch among them, and times since the launch [s] -> a trajectory.
+    - `column`: (trajectory, name of a column) -> its samples.
+
+    **Returns:** for each recording its samples, a time after the other, missing ones included; NaN after the end of a run.
     """
-    if quantity not in quantities:
-        raise ValueError(f"quantity = {quantity!r} must be one of {', '.join(map(repr, quantities))}")
-    require(times, "times", at_least=0.0)
-    moments = np.asarray(times, dtype=float)
-    if moments.ndim != 1 or np.any(np.diff(moments) <= 0.0) or not moments[-1] > 0.0:
-        raise ValueError(f"times = {times!r} must be an increasing list with a positive end")
-    columns = len(quantities[quantity])
-    shape = (len(times), *((columns,) if columns > 1 else ()))
-    if np.shape(value) != shape:
-        raise ValueError(f"value must be of shape {shape} for {quantity!r}, not {np.shape(value)}")
+    longest = max(len(one.times) for one, _ in recordings)
+    columns = tuple(dict.fromkeys(name for one, _ in recordings for name in one.columns))
+
+    def lanes(of_each: list[Array]) -> Array:
+        """The numbers of all runs, one row after the other; each is a scalar or has one number a row."""
+        return jnp.stack([jnp.broadcast_to(one, (rows,)) for one in of_each], axis=1).reshape(-1)
+
+    known = [numbers("launch", one.launch) for one, _ in recordings]
+    given = {name: lanes([one[name] for one in known]) for name, value in known[0].items() if value is not None}
+    given |= {"t0": lanes([one.t0 for one, _ in recordings])}
+    given |= {name: lanes([values[name] for _, values in recordings]) for name in recordings[0][1]}
+    # Shorter recordings go on for an instant, so that all have as many times.
+    clock = jnp.stack([_lengthened(one.times, longest) for one, _ in recordings])
+
+    def one(lane: Values, times: Float[Array, " times"]) -> Float[Array, "times columns"]:
+        rest = {name: value for name, value in lane.items() if name != "t0"}
+        found = run(rest, model_times(times, lane["t0"]))
+        return jnp.stack([column(found, name) for name in columns], axis=-1)
+
+    found = jax.vmap(one)(given, jnp.tile(clock, (rows, 1))).reshape(rows, len(recordings), longest, len(columns))
+    parts = []
+    for k, (recording, _) in enumerate(recordings):
+        places = np.array([columns.index(name) for name in recording.columns])
+        parts.append(found[:, k, : len(recording.times)][..., places].reshape(rows, -1))
+    return parts
 
 
-def samples(value: Any, error: Any) -> Measurements:
-    """The samples as `Measurements`, with one error for all or one for each."""
-    return Measurements(value.reshape(-1), jnp.broadcast_to(error, jnp.shape(value)).reshape(-1))
-
-
-def sample_labels(times: Any, columns: tuple[str, ...]) -> tuple[str, ...]:
-    """A label for each sample, such as `theta(0.1 s)`."""
-    return tuple(f"{column}({time:.4g} s)" for time in np.asarray(times) for column in columns)
+def _lengthened(times: Float[Array, " times"], count: int) -> Float[Array, " count"]:
+    """The times, and after the last one others that follow at once."""
+    return jnp.concatenate([times, times[-1] + AT_ONCE * jnp.arange(1, 1 + count - len(times))])

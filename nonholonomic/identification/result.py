@@ -9,8 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..parameters import text_as_html
-from .levenberg_marquardt import Linearised, Problem, linearise, minimise
+from .levenberg_marquardt import minimise
 from .likelihood import Measurements
+from .problem import Linearised, Problem, linearise
+from .verdict import CLOSE, RIVAL, SAME, Verdict, judge
 
 #: Singular values below this fraction of the largest are those of a direction that the data do not determine at all.
 NO_SLOPE = 1e-7
@@ -59,14 +61,30 @@ class Identifiability(NamedTuple):
 
 
 class ResidualRow(NamedTuple):
-    """One measurement: what was measured, its error, what the fit predicts, and its residual in units of the error."""
+    """One measurement: what was measured, its error, what the fit predicts, its residual in units of the error, and the upper
+    limit, which is the value itself for what was measured and infinite for a lower limit."""
 
     label: str
     value: float
     error: float
     prediction: float
     residual: float
-    censored: bool
+    upper: float
+
+    @property
+    def censored(self) -> bool:
+        """Whether it is a limit, or a pair of them."""
+        return self.upper > self.value
+
+    @property
+    def measured(self) -> str:
+        """What was measured, as text."""
+        if not self.censored:
+            return f" {self.value:.6g} +- {self.error:.2g}"
+        if np.isinf(self.upper):
+            return f">{self.value:.6g} +- {self.error:.2g}"
+        low = "" if np.isneginf(self.value) else f"{self.value:.6g} to "
+        return f"{low or '<'}{self.upper:.6g} +- {self.error:.2g}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,6 +99,7 @@ class Identification:
     - `identifiability`: an `Identifiability`, `residuals`: a `ResidualRow` for every measurement.
     - `status`: "converged" or why not; `starts`, `ends`: name -> (starts,), where each fit began and ended;
       `end_deviances`: (starts,); `statuses`: one of "converged", "not_converged", "failed" for each start.
+    - `verdict`: a `Verdict`, whether the fit can be believed.
     - `coordinates`, `coordinate_covariance`: the same in the coordinates in which the fit was done.
     """
 
@@ -96,6 +115,7 @@ class Identification:
     ends: dict[str, Float[np.ndarray, " starts"]]
     end_deviances: Float[np.ndarray, " starts"]
     statuses: tuple[str, ...]
+    verdict: Verdict
     coordinates: Float[np.ndarray, " unknowns"]
     coordinate_covariance: Float[np.ndarray, "unknowns unknowns"]
     problem: Problem = dataclasses.field(repr=False)
@@ -140,11 +160,28 @@ class Identification:
             raise ValueError(f"values = {values!r} must lie within the bounds ({free.lower}, {free.upper}) of {name!r}")
         starts = np.tile(self.coordinates, (len(values), 1))
         starts[:, k] = np.asarray(free.coordinate(values))
-        ends = minimise(self.problem, jnp.asarray(starts), self.measurements, held=k)
-        found = np.asarray(self.problem.values(ends.coordinates))
+        ends = minimise(self.problem, starts, self.measurements, held=k)
+        found = np.asarray(self.problem.values(jnp.asarray(ends.coordinates)))
         deviance = deviance_of(self.problem, ends.coordinates, self.measurements) - self.deviance
         others = {other: found[:, i] for i, (other, _) in enumerate(self.problem.free) if i != k}
-        return Profile(values, deviance, others, np.asarray(ends.converged))
+        return Profile(values, deviance, others, ends.converged)
+
+    @property
+    def correlation(self) -> Float[np.ndarray, "unknowns unknowns"]:
+        """Correlations of the estimates, in the coordinates of the fit; 0 with those of infinite error."""
+        errors = np.sqrt(np.diag(self.coordinate_covariance))
+        with np.errstate(invalid="ignore"):
+            shares = self.coordinate_covariance / np.outer(errors, errors)
+        return np.where(np.eye(len(errors), dtype=bool), 1.0, np.where(np.isfinite(shares), shares, 0.0))
+
+    def plot(self) -> Any:
+        """Data and model, residuals, the profile likelihood of every parameter, and the correlations (needs matplotlib).
+
+        **Returns:** a matplotlib figure.
+        """
+        from ..views import draw_fit
+
+        return draw_fit(self)
 
     def _place(self, name: str) -> int:
         if name not in self.estimates:
@@ -155,11 +192,12 @@ class Identification:
         return text_as_html(str(self))
 
     def __str__(self) -> str:
-        here = np.sum(self.end_deviances < self.deviance + 0.1)
         lines = [
             f"Identification of {len(self.estimates)} numbers from {len(self.residuals)} measurements: {self.status}",
-            f"  {self.statuses.count('converged')} of {len(self.statuses)} starts converged, {here} ended here",
+            f"  {self.statuses.count('converged')} of {len(self.statuses)} starts converged, {self.verdict.agree} ended here",
             f"  -2 log likelihood {self.deviance:.4g} at {self.degrees} degrees of freedom",
+            "whether it can be believed",
+            str(self.verdict),
             "estimates, standard errors and 95 % intervals",
         ]
         width = max(map(len, self.estimates))
@@ -173,9 +211,7 @@ class Identification:
         lines.append("measured, predicted, residual in units of the error")
         width = max(len(row.label) for row in self.residuals)
         for row in self.residuals[:MOST_ROWS]:
-            sign = ">" if row.censored else " "
-            measured = f"{sign}{row.value:.6g} +- {row.error:.2g}"
-            lines.append(f"  {row.label:{width}}  {measured:20}  {row.prediction:.6g}  {row.residual:+.2f}")
+            lines.append(f"  {row.label:{width}}  {row.measured:20}  {row.prediction:.6g}  {row.residual:+.2f}")
         if len(self.residuals) > MOST_ROWS:
             worst = max(self.residuals, key=lambda row: abs(row.residual))
             lines.append(f"  and {len(self.residuals) - MOST_ROWS} more; largest {worst.label} {worst.residual:+.2f}")
@@ -184,8 +220,8 @@ class Identification:
 
 def deviance_of(problem: Problem, coordinates: Any, measurements: Measurements) -> Float[np.ndarray, " rows"]:
     """-2 log likelihood of every row; infinite where it would be NaN."""
-    deviance = linearise(problem, jnp.asarray(coordinates), measurements).deviance
-    return np.asarray(jnp.where(jnp.isfinite(deviance), deviance, jnp.inf))
+    deviance = linearise(problem, coordinates, measurements).deviance
+    return np.where(np.isfinite(deviance), deviance, np.inf)
 
 
 def coordinate_covariance(jacobian: Float[np.ndarray, "residuals unknowns"]) -> Float[np.ndarray, "unknowns unknowns"]:
@@ -246,8 +282,8 @@ def summarise(
     at_ends: Linearised,
 ) -> Identification:
     """The result of fits from several starts: that of the best of them, with the others on record."""
-    deviances = np.asarray(at_ends.deviance)
-    deviances = np.where(np.isfinite(deviances) & np.all(np.isfinite(ends), axis=1), deviances, np.inf)
+    known = np.any(np.isfinite(at_ends.prediction), axis=1) & np.all(np.isfinite(ends), axis=1)
+    deviances = np.where(known & np.isfinite(at_ends.deviance), at_ends.deviance, np.inf)
     statuses = tuple(
         "failed" if np.isinf(deviance) else "converged" if there else "not_converged"
         for deviance, there in zip(deviances, converged, strict=True)
@@ -256,29 +292,61 @@ def summarise(
     here, names = ends[best], [name for name, _ in problem.free]
     values = np.asarray(problem.values(jnp.asarray(ends)))
     slopes = np.array([float(jax.grad(one.value)(at)) for at, (_, one) in zip(here, problem.free, strict=True)])
-    jacobian = np.asarray(at_ends.jacobian[best])
-    covariance = coordinate_covariance(np.asarray(at_ends.whole_jacobian[best]))
+    covariance = coordinate_covariance(at_ends.whole_information[best])
     with np.errstate(invalid="ignore"):
         by_value = np.where(covariance == 0.0, 0.0, covariance * np.outer(slopes, slopes))
     begins = np.asarray(problem.values(jnp.asarray(starts)))
-    numbers = (measurements.value, measurements.error, at_ends.prediction[best], at_ends.residual[best])
+    numbers = (
+        measurements.value,
+        measurements.error,
+        at_ends.prediction[best],
+        at_ends.residual[best],
+        measurements.upper,
+    )
     table = zip(labels, *(np.asarray(part).tolist() for part in numbers), strict=True)
-    flags = np.asarray(measurements.censored).tolist()
+    found = identifiability(problem, values[best], slopes, at_ends.information[best])
+    priors, limits = at_ends.prior.shape[-1], int(np.sum(np.asarray(measurements.censored)))
+    degrees = len(labels) + priors - len(names)
     return Identification(
         estimates=dict(zip(names, values[best].tolist(), strict=True)),
         standard_errors=dict(zip(names, np.sqrt(np.diag(by_value)).tolist(), strict=True)),
         covariance=by_value,
         deviance=float(deviances[best]),
-        degrees=len(labels) + at_ends.prior.shape[-1] - len(names),
-        identifiability=identifiability(problem, values[best], slopes, jacobian),
-        residuals=tuple(ResidualRow(*row, flag) for row, flag in zip(table, flags, strict=True)),
+        degrees=degrees,
+        identifiability=found,
+        residuals=tuple(ResidualRow(*row) for row in table),
         status=statuses[best],
         starts=dict(zip(names, begins.T, strict=True)),
         ends=dict(zip(names, values.T, strict=True)),
         end_deviances=deviances,
         statuses=statuses,
+        verdict=judge(
+            measurements,
+            at_ends.prediction[best],
+            at_ends.residual[best],
+            degrees - limits,
+            agreement(ends, deviances, covariance, best),
+            found.unseen,
+            statuses[best],
+        ),
         coordinates=here,
         coordinate_covariance=covariance,
         problem=problem,
         measurements=measurements,
     )
+
+
+def agreement(
+    ends: Float[np.ndarray, "starts unknowns"],
+    deviances: Float[np.ndarray, " starts"],
+    covariance: Float[np.ndarray, "unknowns unknowns"],
+    best: int,
+) -> tuple[int, int, int]:
+    """How many starts ended at the best minimum, how many elsewhere with nearly the same likelihood, and how many there are."""
+    errors = np.sqrt(np.diag(covariance))
+    with np.errstate(invalid="ignore"):
+        off = np.abs(ends - ends[best]) / errors
+    # A parameter of infinite error is the same wherever it is.
+    near = np.all(np.where(np.isfinite(errors), off, 0.0) < CLOSE, axis=1) | (deviances < deviances[best] + SAME)
+    agree = near & (deviances < deviances[best] + 1.0)
+    return int(np.sum(agree)), int(np.sum(~agree & (deviances < deviances[best] + RIVAL))), len(ends)

@@ -9,9 +9,9 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from ..xla_cpu import stored_halves
+from ..xla_cpu import stored_halves, written_in_place
 
 Lanes = Float[Array, " lanes"]
 States = Float[Array, "components lanes"]
@@ -84,6 +84,46 @@ def explicit_step(
         end = moved_state(state, length, tableau.b_sol, rates)
         last_rate = jax.lax.optimization_barrier(field(time + length, end))
     error = length * weighted_sum(tableau.b_error, rates)
+    return Step(end, last_rate, error, watch(time + length, end), first_negative)
+
+
+def looped_step(
+    tableau: diffrax.ButcherTableau,
+    field: Callable[[Lanes, States], States],
+    watch: Callable[[Lanes, States], Lanes],
+    time: Lanes,
+    state: States,
+    rate: States,
+    length: Lanes,
+) -> Step:
+    """`explicit_step` with the stages in a loop: it compiles a third as long and takes twice the time.
+
+    **Arguments** and **returns:** as for `explicit_step`.
+    """
+    stages = len(tableau.c)
+    rows, fractions = np.zeros((stages, 1 + stages)), np.asarray(tableau.c)
+    for stage, row in enumerate(tableau.a_lower):
+        rows[stage, : len(row)] = row
+    looks = np.isin(np.arange(stages), list(_places_to_look(tableau.c)))
+    weights, places, looked = jnp.asarray(rows), jnp.asarray(fractions), jnp.asarray(looks)
+
+    def do(stage: Int[Array, ""], carry: tuple[Array, States, Lanes]) -> tuple[Array, States, Lanes]:
+        rates, _, first_negative = carry
+        end = state + length * jnp.tensordot(weights[stage], rates, 1)
+        at = time + places[stage] * length
+        made, seen = jax.lax.optimization_barrier((field(at, end), watch(at, end)))
+        negative = looked[stage] & (seen < 0.0)
+        first_negative = jnp.minimum(first_negative, jnp.where(negative, places[stage], 2.0))
+        return written_in_place(rates, made, at=stage + 1), end, first_negative
+
+    none = jnp.zeros((1 + stages, *rate.shape), rate.dtype)
+    start = (written_in_place(none, rate, at=jnp.zeros((), int)), state, jnp.full_like(length, 2.0))
+    rates, end, first_negative = jax.lax.fori_loop(0, stages, do, start)
+    last_rate = rates[-1]
+    if not tableau.fsal:
+        end = state + length * jnp.tensordot(jnp.asarray(tableau.b_sol), rates, 1)
+        last_rate = jax.lax.optimization_barrier(field(time + length, end))
+    error = length * jnp.tensordot(jnp.asarray(tableau.b_error), rates, 1)
     return Step(end, last_rate, error, watch(time + length, end), first_negative)
 
 

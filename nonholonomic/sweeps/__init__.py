@@ -1,12 +1,14 @@
-"""Grids of named axes, cut into blocks that run on all cores, and the labelled tables and files they end in.
+"""Grids of named axes, cut into blocks that run wherever there is room, and the labelled tables and files they end in.
 
 `sweep` computes a grid and returns a `Table`; with a file it writes every block as it finishes, and an
-interrupted sweep goes on from there.
+interrupted sweep goes on from there. Any executor may compute the blocks; `local_processes` is one.
 """
 
 from .grid import Axis as Axis
 from .grid import Variable as Variable
 from .grid import axis as axis
-from .grid import sweep as sweep
-from .grid import versions as versions
+from .grid import cells_to_check as cells_to_check
+from .processes import local_processes as local_processes
+from .running import sweep as sweep
 from .table import Table as Table
+from .tasks import versions as versions

@@ -1,17 +1,22 @@
 """A labelled result over a grid, and its file."""
 
 import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Shaped
 
 from ..parameters import as_html, readable_unit
-from ._hdf5 import LONG_NAMES, UNREACHED, axes_of, read_grid, write_grid
+from ._blocks import unfinished
+from ._file import HELD, LONG_NAMES, Stored, StoredVariables, coded, replacing, write_file
 from .digits import concise_strings
+from .layout import UNREACHED, Layout, Values, axes_of
 
-Values = Shaped[np.ndarray, "..."]
+#: Cells under one checksum in the file of a table that is saved.
+BLOCK = 1 << 15
 
 
 class Table(eqx.Module):
@@ -21,7 +26,8 @@ class Table(eqx.Module):
 
     - `coords`: name -> values, one for each axis of the grid, in order, and then for the dimensions that some variables have
       besides, such as "time".
-    - `variables`: name -> array over the grid; `status` is an array of words.
+    - `variables`: name -> array over the grid; `status` is an array of words. Those of a table of more than 128 MB that
+      has a file stay there: each is read, and held against its checksums, whenever it is asked for.
     - `units`: name of a coordinate or variable -> its unit.
     - `attributes`: what was computed, with what versions: plain data.
     - `words`: variable that consists of words -> the words, in the order of the numbers that stand for them in a file.
@@ -44,7 +50,7 @@ class Table(eqx.Module):
     """
 
     coords: dict[str, Values]
-    variables: dict[str, Values]
+    variables: Mapping[str, Values]
     units: dict[str, str]
     attributes: dict[str, Any]
     words: dict[str, tuple[str, ...]] = eqx.field(default_factory=dict)
@@ -58,10 +64,10 @@ class Table(eqx.Module):
         raise AttributeError(f"the table has no variable {name!r}; it has {', '.join(variables)}")
 
     def __getitem__(self, name: str) -> Values:
-        known = self.variables | self.coords
-        if name not in known:
-            raise KeyError(f"the table has no {name!r}; it has {', '.join(known)}")
-        return known[name]
+        for known in (self.variables, self.coords):
+            if name in known:
+                return known[name]
+        raise KeyError(f"the table has no {name!r}; it has {', '.join([*self.variables, *self.coords])}")
 
     def _ipython_key_completions_(self) -> list[str]:
         return [*self.variables, *self.coords]
@@ -88,12 +94,26 @@ class Table(eqx.Module):
         """The names of a variable's dimensions: the axes of the grid, and its own."""
         return (*axes_of(self.coords, self.inner), *self.inner.get(variable, ()))
 
-    def to_xarray(self) -> Any:
+    def to_xarray(self, chunks: Any = None) -> Any:
         """The table as an `xarray.Dataset` (needs xarray), with named dimensions and units; words stay words.
+
+        **Arguments:** `chunks`: sizes of the pieces along each dimension, such as `{"theta": 100}`, or "auto", if its numbers
+        are to be read piece by piece when something is computed from them (needs dask, and h5netcdf for a table that
+        stays in its file, which is then read without its checksums).
 
         **Returns:** the dataset; `Table.save` and a sweep's file hold the same.
         """
         import xarray
+
+        if chunks is not None and isinstance(self.variables, StoredVariables):
+            stored = self.variables.stored
+            dataset = xarray.open_dataset(stored.path, engine="h5netcdf", chunks=chunks)
+            for name, words in self.words.items():
+                known = np.array([*words, UNREACHED])
+                dataset[name] = dataset[name].copy(
+                    data=dataset[name].data.map_blocks(known.__getitem__, dtype=known.dtype)
+                )
+            return dataset
 
         def described(name: str, dims: tuple[str, ...], values: Values) -> tuple[Any, ...]:
             long_name = {"long_name": self.long_names[name]} if name in self.long_names else {}
@@ -102,22 +122,54 @@ class Table(eqx.Module):
         variables = {name: described(name, self.dims(name), values) for name, values in self.variables.items()}
         coords = {name: described(name, (name,), values) for name, values in self.coords.items()}
         attributes = {name: value for name, value in self.attributes.items() if name != LONG_NAMES}
-        return xarray.Dataset(variables, coords, attributes)
+        dataset = xarray.Dataset(variables, coords, attributes)
+        return dataset if chunks is None else dataset.chunk(chunks)
 
     def save(self, path: Any) -> None:
         """Write the table to an HDF5 file that `xarray.open_dataset(path, engine="h5netcdf")` opens as it is.
 
         **Raises:** `OSError` that names the path if it cannot be written.
         """
-        write_grid(path, self.coords, self.variables, self.units, self.attributes, self.words, inner=self.inner)
+        if isinstance(self.variables, StoredVariables):
+            with replacing(Path(path)) as scratch:
+                shutil.copyfile(self.variables.stored.path, scratch)
+            return
+        words, stored = {}, {}
+        for name, values in self.variables.items():
+            stored[name] = np.asarray(values)
+            if stored[name].dtype.kind == "U":
+                stored[name], words[name] = coded(stored[name], self.words.get(name, ()))
+        kinds = {name: values.dtype for name, values in stored.items()}
+        layout = Layout(self.coords, kinds, self.units, self.attributes, words, self.inner, BLOCK)
+        flat = {name: values.reshape(-1, *layout.inner_shape(name)) for name, values in stored.items()}
+        ends = enumerate(map(layout.ends, range(layout.blocks)))
+        cut = ((block, {name: some[first:end] for name, some in flat.items()}) for block, (first, end) in ends)
+        write_file(Path(path), layout, cut)
 
     @classmethod
     def load(cls, path: Any) -> "Table":
-        """Read a table from a file that `save` or a sweep wrote; a cell that a sweep has not reached is `pending`.
+        """Read a table from a file that `save` or a sweep wrote, or that a sweep is still to write; a cell that it has not
+        reached is `pending`.
 
         **Raises:** `OSError` that names the path if it cannot be read or holds no table.
         """
-        return cls(*read_grid(path))
+        begun = unfinished(Path(path))
+        return cls.of(Stored(Path(path))) if begun is None else cls.laid_out(*begun)
+
+    @classmethod
+    def of(cls, stored: Stored) -> "Table":
+        """A table in its file; a small one is read at once."""
+        layout = stored.layout
+        if layout.bytes_of_cells(layout.cells) <= HELD:
+            return cls.laid_out(layout, {name: stored.whole(name) for name in layout.kinds})
+        variables = StoredVariables(stored)
+        return cls(layout.coords, variables, layout.units, layout.attributes, layout.words, layout.inner)
+
+    @classmethod
+    def laid_out(cls, layout: Layout, values: dict[str, Values]) -> "Table":
+        """A table of numbers with all cells along the first axis, codes for words."""
+        variables = {name: layout.shaped(name, some) for name, some in values.items()}
+        return cls(layout.coords, variables, layout.units, layout.attributes, layout.words, layout.inner)
 
     def digits(self, variable: str = "time") -> Values:
         """A variable with the digits that its error leaves: "5.01142(3)" is 5.01142 with an error of 0.00003.
@@ -168,6 +220,9 @@ class Table(eqx.Module):
     @property
     def _rows(self) -> list[tuple[str, str, str]]:
         """Each variable in a few words: its name with its dimensions, its range, and what it is."""
+        if isinstance(self.variables, StoredVariables):
+            place = f"in {self.variables.stored.path}"
+            return [(name, place, self.long_names.get(name, "")) for name in self.variables]
         # Cells that have not been computed show in the status only.
         computed = self.variables["status"] != UNREACHED if "status" in self.variables else ...
         rows = []
@@ -199,12 +254,3 @@ def _summary(values: Values) -> str:
         return "none finite"
     missing = values.size - finite.size
     return f"{finite.min():.6g} to {finite.max():.6g}" + (f", {missing} not finite" if missing else "")
-
-
-def same_request(left: str, right: str) -> str | None:
-    """The first difference between two requests (JSON), in words; `None` if they are the same."""
-    one, other = json.loads(left), json.loads(right)
-    for name in [*one, *(name for name in other if name not in one)]:
-        if one.get(name) != other.get(name):
-            return f"{name} is {one.get(name)!r} there and {other.get(name)!r} here"
-    return None

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ def slow_sweep(monkeypatch, stream, cells=6, block=3, **options):
         return {"value": columns["x"]}
 
     monkeypatch.setattr(sys, "stderr", stream)
-    monkeypatch.setattr("nonholonomic.sweeps.grid.workers", lambda: 1)
+    monkeypatch.setattr("nonholonomic.sweeps.running.workers", lambda: 1)
     x = axis("x", "x", "s", np.linspace(0.0, 1.0, cells))
     sweep(compute, [x], {"value": Variable("m", float)}, {"what": "a test"}, block=block, **options)
     return stream.lines
@@ -51,6 +52,15 @@ def test_a_table_of_one_block_says_so_too(monkeypatch):
     lines = slow_sweep(monkeypatch, Terminal(), cells=3)
     assert lines[0][1].startswith("compiling")
     assert any("0/3" in text for _, text in lines)
+
+
+def test_the_rate_is_that_of_all_workers(monkeypatch):
+    """Two at once: what the first two blocks took is not known apart from the preparations, and the rest is twice as fast."""
+    with ThreadPoolExecutor(2) as pool:
+        lines = slow_sweep(monkeypatch, Terminal(), cells=18, executor=pool)
+    half = next(text for _, text in lines if "12/18" in text)
+    assert 5.0 < float(half.split(", ")[1].split("cell/s")[0]) < 14.0
+    assert "18/18" in lines[-1][1]
 
 
 @pytest.mark.parametrize("way", ["pipe", "argument", "environment"])

@@ -25,7 +25,8 @@ from stroller import (
     Torus,
 )
 from stroller.__main__ import GROUNDS, main, parser, scenes
-from stroller.table import RideProblem, named_axes
+from stroller.ride import RideProblem
+from stroller.table import named_axes
 
 BODY = Stroller(1.7, 0.3, 0.4, 0.05)
 

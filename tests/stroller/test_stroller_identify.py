@@ -15,12 +15,16 @@ def scene(rolling=2.0, wheelbase=0.7):
     return stroller.Scene(body, friction=stroller.Damping(rolling))
 
 
-def test_damping_from_recorded_speeds():
-    speeds = stroller.simulate(scene(), LAUNCH, 0.5, times=[0.25, 0.5]).speed
-    data = stroller.Recording(LAUNCH, [0.25, 0.5], speeds, 0.01, quantity="speed")
-    found = stroller.identify(scene(), data, {"rolling": 1.0})
+def test_damping_from_recorded_speeds(tmp_path):
+    """From a file, whose clock was started at an unknown time; a speed of rolling resistance falls as exp(-c t / m)."""
+    clock, path = np.array([1.0, 1.25, 1.5, 2.0]), tmp_path / "ride.csv"
+    speeds = stroller.simulate(scene(), LAUNCH, 1.1, times=clock - 0.9).speed
+    path.write_text("t,v\n" + "\n".join(f"{t},{3.6 * v:.12g}" for t, v in zip(clock, speeds, strict=True)))
+    columns = {"time": ("t", "s"), "speed": ("v", "km/h")}
+    data = stroller.read_recording(path, columns, launch=LAUNCH, error={"speed": (0.036, "km/h")})
+    found = stroller.identify(scene(), data, {"rolling": 1.0, "t0": 0.8})
     assert found.status == "converged"
-    assert_close(found.estimates["scene.friction.rolling"], 2.0, rtol=1e-5)
+    assert_close(list(found.estimates.values()), [2.0, 0.9], rtol=1e-4)
 
 
 @pytest.mark.slow

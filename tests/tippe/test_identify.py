@@ -4,6 +4,7 @@ import dataclasses
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,9 +12,9 @@ from conftest import assert_close, rutstam_top
 
 import tippe
 from nonholonomic.identification import Free, Measurements
-from nonholonomic.identification.levenberg_marquardt import Problem, linearise, minimise
+from nonholonomic.identification.levenberg_marquardt import minimise
+from nonholonomic.identification.problem import Problem, linearise
 from nonholonomic.identification.result import coordinate_covariance
-from tippe.extended_times import extended_inversion_times
 from tippe.identify import SceneModel
 
 LAUNCH = tippe.Launch(theta=[0.2, 0.2, 0.3, 0.2], spin=[110.0, 140.0, 110.0, 60.0])
@@ -41,14 +42,23 @@ def test_friction_from_exact_times(found):
     assert "theta 0.3, spin 110" in str(result)
 
 
+def extended_times(scene, theta, spin, t1, angle):
+    """Times of four launches, as a batch."""
+    return batch_of_times(scene, *(jnp.asarray(one, float) for one in (theta, spin, t1, angle)))
+
+
+@eqx.filter_jit
+def batch_of_times(scene, theta, spin, t1, angle):
+    return jax.vmap(lambda a, w: tippe.extended_inversion_time(scene, tippe.Launch(a, w), t1, angle))(theta, spin)
+
+
 def test_beyond_the_horizon_times_go_on_without_a_jump(rutstam_scene):
     """The penalty begins at the horizon, and tells a run that was nearly there from one that was not."""
-    angle, cells = 0.95 * math.pi, 4
-    launch = tippe.Launch(jnp.array([0.2, 0.2, 0.2, 0.2]), jnp.array([140.0, 110.0, 80.0, 60.0]))
-    late = extended_inversion_times(rutstam_scene, launch, 6.0, angle, 1e-8, cells)
+    theta, spin, angle = np.full(4, 0.2), np.array([140.0, 110.0, 80.0, 60.0]), 0.95 * math.pi
+    late = extended_times(rutstam_scene, theta, spin, 6.0, angle)
     time = float(late[0])
     assert time < 6.0
-    before = extended_inversion_times(rutstam_scene, launch, time * (1.0 - 1e-6), angle, 1e-8, cells)
+    before = extended_times(rutstam_scene, theta, spin, time * (1.0 - 1e-6), angle)
     assert_close(before[0], time, rtol=1e-4)
     assert before[0] < before[3]
 
@@ -58,11 +68,11 @@ def test_beyond_the_horizon_times_follow_the_rate_of_growth(rutstam_scene):
 
     The first tenths of a second, in which theta dips, make an eighth of difference.
     """
-    launch, angle = tippe.Launch(jnp.full(4, 0.002), jnp.array([60.0, 80.0, 100.0, 150.0])), 0.3
-    times = extended_inversion_times(rutstam_scene, launch, 60.0, angle, 1e-8, 4)
+    theta, spin, angle = np.full(4, 0.002), np.array([60.0, 80.0, 100.0, 150.0]), 0.3
+    times = extended_times(rutstam_scene, theta, spin, 60.0, angle)
     assert np.all(times < 60.0)
     t1 = 0.8 * times.min()
-    beyond = extended_inversion_times(rutstam_scene, launch, t1, angle, 1e-8, 4)
+    beyond = extended_times(rutstam_scene, theta, spin, t1, angle)
     assert_close(beyond, t1 * (2.0 - t1 / times), rtol=0.15)
 
 
@@ -72,7 +82,7 @@ def test_slopes_of_the_times_are_those_of_central_differences(rutstam_scene, tab
     """Along three directions, which are run in groups of two; with many lanes, in one kernel; and beyond the horizon."""
     data = tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, np.inf], 0.05, t1=6.0)
     free = tuple((name, Free(at, 0.0)) for name, at in (("scene.friction.mu", 0.3), ("scene.body.offset", 0.006)))
-    problem = Problem(SceneModel(rutstam_scene, (data,), 1e-11), (*free, ("scene.gravity", Free(9.81, 0.0))))
+    problem = Problem(SceneModel(rutstam_scene, (data,), data.seen, 1e-11), (*free, ("scene.gravity", Free(9.81, 0.0))))
     at = jnp.log(jnp.array([[0.3, 0.006, 9.81]])) + jnp.zeros((tables, 1))
     slopes = linearise(problem, at, Measurements(np.full(4, 2.0), 1.0)).jacobian
     predict = eqx.filter_jit(problem.predict)
@@ -86,41 +96,15 @@ def test_slopes_of_the_times_are_those_of_central_differences(rutstam_scene, tab
     assert np.all(np.abs(slopes[0, :, :2]) > 1e-3)
 
 
-def test_friction_from_a_recorded_run(rutstam_scene):
-    """As a user does it: a run's theta, and the friction that made it, from another start."""
-    launch, times = tippe.Launch(0.4, 100.0), [0.1, 0.2, 0.3]
-    run = tippe.simulate(rutstam_scene, launch, 0.3, times=times)
-    other = dataclasses.replace(rutstam_scene, friction=tippe.Viscous(0.2))
-    found = tippe.identify(other, tippe.Recording(launch, times, run.theta, 1e-3), {"mu": 0.2})
-    assert found.status == "converged"
-    assert_close(found.estimates["scene.friction.mu"], 0.3, rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_recordings_are_predicted_as_simulated(rutstam_scene):
-    launch, times = tippe.Launch(0.4, 100.0), np.array([0.1, 0.2, 0.3])
-    run = tippe.simulate(rutstam_scene, launch, 0.3, times=times)
-    recorded = tippe.Recording(launch, times, run.theta, 0.01)
-    track = tippe.Recording(launch, times, run.position, 0.01, quantity="position")
-    model = SceneModel(rutstam_scene, (recorded, track), 1e-9)
-    found = model({"scene.friction.mu": jnp.array([0.3, 0.4]), "launch.theta": jnp.array([0.4, 0.5])})
-    assert_close(found[0], np.concatenate([run.theta, np.ravel(run.position)]), atol=1e-8)
-    assert np.all(np.abs(found[1, :3] - found[0, :3]) > 1e-3)
-    assert recorded.labels[0] == "theta(0.1 s)"
-    assert track.labels[2] == "z(0.1 s)"
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: tippe.InversionTimes(LAUNCH, [1.0, 2.0], 0.1, t1=5.0), "launch.theta must be one number"),
         (lambda: tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, 9.0], 0.1, t1=5.0), "time = 9.0 must be less than 5.0"),
         (lambda: tippe.InversionTimes(LAUNCH, 1.0, 0.1, t1=5.0), "time must be a non-empty list"),
+        (lambda: tippe.InversionTimes(LAUNCH, [(2.0, 1.0)] * 4, 0.1, t1=5.0), "two in order"),
         (lambda: tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, np.nan], 0.1, t1=5.0), "infinite where"),
         (lambda: tippe.InversionTimes(LAUNCH, np.full(4, np.inf), 0.1, t1=5.0, until=9.0), "until = 9.0"),
-        (lambda: tippe.Recording(tippe.Launch(0.1, 9.0), [0.0, 1.0], [1.0], 0.1), "value must be of shape"),
-        (lambda: tippe.Recording(tippe.Launch(0.1, 9.0), [1.0, 0.5], [1.0, 1.0], 0.1), "times"),
-        (lambda: tippe.Recording(tippe.Launch(0.1, 9.0), [1.0], [1.0], 0.1, quantity="phi"), "quantity = 'phi'"),
     ],
 )
 def test_bad_data_are_refused(make, message):
@@ -157,8 +141,8 @@ def test_scenes_with_phases_are_refused(rutstam_scene, phases, message):
     data = tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, 4.0], 0.1, t1=5.0)
     with pytest.raises(ValueError, match=message + " identify"):
         tippe.identify(scene, data, {"mu": 0.2})
-    with pytest.raises(ValueError, match=message + " extended_inversion_times"):
-        extended_inversion_times(scene, LAUNCH, 5.0, 3.0, 1e-8, 4)
+    with pytest.raises(ValueError, match=message + " extended_inversion_time"):
+        tippe.extended_inversion_time(scene, tippe.Launch(0.2, 110.0), 5.0)
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +154,7 @@ def experiment():
     launch = tippe.Launch(np.repeat([0.005, 0.015], 5), np.tile([70.0, 80.0, 100.0, 120.0, 150.0], 2))
     data = tippe.InversionTimes(launch, np.full(10, 5.0), error, t1=60.0, angle=0.5 * np.pi)
     free = (("scene.friction.mu", Free(0.3, 0.0)), ("scene.body.offset", Free(0.0035, 0.0)))
-    problem = Problem(SceneModel(scene, (data,), 1e-6), free)
+    problem = Problem(SceneModel(scene, (data,), data.seen, 1e-6), free)
     return problem, true, linearise(problem, jnp.asarray(true[None]), data.measurements).prediction, error
 
 

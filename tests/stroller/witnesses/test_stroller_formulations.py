@@ -21,7 +21,18 @@ GROUNDS = {
     "intrinsic inside": dict(surface=Spheroid(2.0, 1.1), side="inside"),
     "projected": dict(surface=Spheroid(2.0, 1.1), heading="projected", side="inside"),
 }
-CASES = [(ground, fork) for ground in ("plane", "intrinsic inside", "projected") for fork in ("relative", "absolute")]
+#: Every ground, and both forks on one; the others are slow.
+QUICK = [
+    ("plane", "absolute"),
+    ("intrinsic inside", "relative"),
+    ("intrinsic inside", "absolute"),
+    ("projected", "relative"),
+]
+CASES = [
+    pytest.param(ground, fork, marks=[] if (ground, fork) in QUICK else [pytest.mark.slow])
+    for ground in ("plane", "intrinsic inside", "projected")
+    for fork in ("relative", "absolute")
+]
 
 
 class Push(eqx.Module):
@@ -93,11 +104,17 @@ def test_accelerations_agree_with_rolling_resistance():
     np.testing.assert_allclose(disagreements(scene, Push(jnp.asarray(0.7)), states), 0.0, atol=1e-11)
 
 
+#: Where the accelerations agree, so must the trajectories: one of them is followed in the ordinary run.
 TRAJECTORIES = [
-    ("plane", "absolute", Damping(0.3, 0.2, 0.1, 0.15), Launch((0.2, -0.3), 0.4, 1.2, 0.3, 0.5)),
     ("intrinsic inside", "relative", Damping(0.3, 0.2, 0.1, 0.15), Launch((0.3, -0.9), 0.5, 1.2, 0.3, 0.2)),
-    ("intrinsic outside", "absolute", Frictionless(), Launch((0.3, 0.5), 0.1, 1.2, 0.3, 0.2)),
-    ("projected", "relative", Damping(0.3, 0.2, 0.1, 0.15), Launch((0.3, -1.0), 0.5, 0.6, 0.4, 0.0)),
+    *(
+        pytest.param(*case, marks=pytest.mark.slow)
+        for case in (
+            ("plane", "absolute", Damping(0.3, 0.2, 0.1, 0.15), Launch((0.2, -0.3), 0.4, 1.2, 0.3, 0.5)),
+            ("intrinsic outside", "absolute", Frictionless(), Launch((0.3, 0.5), 0.1, 1.2, 0.3, 0.2)),
+            ("projected", "relative", Damping(0.3, 0.2, 0.1, 0.15), Launch((0.3, -1.0), 0.5, 0.6, 0.4, 0.0)),
+        )
+    ),
 ]
 
 

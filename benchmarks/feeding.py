@@ -1,0 +1,125 @@
+"""What one parent can feed: a sweep whose cells cost nothing but time, to many workers and into a file.
+
+    python benchmarks/feeding.py [--cells 1e8] [--workers 64] [--each 2e-4] [--quick]
+
+The workers are threads that sleep for as long as the cells of a block would take, and then send their results pickled, as
+processes do; making the results is left out of the account. So the parent does all that it does in earnest: hands out,
+unpickles, writes and syncs each block, and makes the table's file of them. `each` is the time that a cell takes [s]; 2e-4 is
+that of a top on the plane at a tolerance of 1e-9. First nobody sleeps: that is the most that the parent can feed. Then they
+sleep, on fewer cells: what is lost against workers who never wait is the parent's overhead.
+"""
+
+import argparse
+import pickle
+import resource
+import tempfile
+import threading
+import time
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from nonholonomic.sweeps import Table, Variable, axis, running, sweep
+
+#: The variables of an inversion table.
+NAMES = ("time", "end_time", "end_theta")
+VARIABLES = {name: Variable("s", np.float64) for name in NAMES}
+VARIABLES |= {"status": Variable("1", np.int8, ("inverted", "not_inverted", "failed"))}
+VARIABLES |= {name: Variable("1", np.int64) for name in ("steps", "rejected")}
+
+
+def results(columns, count):
+    """Numbers that cost next to nothing."""
+    found = {name: columns["x"] for name in NAMES}
+    whole = np.zeros(len(columns["x"]), int)
+    return found | {"status": whole.astype(np.int8), "steps": whole, "rejected": whole}
+
+
+class Sleepers(Executor):
+    """Workers that sleep for `each` seconds a cell; their results arrive as bytes, and are read by the thread of a pool."""
+
+    def __init__(self, workers: int, each: float, cells: int):
+        self._pool, self._each, self._cells = ThreadPoolExecutor(workers), each, cells
+        self._sent: dict[bool, bytes] = {}
+        self._lock, self.slept, self.blocks = threading.Lock(), 0.0, 0
+
+    def submit(self, function, /, sent, needed, first, count, mark) -> Future:
+        return self._pool.submit(self._worked, function, sent, needed, first, count, mark)
+
+    def shutdown(self, wait=True, *, cancel_futures=False):
+        self._pool.shutdown(wait, cancel_futures=cancel_futures)
+
+    def _worked(self, function, sent, needed, first, count, mark):
+        with self._lock:
+            # The last may be shorter; all others have the same results here.
+            last = first + count > self._cells
+            if last not in self._sent:
+                self._sent[last] = pickle.dumps(function(sent, needed, first, count, mark))
+            self.blocks += 1
+        time.sleep(count * self._each)
+        return pickle.loads(self._sent[last])
+
+
+def run(cells: int, workers: int, each: float, folder: Path) -> tuple[float, float, int]:
+    """A sweep over `cells` cells, a multiple of 4096.
+
+    **Returns:** how long its blocks took [s], how long what came after the last of them [s], and how many there were.
+    """
+    x, y = axis("x", "x", "1", np.linspace(0.0, 1.0, 1 << 12)), axis("y", "y", "1", np.arange(cells >> 12))
+    sleepers, fed = Sleepers(workers, each, cells), []
+
+    def handed_out(*arguments, once=running.handed_out):
+        yield from once(*arguments)
+        fed.append(time.perf_counter())
+
+    running.handed_out, once = handed_out, running.handed_out
+    start = time.perf_counter()
+    try:
+        table = sweep(results, [y, x], VARIABLES, {"what": "nothing"}, path=folder / "table.h5", executor=sleepers)
+    finally:
+        running.handed_out = once
+        sleepers.shutdown()
+    end = time.perf_counter()
+    assert isinstance(table, Table)
+    assert table.shape == (len(y.values), len(x.values))
+    (folder / "table.h5").unlink()
+    return fed[0] - start, end - fed[0], sleepers.blocks
+
+
+def peak() -> float:
+    """The most memory that this process has held [GiB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def main() -> None:
+    command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command.add_argument("--cells", type=float, default=1e8, help="cells of the sweep whose workers do not sleep")
+    command.add_argument("--workers", type=int, default=64)
+    command.add_argument("--each", type=float, default=2e-4, help="time that a cell takes [s]")
+    command.add_argument("--quick", action="store_true", help="a hundredth of the cells")
+    options = command.parse_args()
+    cells = int(options.cells / (100 if options.quick else 1)) >> 12 << 12
+    with tempfile.TemporaryDirectory(dir=".") as folder:
+        busy, made, blocks = run(cells, options.workers, 0.0, Path(folder))
+        print(
+            f"{cells:.3g} cells in {blocks} blocks, workers that need no time: {busy:.1f} s, {cells / busy:.3g} cells a second"
+        )
+        print(f"after the last block: {made:.1f} s; at most {peak():.2f} GiB held")
+        feeds = cells / busy * options.each
+        print(f"so one parent feeds {feeds:.0f} workers that take {options.each:g} s a cell")
+        # As many blocks of the same size for each worker, whatever the number of workers.
+        size = -(-cells // blocks // 512) * 512
+        running.blocks_together, once = lambda layout, block: size // block, running.blocks_together
+        few = size * options.workers * 8 >> 12 << 12
+        ideal = few * options.each / options.workers
+        busy, made, blocks = run(few, options.workers, options.each, Path(folder))
+        running.blocks_together = once
+        print(
+            f"{few:.3g} cells in {blocks} blocks, {options.workers} workers that sleep: "
+            f"{busy:.1f} s for {ideal:.1f} s of work, {100 * (busy / ideal - 1):.1f} % more; after the last block: {made:.1f} s"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""Several sets of data fitted together, and the names of the parameters that they share or have of their own."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int
+
+from ..parameters import full_name
+from . import likelihood
+from .likelihood import Measurements
+from .unknown import Free, as_free
+
+#: What stands for every set of data that has the parameter.
+EACH = "data[*]."
+
+
+def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np.ndarray, " n"]]:
+    """The measurements of several sets of data, their labels, and which of all predictions were measured.
+
+    **Arguments:** `data`: each with `measurements`, `labels`, `seen`, and `size`, how many numbers are predicted for it.
+    """
+    labels = tuple(
+        f"{i + 1}: {label}" if len(data) > 1 else label for i, one in enumerate(data) for label in one.labels
+    )
+    before = np.cumsum([0, *(one.size for one in data)])
+    seen = np.concatenate([first + one.seen for first, one in zip(before, data, strict=False)])
+    return likelihood.joined([one.measurements for one in data]), labels, seen
+
+
+def of_data(parameters: dict[str, Any], k: int) -> dict[str, Any]:
+    """The parameters of one set of data: those that all share, and its own without the prefix `data[k].`."""
+    prefix = f"data[{k}]."
+    shared = {name: value for name, value in parameters.items() if not name.startswith("data[")}
+    own = {name.removeprefix(prefix): value for name, value in parameters.items() if name.startswith(prefix)}
+    return shared | own
+
+
+def free_numbers(
+    free: Any,
+    known: list[str],
+    own: list[list[str]],
+    check: Callable[[dict[str, float]], Any],
+) -> dict[str, Free]:
+    """The unknowns of a scene and its data: their full names, and a lower bound of 0 for parameters that cannot be negative.
+
+    **Arguments:**
+
+    - `free`: name, or its unambiguous end, -> a `Free` or where to start. `data[1].launch.azimuth` is a parameter of the
+      second set of data alone, and `data[*].launch.azimuth` stands for one of each.
+    - `known`: the full names of the shared parameters; `own`: those of each set of data, without the prefix.
+    - `check`: name -> number, without prefixes; it raises `ValueError` for values that are refused.
+
+    **Returns:** full name -> `Free`.
+
+    **Raises:** `ValueError` for an unknown name, or starts that are refused.
+    """
+    given: dict[str, Free] = {}
+    for short, one in as_free(free).items():
+        for name in _full_names(short, known, own):
+            if name in given:
+                raise ValueError(f"free: {name!r} is named twice")
+            given[name] = one
+    for name in given:
+        if name.startswith("data[") and name.split(".", 1)[1] in given:
+            raise ValueError(f"free: {name!r} is named twice, alone and for all data")
+    for k in range(len(own)):
+        check({name: one.start for name, one in of_data(given, k).items()})
+    lower = {}
+    for name, one in given.items():
+        try:
+            check({name.split(".", 1)[1] if name.startswith("data[") else name: -(abs(one.start) or 1.0)})
+        except ValueError:
+            lower[name] = 0.0
+    return as_free(given, lower)
+
+
+def _full_names(short: str, known: list[str], own: list[list[str]]) -> list[str]:
+    """The full names that a name stands for."""
+    if not str(short).startswith("data["):
+        return [full_name("free", short, known)]
+    if short.startswith(EACH):
+        every = list(dict.fromkeys(name for names in own for name in names))
+        name = full_name("free", short.removeprefix(EACH), every)
+        return [f"data[{k}].{name}" for k, names in enumerate(own) if name in names]
+    return [full_name("free", short, [f"data[{k}].{name}" for k, names in enumerate(own) for name in names])]

@@ -1,0 +1,134 @@
+"""The posterior of parameters, as a function of unconstrained coordinates for any sampler."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.stats import norm
+from jaxtyping import Array, Float
+
+from ..validation import require
+from .likelihood import Measurements
+from .problem import Problem
+from .unknown import as_free
+
+#: The log density of a parameter: (mean, standard deviation) of a Gaussian, or a function of the parameter.
+Prior = tuple[float, float] | Callable[[Float[Array, ""]], Float[Array, ""]]
+
+
+class LogDensity(eqx.Module):
+    """The log of a posterior density, up to a constant, as a function of coordinates (unknowns,) without bounds.
+
+    It can be differentiated, forwards and backwards, compiled, and batched by `jax.vmap`: then all cells of all chains run in
+    one block. Errors that were not given are unknowns too, each in its logarithm, with a flat prior. Where the model has no
+    prediction it is some -1e8, without a slope.
+
+    - `names`: of the unknowns, in the order of the coordinates; `start`: (unknowns,), where to start.
+    """
+
+    problem: Problem
+    measurements: Measurements
+    priors: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+    open_series: tuple[int, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls,
+        model: Callable[[dict[str, Float[Array, " rows"]]], Float[Array, "rows n"]],
+        measurements: Measurements,
+        free: Any,
+        priors: Any = None,
+    ) -> "LogDensity":
+        """The posterior of a model.
+
+        **Arguments:** `model`, `measurements`, `free`: as for `identify`; `priors`: as for `tippe.log_density`.
+        """
+        unknowns = as_free(free)
+        given = {name: one.prior for name, one in unknowns.items() if one.prior is not None} | dict(priors or {})
+        for name, prior in given.items():
+            if name not in unknowns:
+                raise ValueError(f"priors: {name!r} must be one of {', '.join(unknowns)}")
+            if not callable(prior):
+                if np.shape(prior) != (2,):
+                    raise ValueError(
+                        f"priors: {name!r} = {prior!r} must be a mean and a standard deviation, or a function"
+                    )
+                require(prior[1], f"standard deviation of the prior of {name}", above=0.0)
+        series, open_ = np.asarray(measurements.series), np.asarray(measurements.estimated)
+        kept = tuple((name, prior if callable(prior) else tuple(map(float, prior))) for name, prior in given.items())
+        return cls(
+            Problem(model, tuple(unknowns.items())), measurements, kept, tuple(np.unique(series[open_]).tolist())
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the unknowns; those of errors are numbered by their series."""
+        return (*(name for name, _ in self.problem.free), *(f"error[{k}]" for k in self.open_series))
+
+    @property
+    def start(self) -> Float[Array, " unknowns"]:
+        """The coordinates from which to start."""
+        values = [float(one.coordinate(one.start)) for _, one in self.problem.free]
+        return jnp.array([*values, *(0.0 for _ in self.open_series)])
+
+    def values(self, coordinates: Float[Array, "... unknowns"]) -> dict[str, Float[Array, "..."]]:
+        """The unknowns at some coordinates: name -> (...,); of the errors, the factor on their first guess."""
+        numbers = len(self.problem.free)
+        found = self.problem.values(coordinates[..., :numbers])
+        errors = jnp.exp(coordinates[..., numbers:])
+        return dict(zip(self.names, jnp.moveaxis(jnp.concatenate([found, errors], axis=-1), -1, 0), strict=True))
+
+    def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
+        """What the model predicts for every measurement, at several coordinates."""
+        return self.problem.predict(coordinates[:, : len(self.problem.free)])
+
+    def replicate(self, coordinates: Float[Array, "rows unknowns"], seed: int = 0) -> Float[np.ndarray, "rows n"]:
+        """New measurements as the posterior predicts them, an error drawn for each; those of limits are without limits."""
+        random, predicted = np.random.default_rng(seed), np.asarray(_predicted(self, jnp.asarray(coordinates)))
+        heavy = np.isfinite(freedom := np.asarray(self.measurements.student))
+        drawn = random.normal(size=predicted.shape)
+        drawn /= np.where(
+            heavy, np.sqrt(random.chisquare(np.where(heavy, freedom, 1.0), predicted.shape) / freedom), 1.0
+        )
+        errors = jax.vmap(lambda one: self._with_errors(one).error)(jnp.asarray(coordinates))
+        return predicted + np.asarray(errors) * drawn
+
+    def __call__(self, coordinates: Float[Array, " unknowns"]) -> Float[Array, ""]:
+        prediction = self.predict(coordinates[None])[0]
+        return self._with_errors(coordinates).log_likelihood(prediction) + self._log_prior(coordinates)
+
+    def value_and_gradient(
+        self, coordinates: Float[Array, "*batch unknowns"]
+    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch unknowns"]]:
+        """The log density and its gradient, at one point or at a list of them."""
+        return _value_and_gradient(self, jnp.asarray(coordinates, float))
+
+    def _with_errors(self, coordinates: Float[Array, " unknowns"]) -> Measurements:
+        errors = self.measurements.error
+        for coordinate, series in zip(coordinates[len(self.problem.free) :], self.open_series, strict=True):
+            own = self.measurements.estimated & (self.measurements.series == series)
+            errors = jnp.where(own, errors * jnp.exp(coordinate), errors)
+        return self.measurements.with_errors(errors)
+
+    def _log_prior(self, coordinates: Float[Array, " unknowns"]) -> Float[Array, ""]:
+        """The log density of the priors in the coordinates: that of a parameter, and how the coordinate stretches it."""
+        priors, total = dict(self.priors), jnp.zeros(())
+        for k, (name, free) in enumerate(self.problem.free):
+            if (prior := priors.get(name)) is not None:
+                value, slope = jax.value_and_grad(free.value)(coordinates[k])
+                total += (prior(value) if callable(prior) else norm.logpdf(value, *prior)) + jnp.log(jnp.abs(slope))
+        return total
+
+
+@eqx.filter_jit
+def _predicted(density: LogDensity, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
+    return density.predict(coordinates)
+
+
+@eqx.filter_jit
+def _value_and_gradient(density: LogDensity, coordinates: Float[Array, "*batch unknowns"]) -> tuple[Array, Array]:
+    function = jax.value_and_grad(density)
+    return function(coordinates) if coordinates.ndim == 1 else jax.vmap(function)(coordinates)

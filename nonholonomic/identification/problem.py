@@ -1,0 +1,170 @@
+"""A model with its free parameters, and its predictions with their slopes, for many sets of parameters at once."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .likelihood import Measurements
+from .unknown import Free
+
+Rows = Float[np.ndarray, "rows unknowns"]
+
+
+class Problem(eqx.Module):
+    """A model and its free parameters.
+
+    - `model`: parameters, name -> (rows,), to predictions (rows, n).
+    - `free`: name -> `Free`, as pairs.
+    - `step`: `None` for derivatives by automatic differentiation, forwards; otherwise the coordinates are moved by so much
+      either way, and the model need not be differentiable; nor traceable, if it has `on_host = True`.
+    """
+
+    model: Callable[[dict[str, Float[Array, " rows"]]], Float[Array, "rows n"]]
+    free: tuple[tuple[str, Free], ...] = eqx.field(static=True)
+    step: float | None = eqx.field(static=True, default=None)
+
+    def values(self, coordinates: Float[Array, "... unknowns"]) -> Float[Array, "... unknowns"]:
+        """The parameters at given coordinates."""
+        return jnp.stack([one.value(coordinates[..., k]) for k, (_, one) in enumerate(self.free)], axis=-1)
+
+    def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
+        """What the model predicts in every row."""
+        values = self.values(coordinates)
+        return self.model({name: values[:, k] for k, (name, _) in enumerate(self.free)})
+
+    def prior(self, coordinates: Float[Array, " unknowns"]) -> Float[Array, " priors"]:
+        """Residuals of the priors, in one row."""
+        priors = [(k, *one.prior) for k, (_, one) in enumerate(self.free) if one.prior is not None]
+        values = self.values(coordinates)
+        return jnp.array([(values[k] - mean) / deviation for k, mean, deviation in priors])
+
+
+class Linearised(NamedTuple):
+    """A model and its likelihood at a point of every row.
+
+    - `prediction`: (rows, n); `residual`: (rows, n), those of the data;
+    - `jacobian`: (rows, n, unknowns), their slopes along the coordinates;
+    - `information`: the same with the expected curvature of the likelihood (`Measurements.information`), for errors;
+    - `prior`, `prior_jacobian`: (rows, priors), (rows, priors, unknowns), those of the priors.
+    """
+
+    prediction: Float[np.ndarray, "rows n"]
+    residual: Float[np.ndarray, "rows n"]
+    jacobian: Float[np.ndarray, "rows n unknowns"]
+    information: Float[np.ndarray, "rows n unknowns"]
+    prior: Float[np.ndarray, "rows priors"]
+    prior_jacobian: Float[np.ndarray, "rows priors unknowns"]
+
+    @property
+    def deviance(self) -> Float[np.ndarray, " rows"]:
+        """-2 log posterior of every row, up to a constant."""
+        return np.sum(self.residual**2, axis=-1) + np.sum(self.prior**2, axis=-1)
+
+    @property
+    def whole_residual(self) -> Float[np.ndarray, "rows residuals"]:
+        """The residuals of data and priors."""
+        return np.concatenate([self.residual, self.prior], axis=1)
+
+    @property
+    def whole_jacobian(self) -> Float[np.ndarray, "rows residuals unknowns"]:
+        """The slopes of data and priors."""
+        return np.concatenate([self.jacobian, self.prior_jacobian], axis=1)
+
+    @property
+    def whole_information(self) -> Float[np.ndarray, "rows residuals unknowns"]:
+        """The slopes of data and priors that stand for the expected curvature."""
+        return np.concatenate([self.information, self.prior_jacobian], axis=1)
+
+
+@eqx.filter_jit
+def _differentiated(
+    problem: Problem, coordinates: Float[Array, "rows unknowns"]
+) -> tuple[Float[Array, "rows n"], Float[Array, "rows n unknowns"]]:
+    """Predictions and their slopes; rows do not influence one another, so a coordinate is moved in all of them at once.
+
+    Every evaluation of a model is made here, so that it is compiled once for every number of rows.
+    """
+
+    def along(direction):
+        return jax.jvp(problem.predict, (coordinates,), (jnp.broadcast_to(direction, coordinates.shape),))
+
+    values, slopes = jax.vmap(along, out_axes=(0, -1))(jnp.eye(coordinates.shape[-1]))
+    return values[0], jnp.where(jnp.isfinite(slopes), slopes, 0.0)
+
+
+_predicted = eqx.filter_jit(Problem.predict)
+
+
+def _differences(problem: Problem, step: float, coordinates: Rows) -> tuple[np.ndarray, np.ndarray]:
+    """Predictions and central differences; where a side has no prediction, its slope is 0."""
+    rows, unknowns = coordinates.shape
+    moves = step * np.concatenate([np.zeros((1, unknowns)), np.eye(unknowns), -np.eye(unknowns)])
+    predict = Problem.predict if getattr(problem.model, "on_host", False) else _predicted
+    found = np.asarray(predict(problem, jnp.asarray((coordinates[:, None] + moves).reshape(-1, unknowns))))
+    values, ahead, behind = np.split(found.reshape(rows, len(moves), -1), [1, 1 + unknowns], axis=1)
+    with np.errstate(invalid="ignore"):
+        slopes = np.moveaxis(ahead - behind, 1, -1) / (2.0 * step)
+    return values[:, 0], np.where(np.isfinite(slopes), slopes, 0.0)
+
+
+def predictions_and_slopes(problem: Problem, coordinates: Rows, asked: Any = None) -> tuple[np.ndarray, np.ndarray]:
+    """Predictions and their slopes in every row.
+
+    **Arguments:** `coordinates`: (rows, unknowns); `asked`: (rows,), which of them are needed, by default all.
+
+    **Returns:** (rows, n) and (rows, n, unknowns); NaN and 0 for rows that were not asked for.
+    """
+    coordinates = np.asarray(coordinates, float)
+    asked = np.ones(len(coordinates), bool) if asked is None else np.asarray(asked)
+    # The program is compiled for a number of rows; where a parameter is not a number, a run is not even begun.
+    needed = np.where(asked[:, None], coordinates, np.nan)
+    if problem.step is None:
+        return tuple(map(np.asarray, _differentiated(problem, needed)))
+    return _differences(problem, problem.step, needed)
+
+
+def linearise(problem: Problem, coordinates: Any, measurements: Measurements, asked: Any = None) -> Linearised:
+    """Predictions, residuals and their slopes.
+
+    **Arguments:**
+
+    - `problem`: the `Problem`.
+    - `coordinates`: (rows, unknowns); `asked`: as for `predictions_and_slopes`.
+    - `measurements`: `Measurements` of shape (n,) or (rows, n).
+
+    **Returns:** a `Linearised`.
+
+    **Raises:** `ValueError` for a model that does not predict as many numbers as were measured.
+    """
+    prediction, slopes = predictions_and_slopes(problem, coordinates, asked)
+    wanted = (len(coordinates), measurements.value.shape[-1])
+    if prediction.shape != wanted:
+        raise ValueError(f"model must predict {wanted} for {wanted[0]} sets, not {prediction.shape}")
+    residual, by_prediction, root = map(np.asarray, _residuals(measurements, prediction))
+    prior, by_coordinate = map(np.asarray, _priors(problem.free, jnp.asarray(coordinates, float)))
+    return Linearised(
+        prediction, residual, by_prediction[..., None] * slopes, root[..., None] * slopes, prior, by_coordinate
+    )
+
+
+@eqx.filter_jit
+def _residuals(measurements: Measurements, prediction: Float[Array, "rows n"]) -> tuple[Array, Array, Array]:
+    """Residuals, their slopes by the predictions, and the roots of the expected information."""
+    residual, slope = jax.jvp(measurements.residuals, (prediction,), (jnp.ones_like(prediction),))
+    return residual, slope, measurements.information(prediction)
+
+
+@eqx.filter_jit
+def _priors(free: tuple[tuple[str, Free], ...], coordinates: Float[Array, "rows unknowns"]) -> tuple[Array, Array]:
+    """Residuals of the priors, and their slopes by the coordinates."""
+    problem = Problem(_nothing, free)
+    return jax.vmap(problem.prior)(coordinates), jax.vmap(jax.jacfwd(problem.prior))(coordinates)
+
+
+def _nothing(_: Any) -> Any:
+    """The model of a problem that has none."""

@@ -1,0 +1,132 @@
+"""Recordings from a file of columns, in the units in which they were written down."""
+
+import csv
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..validation import require
+from .recording import Quantities
+
+#: What one of a unit is, in the SI unit of the same dimension.
+UNITS = {
+    "s": {"s": 1.0, "ms": 1e-3, "min": 60.0},
+    "rad": {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi},
+    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0, "rev/s": 2.0 * math.pi},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "m/s": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6},
+    "1": {"1": 1.0, "%": 1e-2},
+}
+
+
+class Read(NamedTuple):
+    """What was read: times [s], the samples of some columns in SI units, NaN where missing, and their errors or `None`."""
+
+    times: Float[np.ndarray, " times"]
+    value: Float[np.ndarray, "times columns"]
+    error: Float[np.ndarray, "times columns"] | None
+    columns: tuple[str, ...]
+
+
+def read_columns(path: Any, columns: Any, fps: float | None, error: Any, quantities: Quantities) -> Read:
+    """Samples from a text file with a line of headers, its columns parted by commas, semicolons, tabs or blanks.
+
+    **Arguments:**
+
+    - `path`: of the file; lines that begin with # are left out, empty cells and `nan` are missing samples.
+    - `columns`: name of a column of the model -> (header, unit); the unit is one of `UNITS`, or a number: how many SI units
+      one of the file is. `"time"` is the clock, `"frame"` the number of the frame, which needs `fps`.
+    - `fps`: frames a second; without a column for the frame, each line is one.
+    - `error`: name of a column -> (standard error or header of its column, unit), for some or all of them; or `None`.
+    - `quantities`: what can be recorded.
+
+    **Raises:** `ValueError` that names the file, the column and what is wrong with it.
+    """
+    if not isinstance(columns, Mapping) or not columns:
+        raise ValueError(f"columns = {columns!r} must be a dictionary, such as {{'theta': ('tilt', 'deg')}}")
+    table = _table(Path(path))
+    names = quantities.of(tuple(name for name in columns if name not in ("time", "frame")))
+    for name in columns:
+        if name not in ("time", "frame", *names):
+            raise ValueError(f"columns: {name!r} must be a single column: time, frame, {', '.join(quantities.units)}")
+    times = _times(table, columns, fps, path)
+    value = np.stack([_column(table, name, columns[name], quantities.units[name], path) for name in names], axis=1)
+    good = np.isfinite(times) & np.any(np.isfinite(value), axis=1)
+    errors = None
+    if error is not None:
+        if not isinstance(error, Mapping) or set(error) != set(names):
+            raise ValueError(f"error = {error!r} must be a dictionary with {', '.join(names)}, or None")
+        units = quantities.units
+        errors = np.stack([_errors(table, name, error[name], units[name], path) for name in names], axis=1)[good]
+    return Read(times[good], value[good], errors, names)
+
+
+def _table(path: Path) -> dict[str, list[str]]:
+    """The cells of every column, as text, by its header."""
+    lines = [
+        line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip() and line.lstrip()[0] != "#"
+    ]
+    if len(lines) < 2:
+        raise ValueError(f"path = {str(path)!r} must have a line of headers and at least one of numbers")
+    parted = next((mark for mark in ("\t", ";", ",") if mark in lines[0]), None)
+    rows = list(csv.reader(lines, delimiter=parted)) if parted else [line.split() for line in lines]
+    headers = [header.strip() for header in rows[0]]
+    for number, row in enumerate(rows[1:], start=2):
+        if len(row) != len(headers):
+            raise ValueError(f"path = {str(path)!r}: line {number} has {len(row)} cells, not {len(headers)}")
+    return {header: [row[k].strip() for row in rows[1:]] for k, header in enumerate(headers)}
+
+
+def _times(table: dict[str, list[str]], columns: Mapping[str, Any], fps: Any, path: Any) -> np.ndarray:
+    """The clock's readings of all lines [s]."""
+    if fps is not None:
+        require(fps, "fps", above=0.0)
+        if "time" in columns:
+            raise ValueError(f"fps = {fps!r} must be left out where 'time' is among the columns")
+        if "frame" not in columns:
+            return np.arange(len(next(iter(table.values())))) / float(fps)
+        return _column(table, "frame", columns["frame"], "1", path) / float(fps)
+    if "time" not in columns or "frame" in columns:
+        raise ValueError("fps must be given, or the columns must have 'time'")
+    return _column(table, "time", columns["time"], "s", path)
+
+
+def _column(table: dict[str, list[str]], name: str, given: Any, si: str, path: Any) -> np.ndarray:
+    """A column in SI units, NaN where it is empty."""
+    header, size = _parts(name, given, si)
+    if header not in table:
+        raise ValueError(f"columns: {header!r} must be one of the headers of {str(path)!r}: {', '.join(table)}")
+    found = []
+    for number, cell in enumerate(table[header], start=2):
+        try:
+            found.append(float(cell) if cell else math.nan)
+        except ValueError:
+            raise ValueError(f"{header} = {cell!r} in line {number} of {str(path)!r} is not a number") from None
+    return size * np.array(found)
+
+
+def _errors(table: dict[str, list[str]], name: str, given: Any, si: str, path: Any) -> np.ndarray:
+    """The standard errors of a column."""
+    first, size = _parts(name, given, si)
+    if isinstance(first, str):
+        return _column(table, name, given, si, path)
+    require(first, f"error of {name}", above=0.0)
+    return np.full(len(next(iter(table.values()))), size * float(first))
+
+
+def _parts(name: str, given: Any, si: str) -> tuple[Any, float]:
+    """Header, or number, and how many SI units one of the file is."""
+    if not isinstance(given, tuple) or len(given) != 2:
+        raise ValueError(f"columns: {name!r} = {given!r} must be (header, unit), such as ('tilt', 'deg')")
+    first, unit = given
+    known = UNITS[si]
+    if isinstance(unit, str):
+        if unit not in known:
+            raise ValueError(f"unit of {name} = {unit!r} must be one of {', '.join(known)}, or a number of {si}")
+        return first, known[unit]
+    require(unit, f"unit of {name}")
+    return first, float(unit)

@@ -1,0 +1,179 @@
+"""Whether a fit can be believed: its scatter, its order, the agreement of its starts, and what the data leave open."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from .likelihood import Measurements
+
+#: A p-value below this is a poor fit.
+POOR = 0.01
+
+#: A measurement whose residual exceeds this cannot be explained.
+FAR = 4.0
+
+#: Ends whose -2 log likelihoods differ by less than this are the same minimum; another one within `RIVAL` of the best explains
+#: the data nearly as well, as a parameter two standard errors off does.
+SAME, RIVAL = 0.1, 4.0
+
+#: Starts agree on a minimum if all their parameters agree to this many standard errors.
+CLOSE = 0.5
+
+
+class FitWarning(UserWarning):
+    """A fit that should not be believed as it stands.
+
+    **Example:** fits that must be good, or else fail.
+
+    ```
+    >>> import warnings
+    >>> import tippe
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", tippe.FitWarning)
+
+    ```
+    """
+
+
+class Series(NamedTuple):
+    """How the residuals of one series follow one another: their number, their runs of one sign, and the probability of so few
+    runs or fewer if signs were drawn at random."""
+
+    count: int
+    runs: int
+    p_value: float
+
+
+class Verdict(NamedTuple):
+    """Whether a fit can be believed.
+
+    - `p_value`: probability of residuals this large or larger if the model and the errors are right (chi squared of the
+      measurements that are no limits); NaN where errors were estimated or no degree of freedom is left.
+    - `series`: a `Series` for each series of measurements.
+    - `agree`, `starts`: how many of the starts reached the same minimum.
+    - `undetermined`: the parameters that the data do not determine, in words.
+    - `concerns`: what is wrong, in words; empty for a fit without a flaw.
+    """
+
+    p_value: float
+    series: tuple[Series, ...]
+    agree: int
+    starts: int
+    undetermined: tuple[str, ...]
+    concerns: tuple[str, ...]
+
+    @property
+    def good(self) -> bool:
+        """Whether nothing speaks against the fit."""
+        return not self.concerns
+
+    def __str__(self) -> str:
+        scatter = (
+            "the errors were estimated from the scatter, which so says nothing of the fit"
+            if math.isnan(self.p_value)
+            else f"residuals this large have a probability of {self.p_value:.2g}"
+        )
+        signs = ", ".join(f"{one.runs} runs of {one.count} signs (p = {one.p_value:.2g})" for one in self.series)
+        lines = [f"  {scatter}", f"  {signs}" if signs else "", f"  {self.agree} of {self.starts} starts agree"]
+        return "\n".join([*filter(None, lines), *(f"  BUT {concern}" for concern in self.concerns)])
+
+
+def judge(
+    measurements: Measurements,
+    prediction: Float[np.ndarray, " n"],
+    residual: Float[np.ndarray, " n"],
+    degrees: int,
+    agreement: tuple[int, int, int],
+    undetermined: tuple[str, ...],
+    status: str,
+) -> Verdict:
+    """The verdict on a fit.
+
+    **Arguments:**
+
+    - `measurements`, `prediction`, `residual`: (n,).
+    - `degrees`: measurements and priors less unknowns, limits left out.
+    - `agreement`: starts that agree with the best, starts that ended elsewhere nearly as well, all starts.
+    - `undetermined`: combinations of parameters, in words; `status`: of the fit.
+
+    **Returns:** a `Verdict`.
+    """
+    scores = normal_scores(measurements, prediction)
+    exact = ~np.asarray(measurements.censored)
+    estimated = bool(np.any(np.asarray(measurements.estimated)))
+    p_value = math.nan if estimated or degrees < 1 else chi_squared_tail(float(np.sum(scores[exact] ** 2)), degrees)
+    numbers = np.asarray(measurements.series)
+    series = [runs_of_signs(scores[exact & (numbers == one)]) for one in np.unique(numbers)]
+    seen = tuple(one for one in series if one.count > 1)
+    agree, rivals, starts = agreement
+    limits = np.abs(residual[~exact])
+    concerns = []
+    if status != "converged":
+        concerns.append("the fit has not converged: allow more steps (max_steps), or start closer")
+    if not np.all(np.isfinite(prediction[exact])):
+        missing = int(np.sum(~np.isfinite(prediction[exact])))
+        concerns.append(f"the model predicts nothing for {missing} measurements: its run ends before, or fails")
+    if p_value < POOR:
+        concerns.append(
+            f"the residuals are too large (p = {p_value:.2g}): the model is wrong, the errors are too small, "
+            "or this is not the best minimum"
+        )
+    if np.any(limits > FAR):
+        concerns.append(f"{int(np.sum(limits > FAR))} limits are violated by more than {FAR:.0f} errors")
+    few = min((one.p_value for one in seen), default=1.0) * max(len(seen), 1)
+    if few < POOR:
+        concerns.append(
+            f"the residuals keep their sign for too long (p = {few:.2g}): the model misses a trend, or errors are correlated"
+        )
+    if rivals:
+        concerns.append(f"{rivals} of {starts} starts ended elsewhere and explain the data nearly as well")
+    if starts > 1 and agree == 1:
+        concerns.append(f"only one of {starts} starts ended here: there may be better minima; give more starts")
+    concerns += [f"the data do not determine {words}" for words in undetermined]
+    return Verdict(p_value, seen, agree, starts, undetermined, tuple(concerns))
+
+
+def normal_scores(measurements: Measurements, prediction: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Residuals as numbers that are normal if the errors are what they are said to be; 0 for limits."""
+    from scipy.stats import norm, t
+
+    z = np.asarray(measurements.standardised(np.asarray(prediction)))
+    freedom = np.asarray(measurements.student)
+    heavy = np.isfinite(freedom)
+    return np.where(heavy, np.sign(z) * norm.isf(t.sf(np.abs(z), np.where(heavy, freedom, 1.0))), z)
+
+
+def chi_squared_tail(value: float, degrees: int) -> float:
+    """The probability that chi squared exceeds a value."""
+    from scipy.stats import chi2
+
+    return float(chi2.sf(value, degrees)) if math.isfinite(value) else 0.0
+
+
+def runs_of_signs(values: Float[np.ndarray, " n"]) -> Series:
+    """Runs of one sign in a series, and the probability of so few (Wald and Wolfowitz, Ann. Math. Stat. 11 (1940) 147).
+
+    Given the numbers of both signs, the number of runs of either sign is hypergeometric; it is summed exactly.
+    """
+    from scipy.special import gammaln
+
+    signs = np.sign(values[np.isfinite(values) & (values != 0.0)])
+    positive, negative = int(np.sum(signs > 0.0)), int(np.sum(signs < 0.0))
+    runs = 1 + int(np.sum(signs[1:] != signs[:-1])) if len(signs) else 0
+    if not positive or not negative:
+        # All of one sign: as improbable as a coin that shows one side only.
+        return Series(len(signs), runs, min(1.0, 2.0 ** (1 - len(signs))) if len(signs) else 1.0)
+
+    def log_choose(n: int, k: np.ndarray) -> np.ndarray:
+        inside = (k >= 0) & (k <= n)
+        at = np.where(inside, k, 0)
+        return np.where(inside, gammaln(n + 1.0) - gammaln(at + 1.0) - gammaln(n - at + 1.0), -np.inf)
+
+    # There are r runs where the positive and the negative signs are cut into r // 2 and r - r // 2 runs, either way round.
+    counts = np.arange(2, runs + 1)
+    less, more = counts // 2 - 1, counts - counts // 2 - 1
+    whole = log_choose(positive + negative, np.array(positive))
+    ways = [log_choose(a - 1, less) + log_choose(b - 1, more) for a, b in ((positive, negative), (negative, positive))]
+    return Series(len(signs), runs, min(1.0, float(np.sum(np.exp(np.array(ways) - whole)))))

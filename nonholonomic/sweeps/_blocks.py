@@ -1,0 +1,233 @@
+"""The blocks of a table that is being computed: a file each, in a folder beside its own; a sweep that was killed goes on."""
+
+import contextlib
+import json
+import os
+import shutil
+import warnings
+import zipfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+try:
+    import fcntl
+except ImportError:  # not a POSIX system
+    fcntl = None
+
+import numpy as np
+
+from ._file import Stored, replacing, sync_folder, write_file
+from .layout import Layout, Values
+
+
+def folder_of(path: Path) -> Path:
+    """Where the blocks of a table's file are while it is computed."""
+    return path.with_name(path.name + ".blocks")
+
+
+class Blocks:
+    """The blocks of a table's file that there are.
+
+    Each is complete and on the disk before it is counted, whenever the process dies, and whenever the machine does, as far as
+    its disk keeps what it confirms.
+
+    `finished`: the numbers of those that there were.
+    """
+
+    def __init__(self, path: Any, layout: Layout):
+        """Find the blocks of an earlier run of the same request, or make room for new ones.
+
+        **Raises:** `OSError` that names the path if it cannot be read or written; `ValueError` that names the first
+        difference if it holds the result of another request or of another version of this package.
+        """
+        try:
+            self.path = Path(path)
+        except TypeError:
+            raise ValueError(f"path = {path!r} must be the path of a file") from None
+        self.folder, self.layout = folder_of(self.path), layout
+        self._lock = self._locked()
+        try:
+            self._find()
+        except BaseException:
+            self.close()
+            raise
+
+    def _find(self) -> None:
+        stored = Stored(self.path) if self.path.exists() else None
+        header = self.folder / "table.h5"
+        begun = stored or (Stored(header) if header.exists() else None)
+        if begun is not None:
+            self._check(begun)
+            # The table says with what versions it was begun.
+            self.layout = begun.layout
+        good = {block for block in range(self.layout.blocks) if stored is not None and stored.block(block) is not None}
+        self._whole = len(good) == self.layout.blocks
+        if self._whole:
+            self.finished = good
+            return
+        if not header.exists():
+            self._begin(header)
+        kept = {int(file.stem) for file in self.folder.glob("*.npz")}
+        damaged = {block for block in kept if read_block(self.folder, self.layout, block) is None}
+        self.finished = kept - damaged
+        if stored is not None:
+            damaged |= set(range(self.layout.blocks)) - good - self.finished
+            for block in sorted(good - self.finished):
+                self.write(block, stored.block(block))
+            self.finished |= good
+        for part in self.folder.glob("*.part"):
+            part.unlink()
+        if damaged:
+            warnings.warn(
+                f"{self.path} is damaged: {len(damaged)} finished blocks do not match their checksums and are computed again",
+                RuntimeWarning,
+                stacklevel=6,
+            )
+
+    def _begin(self, header: Path) -> None:
+        """Make the folder, and say in it what it is for."""
+        # The blocks are there until the table's file is, too.
+        need = 2 * self.layout.bytes_of_cells(self.layout.cells)
+        try:
+            room = shutil.disk_usage(self.path.parent).free
+            if room < need:
+                raise OSError(0, f"{1e-9 * room:.3g} GB are free, and it takes {1e-9 * need:.3g} GB on the way")
+            self.folder.mkdir(exist_ok=True)
+            sync_folder(self.path.parent)
+        except OSError as error:
+            raise OSError(f"cannot write {self.path}: {error.strerror}") from None
+        try:
+            write_file(header, self.layout, ())
+        except OSError:
+            self.folder.rmdir()
+            raise
+
+    def _check(self, begun: Stored) -> None:
+        ours, theirs = self.layout, begun.layout
+        difference = same_request(str(theirs.attributes["request"]), ours.attributes["request"])
+        if difference is None:
+            for name, values in ours.coords.items():
+                if name not in theirs.coords or not np.array_equal(theirs.coords[name], values):
+                    difference = f"the axis {name} differs"
+        if difference is None and list(theirs.coords) != list(ours.coords):
+            difference = f"its axes are {', '.join(theirs.coords)}"
+        here, there = (json.loads(str(one.attributes.get("versions", "{}"))) for one in (ours, theirs))
+        if difference is None and there.get("nonholonomic") != here.get("nonholonomic"):
+            difference = f"nonholonomic is {there.get('nonholonomic')} there and {here.get('nonholonomic')} here"
+        if difference is None and (theirs.kinds, theirs.inner, theirs.block) != (ours.kinds, ours.inner, ours.block):
+            difference = f"it was not written by a sweep in {ours.blocks} blocks"
+        if difference is not None:
+            what = self.path if begun.path == self.path else self.folder
+            raise ValueError(f"{what} holds the result of another run: {difference}; give another path or remove it")
+        others = [name for name in here if name not in ("nonholonomic", "python") and there.get(name) != here[name]]
+        if others and begun.path != self.path:
+            versions = ", ".join(f"{name} {there.get(name)}, now {here[name]}" for name in others)
+            warnings.warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning, stacklevel=7)
+
+    def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Stored:
+        """Store the blocks that are computed, each as it comes, and make the table's file of these and those there were.
+
+        What goes into the file while blocks are computed needs not be read again at the end.
+
+        **Raises:** `OSError` that names the path if it cannot be written, or a block that is damaged; no block is lost.
+        """
+        if not self._whole:
+            write_file(self.path, self.layout, self._all(computed), self.folder)
+        shutil.rmtree(self.folder, ignore_errors=True)
+        return Stored(self.path)
+
+    def _all(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Iterator[tuple[int, dict[str, Values]]]:
+        for block, values in computed:
+            self.write(block, values)
+            yield block, values
+        for block in sorted(self.finished):
+            kept = read_block(self.folder, self.layout, block)
+            if kept is None:
+                raise OSError(f"cannot read {self.folder}: block {block} is damaged; the same call computes it again")
+            yield block, kept
+
+    def write(self, block: int, values: dict[str, Values]) -> None:
+        """Store a block.
+
+        **Raises:** `OSError` that names the path if that fails; no block is then finished but those that were.
+        """
+        kinds = self.layout.kinds
+        with replacing(self.folder / f"{block}.npz") as scratch, scratch.open("wb") as stream:
+            np.savez(stream, **{name: np.asarray(some, kinds[name]) for name, some in values.items()})
+
+    def _locked(self) -> Any:
+        """Keep other processes from computing the same file; the system releases it when the process ends."""
+        if fcntl is None:
+            return None
+        beside = self.path.with_name(self.path.name + ".lock")
+        while True:
+            try:
+                lock = beside.open("w")
+            except OSError as error:
+                raise OSError(f"cannot write {self.path}: {error.strerror}") from None
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                lock.close()
+                raise OSError(f"cannot write {self.path}: another process is writing it") from None
+            # A process that has just closed the file has removed its lock, perhaps after we opened it.
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(lock.fileno()), beside.stat()):
+                    return lock
+            lock.close()
+
+    def close(self) -> None:
+        """Let other processes have the file."""
+        if self._lock is not None:
+            self.path.with_name(self.path.name + ".lock").unlink(missing_ok=True)
+            self._lock.close()
+
+
+def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
+    """What there is of a table whose file is still to be made; `None` if it is not being computed.
+
+    **Returns:** its layout, and its variables with all cells along the first axis.
+
+    **Raises:** `OSError` that names the path if a block is damaged.
+    """
+    folder = folder_of(path)
+    if path.exists() or not (folder / "table.h5").exists():
+        return None
+    layout = Stored(folder / "table.h5").layout
+    found, damaged = layout.empty(layout.cells), 0
+    for file in folder.glob("*.npz"):
+        first, end = layout.ends(int(file.stem))
+        values = read_block(folder, layout, int(file.stem))
+        damaged += values is None
+        for name, some in (values or {}).items():
+            found[name][first:end] = some
+    if path.exists():
+        # It was finished meanwhile.
+        return None
+    if damaged:
+        told = f"{damaged} of its {layout.blocks} blocks do not match their checksums"
+        raise OSError(f"cannot read {path}: it is damaged: {told}")
+    return layout, found
+
+
+def read_block(folder: Path, layout: Layout, block: int) -> dict[str, Values] | None:
+    """The variables of a block; `None` if they are not those that were written, by the checksums of the archive."""
+    try:
+        # NumPy does not close a file that it cannot read.
+        with (folder / f"{block}.npz").open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            found = {name: archive[name] for name in layout.kinds}
+    except (OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile):
+        return None
+    first, end = layout.ends(block)
+    right = {name: (kind, (end - first, *layout.inner_shape(name))) for name, kind in layout.kinds.items()}
+    return found if {name: (values.dtype, values.shape) for name, values in found.items()} == right else None
+
+
+def same_request(left: str, right: str) -> str | None:
+    """The first difference between two requests (JSON), in words; `None` if they are the same."""
+    one, other = json.loads(left), json.loads(right)
+    for name in [*one, *(name for name in other if name not in one)]:
+        if one.get(name) != other.get(name):
+            return f"{name} is {one.get(name)!r} there and {other.get(name)!r} here"
+    return None

@@ -1,0 +1,330 @@
+"""The file of a table: HDF5 with dimension scales, as in netCDF-4, so that xarray opens it with named coordinates.
+
+Words, such as a cell's status, are stored as bytes with the attributes `flag_values` and `flag_meanings` (CF conventions).
+Every number is under a checksum: HDF5 has one for all that describes the arrays, and the group `checksums`, which xarray does
+not show, one for each block of each variable. A file appears when it is complete, or not at all.
+"""
+
+import contextlib
+import json
+import os
+import tempfile
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .layout import PENDING, UNREACHED, Layout, Values, boxes
+
+if TYPE_CHECKING:
+    import h5py
+
+#: The group of the checksums.
+CHECKSUMS = "checksums"
+
+#: The attribute of a table that names its variables in words; in a file each variable has its own, as in CF.
+LONG_NAMES, LONG_NAME = "long_names", "long_name"
+
+#: The file's attribute that names the dimensions which variables have besides the grid's.
+INNER = "inner"
+
+#: Tables of more than this [bytes] stay in their file until they are asked for.
+HELD = 1 << 27
+
+
+@contextlib.contextmanager
+def replacing(path: Path, beside: Path | None = None) -> Iterator[Path]:
+    """A new file, which takes the place of `path` when the context ends: all of it, or nothing.
+
+    **Arguments:** `beside`: the folder where it is until then, by default that of `path`.
+
+    **Raises:** `OSError` that names the path if it cannot be written.
+    """
+    scratch = None
+    try:
+        if path.is_dir():
+            raise OSError(0, "it is a folder")
+        handle, scratch = tempfile.mkstemp(dir=beside or path.parent, prefix=path.name + ".", suffix=".part")
+        os.close(handle)
+        yield Path(scratch)
+        with open(scratch, "r+b") as stream:
+            os.fsync(stream.fileno())
+        # The scratch file is its owner's alone.
+        os.chmod(scratch, 0o666 & ~_umask())
+        os.replace(scratch, path)
+        sync_folder(path.parent)
+    except BaseException as error:
+        if scratch is not None:
+            Path(scratch).unlink(missing_ok=True)
+        # What reading says is not changed.
+        if isinstance(error, OSError) and error.strerror:
+            raise OSError(f"cannot write {path}: {error.strerror}") from None
+        raise
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def sync_folder(folder: Path) -> None:
+    """Flush a folder's entries to disk, on systems that let a folder be opened."""
+    if os.name == "posix":
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def write_file(
+    path: Path, layout: Layout, blocks: Iterable[tuple[int, dict[str, Values]]], beside: Path | None = None
+) -> None:
+    """Write a table, all at once or not at all; a file that exists is replaced.
+
+    **Arguments:** `blocks`: the number of a block and its cells by variable, in any order; with none of them the file says what
+    there will be. `beside`: as for `replacing`.
+
+    **Raises:** `OSError` that names the path if it cannot be written.
+    """
+    # It takes a tenth of a second to import, and most processes do not need it.
+    import h5py
+
+    with replacing(path, beside) as scratch, scratch.open("r+b", buffering=0) as disk:
+        stream = Stream(disk)
+        with h5py.File(stream, "w", libver=("v110", "v110"), track_order=True) as file:
+            _describe(file, layout)
+            group = file.create_group(CHECKSUMS)
+            group.attrs["block"] = layout.block
+            sums = {name: np.zeros(layout.blocks, np.uint32) for name in layout.kinds}
+            for block, values in blocks:
+                for name, kind in layout.kinds.items():
+                    some = np.ascontiguousarray(values[name], kind)
+                    sums[name][block] = zlib.crc32(some)
+                    _put(file[name], some, layout.shape, *layout.ends(block))
+                stream.check()
+            for name in layout.coords:
+                sums[name] = np.array([zlib.crc32(file[name][()])], np.uint32)
+            for name, values in sums.items():
+                group.create_dataset(name, data=values)
+        stream.check()
+
+
+class Stream:
+    """A stream that keeps an error to itself until it is asked: HDF5 cannot close a file that a full disk does not take."""
+
+    def __init__(self, disk: Any):
+        """State what is written to."""
+        self._disk, self._error = disk, None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._disk, name)
+
+    def write(self, data: Any) -> int:
+        """Write all of the data, unless anything has failed before."""
+        rest = memoryview(data)
+        while self._error is None and rest:
+            with self._noting():
+                rest = rest[self._disk.write(rest) :]
+        return len(data)
+
+    def truncate(self, size: int) -> int:
+        """Cut or lengthen the file, unless anything has failed before."""
+        if self._error is None:
+            with self._noting():
+                self._disk.truncate(size)
+        return size
+
+    @contextlib.contextmanager
+    def _noting(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self._error = error
+
+    def check(self) -> None:
+        """Raise the error that there was."""
+        if self._error is not None:
+            raise self._error
+
+
+def _put(array: "h5py.Dataset", values: Values, shape: tuple[int, ...], first: int, end: int) -> None:
+    start = 0
+    for box in boxes(shape, first, end):
+        sizes = [part.stop - part.start for part in box]
+        stop = start + int(np.prod(sizes, dtype=int))
+        array[box] = values[start:stop].reshape(*sizes, *values.shape[1:])
+        start = stop
+
+
+def _describe(file: "h5py.File", layout: Layout) -> None:
+    """All of a table but the numbers of its variables."""
+    attributes = layout.attributes | ({INNER: layout.inner} if layout.inner else {}) | {"Conventions": "CF-1.10"}
+    long_names = json.loads(attributes.pop(LONG_NAMES, "{}"))
+    for name, value in attributes.items():
+        _set(file, name, value if isinstance(value, str | int | float) else json.dumps(value))
+    meanings = dict(layout.words)
+    for name, values in layout.coords.items():
+        if values.dtype.kind == "U":
+            meanings[name], values = tuple(values.tolist()), np.arange(len(values), dtype=np.int8)
+        file.create_dataset(name, data=values).make_scale(name)
+    for name, kind in layout.kinds.items():
+        array = file.create_dataset(name, shape=layout.shape + layout.inner_shape(name), dtype=kind)
+        for axis, coordinate in enumerate((*layout.axes, *layout.inner.get(name, ()))):
+            array.dims[axis].attach_scale(file[coordinate])
+    for name in (*layout.coords, *layout.kinds):
+        if name in meanings:
+            file[name].attrs["flag_values"] = np.arange(len(meanings[name]), dtype=np.int8)
+            _set(file[name], "flag_meanings", " ".join(meanings[name]))
+        else:
+            _set(file[name], "units", layout.units.get(name, "1"))
+        if name in long_names:
+            _set(file[name], LONG_NAME, long_names[name])
+
+
+def _set(of: Any, name: str, value: Any) -> None:
+    """Set an attribute; a string is stored at its own length, because no checksum covers HDF5's strings of variable length."""
+    # Only files need it.
+    import h5py
+
+    if isinstance(value, str):
+        stored = value.encode()
+        of.attrs.create(name, stored, dtype=h5py.string_dtype("utf-8", max(1, len(stored))))
+    else:
+        of.attrs.create(name, value)
+
+
+def _attribute(of: Any, name: str) -> Any:
+    """An attribute, a number or a string."""
+    value = of.attrs[name]
+    return value.decode() if isinstance(value, bytes) else value
+
+
+class Stored:
+    """A table in its file.
+
+    `path`: the file; `layout`: what it holds. Numbers are held against their checksums when they are read.
+    """
+
+    def __init__(self, path: Path):
+        """Look into a file.
+
+        **Raises:** `OSError` that names the path if it cannot be read or holds no table.
+        """
+        if not path.exists():
+            raise FileNotFoundError(f"no such file: {path}")
+        if path.is_dir():
+            raise OSError(f"cannot read {path}: it is a folder")
+        self.path = path
+        with self._opened() as file:
+            self.layout, self._sums = _contents(file)
+
+    def whole(self, name: str) -> Values:
+        """A variable of all cells, which are along the first axis.
+
+        **Raises:** `OSError` that names the path if numbers are not those that were written.
+        """
+        with self._opened() as file:
+            values, sums = np.asarray(file[name][()]), self._sums[name]
+        values = values.reshape(-1, *self.layout.inner_shape(name))
+        damaged = 0
+        for block in range(self.layout.blocks):
+            first, end = self.layout.ends(block)
+            damaged += zlib.crc32(np.ascontiguousarray(values[first:end])) != sums[block]
+        if damaged:
+            raise OSError(
+                f"cannot read {self.path}: it is damaged: {damaged} of its {self.layout.blocks} blocks do not match their "
+                "checksums"
+            )
+        return values
+
+    def block(self, block: int) -> dict[str, Values] | None:
+        """The variables of one block; `None` if its numbers are not those that were written."""
+        first, end = self.layout.ends(block)
+        found = {}
+        with self._opened() as file:
+            for name in self.layout.kinds:
+                parts = [np.asarray(file[name][box]) for box in boxes(self.layout.shape, first, end)]
+                shape = self.layout.inner_shape(name)
+                found[name] = np.concatenate([part.reshape(-1, *shape) for part in parts])
+                if zlib.crc32(found[name]) != self._sums[name][block]:
+                    return None
+        return found
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator["h5py.File"]:
+        # Only files need it.
+        import h5py
+
+        try:
+            with h5py.File(self.path, "r") as file:
+                yield file
+        except (OSError, KeyError, IndexError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+            told = f"it is not a table of nonholonomic, or it is damaged ({error})"
+            raise OSError(f"cannot read {self.path}: {told}") from None
+
+
+def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
+    """A file's layout, and its checksums by variable."""
+    coords, kinds, units, words, shapes, long_names = {}, {}, {}, {}, {}, {}
+    if "request" not in file.attrs:
+        raise ValueError("it names no request")
+    attributes = {name: _attribute(file, name) for name in file.attrs if name != "Conventions"}
+    inner = {name: tuple(dims) for name, dims in json.loads(attributes.pop(INNER, "{}")).items()}
+    dims = [*json.loads(attributes["axes"]), *(dim for dims in inner.values() for dim in dims)]
+    sums = {name: array[()] for name, array in file[CHECKSUMS].items()}
+    for name in (*dict.fromkeys(dims), *(name for name in file if name not in (*dims, CHECKSUMS))):
+        array = file[name]
+        if LONG_NAME in array.attrs:
+            long_names[name] = _attribute(array, LONG_NAME)
+        if "flag_meanings" in array.attrs:
+            words[name] = tuple(_attribute(array, "flag_meanings").split())
+        else:
+            units[name] = _attribute(array, "units")
+        if name in dims:
+            coords[name] = array[()]
+            if [zlib.crc32(coords[name])] != sums[name].tolist():
+                raise ValueError(f"{name} does not match its checksum")
+        else:
+            kinds[name], shapes[name] = array.dtype, array.shape
+    if long_names:
+        attributes[LONG_NAMES] = json.dumps(long_names, sort_keys=True)
+    coords = {name: np.array(words.pop(name))[values] if name in words else values for name, values in coords.items()}
+    layout = Layout(coords, kinds, units, attributes, words, inner, int(file[CHECKSUMS].attrs["block"]))
+    for name, shape in shapes.items():
+        if shape != layout.shape + layout.inner_shape(name) or len(sums[name]) != layout.blocks:
+            raise ValueError(f"{name} has the wrong shape")
+    return layout, sums
+
+
+class StoredVariables(Mapping[str, Values]):
+    """The variables of a table that stays in its file: each is read when it is asked for."""
+
+    def __init__(self, stored: Stored):
+        """State where they are."""
+        self.stored = stored
+
+    def __getitem__(self, name: str) -> Values:
+        if name not in self.stored.layout.kinds:
+            raise KeyError(name)
+        return self.stored.layout.shaped(name, self.stored.whole(name))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.stored.layout.kinds
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.stored.layout.kinds)
+
+    def __len__(self) -> int:
+        return len(self.stored.layout.kinds)
+
+
+def coded(values: Values, words: tuple[str, ...]) -> tuple[Values, tuple[str, ...]]:
+    """Words as the codes that stand for them, and the words in the order of their codes, first those given."""
+    met = (word for word in dict.fromkeys(values.ravel().tolist()) if word not in (*words, UNREACHED))
+    words = (*words, *met)
+    codes = {word: code for code, word in enumerate(words)} | {UNREACHED: PENDING}
+    return np.vectorize(codes.__getitem__, otypes=[np.int8])(values), words

@@ -1,0 +1,103 @@
+"""What a table is made of besides its numbers, and how its cells are cut into blocks."""
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Shaped
+
+Values = Shaped[np.ndarray, "..."]
+
+#: Stored for a cell that has not been computed, and the word for it.
+PENDING, UNREACHED = -1, "pending"
+
+
+class Layout(NamedTuple):
+    """A table without its numbers.
+
+    `kinds`: variable -> dtype; `block`: how many cells a block has, all but the last; the rest is as in `Table`.
+    """
+
+    coords: dict[str, Values]
+    kinds: dict[str, np.dtype]
+    units: dict[str, str]
+    attributes: dict[str, Any]
+    words: dict[str, tuple[str, ...]]
+    inner: dict[str, tuple[str, ...]]
+    block: int
+
+    @property
+    def axes(self) -> list[str]:
+        """The coordinates that are axes of the grid."""
+        return axes_of(self.coords, self.inner)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the grid."""
+        return tuple(len(self.coords[name]) for name in self.axes)
+
+    @property
+    def cells(self) -> int:
+        """How many cells the grid has."""
+        return math.prod(self.shape)
+
+    @property
+    def blocks(self) -> int:
+        """How many blocks it is cut into."""
+        return -(-self.cells // self.block)
+
+    def ends(self, block: int) -> tuple[int, int]:
+        """The first cell of a block, and the one after its last."""
+        return block * self.block, min((block + 1) * self.block, self.cells)
+
+    def size(self, block: int) -> int:
+        """How many cells a block has."""
+        first, end = self.ends(block)
+        return end - first
+
+    def inner_shape(self, name: str) -> tuple[int, ...]:
+        """Shape of what a variable holds for one cell."""
+        return tuple(len(self.coords[dim]) for dim in self.inner.get(name, ()))
+
+    def empty(self, cells: int, status: int = PENDING) -> dict[str, Values]:
+        """The variables of cells that have no numbers, along the first axis; what consists of words is `status`."""
+        found = {}
+        for name, kind in self.kinds.items():
+            value = status if name in self.words else np.nan if kind.kind == "f" else PENDING
+            found[name] = np.full((cells, *self.inner_shape(name)), value, kind)
+        return found
+
+    def shaped(self, name: str, values: Values) -> Values:
+        """A variable of all cells over the grid, with words for codes."""
+        values = values.reshape((*self.shape, *self.inner_shape(name)))
+        return np.array([*self.words[name], UNREACHED])[values] if name in self.words else values
+
+    def bytes_of_cells(self, cells: int) -> int:
+        """What the numbers of some cells take."""
+        return cells * sum(kind.itemsize * math.prod(self.inner_shape(name)) for name, kind in self.kinds.items())
+
+
+def axes_of(coords: dict[str, Values], inner: dict[str, tuple[str, ...]]) -> list[str]:
+    """The coordinates that are axes of the grid: all but those of dimensions that only some variables have."""
+    within = {dim for dims in inner.values() for dim in dims}
+    return [name for name in coords if name not in within]
+
+
+def boxes(shape: tuple[int, ...], first: int, end: int) -> Iterator[tuple[slice, ...]]:
+    """The parts of an array, as slices and in order, that hold its elements from `first` to before `end` of them all."""
+    if not shape:
+        yield ()
+        return
+    row = math.prod(shape[1:])
+    while first < end:
+        start, within = divmod(first, row)
+        rows = (end - first) // row
+        if within == 0 and rows:
+            yield (slice(start, start + rows), *(slice(0, size) for size in shape[1:]))
+            first += rows * row
+        else:
+            stop = min(end, (start + 1) * row)
+            for rest in boxes(shape[1:], within, within + stop - first):
+                yield (slice(start, start + 1), *rest)
+            first = stop

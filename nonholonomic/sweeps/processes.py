@@ -1,0 +1,158 @@
+"""Processes on this machine, each with its own cores, to compute the blocks of a sweep."""
+
+import contextlib
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from queue import SimpleQueue
+from typing import Any
+
+import jax
+
+from ..validation import require
+
+
+@contextlib.contextmanager
+def local_processes(n: int, threads: int = 1) -> Iterator[Executor]:
+    """Processes for `executor=`, which compute on this machine's processor.
+
+    Each has its own cores, and the parent's store of compiled programs if there is one, before it imports JAX. They start as
+    blocks come. One that dies is replaced, and its block is tried in another; they end with the context, or with the
+    parent, however that ends. As for any process started by Python's `multiprocessing`, a script that makes them must have its
+    own calls under `if __name__ == "__main__":`.
+
+    **Arguments:** `n`: how many; `threads`: how many cores each may use.
+
+    **Returns:** the executor, as a context.
+
+    **Raises:** `ValueError` for numbers below 1.
+
+    **Example:**
+
+    ```
+    >>> import nonholonomic
+    >>> with nonholonomic.local_processes(2) as processes:  # doctest: +SKIP
+    ...     table = tippe.inversion_table(scene, theta=theta, spin=spin, t1=8.0, executor=processes)
+
+    ```
+    """
+    for name, value in (("n", n), ("threads", threads)):
+        require(value, name, at_least=1)
+        if value != int(value):
+            raise ValueError(f"{name} = {value!r} must be a whole number")
+    executor = LocalProcesses(int(n), int(threads))
+    try:
+        yield executor
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+class LocalProcesses(Executor):
+    """An executor of pools of one process each: when a process dies, it is known of which call, and no other call is lost."""
+
+    def __init__(self, n: int, threads: int):
+        """State how many processes, and how many cores each has."""
+        self._pools: list[ProcessPoolExecutor | None] = [None] * n
+        self._threads = threads
+        self._free: SimpleQueue[int] = SimpleQueue()
+        for place in range(n):
+            self._free.put(place)
+        self._callers = ThreadPoolExecutor(n)
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future:
+        """Call a function in one of the processes; its future raises `BrokenProcessPool` if the process dies."""
+        return self._callers.submit(self._called, function, arguments, options)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the processes, after the calls that have begun."""
+        self._callers.shutdown(wait, cancel_futures=cancel_futures)
+        for pool in self._pools:
+            if pool is not None:
+                pool.shutdown(wait, cancel_futures=cancel_futures)
+
+    def _called(self, function: Callable[..., Any], arguments: tuple[Any, ...], options: dict[str, Any]) -> Any:
+        place = self._free.get()
+        try:
+            pool = self._pools[place]
+            if pool is None:
+                pool = self._pools[place] = _started(place, self._threads)
+            return pool.submit(function, *arguments, **options).result()
+        except BrokenProcessPool:
+            self._pools[place] = None
+            raise
+        finally:
+            self._free.put(place)
+
+
+#: A process inherits the cores of the thread that starts it, and the environment: that of all threads.
+_starting = threading.Lock()
+
+
+def _started(place: int, threads: int) -> ProcessPoolExecutor:
+    """A process, which has its cores and its settings before its first line runs."""
+    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _leave_with_the_parent)
+    with _starting, _environment(_settings()), _cores(place, threads):
+        # The process starts with the first call.
+        begun = pool.submit(int)
+    try:
+        begun.result()
+    except BrokenProcessPool as error:
+        # It would do so again.
+        raise RuntimeError(
+            "a process ended before it computed anything; a script that starts processes must have its own calls under "
+            "`if __name__ == '__main__':`"
+        ) from error
+    return pool
+
+
+def _settings() -> dict[str, str]:
+    """The environment of a process: it computes on the CPU, and shares the store of compiled programs."""
+    settings = {"JAX_PLATFORMS": "cpu"}
+    folder = getattr(jax.config, "jax_compilation_cache_dir", None)
+    if folder:
+        settings |= {"JAX_COMPILATION_CACHE_DIR": str(folder), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        settings |= {"JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}
+    return settings
+
+
+@contextlib.contextmanager
+def _environment(settings: dict[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in settings}
+    os.environ.update(settings)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _cores(place: int, threads: int) -> Iterator[None]:
+    """This thread on the cores of a process; they are dealt out in turn, again from the first where they run out."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    allowed = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {allowed[(place * threads + k) % len(allowed)] for k in range(threads)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
+def _leave_with_the_parent() -> None:
+    """End this process when its parent does; one that was killed tells nobody."""
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        assert parent is not None
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

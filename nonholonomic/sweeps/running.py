@@ -1,0 +1,210 @@
+"""A grid is cut into blocks, which are computed wherever there is room, stored as they finish, and end up in a table."""
+
+import contextlib
+import functools
+import json
+import os
+import uuid
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..progress import Progress
+from ._blocks import Blocks
+from ._file import LONG_NAMES, Stored
+from .grid import Axis, Variable, columns, size_of
+from .handing import DEATHS, Lost, handed_out
+from .layout import Layout, Values
+from .table import Table
+from .tasks import Job, Work, packed, remote_results, stamp, versions
+
+#: Blocks that are handed out at once, at most: what their results take, when they come faster than they can be stored.
+HANDED_OUT = 512
+
+#: Blocks of a large grid, about, and what the results of one may take [bytes].
+BLOCKS, MOST_BYTES = 1024, 1 << 21
+
+
+def sweep(
+    job: Job,
+    axes: list[Axis],
+    variables: dict[str, Variable],
+    request: dict[str, Any],
+    *,
+    path: Any = None,
+    block: int | None = None,
+    most: int | None = None,
+    inner: Sequence[Axis] = (),
+    progress: bool = True,
+    executor: Executor | None = None,
+) -> Table:
+    """Compute every cell of a grid.
+
+    **Arguments:**
+
+    - `job`: (full name of a parameter -> values of some cells, how many of them count) -> name -> results. It may be called
+      from several threads at once; the first call, with no cell that counts, lets it compile. For an executor whose workers
+      are other processes it is pickled.
+    - `axes`: the grid, the last axis varying fastest.
+    - `variables`: what `job` returns.
+    - `request`: plain data that says what is computed; it is stored in the table and guards the file.
+    - `path`: file to write, block by block; if it holds part of the same request, only the rest is computed.
+    - `block`: how many cells `job` is given at once, `block_for` their number by default; `most`: the most of them, where
+      results are large.
+    - `inner`: the coordinates of the dimensions that results have besides the grid's, numbers or words.
+    - `progress`: whether to show it, on a terminal or in a notebook.
+    - `executor`: who computes; by default a thread for each core.
+
+    **Returns:** the `Table`.
+
+    **Raises:** `OSError` or `ValueError` if the file cannot be written or holds another request; `RuntimeError` if the executor
+    breaks down or a worker has other versions: what had finished is in the file.
+    """
+    cells = size_of(axes)
+    given = block_for(cells) if block is None else block
+    given = given if most is None else min(given, most)
+    layout = layout_of(axes, inner, variables, request, given)
+    layout = layout._replace(block=given * blocks_together(layout, given))
+    work = Work(job, axes, given)
+    store = Held(layout) if path is None else Blocks(path, layout)
+    try:
+        found = store.filled(computed(work, layout, store.finished, executor, progress))
+        return Table.of(found) if isinstance(found, Stored) else Table.laid_out(layout, found)
+    except Lost as error:
+        kept = (
+            "nothing is kept without path=" if path is None else f"{path} has what is done; the same call does the rest"
+        )
+        raise RuntimeError(f"{error}, {kept}") from error.__cause__
+    finally:
+        store.close()
+
+
+def computed(
+    work: Work, layout: Layout, finished: set[int], executor: Executor | None, progress: bool
+) -> Iterator[tuple[int, dict[str, Values]]]:
+    """The blocks that are not finished, each as it is computed; see `sweep`."""
+    todo = [block for block in range(layout.blocks) if block not in finished]
+    done = layout.cells - sum(map(layout.size, todo))
+    with Progress(layout.cells, "cell", shown=progress) as shown, workforce(work, executor) as submit:
+        begun = executor is None
+        if begun:
+            if todo:
+                work.compile()
+            shown.begin(done)
+        try:
+            for block, values in handed_out(lambda block: submit(block * layout.block, layout.block), todo, HANDED_OUT):
+                yield block, given_up(work.axes, layout, block) if values is None else values
+                done += layout.size(block)
+                # Where others compute, nobody tells when the first of them has compiled.
+                if begun:
+                    shown.advance(layout.size(block))
+                else:
+                    shown.begin(done)
+                begun = True
+        except Lost as error:
+            raise Lost(f"{error}; {done} of {layout.cells} cells are done") from error.__cause__
+
+
+def layout_of(
+    axes: list[Axis], inner: Sequence[Axis], variables: dict[str, Variable], request: dict[str, Any], block: int
+) -> Layout:
+    """What a sweep's table is made of; see `sweep`."""
+    coords = {one.name: one.values for one in (*axes, *inner)}
+    units = {one.name: one.unit for one in (*axes, *inner) if one.values.dtype.kind != "U"}
+    units |= {name: one.unit for name, one in variables.items() if one.words is None}
+    attributes = {
+        "request": json.dumps(request | {"float": str(np.dtype(jnp.result_type(float)))}),
+        "axes": json.dumps([one.name for one in axes]),
+        "versions": json.dumps(versions()),
+    }
+    long_names = {one.name: one.long_name for one in (*axes, *inner)}
+    long_names |= {name: one.long_name for name, one in variables.items()}
+    if any(long_names.values()):
+        named = {name: long_name for name, long_name in long_names.items() if long_name}
+        attributes[LONG_NAMES] = json.dumps(named, sort_keys=True)
+    kinds = {name: np.dtype(one.kind) for name, one in variables.items()}
+    words = {name: one.words for name, one in variables.items() if one.words is not None}
+    dims = {name: one.inner for name, one in variables.items() if one.inner}
+    return Layout(coords, kinds, units, attributes, words, dims, block)
+
+
+class Held:
+    """The blocks of a table that is not to be stored: the same as `Blocks`, in memory."""
+
+    def __init__(self, layout: Layout):
+        """State what the table is made of."""
+        self.finished: set[int] = set()
+        self._layout, self._found = layout, layout.empty(layout.cells)
+
+    def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> dict[str, Values]:
+        """Keep the blocks that are computed; the variables, with all cells along the first axis."""
+        for block, values in computed:
+            first, end = self._layout.ends(block)
+            for name, some in values.items():
+                self._found[name][first:end] = some
+        return self._found
+
+    def close(self) -> None:
+        """Nothing is to be closed."""
+
+
+@contextlib.contextmanager
+def workforce(work: Work, executor: Executor | None) -> Iterator[Callable[[int, int], Future]]:
+    """Who computes: a function that has `count` cells from `first` on computed.
+
+    Threads share this process, and what it has compiled. Any other executor is sent all that it takes.
+    """
+    if executor is None:
+        pool = ThreadPoolExecutor(workers())
+        try:
+            yield functools.partial(pool.submit, work.results)
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+    elif isinstance(executor, ThreadPoolExecutor):
+        yield functools.partial(executor.submit, work.results)
+    else:
+        sent, needed = packed(work), stamp()
+        yield lambda first, count: executor.submit(remote_results, sent, needed, first, count, uuid.uuid4().hex)
+
+
+def given_up(axes: list[Axis], layout: Layout, block: int) -> dict[str, Values]:
+    """The results of a block that is given up: `failed`, and no numbers; a warning names its cells."""
+    first, end = layout.ends(block)
+    ends = [columns(axes, cell, 1) for cell in (first, end - 1)]
+    named = ", ".join(f"{name} {ends[0][name].item():.6g} to {ends[1][name].item():.6g}" for name in ends[0])
+    warnings.warn(
+        f"cells {first} to {end - 1} ({named}) are given up as failed: {DEATHS} workers or more died of them",
+        RuntimeWarning,
+        stacklevel=4,
+    )
+    (words,) = layout.words.values()
+    return layout.empty(end - first, words.index("failed"))
+
+
+def block_for(cells: int) -> int:
+    """Cells in a block: few different sizes, so that few programs are compiled, but many blocks, to be shared among cores.
+
+    It does not depend on the number of cores, so that a file can be resumed on another machine.
+    """
+    if jax.default_backend() != "cpu":
+        return 65536 if cells > 4096 else 4096
+    # A block of 64 lanes takes no longer for two cells than one of two lanes does: starting its loops is what takes the time.
+    return 64 if cells <= 64 else 128 if cells <= 4096 else 512
+
+
+def blocks_together(layout: Layout, block: int) -> int:
+    """How many blocks are handed out and stored as one, a power of two: more than one where the grid is large."""
+    wanted = min(layout.cells // (BLOCKS * block), MOST_BYTES // layout.bytes_of_cells(block))
+    return 1 << max(wanted, 1).bit_length() - 1
+
+
+def workers() -> int:
+    """How many blocks run at once in this process: one for each core it may use; an accelerator takes one at a time."""
+    if jax.default_backend() != "cpu":
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

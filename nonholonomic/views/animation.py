@@ -1,0 +1,166 @@
+"""What a page shows, drawn by matplotlib: an animation in a file, and the curves alone."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from .page import ANGLE, finite, view_from
+from .plot import new_figure
+from .stage import Show, Stage, css, matrices, nearest
+
+#: Pictures a second, how many of them by default, and their dots per inch.
+RATE, FRAMES, DOTS = 25, 150, 80
+
+#: Where the light comes from, and how bright is what it does not reach.
+LIGHT, SHADE = np.array([0.3, -0.5, 0.81]), 0.55
+
+Times = Float[np.ndarray, " frames"]
+
+
+def draw_curves(stages: list[Stage]) -> Any:
+    """A panel for each label, with the curves of all runs in it.
+
+    **Returns:** a matplotlib figure.
+    """
+    shows = [show for stage in stages for show in stage.shows]
+    labels = _labels(stages)
+    figure = new_figure(7.0, 1.3 + 1.3 * len(labels))
+    for label, panel in zip(labels, figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0], strict=True):
+        _draw_curve(panel, shows, label)
+        panel.set_ylabel(label, fontsize="small")
+    panel.set_xlabel("time [s]")
+    if len(shows) > 1:
+        figure.legend([f"{show.name}" for show in shows], loc="outside upper center", ncols=3, fontsize="small")
+    return figure
+
+
+def _labels(stages: list[Stage]) -> list[str]:
+    return list(dict.fromkeys(curve.label for stage in stages for show in stage.shows for curve in show.curves))
+
+
+def _draw_curve(panel: Any, shows: list[Show], label: str) -> None:
+    for show in shows:
+        for curve in show.curves:
+            if curve.label == label:
+                panel.plot(show.times, curve.values, color=css(show.colour), linewidth=1.0)
+    panel.margins(x=0.0)
+
+
+def write_animation(stages: list[Stage], path: Any, times: Times | None) -> None:
+    """Write an animation of stages beside each other, with their curves below.
+
+    **Arguments:** as for `Viewable.animate`.
+    """
+    from matplotlib.animation import FFMpegWriter, FuncAnimation, PillowWriter
+
+    writers = {".gif": PillowWriter, ".mp4": FFMpegWriter}
+    kind = writers.get(Path(path).suffix)
+    if kind is None or not kind.isAvailable():
+        raise ValueError(f"path = {str(path)!r} must end in .gif, or in .mp4 where ffmpeg is installed")
+    last = max(float(show.times[-1]) for stage in stages for show in stage.shows)
+    times = np.linspace(0.0, last, FRAMES) if times is None else times
+    labels = _labels(stages)
+    figure = new_figure(max(8.0, 5.0 * len(stages)), 6.0)
+    grid = figure.add_gridspec(2, len(stages) * len(labels), height_ratios=(3.2, 1.0))
+    spaces = []
+    for number, stage in enumerate(stages):
+        columns = slice(number * len(labels), (number + 1) * len(labels))
+        spaces.append(
+            _Space(figure.add_subplot(grid[0, columns], projection="3d", computed_zorder=False), stage, times)
+        )
+    shows = [show for stage in stages for show in stage.shows]
+    cursors = []
+    for number, label in enumerate(labels):
+        panel = figure.add_subplot(grid[1, number * len(stages) : (number + 1) * len(stages)])
+        _draw_curve(panel, shows, label)
+        panel.set_title(label, fontsize="small")
+        panel.tick_params(labelsize="x-small")
+        cursors.append(panel.axvline(0.0, color="0.15", linewidth=1.0))
+    clock = figure.suptitle("", fontsize="medium")
+
+    def update(frame: int) -> list[Any]:
+        for space in spaces:
+            space.draw(frame)
+        for cursor in cursors:
+            cursor.set_xdata([times[frame]] * 2)
+        clock.set_text(f"{times[frame]:.3f} s")
+        return []
+
+    # Margins are found once: found anew for every picture they would shake.
+    update(0)
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    FuncAnimation(figure, update, frames=len(times)).save(path, writer=kind(fps=RATE), dpi=DOTS)
+
+
+class _Space:
+    """One stage in axes of matplotlib."""
+
+    def __init__(self, axes: Any, stage: Stage, times: Times):
+        from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+
+        self.axes, self.stage = axes, stage
+        self.frames = [nearest(show.times, times) for show in stage.shows]
+        camera, self.follow = view_from(stage)
+        place, middle = np.array(camera[:3]), np.array(camera[3:6])
+        away = place - middle
+        distance = np.linalg.norm(away)
+        self.reach, self.middle = 0.8 * distance * np.tan(np.radians(ANGLE) / 2.0), middle
+        axes.view_init(np.degrees(np.arcsin(away[2] / distance)), np.degrees(np.arctan2(away[1], away[0])))
+        axes.set_axis_off()
+        axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.6)
+        axes.set_title(f"{stage.title} ({stage.arena.spacing})", fontsize="medium")
+        self.ground = axes.add_collection3d(Line3DCollection([], colors="0.75", linewidths=0.6, zorder=1))
+        lines = [(trace.colour, 2 if trace.about is None else 3) for show in stage.shows for trace in show.traces]
+        self.traces = [axes.plot([], [], [], color=css(c), linewidth=0.9, zorder=z)[0] for c, z in lines]
+        arrows = [arrow.colour for show in stage.shows for arrow in show.arrows]
+        self.arrows = [axes.plot([], [], [], color=css(c), linewidth=2.2, zorder=5)[0] for c in arrows]
+        self.solids = axes.add_collection3d(Poly3DCollection([np.zeros((3, 3))], zorder=4))
+
+    def draw(self, frame: int) -> None:
+        """The stage at one of its times."""
+        middle = self.stage.shows[0].bodies[0].position[self.frames[0][frame]] if self.follow else self.middle
+        for axis, centre in zip("xyz", middle, strict=True):
+            getattr(self.axes, f"set_{axis}lim")(centre - self.reach, centre + self.reach)
+        near = [line for whole in self.stage.arena.lines for line in _pieces(whole, middle, 1.6 * self.reach)]
+        self.ground.set_segments(near)
+        triangles, colours, traces, arrows = [], [], iter(self.traces), iter(self.arrows)
+        for show, frames in zip(self.stage.shows, self.frames, strict=True):
+            now = frames[frame]
+            for body in show.bodies:
+                turn = matrices(body.turning[now : now + 1])[0]
+                for mesh in body.meshes:
+                    corners = (mesh.vertices @ turn.T + body.position[now])[mesh.triangles]
+                    triangles.append(corners)
+                    colours.append(_shaded(corners, mesh.colour))
+            for trace in show.traces:
+                points = finite(trace.points[: now + 1]) + (0.0 if trace.about is None else trace.about[now])
+                points = np.where(
+                    np.linalg.norm(points - middle, axis=-1, keepdims=True) < 1.6 * self.reach, points, np.nan
+                )
+                next(traces).set_data_3d(*points.T)
+            for arrow in show.arrows:
+                ends = np.stack([arrow.start[now], arrow.start[now] + arrow.vector[now]])
+                next(arrows).set_data_3d(*ends.T)
+        self.solids.set_verts(np.concatenate(triangles))
+        self.solids.set_facecolor(np.concatenate(colours))
+
+
+def _pieces(line: np.ndarray, middle: np.ndarray, reach: float) -> list[np.ndarray]:
+    """The parts of a line that are within reach."""
+    inside = np.linalg.norm(line - middle, axis=-1) < reach
+    cuts = np.flatnonzero(np.diff(inside)) + 1
+    return [
+        part
+        for part, good in zip(np.split(line, cuts), np.split(inside, cuts), strict=True)
+        if good[0] and len(part) > 1
+    ]
+
+
+def _shaded(corners: Float[np.ndarray, "triangles 3 3"], colour: int) -> Float[np.ndarray, "triangles 3"]:
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-30)
+    base = np.array([colour >> 16 & 255, colour >> 8 & 255, colour & 255]) / 255.0
+    return base * (SHADE + (1.0 - SHADE) * np.clip(across @ LIGHT, 0.0, 1.0))[:, None]

@@ -1,0 +1,152 @@
+"""The piece of a surface on which runs take place, from what every surface answers: its chart, or its nearest points."""
+
+import numpy as np
+from jaxtyping import Float
+
+from ..geometry import AbstractSurface
+from .meshes import of_grid
+from .stage import Arena, Mesh
+
+#: Vertices along each side of the mesh.
+FINE = 97
+
+GREY = 0xEEF1F4
+
+#: Most lines in each direction.
+MOST_LINES = 50
+
+#: Lines on the arena are that far apart: these numbers times a power of ten [m], or these [deg].
+LENGTHS = (1.0, 2.0, 5.0, 10.0)
+DEGREES = (1.0, 2.0, 5.0, 10.0, 15.0, 30.0)
+
+Grid = Float[np.ndarray, "rows columns 3"]
+
+
+def arena(
+    surface: AbstractSurface,
+    points: Float[np.ndarray, "points 3"],
+    normal: Float[np.ndarray, " 3"],
+    margin: float,
+    spacing: float,
+) -> Arena:
+    """The surface about some of its points.
+
+    **Arguments:**
+
+    - `surface`: any surface.
+    - `points`: where something touches it [m], in the fixed frame.
+    - `normal`: into the room, somewhere on the run.
+    - `margin`: how far beyond them it is drawn [m]; `spacing`: of the lines on it [m], about.
+
+    **Returns:** an `Arena`.
+    """
+    points = points[np.all(np.isfinite(points), axis=-1)]
+    chart = _Patch(surface, points) if len(surface.coordinates) == 3 else _Chart(surface, points)
+    (first, second), (step_1, step_2), words = chart.ranges(margin, spacing)
+    mesh = chart.grid(*np.meshgrid(np.linspace(*first, FINE), np.linspace(*second, FINE), indexing="ij"))
+    lines = [chart.grid(np.full(FINE, a), np.linspace(*second, FINE)) for a in marks(first, step_1)]
+    lines += [chart.grid(np.linspace(*first, FINE), np.full(FINE, b)) for b in marks(second, step_2)]
+    return Arena(Mesh(mesh.reshape(-1, 3), of_grid(FINE, FINE), GREY), tuple(lines), words, normal)
+
+
+class _Chart:
+    """A surface whose places are two numbers, lengths or angles."""
+
+    def __init__(self, surface: AbstractSurface, points: Float[np.ndarray, "points 3"]):
+        self.surface = surface
+        self.places = [np.asarray(number, dtype=float) for number in surface.place_at(own(surface, points.T))]
+        self.angles = [unit == "rad" for _, unit in surface.coordinates]
+        for number, angle in enumerate(self.angles):
+            if angle:
+                self.places[number] = np.unwrap(self.places[number])
+
+    def grid(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        return fixed(self.surface, self.surface.chart((first, second))[0])
+
+    def ranges(self, margin: float, spacing: float) -> tuple[list, list[float], str]:
+        """The ranges of both numbers, the steps between lines, and what they are in words."""
+        lengths = [self._length(number) for number in (0, 1)]
+        found, steps, words = [], [], []
+        for number, angle in enumerate(self.angles):
+            low, high = self.places[number].min(), self.places[number].max()
+            extra = margin / max(lengths[number], 1e-300)
+            if angle and high - low + 2.0 * extra >= 2.0 * np.pi:
+                low, high = -np.pi, np.pi
+            else:
+                low, high = low - extra, high + extra
+            low, high = self._legal(number, low, high)
+            step = nice(max(spacing / max(lengths[number], 1e-300), (high - low) / MOST_LINES), angle)
+            found.append((low, high))
+            steps.append(step)
+            words.append(f"{np.degrees(step):.3g}°" if angle else in_words(step))
+        return found, steps, "grid " + " x ".join(dict.fromkeys(words))
+
+    def _length(self, number: int) -> float:
+        """Least length [m] along the surface for each unit of a number, at the run's places."""
+        shifted = [place + 1e-6 * (k == number) for k, place in enumerate(self.places)]
+        return float(np.min(np.linalg.norm(self.grid(*shifted) - self.grid(*self.places), axis=-1)) / 1e-6)
+
+    def _legal(self, number: int, low: float, high: float) -> tuple[float, float]:
+        """The part of a range in which places are named by their own numbers: a latitude ends at the poles."""
+        tried = np.linspace(low, high, 401)
+        place = [np.full_like(tried, np.median(values)) for values in self.places]
+        place[number] = tried
+        back = np.asarray(self.surface.place_at(self.surface.chart(tuple(place))[0])[number])
+        away = back - tried
+        if self.angles[number]:
+            away = (away + np.pi) % (2.0 * np.pi) - np.pi
+        good = tried[np.abs(away) < 1e-6 * (1.0 + np.abs(tried))]
+        return (low, high) if len(good) < 2 else (good[0], good[-1])
+
+
+class _Patch:
+    """A surface whose places are positions: the nearest points to a piece of its tangent plane."""
+
+    def __init__(self, surface: AbstractSurface, points: Float[np.ndarray, "points 3"]):
+        self.surface = surface
+        self.middle = fixed(surface, surface.nearest(own(surface, points.mean(axis=0))))
+        _, east, north = surface.chart(tuple(own(surface, self.middle)))
+        self.axes = np.stack([fixed(surface, east), fixed(surface, north)])
+        self.spread = (points - self.middle) @ self.axes.T
+
+    def grid(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        flat = self.middle + first[..., None] * self.axes[0] + second[..., None] * self.axes[1]
+        return fixed(self.surface, self.surface.nearest(own(self.surface, np.moveaxis(flat, -1, 0))))
+
+    def ranges(self, margin: float, spacing: float) -> tuple[list, list[float], str]:
+        ranges = [(part.min() - margin, part.max() + margin) for part in self.spread.T]
+        step = nice(max(spacing, max(high - low for low, high in ranges) / MOST_LINES), False)
+        return ranges, [step, step], f"grid {in_words(step)}"
+
+
+def own(surface: AbstractSurface, position: np.ndarray) -> tuple:
+    """A position (3, ...) in the fixed frame in the surface's axes, as surfaces take it."""
+    return surface.in_own_axes(tuple(np.asarray(part, dtype=float) for part in position))
+
+
+def fixed(surface: AbstractSurface, vector: tuple) -> np.ndarray:
+    """A vector in the surface's axes in the fixed frame, (..., 3)."""
+    like = next(part for part in vector if part is not None)
+    full = tuple(np.zeros_like(np.asarray(like, dtype=float)) if part is None else np.asarray(part) for part in vector)
+    return np.stack(np.broadcast_arrays(*(np.asarray(part) for part in surface.in_fixed_frame(full))), axis=-1)
+
+
+def nice(step: float, angle: bool) -> float:
+    """The next round number."""
+    if angle:
+        return float(np.radians(next((one for one in DEGREES if one >= 0.999 * np.degrees(step)), DEGREES[-1])))
+    unit = 10.0 ** np.floor(np.log10(step))
+    return float(unit * next(one for one in LENGTHS if one * unit >= 0.999 * step))
+
+
+def in_words(length: float) -> str:
+    """A round length with its unit."""
+    for unit, metres in (("m", 1.0), ("cm", 1e-2), ("mm", 1e-3)):
+        if length >= 0.999 * metres:
+            return f"{length / metres:.3g} {unit}"
+    return f"{length:.1e} m"
+
+
+def marks(range_: tuple[float, float], step: float) -> np.ndarray:
+    """The multiples of a step in a range."""
+    return step * np.arange(np.ceil(range_[0] / step - 1e-9), np.floor(range_[1] / step + 1e-9) + 1)

@@ -1,0 +1,93 @@
+"""The picture of a fit: data and model, residuals, profile likelihoods and correlations (needs matplotlib)."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from ..identification import Identification
+
+#: Parameters whose profiles are drawn, and by how much -2 log likelihood rises to the end of a 95 % interval.
+MOST_PROFILES, INTERVAL = 6, 3.84
+
+
+def draw_fit(fit: "Identification") -> Any:
+    """Draw what was measured with what the fit predicts, the residuals in units of the errors, the profile likelihood of
+    every parameter that the data determine, with its parabola dashed, and the correlations.
+
+    **Returns:** a matplotlib figure.
+    """
+    from matplotlib.figure import Figure
+
+    names = list(fit.estimates)
+    determined = [name for name in names if np.isfinite(fit.standard_errors[name])][:MOST_PROFILES]
+    profiled = determined if len(names) > 1 else []
+    lower = max(1, len(profiled) + 1)
+    figure = Figure(figsize=(max(9.0, 2.6 * lower), 8.5), layout="constrained")
+    grid = figure.add_gridspec(3, lower, height_ratios=(2.0, 1.0, 1.6))
+    _draw_data(fit, figure.add_subplot(grid[0, :]))
+    _draw_residuals(fit, figure.add_subplot(grid[1, :]))
+    for k, name in enumerate(profiled):
+        _draw_profile(fit, name, figure.add_subplot(grid[2, k]))
+    _draw_correlation(fit, names, figure.add_subplot(grid[2, lower - 1]))
+    figure.suptitle("; ".join(fit.verdict.concerns) or "nothing speaks against this fit", fontsize=9, wrap=True)
+    return figure
+
+
+def _series(fit: "Identification") -> list[np.ndarray]:
+    """The places of the measurements of each series."""
+    numbers = np.asarray(fit.measurements.series)
+    return [np.flatnonzero(numbers == one) for one in np.unique(numbers)]
+
+
+def _abscissa(fit: "Identification") -> tuple[np.ndarray, str]:
+    """Where to draw every measurement: at its time, where it has one."""
+    times = np.asarray(fit.measurements.time)
+    return (times, "time since the first sample [s]") if np.any(times) else (np.arange(len(times)), "measurement")
+
+
+def _draw_data(fit: "Identification", axes: Any) -> None:
+    places, label = _abscissa(fit)
+    rows = fit.residuals
+    value = np.array([row.value if np.isfinite(row.value) else row.upper for row in rows])
+    errors, predicted = (np.array([getattr(row, name) for row in rows]) for name in ("error", "prediction"))
+    censored = np.array([row.censored for row in rows])
+    for k, here in enumerate(_series(fit)):
+        colour, exact, limits = f"C{k}", here[~censored[here]], here[censored[here]]
+        name = rows[here[0]].label.split("(")[0]
+        axes.errorbar(places[exact], value[exact], errors[exact], fmt=".", color=colour, alpha=0.5, label=name)
+        axes.plot(places[limits], value[limits], "^", color=colour, alpha=0.5)
+        axes.plot(places[here], predicted[here], "-" if label.startswith("time") else "x", color=colour)
+    axes.set_xlabel(label)
+    axes.set_ylabel("measured, predicted (lines, crosses)")
+    axes.legend(fontsize=8)
+
+
+def _draw_residuals(fit: "Identification", axes: Any) -> None:
+    places, label = _abscissa(fit)
+    residual = np.array([row.residual for row in fit.residuals])
+    for k, here in enumerate(_series(fit)):
+        axes.plot(places[here], residual[here], ".", color=f"C{k}")
+    axes.axhspan(-1.96, 1.96, color="0.9", zorder=0)
+    axes.set_xlabel(label)
+    axes.set_ylabel("residual / error")
+
+
+def _draw_profile(fit: "Identification", name: str, axes: Any) -> None:
+    profile = fit.profile(name)
+    deviations = (profile.values - fit.estimates[name]) / fit.standard_errors[name]
+    axes.plot(profile.values, profile.deviance, ".-")
+    axes.plot(profile.values, deviations**2, "--", color="0.6")
+    axes.axhline(INTERVAL, color="0.6", linewidth=0.8)
+    axes.set_ylim(-0.5, 10.0)
+    axes.set_xlabel(name)
+    axes.set_ylabel("-2 log likelihood, profiled")
+
+
+def _draw_correlation(fit: "Identification", names: list[str], axes: Any) -> None:
+    image = axes.imshow(fit.correlation, vmin=-1.0, vmax=1.0, cmap="RdBu")
+    short = [name.rsplit(".", 1)[-1] for name in names]
+    axes.set_xticks(range(len(names)), short, rotation=90, fontsize=8)
+    axes.set_yticks(range(len(names)), short, fontsize=8)
+    axes.set_title("correlation", fontsize=9)
+    axes.figure.colorbar(image, ax=axes, shrink=0.8)

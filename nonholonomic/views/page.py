@@ -1,0 +1,250 @@
+"""One page that holds everything: a view in three dimensions that moves, drawn by K3D, and strips of curves (needs k3d)."""
+
+import base64
+import html
+import json
+import zlib
+from importlib.resources import files
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .meshes import revolved
+from .stage import Arrow, Mesh, Points, Show, Stage, css
+
+#: How fast time may run.
+SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+
+LINES = 0x7C8896
+BACKGROUND = 0xFBFBFA
+
+#: Opening angle of the camera [deg].
+ANGLE = 35.0
+
+
+class Page(NamedTuple):
+    """A page of its own: its HTML. A notebook shows it."""
+
+    html: str
+
+    def save(self, path: Any) -> None:
+        """Write the page to a file.
+
+        **Raises:** `OSError` if it cannot be written.
+        """
+        Path(path).write_text(self.html, encoding="utf-8")
+
+    def _repr_html_(self) -> str:
+        return f'<iframe srcdoc="{html.escape(self.html)}" style="width:100%;height:820px;border:0"></iframe>'
+
+    def __repr__(self) -> str:
+        return f"Page of {len(self.html) / 1e6:.2f} MB; save(path) writes it, and a notebook shows it"
+
+
+def can_view() -> bool:
+    """Whether K3D is installed."""
+    return find_spec("k3d") is not None
+
+
+def page(
+    stages: list[Stage], title: str, speed: float = 1.0, above: str = "", below: str = "", height: int = 460
+) -> Page:
+    """A page with some stages beside each other, whose times run together.
+
+    **Arguments:**
+
+    - `stages`: what is shown; none gives a page of words.
+    - `title`: of the page; `above`, `below`: HTML around the view.
+    - `speed`: how fast time runs at first, one of `SPEEDS`.
+    - `height`: of each stage in pixels.
+
+    **Raises:** `ModuleNotFoundError` if there are stages and K3D is not installed.
+    """
+    parts = {"TITLE": html.escape(title), "HEIGHT": str(height), "ABOVE": above, "BELOW": below, "VIEW": ""}
+    if stages:
+        parts["VIEW"] = _view(stages, speed)
+    whole = _template("page.html")
+    for name, text in parts.items():
+        whole = whole.replace(f"[{name}]", text)
+    return Page(whole)
+
+
+def _template(name: str) -> str:
+    return files(__package__).joinpath(name).read_text(encoding="utf-8")
+
+
+def _coded(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")
+
+
+def _script(name: str, text: str, kind: str = "text/plain") -> str:
+    # A page ends a script where it reads so, whatever the script is.
+    safe = text.replace("</", "<\\/")
+    return f'<script type="{kind}" id="{name}">{safe}</script>'
+
+
+def _view(stages: list[Stage], speed: float) -> str:
+    if not can_view():
+        raise ModuleNotFoundError("a view needs K3D: pip install 'nonholonomic[view]'")
+    library = files("k3d").joinpath("static", "standalone.js").read_bytes()
+    numbers = _Numbers()
+    duration = max(float(show.times[-1]) for stage in stages for show in stage.shows)
+    facts = {
+        "duration": duration,
+        "speed": speed,
+        "speeds": [(f"{one:g} x real time" if one != 1.0 else "real time", one) for one in SPEEDS],
+        "stages": [],
+    }
+    snapshots = []
+    for number, stage in enumerate(stages):
+        snapshot, fact = _stage(stage, numbers)
+        facts["stages"].append(fact | {"snapshot": f"snapshot{number}"})
+        snapshots.append(_script(f"snapshot{number}", _coded(snapshot)))
+    return "\n".join(
+        [
+            _script("library", _coded(zlib.compress(library, 9))),
+            _script("facts", json.dumps(facts), "application/json"),
+            _script("numbers", _coded(zlib.compress(numbers.packed(), 9))),
+            *snapshots,
+            f"<script>{_template('page.js')}</script>",
+        ]
+    )
+
+
+class _Numbers:
+    """Arrays one after the other; each is known by where it begins and how many numbers it has."""
+
+    def __init__(self):
+        self.parts: list[np.ndarray] = []
+        self.length = 0
+
+    def add(self, values: np.ndarray) -> tuple[int, int]:
+        flat = np.ascontiguousarray(values, dtype="<f4").ravel()
+        begin, self.length = self.length, self.length + flat.size
+        self.parts.append(flat)
+        return begin, flat.size
+
+    def packed(self) -> bytes:
+        return np.concatenate(self.parts).tobytes()
+
+
+def _stage(stage: Stage, numbers: _Numbers) -> tuple[bytes, dict[str, Any]]:
+    """K3D's snapshot of what a stage draws, and what the script needs to know of it."""
+    import k3d
+
+    plot = k3d.plot(
+        camera_auto_fit=False,
+        grid_visible=False,
+        menu_visibility=False,
+        camera_fov=ANGLE,
+        background_color=BACKGROUND,
+        camera_mode="orbit",
+        axes_helper=0.0,
+    )
+    drawn = _Drawn(k3d, plot)
+    drawn.mesh(stage.arena.mesh, side="double")
+    drawn.grid(stage.arena.lines)
+    camera, follow = view_from(stage)
+    plot.camera = camera
+    shows = [_show(show, drawn, numbers) for show in stage.shows]
+    keys = [(stage.arena.spacing, "")]
+    for show in stage.shows:
+        keys += [(show.name, css(show.colour))] if len(stage.shows) > 1 else []
+    for show in stage.shows[:1]:
+        keys += [(one.name, css(one.colour)) for one in (*show.traces, *show.arrows)]
+    fact = {"title": stage.title, "keys": keys, "follow": follow, "shows": shows}
+    return plot.get_binary_snapshot(9), fact
+
+
+class _Drawn:
+    """A plot of K3D, and how meshes and lines get into it; each gives its id."""
+
+    def __init__(self, k3d: Any, plot: Any):
+        self.k3d, self.plot = k3d, plot
+
+    def mesh(self, mesh: Mesh, side: str = "double") -> int:
+        vertices, triangles = mesh.vertices.astype("f4"), mesh.triangles.astype("u4")
+        return self._add(self.k3d.mesh(vertices, triangles, color=mesh.colour, flat_shading=False, side=side))
+
+    def line(self, points: Points, colour: int, width: float) -> int:
+        return self._add(self.k3d.line(points.astype("f4"), color=colour, shader="thick", width=width))
+
+    def grid(self, lines: tuple[np.ndarray, ...]) -> int:
+        ends = np.cumsum([len(line) for line in lines])
+        begins = np.setdiff1d(np.arange(ends[-1]), ends - 1)
+        pairs = np.stack([begins, begins + 1], axis=-1).astype("u4")
+        points = np.concatenate(lines).astype("f4")
+        kind = {"indices_type": "segment", "shader": "simple"}
+        return self._add(self.k3d.lines(points, pairs, color=LINES, **kind))
+
+    def _add(self, one: Any) -> int:
+        self.plot += one
+        return one.id
+
+
+def _show(show: Show, drawn: _Drawn, numbers: _Numbers) -> dict[str, Any]:
+    return {
+        "name": show.name,
+        "colour": css(show.colour),
+        "times": numbers.add(show.times),
+        "bodies": [
+            {
+                "name": body.name,
+                "ids": [drawn.mesh(mesh) for mesh in body.meshes],
+                "position": numbers.add(body.position),
+                "turning": numbers.add(body.turning),
+            }
+            for body in show.bodies
+        ],
+        "traces": [
+            {
+                "id": drawn.line(finite(trace.points), trace.colour, trace.width),
+                "about": None if trace.about is None else numbers.add(trace.about),
+            }
+            for trace in show.traces
+        ],
+        "arrows": [_arrow(arrow, drawn, numbers) for arrow in show.arrows],
+        "curves": [{"label": curve.label, "values": numbers.add(curve.values)} for curve in show.curves],
+    }
+
+
+def finite(points: Points) -> Points:
+    """Points, those that are not numbers replaced by the last before them."""
+    good = np.all(np.isfinite(points), axis=-1)
+    last = np.maximum.accumulate(np.where(good, np.arange(len(points)), 0))
+    return np.nan_to_num(points[last])
+
+
+def _arrow(arrow: Arrow, drawn: _Drawn, numbers: _Numbers) -> dict[str, Any]:
+    """A shaft one metre long, which the script scales, and a tip, which it moves to the shaft's end."""
+    head = 5.0 * arrow.width
+    shaft = revolved([(0.0, 1.0), (arrow.width, 1.0), (arrow.width, 0.0), (0.0, 0.0)], arrow.colour)
+    tip = revolved([(0.0, head), (2.4 * arrow.width, 0.0), (0.0, 0.0)], arrow.colour)
+    return {
+        "shaft": drawn.mesh(shaft),
+        "tip": drawn.mesh(tip),
+        "head": head,
+        "start": numbers.add(finite(arrow.start)),
+        "vector": numbers.add(finite(arrow.vector)),
+    }
+
+
+def view_from(stage: Stage) -> tuple[list[float], bool]:
+    """Camera (its place, what it looks at, up), and whether it has to follow, as the body is small against its path."""
+    paths = [finite(show.bodies[0].position) for show in stage.shows]
+    size = max(show.size for show in stage.shows)
+    points = np.concatenate(paths)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
+    reach = np.linalg.norm(points - middle, axis=-1).max()
+    follow = bool(reach > 4.0 * size)
+    if follow:
+        middle, reach = paths[0][0], 2.0 * size
+    normal = stage.arena.normal
+    aside = np.array([0.35, -1.0, 0.0])
+    aside = aside - (aside @ normal) * normal
+    direction = 0.55 * normal + aside / np.linalg.norm(aside)
+    distance = 1.05 * (reach + 1.6 * size) / np.sin(np.radians(ANGLE) / 2.0)
+    place = middle + distance * direction / np.linalg.norm(direction)
+    return [*place.tolist(), *middle.tolist(), 0.0, 0.0, 1.0], follow

@@ -1,0 +1,131 @@
+"""What a page and an animation draw: bodies that move, traces, arrows and curves, on stages with an arena each.
+
+Nothing here knows a top or a stroller. Lengths are in metres in the fixed frame (x, y, z), z up; times in seconds.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+Points = Float[np.ndarray, "times 3"]
+
+
+class Mesh(NamedTuple):
+    """Triangles of one colour, 0xrrggbb, in the axes of the body that they belong to."""
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    triangles: Int[np.ndarray, "triangles 3"]
+    colour: int
+
+
+class Body(NamedTuple):
+    """A rigid body: where its origin is, how it is turned, a quaternion (x, y, z, w) for each time, and its meshes."""
+
+    name: str
+    position: Points
+    turning: Float[np.ndarray, "times 4"]
+    meshes: tuple[Mesh, ...]
+
+
+class Trace(NamedTuple):
+    """A line that grows as time goes on; `about`, if any, is a moving point to which its points are relative."""
+
+    name: str
+    points: Points
+    colour: int
+    width: float
+    about: Points | None = None
+
+
+class Arrow(NamedTuple):
+    """An arrow that changes: where it starts, and its vector as long as it is drawn [m]; `name` says what its length means."""
+
+    name: str
+    start: Points
+    vector: Points
+    colour: int
+    width: float
+
+
+class Curve(NamedTuple):
+    """A number over time, with a label that names its unit."""
+
+    label: str
+    values: Float[np.ndarray, " times"]
+
+
+class Show(NamedTuple):
+    """One run as it is drawn: `size` is a length [m] of the body, `colour` that of its curves."""
+
+    name: str
+    colour: int
+    times: Float[np.ndarray, " times"]
+    size: float
+    bodies: tuple[Body, ...]
+    traces: tuple[Trace, ...]
+    arrows: tuple[Arrow, ...]
+    curves: tuple[Curve, ...]
+
+
+class Arena(NamedTuple):
+    """A piece of a surface: its mesh, the lines drawn on it, how far apart they are, in words, and a normal into the room."""
+
+    mesh: Mesh
+    lines: tuple[Float[np.ndarray, "points 3"], ...]
+    spacing: str
+    normal: Float[np.ndarray, " 3"]
+
+
+class Stage(NamedTuple):
+    """An arena and the runs on it, seen by one camera."""
+
+    title: str
+    arena: Arena
+    shows: tuple[Show, ...]
+
+
+#: Colours of the runs of a stage: that of a run's curves and of one half of its body.
+COLOURS = (0xC8412B, 0x2A6FB0, 0x2E8B57, 0x8E4FA8, 0xC98A1B, 0x3B9AA8)
+
+#: Colour of the other half.
+PALE = 0xF4E9D2
+DARK = 0x3A3A3E
+
+
+def css(colour: int) -> str:
+    """A colour as CSS and matplotlib write it."""
+    return f"#{colour:06x}"
+
+
+def turned(rotation: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "times 4"]:
+    """Quaternions (x, y, z, w) of rotation matrices."""
+    m = np.asarray(rotation, dtype=float)
+    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
+    # Four times the products of the quaternion's components; the column of its largest component has no cancellation.
+    products = np.empty((len(m), 4, 4))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        products[:, i, i] = 1.0 - trace + 2.0 * m[:, i, i]
+        products[:, i, j] = products[:, j, i] = m[:, i, j] + m[:, j, i]
+        products[:, i, 3] = products[:, 3, i] = m[:, k, j] - m[:, j, k]
+    products[:, 3, 3] = 1.0 + trace
+    largest = np.argmax(np.diagonal(products, axis1=1, axis2=2), axis=-1)
+    found = products[np.arange(len(m)), largest]
+    return found / np.linalg.norm(found, axis=-1, keepdims=True)
+
+
+def matrices(turning: Float[np.ndarray, "times 4"]) -> Float[np.ndarray, "times 3 3"]:
+    """Rotation matrices of quaternions (x, y, z, w)."""
+    x, y, z, w = turning.T
+    rows = (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
+        (2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)),
+        (2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def nearest(times: Float[np.ndarray, " times"], at: Float[np.ndarray, " frames"]) -> Int[np.ndarray, " frames"]:
+    """The numbers of the times that are nearest to given ones."""
+    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+    return after - (at - times[after - 1] < times[after] - at)

@@ -1,0 +1,97 @@
+"""Whether a fit can be believed: scatter, order, starts, and what the picture shows."""
+
+import itertools
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from conftest import assert_close
+from matplotlib.figure import Figure
+
+from nonholonomic.identification import FitWarning, Free, Measurements, identify
+from nonholonomic.identification.verdict import normal_scores, runs_of_signs
+
+T = np.linspace(0.0, 4.0, 115)
+
+
+def oscillation(p):
+    return p["height"][:, None] * jnp.sin(p["rate"][:, None] * T)
+
+
+def recorded(error=0.5):
+    """An oscillation of height 1 and rate 6 with noise of 0.5, as it was measured with an alleged error."""
+    return Measurements(np.sin(6.0 * T) + 0.5 * np.random.default_rng(3).normal(size=T.size), error)
+
+
+@pytest.mark.parametrize("positive", [1, 3, 5])
+def test_few_runs_are_as_improbable_as_counting_says(positive):
+    signs = np.array([1.0] * positive + [-1.0] * (7 - positive))
+    orders = [np.array(one) for one in set(itertools.permutations(signs))]
+    runs = np.array([1 + np.sum(one[1:] != one[:-1]) for one in orders])
+    for one, count in list(zip(orders, runs, strict=True))[:12]:
+        found = runs_of_signs(one)
+        assert found.runs == count
+        assert_close(found.p_value, np.mean(runs <= count), rtol=1e-12)
+
+
+def test_a_good_fit_has_nothing_against_it_and_its_p_value_is_that_of_chi_squared():
+    fit = identify(oscillation, recorded(), {"height": 0.8, "rate": 5.8}, starts=3, spread=1.05)
+    assert fit.verdict.good
+    assert_close(fit.verdict.p_value, scipy.stats.chi2.sf(fit.deviance, 113), rtol=1e-9)
+    assert (fit.verdict.agree, fit.verdict.starts) == (3, 3)
+    assert "3 of 3 starts agree" in str(fit)
+
+
+def test_a_wrong_minimum_is_told_although_the_fit_converged():
+    """As one did by a factor in the rate: -2 log likelihood 170 at 115 measurements."""
+    with pytest.warns(FitWarning, match="residuals are too large"):
+        fit = identify(oscillation, recorded(), {"height": 0.8, "rate": 9.0})
+    assert fit.status == "converged"
+    assert fit.deviance / fit.degrees > 1.4
+    assert fit.verdict.p_value < 0.01
+    assert not fit.verdict.good
+
+
+def test_starts_that_disagree_are_told():
+    with pytest.warns(FitWarning, match="only one of 2 starts ended here"):
+        fit = identify(oscillation, recorded(), {"height": 1.0, "rate": Free(6.0, 0.0)}, starts=2, spread=2.0, seed=1)
+    assert fit.verdict.agree == 1
+
+
+def test_a_trend_that_the_model_misses_shows_in_the_runs_where_the_errors_are_too_large():
+    line = Measurements(0.2 * T**2 + 0.01 * np.random.default_rng(0).normal(size=T.size), 0.5)
+    with pytest.warns(FitWarning, match="keep their sign for too long"):
+        fit = identify(lambda p: p["slope"][:, None] * T, line, {"slope": 1.0})
+    assert fit.verdict.p_value > 0.5
+    assert fit.verdict.series[0].p_value < 1e-6
+
+
+def test_estimated_errors_are_those_of_the_scatter():
+    value = np.concatenate([1.0 + 0.1 * np.random.default_rng(1).normal(size=40), np.full(40, 5.0)])
+    value[40:] += 0.7 * np.random.default_rng(2).normal(size=40)
+    data = Measurements(value, 1.0, series=np.repeat([0, 1], 40), estimated=True)
+    fit = identify(lambda p: jnp.repeat(jnp.stack([p["a"], p["b"]], axis=1), 40, axis=1), data, {"a": 0.0, "b": 0.0})
+    assert_close(fit.standard_errors["a"], np.std(value[:40], ddof=1) / math.sqrt(40.0), rtol=0.01)
+    assert_close(fit.standard_errors["b"], np.std(value[40:], ddof=1) / math.sqrt(40.0), rtol=0.01)
+    assert math.isnan(fit.verdict.p_value)
+    assert "estimated from the scatter" in str(fit)
+
+
+def test_scores_of_student_errors_are_normal():
+    z = np.linspace(-8.0, 8.0, 9)
+    scores = normal_scores(Measurements(np.zeros(9), 1.0, student=4.0), z)
+    assert_close(scipy.stats.norm.cdf(scores), scipy.stats.t.cdf(z, 4.0), rtol=1e-9)
+
+
+def test_the_picture_has_data_residuals_profiles_and_correlation():
+    fit = identify(oscillation, recorded(), {"height": 0.8, "rate": 5.8})
+    figure = fit.plot()
+    assert isinstance(figure, Figure)
+    data, residuals, *profiles, correlation, _ = figure.axes
+    assert_close(data.lines[-1].get_ydata(), [row.prediction for row in fit.residuals])
+    assert_close(residuals.lines[0].get_ydata(), [row.residual for row in fit.residuals])
+    assert [axes.get_xlabel() for axes in profiles] == ["height", "rate"]
+    assert_close(correlation.images[0].get_array(), fit.correlation)
+    assert_close(np.diag(fit.correlation), 1.0)

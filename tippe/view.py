@@ -1,0 +1,187 @@
+"""A run of a top as it is drawn: its body, its contact's trace, the path of its axis, arrows, and curves over time."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic.views import (
+    COLOURS,
+    DARK,
+    PALE,
+    Arrow,
+    Body,
+    Curve,
+    Mesh,
+    Show,
+    Stage,
+    Trace,
+    arena,
+    ball,
+    rod,
+    turned,
+)
+
+from .scene import Scene
+from .top import Top
+
+#: Most radians by which the top spins from one frame to the next, and most frames.
+SPIN_PER_FRAME = 0.4
+MOST_FRAMES = 12_000
+LEAST_FRAMES = 400
+
+#: Lengths in units of the radius: of the axis as it is drawn from the centre, and of the arrows for the weight and for the
+#: longest slip.
+AXIS, WEIGHT, SLIP = 1.6, 1.5, 3.0
+
+#: Slips that are greater than this part of all are not drawn longer: the first moments would hide the rest.
+COMMON_SLIP = 0.9
+
+GREEN, VIOLET, BLUE, GOLD = 0x1F8A4C, 0x7B4FA3, 0x1B6CA8, 0xE0A100
+
+
+class Motion(NamedTuple):
+    """What is drawn of a run: vectors in the fixed frame, (times, 3)."""
+
+    times: Float[Array, " times"]
+    position: Float[Array, "times 3"]
+    axis: Float[Array, "times 3"]
+    normal: Float[Array, "times 3"]
+    contact: Float[Array, "times 3"]
+    slip: Float[Array, "times 3"]
+    spin_angle: Float[Array, " times"]
+    theta: Float[Array, " times"]
+    energy: Float[Array, " times"]
+    jellett: Float[Array, " times"]
+    normal_force: Float[Array, " times"]
+
+    @classmethod
+    def of(cls, run: Any) -> "Motion":
+        """The motion of one run, inside or outside of transformations."""
+        body, slip = run.scene.body, run.slip
+        zero = jnp.zeros_like(run.t)
+        position, axis, normal = run.position, run.axis, run._fixed((zero, zero, zero + 1.0))
+        contact = position - body.radius * normal
+        if body.stem is not None:
+            stem = position + (body.stem.offset - body.offset) * axis - body.stem.radius * normal
+            contact = jnp.where((run.contact == 1)[:, None], stem, contact)
+        return cls(
+            run.t,
+            position,
+            axis,
+            normal,
+            contact,
+            run._fixed((slip[:, 0], slip[:, 1], zero)),
+            run.spin_angle,
+            run.theta,
+            run.energy,
+            run.jellett,
+            run.normal_force,
+        )
+
+
+_motion = eqx.filter_jit(Motion.of)
+
+
+def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
+    """Runs as they are drawn: a stage for each, or one for all if they are to be overlaid."""
+    named = [(f"θ(0) = {float(run.theta[0]):.3g} rad", run.scene, motion(run)) for run in runs]
+    return stages([named] if overlaid else [[one] for one in named])
+
+
+def motion(run: Any) -> Motion:
+    """The motion of one run at times so close together that its spin is seen, where it can be told between its own."""
+    if run.t.ndim > 1:
+        raise ValueError(f"a batch of runs, of shape {run.t.shape}, cannot be shown: take one of them")
+    if run.dense is not None:
+        angle = np.abs(np.asarray(run.spin_angle))
+        frames = int(np.clip(np.ptp(angle) / SPIN_PER_FRAME, LEAST_FRAMES, MOST_FRAMES))
+        run = run.at(np.linspace(0.0, float(run.end_time), frames))
+    count = len(run.t)
+    return Motion(*(np.asarray(part)[:count] for part in _motion(run.padded())))
+
+
+def show(scene: Scene, motion: Motion, number: int, name: str) -> Show:
+    """One run as it is drawn, the `number`-th of its stage."""
+    body, colour = scene.body, COLOURS[number % len(COLOURS)]
+    motion = Motion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
+    radius, weight = float(body.radius), float(body.mass * scene.gravity)
+    tip = AXIS * radius
+    speed = np.linalg.norm(motion.slip, axis=-1)
+    longest = max(float(np.quantile(speed, COMMON_SLIP)), 1e-12)
+    slip = motion.slip * (SLIP * radius / np.maximum(speed, longest))[:, None]
+    turning = turned(rotation(motion.axis, motion.spin_angle))
+    force = (WEIGHT * radius / weight * motion.normal_force)[:, None] * motion.normal
+    lifted = motion.contact + 0.02 * radius * motion.normal
+    # Within the sphere it could not be seen.
+    beside = lifted + 1.35 * radius * aside(motion.normal)
+    return Show(
+        name,
+        colour,
+        motion.times,
+        radius,
+        (Body("top", motion.position, turning, meshes(body, colour)),),
+        (
+            Trace("contact", lifted, GREEN, 0.06 * radius),
+            Trace("path of the axis", tip * motion.axis, BLUE, 0.012 * radius, about=motion.position),
+        ),
+        (
+            Arrow(f"normal force ({WEIGHT:g} R: the weight)", beside, force, VIOLET, 0.05 * radius),
+            Arrow(f"slip ({SLIP:g} R: {longest:.2g} m/s or more)", lifted, slip, GOLD, 0.05 * radius),
+        ),
+        (
+            Curve("θ, normal to axis [rad]", motion.theta),
+            Curve("energy [J]", motion.energy),
+            Curve("Jellett's quantity [kg m²/s]", motion.jellett),
+            Curve("normal force [N]", motion.normal_force),
+        ),
+    )
+
+
+def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
+    """A stage for each group of runs, which have one arena, with their names; colours tell all runs apart."""
+    found, number = [], 0
+    for group in groups:
+        (_, scene, first), radius = group[0], float(group[0][1].body.radius)
+        points = np.concatenate([motion.contact for _, _, motion in group])
+        ground = arena(scene.surface, points, first.normal[0], 4.0 * radius, 2.5 * radius)
+        shows = tuple(show(one, motion, number + k, name) for k, (name, one, motion) in enumerate(group))
+        found.append(Stage(", ".join(name for name, _, _ in group), ground, shows))
+        number += len(group)
+    return found
+
+
+def aside(normal: Float[np.ndarray, "times 3"]) -> Float[np.ndarray, "times 3"]:
+    """Unit vectors across the normal, towards x, or towards y where the normal is along x."""
+    towards = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    across = towards - np.sum(towards * normal, axis=-1, keepdims=True) * normal
+    return across / np.linalg.norm(across, axis=-1, keepdims=True)
+
+
+def meshes(body: Top, colour: int) -> tuple[Mesh, ...]:
+    """The sphere in two colours, and the stem: as it is, or a short one that only shows where the axis points."""
+    radius = float(body.radius)
+    sphere = ball(radius, (colour, PALE))
+    if body.stem is None:
+        return (*sphere, rod(0.10 * radius, 0.9 * radius, AXIS * radius - 0.16 * radius, 0.16 * radius, DARK))
+    knob, end = float(body.stem.radius), float(body.stem.offset - body.offset)
+    return (*sphere, rod(0.8 * knob, 0.0, end, knob, DARK))
+
+
+def rotation(
+    axis: Float[np.ndarray, "times 3"], spin_angle: Float[np.ndarray, " times"]
+) -> Float[np.ndarray, "times 3 3"]:
+    """Rotations from body to fixed frame: carried along with the axis without turning about it, then turned by the spin."""
+    first = np.cross(axis[0], np.eye(3)[np.argmin(np.abs(axis[0]))])
+    carried = [first / np.linalg.norm(first)]
+    for old, new in zip(axis[:-1], axis[1:], strict=True):
+        # The shortest turn takes the old axis to the new one, and what is across it along.
+        along = carried[-1] - (carried[-1] @ new) / (1.0 + old @ new) * (old + new)
+        along -= (along @ new) * new
+        carried.append(along / np.linalg.norm(along))
+    x = np.stack(carried)
+    y = np.cross(axis, x)
+    cosine, sine = np.cos(spin_angle)[:, None], np.sin(spin_angle)[:, None]
+    return np.stack([cosine * x + sine * y, cosine * y - sine * x, axis], axis=-1)
