@@ -15,7 +15,7 @@ import numpy as np
 
 from nonholonomic import __version__
 from nonholonomic.compilation_cache import enable_compilation_cache
-from nonholonomic.geometry import Cylinder, Plane
+from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
@@ -29,6 +29,15 @@ from .table import inversion_table
 from .top import Top
 from .trajectory import simulate
 from .view import Motion, stages
+
+#: The arenas that have names, and what their numbers are.
+SURFACES = {
+    "sphere RADIUS": Sphere,
+    "spheroid EQUATORIAL POLAR": Spheroid,
+    "torus RING TUBE": Torus,
+    "paraboloid P": Paraboloid,
+    "plane TILT": Plane,
+}
 
 #: Times at which theta is drawn.
 SAMPLES = 1500
@@ -62,6 +71,12 @@ def parser() -> argparse.ArgumentParser:
         "--mu", type=float, default=0.3, help="friction: viscous [s/m], or Coulomb [1] with --slip-speed"
     )
     scene.add_argument("--slip-speed", type=float, help="regularised Coulomb friction with this slip speed [m/s]")
+    scene.add_argument(
+        "--surface",
+        nargs="+",
+        metavar=("NAME", "NUMBER"),
+        help="another arena, by its name and numbers [m, rad]: " + ", ".join(SURFACES),
+    )
     scene.add_argument("--gravity", type=float, default=9.81, help="acceleration of free fall [m/s^2]")
     launch = command.add_argument_group("the launches")
     launch.add_argument(
@@ -86,7 +101,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def scenes(options: argparse.Namespace) -> dict[str, Scene]:
-    """The two arenas with the declared top."""
+    """The two arenas with the declared top, and the one that is asked for."""
     inertia = options.mass * options.radius**2
     I1 = 131.0 / 350.0 * inertia if options.I1 is None else options.I1
     I3 = 0.4 * inertia if options.I3 is None else options.I3
@@ -95,7 +110,26 @@ def scenes(options: argparse.Namespace) -> dict[str, Scene]:
     if options.slip_speed is not None:
         friction = Coulomb(options.mu, options.slip_speed)
     arenas = {"cylinder": Cylinder(options.cylinder_radius), "plane": Plane()}
+    if options.surface is not None:
+        arenas["surface"] = surface_of(options.surface)
     return {name: Scene(top, arena, friction, options.gravity) for name, arena in arenas.items()}
+
+
+def surface_of(words: list[str]) -> AbstractSurface:
+    """An arena by its name and numbers.
+
+    **Raises:** `ValueError` for a name or numbers that no arena has.
+    """
+    name, *numbers = words
+    for known, kind in SURFACES.items():
+        if known.split()[0] == name and len(numbers) == len(known.split()) - 1:
+            return kind(*map(float, numbers))
+    raise ValueError(f"--surface {' '.join(words)} must be one of: {', '.join(SURFACES)}")
+
+
+def counts_eta(scene: Scene) -> bool:
+    """Whether an arena has places by eta; on others every launch starts at the origin."""
+    return any(name == "eta" for name, _ in scene.surface.coordinates)
 
 
 def spin_of(options: argparse.Namespace, scene: Scene) -> float:
@@ -111,8 +145,7 @@ def tables(options: argparse.Namespace) -> dict[str, Table]:
         found[name] = inversion_table(
             scene,
             theta=options.theta,
-            # On the plane every place is alike.
-            eta=options.eta if name == "cylinder" else 0.0,
+            eta=options.eta if counts_eta(scene) else 0.0,
             spin=spin_of(options, scene),
             t1=options.t1,
             angle=options.angle,
@@ -134,8 +167,11 @@ def printed_times(options: argparse.Namespace, eta: float) -> list[str] | None:
 def columns(options: argparse.Namespace, found: dict[str, Table]) -> list[tuple[str, list[str]]]:
     """The columns of the report: a heading of two words or more, and an entry for every theta(0)."""
     shown = [("theta(0)|[rad]", [f"{theta:.4g}" for theta in options.theta])]
-    places = [("cylinder", f"eta={eta:.4g}", (slice(None), i)) for i, eta in enumerate(options.eta)]
-    for arena, place, cells in [*places, ("plane", "", (slice(None),))]:
+    places = []
+    for arena, scene in scenes(options).items():
+        etas = [(f"eta={eta:.4g}", (slice(None), i)) for i, eta in enumerate(options.eta)]
+        places += [(arena, *place) for place in (etas if counts_eta(scene) else [("", (slice(None),))])]
+    for arena, place, cells in places:
         table = found[arena]
         for crossing, times in (("first", table.first_time), ("last", table.last_time)):
             entries = [_entry(t, word) for t, word in zip(times[cells], table.status[cells], strict=True)]
@@ -149,7 +185,8 @@ def columns(options: argparse.Namespace, found: dict[str, Table]) -> list[tuple[
 def _entry(seconds: float, word: str) -> str:
     if math.isfinite(seconds):
         return f"{seconds:.4f}"
-    return {"not_inverted": "-", "contact_lost": "lost contact", "failed": "failed", "jammed": "jammed"}[word]
+    words = {"not_inverted": "-", "contact_lost": "lost contact", "does_not_fit": "no room"}
+    return words.get(word, word)
 
 
 def report(options: argparse.Namespace, found: dict[str, Table]) -> str:
@@ -192,9 +229,9 @@ def moving(scene: Scene, launches: Launch, t1: Any, times: Any, tolerance: float
     return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, t1, times, tolerance)))(launches)
 
 
-def starts(options: argparse.Namespace, arena: str, scene: Scene) -> tuple[list[float], Launch]:
+def starts(options: argparse.Namespace, scene: Scene) -> tuple[list[float], Launch]:
     """The places eta(0) of an arena, and the launches from all of them, place after place."""
-    etas = options.eta if arena == "cylinder" else [0.0]
+    etas = options.eta if counts_eta(scene) else [0.0]
     eta, theta = (values.ravel() for values in np.meshgrid(etas, options.theta, indexing="ij"))
     return etas, Launch(theta, np.full_like(theta, spin_of(options, scene)), eta, np.zeros_like(theta))
 
@@ -204,12 +241,13 @@ def picture(options: argparse.Namespace, found: dict[str, Table]) -> Any:
     times = np.linspace(0.0, options.t1, SAMPLES)
     panels, thetas = [], np.asarray(options.theta)
     for arena, scene in scenes(options).items():
-        etas, launches = starts(options, arena, scene)
+        etas, launches = starts(options, scene)
         shown = np.asarray(moving(scene, launches, options.t1, times, options.tolerance).theta)
         shown = shown.reshape(len(etas), len(thetas), -1)
         ends = found[arena].last_time.reshape(len(thetas), len(etas))
         for i, eta in enumerate(etas):
-            title = f"cylinder, η(0) = {eta:.4g}" if arena == "cylinder" else "plane"
+            name = " ".join(options.surface) if arena == "surface" else arena
+            title = f"{name}, η(0) = {eta:.4g}" if counts_eta(scene) else name
             panels.append(Panel(title, times, shown[i], thetas, ends[:, i]))
     return draw_launches(panels, options.angle)
 
@@ -223,7 +261,7 @@ def motions(options: argparse.Namespace, found: dict[str, Table]) -> list[Stage]
     last = min(options.t1, longest, float(ends[:, row].max()) + 0.5)
     times, groups = np.linspace(0.0, last, SAMPLES), []
     for arena, scene in scenes(options).items():
-        run = moving(scene, starts(options, arena, scene)[1], last, times, options.tolerance)
+        run = moving(scene, starts(options, scene)[1], last, times, options.tolerance)
         name = f"{arena}, θ(0) = {options.theta[row]:.4g} rad"
         groups.append([(name, scene, Motion(*(np.asarray(part)[row] for part in run)))])
     return stages(groups)
