@@ -23,9 +23,6 @@ MOST_STEPS = 100_000
 #: The least angle [rad] distinguished from 0 in the penalty for a top that does not invert.
 LEAST_ANGLE = 1e-6
 
-#: From this many cells on it pays to compile for twice as long a program that runs in a quarter of the time.
-MANY = 32
-
 #: Directions that run along together: with two, a fit of two numbers compiles for 8 s longer and then gains a fifth.
 TOGETHER = 1
 
@@ -113,9 +110,8 @@ class ExtendedQuestion(AbstractQuestion):
         """The extended times of every cell, and their derivatives along directions (as of `VariationalProblem`)."""
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         varied = VariationalProblem(problem, directions, True)
-        settings = Settings(tolerance, max_steps=MOST_STEPS)
-        kernel = cells >= MANY and not again
-        queue = Queue.of(varied, t1, jnp.asarray(cells), settings, one_kernel=kernel, parts=1 + len(directions))
+        settings = Settings(tolerance, max_steps=MOST_STEPS, looped=bool(directions))
+        queue = Queue.of(varied, t1, jnp.asarray(cells), settings, one_kernel=not again, parts=1 + len(directions))
         outcome, _ = queue.outcome()
         state, *variations = varied.parts(outcome.state)
         crossed = outcome.status == CROSSED
