@@ -253,12 +253,13 @@ def picture(options: argparse.Namespace, found: dict[str, Table]) -> Any:
 
 
 def motions(options: argparse.Namespace, found: dict[str, Table]) -> list[Stage]:
-    """The launch that turns over first, in both arenas, as it is drawn."""
-    ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in found.values()])
-    row = int(np.argmin(ends.max(axis=0)))
+    """The most upright launch that turns over while it can be followed, or else the first to turn over, in both arenas."""
+    ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in found.values()]).max(axis=0)
     # No longer than the spin can be followed from one sample to the next.
     longest = SAMPLES / max(abs(spin_of(options, scene)) for scene in scenes(options).values())
-    last = min(options.t1, longest, float(ends[:, row].max()) + 0.5)
+    tilt = np.where(ends + 0.5 <= longest, options.theta, np.inf)
+    row = int(np.argmin(tilt if np.isfinite(tilt).any() else ends))
+    last = min(options.t1, longest, float(ends[row]) + 0.5)
     times, groups = np.linspace(0.0, last, SAMPLES), []
     for arena, scene in scenes(options).items():
         run = moving(scene, starts(options, scene)[1], last, times, options.tolerance)

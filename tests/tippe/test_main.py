@@ -17,6 +17,12 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys):
     assert "first [s]" in printed
     assert "9.98" in printed
     assert (tmp_path / "out" / "theta.png").read_bytes().startswith(b"\x89PNG")
+    shown = tmp_path / "out" / "index.html"
+    assert printed.rstrip().endswith(f"To see it, open {shown}")
+    page = shown.read_text()
+    assert "<td>9.98" in page
+    assert 'id="snapshot1"' in page
+    assert "data:image/png" in page
     with xarray.open_dataset(tmp_path / "out" / "cylinder.h5", engine="h5netcdf") as data:
         assert data["first_time"].dims == ("theta", "eta")
         assert json.loads(data.attrs["request"])["scene.surface"] == "Cylinder"
