@@ -10,6 +10,7 @@ EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
 
 #: What an example must find, as a pattern of its output.
 FINDS = {
+    "a_page": r"Page of \d\.\d\d MB(?s:.*)wrote tops.html, top.gif and curves.png into page-out",
     "fastest_top": r"leaves 0\.\d% of the time's slope open;\s+of 64 tops around it 0 are faster",
     "hilly_ride": r"end speed \d\.\d+ m/s;.*\n.*\n.*\ncontact lost in \d+ of 12 rides",
     "mu_and_offset": r"2 numbers from 10 measurements: converged\n  4 of 4 starts converged, 4 ended here",
@@ -27,7 +28,9 @@ def test_example_is_short_and_can_be_read(path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_example_runs(path, capsys):
+def test_example_runs(path, capsys, tmp_path, monkeypatch):
+    # Some write files.
+    monkeypatch.chdir(tmp_path)
     names = runpy.run_path(str(path))
     if "draw" in names:
         # A picture of the manual's gallery.

@@ -11,6 +11,7 @@ from nonholonomic.geometry import Spheroid as Spheroid
 from nonholonomic.geometry import Torus as Torus
 from nonholonomic.identification import FitWarning as FitWarning
 from nonholonomic.identification import Free as Free
+from nonholonomic.identification import Identification as Identification
 from nonholonomic.sweeps import Table as Table
 
 from . import steady as steady

@@ -4,10 +4,12 @@ import argparse
 import math
 import sys
 import time
+from html import escape
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -16,6 +18,7 @@ from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require_folder
+from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
 
 from .friction import AbstractFriction, Coulomb, Viscous
 from .launch import Launch
@@ -25,6 +28,7 @@ from .scene import Scene
 from .table import inversion_table
 from .top import Top
 from .trajectory import simulate
+from .view import Motion, stages
 
 #: Times at which theta is drawn.
 SAMPLES = 1500
@@ -150,14 +154,21 @@ def _entry(seconds: float, word: str) -> str:
 
 def report(options: argparse.Namespace, found: dict[str, Table]) -> str:
     """The tables side by side, as text."""
-    scene = scenes(options)["cylinder"]
-    body = scene.body
     shown = columns(options, found)
     heads = [heading.split("|") for heading, _ in shown]
     widths = [max(len(text) for text in (*head, *entries)) for head, (_, entries) in zip(heads, shown, strict=True)]
     rows = [list(row) for row in zip(*heads, strict=True)]
     rows += [list(row) for row in zip(*(entries for _, entries in shown), strict=True)]
-    lines = [
+    lines = [*described(options), ""]
+    lines += ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join(lines)
+
+
+def described(options: argparse.Namespace) -> list[str]:
+    """What the report is about, in some lines."""
+    scene = scenes(options)["cylinder"]
+    body = scene.body
+    return [
         "Inversion of a tippe top: time at which theta reaches "
         f"{options.angle:.4g} rad, for the first time (first) and for good (last).",
         f"Top: m = {float(body.mass):g} kg, R = {float(body.radius):g} m, a = {float(body.offset):g} m, "
@@ -165,10 +176,7 @@ def report(options: argparse.Namespace, found: dict[str, Table]) -> str:
         f"cylinder {options.cylinder_radius:g} m.",
         "The paper's Table 1 lost its numbers, so this top is a declared one (Rutstam's): compare trends, not digits.",
         f"-: not inverted within {options.t1:g} s.",
-        "",
     ]
-    lines += ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join(lines)
 
 
 def _friction(law: AbstractFriction) -> str:
@@ -178,26 +186,63 @@ def _friction(law: AbstractFriction) -> str:
     return f"viscous mu = {float(law.mu):g} s/m"
 
 
+@eqx.filter_jit
+def moving(scene: Scene, launches: Launch, t1: Any, times: Any, tolerance: float) -> Motion:
+    """What is drawn of every launch, in one batched run; the picture and the page share its program."""
+    return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, t1, times, tolerance)))(launches)
+
+
+def starts(options: argparse.Namespace, arena: str, scene: Scene) -> tuple[list[float], Launch]:
+    """The places eta(0) of an arena, and the launches from all of them, place after place."""
+    etas = options.eta if arena == "cylinder" else [0.0]
+    eta, theta = (values.ravel() for values in np.meshgrid(etas, options.theta, indexing="ij"))
+    return etas, Launch(theta, np.full_like(theta, spin_of(options, scene)), eta, np.zeros_like(theta))
+
+
 def picture(options: argparse.Namespace, found: dict[str, Table]) -> Any:
-    """theta(t) of every launch, all launches of a place in one batched run."""
+    """theta(t) of every launch."""
     times = np.linspace(0.0, options.t1, SAMPLES)
     panels, thetas = [], np.asarray(options.theta)
-
-    @jax.jit
-    def theta_of(scene: Scene, launches: Launch) -> Any:
-        run = jax.vmap(lambda launch: simulate(scene, launch, options.t1, times, options.tolerance).theta)
-        return run(launches)
-
     for arena, scene in scenes(options).items():
-        etas = options.eta if arena == "cylinder" else [0.0]
-        eta, theta = (values.ravel() for values in np.meshgrid(etas, thetas, indexing="ij"))
-        launches = Launch(theta, np.full_like(theta, spin_of(options, scene)), eta, np.zeros_like(theta))
-        shown = np.asarray(theta_of(scene, launches)).reshape(len(etas), len(thetas), -1)
+        etas, launches = starts(options, arena, scene)
+        shown = np.asarray(moving(scene, launches, options.t1, times, options.tolerance).theta)
+        shown = shown.reshape(len(etas), len(thetas), -1)
         ends = found[arena].last_time.reshape(len(thetas), len(etas))
         for i, eta in enumerate(etas):
             title = f"cylinder, η(0) = {eta:.4g}" if arena == "cylinder" else "plane"
             panels.append(Panel(title, times, shown[i], thetas, ends[:, i]))
     return draw_launches(panels, options.angle)
+
+
+def motions(options: argparse.Namespace, found: dict[str, Table]) -> list[Stage]:
+    """The launch that turns over first, in both arenas, as it is drawn."""
+    ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in found.values()])
+    row = int(np.argmin(ends.max(axis=0)))
+    # No longer than the spin can be followed from one sample to the next.
+    longest = SAMPLES / max(abs(spin_of(options, scene)) for scene in scenes(options).values())
+    last = min(options.t1, longest, float(ends[:, row].max()) + 0.5)
+    times, groups = np.linspace(0.0, last, SAMPLES), []
+    for arena, scene in scenes(options).items():
+        run = moving(scene, starts(options, arena, scene)[1], last, times, options.tolerance)
+        name = f"{arena}, θ(0) = {options.theta[row]:.4g} rad"
+        groups.append([(name, scene, Motion(*(np.asarray(part)[row] for part in run)))])
+    return stages(groups)
+
+
+def write_page(options: argparse.Namespace, found: dict[str, Table], figure: Any) -> Path:
+    """The page of the main job: two tops in motion where K3D is installed, the tables, and the picture if there is one."""
+    intro, rows = (
+        described(options),
+        [list(row) for row in zip(*(heading.split("|") for heading, _ in columns(options, found)), strict=True)],
+    )
+    rows += [list(row) for row in zip(*(entries for _, entries in columns(options, found)), strict=True)]
+    below = "<h2>Inversion times</h2>" + table_as_html(rows, 2)
+    below += "".join(f'<p class="note">{escape(line)}</p>' for line in intro)
+    below += "" if figure is None else "<h2>θ(t) of every launch</h2>" + picture_as_html(figure)
+    above = "" if can_view() else f'<p class="note">{NO_VIEW}</p>'
+    path = options.out / "index.html"
+    page(motions(options, found) if can_view() else [], "A tippe top turns over", 0.5, above, below).save(path)
+    return path
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -213,17 +258,20 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         found = tables(options)
         print(report(options, found))
-        written = [str(options.out / f"{arena}.h5") for arena in found]
+        written, figure = [str(options.out / f"{arena}.h5") for arena in found], None
         if find_spec("matplotlib") is None:
             print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
         else:
             written.append(str(options.out / "theta.png"))
-            picture(options, found).savefig(written[-1], dpi=130)
+            figure = picture(options, found)
+            figure.savefig(written[-1], dpi=130)
+        shown = write_page(options, found, figure)
     except (ValueError, OSError) as error:
         print(f"python -m tippe: {error}", file=sys.stderr)
         return 2
     cells = sum(table.status.size for table in found.values())
     print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. Wrote {', '.join(written)}.")
+    print(f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}")
     return 0
 
 

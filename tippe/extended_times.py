@@ -55,16 +55,13 @@ def extended_inversion_time(
 
     **Raises:** `ValueError` for arguments out of range, and for a scene with `contact="hybrid"` or `SetValuedCoulomb`.
 
-    **Example:** this top is too slow to invert, and the slope says that a faster one would come closer.
+    **Example:** this top does not invert by 3 s, and counts as one that would later.
 
-    >>> import jax, tippe
+    >>> import tippe
     >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=3.0e-6, I3=3.2e-6)
     >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
-    >>> def time(spin):
-    ...     return tippe.extended_inversion_time(scene, tippe.Launch(0.2, spin), t1=3.0)
-    >>> found, slope = jax.value_and_grad(time)(60.0)
-    >>> print(found > 3.0, slope < 0.0)
-    True True
+    >>> print(3.0 < tippe.extended_inversion_time(scene, tippe.Launch(0.2, 60.0), t1=3.0) < 10.0)
+    True
     """
     check_run(scene, launch, t1, tolerance)
     check_event(angle, "first")

@@ -1,15 +1,19 @@
 """Recorded motion of tops: fitted from start to end, read from files, refused."""
 
+import dataclasses
 import math
 
+import lagrange_top
 import numpy as np
 import pytest
-from conftest import rutstam_top
+from conftest import assert_close, rutstam_top
 from viscous_top import Body, azimuth, follow, start, theta
 
 import tippe
+from tippe.identify import unknowns_of
 
 LAUNCHES = {"theta": (0.4, 0.5), "spin": (100.0, 110.0), "azimuth": (0.7, 3.0), "t0": (0.013, 0.2), "samples": (30, 24)}
+LAUNCHES |= {"velocity[0]": (0.0, 0.08)}
 NOISE, MU = 0.01, 0.3
 
 
@@ -18,7 +22,11 @@ def film(k):
     top, count = rutstam_top(), LAUNCHES["samples"][k]
     body = Body(top.mass, top.radius, top.offset, top.I1, top.I3, MU)
     clock = (0.02 if k == 0 else 0.21) + 0.01 * np.arange(count)
-    states = follow(body, start(body, LAUNCHES["theta"][k], LAUNCHES["spin"][k]), clock - LAUNCHES["t0"][k])
+    state = start(body, LAUNCHES["theta"][k], LAUNCHES["spin"][k])
+    # The program's top leans along x; the whole is turned by the azimuth afterwards.
+    turn = LAUNCHES["azimuth"][k]
+    state[3:5] += LAUNCHES["velocity[0]"][k] * np.array([math.cos(turn), -math.sin(turn)])
+    states = follow(body, state, clock - LAUNCHES["t0"][k])
     exact = np.stack([theta(states), azimuth(states) + LAUNCHES["azimuth"][k]], axis=1)
     value = exact + NOISE * np.random.default_rng(k).normal(size=exact.shape)
     # A camera sees an azimuth up to whole turns.
@@ -29,7 +37,7 @@ def film(k):
 @pytest.fixture(scope="module")
 def fit(tmp_path_factory, rutstam_scene):
     """Friction from two films, each with its own launch and unknown clock and azimuth; one is read from a file, with samples
-    that are missing, and of the other one the errors are not known."""
+    that are missing; of the other one the errors and the velocity of the hand are not known."""
     path = tmp_path_factory.mktemp("films") / "film.csv"
     clock, value = film(0)
     value[5], value[7, 1], value[11] = np.nan, np.nan, np.nan
@@ -37,10 +45,11 @@ def fit(tmp_path_factory, rutstam_scene):
     path.write_text("# a film\nt / ms;tilt;azimuth\n" + "\n".join(cells).replace("nan", "") + "\n")
     columns = {"time": ("t / ms", "ms"), "theta": ("tilt", "deg"), "azimuth": ("azimuth", "rad")}
     error = {"theta": (math.degrees(NOISE), "deg"), "azimuth": (NOISE, "rad")}
-    first = tippe.read_recording(path, columns, launch=tippe.Launch(0.4, 100.0), error=error)
-    second = tippe.Recording(tippe.Launch(0.5, 110.0), *film(1), None, ("theta", "azimuth"))
+    first = tippe.read_recording(path, columns, launch=tippe.Launch(0.4, 100.0, velocity=(0.0, 0.0)), error=error)
+    second = tippe.Recording(tippe.Launch(0.5, 110.0, velocity=(0.0, 0.0)), *film(1), None, ("theta", "azimuth"))
     free = {"mu": 0.2, "data[0].launch.azimuth": 0.5, "data[1].launch.azimuth": 2.7, "data[0].t0": 0.01}
-    return tippe.identify(rutstam_scene, [first, second], free | {"data[1].t0": tippe.Free(0.19, prior=(0.2, 0.05))})
+    free |= {"data[1].t0": tippe.Free(0.19, prior=(0.2, 0.05)), "data[1].launch.velocity[0]": 0.0}
+    return tippe.identify(rutstam_scene, [first, second], free)
 
 
 def test_friction_from_two_films_with_clocks_and_azimuths_of_their_own(fit):
@@ -48,8 +57,9 @@ def test_friction_from_two_films_with_clocks_and_azimuths_of_their_own(fit):
     truth |= {
         f"data[{k}].{name}": LAUNCHES[name.split(".")[-1]][k] for k in (0, 1) for name in ("launch.azimuth", "t0")
     }
+    truth["data[1].launch.velocity[0]"] = LAUNCHES["velocity[0]"][1]
     assert fit.status == "converged"
-    assert list(fit.estimates) == ["scene.friction.mu", *(n for n in fit.estimates if n != "scene.friction.mu")]
+    assert set(fit.estimates) == set(truth)
     for name, value in truth.items():
         assert abs(fit.estimates[name] - value) < 4.0 * fit.standard_errors[name], name
     assert fit.standard_errors["scene.friction.mu"] < 0.02
@@ -69,3 +79,85 @@ def test_missing_samples_are_left_out_and_unknown_errors_are_found(fit):
         assert 0.6 * NOISE < errors.pop() < 1.5 * NOISE
     assert math.isnan(fit.verdict.p_value)
     assert len(fit.verdict.series) == 4
+
+
+@pytest.mark.slow
+def test_friction_of_a_top_that_may_fly_by_differences(rutstam_scene):
+    """Through phases no derivative goes; the times are of the independent program, whose tops stay on the plane."""
+    scene = dataclasses.replace(rutstam_scene, contact="hybrid")
+    top, launch = rutstam_top(), tippe.Launch([0.3, 0.2], [110.0, 140.0])
+    times = [
+        lagrange_top.follow(
+            lagrange_top.Scene(top.mass, top.radius, top.offset, float(top.I1), float(top.I3), a, w, mu=0.3),
+            6.0,
+            0.8,
+            1e-9,
+        )[1]
+        for a, w in ((0.3, 110.0), (0.2, 140.0))
+    ]
+    data = tippe.InversionTimes(launch, times, 0.01, t1=6.0, angle=0.8)
+    fit = tippe.identify(scene, data, {"mu": 0.24}, slopes="differences", tolerance=1e-7)
+    assert abs(fit.estimates["scene.friction.mu"] - 0.3) < 1e-3
+    assert_close([row.prediction for row in fit.residuals], times, atol=0.01)
+
+
+HEADERS = "t,tilt,x\n0.0,5,1\n0.1,6,2\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "columns", "fps", "message"),
+    [
+        (HEADERS, {}, 25.0, "columns = {} must be a dictionary"),
+        (HEADERS, {"theta": ("tilt", "mm")}, 25.0, "unit of theta = 'mm' must be one of rad, deg, rev"),
+        (HEADERS, {"theta": ("angle", "deg")}, 25.0, "'angle' must be one of the headers of"),
+        (HEADERS, {"theta": "tilt"}, 25.0, r"'theta' = 'tilt' must be \(header, unit\)"),
+        (HEADERS, {"phi": ("tilt", "deg")}, 25.0, "quantity = 'phi'"),
+        (HEADERS, {"position": ("x", "m")}, 25.0, "'position' must be a single column"),
+        (HEADERS, {"theta": ("tilt", "deg")}, None, "fps must be given"),
+        (HEADERS, {"time": ("t", "s"), "theta": ("tilt", "deg")}, 25.0, "fps = 25.0 must be left out"),
+        (HEADERS.replace("6", "six"), {"theta": ("tilt", "deg")}, 25.0, "tilt = 'six' in line 3"),
+        (HEADERS + "1\n", {"theta": ("tilt", "deg")}, 25.0, "line 4 has 1 cells, not 3"),
+    ],
+)
+def test_files_that_cannot_be_read_are_refused(tmp_path, text, columns, fps, message):
+    (tmp_path / "film.csv").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        tippe.read_recording(tmp_path / "film.csv", columns, fps, launch=tippe.Launch(0.1, 100.0))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"value": [1.0]}, "value must be of shape"),
+        ({"value": [np.nan, np.nan]}, "at least one number"),
+        ({"times": [1.0, 0.5]}, "increasing"),
+        ({"quantity": "phi"}, "quantity = 'phi' must be one of"),
+        ({"quantity": ("theta", "theta")}, "each once"),
+        ({"error": [0.1, 0.1, 0.1]}, "error must be one number"),
+        ({"error": 0.0}, "error = 0.0 must be greater"),
+        ({"t0": 2.0}, "t0 = 2.0 must be less than"),
+        ({"student": -1.0}, "student = -1.0"),
+    ],
+)
+def test_bad_recordings_are_refused(change, message):
+    given = {"times": [0.0, 1.0], "value": [1.0, 1.1], "error": 0.1} | change
+    with pytest.raises(ValueError, match=message):
+        tippe.Recording(tippe.Launch(0.1, 9.0), **given)
+
+
+def test_names_of_one_film_of_each_and_of_all(rutstam_scene):
+    film = tippe.Recording(tippe.Launch(0.1, 9.0), [0.0, 1.0], [0.1, 0.2], 0.1)
+    times = tippe.InversionTimes(tippe.Launch(0.1, [9.0, 10.0]), [1.0, 2.0], 0.1, t1=5.0)
+    found = unknowns_of(
+        rutstam_scene, (film, times, film), {"data[*].t0": 0.0, "mu": 0.3, "data[1].launch.azimuth": 0.1}
+    )
+    assert list(found) == ["data[0].t0", "data[2].t0", "scene.friction.mu", "data[1].launch.azimuth"]
+    assert found["scene.friction.mu"].lower == 0.0
+    for free, message in (
+        ({"data[1].t0": 0.0}, r"'data\[1\].t0' must be one of"),
+        ({"data[0].launch.velocity[0]": 0.0}, "must be one of"),
+        ({"launch.theta": 0.1, "data[0].launch.theta": 0.1}, "named twice, alone and for all data"),
+        ({"data[0].launch.theta": -0.1}, "theta = -0.1"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            unknowns_of(rutstam_scene, (film, times, film), free)

@@ -63,6 +63,25 @@ def test_it_says_on_a_terminal_what_it_does(regression, monkeypatch):
         assert [text.startswith("compiling") for _, text in stream.lines[:1]] == [True] * progress
 
 
+def test_a_model_without_derivatives_is_fitted_by_differences(regression):
+    """In NumPy, with a step in it that is far below the errors and far above round-off."""
+    value, found = regression
+
+    class Model:
+        on_host = True
+
+        def __call__(self, numbers):
+            return np.round(line({name: np.asarray(one) for name, one in numbers.items()}), 4)
+
+    free = {"height": 0.5, "slope": -1.0}
+    again = identify(Model(), Measurements(value, ERROR), free, slopes="differences")
+    for name, expected in found.estimates.items():
+        assert abs(again.estimates[name] - expected) < 0.05 * found.standard_errors[name]
+    assert_close(list(again.standard_errors.values()), list(found.standard_errors.values()), rtol=0.05)
+    with pytest.raises(ValueError, match="slopes = 'none' must be one of 'exact', 'differences'"):
+        identify(line, Measurements(value, ERROR), free, slopes="none")
+
+
 def test_profile_of_a_linear_model_is_a_parabola(regression):
     _, found = regression
     profile = found.profile("slope")

@@ -1,0 +1,52 @@
+"""The posterior of friction, offset and I1 / I3 from ten times, and what it predicts (needs blackjax, and matplotlib)."""
+
+import sys
+
+import jax
+import numpy as np
+
+import tippe
+from nonholonomic.identification import sample
+
+THETA, SPIN = np.repeat([0.005, 0.015], 5), np.tile([70.0, 80.0, 100.0, 120.0, 150.0], 2)
+ANGLE, ERROR, TRUE_MU, TRUE_OFFSET = 0.5 * np.pi, 0.02, 0.3, 0.0035
+INERTIA = 0.02 * 0.02**2
+I1 = 131 / 350 * INERTIA
+
+
+def scene(mu: float, offset: float) -> tippe.Scene:
+    return tippe.Scene(tippe.Top(0.02, 0.02, offset, I1, 0.4 * INERTIA), friction=tippe.Viscous(mu))
+
+
+def measured() -> tippe.InversionTimes:
+    top = scene(TRUE_MU, TRUE_OFFSET)
+    times = jax.vmap(lambda a, w: tippe.inversion_time(top, tippe.Launch(a, w), t1=60.0, angle=ANGLE))(THETA, SPIN)
+    noisy = np.asarray(times) + ERROR * np.random.default_rng(1).normal(size=len(THETA))
+    return tippe.InversionTimes(tippe.Launch(THETA, SPIN), noisy, ERROR, t1=60.0, angle=ANGLE)
+
+
+def main(path: str | None = None) -> None:
+    data = measured()
+    # Where I3 is known, I1 is known to 3 %, from weighing and measuring; friction is known beforehand to a third.
+    free = {"friction.mu": tippe.Free(0.3, 0.0, prior=(0.3, 0.1)), "offset": tippe.Free(0.0035, 0.0)}
+    free |= {"scene.body.I1": tippe.Free(I1, 0.0, prior=(I1, 0.03 * I1))}
+    fit = tippe.identify(scene(0.3, 0.0035), data, free, tolerance=1e-6)
+    density = tippe.log_density(scene(0.3, 0.0035), data, free, tolerance=1e-6)
+    draws = sample(density, fit.coordinates, fit.coordinate_covariance)
+    print(draws)
+    replicas = density.replicate(draws.coordinates.reshape(-1, len(free))[::10])
+    inside = np.mean((np.sort(replicas, axis=0)[2] < data.time) & (data.time < np.sort(replicas, axis=0)[-3]))
+    print(f"{100.0 * inside:.0f} % of the times lie where the posterior predicts them")
+    if path is not None:
+        from matplotlib.figure import Figure
+
+        axes = Figure(layout="constrained").subplots()
+        axes.violinplot(replicas, positions=range(len(data.time)), showextrema=False)
+        axes.plot(data.time, "k_", markersize=12)
+        axes.set_xticks(range(len(data.time)), data.labels, rotation=60, fontsize=7)
+        axes.set_ylabel("inversion time [s]: measured (bars), predicted (violins)")
+        axes.figure.savefig(path)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:2])
