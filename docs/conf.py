@@ -18,13 +18,10 @@ exclude_patterns = ["tippe.md", "stroller.md", "_build"]
 
 html_theme = "sphinx_book_theme"
 html_title = "nonholonomic"
-html_logo = None
 html_theme_options = {"show_toc_level": 2, "home_page_in_toc": True}
 
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3
-# Formulas are large enough for their words.
-myst_dmath_double_inline = True
 
 nb_execution_mode = "cache"
 nb_execution_timeout = 300
@@ -35,11 +32,8 @@ autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 autodoc_class_signature = "mixed"
 
-PACKAGES = {
-    "tippe": "The top: `tippe`",
-    "stroller": "The vehicle: `stroller`",
-    "nonholonomic": "The ground: `nonholonomic`",
-}
+#: The packages, and the titles of their pages.
+PACKAGES = {"tippe": "The top: tippe", "stroller": "The vehicle: stroller", "nonholonomic": "The ground: nonholonomic"}
 
 # Notebooks keep what they compile, and show no progress bars.
 os.environ["NONHOLONOMIC_PROGRESS"] = "0"
@@ -58,29 +52,24 @@ def public(package: str) -> list[str]:
 
 def write_pages() -> None:
     """A page for each package, with an entry for every public name."""
-    folder = HERE / "api"
+    folder, homes = HERE / "api", {}
     folder.mkdir(exist_ok=True)
     for package, title in PACKAGES.items():
         module = importlib.import_module(package)
-        lines = [title.replace("`", ""), "=" * len(title), "", f".. currentmodule:: {package}", ""]
+        lines = [title, "=" * len(title), "", f".. currentmodule:: {package}", ""]
         for name in public(package):
             value = getattr(module, name)
-            kind = "class" if inspect.isclass(value) else "module" if inspect.ismodule(value) else "function"
-            home = getattr(value, "__module__", package)
             # What several packages hand out stands on the page of the first.
-            first = next(
-                one for one in PACKAGES if name in public(one) and getattr(importlib.import_module(one), name) is value
-            )
-            if first != package:
-                lines += [f"``{package}.{name}``: as ``{first}.{name}``.", ""]
-            elif kind == "module":
-                lines += [f".. automodule:: {package}.{name}", "   :members:", ""]
-            elif callable(value):
-                members = ["   :members:"] if kind == "class" else []
-                lines += [f".. auto{kind}:: {package}.{name}", *members, ""]
-            assert home
-        text = "\n".join(lines)
-        page = folder / f"{package}.rst"
+            home = homes.setdefault(id(value), f"{package}.{name}")
+            if home != f"{package}.{name}":
+                lines += [f"``{package}.{name}``: as ``{home}``.", ""]
+            elif inspect.ismodule(value):
+                lines += [f".. automodule:: {home}", "   :members:", ""]
+            elif inspect.isclass(value):
+                lines += [f".. autoclass:: {home}", "   :members:", ""]
+            else:
+                lines += [f".. autofunction:: {home}", ""]
+        text, page = "\n".join(lines), folder / f"{package}.rst"
         if not page.exists() or page.read_text() != text:
             page.write_text(text)
 

@@ -1,4 +1,4 @@
-"""What a release needs: one version everywhere, typed packages, and the law of friction that CONTRIBUTING.md shows."""
+"""What a release needs: one version everywhere, typed packages, and a law of friction written as CONTRIBUTING.md says."""
 
 import re
 import tomllib
