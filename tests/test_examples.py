@@ -15,6 +15,7 @@ FINDS = {
     "hilly_ride": r"end speed \d\.\d+ m/s;.*\n.*\n.*\ncontact lost in \d+ of 12 rides",
     "mu_and_offset": r"2 numbers from 10 measurements: converged\n  4 of 4 starts converged, 4 ended here",
     "stroller_damping": r"2 numbers from 90 measurements: converged\n  4 of 4 starts converged, 4 ended here",
+    "bowl_map": r"(?s)bowl: seconds to 0\.95 pi.* 5\.416 .*waves: seconds to 0\.95 pi",
     "lost_numbers": r"(?s)likelihood 29\.[45]\d* at 11 degrees.*\n\[29\.[45]\d* 31\.2\d* 30\.[23]\d* 32\.3\d*\]",
 }
 
