@@ -90,16 +90,22 @@ write_pages()
 
 def as_rst(app, what, name, obj, options, lines) -> None:
     """Docstrings are written in Markdown; what of it they use is turned into reStructuredText."""
-    found, example = [], False
+    blocks, example = [[]], False
     for line in lines:
-        if line.strip() == "```":
-            example = not example
-            found.append("")
-        elif example:
-            found.append(line)
+        starts, ends = line.lstrip().startswith(">>>"), example and not line.strip()
+        if (starts and not example) or ends:
+            blocks.append([])
+            example = starts
+        # An example needs no fences; an empty line parts it from the text.
+        blocks[-1].append("" if line.strip() == "```" else line)
+    found = []
+    for block in blocks:
+        text = "\n".join(block)
+        if block and block[0].lstrip().startswith(">>>"):
+            found += ["", *block]
         else:
-            parts = re.split(r"(`+[^`]+`+)", line)
-            found.append("".join(_literal(part) if part.startswith("`") else _plain(part) for part in parts))
+            parts = re.split(r"(`+[^`]+`+)", text)
+            found += "".join(_literal(part) if part.startswith("`") else _plain(part) for part in parts).split("\n")
     lines[:] = found
 
 
@@ -114,7 +120,7 @@ def _plain(text: str) -> str:
 
 def skip(app, what, name, obj, skip, options):
     """Fields without a docstring are told of in that of their class."""
-    return True if name.startswith("_") else skip
+    return True if name.startswith("_") or name == "units" else skip
 
 
 def setup(app) -> None:

@@ -11,8 +11,8 @@ def draw() -> Any:
     """The picture, a matplotlib figure."""
     body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
     scene = stroller.Scene(body, fork="absolute")
-    launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=-2.0, steering=0.02)
-    ride = stroller.simulate(scene, launch, 12.0, times=np.linspace(0.0, 12.0, 2401), tolerance=1e-7)
+    launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=-2.0, steering=0.02, steering_rate=0.06)
+    ride = stroller.simulate(scene, launch, 4.0, times=np.linspace(0.0, 4.0, 2001), tolerance=1e-7)
     figure = ride.portrait("position.x", "position.y")
     turned = ", ".join(f"{time:.2f} s" for time in ride.jackknifed_at)
     figure.axes[0].set(aspect="equal", title=f"jackknifed at {turned}" if turned else "it does not jackknife")

@@ -4,6 +4,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
+from html import escape
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +26,7 @@ from nonholonomic.geometry import (
 from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require, require_folder
+from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html
 
 from .friction import Damping, Frictionless
 from .launch import Launch
@@ -34,6 +36,7 @@ from .scene import FORKS, Scene
 from .simulate import simulate
 from .stroller import Stroller
 from .trajectory import Trajectory
+from .view import grouped
 
 RIDES = ("without friction", "with friction")
 
@@ -164,6 +167,22 @@ def table(options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory])
     return table_of(list(rides.values()), names, request | {"ride": names})
 
 
+def write_page(
+    options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory], words: list[str], figure: Any
+) -> Path:
+    """The page of the main job: the rides in motion where K3D is installed, the audit, and the picture if there is one."""
+    groups: dict[str, list[tuple[int, Trajectory]]] = {}
+    for number, ((ground, _), run) in enumerate(rides.items()):
+        groups.setdefault(ground, []).append((number, run))
+    drawn = grouped(list(groups.values()), [", ".join(name) for name in rides]) if can_view() else []
+    above = "" if drawn else f'<p class="note">{NO_VIEW}</p>'
+    below = "<h2>Energy against work</h2><pre>" + escape("\n".join(words)) + "</pre>"
+    below += "" if figure is None else "<h2>Paths, speeds, energies, side forces</h2>" + picture_as_html(figure, 70)
+    path = options.out / "index.html"
+    page(drawn, "Rides of a stroller", 1.0, above, below).save(path)
+    return path
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the main job.
 
@@ -176,32 +195,38 @@ def main(arguments: list[str] | None = None) -> int:
     started = time.perf_counter()
     try:
         require_folder(options.out, "--out")
-        rides, helm = {}, Helm(options.force, options.steer, options.period)
-        print(
+        heading = (
             f"{'ride':38s} {'solver':10s} {'E start [J]':>12s} {'E end [J]':>12s} {'work [J]':>12s} "
             f"{'residual':>10s} {'slip [m/s]':>10s} {'N min [N]':>10s} {'steps':>6s}  status"
         )
+        print(heading)
+        rides, audits, helm = {}, [], Helm(options.force, options.steer, options.period)
         for name, (scene, launch) in scenes(options).items():
             runs = {
                 "Dopri8": simulate(scene, launch, options.t1, helm, tolerance=options.tolerance),
                 "midpoint": simulate(scene, launch, options.t1, helm, solver=ImplicitMidpoint(options.step)),
             }
             rides[name] = runs["Dopri8"]
-            print("\n".join(audit(", ".join(name), runs)), flush=True)
-        print("\n" + "\n".join(tolerance_curve(options, helm)))
-        written = [options.out / "rides.h5"]
+            audits += audit(", ".join(name), runs)
+            print("\n".join(audits[-len(runs) :]), flush=True)
+        curve = tolerance_curve(options, helm)
+        print("\n" + "\n".join(curve))
+        written, figure = [options.out / "rides.h5"], None
         table(options, rides).save(written[0])
         if find_spec("matplotlib") is None:
             print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
         else:
             written.append(options.out / "rides.png")
             grounds = {ground: scene.surface for (ground, _), (scene, _) in scenes(options).items()}
-            draw_rides(grounds, rides).savefig(written[1], dpi=110)
+            figure = draw_rides(grounds, rides)
+            figure.savefig(written[1], dpi=110)
+        shown = write_page(options, rides, [heading, *audits, "", *curve], figure)
     except (ValueError, OSError) as error:
         print(f"python -m stroller: {error}", file=sys.stderr)
         return 2
     print(f"\n{2 * len(rides)} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
     print(f"Wrote {', '.join(map(str, written))}.")
+    print(f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}")
     return 0
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -85,12 +86,17 @@ def followed(recipe: Recipe) -> tuple[Steps, Stats]:
     problem = _problem(recipe)
     if ride.grid is None:
         path = follow(problem, float(ride.t1), ride.settings)
-        return Steps(path.times, path.states), Stats(path.accepted, path.rejected, not path.failed)
+        return Steps(path.times, path.states), _counted(path.accepted, path.rejected, not path.failed)
     found = _on_grid(problem, recipe)
     ends = np.asarray(ride.grid)
     good = ends <= float(found.end_time)
     steps = Steps(ends[good], np.asarray(found.states)[:, good])
-    return steps, Stats(int(found.accepted), int(found.rejected), bool(good.all()))
+    return steps, _counted(int(found.accepted), int(found.rejected), bool(good.all()))
+
+
+def _counted(accepted: int, rejected: int, finished: bool) -> Stats:
+    """Statistics as arrays: as plain numbers they would be constants of a program, and other numbers another program."""
+    return Stats(jnp.asarray(accepted), jnp.asarray(rejected), jnp.asarray(finished))
 
 
 @eqx.filter_jit

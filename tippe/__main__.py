@@ -4,18 +4,21 @@ import argparse
 import math
 import sys
 import time
+from html import escape
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
 from nonholonomic import __version__
 from nonholonomic.compilation_cache import enable_compilation_cache
-from nonholonomic.geometry import Cylinder, Plane
+from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require_folder
+from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
 
 from .friction import AbstractFriction, Coulomb, Viscous
 from .launch import Launch
@@ -25,6 +28,16 @@ from .scene import Scene
 from .table import inversion_table
 from .top import Top
 from .trajectory import simulate
+from .view import Motion, stages
+
+#: The arenas that have names, and what their numbers are.
+SURFACES = {
+    "sphere RADIUS": Sphere,
+    "spheroid EQUATORIAL POLAR": Spheroid,
+    "torus RING TUBE": Torus,
+    "paraboloid P": Paraboloid,
+    "plane TILT": Plane,
+}
 
 #: Times at which theta is drawn.
 SAMPLES = 1500
@@ -58,6 +71,12 @@ def parser() -> argparse.ArgumentParser:
         "--mu", type=float, default=0.3, help="friction: viscous [s/m], or Coulomb [1] with --slip-speed"
     )
     scene.add_argument("--slip-speed", type=float, help="regularised Coulomb friction with this slip speed [m/s]")
+    scene.add_argument(
+        "--surface",
+        nargs="+",
+        metavar=("NAME", "NUMBER"),
+        help="another arena, by its name and numbers [m, rad]: " + ", ".join(SURFACES),
+    )
     scene.add_argument("--gravity", type=float, default=9.81, help="acceleration of free fall [m/s^2]")
     launch = command.add_argument_group("the launches")
     launch.add_argument(
@@ -82,7 +101,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def scenes(options: argparse.Namespace) -> dict[str, Scene]:
-    """The two arenas with the declared top."""
+    """The two arenas with the declared top, and the one that is asked for."""
     inertia = options.mass * options.radius**2
     I1 = 131.0 / 350.0 * inertia if options.I1 is None else options.I1
     I3 = 0.4 * inertia if options.I3 is None else options.I3
@@ -91,7 +110,26 @@ def scenes(options: argparse.Namespace) -> dict[str, Scene]:
     if options.slip_speed is not None:
         friction = Coulomb(options.mu, options.slip_speed)
     arenas = {"cylinder": Cylinder(options.cylinder_radius), "plane": Plane()}
+    if options.surface is not None:
+        arenas["surface"] = surface_of(options.surface)
     return {name: Scene(top, arena, friction, options.gravity) for name, arena in arenas.items()}
+
+
+def surface_of(words: list[str]) -> AbstractSurface:
+    """An arena by its name and numbers.
+
+    **Raises:** `ValueError` for a name or numbers that no arena has.
+    """
+    name, *numbers = words
+    for known, kind in SURFACES.items():
+        if known.split()[0] == name and len(numbers) == len(known.split()) - 1:
+            return kind(*map(float, numbers))
+    raise ValueError(f"--surface {' '.join(words)} must be one of: {', '.join(SURFACES)}")
+
+
+def counts_eta(scene: Scene) -> bool:
+    """Whether an arena has places by eta; on others every launch starts at the origin."""
+    return any(name == "eta" for name, _ in scene.surface.coordinates)
 
 
 def spin_of(options: argparse.Namespace, scene: Scene) -> float:
@@ -107,8 +145,7 @@ def tables(options: argparse.Namespace) -> dict[str, Table]:
         found[name] = inversion_table(
             scene,
             theta=options.theta,
-            # On the plane every place is alike.
-            eta=options.eta if name == "cylinder" else 0.0,
+            eta=options.eta if counts_eta(scene) else 0.0,
             spin=spin_of(options, scene),
             t1=options.t1,
             angle=options.angle,
@@ -130,8 +167,11 @@ def printed_times(options: argparse.Namespace, eta: float) -> list[str] | None:
 def columns(options: argparse.Namespace, found: dict[str, Table]) -> list[tuple[str, list[str]]]:
     """The columns of the report: a heading of two words or more, and an entry for every theta(0)."""
     shown = [("theta(0)|[rad]", [f"{theta:.4g}" for theta in options.theta])]
-    places = [("cylinder", f"eta={eta:.4g}", (slice(None), i)) for i, eta in enumerate(options.eta)]
-    for arena, place, cells in [*places, ("plane", "", (slice(None),))]:
+    places = []
+    for arena, scene in scenes(options).items():
+        etas = [(f"eta={eta:.4g}", (slice(None), i)) for i, eta in enumerate(options.eta)]
+        places += [(arena, *place) for place in (etas if counts_eta(scene) else [("", (slice(None),))])]
+    for arena, place, cells in places:
         table = found[arena]
         for crossing, times in (("first", table.first_time), ("last", table.last_time)):
             entries = [_entry(t, word) for t, word in zip(times[cells], table.status[cells], strict=True)]
@@ -145,19 +185,27 @@ def columns(options: argparse.Namespace, found: dict[str, Table]) -> list[tuple[
 def _entry(seconds: float, word: str) -> str:
     if math.isfinite(seconds):
         return f"{seconds:.4f}"
-    return {"not_inverted": "-", "contact_lost": "lost contact", "failed": "failed", "jammed": "jammed"}[word]
+    words = {"not_inverted": "-", "contact_lost": "lost contact", "does_not_fit": "no room"}
+    return words.get(word, word)
 
 
 def report(options: argparse.Namespace, found: dict[str, Table]) -> str:
     """The tables side by side, as text."""
-    scene = scenes(options)["cylinder"]
-    body = scene.body
     shown = columns(options, found)
     heads = [heading.split("|") for heading, _ in shown]
     widths = [max(len(text) for text in (*head, *entries)) for head, (_, entries) in zip(heads, shown, strict=True)]
     rows = [list(row) for row in zip(*heads, strict=True)]
     rows += [list(row) for row in zip(*(entries for _, entries in shown), strict=True)]
-    lines = [
+    lines = [*described(options), ""]
+    lines += ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join(lines)
+
+
+def described(options: argparse.Namespace) -> list[str]:
+    """What the report is about, in some lines."""
+    scene = scenes(options)["cylinder"]
+    body = scene.body
+    return [
         "Inversion of a tippe top: time at which theta reaches "
         f"{options.angle:.4g} rad, for the first time (first) and for good (last).",
         f"Top: m = {float(body.mass):g} kg, R = {float(body.radius):g} m, a = {float(body.offset):g} m, "
@@ -165,10 +213,7 @@ def report(options: argparse.Namespace, found: dict[str, Table]) -> str:
         f"cylinder {options.cylinder_radius:g} m.",
         "The paper's Table 1 lost its numbers, so this top is a declared one (Rutstam's): compare trends, not digits.",
         f"-: not inverted within {options.t1:g} s.",
-        "",
     ]
-    lines += ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join(lines)
 
 
 def _friction(law: AbstractFriction) -> str:
@@ -178,26 +223,64 @@ def _friction(law: AbstractFriction) -> str:
     return f"viscous mu = {float(law.mu):g} s/m"
 
 
+@eqx.filter_jit
+def moving(scene: Scene, launches: Launch, t1: Any, times: Any, tolerance: float) -> Motion:
+    """What is drawn of every launch, in one batched run; the picture and the page share its program."""
+    return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, t1, times, tolerance)))(launches)
+
+
+def starts(options: argparse.Namespace, scene: Scene) -> tuple[list[float], Launch]:
+    """The places eta(0) of an arena, and the launches from all of them, place after place."""
+    etas = options.eta if counts_eta(scene) else [0.0]
+    eta, theta = (values.ravel() for values in np.meshgrid(etas, options.theta, indexing="ij"))
+    return etas, Launch(theta, np.full_like(theta, spin_of(options, scene)), eta, np.zeros_like(theta))
+
+
 def picture(options: argparse.Namespace, found: dict[str, Table]) -> Any:
-    """theta(t) of every launch, all launches of a place in one batched run."""
+    """theta(t) of every launch."""
     times = np.linspace(0.0, options.t1, SAMPLES)
     panels, thetas = [], np.asarray(options.theta)
-
-    @jax.jit
-    def theta_of(scene: Scene, launches: Launch) -> Any:
-        run = jax.vmap(lambda launch: simulate(scene, launch, options.t1, times, options.tolerance).theta)
-        return run(launches)
-
     for arena, scene in scenes(options).items():
-        etas = options.eta if arena == "cylinder" else [0.0]
-        eta, theta = (values.ravel() for values in np.meshgrid(etas, thetas, indexing="ij"))
-        launches = Launch(theta, np.full_like(theta, spin_of(options, scene)), eta, np.zeros_like(theta))
-        shown = np.asarray(theta_of(scene, launches)).reshape(len(etas), len(thetas), -1)
+        etas, launches = starts(options, scene)
+        shown = np.asarray(moving(scene, launches, options.t1, times, options.tolerance).theta)
+        shown = shown.reshape(len(etas), len(thetas), -1)
         ends = found[arena].last_time.reshape(len(thetas), len(etas))
         for i, eta in enumerate(etas):
-            title = f"cylinder, η(0) = {eta:.4g}" if arena == "cylinder" else "plane"
+            name = " ".join(options.surface) if arena == "surface" else arena
+            title = f"{name}, η(0) = {eta:.4g}" if counts_eta(scene) else name
             panels.append(Panel(title, times, shown[i], thetas, ends[:, i]))
     return draw_launches(panels, options.angle)
+
+
+def motions(options: argparse.Namespace, found: dict[str, Table]) -> list[Stage]:
+    """The launch that turns over first, in both arenas, as it is drawn."""
+    ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in found.values()])
+    row = int(np.argmin(ends.max(axis=0)))
+    # No longer than the spin can be followed from one sample to the next.
+    longest = SAMPLES / max(abs(spin_of(options, scene)) for scene in scenes(options).values())
+    last = min(options.t1, longest, float(ends[:, row].max()) + 0.5)
+    times, groups = np.linspace(0.0, last, SAMPLES), []
+    for arena, scene in scenes(options).items():
+        run = moving(scene, starts(options, scene)[1], last, times, options.tolerance)
+        name = f"{arena}, θ(0) = {options.theta[row]:.4g} rad"
+        groups.append([(name, scene, Motion(*(np.asarray(part)[row] for part in run)))])
+    return stages(groups)
+
+
+def write_page(options: argparse.Namespace, found: dict[str, Table], figure: Any) -> Path:
+    """The page of the main job: two tops in motion where K3D is installed, the tables, and the picture if there is one."""
+    intro, rows = (
+        described(options),
+        [list(row) for row in zip(*(heading.split("|") for heading, _ in columns(options, found)), strict=True)],
+    )
+    rows += [list(row) for row in zip(*(entries for _, entries in columns(options, found)), strict=True)]
+    below = "<h2>Inversion times</h2>" + table_as_html(rows, 2)
+    below += "".join(f'<p class="note">{escape(line)}</p>' for line in intro)
+    below += "" if figure is None else "<h2>θ(t) of every launch</h2>" + picture_as_html(figure)
+    above = "" if can_view() else f'<p class="note">{NO_VIEW}</p>'
+    path = options.out / "index.html"
+    page(motions(options, found) if can_view() else [], "A tippe top turns over", 0.5, above, below).save(path)
+    return path
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -213,17 +296,20 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         found = tables(options)
         print(report(options, found))
-        written = [str(options.out / f"{arena}.h5") for arena in found]
+        written, figure = [str(options.out / f"{arena}.h5") for arena in found], None
         if find_spec("matplotlib") is None:
             print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
         else:
             written.append(str(options.out / "theta.png"))
-            picture(options, found).savefig(written[-1], dpi=130)
+            figure = picture(options, found)
+            figure.savefig(written[-1], dpi=130)
+        shown = write_page(options, found, figure)
     except (ValueError, OSError) as error:
         print(f"python -m tippe: {error}", file=sys.stderr)
         return 2
     cells = sum(table.status.size for table in found.values())
     print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. Wrote {', '.join(written)}.")
+    print(f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}")
     return 0
 
 

@@ -28,6 +28,7 @@ from nonholonomic.sweeps import Variable
 
 from .dynamics import LOSSES
 from .inversion import InversionProblem, is_inverted
+from .phases import airborne
 from .phases.sliding import phases as hybrid_phases
 from .phases.stick_slip_runs import phases as stick_slip_phases
 from .scene import Scene
@@ -65,12 +66,14 @@ COUNTED = {"steps": "steps", "rejected": "rejected steps", "hops": "flights", "s
 TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_time": "last inversion time"}
 
 # Compiled once for all blocks.
+_on_the_ground = eqx.filter_jit(airborne.on_the_ground)
 _loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
 
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit")
 SMOOTH = Driver(WORDS, (), None)
 STICK_SLIP = Driver((*WORDS, "unresolved"), ("sticks",), stick_slip_phases)
 HYBRID = Driver((*WORDS, "unresolved"), ("hops",), hybrid_phases)
+AIRBORNE = Driver((*WORDS, "unresolved"), ("hops",), airborne.phases)
 
 #: The word for a run's status if it has not inverted; `not_inverted` for all others.
 WORD_OF_STATUS = {GUARD_LOST: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
@@ -80,7 +83,9 @@ def driver_of(scene: Scene) -> Driver:
     """The driver for a scene."""
     if scene.friction.set_valued:
         return STICK_SLIP
-    return HYBRID if scene.contact == "hybrid" else SMOOTH
+    if scene.contact == "hybrid":
+        return HYBRID if scene.level else AIRBORNE
+    return SMOOTH
 
 
 class CellRuns(NamedTuple):
@@ -135,7 +140,10 @@ class CellRuns(NamedTuple):
             assert self.driver.phases is not None
             phases, first = self.driver.phases(scene, problem, tolerance, last)
             start, settings = (np.asarray(first), np.asarray(problem.states)), Settings(tolerance, self.solver)
-            return travel(phases, *start, self.t1, count, settings, kinds=1, passes=last)
+            ended = travel(phases, *start, self.t1, count, settings, kinds=1, passes=last)
+            if self.driver is AIRBORNE:
+                ended = ended._replace(state=np.asarray(_on_the_ground(scene, ended.state, ended.phase)))
+            return ended
 
         found = journey(self.last)
         named = self._named(scene, problem, found) | dict(zip(self.driver.counts, found.counts, strict=True))

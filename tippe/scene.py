@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from nonholonomic.geometry import (
     AbstractFrame,
     AbstractSurface,
+    CarriedFrame,
     Component,
     Plane,
     PlaneFrame,
@@ -53,8 +54,8 @@ class Scene(Bounded):
       or `Rolling(resistance, turning_speed, sliding)` with one of them, or, with `contact="stop"`,
       `SetValuedCoulomb(mu)`.
     - `gravity`: acceleration of free fall [m/s^2], positive.
-    - `contact`: "stop": a run ends where the contact is lost; "hybrid", on the plane: it goes on through flights, impacts
-      and changes to the stem and back (`phases/`). A top with a stem needs the latter.
+    - `contact`: "stop": a run ends where the contact is lost; "hybrid": it goes on through flights and impacts,
+      and on the level plane through changes to the stem and back (`phases/`). A top with a stem needs the latter.
     - `restitution`: Newton's coefficient e_N of impacts [1], in [0, 1], for "hybrid" only; `None` is 0.
     - `side`: "inside" or "outside" of a closed surface, "above" an open one; `None` is inside, or above.
 
@@ -97,8 +98,10 @@ class Scene(Bounded):
         self.surface.sign(self.side, "inside")
         if self.contact not in ("stop", "hybrid"):
             raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
-        if self.contact == "hybrid" and not isinstance(self.surface, Plane):
-            raise ValueError(f"contact = 'hybrid' must be on a Plane(), not on {self.surface!r}")
+        if self.contact == "hybrid" and self.body.stem is not None and not self.level:
+            raise ValueError(
+                f"contact = 'hybrid' must be on a level Plane() for a top with a stem, not on {self.surface!r}"
+            )
         if self.contact == "hybrid" and not self.friction.acts_at_point:
             raise ValueError(f"contact = 'hybrid' must be with friction at a point, not with {self.friction!r}")
         if self.contact == "stop" and self.body.stem is not None:
@@ -116,7 +119,15 @@ class Scene(Bounded):
     def frame(self) -> AbstractFrame:
         """The moving frame of the top's sphere on the arena."""
         side, pull = self.surface.sign(self.side, "inside"), PULL * jnp.sqrt(self.gravity / self.body.radius)
+        if self.contact == "hybrid" and not self.level:
+            # A flight takes the top anywhere: the frame that knows where it is.
+            return CarriedFrame(self.surface, self.body.radius, pull, side)
         return frame_of(self.surface, side, self.body.radius, pull)
+
+    @property
+    def level(self) -> bool:
+        """Whether the arena is a level plane."""
+        return isinstance(self.surface, Plane) and self.surface.tilt is None
 
     @property
     def dynamics(self) -> Dynamics | StickSlip:

@@ -18,6 +18,7 @@ from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, leg
 from .inversion import check_run, run_bounds
 from .launch import Launch
 from .observables import AbstractTrajectory, check_increasing, of_each_run
+from .phases.airborne_trajectory import simulate_airborne
 from .phases.flight_trajectory import HybridTrajectory, simulate_hybrid
 from .phases.stick_slip_runs import follow_stick_slip
 from .sampled import STATUS, TrajectoryProblem, ended, sampled
@@ -170,7 +171,8 @@ def simulate(
         if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1))):
             raise ValueError("contact = 'hybrid' must be 'stop' inside jit, vmap and grad")
         with Progress(1, "run", "simulating"):
-            return simulate_hybrid(scene, launch, float(t1), times, tolerance, solver)
+            follow_flights = simulate_hybrid if scene.level else simulate_airborne
+            return follow_flights(scene, launch, float(t1), times, tolerance, solver)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
         return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
     with Progress(1, "run", "simulating"):

@@ -92,10 +92,11 @@ class CarriedFrame(AbstractFrame):
 
     def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
         foot = tuple(jnp.broadcast_arrays(*(0.0 if x is None else x for x in foot)))
-        t1, _ = tangents(self._normal(foot))
+        t1, _ = tangents(self.normal(foot))
         return (*foot, *t1), ()
 
-    def _normal(self, foot: Fixed) -> Fixed:
+    def normal(self, foot: Fixed) -> Fixed:
+        """The normal n at a foot, in the surface's axes."""
         normal = scale(self.side, self.surface.normal(foot))
         return tuple(jnp.broadcast_to(0.0 if x is None else x, jnp.shape(foot[0])) for x in normal)
 
@@ -106,7 +107,7 @@ class CarriedFrame(AbstractFrame):
     def carriage(self, place: Place, velocity: Tangent) -> Carriage:
         foot, R = place[:3], self.distance
         # Stored: what follows, and its derivatives above all, would each compute these anew.
-        n = stored(*self._normal(foot))
+        n = stored(*self.normal(foot))
         # A first tangent that has drifted counts for its direction along the surface only.
         t1 = stored(*along(n, place[3:])[0])
         t2 = cross(n, t1)
@@ -133,15 +134,16 @@ class CarriedFrame(AbstractFrame):
         """The upward vertical in the frame."""
         return tuple(dot(axis, self.surface.up) for axis in axes)
 
-    def _own_axes(self, place: Place) -> tuple[Fixed, Fixed, Fixed]:
-        n = self._normal(place[:3])
+    def own_axes(self, place: Place) -> tuple[Fixed, Fixed, Fixed]:
+        """The vectors t1, t2 and n in the surface's axes."""
+        n = self.normal(place[:3])
         return (*along(n, place[3:]), n)
 
     def vertical(self, place: Place) -> Vector:
-        return self._seen(*self._own_axes(place))
+        return self._seen(*self.own_axes(place))
 
     def height(self, place: Place) -> Component:
-        return self.surface.elevation(place[:3]) + self.distance * dot(self._normal(place[:3]), self.surface.up)
+        return self.surface.elevation(place[:3]) + self.distance * dot(self.normal(place[:3]), self.surface.up)
 
     def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
         return ()
@@ -156,8 +158,8 @@ class CarriedFrame(AbstractFrame):
         return eta + 0.5 * jnp.pi if names[0] == "mu" else eta
 
     def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
-        return tuple(self.surface.in_fixed_frame(axis) for axis in self._own_axes(place))
+        return tuple(self.surface.in_fixed_frame(axis) for axis in self.own_axes(place))
 
     def position(self, place: Place, cyclic: Place) -> Fixed:
-        centre = sum_vectors(place[:3], scale(self.distance, self._normal(place[:3])))
+        centre = sum_vectors(place[:3], scale(self.distance, self.normal(place[:3])))
         return self.surface.in_fixed_frame(centre)

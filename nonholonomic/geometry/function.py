@@ -24,10 +24,12 @@ class Plain(eqx.Module):
 class Closure(eqx.Module):
     """A function with the traced numbers that it closes over as leaves; it was traced with single numbers."""
 
-    traced: Any
+    numbers: tuple[Any, ...]
+    # JAX's Jaxpr; the same only for the same construction.
+    program: Any = eqx.field(static=True)
 
     def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
-        return jnp.vectorize(self.traced)(*at)
+        return jnp.vectorize(lambda *one: jax.core.eval_jaxpr(self.program, self.numbers, *one)[0])(*at)
 
 
 def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module:
@@ -53,7 +55,7 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
     if isinstance(value, eqx.Module):
         return value
     closes_over = any(is_traced(constant) for constant in traced.consts)
-    return Closure(eqx.filter_closure_convert(value, *zeros)) if closes_over else Plain(value)
+    return Closure(tuple(traced.consts), traced.jaxpr) if closes_over else Plain(value)
 
 
 def partials(function: Callable[..., Any], at: tuple[Any, ...]) -> tuple[Float[Array, "..."], ...]:

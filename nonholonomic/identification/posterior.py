@@ -1,5 +1,6 @@
 """The posterior of parameters, as a function of unconstrained coordinates for any sampler."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -7,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
 from ..validation import require
@@ -119,7 +119,7 @@ class LogDensity(eqx.Module):
         for k, (name, free) in enumerate(self.problem.free):
             if (prior := priors.get(name)) is not None:
                 value, slope = jax.value_and_grad(free.value)(coordinates[k])
-                total += (prior(value) if callable(prior) else norm.logpdf(value, *prior)) + jnp.log(jnp.abs(slope))
+                total += (prior(value) if callable(prior) else _normal(value, *prior)) + jnp.log(jnp.abs(slope))
         return total
 
 
@@ -132,3 +132,8 @@ def _predicted(density: LogDensity, coordinates: Float[Array, "rows unknowns"]) 
 def _value_and_gradient(density: LogDensity, coordinates: Float[Array, "*batch unknowns"]) -> tuple[Array, Array]:
     function = jax.value_and_grad(density)
     return function(coordinates) if coordinates.ndim == 1 else jax.vmap(function)(coordinates)
+
+
+def _normal(value: Float[Array, ""], mean: float, deviation: float) -> Float[Array, ""]:
+    """Logarithm of the normal density. `jax.scipy.stats` has it too, and takes 0.15 s to import."""
+    return -0.5 * ((value - mean) / deviation) ** 2 - math.log(deviation * math.sqrt(2.0 * math.pi))

@@ -8,7 +8,7 @@ not show, one for each block of each variable. A file appears when it is complet
 import contextlib
 import json
 import os
-import tempfile
+import uuid
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -42,32 +42,23 @@ def replacing(path: Path, beside: Path | None = None) -> Iterator[Path]:
 
     **Raises:** `OSError` that names the path if it cannot be written.
     """
-    scratch = None
+    scratch = (beside or path.parent) / f"{path.name}.{uuid.uuid4().hex}.part"
     try:
         if path.is_dir():
             raise OSError(0, "it is a folder")
-        handle, scratch = tempfile.mkstemp(dir=beside or path.parent, prefix=path.name + ".", suffix=".part")
-        os.close(handle)
-        yield Path(scratch)
-        with open(scratch, "r+b") as stream:
+        scratch.touch(exist_ok=False)
+        yield scratch
+        with scratch.open("r+b") as stream:
             os.fsync(stream.fileno())
-        # The scratch file is its owner's alone.
-        os.chmod(scratch, 0o666 & ~_umask())
         os.replace(scratch, path)
         sync_folder(path.parent)
     except BaseException as error:
-        if scratch is not None:
-            Path(scratch).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            scratch.unlink()
         # What reading says is not changed.
         if isinstance(error, OSError) and error.strerror:
             raise OSError(f"cannot write {path}: {error.strerror}") from None
         raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def sync_folder(folder: Path) -> None:

@@ -7,9 +7,12 @@ from .meshes import bar as bar
 from .meshes import box as box
 from .meshes import rod as rod
 from .meshes import wheel as wheel
+from .page import NO_VIEW as NO_VIEW
 from .page import Page as Page
 from .page import can_view as can_view
 from .page import page as page
+from .page import picture_as_html as picture_as_html
+from .page import table_as_html as table_as_html
 from .plot import draw_portrait as draw_portrait
 from .plot import draw_table as draw_table
 from .plot import new_figure as new_figure

@@ -16,6 +16,9 @@ RATE, FRAMES, DOTS = 25, 150, 80
 #: Where the light comes from, and how bright is what it does not reach.
 LIGHT, SHADE = np.array([0.3, -0.5, 0.81]), 0.55
 
+#: Range of the values of a panel, relative to them, below which they are drawn as constant.
+LEAST_RANGE = 1e-3
+
 Times = Float[np.ndarray, " frames"]
 
 
@@ -46,6 +49,12 @@ def _draw_curve(panel: Any, shows: list[Show], label: str) -> None:
             if curve.label == label:
                 panel.plot(show.times, curve.values, color=css(show.colour), linewidth=1.0)
     panel.margins(x=0.0)
+    low, high = panel.get_ylim()
+    middle = (low + high) / 2.0
+    # What is constant but for round-off is drawn as a constant.
+    least = LEAST_RANGE * max(abs(low), abs(high))
+    if high - low < least:
+        panel.set_ylim(middle - least, middle + least)
 
 
 def write_animation(stages: list[Stage], path: Any, times: Times | None) -> None:
@@ -110,14 +119,16 @@ class _Space:
         self.reach, self.middle = 0.8 * distance * np.tan(np.radians(ANGLE) / 2.0), middle
         axes.view_init(np.degrees(np.arcsin(away[2] / distance)), np.degrees(np.arctan2(away[1], away[0])))
         axes.set_axis_off()
-        axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.6)
+        axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.8)
         axes.set_title(f"{stage.title} ({stage.arena.spacing})", fontsize="medium")
-        self.ground = axes.add_collection3d(Line3DCollection([], colors="0.75", linewidths=0.6, zorder=1))
+        self.ground = axes.add_collection3d(
+            Line3DCollection([np.zeros((2, 3))], colors="0.75", linewidths=0.6, zorder=1)
+        )
         lines = [(trace.colour, 2 if trace.about is None else 3) for show in stage.shows for trace in show.traces]
         self.traces = [axes.plot([], [], [], color=css(c), linewidth=0.9, zorder=z)[0] for c, z in lines]
         arrows = [arrow.colour for show in stage.shows for arrow in show.arrows]
-        self.arrows = [axes.plot([], [], [], color=css(c), linewidth=2.2, zorder=5)[0] for c in arrows]
-        self.solids = axes.add_collection3d(Poly3DCollection([np.zeros((3, 3))], zorder=4))
+        self.arrows = [axes.plot([], [], [], color=css(c), linewidth=2.2, zorder=3)[0] for c in arrows]
+        self.solids = axes.add_collection3d(Poly3DCollection([np.zeros((3, 3))], linewidths=0.3, zorder=4))
 
     def draw(self, frame: int) -> None:
         """The stage at one of its times."""
@@ -145,7 +156,9 @@ class _Space:
                 ends = np.stack([arrow.start[now], arrow.start[now] + arrow.vector[now]])
                 next(arrows).set_data_3d(*ends.T)
         self.solids.set_verts(np.concatenate(triangles))
+        # Edges of the same colour close the seams between triangles.
         self.solids.set_facecolor(np.concatenate(colours))
+        self.solids.set_edgecolor(np.concatenate(colours))
 
 
 def _pieces(line: np.ndarray, middle: np.ndarray, reach: float) -> list[np.ndarray]:

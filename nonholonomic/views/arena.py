@@ -1,5 +1,6 @@
 """The piece of a surface on which runs take place, from what every surface answers: its chart, or its nearest points."""
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -44,9 +45,22 @@ def arena(
     chart = _Patch(surface, points) if len(surface.coordinates) == 3 else _Chart(surface, points)
     (first, second), (step_1, step_2), words = chart.ranges(margin, spacing)
     mesh = chart.grid(*np.meshgrid(np.linspace(*first, FINE), np.linspace(*second, FINE), indexing="ij"))
-    lines = [chart.grid(np.full(FINE, a), np.linspace(*second, FINE)) for a in marks(first, step_1)]
-    lines += [chart.grid(np.linspace(*first, FINE), np.full(FINE, b)) for b in marks(second, step_2)]
+    # One grid for all lines: a surface is asked as rarely as can be.
+    along = [(np.full(FINE, a), np.linspace(*second, FINE)) for a in marks(first, step_1)]
+    along += [(np.linspace(*first, FINE), np.full(FINE, b)) for b in marks(second, step_2)]
+    lines = chart.grid(*np.moveaxis(np.array(along), 1, 0)) if along else ()
     return Arena(Mesh(mesh.reshape(-1, 3), of_grid(FINE, FINE), GREY), tuple(lines), words, normal)
+
+
+# Compiled as a whole: every operation by itself would be compiled for every shape.
+@eqx.filter_jit
+def _charted(surface: AbstractSurface, place: tuple) -> tuple:
+    return surface.chart(place)[0]
+
+
+@eqx.filter_jit
+def _nearest(surface: AbstractSurface, position: tuple) -> tuple:
+    return surface.nearest(position)
 
 
 class _Chart:
@@ -61,7 +75,7 @@ class _Chart:
                 self.places[number] = np.unwrap(self.places[number])
 
     def grid(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        return fixed(self.surface, self.surface.chart((first, second))[0])
+        return fixed(self.surface, _charted(self.surface, (first, second)))
 
     def ranges(self, margin: float, spacing: float) -> tuple[list, list[float], str]:
         """The ranges of both numbers, the steps between lines, and what they are in words."""
@@ -91,7 +105,7 @@ class _Chart:
         tried = np.linspace(low, high, 401)
         place = [np.full_like(tried, np.median(values)) for values in self.places]
         place[number] = tried
-        back = np.asarray(self.surface.place_at(self.surface.chart(tuple(place))[0])[number])
+        back = np.asarray(self.surface.place_at(_charted(self.surface, tuple(place)))[number])
         away = back - tried
         if self.angles[number]:
             away = (away + np.pi) % (2.0 * np.pi) - np.pi
@@ -104,14 +118,14 @@ class _Patch:
 
     def __init__(self, surface: AbstractSurface, points: Float[np.ndarray, "points 3"]):
         self.surface = surface
-        self.middle = fixed(surface, surface.nearest(own(surface, points.mean(axis=0))))
+        self.middle = fixed(surface, _nearest(surface, own(surface, points.mean(axis=0))))
         _, east, north = surface.chart(tuple(own(surface, self.middle)))
         self.axes = np.stack([fixed(surface, east), fixed(surface, north)])
         self.spread = (points - self.middle) @ self.axes.T
 
     def grid(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         flat = self.middle + first[..., None] * self.axes[0] + second[..., None] * self.axes[1]
-        return fixed(self.surface, self.surface.nearest(own(self.surface, np.moveaxis(flat, -1, 0))))
+        return fixed(self.surface, _nearest(self.surface, own(self.surface, np.moveaxis(flat, -1, 0))))
 
     def ranges(self, margin: float, spacing: float) -> tuple[list, list[float], str]:
         ranges = [(part.min() - margin, part.max() + margin) for part in self.spread.T]

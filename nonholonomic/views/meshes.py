@@ -10,7 +10,7 @@ SEGMENTS = 48
 
 
 def revolved(profile: list[tuple[float, float]] | Float[np.ndarray, "points 2"], colour: int) -> Mesh:
-    """The solid that a profile, points (distance from the z axis, z) [m] from the top down, sweeps out about that axis."""
+    """The solid that a profile sweeps out about the z axis: points (distance from it, z) [m], from the top downwards."""
     profile = np.asarray(profile, dtype=float)
     angle = np.linspace(0.0, 2.0 * np.pi, SEGMENTS + 1)
     radius, height = profile.T

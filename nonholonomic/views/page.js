@@ -121,7 +121,8 @@
       .map((one) => ({ times: run.times, values: one.values, colour: run.colour }))));
     let low = Infinity, high = -Infinity;
     for (const one of curves) for (const v of one.values) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
-    const least = 1e-6 * Math.max(Math.abs(low), Math.abs(high), 1e-30);
+    // What is constant but for round-off is drawn as a constant.
+    const least = 1e-3 * Math.max(Math.abs(low), Math.abs(high), 1e-30);
     if (!(high - low > least)) { low -= least; high += least; }
     return { canvas, curves, value, low, high, pale: null, strong: null };
   });

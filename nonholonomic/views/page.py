@@ -2,6 +2,7 @@
 
 import base64
 import html
+import io
 import json
 import zlib
 from importlib.resources import files
@@ -16,6 +17,9 @@ from .stage import Arrow, Mesh, Points, Show, Stage, css
 
 #: How fast time may run.
 SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+
+#: What a page says that has no motion.
+NO_VIEW = "The page is without motion: k3d is not installed (pip install 'nonholonomic[view]')."
 
 LINES = 0x7C8896
 BACKGROUND = 0xFBFBFA
@@ -69,6 +73,22 @@ def page(
     for name, text in parts.items():
         whole = whole.replace(f"[{name}]", text)
     return Page(whole)
+
+
+def table_as_html(rows: list[list[str]], heads: int) -> str:
+    """Rows of entries as an HTML table, of which the first ones are headings."""
+    parts = []
+    for number, row in enumerate(rows):
+        kind = "th" if number < heads else "td"
+        parts.append("<tr>" + "".join(f"<{kind}>{html.escape(entry)}</{kind}>" for entry in row) + "</tr>")
+    return f"<table>{''.join(parts)}</table>"
+
+
+def picture_as_html(figure: Any, dots: int = 110) -> str:
+    """A matplotlib figure as an HTML image that carries its data."""
+    image = io.BytesIO()
+    figure.savefig(image, format="png", dpi=dots)
+    return f'<img style="max-width:100%" alt="" src="data:image/png;base64,{_coded(image.getvalue())}">'
 
 
 def _template(name: str) -> str:

@@ -2,10 +2,10 @@
 
 The body is a rigid body in space: centre O of its sphere, velocity u of the centre of mass s = O - a e, axis e, angular
 velocity w, all in the fixed frame, with Euler's equations J w' = M - w x J w, J = I1 + (I3 - I1) e e^T, and e' = w x e. The
-arena is the zero set of a function F, the room where F is positive. The foot q of the centre and its multiplier solve q + k
-grad F = O, F(q) = 0 anew in every evaluation, by Newton's method, so nothing is integrated but the body; the rate of the
-normal follows from the derivative of that system. The normal force is the one that keeps n.O'' + n'.O' = 0: O'' is affine
-in it, so one evaluation without it and one with a newton give it.
+arena is the zero set of a function F, the room where F is positive. The foot q of the centre and its multiplier solve
+q + k grad F = O, F(q) = 0 anew in every evaluation, by Newton's method, so nothing is integrated but the body; the rate of the
+normal follows from the derivative of that system. The normal force is the one that keeps n.O'' + n'.O' = 0: O'' is affine in
+it, so one evaluation without it and one with a newton give it.
 
 Run: python arena_reference.py   writes arena_reference.csv (some minutes).
 """

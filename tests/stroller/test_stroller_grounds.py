@@ -172,7 +172,7 @@ def test_a_hill_is_found_from_a_ride_over_it():
     path = stroller.simulate(HILL, LAUNCH, 2.0, times=times).position
     recording = stroller.Recording(LAUNCH, times, path, 1e-3)
     found = stroller.identify(HILL, recording, {"scene.surface.height.height": 0.6}, progress=False)
-    np.testing.assert_allclose(found.values["scene.surface.height.height"], 0.8, atol=1e-5)
+    np.testing.assert_allclose(found.estimates["scene.surface.height.height"], 0.8, atol=1e-5)
 
 
 @pytest.mark.slow

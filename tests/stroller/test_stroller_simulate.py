@@ -38,7 +38,9 @@ def reference():
     return stroller.simulate(FULL, LAUNCH, 10.0, push, times=jnp.linspace(0.0, 10.0, 11), tolerance=1e-12)
 
 
-@pytest.mark.parametrize(("side", "fork"), [("inside", "absolute"), ("outside", "relative")])
+@pytest.mark.parametrize(
+    ("side", "fork"), [("inside", "absolute"), pytest.param("outside", "relative", marks=pytest.mark.slow)]
+)
 def test_midpoint_rule_balances_energy_to_round_off(side, fork):
     """Section 10b: 20 000 steps with friction and drive leave less than 1e-11 J, and the constraints at 1e-12 m/s."""
     scene = Scene(BODY, Spheroid(2.0, 1.1), Damping(0.3, 0.2, 0.1, 0.15), side=side, fork=fork)

@@ -25,6 +25,15 @@ HORIZON = 0.5
 ARENAS = ["plane", "cylinder", "sphere"]
 
 
+class Hills(eqx.Module):
+    """A few waves of any height, length and direction: z = sum h_k sin(a_k x + b_k y + c_k)."""
+
+    waves: tuple[tuple[jax.Array, jax.Array, jax.Array, jax.Array], ...]
+
+    def __call__(self, x, y):
+        return sum(h * jnp.sin(a * x + b * y + c) for h, a, b, c in self.waves)
+
+
 @st.composite
 def batches(draw, arena: str):
     """A scene and a launch with `LANES` numbers in every place, from grams to kilograms and from slow to 1e3 rad/s."""
@@ -35,6 +44,14 @@ def batches(draw, arena: str):
         return np.exp(random.uniform(np.log(low), np.log(high), LANES)) if log else random.uniform(low, high, LANES)
 
     mass, radius = between(1e-3, 10.0, log=True), between(2e-3, 0.3, log=True)
+
+    def wave():
+        # From ripples in which the ball does not fit to slopes many balls long.
+        length = radius * between(2.0, 100.0, log=True)
+        heading = between(-math.pi, math.pi)
+        parts = (length * between(0.0, 0.3), np.cos(heading) / length, np.sin(heading) / length, between(-3.0, 3.0))
+        return tuple(jnp.asarray(part) for part in parts)
+
     I1 = mass * radius**2 * between(0.15, 0.8)
     I3 = I1 * between(0.3, 2.0)
     top = tippe.Top(mass, radius, radius * between(0.0, 0.9), I1, I3)
@@ -42,6 +59,7 @@ def batches(draw, arena: str):
         "plane": lambda: tippe.Plane(),
         "cylinder": lambda: tippe.Cylinder(radius * between(1.05, 1e3, log=True)),
         "sphere": lambda: tippe.Sphere(radius * between(1.05, 1e3, log=True)),
+        "hills": lambda: tippe.Graph(Hills(tuple(wave() for _ in range(3)))),
     }[arena]()
     # Half of the lanes have no disc or no lever, and so Coulomb friction or no rolling resistance.
     disc, lever = (radius * between(0.0, 0.1) * random.integers(0, 2, LANES) for _ in range(2))
@@ -49,7 +67,7 @@ def batches(draw, arena: str):
     friction = tippe.Rolling(lever, between(0.1, 10.0, log=True), sliding)
     scene = tippe.Scene(top, surface, friction, between(1.0, 30.0))
     spin = between(1.0, 1e3, log=True) * random.choice([-1.0, 1.0], LANES)
-    eta = between(-1.5, 1.5) if arena != "plane" else np.zeros(LANES)
+    eta = between(-1.5, 1.5) if arena in ("cylinder", "sphere") else np.zeros(LANES)
     return scene, tippe.Launch(between(0.0, math.pi), spin, eta, between(-math.pi, math.pi))
 
 
@@ -84,7 +102,10 @@ def check_a_batch(scene: tippe.Scene, launch: tippe.Launch):
         np.asarray(jax.vmap(type(scene).energy)(scene, end.T)),
     )
     size = np.asarray(scene.body.I3 * launch.spin**2 + scene.body.mass * scene.gravity * scene.body.radius)
-    if not plane:
+    if isinstance(scene.surface, tippe.Graph):
+        fallen = jax.vmap(lambda scene, at: scene.frame.height(tuple(at[8:])))(scene, end.T) - scene.body.radius
+        size = size + np.asarray(scene.body.mass * scene.gravity * (jnp.abs(fallen) + 30.0 * scene.body.radius))
+    elif not plane:
         size = size + np.asarray(scene.body.mass * scene.gravity * scene.surface.radius)
     assert np.all(energy[1] <= energy[0] + 1e-7 * size * turns)
     if plane:
@@ -232,6 +253,17 @@ def test_properties(arena):
     @given(batch=batches(arena), angle=ANGLES, exponents=EXPONENTS)
     def check(batch, angle, exponents):
         check_everything(arena, batch, angle, exponents)
+
+    check()
+
+
+def test_random_hills():
+    """Finite or flagged, and energy never grows, over any smooth ground, the ball fitting into its valleys or not."""
+
+    @FEW
+    @given(batch=batches("hills"))
+    def check(batch):
+        check_a_batch(*batch)
 
     check()
 

@@ -114,12 +114,22 @@ class HybridTrajectory(AbstractTrajectory):
 
     def resampled(self, times: Float[np.ndarray, " times"]) -> "HybridTrajectory":
         """The same run at other times, which are not checked."""
-        found = (times, *_parts(self.dense.at(times)), self.dense.numbers(times))
+        found = (times, *self.parts_of(self.dense.at(times)), self.touching(self.dense.numbers(times)))
         return eqx.tree_at(
             lambda one: (one.t, one.states, one.cyclic, one.spin_angle, one.work, one.distance, one.contact),
             self,
             found,
         )
+
+    @staticmethod
+    def parts_of(shown: Float[np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
+        """State, path, spin angle, work, and the distance with its rate, from what the phases show."""
+        return shown[:8], shown[8:10], shown[10], shown[11], shown[12:]
+
+    @staticmethod
+    def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
+        """Which sphere touches, for the numbers of the phases."""
+        return numbers
 
     def __str__(self) -> str:
         return f"{super().__str__()}\n  {len(self.hops)} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
@@ -137,16 +147,23 @@ def simulate_hybrid(
     kinds, first = phases(scene, problem, tolerance, last=False, rides=True)
     path = follow_phases(kinds, int(first[0]), state, t1, Settings(tolerance, solver), kinds=1)
     hops = np.array([(one.begin, one.end) for one in path.pieces if one.number == BETWEEN]).reshape(-1, 2)
-    status, shown = STATUS[path.status], path.times
-    states, place, spin_angle, work, distance = _parts(path.at(shown))
-    ends = (status, path.end_time, {}, path, distance, path.numbers(shown), hops)
-    run = HybridTrajectory(shown, scene, states, place, spin_angle, work, *ends)
+    return flights_of(HybridTrajectory, scene, path, STATUS[path.status], hops, times)
+
+
+def flights_of(
+    kind: type[HybridTrajectory],
+    scene: Scene,
+    path: PhasedPath,
+    status: str,
+    hops: Float[np.ndarray, "hops 2"],
+    times: Any,
+) -> Any:
+    """A trajectory of some kind along a path, at given times or at those of its steps."""
+    shown = path.times
+    states, place, spin_angle, work, distance = kind.parts_of(path.at(shown))
+    ends = (status, path.end_time, {}, path, distance, kind.touching(path.numbers(shown)), hops)
+    run = kind(shown, scene, states, place, spin_angle, work, *ends)
     in_contact = sum(one.motion.states[-1, -1] - one.motion.states[-1, 0] for one in path.stays)
     # What is left of the work is that of the impacts.
     run = run.with_stats(path, impact_loss=float(in_contact - path.state[-1]))
     return run if times is None else run.resampled(np.asarray(times)[np.asarray(times) <= run.end_time])
-
-
-def _parts(shown: Float[np.ndarray, "14 times"]) -> tuple[Any, Any, Any, Any, Any]:
-    """State, path, spin angle, work, and the distance with its rate, from what the phases show."""
-    return shown[:8], shown[8:10], shown[10], shown[11], shown[12:]

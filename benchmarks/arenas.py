@@ -1,0 +1,85 @@
+"""What a step costs on every arena, beside one on the plane, and how far a foot drifts off a general one.
+
+    python benchmarks/arenas.py [--drift]
+
+Rutstam's top with viscous friction in a table of 512 launches, theta(0) from 0.05 to 0.3 and spins from 80 to 120 rad/s, 8 s,
+tolerance 1e-9, one core. Plane, cylinder and sphere have frames of their own; "carried" is the general frame, of any other.
+A first call compiles and runs and is not in the figures. `--drift` adds runs of 1000 s: the greatest distance of the foot from
+the arena, in units of R, at two tolerances. Run it alone: other work on the machine shows in every number.
+"""
+
+import argparse
+
+import jax.numpy as jnp
+import numpy as np
+from measure import machine, one_core, table, timed
+from scenes import TOP
+
+import tippe
+from nonholonomic.sweeps import grid
+
+
+def bowl(x, y):
+    return (x * x + y * y) / 0.6
+
+
+ARENAS = {
+    "plane": tippe.Plane(),
+    "tilted plane": tippe.Plane(0.05),
+    "cylinder": tippe.Cylinder(0.3),
+    "sphere": tippe.Sphere(0.3),
+    "spheroid": tippe.Spheroid(0.3, 0.25),
+    "torus": tippe.Torus(0.5, 0.3),
+    "paraboloid": tippe.Paraboloid(0.3),
+    "graph": tippe.Graph(bowl),
+    "implicit": tippe.Implicit(lambda x, y, z: z - bowl(x, y)),
+}
+
+
+def rows() -> list[dict[str, str]]:
+    """Steps in a second on every arena, and the cost of one over that on the plane."""
+    grid.workers = lambda: 1
+    found, plane = [], None
+    for name, surface in ARENAS.items():
+        scene = tippe.Scene(tippe.Top(*TOP), surface, tippe.Viscous(0.3))
+        given = {"theta": np.linspace(0.05, 0.3, 64), "spin": np.linspace(80.0, 120.0, 8), "t1": 8.0}
+        axes = {f"launch.place[{k}]": 0.0 for k in range(3)} if name == "implicit" else None
+
+        def run(scene=scene, axes=axes, given=given):
+            return tippe.inversion_table(scene, axes=axes, progress=False, **given)
+
+        measured = timed(run, 3)
+        rate = measured.result.steps.sum() / measured.cpu
+        plane = rate if plane is None else plane
+        frame = type(scene.frame).__name__.removesuffix("Frame").lower()
+        found.append(
+            {"arena": name, "frame": frame, "10^6 steps/s": f"{rate / 1e6:.2f}", "cost": f"{plane / rate:.2f}"}
+        )
+    return found
+
+
+def drifts() -> list[dict[str, str]]:
+    """How far the foot is off the arena at most in 1000 s."""
+    times, found = np.linspace(0.0, 1000.0, 501), []
+    for name in ("paraboloid", "torus", "graph"):
+        scene = tippe.Scene(tippe.Top(*TOP), ARENAS[name], tippe.Viscous(0.02))
+        launch = tippe.Launch(0.3, 20.0, place=(0.1, 0.05) if name != "torus" else (0.0, 0.3), velocity=(0.2, 0.1))
+        for tolerance in (1e-6, 1e-9):
+            run = tippe.simulate(scene, launch, 1000.0, times, tolerance)
+            foot = tuple(jnp.asarray(run.states[8:11]))
+            off = float(jnp.max(jnp.abs(scene.surface.offset(foot))) / scene.body.radius)
+            found.append(
+                {"arena": name, "tolerance": f"{tolerance:g}", "status": run.status, "drift / R": f"{off:.1e}"}
+            )
+    return found
+
+
+if __name__ == "__main__":
+    command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command.add_argument("--drift", action="store_true", help="add the drift over 1000 s")
+    options = command.parse_args()
+    one_core()
+    print(machine())
+    print(table(rows()))
+    if options.drift:
+        print(table(drifts()))

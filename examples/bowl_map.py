@@ -1,0 +1,56 @@
+"""Where in a bowl does a top turn over fastest? A map of inversion times over its places, smooth and with frozen waves.
+
+Run: python examples/bowl_map.py   prints both maps; with matplotlib it also draws them.
+"""
+
+from importlib.util import find_spec
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+import tippe
+
+PLACES = np.linspace(-0.12, 0.12, 9)
+
+
+class WavyBowl(eqx.Module):
+    """z = (x^2 + y^2) / (2 p) + height sin(k x); its numbers can be swept and differentiated like any other."""
+
+    p: float
+    height: float
+    k: float
+
+    def __call__(self, x, y):
+        return (x * x + y * y) / (2.0 * self.p) + self.height * jnp.sin(self.k * x)
+
+
+def times(surface) -> tippe.Table:
+    """Inversion times over the places of an arena, for one top, one lean and one spin."""
+    mass, radius = 0.02, 0.02
+    inertia = mass * radius**2
+    top = tippe.Top(mass, radius, 0.3 * radius, I1=131 / 350 * inertia, I3=0.4 * inertia)
+    scene = tippe.Scene(top, surface, tippe.Viscous(0.3))
+    axes = {"launch.place[0]": PLACES, "launch.place[1]": PLACES}
+    return tippe.inversion_table(scene, theta=0.2, spin=155.0, t1=12.0, axes=axes)
+
+
+def shown(table: tippe.Table) -> str:
+    """The times as text, y upwards; where there is none, the first letter of why."""
+    rows = []
+    for y in reversed(range(len(PLACES))):
+        cells = zip(table.time[:, y], table.status[:, y], strict=True)
+        rows.append("  ".join(f"{time:6.3f}" if np.isfinite(time) else f"{word[0]:>6}" for time, word in cells))
+    return "\n".join(rows)
+
+
+def main() -> None:
+    for name, surface in {"bowl": tippe.Paraboloid(0.5), "waves": tippe.Graph(WavyBowl(0.5, 0.004, 40.0))}.items():
+        table = times(surface)
+        print(f"{name}: seconds to 0.95 pi, over x and y from {PLACES[0]} to {PLACES[-1]} m\n{shown(table)}\n")
+        if find_spec("matplotlib"):
+            table.plot("time").savefig(f"bowl_map_{name}.png", dpi=130)
+
+
+if __name__ == "__main__":
+    main()

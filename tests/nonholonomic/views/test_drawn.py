@@ -1,0 +1,100 @@
+"""Arenas, animations and pages of what is no run: a ball that somebody rolls along a line."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+from nonholonomic.geometry import Cylinder, Graph, Implicit, Paraboloid, Plane, Sphere, Spheroid, Torus
+from nonholonomic.views import Arrow, Body, Curve, Show, Stage, Trace, arena, ball, page, turned
+from nonholonomic.views.animation import draw_curves, write_animation
+from nonholonomic.views.stage import matrices
+
+SURFACES = (
+    (Plane(), (0.3, 0.1)),
+    (Plane(0.3), (0.3, 0.1)),
+    (Cylinder(0.5), None),
+    (Sphere(0.5), (0.3, -1.2)),
+    (Spheroid(0.6, 0.3), (2.0, -1.5)),
+    (Torus(1.0, 0.3), (0.3, 2.0)),
+    (Paraboloid(0.4), (0.1, 0.2)),
+    (Graph(lambda x, y: 0.1 * jnp.sin(3.0 * x) * y), (0.1, 0.2)),
+    (Implicit(lambda x, y, z: x**2 + y**2 + z**2 - 0.25), (0.3, 0.0, -0.4)),
+)
+
+
+@pytest.mark.parametrize(("surface", "place"), SURFACES, ids=lambda one: type(one).__name__)
+def test_an_arena_lies_on_its_surface_and_reaches_about_the_run(surface, place):
+    place = (0.2, 0.3) if place is None else place
+    point = np.array([float(part) for part in surface.in_fixed_frame(surface.chart(tuple(map(jnp.asarray, place)))[0])])
+    drawn = arena(surface, point[None], np.array([0.0, 0.0, 1.0]), 0.1, 0.03)
+    for points in (drawn.mesh.vertices, np.concatenate(drawn.lines)):
+        away = surface.distance(surface.in_own_axes(tuple(points.T)))
+        assert away is None or np.max(np.abs(away)) < 1e-9
+    distance = np.linalg.norm(drawn.mesh.vertices - point, axis=-1)
+    assert distance.min() < 0.01
+    assert 0.09 < distance.max() < 0.6
+
+
+def rolling(surface=None) -> Stage:
+    """A ball that rolls along x, a radius each second, for 2 s."""
+    times, radius = np.linspace(0.0, 2.0, 41), 0.1
+    cosine, sine, zero = np.cos(times), np.sin(times), np.zeros(41)
+    rows = [[cosine, zero, sine], [zero, zero + 1.0, zero], [-sine, zero, cosine]]
+    rotation = np.moveaxis(np.array(rows), -1, 0)
+    position = np.stack([radius * times, zero, zero + radius], axis=-1)
+    foot = position * [1.0, 1.0, 0.0]
+    body = Body("ball", position, turned(rotation), ball(radius, (0xC8412B, 0xF4E9D2)))
+    np.testing.assert_allclose(matrices(body.turning), rotation, atol=1e-14)
+    show = Show(
+        "a ball",
+        0xC8412B,
+        times,
+        radius,
+        (body,),
+        (Trace("path", foot, 0x1F8A4C, 0.01),),
+        (Arrow("up", foot, np.tile([0.0, 0.0, radius], (41, 1)), 0x7B4FA3, 0.01),),
+        (Curve("x [m]", position[:, 0]), Curve("z [m]", position[:, 2])),
+    )
+    ground = arena(Plane(), foot, np.array([0.0, 0.0, 1.0]), 0.2, 0.1)
+    return Stage("rolling", ground, (show,))
+
+
+def test_turns_are_told_from_matrices_and_back():
+    random = np.random.default_rng(0)
+    turning = random.normal(size=(200, 4))
+    # Half turns, where the quaternion's last component is 0, among them.
+    turning[:50, 3] = 0.0
+    turning /= np.linalg.norm(turning, axis=-1, keepdims=True)
+    again = turned(matrices(turning))
+    np.testing.assert_allclose(np.abs(np.sum(again * turning, axis=-1)), 1.0, atol=1e-12)
+
+
+def test_an_animation_moves(tmp_path):
+    write_animation([rolling()], tmp_path / "ball.gif", np.array([0.0, 1.0, 2.0]))
+    with Image.open(tmp_path / "ball.gif") as picture:
+        assert picture.n_frames == 3
+        shown = []
+        for frame in range(3):
+            picture.seek(frame)
+            shown.append(np.asarray(picture.convert("RGB"), dtype=float))
+    assert all(np.mean(np.abs(a - b)) > 0.5 for a, b in zip(shown, shown[1:], strict=False))
+    with pytest.raises(ValueError, match=r"ball\.avi' must end in \.gif"):
+        write_animation([rolling()], tmp_path / "ball.avi", None)
+
+
+def test_curves_are_drawn_and_what_is_constant_is_flat():
+    stage = rolling()
+    x, z = draw_curves([stage]).axes
+    np.testing.assert_array_equal(x.lines[0].get_ydata(), stage.shows[0].curves[0].values)
+    assert x.get_ylabel() == "x [m]"
+    low, high = z.get_ylim()
+    assert low < 0.1 < high
+    assert high - low > 1e-5
+
+
+def test_a_page_without_motion_has_no_script(tmp_path):
+    text = page([], "a < b", above="<p>words</p>").html
+    assert "a &lt; b" in text
+    assert "<p>words</p>" in text
+    assert "<script" not in text

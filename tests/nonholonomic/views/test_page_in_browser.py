@@ -1,0 +1,139 @@
+"""The page of a run, opened in a real browser with the network off: what is drawn is where the run is."""
+
+import shutil
+import time
+
+import numpy as np
+import pytest
+
+import stroller
+import tippe
+from nonholonomic.views import page
+
+BROWSER, DRIVER = (shutil.which(name) for name in ("chromium", "chromedriver"))
+
+pytestmark = pytest.mark.skipif(BROWSER is None or DRIVER is None, reason="no chromium with its chromedriver")
+
+#: Poses are sent in single precision.
+SINGLE = 2e-6
+
+
+@pytest.fixture(scope="module")
+def top(rutstam_scene):
+    return tippe.simulate(rutstam_scene, tippe.Launch(0.3, 150.0), 0.5)
+
+
+@pytest.fixture(scope="module")
+def ride():
+    scene = stroller.Scene(stroller.Stroller(12.0, 0.7, 1.5, 0.05), stroller.Plane(0.05))
+    return stroller.simulate(scene, stroller.Launch((0.0, 0.0), 1.2, 2.0, 0.2), 1.0, times=np.linspace(0.0, 1.0, 21))
+
+
+@pytest.fixture(scope="module")
+def browser(top, ride, tmp_path_factory):
+    from selenium.webdriver import Chrome, ChromeOptions
+    from selenium.webdriver.chrome.service import Service
+
+    options = ChromeOptions()
+    options.binary_location = BROWSER
+    wanted = ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader")
+    for argument in (*wanted, "--enable-unsafe-swiftshader", "--window-size=500,500"):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = Chrome(options=options, service=Service(DRIVER))
+    try:
+        off = {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
+        driver.execute_cdp_cmd("Network.enable", {})
+        driver.execute_cdp_cmd("Network.emulateNetworkConditions", off)
+        path = tmp_path_factory.mktemp("page") / "runs.html"
+        # Small pictures, as a processor has to draw them here.
+        page([*top.stages(), *ride.stages()], "Both models", height=100).save(path)
+        driver.get(path.as_uri())
+        wait(driver, "return !!window.player")
+        yield driver
+    finally:
+        driver.quit()
+
+
+def wait(driver, script: str) -> None:
+    until = time.monotonic() + 60.0
+    while not driver.execute_script(script):
+        assert time.monotonic() < until, driver.get_log("browser")
+        time.sleep(0.05)
+
+
+def set_speed(driver, factor: float) -> None:
+    driver.execute_script(f"document.getElementById('speed').value = {factor}")
+
+
+def poses(driver, at: float, stage: int, body: int = 0) -> np.ndarray:
+    """The matrix that takes a body to its place at a time, as the page's scene has it."""
+    script = f"player.seek({at!r}); return player.matrix({stage}, 0, {body})"
+    return np.array(driver.execute_script(script)).reshape(4, 4).T
+
+
+def test_nothing_is_missing_without_a_network(browser):
+    assert [entry for entry in browser.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")] == []
+    assert browser.execute_script("return document.querySelectorAll('.scene canvas').length") >= 2
+    assert browser.execute_script("return document.querySelectorAll('.strip').length") == 6
+
+
+def test_the_top_is_where_the_run_is(browser, top):
+    times = np.array([0.0, 0.1234, 0.3, 0.5])
+    there = top.at(times)
+    for number, at in enumerate(times):
+        pose = poses(browser, float(at), 0)
+        np.testing.assert_allclose(pose[:3, 3], there.position[number], atol=SINGLE)
+        # Between frames it is turned the short way, so its axis cuts a corner.
+        np.testing.assert_allclose(pose[:3, 2], there.axis[number], atol=2e-3)
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=SINGLE)
+
+
+def test_the_top_spins_as_fast_as_the_run(browser, top):
+    frames = np.asarray(top.stages()[0].shows[0].times)
+    before, after = frames[200], frames[201]
+    turn = poses(browser, float(after), 0)[:3, :3] @ poses(browser, float(before), 0)[:3, :3].T
+    angle = np.arccos((np.trace(turn) - 1.0) / 2.0)
+    rate = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    rate *= angle / (2.0 * np.sin(angle) * (after - before))
+    middle = top.at([(before + after) / 2.0])
+    np.testing.assert_allclose(rate @ np.asarray(middle.axis)[0], middle.spin[0], rtol=1e-3)
+
+
+def test_the_stroller_and_its_wheels_are_where_the_ride_is(browser, ride):
+    for number in (0, 10, 20):
+        at = float(ride.t[number])
+        frame, front = poses(browser, at, 1, 0), poses(browser, at, 1, 3)
+        wheels = [poses(browser, at, 1, body)[:3, 3] for body in (1, 2)]
+        up = np.cross(frame[:3, 0], frame[:3, 1])
+        np.testing.assert_allclose(frame[:3, 0], ride.direction[number], atol=SINGLE)
+        np.testing.assert_allclose(frame[:3, 3], ride.position[number] + 0.14 * up, atol=SINGLE)
+        np.testing.assert_allclose(sum(wheels) / 2.0, frame[:3, 3], atol=SINGLE)
+        np.testing.assert_allclose(front[:3, 3] - frame[:3, 3], 0.7 * np.asarray(ride.direction[number]), atol=SINGLE)
+        # The front wheel's axis has turned by the steering angle.
+        turned = np.arctan2(-front[:3, 1] @ frame[:3, 0], front[:3, 1] @ frame[:3, 1])
+        np.testing.assert_allclose(turned, ride.steering[number], atol=SINGLE)
+
+
+def test_the_slider_sets_the_time(browser):
+    browser.execute_script(
+        "const s = document.getElementById('slider'); s.value = 0.4; s.dispatchEvent(new Event('input'));"
+    )
+    assert browser.execute_script("return player.time()") == pytest.approx(0.4)
+    assert browser.find_element("id", "clock").text.startswith("0.400 s")
+
+
+def test_play_runs_to_the_end_and_pause_stops(browser):
+    # So slow that a busy machine does not reach the end meanwhile.
+    set_speed(browser, 0.05)
+    browser.execute_script("player.seek(0.2); document.getElementById('play').click()")
+    wait(browser, "return player.time() > 0.21")
+    browser.execute_script("document.getElementById('play').click()")
+    stopped = browser.execute_script("return player.time()")
+    assert stopped < 1.0
+    time.sleep(0.3)
+    assert browser.execute_script("return [player.time(), player.playing()]") == [stopped, False]
+    set_speed(browser, 1)
+    browser.execute_script("player.seek(0.95); player.play(true)")
+    wait(browser, "return !player.playing()")
+    assert browser.execute_script("return player.time()") == 1.0

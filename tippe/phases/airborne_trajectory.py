@@ -1,0 +1,73 @@
+"""One run through contacts, flights and impacts on an arena that is no level plane, with its path."""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from nonholonomic.integration import Settings, follow_phases
+
+from ..dynamics import LOSSES, NO_COSINE
+from ..inversion import InversionProblem
+from ..launch import Launch
+from ..observables import of_each_run
+from ..sampled import TrajectoryProblem
+from ..scene import Scene
+from ..state import parts
+from .airborne import FLYING, phases
+from .flight_trajectory import STATUS, HybridTrajectory, flights_of
+
+
+class ArenaTrajectory(HybridTrajectory):
+    """A `HybridTrajectory` over any arena: `theta`, `azimuth` and `slip` refer to the frame at the foot, the nearest point of
+    the arena, and `distance` is that of the top's sphere from it. `cyclic` holds the vector c of `tippe/sampled.py`."""
+
+    @property
+    def _path(self) -> tuple[Array, ...]:
+        return ()
+
+    @of_each_run
+    def energy(self) -> Float[Array, " times"]:
+        """Kinetic energy plus weight times the height of the centre of mass [J]."""
+        scene, (_, e, L, place) = self.scene, parts(self.states)
+        (distance, rate), n_up = self.above, scene.frame.vertical(place)[2]
+        # In contact the velocity along n is that of the centre of mass about the sphere's centre.
+        about = -scene.body.offset * (L[0] * e[1] - L[1] * e[0]) / scene.body.I1
+        lifted = scene.gravity * distance * n_up + 0.5 * ((about + rate) ** 2 - about**2)
+        return scene.energy(self.states) + scene.body.mass * lifted
+
+    @of_each_run
+    def normal_force(self) -> Float[Array, " times"]:
+        """Normal force [N]; 0 in flight."""
+        return jnp.where(self.contact < 0, 0.0, self.scene.normal_force(self.states))
+
+    @of_each_run
+    def slip(self) -> Float[Array, "times 2"]:
+        """Velocity along the tangent plane of the point of the sphere that is closest to the arena [m/s]."""
+        return self.scene.slip_velocity(self.states).T
+
+    @staticmethod
+    def parts_of(shown: Float[np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
+        return shown[:14], shown[14:17], shown[17], shown[18], shown[19:]
+
+    @staticmethod
+    def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
+        return np.where(numbers == FLYING, -1, 0)
+
+
+def simulate_airborne(
+    scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver
+) -> ArenaTrajectory:
+    """Run one launch of a hybrid scene that is not on a level plane. **Arguments:** as for `simulate`, checked."""
+    run = TrajectoryProblem.of(scene, launch)
+    state, scales = run.start()
+    problem = InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
+    kinds, first = phases(scene, problem, tolerance, last=False, rides=True)
+    path = follow_phases(kinds, int(first[0]), state, t1, Settings(tolerance, solver), kinds=1)
+    status = STATUS[path.status]
+    if status == "jammed":
+        status = LOSSES[int(scene.dynamics.loss(jnp.asarray(path.state[:14])))]
+    hops = np.array([(one.begin, one.end) for one in path.stays if one.number == FLYING]).reshape(-1, 2)
+    return flights_of(ArenaTrajectory, scene, path, status, hops, times)
