@@ -31,13 +31,13 @@ def main() -> None:
     figure = tippe.Recording(launch, TIMES, THETA, [READING * theta for theta in THETA])
     shown(tippe.identify(scene(0.3, 0.08), figure, {"slip_speed": 0.08}), "the slip speed, if mu is 0.3 as printed:")
     with warnings.catch_warnings():
-        # That the data do not determine both is the point.
+        # How well the data determine both is the point.
         warnings.simplefilter("ignore", tippe.FitWarning)
         both = tippe.identify(scene(0.3, 0.08), figure, {"mu": 0.3, "slip_speed": 0.08})
     shown(both, "both:")
     for value, words in zip(both.identifiability.singular_values, both.identifiability.words, strict=True):
         print(f"  known to {100.0 / value:.2g} %: {words}")
-    print("The figure fixes mu / v0, the slope of the law at low slip; it says next to nothing about mu.")
+    print("So the figure fixes mu / sqrt(v0) to 1 %, but mu and v0 along that line to 10 % only.")
 
 
 if __name__ == "__main__":

@@ -16,6 +16,9 @@ FINDS = {
     "mu_and_offset": r"2 numbers from 10 measurements: converged\n  4 of 4 starts converged, 4 ended here",
     "stroller_damping": r"2 numbers from 90 measurements: converged\n  4 of 4 starts converged, 4 ended here",
     "bowl_map": r"(?s)bowl: seconds to 0\.95 pi.* 5\.416 .*waves: seconds to 0\.95 pi",
+    "next_launch": r"fix mu to 2\d %, offset to 2\d %\nnext: theta 0\.005, spin 70 rad/s: then mu to 0\.9\d? %",
+    "posterior": r"4 chains of 250 draws, 0 divergences",
+    "cohens_figure": r"(?s)slip_speed = 0\.11\d,.*mu = 0\.3\d\d,.*known to 0\.\d+ %: .*known to \d+ %: ",
     "lost_numbers": r"(?s)likelihood 29\.[45]\d* at 11 degrees.*\n\[29\.[45]\d* 31\.2\d* 30\.[23]\d* 32\.3\d*\]",
 }
 
