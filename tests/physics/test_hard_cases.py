@@ -10,7 +10,8 @@ from hard.row import Row
 SLOW = (
     *("no_offset", "no_friction_at_all", "huge_cylinder", "spins_of_all_sizes", "extreme_inertias", "tight_cylinder"),
     *("inverted_exactly", "ball_that_drills", "ball_that_rolls", "energy_under_torque", "torques_by_lagrange"),
-    *("chaos_in_a_cylinder", "the_law_itself", "over_to_the_stem"),
+    *("chaos_in_a_cylinder", "the_law_itself", "over_to_the_stem", "stick_and_slip_again", "leaning_on_the_stem"),
+    *("explicit_at_a_tenth", "orderly_without_friction", "energy_through_hops", "bounces", "coulomb_hops"),
 )
 
 ROWS = [

@@ -60,7 +60,6 @@ def test_friction_from_exact_times(found):
     assert "theta 0.3, spin 110" in str(result)
 
 
-@pytest.mark.slow
 def test_noisy_times_give_unbiased_friction_within_its_errors(found):
     """Twelve tables, in short for the 200 below; what the launches have in common is compiled once.
 
