@@ -29,11 +29,11 @@ def test_a_top_jumps_over_a_hill():
     scene = tippe.Scene(rutstam_top(), hills, tippe.Viscous(0.02), contact="hybrid", restitution=0.4)
     run = tippe.simulate(scene, tippe.Launch(1.2, 150.0, place=(-0.157, 0.0), velocity=(1.6, 0.2)), 0.5)
     assert run.status == "reached t1"
-    assert len(run.hops) > 0
+    # The last of the bounces takes a microsecond.
+    assert len(run.hops) > 10
     aloft = run.contact < 0
     assert aloft.any()
-    # TODO: 2.6e-5 of the energy is lost unaccounted where the bounces close (on the plane's graph times agree to 1e-8).
-    assert run.stats["energy_residual"] < 1e-4 * float(run.energy[0])
+    assert run.stats["energy_residual"] < 1e-9 * float(run.energy[0])
     assert_close(run.distance[0][~aloft], 0.0, atol=1e-12)
     assert_close(run.normal_force[aloft], 0.0)
 

@@ -249,7 +249,9 @@ class Fly(AbstractPhase):
         bounce = zero if scene.restitution is None else scene.restitution + zero
         rebounds = bounce * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
         struck, fails = strike(scene.body, scene.friction, ball, free, jnp.where(rebounds, bounce, 0.0))
-        after = jnp.where(rebounds, in_flight(flying.place, ground.axes, struck), in_contact(ground, struck))
+        # Where the landing was located a little below the arena, the next flight would end where it begins.
+        lifted = tuple(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
+        after = jnp.where(rebounds, in_flight(lifted, ground.axes, struck), in_contact(ground, struck))
         if self.rides:
             across = tuple(state[OWN + k] for k in range(3))
             across = jnp.where(rebounds, jnp.stack(across), jnp.stack(seen(across, ground.axes)))
