@@ -29,7 +29,7 @@ def test_a_scene_tells_its_numbers_with_units():
     assert "gravity   9.81 m/s²" in printed
     assert "Cylinder(radius=0.3 m)" in scene._repr_html_()
     with pytest.raises(ValueError, match=re.escape("not on Cylinder(radius=0.3 m)")):
-        tippe.Scene(tippe.Top(**GOOD, stem=tippe.Stem(0.005, 0.018)), tippe.Cylinder(0.3), contact="hybrid")
+        tippe.Scene(tippe.Top(**GOOD, stem=tippe.Stem(0.005, 0.024)), tippe.Cylinder(0.3), contact="hybrid")
 
 
 @pytest.mark.parametrize(
