@@ -28,7 +28,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 #: Memory mappings that a process may collect before it forgets its compiled programs; Linux allows 65 530, and a compiler that
 #: gets no more of them crashes.
-MOST_MAPPINGS = 30_000
+MOST_MAPPINGS = 45_000
 
 
 @pytest.fixture(autouse=True)

@@ -30,8 +30,10 @@ def relative_errors(family: str, tolerance: float) -> np.ndarray:
     "family",
     [
         pytest.param("plane-viscous", marks=pytest.mark.newest),
-        "cylinder-Coulomb",
-        *(pytest.param(one, marks=pytest.mark.slow) for one in ("plane-Coulomb", "cylinder-viscous", "sphere-viscous")),
+        *(
+            pytest.param(one, marks=pytest.mark.slow)
+            for one in ("cylinder-Coulomb", "plane-Coulomb", "cylinder-viscous", "sphere-viscous")
+        ),
     ],
 )
 def test_derivatives_agree_with_extrapolated_differences(family):

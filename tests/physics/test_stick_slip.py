@@ -113,6 +113,7 @@ def test_a_ball_on_a_slope_rolls_where_friction_is_two_sevenths_of_the_slope():
         assert kinds(run.dense) == [bool(2.0 / 7.0 * np.tan(place) < 0.3)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spin", [-20.0, 0.0])
 def test_a_ball_that_friction_cannot_hold_slips_down_through_a_turn_of_its_slip(spin):
     """Across the cylinder, the axis along it, where the slip v = V - R w is a number that changes its sign at 0.045 s, or

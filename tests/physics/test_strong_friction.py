@@ -203,6 +203,7 @@ def test_every_road_tells_of_the_jam():
     assert slope == 0.0
 
 
+@pytest.mark.slow
 def test_exact_coulomb_friction_jams_too():
     """While the top slips, as a slip speed of next to nothing has it."""
     scene = tippe.Scene(tippe.Top(*NUMBERS), friction=tippe.SetValuedCoulomb(MU))

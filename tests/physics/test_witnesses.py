@@ -124,7 +124,7 @@ def test_rutstam_and_the_jellett_reduction_give_the_accelerations_of_the_vector_
     assert jnp.max(jellett) < 1e-10
 
 
-@pytest.mark.parametrize("arena", ARENAS)
+@pytest.mark.parametrize("arena", [pytest.param("plane", marks=pytest.mark.slow), "cylinder"])
 def test_the_general_formulations_give_the_accelerations_of_the_frictionless_top(arena):
     """Multipliers, Hamel, connection and bracket, from nothing but metric and potential, 1000 random states."""
     scenes, states = legal_cases(arena, "frictionless")
@@ -229,6 +229,7 @@ def run(parts, t1, count=26):
 ANGLES = np.array([1.0, 1.0, 1.0, 10.0, 0.1, 10.0, 10.0, 10.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "friction",
     [

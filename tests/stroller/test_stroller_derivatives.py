@@ -42,6 +42,7 @@ def test_a_strongly_damped_steering(steering):
     np.testing.assert_allclose(jax.grad(end)(0.0), extrapolated(end, 0.0, 1e-4), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_sprung_steering_in_the_middle():
     scene = Scene(Stroller(10.0, 0.7, 1.0, 0.01, steering_spring=20.0), friction=Damping(0.5, 0.0, 0.0, 0.01))
 

@@ -39,6 +39,7 @@ def cylinder_scene():
     return tippe.Scene(rutstam_top(), tippe.Cylinder(0.06))
 
 
+@pytest.mark.slow
 def test_chaos_in_a_cylinder():
     """A top that rocks and rolls without friction parts at 2 /s; one that spins fast does not part exponentially.
 

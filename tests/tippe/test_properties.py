@@ -257,6 +257,7 @@ def test_properties(arena):
     check()
 
 
+@pytest.mark.slow
 def test_random_hills():
     """Finite or flagged, and energy never grows, over any smooth ground, the ball fitting into its valleys or not."""
 

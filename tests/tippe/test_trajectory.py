@@ -83,6 +83,7 @@ def test_other_solvers_agree(rutstam_scene, solver, tolerance):
     assert_close(run.axis, expected.axis, atol=1e3 * tolerance)
 
 
+@pytest.mark.slow
 def test_the_derivative_of_a_trajectory(rutstam_scene):
     """Reverse and forward mode, and forward mode by Diffrax, against a central difference."""
 

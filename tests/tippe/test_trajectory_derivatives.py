@@ -37,7 +37,10 @@ def test_an_upright_start_has_its_tangent_integrated_too():
         assert_close(transform(axis_x)(0.0), expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize("adjoint", [diffrax.RecursiveCheckpointAdjoint(), diffrax.ForwardMode()])
+@pytest.mark.parametrize(
+    "adjoint",
+    [pytest.param(diffrax.RecursiveCheckpointAdjoint(), marks=pytest.mark.slow), diffrax.ForwardMode()],
+)
 def test_an_upright_start_by_diffrax(adjoint):
     transform = jax.jacfwd if isinstance(adjoint, diffrax.ForwardMode) else jax.grad
     assert_close(transform(lambda theta: axis_x(theta, adjoint=adjoint))(0.0), jax.grad(axis_x)(0.0), rtol=1e-6)

@@ -65,7 +65,13 @@ def test_a_batch_by_vmap_is_the_same(table, scene):
     assert_close(table.end_time[1, 1], runs.end_time, atol=1e-7)
 
 
-@pytest.mark.parametrize("arena", [tippe.Cylinder(0.3), tippe.Sphere(0.3)], ids=["cylinder", "sphere"])
+@pytest.mark.parametrize(
+    "arena",
+    [
+        pytest.param(tippe.Cylinder(0.3), id="cylinder"),
+        pytest.param(tippe.Sphere(0.3), id="sphere", marks=pytest.mark.slow),
+    ],
+)
 def test_every_quantity_is_that_of_a_single_run_and_comes_back_from_a_file(arena, tmp_path):
     """In a cylinder and a sphere some are read off the arena's path, which the runs then carry."""
     scene, names = tippe.Scene(rutstam_top(), arena, tippe.Viscous(0.3)), SCALARS + VECTORS

@@ -132,21 +132,30 @@ def test_too_many_steps_and_nonsense_are_failures():
     assert outcome.status[0] == FAILED
 
 
+def time_of(numbers):
+    """When one oscillator reaches its level, w and level given; the exact time is acos(level) / w."""
+    problem = Oscillators(numbers[:1], numbers[1:], jnp.asarray(2.0))
+    settings = Settings(1e-12, absolute=1.0, lanes=1, looped=True)
+    outcome, _ = march(problem, jnp.asarray(9.0), jnp.asarray(1), settings)
+    return outcome.crossing_time[0]
+
+
+def exact_time_of(numbers):
+    return jnp.arccos(numbers[1]) / numbers[0]
+
+
+POINT = jnp.array([1.7, 0.4])
+
+
 def test_the_derivative_is_that_of_the_implicit_function_theorem():
-    """t = acos(level)/w: dt/dw = -t/w, dt/dlevel = -1/(w sqrt(1 - level^2)), and the second derivatives."""
+    """dt/dw = -t/w, dt/dlevel = -1/(w sqrt(1 - level^2))."""
+    assert_close(jax.jacfwd(time_of)(POINT), jax.jacfwd(exact_time_of)(POINT), rtol=1e-10)
 
-    def time_of(numbers):
-        problem = Oscillators(numbers[:1], numbers[1:], jnp.asarray(2.0))
-        settings = Settings(1e-12, absolute=1.0, lanes=1, looped=True)
-        outcome, _ = march(problem, jnp.asarray(9.0), jnp.asarray(1), settings)
-        return outcome.crossing_time[0]
 
-    def exact(numbers):
-        return jnp.arccos(numbers[1]) / numbers[0]
-
-    point = jnp.array([1.7, 0.4])
-    assert_close(jax.jacfwd(time_of)(point), jax.jacfwd(exact)(point), rtol=1e-10)
-    assert_close(jax.jacfwd(jax.jacfwd(time_of))(point), jax.hessian(exact)(point), rtol=1e-8, atol=1e-9)
+@pytest.mark.slow
+def test_so_is_the_second_derivative():
+    """`tippe.inversion_time` has its own in the ordinary run."""
+    assert_close(jax.jacfwd(jax.jacfwd(time_of))(POINT), jax.hessian(exact_time_of)(POINT), rtol=1e-8, atol=1e-9)
 
 
 class Growing(AbstractProblem):

@@ -113,6 +113,7 @@ TRAJECTORIES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ground", "fork", "friction", "launch"), TRAJECTORIES)
 def test_trajectories_agree_over_ten_seconds(ground, fork, friction, launch):
     """The four formulations, integrated side by side, and the P-form end at the same coordinates."""
