@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import numpy as np
@@ -225,8 +226,11 @@ def _friction(law: AbstractFriction) -> str:
 
 @eqx.filter_jit
 def moving(scene: Scene, launches: Launch, t1: Any, times: Any, tolerance: float) -> Motion:
-    """What is drawn of every launch, in one batched run; the picture and the page share its program."""
-    return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, t1, times, tolerance)))(launches)
+    """What is drawn of every launch, in one batched run; the picture and the page share its program.
+
+    Tsit5 has half as many stages as Dopri8 to compile, and few runs are drawn.
+    """
+    return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, t1, times, tolerance, diffrax.Tsit5())))(launches)
 
 
 def starts(options: argparse.Namespace, scene: Scene) -> tuple[list[float], Launch]:
