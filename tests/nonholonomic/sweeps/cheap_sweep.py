@@ -7,6 +7,7 @@ import warnings
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from nonholonomic.sweeps import Table, Variable, axis, sweep
@@ -97,3 +98,8 @@ def resumed(path: Path) -> set[int]:
     assert len(computed) == len(set(computed))
     assert finished_blocks(table) == finished_blocks(Table.load(path)) == set(range(7))
     return set(computed)
+
+
+def place() -> tuple[int, set[int], str, str]:
+    """Where this is called: the process, its cores, and what JAX read when it was imported."""
+    return os.getpid(), os.sched_getaffinity(0), jax.config.jax_platforms, jax.config.jax_compilation_cache_dir

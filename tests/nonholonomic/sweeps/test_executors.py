@@ -15,7 +15,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from cheap_sweep import CELLS, CheapJob, cheap_sweep, finished_blocks, resumed
+from cheap_sweep import CELLS, CheapJob, cheap_sweep, finished_blocks, place, resumed
 from conftest import rutstam_top
 
 import nonholonomic
@@ -218,11 +218,6 @@ def test_an_error_of_a_block_is_the_sweep_s_and_starts_no_further_block(processe
         cheap_sweep(None, job=CheapJob(tmp_path, pause=0.3), executor=processes)
     time.sleep(0.8)
     assert len(list(tmp_path.iterdir())) < 7
-
-
-def place() -> tuple[int, set[int], str, str]:
-    """Where this is called: the process, its cores, and what JAX read when it was imported."""
-    return os.getpid(), os.sched_getaffinity(0), jax.config.jax_platforms, jax.config.jax_compilation_cache_dir
 
 
 def test_local_processes_have_their_cores_and_settings(processes):
