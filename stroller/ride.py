@@ -132,7 +132,8 @@ def traced_ride(
     if adjoint is None:
         found = sampled_run(ride_problem, modules, times, ride.t1, ride.settings, ride.grid)
     else:
-        found = sampled_run_by_diffrax(ride_problem(modules, None), times, ride.t1, ride.settings, adjoint)
+        given = (times, ride.t1, ride.settings, adjoint, ride.grid)
+        found = sampled_run_by_diffrax(ride_problem(modules, None), *given)
     return found.states.T, stats_of(found)
 
 

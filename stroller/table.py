@@ -139,7 +139,7 @@ def sweep(
     grid = named_axes(axes, scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.
     for cells in cells_to_check(grid):
-        changed = replaced(roots, cells)
+        changed = with_numbers(roots, cells)
         changed["scene"].check(changed["launch"])
 
     request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
@@ -173,7 +173,7 @@ class RideJob(NamedTuple):
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which the first `count` are to be run."""
-        cells = replaced(self.roots, columns)
+        cells = with_numbers(self.roots, columns)
         size = next((len(values) for values in columns.values()), 1)
         controls = cells.get("input", self.controls)
         problem = RideProblem.of(cells["scene"], cells["launch"], controls, size, watched=True)
@@ -235,15 +235,6 @@ def named_axes(axes: dict[str, Any], surface: AbstractSurface, launch: Launch) -
             unit = "N m s" if "friction" in number else "rad"
         grid.append(axis(name, number, unit, axes[number], LONG_NAMES.get(name, name.replace("_", " "))))
     return grid
-
-
-def replaced(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """Scene, launch and input with some of their parameters replaced."""
-    launch = roots["launch"]
-    places = dict(zip(place_numbers(launch), launch.place, strict=True))
-    place = tuple(values.get(number, part) for number, part in places.items())
-    roots = roots | {"launch": dataclasses.replace(launch, place=place)}
-    return with_numbers(roots, {number: one for number, one in values.items() if number not in places})
 
 
 def described(controls: Any) -> Any:

@@ -98,13 +98,17 @@ def sampled_run_by_diffrax(
     t1: Float[Array, ""],
     settings: Settings,
     adjoint: diffrax.AbstractAdjoint,
+    grid: Float[Array, " steps"] | None = None,
 ) -> SampledRun:
     """Run a problem and let Diffrax differentiate its steps, which a probe keeps short enough for tangents.
+
+    Steps that are given need no probe.
 
     **Arguments:** as for `sampled_run`; `adjoint`: how Diffrax differentiates.
     """
     size = len(problem.start()[0])
-    path = sample(probed(problem), times, t1, settings, adjoint=adjoint)
+    whole = probed(problem) if grid is None else problem
+    path = sample(whole, times, t1, settings, grid=grid, adjoint=adjoint)
     status, *counts = (part.astype(float) for part in (_status(path, t1), path.accepted, path.rejected))
     return SampledRun(path.states[:size].T, path.end_time, path.end_state[:size], status, *counts)
 

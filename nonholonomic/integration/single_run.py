@@ -60,12 +60,6 @@ def _guard(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array,
     return guard
 
 
-@eqx.filter_jit
-def _guard_on(problem: AbstractProblem, solution: diffrax.Solution, time: Float[Array, ""]) -> Float[Array, ""]:
-    """The guard on the dense output."""
-    return _guard(problem, time, solution.evaluate(time))
-
-
 def _control(settings: Settings, scales: Float[Array, " components"]) -> diffrax.PIDController:
     # The greatest error counts, not the mean: cyclic coordinates that ride along must not dilute the others' errors.
     atol = settings.absolute * settings.tolerance * jax.lax.stop_gradient(scales)

@@ -119,3 +119,13 @@ def test_random_rides_with_components_at_rest():
         scale = np.max(np.abs(gradients), axis=1)
         error = np.abs(gradients[:, k] - (4.0 * one - two) / 3.0)
         assert np.all(error < 1e-6 * scale / sizes[:, k].clip(max=1.0)), (k, error / scale)
+
+
+def test_diffrax_differentiates_the_midpoint_rule_too():
+    """Its steps have a given length, whoever differentiates them."""
+
+    def end(torque, **options):
+        return sideways(torque, t1=1.0, solver=stroller.ImplicitMidpoint(0.1), **options)
+
+    found = jax.jacfwd(lambda torque: end(torque, adjoint=diffrax.ForwardMode()))(0.1)
+    np.testing.assert_allclose(found, extrapolated(end, 0.1, 1e-4), rtol=1e-7)
