@@ -7,8 +7,8 @@ from pathlib import Path
 import diffrax
 import numpy as np
 import pytest
-from conftest import rutstam_top
 from make_gradient_reference import ANGLE, MOVED, columns_of, extrapolated, roots_of
+from tops import rutstam_top
 
 import tippe
 from tippe.sensitivities import slopes_of_cells

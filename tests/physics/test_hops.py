@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, rutstam_top
+from close import assert_close
 from hop_reference import CASES, Case, row
 from hop_reference import strike as reference_strike
+from tops import rutstam_top
 
 import tippe
 from tippe.phases import first_contact, standing_spin

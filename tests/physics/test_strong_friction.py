@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close
+from close import assert_close
 from hop_reference import Case, contact, launch, rate, row
 from impact_reference import Body
 from impact_reference import strike as reference_strike

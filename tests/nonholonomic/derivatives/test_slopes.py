@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close
+from close import assert_close
 
 import nonholonomic.derivatives._adjoint as adjoint
 from nonholonomic.derivatives import directions_of
