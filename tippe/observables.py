@@ -34,7 +34,7 @@ def of_each_run(function: Callable[[Any], Array]) -> property:
 
     def get(self):
         if self.t.ndim == 1 and not any(is_traced(leaf) for leaf in jax.tree.leaves((self.t, self.states, self.scene))):
-            return jnp.asarray(np.asarray(compiled(self.padded()))[: len(self.t)])
+            return jax.device_put(np.asarray(compiled(self.padded()))[: len(self.t)])
         mapped = function
         for _ in range(self.t.ndim - 1):
             mapped = eqx.filter_vmap(mapped)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from .phases import MOST_ROUNDS, AbstractPhase, Passage
 from .problem import AbstractProblem
 from .settings import Settings
-from .single_run import Followed, follow
+from .single_run import Followed, follow, padded
 from .status import FAILED, GUARD_LOST, REACHED_END, RUNNING, UNRESOLVED
 
 #: The number of a piece on the way between two phases.
@@ -91,9 +91,8 @@ class PhasedPath(NamedTuple):
         where, found = self._where(times), []
         for index in np.unique(where):
             here = np.flatnonzero(where == index)
-            # Padded to one length, so that one program serves all pieces.
-            padded = np.concatenate([times[here], np.full(len(times) - here.size, times[here[-1]])])
-            found.append((here, self.pieces[index].at(padded)[:, : here.size]))
+            # To one length, so that one program serves all pieces.
+            found.append((here, self.pieces[index].at(padded(times[here], len(times)))[:, : here.size]))
         shown = np.empty((len(found[0][1]), len(times)))
         for here, values in found:
             shown[:, here] = values

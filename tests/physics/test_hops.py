@@ -350,6 +350,7 @@ def test_a_start_on_the_wall_has_contact():
     assert_close(scene.normal_force(state) / expected, 1.0, atol=6e-3)
 
 
+@pytest.mark.slow
 def test_a_table_starts_on_the_wall():
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Viscous(0.3))
     etas = [math.pi / 2.0 - 1e-9, math.pi / 2.0]

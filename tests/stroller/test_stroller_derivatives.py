@@ -90,6 +90,7 @@ def test_an_array_in_the_input_has_a_slope_for_each_entry():
         np.testing.assert_allclose(gradient[k], expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_random_rides_with_components_at_rest():
     """Steering, its rate, both or neither at rest, stiff and soft forks: gradients by every number against differences."""
     random = np.random.default_rng(3)
@@ -121,6 +122,7 @@ def test_random_rides_with_components_at_rest():
         assert np.all(error < 1e-6 * scale / sizes[:, k].clip(max=1.0)), (k, error / scale)
 
 
+@pytest.mark.slow
 def test_diffrax_differentiates_the_midpoint_rule_too():
     """Its steps have a given length, whoever differentiates them."""
 
