@@ -121,11 +121,13 @@ def test_random_rides_with_components_at_rest():
         assert np.all(error < 1e-6 * scale / sizes[:, k].clip(max=1.0)), (k, error / scale)
 
 
-def test_diffrax_differentiates_the_midpoint_rule_too():
+def test_the_midpoint_rule_is_differentiated_by_either_way():
     """Its steps have a given length, whoever differentiates them."""
 
     def end(torque, **options):
         return sideways(torque, t1=1.0, solver=stroller.ImplicitMidpoint(0.1), **options)
 
+    expected = extrapolated(end, 0.1, 1e-4)
     found = jax.jacfwd(lambda torque: end(torque, adjoint=diffrax.ForwardMode()))(0.1)
-    np.testing.assert_allclose(found, extrapolated(end, 0.1, 1e-4), rtol=1e-7)
+    np.testing.assert_allclose(found, expected, rtol=1e-7)
+    np.testing.assert_allclose(jax.grad(end)(0.1), expected, rtol=1e-7)
