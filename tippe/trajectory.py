@@ -93,19 +93,6 @@ class Trajectory(AbstractTrajectory):
         return jnp.stack(foot, axis=-1)
 
     @of_each_run
-    def rotation(self) -> Float[Array, "times 3 3"]:
-        """From the body to the fixed frame: its columns are the body's axes, the third of them e. At the start the first is
-        de/dtheta: it leans from e away from the arena's normal."""
-        e, across, angle = self.axis, self._fixed(tuple(self.cyclic[-3:])), self.spin_angle[:, None]
-        aside = jnp.cross(e, across)
-        first = jnp.cos(angle) * across + jnp.sin(angle) * aside
-        return jnp.stack([first, jnp.cross(e, first), e], axis=-1)
-
-    @property
-    def _path(self) -> tuple[Array, ...]:
-        return tuple(self.cyclic[:-3])
-
-    @of_each_run
     def slip(self) -> Float[Array, "times 2"]:
         """Velocity of the contact point along the arena, in the moving frame [m/s]."""
         return self.scene.slip_velocity(self.states).T

@@ -36,14 +36,14 @@ LEAST_FRAMES = 400
 #: longest slip.
 AXIS, WEIGHT, SLIP = 1.6, 1.5, 3.0
 
-#: Slips that are greater than this part of all are not drawn longer: the first moments would hide the rest.
+#: Slips above this quantile are not drawn longer: the first moments would hide the rest.
 COMMON_SLIP = 0.9
 
 GREEN, VIOLET, BLUE, GOLD = 0x1F8A4C, 0x7B4FA3, 0x1B6CA8, 0xE0A100
 
 
 class Motion(NamedTuple):
-    """What is drawn of a run: vectors in the fixed frame, (times, 3)."""
+    """What is drawn of a run: vectors in the fixed frame, (times, 3), and the rotation to it from the body."""
 
     times: Float[Array, " times"]
     position: Float[Array, "times 3"]
@@ -51,7 +51,7 @@ class Motion(NamedTuple):
     normal: Float[Array, "times 3"]
     contact: Float[Array, "times 3"]
     slip: Float[Array, "times 3"]
-    spin_angle: Float[Array, " times"]
+    rotation: Float[Array, "times 3 3"]
     theta: Float[Array, " times"]
     energy: Float[Array, " times"]
     jellett: Float[Array, " times"]
@@ -74,7 +74,7 @@ class Motion(NamedTuple):
             normal,
             contact,
             run._fixed((slip[:, 0], slip[:, 1], zero)),
-            run.spin_angle,
+            run.rotation,
             run.theta,
             run.energy,
             run.jellett,
@@ -112,7 +112,7 @@ def show(scene: Scene, motion: Motion, number: int, name: str) -> Show:
     speed = np.linalg.norm(motion.slip, axis=-1)
     longest = max(float(np.quantile(speed, COMMON_SLIP)), 1e-12)
     slip = motion.slip * (SLIP * radius / np.maximum(speed, longest))[:, None]
-    turning = turned(rotation(motion.axis, motion.spin_angle))
+    turning = turned(motion.rotation)
     force = (WEIGHT * radius / weight * motion.normal_force)[:, None] * motion.normal
     lifted = motion.contact + 0.02 * radius * motion.normal
     # Within the sphere it could not be seen.
@@ -168,20 +168,3 @@ def meshes(body: Top, colour: int) -> tuple[Mesh, ...]:
         return (*sphere, rod(0.10 * radius, 0.9 * radius, AXIS * radius - 0.16 * radius, 0.16 * radius, DARK))
     knob, end = float(body.stem.radius), float(body.stem.offset - body.offset)
     return (*sphere, rod(0.8 * knob, 0.0, end, knob, DARK))
-
-
-def rotation(
-    axis: Float[np.ndarray, "times 3"], spin_angle: Float[np.ndarray, " times"]
-) -> Float[np.ndarray, "times 3 3"]:
-    """Rotations from body to fixed frame: carried along with the axis without turning about it, then turned by the spin."""
-    first = np.cross(axis[0], np.eye(3)[np.argmin(np.abs(axis[0]))])
-    carried = [first / np.linalg.norm(first)]
-    for old, new in zip(axis[:-1], axis[1:], strict=True):
-        # The shortest turn takes the old axis to the new one, and what is across it along.
-        along = carried[-1] - (carried[-1] @ new) / (1.0 + old @ new) * (old + new)
-        along -= (along @ new) * new
-        carried.append(along / np.linalg.norm(along))
-    x = np.stack(carried)
-    y = np.cross(axis, x)
-    cosine, sine = np.cos(spin_angle)[:, None], np.sin(spin_angle)[:, None]
-    return np.stack([cosine * x + sine * y, cosine * y - sine * x, axis], axis=-1)
