@@ -93,6 +93,15 @@ PALE = 0xF4E9D2
 DARK = 0x3A3A3E
 
 
+def told_by_colour(shows: tuple[Show, ...]) -> tuple[Show, ...]:
+    """The shows of one stage: where there are several, the traces of each have its colour."""
+    if len(shows) == 1:
+        return shows
+    return tuple(
+        show._replace(traces=tuple(trace._replace(colour=show.colour) for trace in show.traces)) for show in shows
+    )
+
+
 def css(colour: int) -> str:
     """A colour as CSS and matplotlib write it."""
     return f"#{colour:06x}"
