@@ -114,8 +114,9 @@
   const labels = [...new Set(stages.flatMap((s) => s.shows.flatMap((run) => run.curves.map((one) => one.label))))];
   const strips = labels.map((label) => {
     const box = element("div", stripsBox, { className: "strip" });
-    const value = element("span", box, { className: "value" });
-    element("span", box, { textContent: label });
+    const head = element("div", box, { className: "head" });
+    element("span", head, { textContent: label });
+    const value = element("span", head, { className: "value" });
     const canvas = element("canvas", box);
     const curves = stages.flatMap((s) => s.shows.flatMap((run) => run.curves.filter((one) => one.label === label)
       .map((one) => ({ times: run.times, values: one.values, colour: run.colour }))));
