@@ -163,6 +163,37 @@ def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
     return "\n".join([title, *(f"  {name:{width}}  {text}" for name, text in rows)])
 
 
+def told_apart(starts: list[str], *groups: list[Any]) -> list[str]:
+    """A name for each of some things: what it starts with, and where its modules differ from those of the others.
+
+    **Arguments:** `starts`: the beginnings; `groups`: modules of one role, such as the scenes, one for each thing.
+
+    **Returns:** the names. Those that would be the same are numbered.
+    """
+    apart = [differences(group) for group in groups]
+    names = [", ".join([start, *(part for one in apart for part in one[k])]) for k, start in enumerate(starts)]
+    return [
+        name if names.count(name) == 1 else f"{name} ({names[: k + 1].count(name)})" for k, name in enumerate(names)
+    ]
+
+
+def differences(modules: list[Any]) -> list[list[str]]:
+    """For each of some modules, as text, what the others do not have like it: its kind, or some of its numbers."""
+    if len({type(one) for one in modules}) > 1:
+        return [[type(one).__name__] for one in modules]
+    found: list[list[str]] = [[] for _ in modules]
+    for field in dataclasses.fields(modules[0]):
+        values = [getattr(one, field.name) for one in modules]
+        if all(isinstance(value, eqx.Module) for value in values):
+            parts = differences(values)
+        else:
+            unit = getattr(modules[0], "units", {}).get(field.name, "1")
+            texts = [as_text(value, unit) for value in values]
+            parts = [[f"{field.name} {text}"] if len(set(texts)) > 1 else [] for text in texts]
+        found = [before + part for before, part in zip(found, parts, strict=True)]
+    return found
+
+
 def as_html(title: str, rows: list[tuple[str, ...]]) -> str:
     """A title and a table of rows, as a notebook shows them."""
     style = "text-align: left; vertical-align: top"

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from nonholonomic.parameters import told_apart
 from nonholonomic.views import (
     COLOURS,
     DARK,
@@ -21,14 +22,15 @@ from nonholonomic.views import (
     arena,
     ball,
     rod,
+    told_by_colour,
     turned,
 )
 
 from .scene import Scene
 from .top import Top
 
-#: Most radians by which the top spins from one frame to the next, and most frames.
-SPIN_PER_FRAME = 0.4
+#: Radians by which the top turns from one frame to the next, about, and most frames.
+TURN_PER_FRAME = 0.4
 MOST_FRAMES = 12_000
 LEAST_FRAMES = 400
 
@@ -83,21 +85,26 @@ class Motion(NamedTuple):
 
 
 _motion = eqx.filter_jit(Motion.of)
+_turning = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis=-1))
 
 
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     """Runs as they are drawn: a stage for each, or one for all if they are to be overlaid."""
-    named = [(f"θ(0) = {float(run.theta[0]):.3g} rad", run.scene, motion(run)) for run in runs]
+    starts = [f"θ(0) = {float(run.theta[0]):.3g} rad, {float(run.spin[0]):.4g} rad/s" for run in runs]
+    names = told_apart(starts, [run.scene for run in runs])
+    named = [(name, run.scene, motion(run)) for name, run in zip(names, runs, strict=True)]
     return stages([named] if overlaid else [[one] for one in named])
 
 
 def motion(run: Any) -> Motion:
-    """The motion of one run at times so close together that its spin is seen, where it can be told between its own."""
+    """The motion of one run at times so close together that its turning is seen, where it can be told between its own."""
     if run.t.ndim > 1:
         raise ValueError(f"a batch of runs, of shape {run.t.shape}, cannot be shown: take one of them")
     if run.dense is not None:
-        angle = np.abs(np.asarray(run.spin_angle))
-        frames = int(np.clip(np.ptp(angle) / SPIN_PER_FRAME, LEAST_FRAMES, MOST_FRAMES))
+        times = np.asarray(run.t)
+        # Not the angle about the axis alone: half-way up a top turns across it, as fast.
+        turned_by = np.trapezoid(np.asarray(_turning(run.padded()))[: len(times)], times)
+        frames = int(np.clip(turned_by / TURN_PER_FRAME, LEAST_FRAMES, MOST_FRAMES))
         run = run.at(np.linspace(0.0, float(run.end_time), frames))
     count = len(run.t)
     return Motion(*(np.asarray(part)[:count] for part in _motion(run.padded())))
@@ -147,8 +154,10 @@ def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
         (_, scene, first), radius = group[0], float(group[0][1].body.radius)
         points = np.concatenate([motion.contact for _, _, motion in group])
         ground = arena(scene.surface, points, first.normal[0], 4.0 * radius, 2.5 * radius)
-        shows = tuple(show(one, motion, number + k, name) for k, (name, one, motion) in enumerate(group))
-        found.append(Stage(", ".join(name for name, _, _ in group), ground, shows))
+        shows = told_by_colour(
+            tuple(show(one, motion, number + k, name) for k, (name, one, motion) in enumerate(group))
+        )
+        found.append(Stage("; ".join(name for name, _, _ in group), ground, shows))
         number += len(group)
     return found
 
