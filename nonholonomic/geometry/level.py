@@ -53,6 +53,8 @@ def _vector(components: Iterable[Component]) -> Vector:
 class AbstractDifferentiated(AbstractLevel):
     """A surface that gives only a gradient along its normal; the rest follows by automatic differentiation."""
 
+    differentiated = True
+
     @abc.abstractmethod
     def gradient(self, position: Vector) -> Vector:
         """Gradient of the function at a position [m]."""
