@@ -75,6 +75,11 @@ class AbstractSurface(Bounded):
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
         """Rate n' [1/s] of the normal at a position [m] that moves with a velocity [m/s]: minus the shape operator times it."""
 
+    def bending(self, position: Vector, a: Vector, b: Vector) -> tuple[Component, Component, Component]:
+        """(a . n'(a), a . n'(b), b . n'(b)) [1/m] for two vectors along the surface: minus its second fundamental form."""
+        by_a, by_b = self.normal_rate(position, a), self.normal_rate(position, b)
+        return dot(a, by_a), dot(b, by_a), dot(b, by_b)
+
     @abc.abstractmethod
     def elevation(self, position: Vector) -> Component:
         """Height [m] of a position: above the lowest point, or above the origin of a surface that has none."""
