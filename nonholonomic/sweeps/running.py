@@ -145,8 +145,8 @@ class Held:
         need, room = layout.bytes_of_cells(layout.cells), memory()
         if need > room:
             raise ValueError(
-                f"path = None: {layout.cells:.3g} cells take {1e-9 * need:.3g} GB, and this machine has {1e-9 * room:.3g} GB of "
-                "memory; with path= they are held in a file"
+                f"path = None: {layout.cells:.3g} cells take {1e-9 * need:.3g} GB, and this machine has {1e-9 * room:.3g} GB "
+                "of memory; with path= they are held in a file"
             )
         self.finished: set[int] = set()
         self._layout, self._found = layout, layout.empty(layout.cells)
