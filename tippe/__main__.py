@@ -40,8 +40,8 @@ SURFACES = {
     "plane TILT": Plane,
 }
 
-#: Times at which theta is drawn.
-SAMPLES = 1500
+#: Times at which theta is drawn, and the tops on the page.
+SAMPLES = 3000
 
 
 class Help(argparse.ArgumentDefaultsHelpFormatter):

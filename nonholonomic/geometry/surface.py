@@ -56,6 +56,9 @@ class AbstractSurface(Bounded):
     #: The words for the side on which a body is, and the sign of n that points to it.
     sides: ClassVar[Mapping[str, float]] = CLOSED
 
+    #: Whether normal and curvature follow from a user's function by automatic differentiation, which makes them long.
+    differentiated: ClassVar[bool] = False
+
     #: Names and units of the numbers of a place.
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("mu", "rad"), ("eta", "rad"))
 
@@ -94,7 +97,7 @@ class AbstractSurface(Bounded):
         return self.distance(position)
 
     def distance(self, position: Vector) -> Component:
-        """Distance [m] of a position from the surface, positive on the side to which n points; as far as for `nearest`."""
+        """Distance [m] of a position from the surface, positive on the side to which n points; limited as `nearest` is."""
         foot = self.nearest(position)
         away = (subtract(position[0], foot[0]), subtract(position[1], foot[1]), subtract(position[2], foot[2]))
         return dot(away, self.normal(foot))

@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arena_reference import SAMPLES, cases, recorded
-from conftest import assert_close, rutstam_top
+from close import assert_close
 from hypothesis import given, settings
 from hypothesis import strategies as some
 from make_gradient_reference import extrapolated
+from tops import rutstam_top
 
 import tippe
 from nonholonomic.integration import CROSSED, FAILED, Settings, compiled_march

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arena_reference import SAMPLES, Top, cases, recorded
-from conftest import assert_close, rutstam_top
+from close import assert_close
 from scipy.integrate import solve_ivp
+from tops import rutstam_top
 
 import tippe
 from nonholonomic.geometry import CarriedFrame
