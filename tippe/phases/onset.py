@@ -39,8 +39,8 @@ FIRST = 5.0
 #: follows the tolerance below this too; steps with an estimate of 1e-11 were found to err by 1e-13.
 ROUNDING = 1e-10
 
-#: Trials of the length, and iterations for each; where they are not enough, the run has failed (one of 3300 slips of a table in
-#: a sphere).
+#: Trials of the length, and iterations for each; where they are not enough, the run has failed (none of 256 tops that slip and
+#: stick for 4 s in a sphere).
 TRIALS, ITERATIONS = 10, 10
 
 
