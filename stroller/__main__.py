@@ -174,7 +174,13 @@ def write_page(
     groups: dict[str, list[tuple[int, Trajectory]]] = {}
     for number, ((ground, _), run) in enumerate(rides.items()):
         groups.setdefault(ground, []).append((number, run))
-    drawn = grouped(list(groups.values()), [", ".join(name) for name in rides]) if can_view() else []
+    drawn = []
+    if can_view():
+        # The place of both rides is their stage's title, and their names stand beside it.
+        drawn = [
+            stage._replace(title=ground)
+            for ground, stage in zip(groups, grouped(list(groups.values()), [ride for _, ride in rides]), strict=True)
+        ]
     above = "" if drawn else f'<p class="note">{NO_VIEW}</p>'
     below = "<h2>Energy against work</h2><pre>" + escape("\n".join(words)) + "</pre>"
     below += "" if figure is None else "<h2>Paths, speeds, energies, side forces</h2>" + picture_as_html(figure, 70)

@@ -5,8 +5,8 @@ import itertools
 import jax
 import jax.numpy as jnp
 import pytest
-from conftest import rutstam_top
 from jax.extend.core import ClosedJaxpr, Jaxpr
+from tops import rutstam_top
 
 import stroller
 import tippe

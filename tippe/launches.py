@@ -111,5 +111,5 @@ def _with_room(scene: Scene, values: Collection[str]) -> tuple[Launch, dict[str,
 
 def described(roots: dict[str, Any], grid: list[Axis]) -> dict[str, Any]:
     """What is asked of which scene and launch, as plain data; the values of axes stand elsewhere."""
-    found = {path: told for name, root in roots.items() for path, told in description(name, root).items()}
+    found = {path: value for name, root in roots.items() for path, value in description(name, root).items()}
     return found | {one.number: "an axis" for one in grid}

@@ -17,7 +17,7 @@ from .body import AbstractBody, Round
 #: Units in which moments of inertia are given by mistake, in kg m^2.
 INERTIAS = {"kg cm^2": 1e-4, "kg mm^2": 1e-6, "g cm^2": 1e-7, "g mm^2": 1e-9}
 
-#: The greatest radius [m] that is not taken for one in another unit, and the range of I1 / (m R^2) of bodies.
+#: The radius [m] above which another unit is suspected, and the range of I1 / (m R^2) outside of which one is.
 GREATEST_RADIUS = 1.0
 RATIOS = (0.1, 2.0)
 

@@ -14,6 +14,7 @@ from nonholonomic.geometry import scale, sum_vectors
 from nonholonomic.integration import Followed, PhasedPath, Settings, follow
 from nonholonomic.progress import Progress
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require_all
+from nonholonomic.xla_cpu import on_device
 
 from .inversion import check_run, run_bounds
 from .launch import Launch
@@ -92,28 +93,13 @@ class Trajectory(AbstractTrajectory):
         return jnp.stack(foot, axis=-1)
 
     @of_each_run
-    def rotation(self) -> Float[Array, "times 3 3"]:
-        """From the body to the fixed frame: its columns are the body's axes, the third of them e. At the start the first is
-        de/dtheta: it leans from e away from the arena's normal."""
-        e, across, angle = self.axis, self._fixed(tuple(self.cyclic[-3:])), self.spin_angle[:, None]
-        aside = jnp.cross(e, across)
-        first = jnp.cos(angle) * across + jnp.sin(angle) * aside
-        return jnp.stack([first, jnp.cross(e, first), e], axis=-1)
-
-    @property
-    def _path(self) -> tuple[Array, ...]:
-        return tuple(self.cyclic[:-3])
-
-    @of_each_run
     def slip(self) -> Float[Array, "times 2"]:
         """Velocity of the contact point along the arena, in the moving frame [m/s]."""
         return self.scene.slip_velocity(self.states).T
 
     def resampled(self, times: Float[np.ndarray, " times"]) -> "Trajectory":
         """The same run at other times, which are not checked."""
-        states = jnp.asarray(self.dense.at(times))
-        size = len(self.states)
-        found = (jnp.asarray(times), states[:size], states[size:-2], states[-2], states[-1])
+        found = on_device(times, *_parts(len(self.states), self.dense.at(times)))
         return eqx.tree_at(lambda one: (one.t, one.states, one.cyclic, one.spin_angle, one.work), self, found)
 
 
@@ -230,13 +216,12 @@ def _traced(
     status = found.status.astype(int)
     stats = {"accepted": found.accepted.astype(int), "rejected": found.rejected.astype(int)}
     return Trajectory(
-        times, scene, *_parts(TrajectoryProblem.of(scene, launch), found.states), status, found.end_time, stats, None
+        times, scene, *_parts(len(scene.state(launch)), found.states), status, found.end_time, stats, None
     )
 
 
-def _parts(run: TrajectoryProblem, states: Float[Array, "components times"]) -> tuple[Any, Any, Any, Any]:
-    """State, cyclic coordinates, spin angle and work."""
-    lean = len(run.state)
+def _parts(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:
+    """State, with its number of components, cyclic coordinates, spin angle and work, of an array (components, times)."""
     return states[:lean], states[lean:-2], states[-2], states[-1]
 
 
@@ -245,10 +230,10 @@ _ended = eqx.filter_jit(ended)
 
 def _as_trajectory(scene: Scene, run: TrajectoryProblem, path: Followed | PhasedPath) -> Trajectory:
     # NumPy cuts these: JAX would compile every cut anew for every number of steps.
-    states, times = np.asarray(path.states), jnp.asarray(path.times)
-    last = jnp.asarray(states[:, -1])
+    states = np.asarray(path.states)
+    times, end, last = on_device(path.times, path.times[-1], states[:, -1])
     status = STATUS[int(_ended(run, last, jnp.asarray(path.guard_lost), jnp.asarray(path.failed)))]
     sticks = {"sticks": int(path.counts[0])} if isinstance(path, PhasedPath) else {}
-    return Trajectory(
-        times, scene, *map(jnp.asarray, _parts(run, states)), status, jnp.asarray(path.times[-1]), {}, path
-    ).with_stats(path, **sticks)
+    return Trajectory(times, scene, *on_device(*_parts(len(run.state), states)), status, end, {}, path).with_stats(
+        path, **sticks
+    )

@@ -34,7 +34,7 @@ from .vector import Component, Vector, cross, dot, scale, sum_vectors, tangents
 
 
 def place_named(surface: AbstractSurface, place: Place) -> Place:
-    """A place as `surface.chart` takes it, of one in which a closed surface's eta counts from the lowest point.
+    """A place as `surface.chart` takes it, given one in which the eta of a closed surface counts from the lowest point.
 
     **Arguments:** `place`: numbers named by `surface.coordinates`, or (x, y, z).
     """
@@ -108,7 +108,7 @@ class CarriedFrame(AbstractFrame):
         foot, R = place[:3], self.distance
         # Stored: what follows, and its derivatives above all, would each compute these anew.
         n = stored(*self.normal(foot))
-        # A first tangent that has drifted counts for its direction along the surface only.
+        # Of a first tangent that has drifted, only the direction along the surface counts.
         t1 = stored(*along(n, place[3:])[0])
         t2 = cross(n, t1)
         S11, S12, S22 = stored(*self._shape(foot, t1, t2))

@@ -209,7 +209,8 @@ class CylinderFrame(AbstractFrame):
 class SphereFrame(AbstractFrame):
     """Inside or outside of a sphere; the frame is carried parallel to itself, so no place is singular.
 
-    The place is the vertical z seen in the frame; `cyclic` adds the horizontal x axis seen in it. Fields as of `CylinderFrame`.
+    The place is the vertical z seen in the frame; `cyclic` adds the horizontal x axis seen in it. The fields are those of
+    `CylinderFrame`.
     """
 
     radius: Float[Array, "..."]

@@ -89,7 +89,7 @@ class AbstractSurface(Bounded):
         return self.distance(position)
 
     def distance(self, position: Vector) -> Component:
-        """Distance [m] of a position from the surface, positive on the side to which n points; as far as for `nearest`."""
+        """Distance [m] of a position from the surface, positive on the side to which n points; limited as `nearest` is."""
         foot = self.nearest(position)
         away = (subtract(position[0], foot[0]), subtract(position[1], foot[1]), subtract(position[2], foot[2]))
         return dot(away, self.normal(foot))

@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, random_states, rutstam_top
+from close import assert_close
 from egg_reference import Egg
 from scipy.integrate import solve_ivp
+from tops import random_states, rutstam_top
 
 import tippe
 from nonholonomic.views.stage import matrices

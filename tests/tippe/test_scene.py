@@ -6,7 +6,8 @@ from collections import Counter
 import jax
 import jax.numpy as jnp
 import pytest
-from conftest import assert_close, random_states, rutstam_top
+from close import assert_close
+from tops import random_states, rutstam_top
 
 import tippe
 from nonholonomic.validation import all_bounds, legal

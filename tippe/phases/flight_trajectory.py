@@ -23,6 +23,7 @@ from ..dynamics import NO_COSINE
 from ..inversion import InversionProblem
 from ..launch import Launch
 from ..observables import AbstractTrajectory, of_each_run
+from ..sampled import TrajectoryProblem
 from ..scene import Scene
 from .free_body import Ball, FreeBody, balls, energy, freed, standing_on
 from .impact import approach
@@ -41,7 +42,8 @@ class HybridTrajectory(AbstractTrajectory):
     the time of an impact the values are those before it. `distance` is that of the top's own sphere from the plane [m] with
     its rate [m/s]. `hops` has a row for each flight until `end_time`, its begin and its end [s]; a table counts those before
     the inversion. `work` is that of friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest
-    drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J].
+    drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J]. `rotation` and
+    `angular_velocity` are those of `Trajectory`.
 
     **Example:**
 
@@ -59,7 +61,7 @@ class HybridTrajectory(AbstractTrajectory):
     t: Float[np.ndarray, " times"]
     scene: Scene
     states: Float[np.ndarray, "8 times"]
-    cyclic: Float[np.ndarray, "2 times"]
+    cyclic: Float[np.ndarray, "5 times"]
     spin_angle: Float[np.ndarray, " times"]
     work: Float[np.ndarray, " times"]
     status: str
@@ -123,8 +125,8 @@ class HybridTrajectory(AbstractTrajectory):
 
     @staticmethod
     def parts_of(shown: Float[np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
-        """State, path, spin angle, work, and the distance with its rate, from what the phases show."""
-        return shown[:8], shown[8:10], shown[10], shown[11], shown[12:]
+        """State, cyclic coordinates, spin angle, work, and the distance with its rate, from what the phases show."""
+        return shown[:8], shown[8:13], shown[13], shown[14], shown[15:]
 
     @staticmethod
     def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
@@ -139,10 +141,9 @@ def simulate_hybrid(
     scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver
 ) -> HybridTrajectory:
     """Run one launch of a hybrid scene until `t1`. **Arguments:** as for `simulate`, checked."""
-    state, radius, weight = scene.state(launch), scene.body.radius, scene.body.mass * scene.gravity
-    zero = jnp.zeros(())
-    state = jnp.stack([*state, -scene.body.offset * state[2], -scene.body.offset * state[3], zero, zero])
-    scales = jnp.stack([*scene.scales(launch), radius, radius, jnp.ones(()), weight * radius])
+    state, scales = TrajectoryProblem.of(scene, launch).start()
+    # The place is that of the centre of mass.
+    state = state.at[8:10].add(-scene.body.offset * state[2:4])
     problem = InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
     kinds, first = phases(scene, problem, tolerance, last=False, rides=True)
     path = follow_phases(kinds, int(first[0]), state, t1, Settings(tolerance, solver), kinds=1)

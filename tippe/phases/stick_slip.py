@@ -33,7 +33,7 @@ LEFT = 0.1
 AT_REST = 1e-10
 
 #: The round-off that rolling is allowed in its grip: a top that stands upright needs none. It delays a slip by this over the
-#: rate of the grip, some 1e-14 s.
+#: rate of the grip, about 1e-14 s.
 ROUNDING = 1e-13
 
 
