@@ -1,7 +1,8 @@
 """Derivatives of the end of a run, forwards along it and backwards through it; and the rate at which neighbouring runs diverge.
 
 For one direction the variation is integrated along with the run; for several, every run is differentiated backwards
-once. Step lengths are held fixed in both. `sampled_run` gives a run at given times, with its derivatives.
+once. Step lengths are held fixed in both. `sampled_run` gives a run at given times, with its derivatives. Runs of several
+phases have their variations carried along through every change of phase (`travel_with_slopes`).
 """
 
 from .differentiable import AbstractQuestion as AbstractQuestion
@@ -19,3 +20,6 @@ from .slopes import traced_march_with_slopes as traced_march_with_slopes
 from .variation import VariationalProblem as VariationalProblem
 from .variation import in_groups as in_groups
 from .variation import natural_size as natural_size
+from .varied_phases import Slopes as Slopes
+from .varied_phases import traced_travel_with_slopes as traced_travel_with_slopes
+from .varied_phases import travel_with_slopes as travel_with_slopes

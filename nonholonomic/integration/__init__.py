@@ -1,7 +1,8 @@
 """Runs in time: from a start along a field to an event, to the end of the model's validity, or to a horizon.
 
 `compiled_march` runs many cells of a problem in lanes that keep step with one another; `follow` and `sample` are single runs
-with any solver of Diffrax. `travel` runs many cells through phases, `follow_phases` a single run with its path.
+with any solver of Diffrax. `travel` runs many cells through phases (`traced_travel` inside other transformed functions),
+`follow_phases` a single run with its path.
 `march_by_diffrax` is the independent second road. `Settings` says how, and the codes of a run's status are `RUNNING`,
 `REACHED_END`, `CROSSED`, `GUARD_LOST`, `FAILED` and `UNRESOLVED`.
 """
@@ -46,6 +47,7 @@ from .status import GUARD_LOST as GUARD_LOST
 from .status import REACHED_END as REACHED_END
 from .status import RUNNING as RUNNING
 from .status import UNRESOLVED as UNRESOLVED
+from .traced_phases import traced_travel as traced_travel
 from .zeros import few_trials as few_trials
 from .zeros import halved as halved
 from .zeros import sign_changes as sign_changes

@@ -375,10 +375,6 @@ def test_a_table_starts_on_the_wall():
         (lambda top: tippe.Top(6e-3, 0.015, 3e-3, 8e-7, 7e-7, 0.3), "stem = 0.3 must be a Stem"),
         (lambda top: first_contact(rutstam_top()), "stem = None must be a Stem"),
         (
-            lambda top: tippe.inversion_time(tippe.Scene(top, contact="hybrid"), tippe.Launch(0.1, 100.0), 1.0),
-            "contact = 'hybrid' must be 'stop' for inversion_time",
-        ),
-        (
             lambda top: tippe.inversion_table(
                 tippe.Scene(top, contact="hybrid"), theta=0.1, spin=100.0, t1=1.0, method="diffrax"
             ),
