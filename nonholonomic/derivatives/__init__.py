@@ -11,6 +11,8 @@ from .differentiable import directions_by as directions_by
 from .lyapunov import exponent_of as exponent_of
 from .lyapunov import growth as growth
 from .lyapunov import probed as probed
+from .phased_samples import PhasedSamples as PhasedSamples
+from .phased_samples import phased_samples as phased_samples
 from .sampled_runs import SampledRun as SampledRun
 from .sampled_runs import sampled_run as sampled_run
 from .sampled_runs import sampled_run_by_diffrax as sampled_run_by_diffrax

@@ -15,6 +15,7 @@ tolerance, the event is grazing and the derivative has no digits: such events ar
 """
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -88,6 +89,17 @@ class VariedPhase(AbstractPhase):
 
     def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
         """What follows the phase itself, with variations. Counted in the last row are grazing events."""
+        return self.left_behind(state, left, lambda phase, record, left: ())[0]
+
+    def left_behind(
+        self, state: Float[Array, "components cells"], left: Float[Array, " cells"], seen: Callable[..., Any]
+    ) -> tuple[Passage, Any, Any]:
+        """What follows the phase, as `leave` says it, and what is seen of the way to the next.
+
+        **Arguments:** `seen`: takes the phase, the `Record` of the way and `left`, and gives a tree of numbers.
+
+        **Returns:** the `Passage`; the numbers; and their variations, with the directions first.
+        """
         at, *variations = self.parts(state)
         at, lasted, count = at[:-1], at[-1], len(variations)
         numbers, build = self._moving()
@@ -103,22 +115,25 @@ class VariedPhase(AbstractPhase):
         along += [(self._error(at, lasted, rates), *still), (rates, *still)]
         (_, rate), (guards, changes) = _along(met, (at, *numbers), along)
         # A phase that ended as it began has not met its event.
-        there = (lasted > 0.0) & (rate != 0.0)
-        safe = jnp.where(there, rate, 1.0)
-        later = jnp.where(there, -guards[:-1] / safe, 0.0)
-        log_rates = jnp.where(there, (changes[:-1] + changes[-1] * later) / safe, 0.0)
+        happened = (lasted > 0.0) & (rate != 0.0)
+        safe = jnp.where(happened, rate, 1.0)
+        later = jnp.where(happened, -guards[:-1] / safe, 0.0)
+        log_rates = jnp.where(happened, (changes[:-1] + changes[-1] * later) / safe, 0.0)
 
         def passed(at: Float[Array, "components cells"], left: Float[Array, " cells"], *numbers: Array) -> Any:
-            onward = build(*numbers).leave(at, left)
+            phase = build(*numbers)
+            onward = phase.leave(at, left)
             inside = jnp.zeros_like(left) if onward.log_rates is None else onward.log_rates
-            return (onward.state, onward.elapsed, inside), onward._replace(record=None, log_rates=None)
+            path = seen(phase, onward.record, left)
+            return (onward.state, onward.elapsed, inside, path), onward._replace(record=None, log_rates=None)
 
         begins = jnp.concatenate([*[one[None, -1] for one in variations], jnp.zeros_like(lasted)[None]]) + later
         onwards = [
             (moved[0] + shift * rates, -begin, *moved[1:])
             for moved, shift, begin in zip(along[:-1], later, begins, strict=True)
         ]
-        _, (states, elapsed, inside), onward = _along(passed, (at, left, *numbers), onwards, has_aux=True)
+        there, moved, onward = _along(passed, (at, left, *numbers), onwards, has_aux=True)
+        states, elapsed, inside, changes = moved
         found = jnp.concatenate([states, (begins + elapsed)[:, None]], axis=1)[:count]
         log_rates = jnp.max(jnp.abs(log_rates + inside), axis=0)
         finite = jnp.isfinite(found).all(axis=(0, 1)) & jnp.isfinite(log_rates)
@@ -126,7 +141,26 @@ class VariedPhase(AbstractPhase):
         # The run itself is sound: without digits its variations must not end it.
         found = jnp.where(finite, found, 0.0)
         whole = jnp.concatenate([onward.state, jnp.zeros_like(lasted)[None], *found])
-        return onward._replace(state=whole, counts=jnp.concatenate([onward.counts, grazes.astype(int)[None]]))
+        onward = onward._replace(state=whole, counts=jnp.concatenate([onward.counts, grazes.astype(int)[None]]))
+        return onward, there[-1], jax.tree.map(lambda change: change[:count], changes)
+
+    def seen(
+        self, state: Float[Array, "components times"]
+    ) -> tuple[Float[Array, "shown times"], Float[Array, "directions shown times"]]:
+        """What is shown of states of a single run, and how it varies at times that stay as they are."""
+        at, *variations = self.parts(state)
+        at, lasted = at[:-1], at[-1]
+        numbers, build = self._moving()
+
+        def shown(at: Float[Array, "components times"], *numbers: Array) -> Float[Array, "shown times"]:
+            return build(*numbers).shown(at)
+
+        if not variations:
+            return shown(at), jnp.zeros((0, *shown(at).shape))
+        rates = self.phase.problem(at).field(lasted, at)
+        # A phase that begins later is less far at the same time.
+        along = [(one[:-1] - rates * one[-1], *moved) for one, moved in zip(variations, self._rates(), strict=True)]
+        return _along(shown, (at, *numbers), along)
 
     def slopes(self, state: Float[Array, "components cells"]) -> Float[Array, "directions cells"]:
         """The derivative of the time of the event at which runs have ended in this phase, or on the way to it."""

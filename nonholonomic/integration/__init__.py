@@ -22,6 +22,8 @@ from .phases import AbstractPhase as AbstractPhase
 from .phases import Journey as Journey
 from .phases import Passage as Passage
 from .phases import Record as Record
+from .phases import marched as marched
+from .phases import passed_on as passed_on
 from .phases import travel as travel
 from .problem import AbstractProblem as AbstractProblem
 from .problem import crossing_time as crossing_time
@@ -47,6 +49,7 @@ from .status import GUARD_LOST as GUARD_LOST
 from .status import REACHED_END as REACHED_END
 from .status import RUNNING as RUNNING
 from .status import UNRESOLVED as UNRESOLVED
+from .traced_phases import in_rounds as in_rounds
 from .traced_phases import traced_travel as traced_travel
 from .zeros import few_trials as few_trials
 from .zeros import halved as halved

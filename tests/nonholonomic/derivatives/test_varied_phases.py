@@ -94,6 +94,7 @@ def balls():
     return given, time_of_level(*numbers, bounces), np.stack([np.broadcast_to(one, CELLS) for one in expected])
 
 
+@pytest.mark.slow
 def test_a_bouncing_ball(balls):
     """By the height, gravity, the restitution and the level, through five impacts and what follows each."""
     given, times, expected = balls
@@ -159,7 +160,7 @@ class Flies(AbstractPhase):
 
 
 def test_a_grazing_event_is_seen():
-    """The time is 1 + cbrt(y - 1) + 2 for a ball at the height y: its derivative is right, or it is marked."""
+    """The time is 1 + cbrt(y - 1) + 2 for a ball at the height y: its derivative is right, or it is marked, when traced too."""
     heights, tolerance = 10.0 ** -np.arange(1.0, 13.0), 1e-9
 
     def build(height):
@@ -168,8 +169,16 @@ def test_a_grazing_event_is_seen():
     point = (jnp.asarray(1.0 + heights),)
     phases, states = build(*point)
     directions = directions_of(build, point, [(jnp.ones_like(heights),)])
-    start = (np.zeros(len(heights), int), np.asarray(states))
-    journey, found = travel_with_slopes(phases, directions, *start, 9.0, len(heights), settings_of(tolerance), kinds=1)
+    first = jnp.zeros(len(heights), int)
+
+    @eqx.filter_jit
+    def run(phases, directions, first, states):
+        return traced_travel_with_slopes(
+            phases, directions, first, states, jnp.asarray(9.0), settings_of(tolerance), kinds=1
+        )
+
+    journey, found = jax.tree.map(np.asarray, run(phases, directions, first, states))
+    assert (journey.status == CROSSED).all()
     assert (journey.counts == 1).all()
     assert found.grazing[heights < 1e-8].all()
     assert not found.grazing[heights > 1e-7].any()
