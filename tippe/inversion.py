@@ -19,6 +19,7 @@ from nonholonomic.integration import (
 )
 from nonholonomic.parameters import numbers
 from nonholonomic.validation import Bound, all_bounds, legal, require_all
+from nonholonomic.xla_cpu import compiled_setup
 
 from .dynamics import Dynamics
 from .launch import Launch
@@ -41,11 +42,11 @@ class InversionProblem(AbstractProblem):
     @classmethod
     def of(cls, scene: Scene, launch: Launch, angle: Float[ArrayLike, "..."], cells: int) -> "InversionProblem":
         """The problem of the given number of cells; the numbers of scene and launch are scalars or one per cell."""
-        states = scene.state(launch)
-        shape = (states.shape[0], cells)
-        states = jnp.broadcast_to(states.reshape(shape[0], -1), shape)
-        scales = jnp.broadcast_to(scene.scales(launch).reshape(shape[0], -1), shape)
-        return cls(scene.dynamics, jnp.cos(angle), states, scales)
+        return _problem(scene, launch, jnp.asarray(angle), cells)
+
+    @property
+    def long(self) -> bool:
+        return self.dynamics.frame.long
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
@@ -58,6 +59,15 @@ class InversionProblem(AbstractProblem):
 
     def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
         return self.dynamics.contact_margin(state)
+
+
+@compiled_setup
+def _problem(scene: Scene, launch: Launch, angle: Float[Array, "..."], cells: int) -> InversionProblem:
+    states = scene.state(launch)
+    shape = (states.shape[0], cells)
+    states = jnp.broadcast_to(states.reshape(shape[0], -1), shape)
+    scales = jnp.broadcast_to(scene.scales(launch).reshape(shape[0], -1), shape)
+    return InversionProblem(scene.dynamics, jnp.cos(angle), states, scales)
 
 
 @eqx.filter_jit

@@ -14,6 +14,7 @@ from nonholonomic.geometry import scale, sum_vectors
 from nonholonomic.integration import Followed, PhasedPath, Settings, explicit_tableau, follow
 from nonholonomic.progress import Progress
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require_all
+from nonholonomic.xla_cpu import on_device
 
 from .inversion import check_run, run_bounds
 from .launch import Launch
@@ -28,10 +29,10 @@ from .scene import Scene
 class Trajectory(AbstractTrajectory):
     """A run of a tippe top, or a batch of runs, with the batch first.
 
-    Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame
-    (t1, t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre; `contact` is where it
-    touches the arena, `normal` the arena's normal there. `rotation` (times, 3, 3) takes the body's axes to the fixed frame, and
-    `angular_velocity` is the rate at which it turns.
+    Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame (t1,
+    t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre, of bodies that are no
+    sphere those of the centre of mass; `contact` is where the body touches the arena, `normal` the arena's normal there.
+    `rotation` (times, 3, 3) takes the body's axes to the fixed frame, and `angular_velocity` is the rate at which it turns.
 
     `status` is "reached t1", "contact_lost", "failed", "jammed" or "does_not_fit"; inside a transformation it is a code 0, 1,
     2, 3, 5, or 4, "illegal", for numbers out of range, for which everything is NaN. The run ends at `end_time`. The top does
@@ -88,21 +89,8 @@ class Trajectory(AbstractTrajectory):
     def contact(self) -> Float[Array, "times 3"]:
         """The point at which the top touches the arena [m]."""
         frame, where = self.scene.frame, (self._place, self._path)
-        foot = sum_vectors(frame.position(*where), scale(-self.scene.body.radius, frame.axes(*where)[2]))
+        foot = sum_vectors(frame.position(*where), scale(-self.scene.body.size, frame.axes(*where)[2]))
         return jnp.stack(foot, axis=-1)
-
-    @of_each_run
-    def rotation(self) -> Float[Array, "times 3 3"]:
-        """From the body to the fixed frame: its columns are the body's axes, the third of them e. At the start the first is
-        de/dtheta: it leans from e away from the arena's normal."""
-        e, across, angle = self.axis, self._fixed(tuple(self.cyclic[-3:])), self.spin_angle[:, None]
-        aside = jnp.cross(e, across)
-        first = jnp.cos(angle) * across + jnp.sin(angle) * aside
-        return jnp.stack([first, jnp.cross(e, first), e], axis=-1)
-
-    @property
-    def _path(self) -> tuple[Array, ...]:
-        return tuple(self.cyclic[:-3])
 
     @of_each_run
     def slip(self) -> Float[Array, "times 2"]:
@@ -111,9 +99,7 @@ class Trajectory(AbstractTrajectory):
 
     def resampled(self, times: Float[np.ndarray, " times"]) -> "Trajectory":
         """The same run at other times, which are not checked."""
-        states = jnp.asarray(self.dense.at(times))
-        size = len(self.states)
-        found = (jnp.asarray(times), states[:size], states[size:-2], states[-2], states[-1])
+        found = on_device(times, *_parts(len(self.states), self.dense.at(times)))
         return eqx.tree_at(lambda one: (one.t, one.states, one.cyclic, one.spin_angle, one.work), self, found)
 
 
@@ -236,13 +222,12 @@ def _traced(
     status = found.status.astype(int)
     stats = {"accepted": found.accepted.astype(int), "rejected": found.rejected.astype(int)}
     return Trajectory(
-        times, scene, *_parts(TrajectoryProblem.of(scene, launch), found.states), status, found.end_time, stats, None
+        times, scene, *_parts(len(scene.state(launch)), found.states), status, found.end_time, stats, None
     )
 
 
-def _parts(run: TrajectoryProblem, states: Float[Array, "components times"]) -> tuple[Any, Any, Any, Any]:
-    """State, cyclic coordinates, spin angle and work."""
-    lean = len(run.state)
+def _parts(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:
+    """State, with its number of components, cyclic coordinates, spin angle and work, of an array (components, times)."""
     return states[:lean], states[lean:-2], states[-2], states[-1]
 
 
@@ -251,10 +236,10 @@ _ended = eqx.filter_jit(ended)
 
 def _as_trajectory(scene: Scene, run: TrajectoryProblem, path: Followed | PhasedPath) -> Trajectory:
     # NumPy cuts these: JAX would compile every cut anew for every number of steps.
-    states, times = np.asarray(path.states), jnp.asarray(path.times)
-    last = jnp.asarray(states[:, -1])
+    states = np.asarray(path.states)
+    times, end, last = on_device(path.times, path.times[-1], states[:, -1])
     status = STATUS[int(_ended(run, last, jnp.asarray(path.guard_lost), jnp.asarray(path.failed)))]
     sticks = {"sticks": int(path.counts[0])} if isinstance(path, PhasedPath) else {}
-    return Trajectory(
-        times, scene, *map(jnp.asarray, _parts(run, states)), status, jnp.asarray(path.times[-1]), {}, path
-    ).with_stats(path, **sticks)
+    return Trajectory(times, scene, *on_device(*_parts(len(run.state), states)), status, end, {}, path).with_stats(
+        path, **sticks
+    )

@@ -76,8 +76,11 @@ def phased_samples(
     numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(numbers)
     bare = eqx.tree_at(lambda one: one.tolerance, settings, None, is_leaf=lambda leaf: leaf is None)
-    question = PhasedSampling(len(leaves), build, structure, rest, bare, kinds)
-    return ask(question, *leaves, _fixed(times), as_number(t1), settings.tolerance)
+    # Arrays, such as those of the solver, may be traced, so they go among the leaves.
+    arrays, others = eqx.partition((rest, bare), eqx.is_array)
+    held, places = jax.tree.flatten(arrays)
+    question = PhasedSampling(len(leaves), build, structure, others, places, kinds)
+    return ask(question, *leaves, _fixed(times), as_number(t1), settings.tolerance, *held)
 
 
 @eqx.filter_custom_jvp
@@ -94,7 +97,8 @@ def _refused(primals: Any, tangents: Any) -> Any:
 
 
 class PhasedSampling(AbstractQuestion):
-    """Samples of a run through phases; the leaves are the modules' numbers, the times, the horizon and the tolerance."""
+    """Samples of a run through phases; the leaves are the modules' numbers, the times, the horizon, the tolerance, and the
+    arrays that belong to `others`, the rest of the modules and the settings, at its `places`."""
 
     in_blocks = False
 
@@ -102,16 +106,16 @@ class PhasedSampling(AbstractQuestion):
     build: Build = eqx.field(static=True)
     # JAX's PyTreeDef, which type checkers take for a variable.
     structure: Any = eqx.field(static=True)
-    rest: Any
-    settings: Settings
+    others: Any
+    places: Any = eqx.field(static=True)
     kinds: int = eqx.field(static=True)
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isnan(value)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> PhasedSamples:
-        given = leaves[self.movable :]
-        found, _ = self.follow(self.built(leaves[: self.movable], given[-1]), (), given)
+        numbers, given, rest, settings = self._sorted(leaves)
+        found, _ = _follow(self._built(numbers, rest, settings), (), given, settings, self.kinds)
         return jax.tree.map(lambda part: part[None], found)
 
     def with_slopes(
@@ -119,32 +123,40 @@ class PhasedSampling(AbstractQuestion):
     ) -> tuple[PhasedSamples, list[PhasedSamples]]:
         if again:
             raise ValueError("second derivatives do not go through changes of phase: contact = 'hybrid'")
-        given = leaves[self.movable :]
+        numbers, given, rest, settings = self._sorted(leaves)
 
-        def build(leaves: tuple[Array, ...], cells: None) -> Any:
-            return self.built(leaves, given[-1])
+        def build(numbers: tuple[Array, ...], cells: None) -> Any:
+            return self._built(numbers, rest, settings)
 
-        built, directions, gather = directions_by(build, active, leaves[: self.movable], None)
+        built, directions, gather = directions_by(build, active, numbers, None)
 
         def run(some: tuple[Any, ...]) -> tuple[PhasedSamples, list[PhasedSamples]]:
-            return self.follow(built, tuple((one[0], one[2]) for one in some), given)
+            return _follow(built, tuple((one[0], one[2]) for one in some), given, settings, self.kinds)
 
         found, slopes = in_groups(run, directions)
         return jax.tree.map(lambda part: part[None], (found, gather(slopes)))
 
-    def built(self, leaves: tuple[Array, ...], tolerance: Float[Array, ""]) -> Any:
-        """The phases, the number of the first, and the state there."""
-        return self.build(eqx.combine(jax.tree.unflatten(self.structure, leaves), self.rest), tolerance)
+    def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array], Any, Settings]:
+        """The modules' numbers; times and horizon; the rest of the modules; and the settings."""
+        last = self.movable + 3
+        *given, tolerance = leaves[self.movable : last]
+        rest, bare = eqx.combine(self.others, jax.tree.unflatten(self.places, leaves[last:]))
+        settings = eqx.tree_at(lambda one: one.tolerance, bare, tolerance, is_leaf=lambda leaf: leaf is None)
+        return leaves[: self.movable], tuple(given), rest, settings
 
-    def follow(
-        self, built: Any, directions: tuple[Any, ...], given: tuple[Array, ...]
-    ) -> tuple[PhasedSamples, list[PhasedSamples]]:
-        """The run, and its slope along each of the directions."""
-        (phases, first, state), (times, t1, tolerance) = built, given
-        settings = eqx.tree_at(lambda one: one.tolerance, self.settings, tolerance, is_leaf=lambda leaf: leaf is None)
-        varied = varied_phases(phases, directions, tolerance, False)
-        ended, filled = _followed(varied, first, varied_start(state, directions), times, t1, settings, self.kinds)
-        return _found(ended, filled, times, len(state), len(directions))
+    def _built(self, numbers: tuple[Array, ...], rest: Any, settings: Settings) -> Any:
+        """The phases, the number of the first, and the state there."""
+        return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), rest), settings.tolerance)
+
+
+def _follow(
+    built: Any, directions: tuple[Any, ...], given: tuple[Array, Array], settings: Settings, kinds: int
+) -> tuple[PhasedSamples, list[PhasedSamples]]:
+    """The run, and its slope along each of the directions."""
+    (phases, first, state), (times, t1) = built, given
+    varied, start = varied_phases(phases, directions, settings.tolerance, False), varied_start(state, directions)
+    ended, filled = _followed(varied, first, start, times, t1, settings, kinds)
+    return _found(ended, filled, times, len(state), len(directions))
 
 
 class Filled(NamedTuple):

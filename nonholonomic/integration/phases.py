@@ -30,7 +30,7 @@ class Record(NamedTuple):
 
     - `ends`: when each stretch ends [s], counted from the end of the phase; infinite where there are no more.
     - `motions`: what `AbstractPhase.between` needs of each, with the stretches on the first axis of every leaf.
-    - `shown`: at how many times each is to be shown where nobody asks for others.
+    - `shown`: at how many times each is to be shown by default.
     """
 
     ends: Float[Array, " stretches 1"]
@@ -43,9 +43,9 @@ class Passage(NamedTuple):
 
     `status` is `RUNNING` where the motion goes on in the phase numbered `phase`, else how it ended; `state` is the state
     then, `elapsed` [s] the time that passed on the way, `crossing_time` [s] when on the way the event was passed (for the
-    last time), infinite if it was not; `counts` what happened how often, a row for each kind. `record` is for a single run
-    that keeps its path (`phased_run.py`); `None` where no time passes on the way, or where the path is not kept. `log_rates`
-    is the sum of the logarithms of the rates at which events on the way are met; `None` if there are none.
+    last time), infinite if it was not; `counts` how often each kind of thing happened, a row for each kind. `record` is for a
+    single run that keeps its path (`phased_run.py`); `None` where no time passes on the way, or where the path is not kept.
+    `log_rates` is the sum of the logarithms of the rates at which events on the way are met; `None` if there are none.
     """
 
     phase: Int[Array, " cells"]
@@ -132,7 +132,7 @@ def travel(
     - `phases`: the phases, of which `phase` and `Passage.phase` are numbers.
     - `phase`, `state`: where every cell starts.
     - `t1`: horizon [s], one for all or one per cell.
-    - `cells`: how many cells to run; the rest is padding. With none, everything is compiled.
+    - `cells`: how many cells to run; the rest is padding. With 0, the programs are compiled and nothing is run.
     - `settings`: with an explicit Runge-Kutta solver of Diffrax.
     - `kinds`: rows of `Passage.counts`.
     - `passes`, `parts`: as for `march`.

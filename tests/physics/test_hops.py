@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, rutstam_top
+from close import assert_close
 from hop_reference import CASES, Case, row
 from hop_reference import strike as reference_strike
+from tops import rutstam_top
 
 import tippe
 from tippe.phases import first_contact, standing_spin
@@ -179,10 +180,28 @@ def test_a_ride_at_other_times_is_the_same(ride):
         assert_close(getattr(again, name)[places(some)], getattr(ride, name)[::7], rtol=1e-12, atol=1e-12)
     assert np.all(again.contact[places(middles)] == -1)
     # Positions are continuous, also where velocities are not.
-    assert_close(again.position[places(ends + 1e-9)], again.position[places(ends)], atol=1e-8)
+    for name, atol in (("position", 1e-8), ("rotation", 1e-6)):
+        shown = getattr(again, name)
+        assert_close(shown[places(ends + 1e-9)], shown[places(ends)], atol=atol)
     assert "flights" in str(ride)
     with pytest.raises(ValueError, match=r"must be at most .* \(the run ends there\)"):
         ride.at([4.5])
+
+
+def test_the_rotation_goes_with_the_angular_velocity(ride):
+    """In a flight, on the sphere and on the stem: R' = w x R."""
+    small, moments = 1e-6, []
+    for number in (-1, 0, 1):
+        here = np.flatnonzero((ride.contact[1:] == number) & (ride.contact[:-1] == number))
+        longest = here[np.argmax(np.diff(ride.t)[here])]
+        moments.append(ride.t[longest : longest + 2].mean())
+    run = ride.at(np.add.outer(sorted(moments), [-small, 0.0, small]).ravel())
+    rotation = np.asarray(run.rotation).reshape(3, 3, 3, 3)
+    rate = (rotation[:, 2] - rotation[:, 0]) / (2.0 * small)
+    turning = np.asarray(run.angular_velocity)[1::3]
+    expected = np.cross(turning[:, :, None], rotation[:, 1], axis=1)
+    assert_close(rate, expected, atol=1e-6 * np.max(np.abs(turning)))
+    assert_close(np.swapaxes(rotation, -1, -2) @ rotation, np.broadcast_to(np.eye(3), rotation.shape), atol=1e-14)
 
 
 def test_closed_forms_of_the_stem():
@@ -350,6 +369,7 @@ def test_a_start_on_the_wall_has_contact():
     assert_close(scene.normal_force(state) / expected, 1.0, atol=6e-3)
 
 
+@pytest.mark.slow
 def test_a_table_starts_on_the_wall():
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Viscous(0.3))
     etas = [math.pi / 2.0 - 1e-9, math.pi / 2.0]

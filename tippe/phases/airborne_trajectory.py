@@ -24,11 +24,7 @@ from .flight_trajectory import STATUS, HybridTrajectory, flights_of, sampled_fli
 
 class ArenaTrajectory(HybridTrajectory):
     """A `HybridTrajectory` over any arena: `theta`, `azimuth` and `slip` refer to the frame at the foot, the nearest point of
-    the arena, and `distance` is that of the top's sphere from it. `cyclic` holds the vector c of `tippe/sampled.py`."""
-
-    @property
-    def _path(self) -> tuple[Array, ...]:
-        return ()
+    the arena, and `distance` is that of the top's sphere from it."""
 
     @of_each_run
     def energy(self) -> Float[Array, " times"]:

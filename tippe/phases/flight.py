@@ -99,6 +99,24 @@ def flown(body: Top, gravity: Float[Array, "..."], free: FreeBody, time: Float[A
     return FreeBody((u1, u2, u3 - gravity * time), height, sum_vectors(*turned), free.momentum)
 
 
+def carried_aloft(body: Top, free: FreeBody, across: Vector, time: Float[Array, "..."]) -> Vector:
+    """A vector across the axis that turns with it and not about it, some time [s] later.
+
+    It turns at the rate L / I1 - (e.L / I1) e: about L, and less about e.
+    """
+    size = jnp.sqrt(dot(free.momentum, free.momentum))
+    direction = scale(1.0 / jnp.where(size == 0.0, 1.0, size), free.momentum)
+    about_axis = turned(across, free.axis, -dot(free.axis, free.momentum) / body.I1 * time)
+    return turned(about_axis, direction, size / body.I1 * time)
+
+
+def turned(vector: Vector, axis: Vector, angle: Float[Array, "..."]) -> Vector:
+    """A vector turned about a unit axis by an angle [rad]."""
+    along, ahead = scale(dot(axis, vector), axis), cross(axis, vector)
+    across = tuple(subtract(v, p) for v, p in zip(vector, along, strict=True))
+    return sum_vectors(along, scale(jnp.cos(angle), across), scale(jnp.sin(angle), ahead))
+
+
 def fly(
     body: Top,
     gravity: Float[Array, "..."],

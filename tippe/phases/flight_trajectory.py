@@ -25,6 +25,7 @@ from ..inversion import InversionProblem
 from ..launch import Launch
 from ..observables import AbstractTrajectory, of_each_run
 from ..sampled import STATUS as CODES
+from ..sampled import TrajectoryProblem
 from ..scene import Scene
 from .free_body import Ball, FreeBody, balls, energy, freed, standing_on
 from .impact import approach
@@ -43,7 +44,8 @@ class HybridTrajectory(AbstractTrajectory):
     the time of an impact the values are those before it. `distance` is that of the top's own sphere from the plane [m] with
     its rate [m/s]. `hops` has a row for each flight until `end_time`, its begin and its end [s]; a table counts those before
     the inversion. `work` is that of friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest
-    drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J].
+    drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J]. `rotation` and
+    `angular_velocity` are those of `Trajectory`.
 
     Inside a transformation `status` is a code as for `Trajectory`, 6 for "unresolved"; `hops` is `None`, `stats["hops"]`
     counts the flights. First derivatives by the scene and the launch go through flights and impacts; they are NaN behind an
@@ -65,7 +67,7 @@ class HybridTrajectory(AbstractTrajectory):
     t: Float[np.ndarray, " times"]
     scene: Scene
     states: Float[np.ndarray, "8 times"]
-    cyclic: Float[np.ndarray, "2 times"]
+    cyclic: Float[np.ndarray, "5 times"]
     spin_angle: Float[np.ndarray, " times"]
     work: Float[np.ndarray, " times"]
     status: str
@@ -129,8 +131,8 @@ class HybridTrajectory(AbstractTrajectory):
 
     @staticmethod
     def parts_of(shown: Float[np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
-        """State, path, spin angle, work, and the distance with its rate, from what the phases show."""
-        return shown[:8], shown[8:10], shown[10], shown[11], shown[12:]
+        """State, cyclic coordinates, spin angle, work, and the distance with its rate, from what the phases show."""
+        return shown[:8], shown[8:13], shown[13], shown[14], shown[15:]
 
     @staticmethod
     def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
@@ -141,16 +143,15 @@ class HybridTrajectory(AbstractTrajectory):
         return f"{super().__str__()}\n  {len(self.hops)} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
 
 
-def level_phases(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "12 1"]]:
+def level_phases(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "15 1"]]:
     """The phases of one launch of a hybrid scene on a level plane, the number of the first, and the state there.
 
     **Arguments:** `modules`: scene and launch; `tolerance`: no phase needs it.
     """
-    scene, launch = modules
-    state, radius, weight = scene.state(launch), scene.body.radius, scene.body.mass * scene.gravity
-    zero = jnp.zeros(())
-    state = jnp.stack([*state, -scene.body.offset * state[2], -scene.body.offset * state[3], zero, zero])
-    scales = jnp.stack([*scene.scales(launch), radius, radius, jnp.ones(()), weight * radius])
+    scene = modules[0]
+    state, scales = TrajectoryProblem.of(*modules).start()
+    # The place is that of the centre of mass.
+    state = state.at[8:10].add(-scene.body.offset * state[2:4])
     problem = InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
     return (*phases(scene, problem, tolerance, last=False, rides=True), state[:, None])
 

@@ -39,7 +39,7 @@ FIRST = 5.0
 #: follows the tolerance below this too; steps with an estimate of 1e-11 were found to err by 1e-13.
 ROUNDING = 1e-10
 
-#: Trials of the length, and iterations for each; where they do not do, the run has failed (one of 3300 slips of a table in
+#: Trials of the length, and iterations for each; where they are not enough, the run has failed (one of 3300 slips of a table in
 #: a sphere).
 TRIALS, ITERATIONS = 10, 10
 

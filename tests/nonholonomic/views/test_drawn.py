@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from nonholonomic.geometry import Cylinder, Graph, Implicit, Paraboloid, Plane, Sphere, Spheroid, Torus
-from nonholonomic.views import Arrow, Body, Curve, Show, Stage, Trace, arena, ball, page, turned
+from nonholonomic.views import Arrow, Body, Curve, Show, Stage, Trace, arena, ball, page, told_by_colour, turned
 from nonholonomic.views.animation import draw_curves, write_animation
 from nonholonomic.views.stage import matrices
 
@@ -98,3 +98,10 @@ def test_a_page_without_motion_has_no_script(tmp_path):
     assert "a &lt; b" in text
     assert "<p>words</p>" in text
     assert "<script" not in text
+
+
+def test_traces_of_several_runs_have_their_colours():
+    (show,) = rolling().shows
+    assert told_by_colour((show,)) == (show,)
+    both = told_by_colour((show, show._replace(colour=0x2A6FB0)))
+    assert [one.traces[0].colour for one in both] == [0xC8412B, 0x2A6FB0]

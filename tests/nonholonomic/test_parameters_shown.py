@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import tippe
-from nonholonomic.parameters import as_html, in_lines, readable_unit, text_as_html, told
+from nonholonomic.parameters import as_html, as_text, in_lines, readable_unit, text_as_html, told_apart
 
 
 @pytest.mark.parametrize(
@@ -28,13 +28,13 @@ def test_units_are_written_as_people_write_them(unit, shown):
 
 
 def test_values_are_told():
-    assert told(0.02, "kg") == "0.02 kg"
-    assert told(jnp.asarray(1 / 3), "m s-1") == "0.333333 m/s"
-    assert told(np.array([1.0, 2.0])) == "[1, 2]"
-    assert told(np.arange(6.0), "s") == "[0, 1, ..., 5, 6 numbers] s"
-    assert told((0.0, 1.0), "m") == "(0, 1) m"
-    assert told(readable_unit) == "readable_unit"
-    assert told("stop") == "'stop'"
+    assert as_text(0.02, "kg") == "0.02 kg"
+    assert as_text(jnp.asarray(1 / 3), "m s-1") == "0.333333 m/s"
+    assert as_text(np.array([1.0, 2.0])) == "[1, 2]"
+    assert as_text(np.arange(6.0), "s") == "[0, 1, ..., 5, 6 numbers] s"
+    assert as_text((0.0, 1.0), "m") == "(0, 1) m"
+    assert as_text(readable_unit) == "readable_unit"
+    assert as_text("stop") == "'stop'"
 
 
 def test_traced_numbers_say_that_they_are():
@@ -49,3 +49,15 @@ def test_html_escapes_and_lines_are_aligned():
     assert "&lt;1&gt;" in as_html("a", [("x", "<1>")])
     assert text_as_html("title\nx < 1").count("<pre>x &lt; 1</pre>") == 1
     assert in_lines("T", [("a", "1"), ("long", "2")]) == "T\n  a     1\n  long  2"
+
+
+def test_runs_are_told_apart_by_what_differs():
+    body = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    scenes = [
+        tippe.Scene(body, tippe.Plane(), tippe.Viscous(0.3)),
+        tippe.Scene(body, tippe.Plane(), tippe.Viscous(0.2)),
+    ]
+    assert told_apart(["a", "a"], scenes) == ["a, mu 0.3 s/m", "a, mu 0.2 s/m"]
+    scenes[1] = tippe.Scene(body, tippe.Cylinder(0.3), tippe.Viscous(0.3))
+    assert told_apart(["a", "b"], scenes) == ["a, Plane", "b, Cylinder"]
+    assert told_apart(["a", "b", "a"], [scenes[0]] * 3) == ["a (1)", "b", "a (2)"]
