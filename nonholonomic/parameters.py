@@ -124,7 +124,7 @@ def readable_unit(unit: str) -> str:
     return re.sub(r"(?<=[A-Za-z])\d+", lambda power: power[0].translate(_SUPERSCRIPTS), text)
 
 
-def told(value: Any, unit: str = "1") -> str:
+def as_text(value: Any, unit: str = "1") -> str:
     """A value as text: a number to six digits with its unit, an array by its first and last numbers."""
     if isinstance(value, eqx.Module):
         return repr(value)
@@ -133,7 +133,7 @@ def told(value: Any, unit: str = "1") -> str:
     behind = readable_unit(unit)
     behind = f" {behind}" if behind else ""
     if isinstance(value, tuple):
-        return f"({', '.join(told(part) for part in value)}){behind}"
+        return f"({', '.join(as_text(part) for part in value)}){behind}"
     if isinstance(value, jax.Array | np.ndarray | float) and np.asarray(value).dtype.kind in "fiu":
         numbers = np.asarray(value)
         some = numbers.ravel()
@@ -149,7 +149,7 @@ def contents(module: Any) -> list[tuple[str, str]]:
     """What a module holds, field by field: (name, value as text); what is left out is left out."""
     found = [(field.name, getattr(module, field.name, None)) for field in dataclasses.fields(module)]
     units = getattr(module, "units", {})
-    return [(name, told(value, units.get(name, "1"))) for name, value in found if value is not None]
+    return [(name, as_text(value, units.get(name, "1"))) for name, value in found if value is not None]
 
 
 def one_line(module: Any) -> str:
@@ -188,7 +188,7 @@ def differences(modules: list[Any]) -> list[list[str]]:
             parts = differences(values)
         else:
             unit = getattr(modules[0], "units", {}).get(field.name, "1")
-            texts = [told(value, unit) for value in values]
+            texts = [as_text(value, unit) for value in values]
             parts = [[f"{field.name} {text}"] if len(set(texts)) > 1 else [] for text in texts]
         found = [before + part for before, part in zip(found, parts, strict=True)]
     return found

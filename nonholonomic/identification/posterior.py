@@ -24,7 +24,7 @@ class LogDensity(eqx.Module):
 
     It can be differentiated, forwards and backwards, compiled, and batched by `jax.vmap`: then all cells of all chains run in
     one block. Errors that were not given are unknowns too, each in its logarithm, with a flat prior. Where the model has no
-    prediction it is some -1e8, without a slope.
+    prediction it is about -1e8, without a slope.
 
     - `names`: of the unknowns, in the order of the coordinates; `start`: (unknowns,), where to start.
     """

@@ -23,10 +23,10 @@ from .layout import Layout, Values
 from .table import Table
 from .tasks import Job, Work, packed, remote_results, stamp, versions
 
-#: Blocks that are handed out at once, at most: what their results take, when they come faster than they can be stored.
+#: The most blocks that are handed out at once: their results are held in memory until they are stored.
 HANDED_OUT = 512
 
-#: Blocks of a large grid, about, and what the results of one may take [bytes].
+#: About how many blocks a large grid is cut into, and what the results of one may take [bytes].
 BLOCKS, MOST_BYTES = 1024, 1 << 21
 
 
@@ -48,14 +48,14 @@ def sweep(
     **Arguments:**
 
     - `job`: (full name of a parameter -> values of some cells, how many of them count) -> name -> results. It may be called
-      from several threads at once; the first call, with no cell that counts, lets it compile. For an executor whose workers
+      from several threads at once; the first call, in which no cell counts, is for compiling. For an executor whose workers
       are other processes it is pickled.
     - `axes`: the grid, the last axis varying fastest.
     - `variables`: what `job` returns.
     - `request`: plain data that says what is computed; it is stored in the table and guards the file.
     - `path`: file to write, block by block; if it holds part of the same request, only the rest is computed.
-    - `block`: how many cells `job` is given at once, `block_for` their number by default; `most`: the most of them, where
-      results are large.
+    - `block`: how many cells `job` is given at once, by default `block_for` the number of cells; `most`: an upper limit
+      to it, where results are large.
     - `inner`: the coordinates of the dimensions that results have besides the grid's, numbers or words.
     - `progress`: whether to show it, on a terminal or in a notebook.
     - `executor`: who computes; by default a thread for each core.

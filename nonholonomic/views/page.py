@@ -21,7 +21,7 @@ from .stage import Arrow, Mesh, Points, Show, Stage, css
 #: How fast time may run.
 SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 
-#: What a page says that has no motion.
+#: What a page without motion says.
 NO_VIEW = "The page is without motion: k3d is not installed (pip install 'nonholonomic[view]')."
 
 LINES = 0x7C8896
@@ -103,7 +103,7 @@ def _coded(data: bytes) -> str:
 
 
 def _script(name: str, text: str, kind: str = "text/plain") -> str:
-    # A page ends a script where it reads so, whatever the script is.
+    # A browser takes "</script>" for the end of a script wherever it stands, even in data.
     safe = text.replace("</", "<\\/")
     return f'<script type="{kind}" id="{name}">{safe}</script>'
 

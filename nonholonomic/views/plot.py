@@ -66,7 +66,7 @@ def draw_table(
     figure = new_figure() if ax is None else None
     drawing = ax if figure is None else figure.add_subplot()
     drawing.set_xlabel(table.label(names[0]))
-    drawing.set_title(", ".join(_told(table, name, place) for name, place in cut.items()), fontsize="medium")
+    drawing.set_title(", ".join(_cut_text(table, name, place) for name, place in cut.items()), fontsize="medium")
     if len(names) == 1 or len(table.coords[names[1]]) <= MOST_LINES:
         _draw_lines(drawing, table, names, shown.reshape(len(shown), -1))
         drawing.set_ylabel(table.label(variable))
@@ -117,7 +117,7 @@ def _slice(values: Any, dims: tuple[str, ...], names: list[str], cut: dict[str, 
     return values[tuple(cut.get(name, slice(None)) for name in dims)].transpose([left.index(name) for name in names])
 
 
-def _told(table: "Table", name: str, place: int) -> str:
+def _cut_text(table: "Table", name: str, place: int) -> str:
     """A coordinate's value as text: "θ(0) = 0.1 rad"."""
     value = table.coords[name][place]
     text = str(value) if isinstance(value, str) else f"{value:.4g}"
@@ -127,7 +127,7 @@ def _told(table: "Table", name: str, place: int) -> str:
 def _draw_lines(drawing: Any, table: "Table", names: list[str], lines: Any) -> None:
     marker = "o-" if len(lines) <= 100 else "-"
     for column, line in enumerate(lines.T):
-        label = _told(table, names[1], column) if len(names) > 1 else None
+        label = _cut_text(table, names[1], column) if len(names) > 1 else None
         drawing.plot(table.coords[names[0]], line, marker, markersize=3, label=label)
     if len(names) > 1:
         drawing.legend()

@@ -1,4 +1,4 @@
-"""What a run can be asked to be seen: a page, an animation, a picture of its curves."""
+"""The ways in which a run can be shown: a page, an animation, a picture of its curves."""
 
 import abc
 from collections.abc import Sequence

@@ -6,7 +6,8 @@ import warnings
 import numpy as np
 import pytest
 import xarray
-from conftest import assert_close, rutstam_top
+from close import assert_close
+from tops import rutstam_top
 
 import tippe
 from tippe.__main__ import main

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import pytest
 from cheap_sweep import CELLS, CheapJob, cheap_sweep, finished_blocks, place, resumed
-from conftest import rutstam_top
+from tops import rutstam_top
 
 import nonholonomic
 import stroller
@@ -91,7 +91,7 @@ def test_mpi_gives_the_same_bits_too(tmp_path, by_threads):
     if mpirun is None:
         pytest.skip("no MPI is installed")
     tests = HERE.parents[1]
-    path = os.pathsep.join(str(folder) for folder in (tests.parent, tests, HERE))
+    path = os.pathsep.join(str(folder) for folder in (tests.parent, tests / "shared", HERE))
     environment = os.environ | {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu", "OMPI_MCA_rmaps_base_oversubscribe": "1"}
     environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     environment |= {"PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}

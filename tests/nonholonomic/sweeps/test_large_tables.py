@@ -8,7 +8,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from conftest import rutstam_top
+from tops import rutstam_top
 
 import tippe
 from nonholonomic.sweeps import Table, Variable, axis, running, sweep

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import tippe
-from nonholonomic.parameters import as_html, in_lines, readable_unit, text_as_html, told, told_apart
+from nonholonomic.parameters import as_html, as_text, in_lines, readable_unit, text_as_html, told_apart
 
 
 @pytest.mark.parametrize(
@@ -28,13 +28,13 @@ def test_units_are_written_as_people_write_them(unit, shown):
 
 
 def test_values_are_told():
-    assert told(0.02, "kg") == "0.02 kg"
-    assert told(jnp.asarray(1 / 3), "m s-1") == "0.333333 m/s"
-    assert told(np.array([1.0, 2.0])) == "[1, 2]"
-    assert told(np.arange(6.0), "s") == "[0, 1, ..., 5, 6 numbers] s"
-    assert told((0.0, 1.0), "m") == "(0, 1) m"
-    assert told(readable_unit) == "readable_unit"
-    assert told("stop") == "'stop'"
+    assert as_text(0.02, "kg") == "0.02 kg"
+    assert as_text(jnp.asarray(1 / 3), "m s-1") == "0.333333 m/s"
+    assert as_text(np.array([1.0, 2.0])) == "[1, 2]"
+    assert as_text(np.arange(6.0), "s") == "[0, 1, ..., 5, 6 numbers] s"
+    assert as_text((0.0, 1.0), "m") == "(0, 1) m"
+    assert as_text(readable_unit) == "readable_unit"
+    assert as_text("stop") == "'stop'"
 
 
 def test_traced_numbers_say_that_they_are():
