@@ -34,6 +34,9 @@ class LogDensity(eqx.Module):
     priors: tuple[tuple[str, Any], ...] = eqx.field(static=True)
     open_series: tuple[int, ...] = eqx.field(static=True)
 
+    def __repr__(self) -> str:
+        return f"LogDensity of {', '.join(self.names)}, given {self.measurements.value.size} measurements"
+
     @classmethod
     def of(
         cls,
