@@ -14,6 +14,8 @@ from nonholonomic.identification import Free as Free
 from nonholonomic.sweeps import Table as Table
 
 from . import steady as steady
+from .convex import ConvexBody as ConvexBody
+from .convex import SpheroidBody as SpheroidBody
 from .extended_times import extended_inversion_time as extended_inversion_time
 from .friction import AbstractFriction as AbstractFriction
 from .friction import Contensou as Contensou

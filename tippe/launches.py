@@ -26,6 +26,8 @@ LONG_NAMES = {
     "mass": "mass m",
     "radius": "radius",
     "offset": "offset a",
+    "equatorial": "equatorial half axis b",
+    "polar": "polar half axis p",
     "I1": "moment of inertia I₁",
     "I3": "moment of inertia I₃",
     "gravity": "gravity g",
@@ -73,7 +75,7 @@ def launches(
     values |= axes or {}
     fixed = {number: value for number, value in values.items() if np.ndim(value) == 0}
     launch, several = _with_room(scene, values)
-    units = UNITS | scene.friction.units | dict(several.values())
+    units = UNITS | scene.body.units | scene.friction.units | dict(several.values())
     names = {number: several.get(number, (number.rsplit(".", 1)[-1],))[0] for number in values}
     # A place that is given takes the place of the argument eta.
     counts = Counter(name for number, name in names.items() if number != "launch.eta" or launch.place is None)

@@ -142,16 +142,20 @@ class AbstractTrajectory(eqx.Module, Viewable):
 
     @of_each_run
     def velocity(self) -> Float[Array, "times 3"]:
-        """Velocity of the sphere's centre [m/s]."""
-        return self._fixed((*self.scene.dynamics.motion(self.states).velocity, self.above[1]))
+        """Velocity of the point whose path `position` is [m/s]."""
+        motion, axis = self.scene.dynamics.motion(self.states), parts(self.states).axis
+        beside = jax.jvp(self.scene.body.path_from_frame, (axis,), (motion.rate[2:5],))[1]
+        return self._fixed(sum_vectors((*motion.velocity, self.above[1]), beside))
 
     @of_each_run
     def position(self) -> Float[Array, "times 3"]:
-        """Position of the sphere's centre [m]; the plane is z = 0, the cylinder's axis x = z = 0, and a run on the plane
-        starts above the origin."""
+        """Position of the sphere's centre, of other bodies of the centre of mass [m]; the plane is z = 0, the cylinder's axis
+        x = z = 0, and a run on the plane starts above the origin."""
         frame, where = self.scene.frame, (self._place, self._path)
         centre = sum_vectors(frame.position(*where), scale(self.above[0], frame.axes(*where)[2]))
-        return jnp.stack(centre, axis=-1)
+        beside = self.scene.body.path_from_frame(parts(self.states).axis)
+        found = jnp.stack(centre, axis=-1)
+        return found if beside == (None, None, None) else found + self._fixed(beside)
 
     @of_each_run
     def jellett(self) -> Float[Array, " times"]:

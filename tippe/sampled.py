@@ -68,12 +68,12 @@ class TrajectoryProblem(AbstractProblem):
 
 @compiled_setup
 def _problem(scene: Scene, launch: Launch, cells: int | None) -> TrajectoryProblem:
-    radius, weight = scene.body.radius, scene.body.mass * scene.gravity
+    size, weight = scene.body.size, scene.body.mass * scene.gravity
     sine, cosine = jnp.sin(launch.theta), jnp.cos(launch.theta)
     across = (cosine * jnp.cos(launch.azimuth), cosine * jnp.sin(launch.azimuth), -sine)
     cyclic = (*scene.start(launch)[1], *across)
     one = jnp.ones(())
-    extra = jnp.stack(jnp.broadcast_arrays(*[radius] * (len(cyclic) - 3), one, one, one, one, weight * radius))
+    extra = jnp.stack(jnp.broadcast_arrays(*[size] * (len(cyclic) - 3), one, one, one, one, weight * size))
     cyclic = jnp.stack(jnp.broadcast_arrays(*cyclic))
     rows = (scene.state(launch), cyclic, scene.scales(launch), extra)
     if cells is not None:

@@ -29,10 +29,10 @@ from .scene import Scene
 class Trajectory(AbstractTrajectory):
     """A run of a tippe top, or a batch of runs, with the batch first.
 
-    Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame
-    (t1, t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre; `contact` is where it
-    touches the arena, `normal` the arena's normal there. `rotation` (times, 3, 3) takes the body's axes to the fixed frame, and
-    `angular_velocity` is the rate at which it turns.
+    Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame (t1,
+    t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre, of bodies that are no
+    sphere those of the centre of mass; `contact` is where the body touches the arena, `normal` the arena's normal there.
+    `rotation` (times, 3, 3) takes the body's axes to the fixed frame, and `angular_velocity` is the rate at which it turns.
 
     `status` is "reached t1", "contact_lost", "failed", "jammed" or "does_not_fit"; inside a transformation it is a code 0, 1,
     2, 3, 5, or 4, "illegal", for numbers out of range, for which everything is NaN. The run ends at `end_time`. The top does
@@ -89,7 +89,7 @@ class Trajectory(AbstractTrajectory):
     def contact(self) -> Float[Array, "times 3"]:
         """The point at which the top touches the arena [m]."""
         frame, where = self.scene.frame, (self._place, self._path)
-        foot = sum_vectors(frame.position(*where), scale(-self.scene.body.radius, frame.axes(*where)[2]))
+        foot = sum_vectors(frame.position(*where), scale(-self.scene.body.size, frame.axes(*where)[2]))
         return jnp.stack(foot, axis=-1)
 
     @of_each_run

@@ -22,10 +22,12 @@ from nonholonomic.views import (
     arena,
     ball,
     rod,
+    striped,
     told_by_colour,
     turned,
 )
 
+from .body import AbstractBody
 from .scene import Scene
 from .top import Top
 
@@ -65,8 +67,8 @@ class Motion(NamedTuple):
         body, slip = run.scene.body, run.slip
         zero = jnp.zeros_like(run.t)
         position, axis, normal = run.position, run.axis, run._fixed((zero, zero, zero + 1.0))
-        contact = position - body.radius * normal
-        if body.stem is not None:
+        contact = run.contact if not isinstance(body, Top) else position - body.radius * normal
+        if isinstance(body, Top) and body.stem is not None:
             stem = position + (body.stem.offset - body.offset) * axis - body.stem.radius * normal
             contact = jnp.where((run.contact == 1)[:, None], stem, contact)
         return cls(
@@ -114,7 +116,7 @@ def show(scene: Scene, motion: Motion, number: int, name: str) -> Show:
     """One run as it is drawn, the `number`-th of its stage."""
     body, colour = scene.body, COLOURS[number % len(COLOURS)]
     motion = Motion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
-    radius, weight = float(body.radius), float(body.mass * scene.gravity)
+    radius, weight = float(body.size), float(body.mass * scene.gravity)
     tip = AXIS * radius
     speed = np.linalg.norm(motion.slip, axis=-1)
     longest = max(float(np.quantile(speed, COMMON_SLIP)), 1e-12)
@@ -151,7 +153,7 @@ def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
     """A stage for each group of runs, which have one arena, with their names; colours tell all runs apart."""
     found, number = [], 0
     for group in groups:
-        (_, scene, first), radius = group[0], float(group[0][1].body.radius)
+        (_, scene, first), radius = group[0], float(group[0][1].body.size)
         points = np.concatenate([motion.contact for _, _, motion in group])
         ground = arena(scene.surface, points, first.normal[0], 4.0 * radius, 2.5 * radius)
         shows = told_by_colour(
@@ -169,11 +171,20 @@ def aside(normal: Float[np.ndarray, "times 3"]) -> Float[np.ndarray, "times 3"]:
     return across / np.linalg.norm(across, axis=-1, keepdims=True)
 
 
-def meshes(body: Top, colour: int) -> tuple[Mesh, ...]:
-    """The sphere in two colours, and the stem: as it is, or a short one that only shows where the axis points."""
+def meshes(body: AbstractBody, colour: int) -> tuple[Mesh, ...]:
+    """The body in two colours; of a top with the stem, as it is, or a short one that only shows where the axis points."""
+    if not isinstance(body, Top):
+        return striped(profile(body), (colour, PALE))
     radius = float(body.radius)
     sphere = ball(radius, (colour, PALE))
     if body.stem is None:
         return (*sphere, rod(0.10 * radius, 0.9 * radius, AXIS * radius - 0.16 * radius, 0.16 * radius, DARK))
     knob, end = float(body.stem.radius), float(body.stem.offset - body.offset)
     return (*sphere, rod(0.8 * knob, 0.0, end, knob, DARK))
+
+
+def profile(body: AbstractBody) -> Float[np.ndarray, "points 2"]:
+    """The meridian of a body about its centre of mass, from the top of its axis down: (distance from the axis, height) [m]."""
+    theta = jnp.linspace(jnp.pi, 0.0, 49)
+    lever = body.outline.at(jnp.cos(theta))
+    return np.stack([lever.radius * jnp.sin(theta), lever.offset - lever.radius * jnp.cos(theta)], axis=-1)

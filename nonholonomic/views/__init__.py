@@ -6,6 +6,7 @@ from .meshes import ball as ball
 from .meshes import bar as bar
 from .meshes import box as box
 from .meshes import rod as rod
+from .meshes import striped as striped
 from .meshes import wheel as wheel
 from .page import NO_VIEW as NO_VIEW
 from .page import Page as Page

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector, cross, dot, scale
 
+from ..body import Round
 from ..dynamics import Dynamics
 from ..state import joined, parts
 from ..top import Top
@@ -44,7 +45,7 @@ def balls(body: Top) -> tuple[Ball, ...]:
 def standing_on(dynamics: Dynamics, ball: Ball) -> Dynamics:
     """The equations of motion of a top that stands on another of its spheres: of the same form with its numbers."""
     coupling = dynamics.mass * ball.offset * dynamics.per_transverse
-    return dataclasses.replace(dynamics, offset=ball.offset, radius=ball.radius, coupling=coupling)
+    return dataclasses.replace(dynamics, outline=Round(ball.offset, ball.radius, coupling))
 
 
 def freed(body: Top, ball: Ball, state: Float[Array, "components ..."]) -> FreeBody:
