@@ -82,7 +82,7 @@ def _problem(scene: Scene, launch: Launch, cells: int | None) -> TrajectoryProbl
 
 
 #: How a run can end; inside a transformation the index stands for the word.
-STATUS = ("reached t1", "contact_lost", "failed", "jammed", "illegal", "does_not_fit")
+STATUS = ("reached t1", "contact_lost", "failed", "jammed", "illegal", "does_not_fit", "unresolved")
 
 
 def ended(

@@ -55,7 +55,7 @@ class VariationalProblem(AbstractProblem):
         at, *variations = self.parts(state)
         if not variations:
             return self.problem.field(time, at)
-        moving = _where_moved(self.problem, self.directions[0])
+        moving = where_moved(self.problem, self.directions[0])
 
         def rate(moving: Any, at: Float[Array, "components lanes"]) -> Float[Array, "components lanes"]:
             return eqx.combine(moving, self.problem).field(time, at)
@@ -126,7 +126,7 @@ def in_groups(run: Callable[..., tuple[Any, list[Any]]], directions: tuple[Any, 
     return jax.tree.map(lambda leaf: leaf[0], results), each[: len(directions)]
 
 
-def _where_moved(problem: Any, direction: Any) -> Any:
+def where_moved(problem: Any, direction: Any) -> Any:
     """The numbers of a problem that a direction moves, `None` for the others."""
 
     def moved(rate: Any, number: Any) -> Any:
