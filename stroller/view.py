@@ -117,7 +117,9 @@ def show(run: Any, number: int, name: str) -> Show:
         ),
         (
             # Above the axle the basket would hide it.
-            Arrow(f"normal force ({WEIGHT:g} wheelbase: the weight)", axle - 1.4 * half * y, push, VIOLET, 0.035 * length),
+            Arrow(
+                f"normal force ({WEIGHT:g} wheelbase: the weight)", axle - 1.4 * half * y, push, VIOLET, 0.035 * length
+            ),
             Arrow("side force, rear (as long)", contacts[0], forces[:, :1] * y, GOLD, 0.035 * length),
             Arrow("side force, front", contacts[1], forces[:, 1:] * left, GOLD, 0.035 * length),
         ),

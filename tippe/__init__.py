@@ -25,7 +25,7 @@ from .friction import Rolling as Rolling
 from .friction import SetValuedCoulomb as SetValuedCoulomb
 from .friction import Viscous as Viscous
 from .identify import identify as identify
-from .inversion import inversion_time as inversion_time
+from .inversion_time import inversion_time as inversion_time
 from .launch import Launch as Launch
 from .lyapunov import LyapunovExponent as LyapunovExponent
 from .lyapunov import lyapunov_exponent as lyapunov_exponent

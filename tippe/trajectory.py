@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import scale, sum_vectors
-from nonholonomic.integration import Followed, PhasedPath, Settings, follow
+from nonholonomic.integration import Followed, PhasedPath, Settings, explicit_tableau, follow
 from nonholonomic.progress import Progress
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require_all
 from nonholonomic.xla_cpu import on_device
@@ -19,8 +19,8 @@ from nonholonomic.xla_cpu import on_device
 from .inversion import check_run, run_bounds
 from .launch import Launch
 from .observables import AbstractTrajectory, check_increasing, of_each_run
-from .phases.airborne_trajectory import simulate_airborne
-from .phases.flight_trajectory import HybridTrajectory, simulate_hybrid
+from .phases.airborne_trajectory import sampled_airborne, simulate_airborne
+from .phases.flight_trajectory import HybridTrajectory, sampled_hybrid, simulate_hybrid
 from .phases.stick_slip_runs import follow_stick_slip
 from .sampled import STATUS, TrajectoryProblem, ended, sampled
 from .scene import Scene
@@ -131,7 +131,9 @@ def simulate(
 
     **Returns:** a `Trajectory`, for a hybrid scene a `HybridTrajectory`.
 
-    **Raises:** `ValueError` for arguments out of range, and for a hybrid scene inside a transformation.
+    **Raises:** `ValueError` for arguments out of range; inside a transformation for a law with phases (`SetValuedCoulomb`),
+    and for a hybrid scene with `adjoint`, with a solver that is not an explicit Runge-Kutta one, and where derivatives by
+    `times` or second derivatives are asked for.
 
     **Example:**
 
@@ -153,14 +155,12 @@ def simulate(
         times = as_number(times)
         require_all(times_bounds(times, t1))
         check_increasing(times)
+    if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
+        return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
     if scene.contact == "hybrid":
-        if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1))):
-            raise ValueError("contact = 'hybrid' must be 'stop' inside jit, vmap and grad")
         with Progress(1, "run", "simulating"):
             follow_flights = simulate_hybrid if scene.level else simulate_airborne
             return follow_flights(scene, launch, float(t1), times, tolerance, solver)
-    if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
-        return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
     with Progress(1, "run", "simulating"):
         run = TrajectoryProblem.of(scene, launch)
         through = follow_stick_slip if scene.friction.set_valued else follow
@@ -178,7 +178,7 @@ def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
-def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: Any, *options: Any) -> Trajectory:
+def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: Any, *options: Any) -> Any:
     """What `_traced` gives, or NaN and the status "illegal" where a traced number is out of range."""
     if times is None:
         # It raises the error that says so.
@@ -205,14 +205,20 @@ def _traced(
     tolerance: float,
     solver: diffrax.AbstractSolver,
     adjoint: diffrax.AbstractAdjoint | None,
-) -> Trajectory:
+) -> Trajectory | HybridTrajectory:
     if scene.friction.set_valued:
         raise ValueError(
             f"friction = {type(scene.friction).__name__} must be a law without phases inside jit, vmap and grad"
         )
     if times is None:
         raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
-    found = sampled(scene, launch, times, t1, Settings(tolerance, solver), adjoint)
+    settings = Settings(tolerance, solver)
+    if scene.contact == "hybrid":
+        if adjoint is not None:
+            raise ValueError(f"adjoint = {adjoint!r} must be left out for contact = 'hybrid'")
+        explicit_tableau(solver)
+        return (sampled_hybrid if scene.level else sampled_airborne)(scene, launch, times, t1, settings)
+    found = sampled(scene, launch, times, t1, settings, adjoint)
     status = found.status.astype(int)
     stats = {"accepted": found.accepted.astype(int), "rejected": found.rejected.astype(int)}
     return Trajectory(

@@ -139,10 +139,6 @@ class Recipe(eqx.Module):
         return self.build(eqx.combine(jax.tree.unflatten(self.structure, leaves), self.rest), cells)
 
 
-#: From this many cells on two directions run along together: that takes 0.8 times as long, but twice as long to compile.
-MANY, TOGETHER = 64, 2
-
-
 class AbstractSampling(AbstractQuestion):
     """Samples of a run; the leaves are the modules' numbers, the times, the horizon, the tolerance and the recipe's arrays.
 
@@ -182,7 +178,7 @@ class BlockSampling(AbstractSampling):
         def run(some: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
             return _march(VariationalProblem(problem, some, False), given, recipe.settings, not again)
 
-        found, slopes = in_groups(run, directions, TOGETHER if cells >= MANY else 1)
+        found, slopes = in_groups(run, directions)
         return found, gather(slopes)
 
 

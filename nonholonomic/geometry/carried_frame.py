@@ -83,6 +83,10 @@ class CarriedFrame(AbstractFrame):
     pull: Float[Array, "..."]
     side: float = eqx.field(static=True, default=1.0)
 
+    @property
+    def long(self) -> bool:
+        return self.surface.differentiated
+
     def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
         eta = as_number(eta)
         zero = jnp.zeros_like(eta)
@@ -125,10 +129,8 @@ class CarriedFrame(AbstractFrame):
 
     def _shape(self, foot: Fixed, t1: Fixed, t2: Fixed) -> tuple[Component, Component, Component]:
         """The shape operator of the arena, n' = -S_a q', as (S11, S12, S22)."""
-        first, second = (scale(-self.side, self.surface.normal_rate(foot, t)) for t in (t1, t2))
-        S11, S12, S22 = dot(first, t1), dot(first, t2), dot(second, t2)
-        zero = jnp.zeros_like(foot[0])
-        return tuple(zero if S is None else S for S in (S11, S12, S22))
+        bending, zero = scale(-self.side, self.surface.bending(foot, t1, t2)), jnp.zeros_like(foot[0])
+        return tuple(zero if S is None else S for S in bending)
 
     def _seen(self, *axes: Fixed) -> Vector:
         """The upward vertical in the frame."""

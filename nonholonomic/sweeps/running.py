@@ -62,8 +62,9 @@ def sweep(
 
     **Returns:** the `Table`.
 
-    **Raises:** `OSError` or `ValueError` if the file cannot be written or holds another request; `RuntimeError` if the executor
-    breaks down or a worker has other versions: what had finished is in the file.
+    **Raises:** `ValueError` if there is no file, and less memory than the table takes; `OSError` or `ValueError` if the file
+    cannot be written or holds another request; `RuntimeError` if the executor breaks down or a worker has other versions: what
+    had finished is in the file.
     """
     cells = size_of(axes)
     given = block_for(cells) if block is None else block
@@ -137,7 +138,16 @@ class Held:
     """The blocks of a table that is not to be stored: the same as `Blocks`, in memory."""
 
     def __init__(self, layout: Layout):
-        """State what the table is made of."""
+        """State what the table is made of.
+
+        **Raises:** `ValueError` if this machine has less memory than it takes.
+        """
+        need, room = layout.bytes_of_cells(layout.cells), memory()
+        if need > room:
+            raise ValueError(
+                f"path = None: {layout.cells:.3g} cells take {1e-9 * need:.3g} GB, and this machine has {1e-9 * room:.3g} GB "
+                "of memory; with path= they are held in a file"
+            )
         self.finished: set[int] = set()
         self._layout, self._found = layout, layout.empty(layout.cells)
 
@@ -201,6 +211,14 @@ def blocks_together(layout: Layout, block: int) -> int:
     """How many blocks are handed out and stored as one, a power of two: more than one where the grid is large."""
     wanted = min(layout.cells // (BLOCKS * block), MOST_BYTES // layout.bytes_of_cells(block))
     return 1 << max(wanted, 1).bit_length() - 1
+
+
+def memory() -> float:
+    """The memory of this machine in bytes; infinite where it is not told."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return float("inf")
 
 
 def workers() -> int:

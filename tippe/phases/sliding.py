@@ -161,7 +161,8 @@ class Slide(AbstractPhase):
         state = grounded(air.free)
         if air.riding is not None:
             state = jnp.concatenate([state, air.riding])
-        return Passage(air.ball, state, air.elapsed, status, air.crossing_time, air.flights[None], record)
+        found = (air.ball, state, air.elapsed, status, air.crossing_time, air.flights[None])
+        return Passage(*found, record, air.log_rates)
 
 
 class Lean(AbstractPhase):
@@ -221,6 +222,7 @@ class Air(NamedTuple):
     - `status`: `RUNNING`, or how the run ended, `GUARD_LOST` if it has jammed; `crossing_time` [s] of the event, infinite if
       there was none.
     - `flights`: so far; `open`: whether there is no contact and the run goes on.
+    - `log_rates`: of the landings, as in `Passage`.
     - `riding`: what rides along with a single run.
     """
 
@@ -233,6 +235,7 @@ class Air(NamedTuple):
     crossing_time: Cells
     flights: Int[Array, " cells"]
     open: Bool[Array, " cells"]
+    log_rates: Cells
     riding: Float[Array, "7 cells"] | None = None
 
 
@@ -255,6 +258,7 @@ def lost_contact(scene: Scene, number: Int[Array, ""], state: Float[Array, "comp
         crossing_time=jnp.full_like(zero, jnp.inf),
         flights=jnp.zeros(zero.shape, int),
         open=~jams,
+        log_rates=zero,
     )
 
 
@@ -282,6 +286,7 @@ def take_flight(
         crossing_time=jnp.where(jnp.isfinite(reached), air.elapsed + reached, air.crossing_time),
         flights=air.flights + 1,
         open=landed,
+        log_rates=air.log_rates + jnp.where(landed, flight.log_rate, 0.0),
         riding=None if air.riding is None else _carried(body, air.free, air.riding, duration),
     )
     return after, landed
