@@ -6,8 +6,9 @@ The workers are threads that sleep for as long as the cells of a block would tak
 processes do; making the results is left out of the account. So the parent does all that it does in earnest: hands out,
 unpickles, writes and syncs each block, and makes the table's file of them. `each` is the time that a cell takes [s]; 2e-4 is
 that of a top on the plane at a tolerance of 1e-9. First nobody sleeps: that is the most that the parent can feed. Then they
-sleep, on fewer cells: what is lost against workers who never wait is the parent's overhead. Before all that, what a cell
-costs in earnest.
+sleep, on fewer cells: what they wait for blocks is the parent's overhead. Their blocks all take the same
+time, so the last of all come at once: what the parent has to do with those, when everybody else is done, is told apart. So is
+its processor's time, which another load on the machine does not change. Before all that, what a cell costs in earnest.
 """
 
 import argparse
@@ -18,6 +19,7 @@ import threading
 import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,7 +46,7 @@ class Sleepers(Executor):
     def __init__(self, workers: int, each: float, cells: int):
         self._pool, self._each, self._cells = ThreadPoolExecutor(workers), each, cells
         self._sent: dict[bool, bytes] = {}
-        self._lock, self.slept, self.blocks = threading.Lock(), 0.0, 0
+        self._lock, self.blocks, self.done = threading.Lock(), 0, 0.0
 
     def submit(self, function, /, sent, needed, first, count, mark) -> Future:
         return self._pool.submit(self._worked, function, sent, needed, first, count, mark)
@@ -60,23 +62,33 @@ class Sleepers(Executor):
                 self._sent[last] = pickle.dumps(function(sent, needed, first, count, mark))
             self.blocks += 1
         time.sleep(count * self._each)
-        return pickle.loads(self._sent[last])
+        found = pickle.loads(self._sent[last])
+        self.done = time.perf_counter()
+        return found
 
 
-def run(cells: int, workers: int, each: float, folder: Path) -> tuple[float, float, int]:
-    """A sweep over `cells` cells, a multiple of 4096.
+class Took(NamedTuple):
+    """What a sweep took [s]: until the last worker was done, until the last block was written, for what came after; on the
+    processor until then; and how many blocks there were."""
 
-    **Returns:** how long its blocks took [s], how long what came after the last of them [s], and how many there were.
-    """
+    worked: float
+    fed: float
+    after: float
+    processor: float
+    blocks: int
+
+
+def run(cells: int, workers: int, each: float, folder: Path) -> Took:
+    """A sweep over `cells` cells, a multiple of 4096."""
     x, y = axis("x", "x", "1", np.linspace(0.0, 1.0, 1 << 12)), axis("y", "y", "1", np.arange(cells >> 12))
     sleepers, fed = Sleepers(workers, each, cells), []
 
     def handed_out(*arguments, once=running.handed_out):
         yield from once(*arguments)
-        fed.append(time.perf_counter())
+        fed.extend([time.perf_counter(), time.process_time()])
 
     running.handed_out, once = handed_out, running.handed_out
-    start = time.perf_counter()
+    start, processor = time.perf_counter(), time.process_time()
     try:
         table = sweep(results, [y, x], VARIABLES, {"what": "nothing"}, path=folder / "table.h5", executor=sleepers)
     finally:
@@ -86,7 +98,7 @@ def run(cells: int, workers: int, each: float, folder: Path) -> tuple[float, flo
     assert isinstance(table, Table)
     assert table.shape == (len(y.values), len(x.values))
     (folder / "table.h5").unlink()
-    return fed[0] - start, end - fed[0], sleepers.blocks
+    return Took(sleepers.done - start, fed[0] - start, end - fed[0], fed[1] - processor, sleepers.blocks)
 
 
 def cost_of_a_cell() -> float:
@@ -120,24 +132,28 @@ def main() -> None:
         # The blocks keep their size.
         cells, running.BLOCKS = cells // 100 >> 12 << 12, running.BLOCKS // 100
     with tempfile.TemporaryDirectory(dir=".") as folder:
-        busy, made, blocks = run(cells, options.workers, 0.0, Path(folder))
+        took = run(cells, options.workers, 0.0, Path(folder))
+        rate = cells / took.fed
         print(
-            f"{cells:.3g} cells in {blocks} blocks, workers that need no time: {busy:.1f} s, {cells / busy:.3g} cells a second"
+            f"{cells:.3g} cells in {took.blocks} blocks, workers that need no time: {took.fed:.1f} s, {rate:.3g} cells a second"
         )
-        print(f"after the last block: {made:.1f} s; at most {peak():.2f} GiB held")
-        feeds = cells / busy * options.each
-        print(f"so one parent feeds {feeds:.0f} workers that take {options.each:g} s a cell")
+        print(f"after the last block: {took.after:.1f} s; at most {peak():.2f} GiB held")
+        print(f"so one parent feeds {rate * options.each:.0f} workers that take {options.each:g} s a cell")
         # As many blocks of the same size for each worker, whatever the number of workers.
-        size = -(-cells // blocks // 512) * 512
+        size = -(-cells // took.blocks // 512) * 512
         running.blocks_together, once = lambda layout, block: size // block, running.blocks_together
         few = size * options.workers * 8 >> 12 << 12
         ideal = few * options.each / options.workers
-        busy, made, blocks = run(few, options.workers, options.each, Path(folder))
+        took = run(few, options.workers, options.each, Path(folder))
         running.blocks_together = once
+        print(f"{few:.3g} cells in {took.blocks} blocks, {options.workers} workers that sleep for {ideal:.1f} s each:")
         print(
-            f"{few:.3g} cells in {blocks} blocks, {options.workers} workers that sleep: "
-            f"{busy:.1f} s for {ideal:.1f} s of work, {100 * (busy / ideal - 1):.1f} % more; after the last block: {made:.1f} s"
+            f"  the last was done after {took.worked:.1f} s: they waited for {100 * (took.worked / ideal - 1):.1f} % of that"
         )
+        print(
+            f"  the last {options.workers} blocks, which came at once, were written {took.fed - took.worked:.1f} s later"
+        )
+        print(f"  the parent took {took.processor:.1f} s of a core, {100 * took.processor / ideal:.1f} %")
 
 
 if __name__ == "__main__":

@@ -79,11 +79,11 @@ def tabled(thetas: Any, times: Any, tolerance: float = TOLERANCE, **options: Any
 
 def main() -> None:
     """Measure and print."""
-    told = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    told.add_argument("--launches", type=int, default=512)
-    told.add_argument("--samples", type=int, default=1001)
-    told.add_argument("--quick", action="store_true", help="without Diffrax and derivatives")
-    options = told.parse_args()
+    command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    command.add_argument("--launches", type=int, default=512)
+    command.add_argument("--samples", type=int, default=1001)
+    command.add_argument("--quick", action="store_true", help="without Diffrax and derivatives")
+    options = command.parse_args()
     one_core()
     print(machine())
     launches, thetas, times = options.launches, np.linspace(0.05, 0.15, options.launches), None

@@ -124,7 +124,7 @@ def readable_unit(unit: str) -> str:
     return re.sub(r"(?<=[A-Za-z])\d+", lambda power: power[0].translate(_SUPERSCRIPTS), text)
 
 
-def told(value: Any, unit: str = "1") -> str:
+def as_text(value: Any, unit: str = "1") -> str:
     """A value as text: a number to six digits with its unit, an array by its first and last numbers."""
     if isinstance(value, eqx.Module):
         return repr(value)
@@ -133,7 +133,7 @@ def told(value: Any, unit: str = "1") -> str:
     behind = readable_unit(unit)
     behind = f" {behind}" if behind else ""
     if isinstance(value, tuple):
-        return f"({', '.join(told(part) for part in value)}){behind}"
+        return f"({', '.join(as_text(part) for part in value)}){behind}"
     if isinstance(value, jax.Array | np.ndarray | float) and np.asarray(value).dtype.kind in "fiu":
         numbers = np.asarray(value)
         some = numbers.ravel()
@@ -149,7 +149,7 @@ def contents(module: Any) -> list[tuple[str, str]]:
     """What a module holds, field by field: (name, value as text); what is left out is left out."""
     found = [(field.name, getattr(module, field.name, None)) for field in dataclasses.fields(module)]
     units = getattr(module, "units", {})
-    return [(name, told(value, units.get(name, "1"))) for name, value in found if value is not None]
+    return [(name, as_text(value, units.get(name, "1"))) for name, value in found if value is not None]
 
 
 def one_line(module: Any) -> str:
@@ -161,6 +161,37 @@ def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
     """A title, and a line for each row."""
     width = max((len(name) for name, _ in rows), default=0)
     return "\n".join([title, *(f"  {name:{width}}  {text}" for name, text in rows)])
+
+
+def told_apart(starts: list[str], *groups: list[Any]) -> list[str]:
+    """A name for each of some things: what it starts with, and where its modules differ from those of the others.
+
+    **Arguments:** `starts`: the beginnings; `groups`: modules of one role, such as the scenes, one for each thing.
+
+    **Returns:** the names. Those that would be the same are numbered.
+    """
+    apart = [differences(group) for group in groups]
+    names = [", ".join([start, *(part for one in apart for part in one[k])]) for k, start in enumerate(starts)]
+    return [
+        name if names.count(name) == 1 else f"{name} ({names[: k + 1].count(name)})" for k, name in enumerate(names)
+    ]
+
+
+def differences(modules: list[Any]) -> list[list[str]]:
+    """For each of some modules, as text, what the others do not have like it: its kind, or some of its numbers."""
+    if len({type(one) for one in modules}) > 1:
+        return [[type(one).__name__] for one in modules]
+    found: list[list[str]] = [[] for _ in modules]
+    for field in dataclasses.fields(modules[0]):
+        values = [getattr(one, field.name) for one in modules]
+        if all(isinstance(value, eqx.Module) for value in values):
+            parts = differences(values)
+        else:
+            unit = getattr(modules[0], "units", {}).get(field.name, "1")
+            texts = [as_text(value, unit) for value in values]
+            parts = [[f"{field.name} {text}"] if len(set(texts)) > 1 else [] for text in texts]
+        found = [before + part for before, part in zip(found, parts, strict=True)]
+    return found
 
 
 def as_html(title: str, rows: list[tuple[str, ...]]) -> str:

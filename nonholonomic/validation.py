@@ -20,7 +20,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from .parameters import as_html, contents, in_lines, one_line, told
+from .parameters import as_html, as_text, contents, in_lines, one_line
 
 
 def as_number(value: Any) -> Float[Array, "..."]:
@@ -41,7 +41,7 @@ def is_traced(value: Any) -> bool:
 def shown(value: Any) -> str:
     """The value as a message should show it: a plain number if it is one."""
     array = np.asarray(value)
-    return repr(array.item()) if array.ndim == 0 and array.dtype != object else told(value)
+    return repr(array.item()) if array.ndim == 0 and array.dtype != object else as_text(value)
 
 
 def _first(numbers: np.ndarray, holds: np.ndarray) -> str:

@@ -12,14 +12,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlib
+import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
-#: Wide vectors, which compilers shy away from, pay for the sums over stages, streams of multiply-adds: 1.2 to 1.6 times. JAX
+#: Vectors of 512 bits, which compilers avoid by default, make the sums over stages 1.2 to 1.6 times as fast. JAX
 #: takes compiler options only for the outermost compiled function, so it is for programs that are called on their own. It can
 #: go when XLA prefers 512 bits by itself; without AVX-512 it does nothing.
 compiled_alone = eqx.filter_jit(compiler_options={"xla_cpu_prefer_vector_width": 512})
+
+#: For what is done once before a run: called on its own it is one program and not dozens of small ones, each of which takes
+#: 40 ms to compile; inside other programs it leaves no trace.
+compiled_setup = eqx.filter_jit(inline=True)
 
 
 def stored(*values: Float[Array, "..."] | None) -> tuple[Float[Array, "..."] | None, ...]:
@@ -46,6 +51,12 @@ def written_in_place(
 ) -> Float[Array, "stack ..."]:
     """A stack of arrays with one of them replaced; without the bounds check of `at[].set`, so that it is done in place."""
     return jax.lax.dynamic_update_index_in_dim(whole, one, at, 0)
+
+
+def on_device(*arrays: Float[ArrayLike, "..."]) -> tuple[Float[Array, "..."], ...]:
+    """NumPy's arrays as JAX's, without a compilation: `jnp.asarray` compiles a copy for every new shape since JAX 0.10, which
+    takes 30 ms. Not for numbers under a transformation. It can go when `jnp.asarray` only copies."""
+    return tuple(jax.device_put(np.asarray(array, dtype=float)) for array in arrays)
 
 
 def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:

@@ -174,7 +174,13 @@ def write_page(
     groups: dict[str, list[tuple[int, Trajectory]]] = {}
     for number, ((ground, _), run) in enumerate(rides.items()):
         groups.setdefault(ground, []).append((number, run))
-    drawn = grouped(list(groups.values()), [", ".join(name) for name in rides]) if can_view() else []
+    drawn = []
+    if can_view():
+        # The place of both rides is their stage's title, and their names stand beside it.
+        drawn = [
+            stage._replace(title=ground)
+            for ground, stage in zip(groups, grouped(list(groups.values()), [ride for _, ride in rides]), strict=True)
+        ]
     above = "" if drawn else f'<p class="note">{NO_VIEW}</p>'
     below = "<h2>Energy against work</h2><pre>" + escape("\n".join(words)) + "</pre>"
     below += "" if figure is None else "<h2>Paths, speeds, energies, side forces</h2>" + picture_as_html(figure, 70)
@@ -199,9 +205,9 @@ def main(arguments: list[str] | None = None) -> int:
             f"{'ride':38s} {'solver':10s} {'E start [J]':>12s} {'E end [J]':>12s} {'work [J]':>12s} "
             f"{'residual':>10s} {'slip [m/s]':>10s} {'N min [N]':>10s} {'steps':>6s}  status"
         )
+        rides, audits, helm, asked = {}, [], Helm(options.force, options.steer, options.period), scenes(options)
         print(heading)
-        rides, audits, helm = {}, [], Helm(options.force, options.steer, options.period)
-        for name, (scene, launch) in scenes(options).items():
+        for name, (scene, launch) in asked.items():
             runs = {
                 "Dopri8": simulate(scene, launch, options.t1, helm, tolerance=options.tolerance),
                 "midpoint": simulate(scene, launch, options.t1, helm, solver=ImplicitMidpoint(options.step)),
@@ -217,7 +223,7 @@ def main(arguments: list[str] | None = None) -> int:
             print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
         else:
             written.append(options.out / "rides.png")
-            grounds = {ground: scene.surface for (ground, _), (scene, _) in scenes(options).items()}
+            grounds = {ground: scene.surface for (ground, _), (scene, _) in asked.items()}
             figure = draw_rides(grounds, rides)
             figure.savefig(written[1], dpi=110)
         shown = write_page(options, rides, [heading, *audits, "", *curve], figure)

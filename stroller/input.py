@@ -129,8 +129,8 @@ def check_input(controls: Any, scene: Any, launch: Any) -> None:
         raise ValueError(f"{name} must return one drive force [N] and one steering torque [N m], not shapes {shapes}")
     given = controls(t, motion)
     if not any(is_traced(part) for part in given) and not np.all(np.isfinite([float(part) for part in given])):
-        told = ", ".join(f"{float(part):g}" for part in given)
-        raise ValueError(f"{name} must be finite: at the start it gives ({told})")
+        numbers = ", ".join(f"{float(part):g}" for part in given)
+        raise ValueError(f"{name} must be finite: at the start it gives ({numbers})")
 
 
 def _first_line(error: Exception) -> str:

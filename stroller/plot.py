@@ -33,18 +33,19 @@ def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str],
         panels = [figure.add_subplot(layout[row, column]) for column in (1, 2, 3)]
         for colour, (ride, run) in zip(COLOURS, here.items(), strict=False):
             space.plot(*np.asarray(run.position).T, color=colour, linewidth=1.4, label=ride)
-            panels[0].plot(run.t, run.speed, color=colour, label=ride)
-            panels[1].plot(run.t, run.energy, color=colour, label=ride)
+            panels[0].plot(run.t, run.speed, color=colour)
+            panels[1].plot(run.t, run.energy, color=colour)
             panels[1].plot(run.t, run.energy[0] + run.work, color="black", linewidth=0.8, linestyle=":")
-            panels[2].plot(run.t, run.side_force[:, 0], color=colour, label=f"rear, {ride}")
-            panels[2].plot(run.t, run.side_force[:, 1], color=colour, linestyle="--", label=f"front, {ride}")
+            panels[2].plot(run.t, run.side_force[:, 0], color=colour)
+            panels[2].plot(run.t, run.side_force[:, 1], color=colour, linestyle="--")
         space.set_title(name)
         space.legend(fontsize="small")
         for panel, label in zip(panels, ("speed [m/s]", "energy [J]", "side force [N]"), strict=True):
-            panel.set_xlabel("t [s]")
+            panel.set_xlabel("time [s]")
             panel.set_ylabel(label)
-            panel.legend(fontsize="small")
+        # Colours are told beside the path; here it is lines that need words, and above, where they hide nothing.
         panels[1].set_title("dotted: start plus work", fontsize="small")
+        panels[2].set_title("full: rear axle, dashed: front wheel", fontsize="small")
     return figure
 
 
@@ -64,4 +65,8 @@ def _draw_ground(space: Any, ground: AbstractSurface, rides: dict[str, Trajector
     space.set_ylabel("y [m]")
     space.set_zlabel("z [m]")
     space.locator_params(nbins=4)
+    # A plane has hardly any height to tell.
+    if np.ptp(z) < 0.1 * max(np.ptp(x), np.ptp(y)):
+        space.set_zticks([])
+        space.set_zlabel("")
     space.set_aspect("equal")

@@ -1,20 +1,11 @@
 """Recorded rides of strollers, from arrays and from files."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
-import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.identification import (
-    Measurements,
-    Quantities,
-    check_recording,
-    read_columns,
-    sample_labels,
-    samples,
-    seen_samples,
-)
+from nonholonomic.identification import AbstractRecording, Quantities, as_quantity, read_columns
 from nonholonomic.validation import as_number
 
 from .input import Input
@@ -29,7 +20,7 @@ QUANTITIES = Quantities(
 )
 
 
-class Recording(eqx.Module):
+class Recording(AbstractRecording):
     """A recorded ride: some quantities at the readings of a clock.
 
     **Arguments:**
@@ -58,43 +49,11 @@ class Recording(eqx.Module):
     """
 
     launch: Launch
-    times: Float[Array, " times"] = eqx.field(converter=as_number)
-    value: Float[Array, "times *columns"] = eqx.field(converter=as_number)
-    error: Any = eqx.field(converter=lambda error: error if error is None else as_number(error))
-    quantity: str | tuple[str, ...] = eqx.field(
-        static=True, default="position", converter=lambda words: tuple(words) if isinstance(words, list) else words
-    )
+    quantity: str | tuple[str, ...] = eqx.field(static=True, default="position", converter=as_quantity)
     input: Input | None = None
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     student: float | None = None
-
-    def __check_init__(self):
-        check_recording(self, self.columns)
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """The names of what a sample consists of."""
-        return QUANTITIES.of(self.quantity)
-
-    @property
-    def measurements(self) -> Measurements:
-        """The samples as `Measurements`, without the missing ones."""
-        return samples(self, self.columns, QUANTITIES.angles)
-
-    @property
-    def size(self) -> int:
-        """How many numbers are predicted, missing samples included."""
-        return np.size(self.value)
-
-    @property
-    def seen(self) -> np.ndarray:
-        """Which of the predictions were measured."""
-        return seen_samples(self)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """A label for each sample."""
-        return sample_labels(self, self.columns)
+    quantities: ClassVar[Quantities] = QUANTITIES
 
 
 def read_recording(
@@ -137,10 +96,4 @@ def read_recording(
     [0. 1. 2.] [1.5  1.39 1.31]
     """
     read = read_columns(path, columns, fps, error, QUANTITIES)
-    single = len(read.columns) == 1
-
-    def shaped(one: Any) -> Any:
-        return one if one is None else np.squeeze(one, axis=1) if single else one
-
-    quantity = read.columns[0] if single else read.columns
-    return Recording(launch, read.times, shaped(read.value), shaped(read.error), quantity, input, t0, student)
+    return Recording(launch, *read, input, t0, student)

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from nonholonomic.geometry import AbstractSurface
+from nonholonomic.parameters import told_apart
 from nonholonomic.views import (
     COLOURS,
     DARK,
@@ -19,6 +20,7 @@ from nonholonomic.views import (
     arena,
     bar,
     box,
+    told_by_colour,
     turned,
     wheel,
 )
@@ -27,6 +29,9 @@ from .scene import DRIVES
 
 #: Lengths in units of the wheelbase, which is all that the model knows: radius and width of the wheels, and the track.
 RADIUS, WIDTH, TRACK = 0.2, 0.07, 0.8
+
+#: How large it counts to the camera, in units of the wheelbase.
+SIZE = 0.65
 
 #: Most radians by which a wheel rolls from one frame to the next.
 ROLL_PER_FRAME = 0.5
@@ -37,22 +42,25 @@ WEIGHT = 1.0
 GREEN, BLUE, VIOLET, GOLD = 0x1F8A4C, 0x1B6CA8, 0x7B4FA3, 0xE0A100
 
 
-def as_stages(runs: list[Any], overlaid: bool, names: list[str] | None = None) -> list[Stage]:
+def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     """Rides as they are drawn: a stage for each, or one for all if they are to be overlaid."""
+    rides = [run.recipe.ride for run in runs]
+    starts = [f"ride of {float(run.t[-1]):.3g} s" for run in runs]
+    names = told_apart(starts, [ride.scene for ride in rides], [ride.launch for ride in rides])
     return grouped([list(enumerate(runs))] if overlaid else [[one] for one in enumerate(runs)], names)
 
 
-def grouped(groups: list[list[tuple[int, Any]]], names: list[str] | None = None) -> list[Stage]:
+def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage]:
     """A stage for each group of rides, which are numbered and have one ground; `names` are those of the rides."""
     found = []
     for group in groups:
         scene = group[0][1].recipe.ride.scene
         length = float(scene.body.wheelbase)
-        shows = tuple(show(run, k, names[k] if names else f"ride {k + 1}") for k, run in group)
+        shows = told_by_colour(tuple(show(run, k, names[k]) for k, run in group))
         points = np.concatenate([np.asarray(run.position) for _, run in group])
         normal = normals(scene.surface, scene.side, np.asarray(group[0][1].position)[:1])[0]
         ground = arena(scene.surface, points, normal, 3.0 * length, length)
-        found.append(Stage(", ".join(one.name for one in shows), ground, shows))
+        found.append(Stage("; ".join(one.name for one in shows), ground, shows))
     return found
 
 
@@ -96,7 +104,7 @@ def show(run: Any, number: int, name: str) -> Show:
         name,
         colour,
         times,
-        length,
+        SIZE * length,
         (
             Body("frame", axle, _turning(x, y, z), frame(length, colour)),
             Body("left wheel", axle + half * y, _rolling(x, y, z, rolled["left"]), rear),
@@ -104,13 +112,16 @@ def show(run: Any, number: int, name: str) -> Show:
             Body("front wheel", front, _rolling(forward, left, z, ahead), wheel(radius, WIDTH * length, (DARK, PALE))),
         ),
         (
-            Trace("path of the rear axle", contacts[0], GREEN, 0.03 * length),
-            Trace("path of the front wheel", contacts[1], BLUE, 0.02 * length),
+            Trace("path of the rear axle", contacts[0], GREEN, 0.05 * length),
+            Trace("path of the front wheel", contacts[1], BLUE, 0.025 * length),
         ),
         (
-            Arrow(f"normal force ({WEIGHT:g} wheelbase: the weight)", axle, push, VIOLET, 0.02 * length),
-            Arrow("side force, rear (as long)", contacts[0], forces[:, :1] * y, GOLD, 0.02 * length),
-            Arrow("side force, front", contacts[1], forces[:, 1:] * left, GOLD, 0.02 * length),
+            # Above the axle the basket would hide it.
+            Arrow(
+                f"normal force ({WEIGHT:g} wheelbase: the weight)", axle - 1.4 * half * y, push, VIOLET, 0.035 * length
+            ),
+            Arrow("side force, rear (as long)", contacts[0], forces[:, :1] * y, GOLD, 0.035 * length),
+            Arrow("side force, front", contacts[1], forces[:, 1:] * left, GOLD, 0.035 * length),
         ),
         (
             Curve("speed [m/s]", read(run.speed)),

@@ -5,8 +5,8 @@ import itertools
 import jax
 import jax.numpy as jnp
 import pytest
-from conftest import rutstam_top
 from jax.extend.core import ClosedJaxpr, Jaxpr
+from tops import rutstam_top
 
 import stroller
 import tippe
@@ -63,6 +63,14 @@ def test_fields_of_the_top(arena, law):
     assert slow_in(dynamics.field, scene.state(launch)) == set()
     assert slow_in(run.field, jnp.zeros(()), run.start()[0]) == set()
     assert slow_in(dynamics.contact_margin, scene.state(launch)) == set()
+
+
+@pytest.mark.parametrize("law", LAWS[:5], ids=lambda part: type(part).__name__)
+def test_fields_of_an_egg(law):
+    body = tippe.SpheroidBody(mass=0.05, equatorial=0.02, polar=0.028, I1=1.184e-5, I3=8e-6, offset=0.003)
+    scene, launch = tippe.Scene(body, tippe.Plane(0.1), law), tippe.Launch(1.3, 100.0)
+    run = TrajectoryProblem.of(scene, launch)
+    assert slow_in(run.field, jnp.zeros(()), run.start()[0]) == set()
 
 
 GROUNDS = (stroller.Plane(), stroller.Plane(0.3), stroller.Sphere(2.0), stroller.Spheroid(2.0, 1.1))

@@ -14,6 +14,8 @@ from nonholonomic.identification import Free as Free
 from nonholonomic.sweeps import Table as Table
 
 from . import steady as steady
+from .convex import ConvexBody as ConvexBody
+from .convex import SpheroidBody as SpheroidBody
 from .extended_times import extended_inversion_time as extended_inversion_time
 from .friction import AbstractFriction as AbstractFriction
 from .friction import Contensou as Contensou
@@ -23,7 +25,7 @@ from .friction import Rolling as Rolling
 from .friction import SetValuedCoulomb as SetValuedCoulomb
 from .friction import Viscous as Viscous
 from .identify import identify as identify
-from .inversion import inversion_time as inversion_time
+from .inversion_time import inversion_time as inversion_time
 from .launch import Launch as Launch
 from .lyapunov import LyapunovExponent as LyapunovExponent
 from .lyapunov import lyapunov_exponent as lyapunov_exponent

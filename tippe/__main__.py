@@ -40,8 +40,8 @@ SURFACES = {
     "plane TILT": Plane,
 }
 
-#: Times at which theta is drawn.
-SAMPLES = 1500
+#: Times at which theta is drawn, and the tops on the page.
+SAMPLES = 3000
 
 
 class Help(argparse.ArgumentDefaultsHelpFormatter):
@@ -124,8 +124,17 @@ def surface_of(words: list[str]) -> AbstractSurface:
     name, *numbers = words
     for known, kind in SURFACES.items():
         if known.split()[0] == name and len(numbers) == len(known.split()) - 1:
-            return kind(*map(float, numbers))
+            try:
+                given = [float(number) for number in numbers]
+            except ValueError:
+                break
+            return kind(*given)
     raise ValueError(f"--surface {' '.join(words)} must be one of: {', '.join(SURFACES)}")
+
+
+def shown_name(options: argparse.Namespace, arena: str) -> str:
+    """What an arena is called where it is shown."""
+    return " ".join(options.surface) if arena == "surface" else arena
 
 
 def counts_eta(scene: Scene) -> bool:
@@ -176,7 +185,7 @@ def columns(options: argparse.Namespace, found: dict[str, Table]) -> list[tuple[
         table = found[arena]
         for crossing, times in (("first", table.first_time), ("last", table.last_time)):
             entries = [_entry(t, word) for t, word in zip(times[cells], table.status[cells], strict=True)]
-            shown.append((f"{arena} {place}|{crossing} [s]", entries))
+            shown.append((f"{shown_name(options, arena)} {place}|{crossing} [s]", entries))
         printed = printed_times(options, options.eta[cells[1]]) if arena == "cylinder" else None
         if printed is not None:
             shown.append(("paper|[s]", printed))
@@ -250,7 +259,7 @@ def picture(options: argparse.Namespace, found: dict[str, Table]) -> Any:
         shown = shown.reshape(len(etas), len(thetas), -1)
         ends = found[arena].last_time.reshape(len(thetas), len(etas))
         for i, eta in enumerate(etas):
-            name = " ".join(options.surface) if arena == "surface" else arena
+            name = shown_name(options, arena)
             title = f"{name}, η(0) = {eta:.4g}" if counts_eta(scene) else name
             panels.append(Panel(title, times, shown[i], thetas, ends[:, i]))
     return draw_launches(panels, options.angle)
@@ -267,7 +276,7 @@ def motions(options: argparse.Namespace, found: dict[str, Table]) -> list[Stage]
     times, groups = np.linspace(0.0, last, SAMPLES), []
     for arena, scene in scenes(options).items():
         run = moving(scene, starts(options, scene)[1], last, times, options.tolerance)
-        name = f"{arena}, θ(0) = {options.theta[row]:.4g} rad"
+        name = f"{shown_name(options, arena)}, θ(0) = {options.theta[row]:.4g} rad"
         groups.append([(name, scene, Motion(*(np.asarray(part)[row] for part in run)))])
     return stages(groups)
 

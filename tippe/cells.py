@@ -1,5 +1,6 @@
 """How the cells of a table are run: the kinds of scene, and the variables of each."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from nonholonomic.integration import (
     CROSSED,
     FAILED,
     GUARD_LOST,
+    REACHED_END,
     UNRESOLVED,
     AbstractPhase,
     Journey,
@@ -32,7 +34,7 @@ from .phases import airborne
 from .phases.sliding import phases as hybrid_phases
 from .phases.stick_slip_runs import phases as stick_slip_phases
 from .scene import Scene
-from .sensitivities import slopes_of_cells
+from .sensitivities import phased_slopes_of_cells, slopes_of_cells
 
 
 class Driver(NamedTuple):
@@ -113,7 +115,8 @@ class CellRuns(NamedTuple):
     def variables(self) -> dict[str, Variable]:
         """The table's variables, but errors and derivatives."""
         times = {name: Variable("s", np.float64, long_name=TIMES[name]) for name in self.times}
-        return times | self.driver.variables
+        grazes = Variable("1", np.int8, long_name="whether an event on the way was grazing")
+        return times | self.driver.variables | ({"grazes": grazes} if self.slopes_by and not self.driver.smooth else {})
 
     def results(self, roots: dict[str, Any], columns: dict[str, Any], tolerance: float, count: int) -> dict[str, Any]:
         """The variables of some cells.
@@ -125,33 +128,50 @@ class CellRuns(NamedTuple):
         scene, launch = cells["scene"], cells["launch"]
         size = next((len(values) for values in columns.values()), 1)
         problem = InversionProblem.of(scene, launch, self.angle, size)
+        options = {"count": count, "size": size, "solver": self.solver, "last": self.last}
+        numbers = (roots, columns, self.slopes_by, self.angle)
         if self.driver.phases is not None:
-            return self._travelled(scene, problem, tolerance, count)
+            along = functools.partial(phased_slopes_of_cells, self.driver.phases, *numbers, **options)
+            return self._travelled(scene, problem, tolerance, count, along)
         if not self.slopes_by:
             return self._named(scene, problem, self._outcome(problem, tolerance, count))
-        options = {"count": count, "size": size, "solver": self.solver, "last": self.last}
-        outcome, slopes = slopes_of_cells(roots, columns, self.slopes_by, self.angle, self.t1, tolerance, **options)
+        outcome, slopes = slopes_of_cells(*numbers, self.t1, tolerance, **options)
         return self._named(scene, problem, outcome) | slopes
 
-    def _travelled(self, scene: Scene, problem: InversionProblem, tolerance: float, count: int) -> dict[str, Any]:
-        """The variables of cells whose runs have phases."""
-
-        def journey(last: bool) -> Journey:
-            assert self.driver.phases is not None
-            phases, first = self.driver.phases(scene, problem, tolerance, last)
-            start, settings = (np.asarray(first), np.asarray(problem.states)), Settings(tolerance, self.solver)
-            ended = travel(phases, *start, self.t1, count, settings, kinds=1, passes=last)
-            if self.driver is AIRBORNE:
-                ended = ended._replace(state=np.asarray(_on_the_ground(scene, ended.state, ended.phase)))
-            return ended
-
-        found = journey(self.last)
+    def _travelled(
+        self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, along: Callable[..., Any]
+    ) -> dict[str, Any]:
+        """The variables of cells whose runs have phases; `along` takes (horizon, tolerance) and gives runs and slopes."""
+        if self.slopes_by and not self.last:
+            found, slopes, grazing = along(self.t1, tolerance)
+        else:
+            found = self._journey(scene, problem, tolerance, count, self.last)
+        if self.slopes_by and self.last:
+            # The slopes need the run up to the event alone, whose time is known by now.
+            there, slopes, grazing = along(
+                np.where(np.isfinite(found.crossing_time), found.crossing_time, 0.0), tolerance
+            )
+            grazing |= there.status != REACHED_END
+        if self.driver is AIRBORNE:
+            found = found._replace(state=np.asarray(_on_the_ground(scene, found.state, found.phase)))
         named = self._named(scene, problem, found) | dict(zip(self.driver.counts, found.counts, strict=True))
         if self.crossing == "both":
             # Through phases the first crossing takes a journey of its own, which ends there.
-            first = journey(False)
+            first = self._journey(scene, problem, tolerance, count, False)
             named["first_time"] = np.where(first.status == CROSSED, first.crossing_time, np.inf)
-        return named
+        if not self.slopes_by:
+            return named
+        # At the very start the event is there at once, whatever moves.
+        moves = (named["status"] == 0) & (named[self.times[-1]] > 0.0)
+        slopes = {name: np.where(moves, np.where(grazing, np.nan, slope), 0.0) for name, slope in slopes.items()}
+        return named | slopes | {"grazes": (moves & grazing).astype(np.int8)}
+
+    def _journey(self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, last: bool) -> Journey:
+        """The runs of cells through their phases."""
+        assert self.driver.phases is not None
+        phases, first = self.driver.phases(scene, problem, tolerance, last)
+        start, settings = (np.asarray(first), np.asarray(problem.states)), Settings(tolerance, self.solver)
+        return travel(phases, *start, self.t1, count, settings, kinds=1, passes=last)
 
     def _outcome(self, problem: InversionProblem, tolerance: float, count: int) -> Outcome:
         horizon, settings = jnp.asarray(self.t1), Settings(tolerance, self.solver)

@@ -26,9 +26,9 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.xla_cpu import stored
 
+from .body import AbstractBody, AbstractOutline
 from .friction import AbstractFriction, ContactLoad, Slip
 from .state import parts
-from .top import Top
 
 #: Where the axis' component along n stands in the state: cos(theta).
 COS_THETA = 4
@@ -53,8 +53,8 @@ class Motion(NamedTuple):
     """What the equations of motion give for one state, every vector in the moving frame.
 
     `stiffness` is the factor of N in its equation, 1 + m a A in `tippe.md`, section 2: 1 without an offset, and zero if the
-    friction due to each newton of N pulls the top down as hard as that newton pushes it up. `room` is positive where the ball
-    fits, `None` where it does everywhere.
+    friction due to each newton of N pulls the top down as hard as that newton pushes it up. `velocity` is that of the point
+    that the frame carries along. `room` is positive where the ball fits, `None` where it does everywhere.
     """
 
     rate: tuple[Component, ...]
@@ -78,34 +78,30 @@ class Dynamics(eqx.Module):
 
     frame: AbstractFrame
     friction: AbstractFriction
-    radius: Float[Array, "..."]
-    offset: Float[Array, "..."]
+    outline: AbstractOutline
     mass: Float[Array, "..."]
     gravity: Float[Array, "..."]
     per_mass: Float[Array, "..."]
     per_transverse: Float[Array, "..."]
     axial_excess: Float[Array, "..."]
-    coupling: Float[Array, "..."]
 
     @classmethod
     def of(
-        cls, body: Top, frame: AbstractFrame, friction: AbstractFriction, gravity: Float[Array, "..."]
+        cls, body: AbstractBody, frame: AbstractFrame, friction: AbstractFriction, gravity: Float[Array, "..."]
     ) -> "Dynamics":
         """The equations for a body on an arena.
 
-        **Arguments:** `frame`: that of the body's sphere on the arena; the others as for `Scene`.
+        **Arguments:** `frame`: that of the body on the arena; the others as for `Scene`.
         """
         return cls(
             frame=frame,
             friction=friction,
-            radius=body.radius,
-            offset=body.offset,
+            outline=body.outline,
             mass=body.mass,
             gravity=gravity,
             per_mass=1.0 / body.mass,
             per_transverse=1.0 / body.I1,
             axial_excess=1.0 / body.I3 - 1.0 / body.I1,
-            coupling=body.mass * body.offset / body.I1,
         )
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
@@ -115,15 +111,19 @@ class Dynamics(eqx.Module):
 
         - `state`: (8 + the arena's place, ...) as `state.py` describes it.
 
-        **Returns:** a `Motion`; `rate` is (m/s^2, 1/s, N m, 1/s). Source: `tippe.md`, section 2 (i)-(iii).
+        **Returns:** a `Motion`; `rate` is (m/s^2, 1/s, N m, 1/s). Source: `tippe.md`, section 2 (i)-(iii); with the lever of
+        `body.py` in place of a and R, on the plane, the height's second rate H' c'' + H'' c'^2 in N.
         """
         (u1, u2), e, L, place = parts(state)
-        R, a = self.radius, self.offset
+        a, R, coupling, growth = self.outline.at(e[2])
 
-        # The axis turns with the body; V is the velocity of the sphere's centre, o the rate at which it turns the frame.
+        # The axis turns with the body; V is the velocity of the centre of the sphere that touches as the body does, o the rate
+        # at which the frame turns. The frame carries that centre, or what is below it if the sphere is another at each moment.
         e_dot = scale(self.per_transverse, cross(L, e))
         V = (u1 + a * e_dot[0], u2 + a * e_dot[1])
-        o, up, place_rate, room = self.frame.carriage(place, V)
+        changing = multiply(growth, e_dot[2])
+        path = (add(V[0], multiply(changing, e[0])), add(V[1], multiply(changing, e[1])))
+        o, up, place_rate, room = self.frame.carriage(place, path)
 
         spin_momentum = dot(L, e)
         along_axis = self.axial_excess * spin_momentum
@@ -146,8 +146,9 @@ class Dynamics(eqx.Module):
         # n . acceleration of the centre = centripetal; N is on both sides through M.
         centripetal = dot(V, o)
         pull = add(multiply(self.gravity, up[2]), centripetal)
-        load = self.mass * pull - self.coupling * (L[0] * e_dot[1] - L[1] * e_dot[0])
-        stiffness = 1.0 + self.coupling * (M1 * e[1] - M2 * e[0])
+        load = self.mass * pull - coupling * (L[0] * e_dot[1] - L[1] * e_dot[0])
+        load = subtract(load, multiply(self.mass, changing, e_dot[2]))
+        stiffness = 1.0 + coupling * (M1 * e[1] - M2 * e[0])
         N = load / stiffness
 
         thrust = N * self.per_mass
@@ -157,7 +158,7 @@ class Dynamics(eqx.Module):
         e_dot = sum_vectors(e_dot, carried(e, o))
         L_dot = sum_vectors(scale(N, (M1, M2, M3)), carried(L, o))
         rate = (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate)
-        return Motion(rate, N, friction, slip, V, o, spin_momentum, stiffness, room)
+        return Motion(rate, N, friction, slip, path, o, spin_momentum, stiffness, room)
 
     def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """Rate of change of the state, (components, ...)."""

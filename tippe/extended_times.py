@@ -23,9 +23,6 @@ MOST_STEPS = 100_000
 #: The least angle [rad] distinguished from 0 in the penalty for a top that does not invert.
 LEAST_ANGLE = 1e-6
 
-#: Directions that run along together: with two, a fit of two numbers compiles for 8 s longer and then gains a fifth.
-TOGETHER = 1
-
 
 def extended_inversion_time(
     scene: Scene,
@@ -90,7 +87,7 @@ class ExtendedQuestion(AbstractQuestion):
         def run(some: tuple[Any, ...]) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
             return self._found(some, problem, leaves, cells, again)
 
-        times, slopes = in_groups(run, directions, TOGETHER)
+        times, slopes = in_groups(run, directions)
         return times, gather(slopes)
 
     def _problem(self, leaves: tuple[Array, ...], cells: int | None) -> InversionProblem:

@@ -37,7 +37,8 @@ class Launch(Bounded):
     - `place`: where the top touches the arena, instead of `eta`: (x, y) [m] on a plane, along it, a paraboloid and a graph;
       (y, eta) on a cylinder; (mu, eta) [rad], azimuth and angle from the lowest point, on a sphere, spheroid or torus;
       or (x, y, z) [m], a point of the arena but for round-off.
-    - `velocity`: (2,) [m/s] of the sphere's centre along (t1, t2); at rest by default.
+    - `velocity`: (2,) [m/s] of the sphere's centre, of other bodies of the centre of mass, along (t1, t2); at rest by
+      default.
     - `angular_velocity`: (3,) [rad/s] in (t1, t2, n), besides the spin about the axis; none by default.
 
     **Raises:** `ValueError` for numbers outside these ranges.

@@ -26,6 +26,8 @@ LONG_NAMES = {
     "mass": "mass m",
     "radius": "radius",
     "offset": "offset a",
+    "equatorial": "equatorial half axis b",
+    "polar": "polar half axis p",
     "I1": "moment of inertia I₁",
     "I3": "moment of inertia I₃",
     "gravity": "gravity g",
@@ -73,7 +75,7 @@ def launches(
     values |= axes or {}
     fixed = {number: value for number, value in values.items() if np.ndim(value) == 0}
     launch, several = _with_room(scene, values)
-    units = UNITS | scene.friction.units | dict(several.values())
+    units = UNITS | scene.body.units | scene.friction.units | dict(several.values())
     names = {number: several.get(number, (number.rsplit(".", 1)[-1],))[0] for number in values}
     # A place that is given takes the place of the argument eta.
     counts = Counter(name for number, name in names.items() if number != "launch.eta" or launch.place is None)
@@ -109,5 +111,5 @@ def _with_room(scene: Scene, values: Collection[str]) -> tuple[Launch, dict[str,
 
 def described(roots: dict[str, Any], grid: list[Axis]) -> dict[str, Any]:
     """What is asked of which scene and launch, as plain data; the values of axes stand elsewhere."""
-    found = {path: told for name, root in roots.items() for path, told in description(name, root).items()}
+    found = {path: value for name, root in roots.items() for path, value in description(name, root).items()}
     return found | {one.number: "an axis" for one in grid}

@@ -136,6 +136,6 @@ def _direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, "compon
     u1, u2, r1, r2, r3, *L = (magnitudes[i] * jnp.cos(1.0 + i) for i in range(8))
     e = parts(scene.state(launch)).axis
     frame, (place, _) = scene.frame, scene.start(launch)
-    place = frame.carriage(place, (scene.body.radius, scene.body.radius)).place_rate
+    place = frame.carriage(place, (scene.body.size, scene.body.size)).place_rate
     direction = joined((u1, u2), cross((r1, r2, r3), e), tuple(L), place)
     return jnp.broadcast_to(direction.reshape(len(direction), -1), (len(direction), cells))

@@ -1,7 +1,7 @@
 """What is measured of a tippe top: inversion times of launches, and recorded motion."""
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -9,16 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.identification import (
-    Measurements,
-    Quantities,
-    check_recording,
-    predicted,
-    sample_labels,
-    samples,
-    seen_samples,
-)
-from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.identification import AbstractRecording, Measurements, Quantities, as_quantity, predicted
+from nonholonomic.parameters import numbers, one_line, with_numbers
 from nonholonomic.validation import as_number, require
 
 from .extended_times import extended_inversion_time
@@ -77,6 +69,10 @@ class InversionTimes(eqx.Module):
     until: Any = None
     angle: Float[Array, ""] = eqx.field(converter=as_number, default=0.95 * math.pi)
     student: float | None = None
+    units: ClassVar[dict[str, str]] = {"time": "s", "error": "s", "t1": "s", "until": "s", "angle": "rad"}
+
+    def __repr__(self) -> str:
+        return one_line(self)
 
     def __check_init__(self):
         shape = np.shape(self.time)
@@ -149,7 +145,7 @@ class InversionTimes(eqx.Module):
         return jax.vmap(one)(lanes).reshape(rows, launches)
 
 
-class Recording(eqx.Module):
+class Recording(AbstractRecording):
     """A recorded run: some quantities at the readings of a clock.
 
     **Arguments:**
@@ -177,42 +173,10 @@ class Recording(eqx.Module):
     """
 
     launch: Launch
-    times: Float[Array, " times"] = eqx.field(converter=as_number)
-    value: Float[Array, "times *columns"] = eqx.field(converter=as_number)
-    error: Any = eqx.field(converter=lambda error: error if error is None else as_number(error))
-    quantity: str | tuple[str, ...] = eqx.field(
-        static=True, default="theta", converter=lambda words: tuple(words) if isinstance(words, list) else words
-    )
+    quantity: str | tuple[str, ...] = eqx.field(static=True, default="theta", converter=as_quantity)
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     student: float | None = None
-
-    def __check_init__(self):
-        check_recording(self, self.columns)
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """The names of what a sample consists of."""
-        return QUANTITIES.of(self.quantity)
-
-    @property
-    def measurements(self) -> Measurements:
-        """The samples as `Measurements`, without the missing ones."""
-        return samples(self, self.columns, QUANTITIES.angles)
-
-    @property
-    def size(self) -> int:
-        """How many numbers are predicted, missing samples included."""
-        return np.size(self.value)
-
-    @property
-    def seen(self) -> np.ndarray:
-        """Which of the predictions were measured."""
-        return seen_samples(self)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """A label for each sample."""
-        return sample_labels(self, self.columns)
+    quantities: ClassVar[Quantities] = QUANTITIES
 
 
 def predict_recordings(

@@ -34,13 +34,18 @@ def of_each_run(function: Callable[[Any], Array]) -> property:
 
     def get(self):
         if self.t.ndim == 1 and not any(is_traced(leaf) for leaf in jax.tree.leaves((self.t, self.states, self.scene))):
-            return jnp.asarray(np.asarray(compiled(self.padded()))[: len(self.t)])
+            return jax.device_put(np.asarray(compiled(self.padded()))[: len(self.t)])
         mapped = function
         for _ in range(self.t.ndim - 1):
             mapped = eqx.filter_vmap(mapped)
         return mapped(self)
 
     return property(get, doc=function.__doc__)
+
+
+def unit(vectors: Float[Array, "times 3"]) -> Float[Array, "times 3"]:
+    """Vectors at unit length."""
+    return vectors / jnp.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def check_increasing(times: Any) -> None:
@@ -137,16 +142,20 @@ class AbstractTrajectory(eqx.Module, Viewable):
 
     @of_each_run
     def velocity(self) -> Float[Array, "times 3"]:
-        """Velocity of the sphere's centre [m/s]."""
-        return self._fixed((*self.scene.dynamics.motion(self.states).velocity, self.above[1]))
+        """Velocity of the point whose path `position` is [m/s]."""
+        motion, axis = self.scene.dynamics.motion(self.states), parts(self.states).axis
+        beside = jax.jvp(self.scene.body.path_from_frame, (axis,), (motion.rate[2:5],))[1]
+        return self._fixed(sum_vectors((*motion.velocity, self.above[1]), beside))
 
     @of_each_run
     def position(self) -> Float[Array, "times 3"]:
-        """Position of the sphere's centre [m]; the plane is z = 0, the cylinder's axis x = z = 0, and a run on the plane
-        starts above the origin."""
+        """Position of the sphere's centre, of other bodies of the centre of mass [m]; the plane is z = 0, the cylinder's axis
+        x = z = 0, and a run on the plane starts above the origin."""
         frame, where = self.scene.frame, (self._place, self._path)
         centre = sum_vectors(frame.position(*where), scale(self.above[0], frame.axes(*where)[2]))
-        return jnp.stack(centre, axis=-1)
+        beside = self.scene.body.path_from_frame(parts(self.states).axis)
+        found = jnp.stack(centre, axis=-1)
+        return found if beside == (None, None, None) else found + self._fixed(beside)
 
     @of_each_run
     def jellett(self) -> Float[Array, " times"]:
@@ -229,10 +238,21 @@ class AbstractTrajectory(eqx.Module, Viewable):
         along = (1.0 / body.I3 - 1.0 / body.I1) * dot(L, e)
         return self._fixed(sum_vectors(scale(1.0 / body.I1, L), scale(along, e)))
 
+    @of_each_run
+    def rotation(self) -> Float[Array, "times 3 3"]:
+        """From the body to the fixed frame: its columns are the body's axes, the third of them e. At the start the first is
+        de/dtheta: it leans from e away from the arena's normal."""
+        # The errors of the steps take both vectors off unit length and off a right angle.
+        e, angle = unit(self.axis), self.spin_angle[:, None]
+        aside = unit(jnp.cross(e, self._fixed(tuple(self.cyclic[-3:]))))
+        across = jnp.cross(aside, e)
+        first = jnp.cos(angle) * across + jnp.sin(angle) * aside
+        return jnp.stack([first, jnp.cross(e, first), e], axis=-1)
+
     @property
     def _path(self) -> tuple[Array, ...]:
-        """The cyclic coordinates of the arena's frame."""
-        return tuple(self.cyclic)
+        """The cyclic coordinates of the arena's frame; behind them stands the vector c of `tippe/sampled.py`."""
+        return tuple(self.cyclic[:-3])
 
     @property
     def _place(self) -> tuple[Array, ...]:

@@ -27,8 +27,8 @@ QUANTITIES = {
     "jellett": Quantity("kg m3 s-1", long_name="Jellett's quantity"),
     "normal_force": Quantity("N", long_name="normal force"),
     "axis": Quantity("1", "component", "axis e"),
-    "position": Quantity("m", "component", "position of the sphere's centre"),
-    "velocity": Quantity("m s-1", "component", "velocity of the sphere's centre"),
+    "position": Quantity("m", "component", "position of the centre"),
+    "velocity": Quantity("m s-1", "component", "velocity of the centre"),
     "angular_momentum": Quantity("kg m2 s-1", "component", "angular momentum"),
     "slip": Quantity("m s-1", "tangent", "slip velocity"),
 }

@@ -2,8 +2,6 @@
 
 from typing import Any
 
-import numpy as np
-
 from nonholonomic.identification import read_columns
 
 from .launch import Launch
@@ -50,10 +48,4 @@ def read_recording(
     [0.   0.04] [0.0995 0.11  ]
     """
     read = read_columns(path, columns, fps, error, QUANTITIES)
-    single = len(read.columns) == 1
-
-    def shaped(one: Any) -> Any:
-        return one if one is None else np.squeeze(one, axis=1) if single else one
-
-    quantity = read.columns[0] if single else read.columns
-    return Recording(launch, read.times, shaped(read.value), shaped(read.error), quantity, t0, student)
+    return Recording(launch, *read, t0, student)

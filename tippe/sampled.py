@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.derivatives import sampled_run, sampled_run_by_diffrax
 from nonholonomic.geometry import carried, cross, dot, scale, sum_vectors
 from nonholonomic.integration import FAILED, GUARD_LOST, AbstractProblem, Settings
+from nonholonomic.xla_cpu import compiled_setup
 
 from .dynamics import LOSSES, Dynamics, stacked
 from .launch import Launch
@@ -37,17 +38,11 @@ class TrajectoryProblem(AbstractProblem):
     @classmethod
     def of(cls, scene: Scene, launch: Launch, cells: int | None = None) -> "TrajectoryProblem":
         """The run of one launch, or the runs of some cells, whose numbers are scalars or one per cell."""
-        radius, weight = scene.body.radius, scene.body.mass * scene.gravity
-        sine, cosine = jnp.sin(launch.theta), jnp.cos(launch.theta)
-        across = (cosine * jnp.cos(launch.azimuth), cosine * jnp.sin(launch.azimuth), -sine)
-        cyclic = (*scene.start(launch)[1], *across)
-        one = jnp.ones(())
-        extra = jnp.stack(jnp.broadcast_arrays(*[radius] * (len(cyclic) - 3), one, one, one, one, weight * radius))
-        cyclic = jnp.stack(jnp.broadcast_arrays(*cyclic))
-        rows = (scene.state(launch), cyclic, scene.scales(launch), extra)
-        if cells is not None:
-            rows = tuple(jnp.broadcast_to(row.reshape(len(row), -1), (len(row), cells)) for row in rows)
-        return cls(scene.dynamics, scene.body.I3, rows[0], rows[1], jnp.concatenate(rows[2:]))
+        return _problem(scene, launch, cells)
+
+    @property
+    def long(self) -> bool:
+        return self.dynamics.frame.long
 
     def start(self) -> tuple[Float[Array, "components ..."], Float[Array, "components ..."]]:
         rest = jnp.zeros((2, *self.state.shape[1:])) if self.rest is None else self.rest
@@ -71,8 +66,23 @@ class TrajectoryProblem(AbstractProblem):
         return self.dynamics.contact_margin(state[: len(self.state)])
 
 
+@compiled_setup
+def _problem(scene: Scene, launch: Launch, cells: int | None) -> TrajectoryProblem:
+    size, weight = scene.body.size, scene.body.mass * scene.gravity
+    sine, cosine = jnp.sin(launch.theta), jnp.cos(launch.theta)
+    across = (cosine * jnp.cos(launch.azimuth), cosine * jnp.sin(launch.azimuth), -sine)
+    cyclic = (*scene.start(launch)[1], *across)
+    one = jnp.ones(())
+    extra = jnp.stack(jnp.broadcast_arrays(*[size] * (len(cyclic) - 3), one, one, one, one, weight * size))
+    cyclic = jnp.stack(jnp.broadcast_arrays(*cyclic))
+    rows = (scene.state(launch), cyclic, scene.scales(launch), extra)
+    if cells is not None:
+        rows = tuple(jnp.broadcast_to(row.reshape(len(row), -1), (len(row), cells)) for row in rows)
+    return TrajectoryProblem(scene.dynamics, scene.body.I3, rows[0], rows[1], jnp.concatenate(rows[2:]))
+
+
 #: How a run can end; inside a transformation the index stands for the word.
-STATUS = ("reached t1", "contact_lost", "failed", "jammed", "illegal", "does_not_fit")
+STATUS = ("reached t1", "contact_lost", "failed", "jammed", "illegal", "does_not_fit", "unresolved")
 
 
 def ended(

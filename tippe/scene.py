@@ -18,6 +18,7 @@ from nonholonomic.geometry import (
     cross,
     dot,
     frame_of,
+    multiply,
     none_if_zero,
     place_named,
     room_bounds,
@@ -26,6 +27,7 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.validation import Bound, Bounded, as_number, require_all
 
+from .body import AbstractBody
 from .dynamics import Dynamics
 from .friction import AbstractFriction, Frictionless
 from .launch import Launch
@@ -47,7 +49,7 @@ class Scene(Bounded):
 
     **Arguments:**
 
-    - `body`: a `Top`.
+    - `body`: a `Top`; or a `SpheroidBody` or `ConvexBody`, on a plane, with `contact="stop"` and friction without phases.
     - `surface`: the arena: `Plane(tilt)`, `Cylinder(radius)`, `Sphere(radius)`, `Spheroid(equatorial, polar)`, `Torus(ring,
       tube)`, `Paraboloid(p)`, `Graph(height)` or `Implicit(function)`.
     - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
@@ -81,7 +83,7 @@ class Scene(Bounded):
 
     units: ClassVar[dict[str, str]] = {"gravity": "m s-2", "restitution": "1"}
 
-    body: Top
+    body: AbstractBody
     surface: AbstractSurface = Plane()
     friction: AbstractFriction = Frictionless()
     gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81)
@@ -90,14 +92,23 @@ class Scene(Bounded):
     side: str | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        parts = (("body", self.body, Top), ("surface", self.surface, AbstractSurface))
-        for name, part, kind in (*parts, ("friction", self.friction, AbstractFriction)):
+        if not isinstance(self.body, AbstractBody):
+            raise ValueError(f"body = {self.body!r} must be a Top, a SpheroidBody or a ConvexBody")
+        for name, part, kind in (
+            ("surface", self.surface, AbstractSurface),
+            ("friction", self.friction, AbstractFriction),
+        ):
             if not isinstance(part, kind):
                 raise ValueError(f"{name} = {part!r} must be a {kind.__name__.removeprefix('Abstract')}")
         # This raises if the surface has no such side.
         self.surface.sign(self.side, "inside")
         if self.contact not in ("stop", "hybrid"):
             raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
+        if self.restitution is not None and self.contact == "stop":
+            raise ValueError(f"restitution = {self.restitution!r} must be left out where contact = 'stop'")
+        if not isinstance(self.body, Top):
+            self._check_convex(type(self.body).__name__)
+            return
         if self.contact == "hybrid" and self.body.stem is not None and not self.level:
             raise ValueError(
                 f"contact = 'hybrid' must be on a level Plane() for a top with a stem, not on {self.surface!r}"
@@ -106,23 +117,30 @@ class Scene(Bounded):
             raise ValueError(f"contact = 'hybrid' must be with friction at a point, not with {self.friction!r}")
         if self.contact == "stop" and self.body.stem is not None:
             raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
-        if self.restitution is not None and self.contact == "stop":
-            raise ValueError(f"restitution = {self.restitution!r} must be left out where contact = 'stop'")
+
+    def _check_convex(self, kind: str) -> None:
+        """Raise `ValueError` for what only a sphere can: its contact follows from the place of its centre."""
+        if not isinstance(self.surface, Plane):
+            raise ValueError(f"surface = {self.surface!r} must be a Plane for a {kind}; a Top runs on any arena")
+        if self.contact != "stop":
+            raise ValueError(f"contact = {self.contact!r} must be 'stop' for a {kind}; a Top flies on")
+        if self.friction.set_valued:
+            raise ValueError(f"friction = {self.friction!r} must be a law without phases for a {kind}, such as Coulomb")
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.gravity, "gravity", above=0.0)
-        yield from room_bounds(self.surface, self.surface.sign(self.side, "inside"), self.body.radius)
+        yield from room_bounds(self.surface, self.surface.sign(self.side, "inside"), self.body.size)
         if self.restitution is not None:
             yield Bound(self.restitution, "restitution", at_least=0.0, at_most=1.0)
 
     @property
     def frame(self) -> AbstractFrame:
-        """The moving frame of the top's sphere on the arena."""
-        side, pull = self.surface.sign(self.side, "inside"), PULL * jnp.sqrt(self.gravity / self.body.radius)
+        """The moving frame of the body on the arena."""
+        side, pull = self.surface.sign(self.side, "inside"), PULL * jnp.sqrt(self.gravity / self.body.size)
         if self.contact == "hybrid" and not self.level:
             # A flight takes the top anywhere: the frame that knows where it is.
-            return CarriedFrame(self.surface, self.body.radius, pull, side)
-        return frame_of(self.surface, side, self.body.radius, pull)
+            return CarriedFrame(self.surface, self.body.size, pull, side)
+        return frame_of(self.surface, side, self.body.size, pull)
 
     @property
     def level(self) -> bool:
@@ -153,7 +171,7 @@ class Scene(Bounded):
                 yield Bound(launch.eta, "eta", at_least=0.0, at_most=0.0, why=f"a place on a {kind} is given by place")
             return
         counts_from_below = len(launch.place) == 2 and names[0] == "mu"
-        for bound in surface.place_bounds(place_named(surface, launch.place), self.body.radius):
+        for bound in surface.place_bounds(place_named(surface, launch.place), self.body.size):
             if counts_from_below and bound.name == "place[1]":
                 yield Bound(launch.place[1], "place[1]", at_least=0.0, at_most=math.pi, why="from the lowest point")
             else:
@@ -181,21 +199,21 @@ class Scene(Bounded):
             turning = launch.angular_velocity
             along = dot(turning, e)
             L = sum_vectors(L, scale(body.I1, turning), scale((body.I3 - body.I1) * along, e))
-            u = sum_vectors(u, scale(-body.offset, cross(turning, e)[:2]))
+            u = sum_vectors(u, scale(multiply(-1.0, body.offset_of_path), cross(turning, e)[:2]))
         return joined(u, e, L, self.start(launch)[0])
 
     def scales(self, launch: Launch) -> Float[Array, "components ..."]:
         """Magnitudes by which absolute errors of the state are measured, component by component.
 
-        Velocities count in units of sqrt(g R), directions in units of 1, angular momenta in units of the launch's own,
-        or of I1 sqrt(g / R) where that is more. For a launch within `NEARLY_UPRIGHT` of the normal, what vanishes with
-        the tilt counts in proportion to it; otherwise errors would hide its growth, which decides when the top turns over.
+        Velocities count in units of sqrt(g R) with the body's size R, directions in units of 1, angular momenta in units of the
+        launch's own, or of I1 sqrt(g / R) where that is more. For a launch within `NEARLY_UPRIGHT` of the normal, what vanishes
+        with the tilt counts in proportion to it; otherwise errors would hide its growth, which decides when the top turns over.
 
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
         one = jnp.ones_like(launch.theta)
-        rate = jnp.sqrt(self.gravity / self.body.radius)
-        velocity = rate * self.body.radius
+        rate = jnp.sqrt(self.gravity / self.body.size)
+        velocity = rate * self.body.size
         momentum = jnp.maximum(self.body.I3 * jnp.abs(launch.spin), self.body.I1 * rate)
         if launch.angular_velocity is not None:
             turning = launch.angular_velocity
@@ -231,20 +249,22 @@ class Scene(Bounded):
         body, dynamics = self.body, self.dynamics
         (u1, u2), e, L, place = parts(state)
         e3_dot = (L[0] * e[1] - L[1] * e[0]) / body.I1
-        speed2 = u1**2 + u2**2 + (body.offset * e3_dot) ** 2
+        speed2 = u1**2 + u2**2 + (body.outline.at(e[2]).offset * e3_dot) ** 2
         axial = dot(L, e)
         rotation = (dot(L, L) - axial**2) / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
-        height = dynamics.frame.height(place) - body.offset * dot(e, dynamics.frame.vertical(place))
+        height = dynamics.frame.height(place) + dot(body.mass_from_frame(e), dynamics.frame.vertical(place))
         return 0.5 * body.mass * speed2 + rotation + body.mass * self.gravity * height
 
     def jellett(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Jellett's quantity L.(R n - a e) [kg m^3/s]: constant on the plane for every friction at the contact point.
+        """Jellett's quantity L.(R n - a e) [kg m^3/s]: for a sphere constant on the plane under every friction at the contact
+        point. Of other bodies -L.r, which is constant only nearly, and while they spin fast.
 
         On a curved arena it changes at the rate R L.n', and a contact torque N tau changes it at the rate
         N tau.(R n - a e) (`tippe.md`, section 2).
         """
         _, e, L, _ = parts(state)
-        return self.body.radius * L[2] - self.body.offset * dot(e, L)
+        lever = self.body.outline.at(e[2])
+        return lever.radius * L[2] - lever.offset * dot(e, L)
 
     def theta(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Angle [rad] from the arena's normal to the axis, in [0, pi]."""

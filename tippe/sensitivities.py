@@ -1,15 +1,16 @@
 """Derivatives of the inversion times of a table's cells with respect to parameters of the scene and the launch."""
 
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from nonholonomic.derivatives import compiled_march_with_slopes, directions_of, natural_size
-from nonholonomic.integration import Outcome, Settings
+from nonholonomic.derivatives import compiled_march_with_slopes, directions_of, natural_size, travel_with_slopes
+from nonholonomic.integration import Journey, Outcome, Settings
 from nonholonomic.parameters import full_name, numbers, with_numbers
 from nonholonomic.sweeps import Variable
 
@@ -100,6 +101,70 @@ def _problem_and_directions(
         cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))
         return InversionProblem.of(cells["scene"], cells["launch"], angle, size)
 
+    return _with_directions(build, roots, columns, names)
+
+
+def phased_slopes_of_cells(
+    phases_of: Callable[..., Any],
+    roots: dict[str, Any],
+    columns: dict[str, Any],
+    names: list[str],
+    angle: float,
+    t1: float | Float[np.ndarray, " cells"],
+    tolerance: float,
+    *,
+    count: int,
+    size: int,
+    solver: diffrax.AbstractERK,
+    last: bool,
+) -> tuple[Journey, dict[str, Any], Bool[np.ndarray, " size"]]:
+    """What `slopes_of_cells` gives, for runs of several phases.
+
+    **Arguments:** as there, and
+
+    - `phases_of`: the phases, as `Driver` has them.
+    - `t1`: horizon [s]; where the `last` crossing counts, its time in every cell, at which the runs end.
+
+    **Returns:** the `Journey`; name of the variable -> derivatives (size,); and where these have no digits, because an event
+    on the way was grazing. Source: saltation at every change of phase (`nonholonomic/derivatives/varied_phases.py`).
+    """
+    numbers = (jnp.asarray(angle, float), jnp.asarray(tolerance, float))
+    built = _phases_and_directions(phases_of, roots, columns, names, *numbers, size, last)
+    (phases, first, states), directions, sizes = built
+    directions = tuple((one[0], one[2]) for one in directions)
+    # In a loop the stages compile in a third of the time, and there is a program for every phase.
+    settings = Settings(tolerance, solver, looped=True)
+    given = (directions, np.asarray(first), np.asarray(states), t1, count, settings)
+    journey, found = travel_with_slopes(phases, *given, kinds=1, ends_on_event=not last)
+    slopes = [slope / np.asarray(size) for slope, size in zip(found.slopes, sizes, strict=True)]
+    return journey, dict(zip(slope_names(names), slopes, strict=True)), found.grazing
+
+
+@eqx.filter_jit
+def _phases_and_directions(
+    phases_of: Callable[..., Any],
+    roots: dict[str, Any],
+    columns: dict[str, Any],
+    names: list[str],
+    angle: Float[Array, ""],
+    tolerance: Float[Array, ""],
+    size: int,
+    last: bool,
+) -> tuple[Any, tuple[Any, ...], list[Float[Array, "..."]]]:
+    """The phases of the cells, the number of each one's first and its state there; tangents and sizes as above."""
+
+    def build(*moving: Any) -> Any:
+        cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))
+        problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
+        return (*phases_of(cells["scene"], problem, tolerance, last), problem.states)
+
+    return _with_directions(build, roots, columns, names)
+
+
+def _with_directions(
+    build: Callable[..., Any], roots: dict[str, Any], columns: dict[str, Any], names: list[str]
+) -> tuple[Any, tuple[Any, ...], list[Float[Array, "..."]]]:
+    """What is built from the numbers to differentiate by, its tangents along them, and by how much these move each."""
     cells = with_numbers(roots, columns)
     values = {name: value for root, tree in cells.items() for name, value in numbers(root, tree).items()}
     point = tuple(jnp.asarray(values[name], float) for name in names)

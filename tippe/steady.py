@@ -44,7 +44,12 @@ from .top import Top
 
 
 def proportions(body: Top) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """The two numbers that classify a top: alpha = a / R and gamma = I1 / I3."""
+    """The two numbers that classify a top: alpha = a / R and gamma = I1 / I3.
+
+    **Raises:** `ValueError` for a body that is no `Top`, of which these formulas do not hold.
+    """
+    if not isinstance(body, Top):
+        raise ValueError(f"body = {body!r} must be a Top: the formulas are those of a sphere")
     return body.offset / body.radius, body.I1 / body.I3
 
 
@@ -101,9 +106,9 @@ def jellett_thresholds(scene: Scene) -> tuple[Float[Array, "..."], Float[Array, 
 
     Below the first, the upright top is stable; above the second, the inverted one is (Rutstam's lambda_thres).
     """
-    body = scene.body
-    upright = (body.radius - body.offset) * body.I3 * upright_critical_spin(scene)
-    inverted = (body.radius + body.offset) * body.I3 * inverted_critical_spin(scene)
+    (alpha, _), body = proportions(scene.body), scene.body
+    upright = (1.0 - alpha) * body.radius * body.I3 * upright_critical_spin(scene)
+    inverted = (1.0 + alpha) * body.radius * body.I3 * inverted_critical_spin(scene)
     return upright, inverted
 
 

@@ -72,7 +72,9 @@ def inversion_table(
     or jammed, when and at what angle), `steps` and `rejected`. With `errors` also `time_error` [s], infinite where the two
     runs disagree on the status or failed, 0 where they agree that there is no time; `Table.digits("time")` shows the digits
     it leaves. With `sensitivities` also the derivative of `time` by each number, `time_by_mu` for `"scene.friction.mu"`, 0
-    where the top did not invert. A scene with `contact="hybrid"` flies on where contact is lost, and the angle counts in
+    where the top did not invert. It goes through flights, impacts, stick and slip; there `grazes` is 1 where an event on the
+    way, such as a landing, was grazing, so that within the tolerance it may not happen at all: the derivative is then NaN. A
+    scene with `contact="hybrid"` flies on where contact is lost, and the angle counts in
     flight too; `hops` is the number of flights until the run ended, and `status` may be "unresolved" (10 000 of them in a
     row, or sphere and stem on the plane together with so much friction that the forces are not determined). With
     `SetValuedCoulomb`, `sticks` is how often a slip has turned into rolling, and `status` may be "unresolved" (too many
@@ -115,9 +117,8 @@ def inversion_table(
     roots, grid, units = launches(scene, given, axes, t1, tolerance)
     paths = sensitivity_names(roots, sensitivities)
     driver = driver_of(scene)
-    if not driver.smooth and (method == "diffrax" or paths):
-        what = "method = 'diffrax'" if method == "diffrax" else f"sensitivities = {sensitivities!r}"
-        raise ValueError(f"{what} is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
+    if not driver.smooth and method == "diffrax":
+        raise ValueError("method = 'diffrax' is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
     runs = CellRuns(driver, float(t1), float(angle), crossing, solver, method, paths)
     job = InversionJob(runs, roots, float(tolerance), errors)
 

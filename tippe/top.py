@@ -9,12 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from nonholonomic.geometry import Vector
 from nonholonomic.validation import Bound, Bounded, as_number, is_traced
+
+from .body import AbstractBody, Round
 
 #: Units in which moments of inertia are given by mistake, in kg m^2.
 INERTIAS = {"kg cm^2": 1e-4, "kg mm^2": 1e-6, "g cm^2": 1e-7, "g mm^2": 1e-9}
 
-#: The greatest radius [m] that is not taken for one in another unit, and the range of I1 / (m R^2) of bodies.
+#: The radius [m] above which another unit is suspected, and the range of I1 / (m R^2) outside of which one is.
 GREATEST_RADIUS = 1.0
 RATIOS = (0.1, 2.0)
 
@@ -51,7 +54,7 @@ class Stem(Bounded):
         yield Bound(self.offset, "stem offset", above=0.0)
 
 
-class Top(Bounded):
+class Top(AbstractBody):
     """A tippe top: a sphere with the centre of mass off its centre, symmetric about the axis e, and the stem's end if any.
 
     The centre of mass lies at -`offset` e from the sphere's centre, e being the direction of the stem.
@@ -98,12 +101,29 @@ class Top(Bounded):
         yield Bound(self.radius, "radius", above=0.0)
         yield Bound(self.offset, "offset", at_least=0.0)
         yield Bound(self.offset, "offset", below=self.radius, why="the centre of mass lies inside the sphere")
-        yield Bound(self.I1, "I1", above=0.0)
-        yield Bound(self.I3, "I3", above=0.0)
-        yield Bound(self.I3, "I3", at_most=2.0 * self.I1, why="I3 <= 2 I1 for every rigid body")
+        yield from self.inertia_bounds()
         if self.stem is not None:
             reach = self.offset + jnp.abs(self.radius - self.stem.radius)
             yield Bound(self.stem.offset, "stem offset", above=reach, why="neither sphere lies within the other")
+
+    @property
+    def outline(self) -> Round:
+        return Round(self.offset, self.radius, self.mass * self.offset / self.I1)
+
+    @property
+    def size(self) -> Float[Array, "..."]:
+        return self.radius
+
+    @property
+    def offset_of_path(self) -> Float[Array, "..."]:
+        return self.offset
+
+    def mass_from_frame(self, axis: Vector) -> Vector:
+        return (-self.offset * axis[0], -self.offset * axis[1], -self.offset * axis[2])
+
+    def path_from_frame(self, axis: Vector) -> Vector:
+        # The frame carries the centre of the sphere along, whose path is reported too.
+        return (None, None, None)
 
     def suspicion(self) -> str | None:
         numbers = (self.mass, self.radius, self.I1)

@@ -11,15 +11,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import scale, sum_vectors
-from nonholonomic.integration import Followed, PhasedPath, Settings, follow
+from nonholonomic.integration import Followed, PhasedPath, Settings, explicit_tableau, follow
 from nonholonomic.progress import Progress
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require_all
+from nonholonomic.xla_cpu import on_device
 
 from .inversion import check_run, run_bounds
 from .launch import Launch
 from .observables import AbstractTrajectory, check_increasing, of_each_run
-from .phases.airborne_trajectory import simulate_airborne
-from .phases.flight_trajectory import HybridTrajectory, simulate_hybrid
+from .phases.airborne_trajectory import sampled_airborne, simulate_airborne
+from .phases.flight_trajectory import HybridTrajectory, sampled_hybrid, simulate_hybrid
 from .phases.stick_slip_runs import follow_stick_slip
 from .sampled import STATUS, TrajectoryProblem, ended, sampled
 from .scene import Scene
@@ -28,10 +29,10 @@ from .scene import Scene
 class Trajectory(AbstractTrajectory):
     """A run of a tippe top, or a batch of runs, with the batch first.
 
-    Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame
-    (t1, t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre; `contact` is where it
-    touches the arena, `normal` the arena's normal there. `rotation` (times, 3, 3) takes the body's axes to the fixed frame, and
-    `angular_velocity` is the rate at which it turns.
+    Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame (t1,
+    t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre, of bodies that are no
+    sphere those of the centre of mass; `contact` is where the body touches the arena, `normal` the arena's normal there.
+    `rotation` (times, 3, 3) takes the body's axes to the fixed frame, and `angular_velocity` is the rate at which it turns.
 
     `status` is "reached t1", "contact_lost", "failed", "jammed" or "does_not_fit"; inside a transformation it is a code 0, 1,
     2, 3, 5, or 4, "illegal", for numbers out of range, for which everything is NaN. The run ends at `end_time`. The top does
@@ -88,21 +89,8 @@ class Trajectory(AbstractTrajectory):
     def contact(self) -> Float[Array, "times 3"]:
         """The point at which the top touches the arena [m]."""
         frame, where = self.scene.frame, (self._place, self._path)
-        foot = sum_vectors(frame.position(*where), scale(-self.scene.body.radius, frame.axes(*where)[2]))
+        foot = sum_vectors(frame.position(*where), scale(-self.scene.body.size, frame.axes(*where)[2]))
         return jnp.stack(foot, axis=-1)
-
-    @of_each_run
-    def rotation(self) -> Float[Array, "times 3 3"]:
-        """From the body to the fixed frame: its columns are the body's axes, the third of them e. At the start the first is
-        de/dtheta: it leans from e away from the arena's normal."""
-        e, across, angle = self.axis, self._fixed(tuple(self.cyclic[-3:])), self.spin_angle[:, None]
-        aside = jnp.cross(e, across)
-        first = jnp.cos(angle) * across + jnp.sin(angle) * aside
-        return jnp.stack([first, jnp.cross(e, first), e], axis=-1)
-
-    @property
-    def _path(self) -> tuple[Array, ...]:
-        return tuple(self.cyclic[:-3])
 
     @of_each_run
     def slip(self) -> Float[Array, "times 2"]:
@@ -111,9 +99,7 @@ class Trajectory(AbstractTrajectory):
 
     def resampled(self, times: Float[np.ndarray, " times"]) -> "Trajectory":
         """The same run at other times, which are not checked."""
-        states = jnp.asarray(self.dense.at(times))
-        size = len(self.states)
-        found = (jnp.asarray(times), states[:size], states[size:-2], states[-2], states[-1])
+        found = on_device(times, *_parts(len(self.states), self.dense.at(times)))
         return eqx.tree_at(lambda one: (one.t, one.states, one.cyclic, one.spin_angle, one.work), self, found)
 
 
@@ -145,7 +131,9 @@ def simulate(
 
     **Returns:** a `Trajectory`, for a hybrid scene a `HybridTrajectory`.
 
-    **Raises:** `ValueError` for arguments out of range, and for a hybrid scene inside a transformation.
+    **Raises:** `ValueError` for arguments out of range; inside a transformation for a law with phases (`SetValuedCoulomb`),
+    and for a hybrid scene with `adjoint`, with a solver that is not an explicit Runge-Kutta one, and where derivatives by
+    `times` or second derivatives are asked for.
 
     **Example:**
 
@@ -167,14 +155,12 @@ def simulate(
         times = as_number(times)
         require_all(times_bounds(times, t1))
         check_increasing(times)
+    if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
+        return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
     if scene.contact == "hybrid":
-        if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1))):
-            raise ValueError("contact = 'hybrid' must be 'stop' inside jit, vmap and grad")
         with Progress(1, "run", "simulating"):
             follow_flights = simulate_hybrid if scene.level else simulate_airborne
             return follow_flights(scene, launch, float(t1), times, tolerance, solver)
-    if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
-        return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
     with Progress(1, "run", "simulating"):
         run = TrajectoryProblem.of(scene, launch)
         through = follow_stick_slip if scene.friction.set_valued else follow
@@ -192,7 +178,7 @@ def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
-def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: Any, *options: Any) -> Trajectory:
+def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: Any, *options: Any) -> Any:
     """What `_traced` gives, or NaN and the status "illegal" where a traced number is out of range."""
     if times is None:
         # It raises the error that says so.
@@ -219,24 +205,29 @@ def _traced(
     tolerance: float,
     solver: diffrax.AbstractSolver,
     adjoint: diffrax.AbstractAdjoint | None,
-) -> Trajectory:
+) -> Trajectory | HybridTrajectory:
     if scene.friction.set_valued:
         raise ValueError(
             f"friction = {type(scene.friction).__name__} must be a law without phases inside jit, vmap and grad"
         )
     if times is None:
         raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
-    found = sampled(scene, launch, times, t1, Settings(tolerance, solver), adjoint)
+    settings = Settings(tolerance, solver)
+    if scene.contact == "hybrid":
+        if adjoint is not None:
+            raise ValueError(f"adjoint = {adjoint!r} must be left out for contact = 'hybrid'")
+        explicit_tableau(solver)
+        return (sampled_hybrid if scene.level else sampled_airborne)(scene, launch, times, t1, settings)
+    found = sampled(scene, launch, times, t1, settings, adjoint)
     status = found.status.astype(int)
     stats = {"accepted": found.accepted.astype(int), "rejected": found.rejected.astype(int)}
     return Trajectory(
-        times, scene, *_parts(TrajectoryProblem.of(scene, launch), found.states), status, found.end_time, stats, None
+        times, scene, *_parts(len(scene.state(launch)), found.states), status, found.end_time, stats, None
     )
 
 
-def _parts(run: TrajectoryProblem, states: Float[Array, "components times"]) -> tuple[Any, Any, Any, Any]:
-    """State, cyclic coordinates, spin angle and work."""
-    lean = len(run.state)
+def _parts(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:
+    """State, with its number of components, cyclic coordinates, spin angle and work, of an array (components, times)."""
     return states[:lean], states[lean:-2], states[-2], states[-1]
 
 
@@ -245,10 +236,10 @@ _ended = eqx.filter_jit(ended)
 
 def _as_trajectory(scene: Scene, run: TrajectoryProblem, path: Followed | PhasedPath) -> Trajectory:
     # NumPy cuts these: JAX would compile every cut anew for every number of steps.
-    states, times = np.asarray(path.states), jnp.asarray(path.times)
-    last = jnp.asarray(states[:, -1])
+    states = np.asarray(path.states)
+    times, end, last = on_device(path.times, path.times[-1], states[:, -1])
     status = STATUS[int(_ended(run, last, jnp.asarray(path.guard_lost), jnp.asarray(path.failed)))]
     sticks = {"sticks": int(path.counts[0])} if isinstance(path, PhasedPath) else {}
-    return Trajectory(
-        times, scene, *map(jnp.asarray, _parts(run, states)), status, jnp.asarray(path.times[-1]), {}, path
-    ).with_stats(path, **sticks)
+    return Trajectory(times, scene, *on_device(*_parts(len(run.state), states)), status, end, {}, path).with_stats(
+        path, **sticks
+    )

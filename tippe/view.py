@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from nonholonomic.parameters import told_apart
 from nonholonomic.views import (
     COLOURS,
     DARK,
@@ -21,14 +22,17 @@ from nonholonomic.views import (
     arena,
     ball,
     rod,
+    striped,
+    told_by_colour,
     turned,
 )
 
+from .body import AbstractBody
 from .scene import Scene
 from .top import Top
 
-#: Most radians by which the top spins from one frame to the next, and most frames.
-SPIN_PER_FRAME = 0.4
+#: Radians by which the top turns from one frame to the next, about, and most frames.
+TURN_PER_FRAME = 0.4
 MOST_FRAMES = 12_000
 LEAST_FRAMES = 400
 
@@ -36,14 +40,14 @@ LEAST_FRAMES = 400
 #: longest slip.
 AXIS, WEIGHT, SLIP = 1.6, 1.5, 3.0
 
-#: Slips that are greater than this part of all are not drawn longer: the first moments would hide the rest.
+#: Slips above this quantile are not drawn longer: the first moments would hide the rest.
 COMMON_SLIP = 0.9
 
 GREEN, VIOLET, BLUE, GOLD = 0x1F8A4C, 0x7B4FA3, 0x1B6CA8, 0xE0A100
 
 
 class Motion(NamedTuple):
-    """What is drawn of a run: vectors in the fixed frame, (times, 3)."""
+    """What is drawn of a run: vectors in the fixed frame, (times, 3), and the rotation to it from the body."""
 
     times: Float[Array, " times"]
     position: Float[Array, "times 3"]
@@ -51,7 +55,7 @@ class Motion(NamedTuple):
     normal: Float[Array, "times 3"]
     contact: Float[Array, "times 3"]
     slip: Float[Array, "times 3"]
-    spin_angle: Float[Array, " times"]
+    rotation: Float[Array, "times 3 3"]
     theta: Float[Array, " times"]
     energy: Float[Array, " times"]
     jellett: Float[Array, " times"]
@@ -63,8 +67,8 @@ class Motion(NamedTuple):
         body, slip = run.scene.body, run.slip
         zero = jnp.zeros_like(run.t)
         position, axis, normal = run.position, run.axis, run._fixed((zero, zero, zero + 1.0))
-        contact = position - body.radius * normal
-        if body.stem is not None:
+        contact = run.contact if not isinstance(body, Top) else position - body.radius * normal
+        if isinstance(body, Top) and body.stem is not None:
             stem = position + (body.stem.offset - body.offset) * axis - body.stem.radius * normal
             contact = jnp.where((run.contact == 1)[:, None], stem, contact)
         return cls(
@@ -74,7 +78,7 @@ class Motion(NamedTuple):
             normal,
             contact,
             run._fixed((slip[:, 0], slip[:, 1], zero)),
-            run.spin_angle,
+            run.rotation,
             run.theta,
             run.energy,
             run.jellett,
@@ -83,21 +87,26 @@ class Motion(NamedTuple):
 
 
 _motion = eqx.filter_jit(Motion.of)
+_turning = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis=-1))
 
 
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     """Runs as they are drawn: a stage for each, or one for all if they are to be overlaid."""
-    named = [(f"θ(0) = {float(run.theta[0]):.3g} rad", run.scene, motion(run)) for run in runs]
+    starts = [f"θ(0) = {float(run.theta[0]):.3g} rad, {float(run.spin[0]):.4g} rad/s" for run in runs]
+    names = told_apart(starts, [run.scene for run in runs])
+    named = [(name, run.scene, motion(run)) for name, run in zip(names, runs, strict=True)]
     return stages([named] if overlaid else [[one] for one in named])
 
 
 def motion(run: Any) -> Motion:
-    """The motion of one run at times so close together that its spin is seen, where it can be told between its own."""
+    """The motion of one run at times so close together that its turning is seen, where it can be told between its own."""
     if run.t.ndim > 1:
         raise ValueError(f"a batch of runs, of shape {run.t.shape}, cannot be shown: take one of them")
     if run.dense is not None:
-        angle = np.abs(np.asarray(run.spin_angle))
-        frames = int(np.clip(np.ptp(angle) / SPIN_PER_FRAME, LEAST_FRAMES, MOST_FRAMES))
+        times = np.asarray(run.t)
+        # Not the angle about the axis alone: half-way up a top turns across it, as fast.
+        turned_by = np.trapezoid(np.asarray(_turning(run.padded()))[: len(times)], times)
+        frames = int(np.clip(turned_by / TURN_PER_FRAME, LEAST_FRAMES, MOST_FRAMES))
         run = run.at(np.linspace(0.0, float(run.end_time), frames))
     count = len(run.t)
     return Motion(*(np.asarray(part)[:count] for part in _motion(run.padded())))
@@ -107,12 +116,12 @@ def show(scene: Scene, motion: Motion, number: int, name: str) -> Show:
     """One run as it is drawn, the `number`-th of its stage."""
     body, colour = scene.body, COLOURS[number % len(COLOURS)]
     motion = Motion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
-    radius, weight = float(body.radius), float(body.mass * scene.gravity)
+    radius, weight = float(body.size), float(body.mass * scene.gravity)
     tip = AXIS * radius
     speed = np.linalg.norm(motion.slip, axis=-1)
     longest = max(float(np.quantile(speed, COMMON_SLIP)), 1e-12)
     slip = motion.slip * (SLIP * radius / np.maximum(speed, longest))[:, None]
-    turning = turned(rotation(motion.axis, motion.spin_angle))
+    turning = turned(motion.rotation)
     force = (WEIGHT * radius / weight * motion.normal_force)[:, None] * motion.normal
     lifted = motion.contact + 0.02 * radius * motion.normal
     # Within the sphere it could not be seen.
@@ -144,11 +153,13 @@ def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
     """A stage for each group of runs, which have one arena, with their names; colours tell all runs apart."""
     found, number = [], 0
     for group in groups:
-        (_, scene, first), radius = group[0], float(group[0][1].body.radius)
+        (_, scene, first), radius = group[0], float(group[0][1].body.size)
         points = np.concatenate([motion.contact for _, _, motion in group])
         ground = arena(scene.surface, points, first.normal[0], 4.0 * radius, 2.5 * radius)
-        shows = tuple(show(one, motion, number + k, name) for k, (name, one, motion) in enumerate(group))
-        found.append(Stage(", ".join(name for name, _, _ in group), ground, shows))
+        shows = told_by_colour(
+            tuple(show(one, motion, number + k, name) for k, (name, one, motion) in enumerate(group))
+        )
+        found.append(Stage("; ".join(name for name, _, _ in group), ground, shows))
         number += len(group)
     return found
 
@@ -160,8 +171,10 @@ def aside(normal: Float[np.ndarray, "times 3"]) -> Float[np.ndarray, "times 3"]:
     return across / np.linalg.norm(across, axis=-1, keepdims=True)
 
 
-def meshes(body: Top, colour: int) -> tuple[Mesh, ...]:
-    """The sphere in two colours, and the stem: as it is, or a short one that only shows where the axis points."""
+def meshes(body: AbstractBody, colour: int) -> tuple[Mesh, ...]:
+    """The body in two colours; of a top with the stem, as it is, or a short one that only shows where the axis points."""
+    if not isinstance(body, Top):
+        return striped(profile(body), (colour, PALE))
     radius = float(body.radius)
     sphere = ball(radius, (colour, PALE))
     if body.stem is None:
@@ -170,18 +183,8 @@ def meshes(body: Top, colour: int) -> tuple[Mesh, ...]:
     return (*sphere, rod(0.8 * knob, 0.0, end, knob, DARK))
 
 
-def rotation(
-    axis: Float[np.ndarray, "times 3"], spin_angle: Float[np.ndarray, " times"]
-) -> Float[np.ndarray, "times 3 3"]:
-    """Rotations from body to fixed frame: carried along with the axis without turning about it, then turned by the spin."""
-    first = np.cross(axis[0], np.eye(3)[np.argmin(np.abs(axis[0]))])
-    carried = [first / np.linalg.norm(first)]
-    for old, new in zip(axis[:-1], axis[1:], strict=True):
-        # The shortest turn takes the old axis to the new one, and what is across it along.
-        along = carried[-1] - (carried[-1] @ new) / (1.0 + old @ new) * (old + new)
-        along -= (along @ new) * new
-        carried.append(along / np.linalg.norm(along))
-    x = np.stack(carried)
-    y = np.cross(axis, x)
-    cosine, sine = np.cos(spin_angle)[:, None], np.sin(spin_angle)[:, None]
-    return np.stack([cosine * x + sine * y, cosine * y - sine * x, axis], axis=-1)
+def profile(body: AbstractBody) -> Float[np.ndarray, "points 2"]:
+    """The meridian of a body about its centre of mass, from the top of its axis down: (distance from the axis, height) [m]."""
+    theta = jnp.linspace(jnp.pi, 0.0, 49)
+    lever = body.outline.at(jnp.cos(theta))
+    return np.stack([lever.radius * jnp.sin(theta), lever.offset - lever.radius * jnp.cos(theta)], axis=-1)

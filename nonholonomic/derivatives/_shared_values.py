@@ -3,7 +3,7 @@
 XLA fuses every result of a function over many lanes with everything that leads to it, and computes what several results
 share again for each. For the derivatives of a field, where nearly everything is shared, that multiplies the work. Here a
 function is split into its operations, and values that are needed again are stored: in levels, each joined into one array
-followed by a barrier, as in `vector.stored`.
+followed by a barrier, as in `xla_cpu.stored`.
 """
 
 from collections import Counter

@@ -32,6 +32,10 @@ class VariedProblem(AbstractProblem):
     states: Float[Array, "twice_components_and_one cells"]
     magnitudes: Float[Array, "components cells"]
 
+    @property
+    def long(self) -> bool:
+        return self.problem.long
+
     def start(self) -> tuple[Float[Array, "all cells"], Float[Array, "all cells"]]:
         ones = jnp.ones((self.states.shape[0] - len(self.magnitudes), *self.states.shape[1:]))
         return self.states, jnp.concatenate([self.magnitudes, ones])
@@ -125,11 +129,12 @@ def exponent_of(
 ) -> tuple[Float[np.ndarray, " cells"], Float[np.ndarray, " cells"]]:
     """The exponent that a growth shows, and its error.
 
-    The first half of the run is left out: there the direction still turns to that of fastest growth. The error has two
-    parts: the scatter of the other half's stretches, in groups of 1, 2 and 4 and that of the last three quarters, the greatest
+    The first half of the run is left out: there the direction still turns to that of fastest growth. The error has two parts:
+    the scatter of the other half's stretches, in groups of 1, 2 and 4 and that of the last three quarters, the greatest
     counting, because chaotic motion lingers near orderly motion (Flyvbjerg and Petersen, J. Chem. Phys. 91 (1989) 461); and
-    ln 2 over half the run, which is what the linear parting of orderly motion adds. An exponent below twice its error is no
-    sign of chaos. Where motion lingers for long, the error is too small by up to four (`tests/tippe/test_lyapunov.py`).
+    ln 2 over half the run, which is what the linear divergence of orderly motion adds. An exponent below twice its error is
+    no sign of chaos. Where motion lingers for long, the error is too small by a factor of up to four
+    (`tests/tippe/test_lyapunov.py`).
 
     **Arguments:** `logarithm`: as in `Growth`, the stretches a multiple of 8; `t1`: time [s] that it spans.
 

@@ -68,9 +68,11 @@ def sampled_run(
     numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(numbers)
     in_block = isinstance(settings.solver, diffrax.AbstractERK) and all(leaf.ndim == 0 for leaf in leaves)
-    recipe = Recipe(build, structure, rest, _with_tolerance(settings, None), grid)
-    question = (BlockSampling if in_block else SingleSampling)(len(leaves), recipe)
-    found = ask(question, *leaves, jax.lax.stop_gradient(times), as_number(t1), settings.tolerance)
+    # Arrays, such as those of the solver, may be traced, so they go among the leaves.
+    arrays, recipe = eqx.partition(Recipe(build, structure, rest, _with_tolerance(settings, None), grid), eqx.is_array)
+    held, places = jax.tree.flatten(arrays)
+    question = (BlockSampling if in_block else SingleSampling)(len(leaves), recipe, places)
+    found = ask(question, *leaves, jax.lax.stop_gradient(times), as_number(t1), settings.tolerance, *held)
     return found._replace(states=_at_times(found.states, times, modules, build))
 
 
@@ -137,33 +139,46 @@ class Recipe(eqx.Module):
         return self.build(eqx.combine(jax.tree.unflatten(self.structure, leaves), self.rest), cells)
 
 
-#: From this many cells on two directions run along together: that takes 0.8 times as long, but twice as long to compile.
-MANY, TOGETHER = 64, 2
+class AbstractSampling(AbstractQuestion):
+    """Samples of a run; the leaves are the modules' numbers, the times, the horizon, the tolerance and the recipe's arrays.
 
+    `recipe` is without its arrays, and `places` says where they belong in it.
+    """
 
-class BlockSampling(AbstractQuestion):
-    """Samples by the block of lanes; the leaves are the modules' numbers, the times, the horizon and the tolerance."""
-
-    movable: int
-    recipe: Recipe
+    recipe: eqx.AbstractVar[Recipe]
+    places: eqx.AbstractVar[Any]
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isnan(value)
 
+    def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, ...], Recipe]:
+        """The modules' numbers; times, horizon and tolerance; and the whole recipe."""
+        last = self.movable + 3
+        recipe = eqx.combine(self.recipe, jax.tree.unflatten(self.places, leaves[last:]))
+        return leaves[: self.movable], leaves[self.movable : last], recipe
+
+
+class BlockSampling(AbstractSampling):
+    """Samples by the block of lanes."""
+
+    movable: int
+    recipe: Recipe
+    places: Any = eqx.field(static=True)
+
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
-        problem = self.recipe.problem(leaves[: self.movable], cells)
-        return _march(VariationalProblem(problem, (), False), leaves[self.movable :], self.recipe.settings)[0]
+        numbers, given, recipe = self._sorted(leaves)
+        return _march(VariationalProblem(recipe.problem(numbers, cells), (), False), given, recipe.settings)[0]
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[SampledRun, list[SampledRun]]:
-        problem, directions, gather = directions_by(self.recipe.problem, active, leaves[: self.movable], cells)
+        numbers, given, recipe = self._sorted(leaves)
+        problem, directions, gather = directions_by(recipe.problem, active, numbers, cells)
 
         def run(some: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
-            varied = VariationalProblem(problem, some, False)
-            return _march(varied, leaves[self.movable :], self.recipe.settings, not again)
+            return _march(VariationalProblem(problem, some, False), given, recipe.settings, not again)
 
-        found, slopes = in_groups(run, directions, TOGETHER if cells >= MANY else 1)
+        found, slopes = in_groups(run, directions)
         return found, gather(slopes)
 
 
@@ -214,29 +229,28 @@ def _found(
     return SampledRun(states, time, jnp.moveaxis(end, 0, -1), *numbers), slopes
 
 
-class SingleSampling(AbstractQuestion):
-    """Samples by Diffrax, with any of its solvers; the leaves are those of `BlockSampling`."""
+class SingleSampling(AbstractSampling):
+    """Samples by Diffrax, with any of its solvers."""
 
     in_blocks = False
 
     movable: int
     recipe: Recipe
-
-    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
-        return jnp.isnan(value)
+    places: Any = eqx.field(static=True)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
-        problem = self.recipe.problem(leaves[: self.movable], None)
-        found, _ = _follow(VariationalProblem(problem, (), False), leaves[self.movable :], self.recipe)
+        numbers, given, recipe = self._sorted(leaves)
+        found, _ = _follow(VariationalProblem(recipe.problem(numbers, None), (), False), given, recipe)
         return jax.tree.map(lambda part: part[None], found)
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[SampledRun, list[SampledRun]]:
-        problem, directions, gather = directions_by(self.recipe.problem, active, leaves[: self.movable], None)
+        numbers, given, recipe = self._sorted(leaves)
+        problem, directions, gather = directions_by(recipe.problem, active, numbers, None)
 
         def run(some: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
-            return _follow(VariationalProblem(problem, some, False), leaves[self.movable :], self.recipe)
+            return _follow(VariationalProblem(problem, some, False), given, recipe)
 
         found, slopes = in_groups(run, directions)
         return jax.tree.map(lambda part: part[None], (found, gather(slopes)))

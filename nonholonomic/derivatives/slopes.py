@@ -36,8 +36,8 @@ def march_with_slopes(
 
     - `directions`: tangents of the problem, as for `VariationalProblem`. Their variations, or a mixture of them, take part in
       step control.
-    - `one_kernel`: as there, not for programs that are differentiated again; nor is the way back, so that without it
-      variations run along any number of directions.
+    - `one_kernel`: as for `march`. Without it, so that the result can be differentiated again, runs are not taken back:
+      variations run along, whatever the number of directions.
 
     **Returns:** the `Outcome`, and for each direction the derivative of `crossing_time`, 0 where that is infinite. Source:
     implicit function theorem at the event; step lengths are held fixed.

@@ -17,6 +17,7 @@ from .frames import PlaneFrame as PlaneFrame
 from .frames import SphereFrame as SphereFrame
 from .frames import Tangent as Tangent
 from .frames import carried as carried
+from .function import as_function as as_function
 from .graph import Graph as Graph
 from .graph import Paraboloid as Paraboloid
 from .implicit import Implicit as Implicit

@@ -34,7 +34,7 @@ from .vector import Component, Vector, cross, dot, scale, sum_vectors, tangents
 
 
 def place_named(surface: AbstractSurface, place: Place) -> Place:
-    """A place as `surface.chart` takes it, of one in which a closed surface's eta counts from the lowest point.
+    """A place as `surface.chart` takes it, given one in which the eta of a closed surface counts from the lowest point.
 
     **Arguments:** `place`: numbers named by `surface.coordinates`, or (x, y, z).
     """
@@ -83,6 +83,10 @@ class CarriedFrame(AbstractFrame):
     pull: Float[Array, "..."]
     side: float = eqx.field(static=True, default=1.0)
 
+    @property
+    def long(self) -> bool:
+        return self.surface.differentiated
+
     def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
         eta = as_number(eta)
         zero = jnp.zeros_like(eta)
@@ -108,7 +112,7 @@ class CarriedFrame(AbstractFrame):
         foot, R = place[:3], self.distance
         # Stored: what follows, and its derivatives above all, would each compute these anew.
         n = stored(*self.normal(foot))
-        # A first tangent that has drifted counts for its direction along the surface only.
+        # Of a first tangent that has drifted, only the direction along the surface counts.
         t1 = stored(*along(n, place[3:])[0])
         t2 = cross(n, t1)
         S11, S12, S22 = stored(*self._shape(foot, t1, t2))
@@ -125,10 +129,8 @@ class CarriedFrame(AbstractFrame):
 
     def _shape(self, foot: Fixed, t1: Fixed, t2: Fixed) -> tuple[Component, Component, Component]:
         """The shape operator of the arena, n' = -S_a q', as (S11, S12, S22)."""
-        first, second = (scale(-self.side, self.surface.normal_rate(foot, t)) for t in (t1, t2))
-        S11, S12, S22 = dot(first, t1), dot(first, t2), dot(second, t2)
-        zero = jnp.zeros_like(foot[0])
-        return tuple(zero if S is None else S for S in (S11, S12, S22))
+        bending, zero = scale(-self.side, self.surface.bending(foot, t1, t2)), jnp.zeros_like(foot[0])
+        return tuple(zero if S is None else S for S in bending)
 
     def _seen(self, *axes: Fixed) -> Vector:
         """The upward vertical in the frame."""

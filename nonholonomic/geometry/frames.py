@@ -52,6 +52,11 @@ class AbstractFrame(eqx.Module):
     The place is what the frame must integrate to know where it is; `cyclic` is what else it takes to draw it.
     """
 
+    @property
+    def long(self) -> bool:
+        """Whether it takes many operations to say what the frame does."""
+        return False
+
     @abc.abstractmethod
     def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
         """Place and cyclic coordinates at the angle `eta` [rad] from the lowest point, in the x-z plane."""
@@ -209,7 +214,8 @@ class CylinderFrame(AbstractFrame):
 class SphereFrame(AbstractFrame):
     """Inside or outside of a sphere; the frame is carried parallel to itself, so no place is singular.
 
-    The place is the vertical z seen in the frame; `cyclic` adds the horizontal x axis seen in it. Fields as of `CylinderFrame`.
+    The place is the vertical z seen in the frame; `cyclic` adds the horizontal x axis seen in it. The fields are those of
+    `CylinderFrame`.
     """
 
     radius: Float[Array, "..."]

@@ -65,3 +65,12 @@ def partials(function: Callable[..., Any], at: tuple[Any, ...]) -> tuple[Float[A
         return jax.jvp(lambda one: function(*at[:k], one, *at[k + 1 :]), (at[k],), (jnp.ones_like(at[k]),))[1]
 
     return tuple(along(k) for k in range(len(at)))
+
+
+def second_derivative(
+    function: Callable[..., Any], at: tuple[Any, ...], a: tuple[Any, ...], b: tuple[Any, ...]
+) -> Float[Array, "..."]:
+    """Second derivative of a function of several numbers along two vectors, each component a number or an array over lanes."""
+    size, numbers = len(at), tuple(jnp.broadcast_arrays(*at, *a, *b))
+    place, first, second = numbers[:size], numbers[size : 2 * size], numbers[2 * size :]
+    return jax.jvp(lambda *here: jax.jvp(function, here, first)[1], place, second)[1]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..validation import Bound, as_number
-from .function import as_function, partials
+from .function import as_function, partials, second_derivative
 from .level import AbstractDifferentiated, AbstractLevel
 from .surface import OPEN, AbstractSurface, Place
 from .vector import Component, Vector, dot, scale, subtract, sum_vectors, tangents
@@ -120,6 +120,9 @@ class Graph(AbstractOpen, AbstractDifferentiated):
     def gradient(self, position: Vector) -> Vector:
         slope = partials(self.height, position[:2])
         return (-slope[0], -slope[1], jnp.ones_like(slope[0]))
+
+    def second_derivative(self, position: Vector, a: Vector, b: Vector) -> Component:
+        return -second_derivative(self.height, position[:2], a[:2], b[:2])
 
     def offset(self, position: Vector) -> Component:
         return (position[2] - self.height(position[0], position[1])) * self.normal(position)[2]

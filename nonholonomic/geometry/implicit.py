@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from .function import as_function, partials
+from .function import as_function, partials, second_derivative
 from .level import AbstractDifferentiated
 from .surface import DIVIDED, Place
 from .vector import Component, Vector, dot, tangents
@@ -45,6 +45,9 @@ class Implicit(AbstractDifferentiated):
     def gradient(self, position: Vector) -> Vector:
         slope = partials(self.function, position)
         return (slope[0], slope[1], slope[2])
+
+    def second_derivative(self, position: Vector, a: Vector, b: Vector) -> Component:
+        return second_derivative(self.function, position, a, b)
 
     def offset(self, position: Vector) -> Component:
         gradient = self.gradient(position)

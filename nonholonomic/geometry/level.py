@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from .surface import AbstractSurface
-from .vector import Component, Vector, cross, dot, scale, subtract, sum_vectors, tangents
+from .vector import Component, Vector, dot, scale, subtract, sum_vectors, tangents
 
 #: Newton steps to the nearest point. They double its digits, so that a few are enough.
 STEPS = 8
@@ -51,11 +51,17 @@ def _vector(components: Iterable[Component]) -> Vector:
 
 
 class AbstractDifferentiated(AbstractLevel):
-    """A surface that gives only a gradient along its normal; the rest follows by automatic differentiation."""
+    """A surface that gives only a function's first and second derivatives, which automatic differentiation finds."""
+
+    differentiated = True
 
     @abc.abstractmethod
     def gradient(self, position: Vector) -> Vector:
-        """Gradient of the function at a position [m]."""
+        """Gradient of the function at a position [m], along the normal."""
+
+    @abc.abstractmethod
+    def second_derivative(self, position: Vector, a: Vector, b: Vector) -> Component:
+        """Second derivative of the function at a position [m], along two vectors."""
 
     def normal(self, position: Vector) -> Vector:
         gradient = self.gradient(position)
@@ -65,7 +71,13 @@ class AbstractDifferentiated(AbstractLevel):
         together = jnp.broadcast_arrays(*position, *velocity)
         return jax.jvp(self.normal, (_vector(together[:3]),), (_vector(together[3:]),))[1]
 
+    def bending(self, position: Vector, a: Vector, b: Vector) -> tuple[Component, Component, Component]:
+        # Along the surface the change of the gradient's size is across a and b.
+        gradient = self.gradient(position)
+        per_size = 1.0 / jnp.sqrt(dot(gradient, gradient))
+        aa, ab, bb = (self.second_derivative(position, *pair) for pair in ((a, a), (a, b), (b, b)))
+        return per_size * aa, per_size * ab, per_size * bb
+
     def gaussian_curvature(self, position: Vector) -> Component:
-        n = self.normal(position)
-        t1, t2 = tangents(n)
-        return dot(n, cross(self.normal_rate(position, t1), self.normal_rate(position, t2)))
+        aa, ab, bb = self.bending(position, *tangents(self.normal(position)))
+        return aa * bb - ab * ab

@@ -56,6 +56,9 @@ class AbstractSurface(Bounded):
     #: The words for the side on which a body is, and the sign of n that points to it.
     sides: ClassVar[Mapping[str, float]] = CLOSED
 
+    #: Whether normal and curvature follow from a user's function by automatic differentiation, which makes them long.
+    differentiated: ClassVar[bool] = False
+
     #: Names and units of the numbers of a place.
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("mu", "rad"), ("eta", "rad"))
 
@@ -71,6 +74,11 @@ class AbstractSurface(Bounded):
     @abc.abstractmethod
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
         """Rate n' [1/s] of the normal at a position [m] that moves with a velocity [m/s]: minus the shape operator times it."""
+
+    def bending(self, position: Vector, a: Vector, b: Vector) -> tuple[Component, Component, Component]:
+        """(a . n'(a), a . n'(b), b . n'(b)) [1/m] for two vectors along the surface: minus its second fundamental form."""
+        by_a, by_b = self.normal_rate(position, a), self.normal_rate(position, b)
+        return dot(a, by_a), dot(b, by_a), dot(b, by_b)
 
     @abc.abstractmethod
     def elevation(self, position: Vector) -> Component:
@@ -89,7 +97,7 @@ class AbstractSurface(Bounded):
         return self.distance(position)
 
     def distance(self, position: Vector) -> Component:
-        """Distance [m] of a position from the surface, positive on the side to which n points; as far as for `nearest`."""
+        """Distance [m] of a position from the surface, positive on the side to which n points; limited as `nearest` is."""
         foot = self.nearest(position)
         away = (subtract(position[0], foot[0]), subtract(position[1], foot[1]), subtract(position[2], foot[2]))
         return dot(away, self.normal(foot))

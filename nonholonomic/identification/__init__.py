@@ -12,12 +12,10 @@ from .identify import identify as identify
 from .likelihood import Measurements as Measurements
 from .posterior import LogDensity as LogDensity
 from .reading import read_columns as read_columns
+from .recording import AbstractRecording as AbstractRecording
 from .recording import Quantities as Quantities
-from .recording import check_recording as check_recording
+from .recording import as_quantity as as_quantity
 from .recording import predicted as predicted
-from .recording import sample_labels as sample_labels
-from .recording import samples as samples
-from .recording import seen_samples as seen_samples
 from .result import Identification as Identification
 from .sampling import Draws as Draws
 from .sampling import sample as sample

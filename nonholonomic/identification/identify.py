@@ -22,7 +22,7 @@ ROUNDS, SETTLED = 10, 0.01
 #: The parts of a recording that are fitted before the whole.
 PARTS = (0.1, 0.25, 0.5)
 
-#: By how much differences move the coordinates: 1 % of a positive parameter. It smooths what is less wide.
+#: By how much differences move the coordinates: 1 % of a positive parameter. Differences smooth over what is narrower.
 DIFFERENCE = 0.01
 
 

@@ -15,7 +15,7 @@ from ..validation import require
 #: Residual of a measurement for which the model has no prediction: a penalty without a slope.
 MISSING = 1e4
 
-#: By how much an error grows where a measurement is to count for nothing, yet.
+#: The factor on the error of a measurement that is not to count yet.
 MUTED = 1e6
 
 
@@ -218,6 +218,6 @@ def estimated_errors(measurements: Measurements, prediction: Any, unknowns: int)
 
 
 def muted(measurements: Measurements, horizon: float) -> Measurements:
-    """The same with what was measured after a time next to meaningless."""
+    """The same, but what was measured after a time counts for next to nothing."""
     late = measurements.time > horizon
     return measurements.with_errors(jnp.where(late, measurements.error * MUTED, measurements.error))

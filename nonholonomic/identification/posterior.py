@@ -24,7 +24,7 @@ class LogDensity(eqx.Module):
 
     It can be differentiated, forwards and backwards, compiled, and batched by `jax.vmap`: then all cells of all chains run in
     one block. Errors that were not given are unknowns too, each in its logarithm, with a flat prior. Where the model has no
-    prediction it is some -1e8, without a slope.
+    prediction it is about -1e8, without a slope.
 
     - `names`: of the unknowns, in the order of the coordinates; `start`: (unknowns,), where to start.
     """
@@ -33,6 +33,9 @@ class LogDensity(eqx.Module):
     measurements: Measurements
     priors: tuple[tuple[str, Any], ...] = eqx.field(static=True)
     open_series: tuple[int, ...] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        return f"LogDensity of {', '.join(self.names)}, given {self.measurements.value.size} measurements"
 
     @classmethod
     def of(

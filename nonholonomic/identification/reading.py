@@ -24,12 +24,15 @@ UNITS = {
 
 
 class Read(NamedTuple):
-    """What was read: times [s], the samples of some columns in SI units, NaN where missing, and their errors or `None`."""
+    """What was read: times [s], samples in SI units, NaN where missing, their errors or `None`, and what was recorded.
+
+    A single column is named by its word, and its samples are (times,).
+    """
 
     times: Float[np.ndarray, " times"]
-    value: Float[np.ndarray, "times columns"]
-    error: Float[np.ndarray, "times columns"] | None
-    columns: tuple[str, ...]
+    value: Float[np.ndarray, "times *columns"]
+    error: Float[np.ndarray, "times *columns"] | None
+    quantity: str | tuple[str, ...]
 
 
 def read_columns(path: Any, columns: Any, fps: float | None, error: Any, quantities: Quantities) -> Read:
@@ -62,6 +65,8 @@ def read_columns(path: Any, columns: Any, fps: float | None, error: Any, quantit
             raise ValueError(f"error = {error!r} must be a dictionary with {', '.join(names)}, or None")
         units = quantities.units
         errors = np.stack([_errors(table, name, error[name], units[name], path) for name in names], axis=1)[good]
+    if len(names) == 1:
+        return Read(times[good], value[good, 0], None if errors is None else errors[:, 0], names[0])
     return Read(times[good], value[good], errors, names)
 
 

@@ -3,15 +3,16 @@
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..parameters import numbers
-from ..validation import require
+from ..parameters import numbers, one_line
+from ..validation import as_number, require
 from .likelihood import Measurements
 
 #: Model times of samples before the launch: so close to it, and to one another [s], that nothing moves.
@@ -54,63 +55,113 @@ class Quantities:
         return tuple(found)
 
 
-def check_recording(recording: Any, columns: tuple[str, ...]) -> None:
-    """Raise `ValueError` unless a recording has increasing times and as many samples, errors and degrees of freedom.
+def as_quantity(words: Any) -> Any:
+    """A word, or a tuple of words."""
+    return tuple(words) if isinstance(words, list) else words
 
-    **Arguments:** `recording`: with `times`, `value`, `error`, `t0` and `student`; `columns`: of its samples.
+
+class AbstractRecording(eqx.Module):
+    """A recorded run: samples of some quantities at the readings of a clock.
+
+    **Arguments:**
+
+    - `launch`: how the run began, every number a scalar.
+    - `times`: (times,) [s], increasing.
+    - `value`: (times,) for one column, (times, columns) for several; NaN where a sample is missing.
+    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: to be estimated for each column
+      from the scatter about the fit.
+    - `quantity`: what was recorded: a quantity, a column, or a tuple of them.
+    - `t0`: the clock's reading [s] at the launch.
+    - `student`: degrees of freedom of Student's t distribution of the errors; `None`: Gaussian.
+
+    A model says in `quantities` what can be recorded of its runs.
+
+    **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
     """
-    require(recording.times, "times")
-    times = np.asarray(recording.times, dtype=float)
-    if times.ndim != 1 or not len(times) or np.any(np.diff(times) <= 0.0):
-        raise ValueError(f"times = {recording.times!r} must be an increasing list")
-    require(recording.t0, "t0", below=times[-1], why="the last time")
-    shape = (len(times), len(columns)) if len(columns) > 1 else (len(times),)
-    if np.shape(recording.value) != shape:
-        raise ValueError(f"value must be of shape {shape} for {', '.join(columns)}, not {np.shape(recording.value)}")
-    seen = ~np.isnan(np.asarray(recording.value))
-    if not np.any(seen):
-        raise ValueError("value must have at least one number; missing samples are NaN")
-    require(np.asarray(recording.value)[seen], "value")
-    if recording.error is not None:
-        if np.shape(recording.error) not in ((), shape[1:], shape):
-            raise ValueError(f"error must be one number, one for each column, or of shape {shape}")
-        require(np.broadcast_to(recording.error, shape)[seen], "error", above=0.0)
-    if recording.student is not None:
-        require(recording.student, "student", above=0.0)
-        if np.ndim(recording.student) != 0:
-            raise ValueError(f"student must be one number, not of shape {np.shape(recording.student)}")
 
+    launch: Any
+    times: Float[Array, " times"] = eqx.field(converter=as_number)
+    value: Float[Array, "times *columns"] = eqx.field(converter=as_number)
+    error: Any = eqx.field(converter=lambda error: error if error is None else as_number(error))
+    quantity: eqx.AbstractVar[str | tuple[str, ...]]
+    t0: eqx.AbstractVar[Float[Array, ""]]
+    student: eqx.AbstractVar[float | None]
+    quantities: eqx.AbstractClassVar[Quantities]
+    units: ClassVar[dict[str, str]] = {"times": "s", "t0": "s"}
 
-def seen_samples(recording: Any) -> np.ndarray:
-    """Where in the samples, a time after the other, there are numbers."""
-    return np.flatnonzero(~np.isnan(np.asarray(recording.value).reshape(-1)))
+    def __repr__(self) -> str:
+        return one_line(self)
 
+    def __check_init__(self):
+        require(self.times, "times")
+        times = np.asarray(self.times, dtype=float)
+        if times.ndim != 1 or not len(times) or np.any(np.diff(times) <= 0.0):
+            raise ValueError(f"times = {self.times!r} must be an increasing list")
+        require(self.t0, "t0", below=times[-1], why="the last time")
+        shape = (len(times), len(self.columns)) if len(self.columns) > 1 else (len(times),)
+        if np.shape(self.value) != shape:
+            raise ValueError(
+                f"value must be of shape {shape} for {', '.join(self.columns)}, not {np.shape(self.value)}"
+            )
+        seen = ~np.isnan(np.asarray(self.value))
+        if not np.any(seen):
+            raise ValueError("value must have at least one number; missing samples are NaN")
+        require(np.asarray(self.value)[seen], "value")
+        if self.error is not None:
+            if np.shape(self.error) not in ((), shape[1:], shape):
+                raise ValueError(f"error must be one number, one for each column, or of shape {shape}")
+            require(np.broadcast_to(self.error, shape)[seen], "error", above=0.0)
+        if self.student is not None:
+            require(self.student, "student", above=0.0)
+            if np.ndim(self.student) != 0:
+                raise ValueError(f"student must be one number, not of shape {np.shape(self.student)}")
 
-def samples(recording: Any, columns: tuple[str, ...], angles: frozenset[str]) -> Measurements:
-    """The samples of a recording as `Measurements`, a series for each column; missing ones are left out."""
-    value = np.asarray(recording.value).reshape(len(recording.times), len(columns))
-    keep = seen_samples(recording)
-    if recording.error is None:
-        error = np.broadcast_to(noise(value), value.shape)
-    else:
-        given = np.asarray(recording.error)
-        error = np.broadcast_to(
-            given.reshape(value.shape) if given.ndim == np.ndim(recording.value) else given, value.shape
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The names of what a sample consists of."""
+        return self.quantities.of(self.quantity)
+
+    @property
+    def size(self) -> int:
+        """How many numbers are predicted, missing samples included."""
+        return np.size(self.value)
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Where in the samples, a time after the other, there are numbers."""
+        return np.flatnonzero(~np.isnan(np.asarray(self.value).reshape(-1)))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A label for each sample, such as `theta(0.1 s)`; missing ones are left out."""
+        every = [f"{column}({time:.4g} s)" for time in np.asarray(self.times) for column in self.columns]
+        return tuple(every[i] for i in self.seen)
+
+    @property
+    def measurements(self) -> Measurements:
+        """The samples as `Measurements`, a series for each column; missing ones are left out."""
+        value = np.asarray(self.value).reshape(len(self.times), len(self.columns))
+        if self.error is None:
+            error = np.broadcast_to(noise(value), value.shape)
+        else:
+            given = np.asarray(self.error)
+            error = np.broadcast_to(
+                given.reshape(value.shape) if given.ndim == np.ndim(self.value) else given, value.shape
+            )
+        period = [2.0 * math.pi if name in self.quantities.angles else math.inf for name in self.columns]
+
+        def each(one: Any) -> np.ndarray:
+            return np.broadcast_to(one, value.shape).reshape(-1)[self.seen]
+
+        return Measurements(
+            each(value),
+            each(error),
+            period=each(period),
+            student=math.inf if self.student is None else float(self.student),
+            series=each(np.arange(len(self.columns))),
+            time=each((np.asarray(self.times) - float(self.times[0]))[:, None]),
+            estimated=self.error is None,
         )
-    period = [2.0 * math.pi if name in angles else math.inf for name in columns]
-
-    def each(one: Any) -> np.ndarray:
-        return np.broadcast_to(one, value.shape).reshape(-1)[keep]
-
-    return Measurements(
-        each(value),
-        each(error),
-        period=each(period),
-        student=math.inf if recording.student is None else float(recording.student),
-        series=each(np.arange(len(columns))),
-        time=each((np.asarray(recording.times) - float(recording.times[0]))[:, None]),
-        estimated=recording.error is None,
-    )
 
 
 def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " columns"]:
@@ -125,19 +176,13 @@ def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " colu
     return np.array([of(column) for column in value.T])
 
 
-def sample_labels(recording: Any, columns: tuple[str, ...]) -> tuple[str, ...]:
-    """A label for each sample, such as `theta(0.1 s)`; missing ones are left out."""
-    every = [f"{column}({time:.4g} s)" for time in np.asarray(recording.times) for column in columns]
-    return tuple(every[i] for i in seen_samples(recording))
-
-
 def model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Array, " times"]:
     """The times of the samples since the launch [s]; those before it are moved to it."""
     return jnp.maximum(times - t0, INSTANT * jnp.arange(times.shape[0]))
 
 
 def predicted(
-    recordings: list[tuple[Any, Values]],
+    recordings: list[tuple[AbstractRecording, Values]],
     rows: int,
     run: Callable[[Values, Float[Array, " times"]], Any],
     column: Callable[[Any, str], Float[Array, " times"]],

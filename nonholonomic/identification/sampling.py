@@ -74,7 +74,7 @@ def sample(
 
     - `density`: a `LogDensity`.
     - `centre`, `covariance`: (unknowns,), (unknowns, unknowns), of a fit in its coordinates: `Identification.coordinates` and
-      `coordinate_covariance`. Unknown errors, which a fit has not among its unknowns, are started where they are.
+      `coordinate_covariance`. Unknown errors, which are not among the unknowns of a fit, start from their first guess.
     - `chains`, `warmup`, `draws`: how many chains, and steps of each before those that are kept.
     - `seed`: of the draw; `progress`: whether to show it, on a terminal or in a notebook.
 

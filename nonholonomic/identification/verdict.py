@@ -1,4 +1,4 @@
-"""Whether a fit can be believed: its scatter, its order, the agreement of its starts, and what the data leave open."""
+"""Whether a fit can be believed: the size and order of its residuals, whether its starts agree, what the data leave open."""
 
 import math
 from typing import NamedTuple

@@ -1,7 +1,8 @@
 """Runs in time: from a start along a field to an event, to the end of the model's validity, or to a horizon.
 
 `compiled_march` runs many cells of a problem in lanes that keep step with one another; `follow` and `sample` are single runs
-with any solver of Diffrax. `travel` runs many cells through phases, `follow_phases` a single run with its path.
+with any solver of Diffrax. `travel` runs many cells through phases (`traced_travel` inside other transformed functions),
+`follow_phases` a single run with its path.
 `march_by_diffrax` is the independent second road. `Settings` says how, and the codes of a run's status are `RUNNING`,
 `REACHED_END`, `CROSSED`, `GUARD_LOST`, `FAILED` and `UNRESOLVED`.
 """
@@ -21,6 +22,8 @@ from .phases import AbstractPhase as AbstractPhase
 from .phases import Journey as Journey
 from .phases import Passage as Passage
 from .phases import Record as Record
+from .phases import marched as marched
+from .phases import passed_on as passed_on
 from .phases import travel as travel
 from .problem import AbstractProblem as AbstractProblem
 from .problem import crossing_time as crossing_time
@@ -46,6 +49,8 @@ from .status import GUARD_LOST as GUARD_LOST
 from .status import REACHED_END as REACHED_END
 from .status import RUNNING as RUNNING
 from .status import UNRESOLVED as UNRESOLVED
+from .traced_phases import in_rounds as in_rounds
+from .traced_phases import traced_travel as traced_travel
 from .zeros import few_trials as few_trials
 from .zeros import halved as halved
 from .zeros import sign_changes as sign_changes

@@ -25,8 +25,8 @@ class Control(NamedTuple):
     """How steps are taken.
 
     `tableau` and `order` are the method's; `rtol` the relative tolerance; `t1` the horizon [s], one for all or one per lane;
-    a lane that needs more than `max_steps` has failed; `passes` says whether a run goes on through its event; `parts` is of how
-    many equal parts the state is made, such as a state and its variations: a step is judged by the part that errs most;
+    a lane that needs more than `max_steps` has failed; `passes` says whether a run goes on through its event; `parts` is the
+    number of equal parts in the state, such as a state and its variations: a step is judged by the part with the largest error;
     `looped` says whether the stages of a step are done in a loop.
     """
 
@@ -43,7 +43,7 @@ class Control(NamedTuple):
 class Block(NamedTuple):
     """The lanes of a block.
 
-    - `cell`: which cell of the problem a lane runs; `status`: one of the codes above.
+    - `cell`: which cell of the problem a lane runs; `status`: a code of `status.py`.
     - `time` [s], `state`, `rate`: where the lane is, and the field there.
     - `length`: of the step to be tried [s], if the horizon is not nearer.
     - `side`: 1 before the event, -1 beyond it; `margin`: the least of `side` times the crossing function and the guard.
@@ -163,7 +163,7 @@ def _fate(
     if not control.passes:
         status = jnp.where(hit, jnp.where(by_guard, GUARD_LOST, CROSSED), block.status)
         return status, block.side, block.first_crossing, block.crossing_time
-    # Only the way from positive to negative is the event; the way back is passed in silence.
+    # Only the way from positive to negative is the event; the way back does not count.
     counts = crossed & (block.side > 0.0)
     here = crossing_time(problem, time, tried.state)
     first = jnp.where(counts & jnp.isinf(block.first_crossing), here, block.first_crossing)

@@ -12,17 +12,18 @@ from jaxtyping import Array, Bool, Int
 
 from .runge_kutta import Lanes, States, Step
 
-#: An event is located once the next trial would differ by less than this part of the step in which it lies. The end of contact
-#: errs by 2e-13 of its time from it, and by 2e-12 with ten times the value; `crossing_time` takes it out of a crossing.
+#: An event is located once the next trial would differ by less than this fraction of the step in which it lies. The end of
+#: contact errs by 2e-13 of its time from it, and by 2e-12 with ten times the value; `crossing_time` takes it out of a
+#: crossing.
 LOCATED = 1e-10
 
-#: A dip of the crossing function within a step is looked at if its estimate is below this part of the values at both ends.
+#: A dip of the crossing function within a step is looked at if its estimate is below this fraction of the values at both ends.
 #: With a tenth of it one first crossing of 1279 in a cylinder is missed at a tolerance of 1e-7 and none at 1e-9; with ten
 #: times as much none is found that was not, for a quarter more steps.
 DIP = 0.2
 
-#: Trials after which the far end of what is left of the step is taken for the event. It is a net: ten times as many change no
-#: bit of a result, six would let the end of contact err by 1e-8.
+#: Trials after which the far end of what is left of the step is taken for the event. It is a safety net: ten times as many
+#: change no bit of a result, six would let the end of contact err by 1e-8.
 MOST_TRIALS = 64
 
 

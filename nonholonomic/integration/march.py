@@ -29,6 +29,7 @@ def march(
     *,
     passes: bool = False,
     one_kernel: bool = False,
+    parts: int = 1,
 ) -> tuple[Outcome, Int[Array, ""]]:
     """Run every cell of a problem from t = 0 to its event, to the end of the model's validity, or to `t1`.
 
@@ -42,10 +43,12 @@ def march(
     - `passes`: whether a run goes on through the event, in either direction, rather than ending there.
     - `one_kernel`: whether to have the loop compiled into a single kernel on a CPU, which halves its cost; not for
       programs that are differentiated again.
+    - `parts`: of how many equal parts the state is made, as for `Queue.of`.
 
     **Returns:** the `Outcome`, and the number of lockstep iterations, each of which advanced a block of lanes.
     """
-    outcome, iterations = Queue.of(problem, t1, cells, settings, passes=passes, one_kernel=one_kernel).outcome()
+    options = {"passes": passes, "one_kernel": one_kernel, "parts": parts}
+    outcome, iterations = Queue.of(problem, t1, cells, settings, **options).outcome()
     return (outcome if passes else with_crossing_times(problem, outcome)), iterations
 
 

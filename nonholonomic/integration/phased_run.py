@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from .phases import MOST_ROUNDS, AbstractPhase, Passage
 from .problem import AbstractProblem
 from .settings import Settings
-from .single_run import Followed, follow
+from .single_run import Followed, follow, padded
 from .status import FAILED, GUARD_LOST, REACHED_END, RUNNING, UNRESOLVED
 
 #: The number of a piece on the way between two phases.
@@ -23,7 +23,7 @@ class Piece(NamedTuple):
     """A part of a run: from `begin` to `end` [s], in the phase numbered `number`, or `BETWEEN` two phases.
 
     `motion` is the `Followed` in the phase, its times counted from `begin`, or one stretch of a `Record`; `shown` are the times
-    [s] at which it is shown where nobody asks for others.
+    [s] at which it is shown by default.
     """
 
     begin: float
@@ -44,7 +44,7 @@ class Piece(NamedTuple):
 class PhasedPath(NamedTuple):
     """A run through several phases: its pieces in order, how and when [s] it ended, in what state, and what it took.
 
-    `status` is one of the codes of a `Journey`; `counts` says what happened how often on the way.
+    `status` is one of the codes of a `Journey`; `counts` says how often each kind of thing happened on the way.
     """
 
     pieces: list[Piece]
@@ -72,7 +72,7 @@ class PhasedPath(NamedTuple):
 
     @property
     def times(self) -> Float[np.ndarray, " times"]:
-        """The times [s] at which the run is shown where nobody asks for others: those of all its steps."""
+        """The times [s] at which the run is shown by default: those of all its steps."""
         return np.unique(np.minimum(np.concatenate([np.zeros(1), *(one.shown for one in self.pieces)]), self.end_time))
 
     @property
@@ -91,9 +91,8 @@ class PhasedPath(NamedTuple):
         where, found = self._where(times), []
         for index in np.unique(where):
             here = np.flatnonzero(where == index)
-            # Padded to one length, so that one program serves all pieces.
-            padded = np.concatenate([times[here], np.full(len(times) - here.size, times[here[-1]])])
-            found.append((here, self.pieces[index].at(padded)[:, : here.size]))
+            # To one length, so that one program serves all pieces.
+            found.append((here, self.pieces[index].at(padded(times[here], len(times)))[:, : here.size]))
         shown = np.empty((len(found[0][1]), len(times)))
         for here, values in found:
             shown[:, here] = values

@@ -7,6 +7,7 @@ of the state. The cells advance in rounds: in each, the cells that are now in a 
 """
 
 import abc
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,6 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from .march import compiled_march
 from .problem import AbstractProblem
+from .queue import Outcome
 from .settings import Settings
 from .status import FAILED, GUARD_LOST, REACHED_END, RUNNING, UNRESOLVED
 
@@ -29,7 +31,7 @@ class Record(NamedTuple):
 
     - `ends`: when each stretch ends [s], counted from the end of the phase; infinite where there are no more.
     - `motions`: what `AbstractPhase.between` needs of each, with the stretches on the first axis of every leaf.
-    - `shown`: at how many times each is to be shown where nobody asks for others.
+    - `shown`: at how many times each is to be shown by default.
     """
 
     ends: Float[Array, " stretches 1"]
@@ -42,8 +44,9 @@ class Passage(NamedTuple):
 
     `status` is `RUNNING` where the motion goes on in the phase numbered `phase`, else how it ended; `state` is the state
     then, `elapsed` [s] the time that passed on the way, `crossing_time` [s] when on the way the event was passed (for the
-    last time), infinite if it was not; `counts` what happened how often, a row for each kind. `record` is for a single run
-    that keeps its path (`phased_run.py`); `None` where no time passes on the way, or where the path is not kept.
+    last time), infinite if it was not; `counts` how often each kind of thing happened, a row for each kind. `record` is for a
+    single run that keeps its path (`phased_run.py`); `None` where no time passes on the way, or where the path is not kept.
+    `log_rates` is the sum of the logarithms of the rates at which events on the way are met; `None` if there are none.
     """
 
     phase: Int[Array, " cells"]
@@ -53,6 +56,7 @@ class Passage(NamedTuple):
     crossing_time: Float[Array, " cells"]
     counts: Int[Array, "kinds cells"]
     record: Record | None = None
+    log_rates: Float[Array, " cells"] | None = None
 
 
 class AbstractPhase(eqx.Module):
@@ -110,12 +114,13 @@ def travel(
     phases: tuple[AbstractPhase, ...],
     phase: Int[np.ndarray, " cells"],
     state: Float[np.ndarray, "components cells"],
-    t1: float,
+    t1: float | Float[np.ndarray, " cells"],
     cells: int,
     settings: Settings,
     *,
     kinds: int,
     passes: bool = False,
+    parts: int = 1,
     most_rounds: int = MOST_ROUNDS,
 ) -> Journey:
     """Run every cell through its phases to its event, to `t1`, or to where the model ends.
@@ -127,16 +132,17 @@ def travel(
 
     - `phases`: the phases, of which `phase` and `Passage.phase` are numbers.
     - `phase`, `state`: where every cell starts.
-    - `t1`: horizon [s].
-    - `cells`: how many cells to run; the rest is padding. With none, everything is compiled.
+    - `t1`: horizon [s], one for all or one per cell.
+    - `cells`: how many cells to run; the rest is padding. With 0, the programs are compiled and nothing is run.
     - `settings`: with an explicit Runge-Kutta solver of Diffrax.
     - `kinds`: rows of `Passage.counts`.
-    - `passes`: as for `march`.
+    - `passes`, `parts`: as for `march`.
     - `most_rounds`: a cell that needs more ends as `UNRESOLVED`.
 
     **Returns:** a `Journey`.
     """
-    size = len(phase)
+    size, options = len(phase), {"passes": passes, "parts": parts}
+    t1 = np.broadcast_to(np.asarray(t1, float), size)
     found = Journey(
         status=np.full(size, RUNNING),
         crossing_time=np.full(size, np.inf),
@@ -149,15 +155,13 @@ def travel(
     )
     found.status[cells:] = REACHED_END
     if cells == 0:
-        for one in phases:
-            _march(one, found, np.arange(0), t1, settings, passes)
-            _pass_on(one, found, np.arange(0), t1)
+        _compile(phases, found, t1, settings, options)
     for _ in range(most_rounds):
         # Selected before the round: a cell that changes its phase during it waits for the next round.
         here = [np.flatnonzero((found.status == RUNNING) & (found.phase == number)) for number in range(len(phases))]
         for one, some in zip(phases, here, strict=True):
             if some.size:
-                _march(one, found, some, t1, settings, passes)
+                _march(one, found, some, t1, settings, options)
                 lost = some[found.status[some] == GUARD_LOST]
                 if lost.size:
                     _pass_on(one, found, lost, t1)
@@ -167,47 +171,98 @@ def travel(
     return found
 
 
-def _gather(phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"], t1: float) -> tuple[Any, ...]:
+def _compile(
+    phases: tuple[AbstractPhase, ...],
+    found: Journey,
+    t1: Float[np.ndarray, " cells"],
+    settings: Settings,
+    options: dict[str, Any],
+) -> None:
+    """Compile all programs by running none of the cells: two at once, for the compiler uses little more than one core."""
+    none = np.arange(0)
+    with ThreadPoolExecutor(2) as threads:
+        marches = [threads.submit(_march, one, found, none, t1, settings, options) for one in phases]
+        leaving = [threads.submit(_pass_on, one, found, none, t1) for one in phases]
+        for program in (*marches, *leaving):
+            program.result()
+
+
+def _gather(
+    phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
+) -> tuple[Any, ...]:
     """The phase, the states and the remaining times of some cells, padded to the size of the whole."""
     size = len(found.status)
     cell = np.concatenate([some, np.full(size - some.size, some[-1] if some.size else 0)])
     numbers, rest = eqx.partition(phase, eqx.is_array)
     numbers = jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., cell], numbers)
-    left = jnp.asarray(np.maximum(t1 - found.end_time[cell], 0.0))
+    left = jnp.asarray(np.maximum(t1[cell] - found.end_time[cell], 0.0))
     return eqx.combine(numbers, rest), jnp.asarray(found.state[:, cell]), left
 
 
 def _march(
-    phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"], t1: float, settings: Settings, passes: bool
+    phase: AbstractPhase,
+    found: Journey,
+    some: Int[np.ndarray, " some"],
+    t1: Float[np.ndarray, " cells"],
+    settings: Settings,
+    options: dict[str, Any],
 ) -> None:
     """March some cells to the end of their phase and note what was found."""
     phase, state, left = _gather(phase, found, some, t1)
     problem = _problem(phase, state)
     count = jnp.asarray(some.size)
-    outcome, _ = compiled_march(problem, left, count, settings, passes=passes)
+    outcome, _ = compiled_march(problem, left, count, settings, **options)
     outcome = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], outcome)
-    began = found.end_time[some]
-    # A cell that enters a phase beyond the event passed it earlier, unless it started there.
-    passed = np.isfinite(outcome.crossing_time) & ((outcome.crossing_time > 0.0) | np.isinf(found.crossing_time[some]))
-    found.crossing_time[some] = np.where(passed, began + outcome.crossing_time, found.crossing_time[some])
-    found.end_time[some] = np.where(outcome.status == REACHED_END, t1, began + outcome.end_time)
-    found.state[:, some] = outcome.state
-    found.steps[some] += outcome.steps
-    found.rejected[some] += outcome.rejected
-    found.status[some] = outcome.status
+    _store(found, some, marched(np, _some(found, some), outcome, t1[some]))
 
 
-def _pass_on(phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"], t1: float) -> None:
+def _pass_on(
+    phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
+) -> None:
     """Pass some cells on to the phase that follows and note what happened on the way."""
     passage = _leave(*_gather(phase, found, some, t1))
     passage = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], passage)
-    began = found.end_time[some]
-    passed = np.isfinite(passage.crossing_time)
-    found.crossing_time[some] = np.where(passed, began + passage.crossing_time, found.crossing_time[some])
-    found.end_time[some] = np.where(passage.status == REACHED_END, t1, began + passage.elapsed)
-    found.state[:, some] = passage.state
-    found.phase[some] = passage.phase
-    found.counts[:, some] += passage.counts
+    _store(found, some, passed_on(np, _some(found, some), passage, t1[some]))
+
+
+def _some(found: Journey, some: Int[np.ndarray, " some"]) -> Journey:
+    return Journey(*(values[..., some] for values in found))
+
+
+def _store(found: Journey, some: Int[np.ndarray, " some"], new: Journey) -> None:
+    for values, of_some in zip(found, new, strict=True):
+        values[..., some] = of_some
+
+
+def marched(xp: Any, found: Journey, outcome: Outcome, t1: Float[Array, " cells"]) -> Journey:
+    """What is known of cells after a march that ended as `outcome` says. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
+    began = found.end_time
+    # A cell that enters a phase beyond the event passed it earlier, unless it started there.
+    passed = xp.isfinite(outcome.crossing_time) & ((outcome.crossing_time > 0.0) | xp.isinf(found.crossing_time))
+    return Journey(
+        status=outcome.status,
+        crossing_time=xp.where(passed, began + outcome.crossing_time, found.crossing_time),
+        end_time=xp.where(outcome.status == REACHED_END, t1, began + outcome.end_time),
+        state=outcome.state,
+        steps=found.steps + outcome.steps,
+        rejected=found.rejected + outcome.rejected,
+        phase=found.phase,
+        counts=found.counts,
+    )
+
+
+def passed_on(xp: Any, found: Journey, passage: Passage, t1: Float[Array, " cells"]) -> Journey:
+    """What is known of cells after the passage from one phase to the next. **Arguments:** as for `marched`."""
+    passed = xp.isfinite(passage.crossing_time)
     # Non-finite states would be marched forever.
-    sound = np.isfinite(passage.state).all(axis=0) & np.isfinite(passage.elapsed)
-    found.status[some] = np.where(sound, passage.status, FAILED)
+    sound = xp.isfinite(passage.state).all(axis=0) & xp.isfinite(passage.elapsed)
+    return Journey(
+        status=xp.where(sound, passage.status, FAILED),
+        crossing_time=xp.where(passed, found.end_time + passage.crossing_time, found.crossing_time),
+        end_time=xp.where(passage.status == REACHED_END, t1, found.end_time + passage.elapsed),
+        state=passage.state,
+        steps=found.steps,
+        rejected=found.rejected,
+        phase=passage.phase,
+        counts=found.counts + passage.counts,
+    )

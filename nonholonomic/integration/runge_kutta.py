@@ -1,4 +1,4 @@
-"""One explicit Runge-Kutta step of many lanes, from a Diffrax solver's tableau, with the stages written out."""
+"""One explicit Runge-Kutta step of many lanes, from a Diffrax solver's tableau, with the stages written out or in a loop."""
 
 import functools
 import operator

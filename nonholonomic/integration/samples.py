@@ -23,8 +23,8 @@ from .status import REACHED_END, RUNNING
 #: Iterations of a period: as many as fit the caches with their record.
 PERIOD = 64
 
-#: By how much a step is stretched to end on a sample: the error stays below the tolerance, which a step is proposed to miss
-#: by `attempt.SAFETY`.
+#: By how much a step is stretched to end on a sample: its error stays below the tolerance, because steps are proposed with a
+#: margin of `attempt.SAFETY`.
 STRETCH = 1.08
 
 Samples = Float[Array, "cells times components"]

@@ -32,12 +32,12 @@ class Settings(eqx.Module):
     lanes: int | None = eqx.field(static=True, default=None)
 
     def lanes_of(self, cells: int, parts: int = 1) -> int:
-        """How many of the cells of a problem advance together, its state being of so many parts."""
+        """How many of the cells of a problem advance together, given the number of parts in its state."""
         return lanes_for(cells, parts) if self.lanes is None else self.lanes
 
 
 def lanes_for(cells: int, parts: int = 1) -> int:
-    """How many cells should advance together, given their number and of how many parts the state is made.
+    """How many cells should advance together, given their number and the number of equal parts in the state.
 
     On a CPU a block and its stages should fit the first caches; an accelerator is idle below tens of thousands.
     """

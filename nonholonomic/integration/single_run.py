@@ -39,8 +39,13 @@ class Followed(NamedTuple):
         for piece in self.pieces:
             here = (times > float(piece.t0)) & (times <= float(piece.t1))
             if here.any():
-                states[:, here] = np.asarray(_evaluate(piece, jnp.asarray(times)[here])).T
+                states[:, here] = np.asarray(_evaluate(piece, padded(times[here], len(times)))).T[:, : here.sum()]
         return states
+
+
+def padded(times: Float[np.ndarray, " times"], least: int) -> Float[np.ndarray, " more"]:
+    """Times with the last repeated, up to a power of two of at least `least`: a program serves many numbers of times."""
+    return np.pad(times, (0, (1 << (least - 1).bit_length()) - len(times)), mode="edge")
 
 
 @eqx.filter_jit
@@ -142,15 +147,16 @@ def follow(
         steps = int(solution.stats["num_accepted_steps"])
         accepted, rejected = accepted + steps, rejected + int(solution.stats["num_rejected_steps"])
         ts, ys = saved(solution)
-        ts, ys = np.asarray(ts[1 : steps + 1]), np.asarray(ys[1 : steps + 1]).T
+        # Cut as NumPy arrays: a slice by JAX would be compiled for every number of steps.
+        ts, ys = np.asarray(ts)[1 : steps + 1], np.asarray(ys)[1 : steps + 1].T
         finite = np.isfinite(ts) & np.all(np.isfinite(ys), axis=0)
-        out = np.flatnonzero(np.asarray(guards[:steps]) < 0.0)
+        out = np.flatnonzero(np.asarray(guards)[:steps] < 0.0)
         if out.size:
             lost, steps = True, int(out[0]) + 1
             begin = float(ts[out[0] - 1]) if out[0] else float(time)
             ts, ys, finite = ts[:steps].copy(), ys[:, :steps].copy(), finite[:steps]
             ts[-1] = float(_loss(problem, solution, jnp.asarray(begin), jnp.asarray(ts[-1])))
-            ys[:, -1] = np.asarray(solution.evaluate(ts[-1]))
+            ys[:, -1] = np.asarray(_evaluate(solution, ts[-1:]))[0]
         failed = steps == 0 or not finite.all()
         good = int(finite.sum()) if finite.all() else int(np.argmin(finite))
         times.append(ts[:good])

@@ -27,12 +27,12 @@ def folder_of(path: Path) -> Path:
 
 
 class Blocks:
-    """The blocks of a table's file that there are.
+    """The finished blocks of a table's file.
 
     Each is complete and on the disk before it is counted, whenever the process dies, and whenever the machine does, as far as
     its disk keeps what it confirms.
 
-    `finished`: the numbers of those that there were.
+    `finished`: the numbers of the blocks that were found when the sweep began.
     """
 
     def __init__(self, path: Any, layout: Layout):
@@ -128,7 +128,7 @@ class Blocks:
     def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Stored:
         """Store the blocks that are computed, each as it comes, and make the table's file of these and those there were.
 
-        What goes into the file while blocks are computed needs not be read again at the end.
+        What goes into the file while blocks are computed need not be read again at the end.
 
         **Raises:** `OSError` that names the path if it cannot be written, or a block that is damaged; no block is lost.
         """
@@ -206,8 +206,8 @@ def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
         # It was finished meanwhile.
         return None
     if damaged:
-        told = f"{damaged} of its {layout.blocks} blocks do not match their checksums"
-        raise OSError(f"cannot read {path}: it is damaged: {told}")
+        reason = f"{damaged} of its {layout.blocks} blocks do not match their checksums"
+        raise OSError(f"cannot read {path}: it is damaged: {reason}")
     return layout, found
 
 

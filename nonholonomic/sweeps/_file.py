@@ -55,7 +55,7 @@ def replacing(path: Path, beside: Path | None = None) -> Iterator[Path]:
     except BaseException as error:
         with contextlib.suppress(OSError):
             scratch.unlink()
-        # What reading says is not changed.
+        # Errors that were raised while reading the blocks keep their own message.
         if isinstance(error, OSError) and error.strerror:
             raise OSError(f"cannot write {path}: {error.strerror}") from None
         raise
@@ -197,7 +197,7 @@ def _attribute(of: Any, name: str) -> Any:
 class Stored:
     """A table in its file.
 
-    `path`: the file; `layout`: what it holds. Numbers are held against their checksums when they are read.
+    `path`: the file; `layout`: what it holds. Numbers are checked against their checksums when they are read.
     """
 
     def __init__(self, path: Path):
@@ -254,8 +254,8 @@ class Stored:
             with h5py.File(self.path, "r") as file:
                 yield file
         except (OSError, KeyError, IndexError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-            told = f"it is not a table of nonholonomic, or it is damaged ({error})"
-            raise OSError(f"cannot read {self.path}: {told}") from None
+            reason = f"it is not a table of nonholonomic, or it is damaged ({error})"
+            raise OSError(f"cannot read {self.path}: {reason}") from None
 
 
 def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:

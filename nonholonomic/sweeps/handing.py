@@ -8,7 +8,7 @@ from concurrent.futures import BrokenExecutor, CancelledError, Future
 from queue import SimpleQueue
 from typing import Any
 
-#: A block is given up when this many workers have died of it, the last of them when it was the only block handed out.
+#: A block is given up once it has killed this many workers, the last of them when it was the only block handed out.
 DEATHS = 3
 
 

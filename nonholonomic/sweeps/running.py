@@ -23,10 +23,10 @@ from .layout import Layout, Values
 from .table import Table
 from .tasks import Job, Work, packed, remote_results, stamp, versions
 
-#: Blocks that are handed out at once, at most: what their results take, when they come faster than they can be stored.
+#: The most blocks that are handed out at once: their results are held in memory until they are stored.
 HANDED_OUT = 512
 
-#: Blocks of a large grid, about, and what the results of one may take [bytes].
+#: About how many blocks a large grid is cut into, and what the results of one may take [bytes].
 BLOCKS, MOST_BYTES = 1024, 1 << 21
 
 
@@ -48,22 +48,23 @@ def sweep(
     **Arguments:**
 
     - `job`: (full name of a parameter -> values of some cells, how many of them count) -> name -> results. It may be called
-      from several threads at once; the first call, with no cell that counts, lets it compile. For an executor whose workers
+      from several threads at once; the first call, in which no cell counts, is for compiling. For an executor whose workers
       are other processes it is pickled.
     - `axes`: the grid, the last axis varying fastest.
     - `variables`: what `job` returns.
     - `request`: plain data that says what is computed; it is stored in the table and guards the file.
     - `path`: file to write, block by block; if it holds part of the same request, only the rest is computed.
-    - `block`: how many cells `job` is given at once, `block_for` their number by default; `most`: the most of them, where
-      results are large.
+    - `block`: how many cells `job` is given at once, by default `block_for` the number of cells; `most`: an upper limit
+      to it, where results are large.
     - `inner`: the coordinates of the dimensions that results have besides the grid's, numbers or words.
     - `progress`: whether to show it, on a terminal or in a notebook.
     - `executor`: who computes; by default a thread for each core.
 
     **Returns:** the `Table`.
 
-    **Raises:** `OSError` or `ValueError` if the file cannot be written or holds another request; `RuntimeError` if the executor
-    breaks down or a worker has other versions: what had finished is in the file.
+    **Raises:** `ValueError` if there is no file, and less memory than the table takes; `OSError` or `ValueError` if the file
+    cannot be written or holds another request; `RuntimeError` if the executor breaks down or a worker has other versions: what
+    had finished is in the file.
     """
     cells = size_of(axes)
     given = block_for(cells) if block is None else block
@@ -137,7 +138,16 @@ class Held:
     """The blocks of a table that is not to be stored: the same as `Blocks`, in memory."""
 
     def __init__(self, layout: Layout):
-        """State what the table is made of."""
+        """State what the table is made of.
+
+        **Raises:** `ValueError` if this machine has less memory than it takes.
+        """
+        need, room = layout.bytes_of_cells(layout.cells), memory()
+        if need > room:
+            raise ValueError(
+                f"path = None: {layout.cells:.3g} cells take {1e-9 * need:.3g} GB, and this machine has {1e-9 * room:.3g} GB "
+                "of memory; with path= they are held in a file"
+            )
         self.finished: set[int] = set()
         self._layout, self._found = layout, layout.empty(layout.cells)
 
@@ -201,6 +211,14 @@ def blocks_together(layout: Layout, block: int) -> int:
     """How many blocks are handed out and stored as one, a power of two: more than one where the grid is large."""
     wanted = min(layout.cells // (BLOCKS * block), MOST_BYTES // layout.bytes_of_cells(block))
     return 1 << max(wanted, 1).bit_length() - 1
+
+
+def memory() -> float:
+    """The memory of this machine in bytes; infinite where it is not told."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return float("inf")
 
 
 def workers() -> int:

@@ -27,7 +27,7 @@ class Table(eqx.Module):
     - `coords`: name -> values, one for each axis of the grid, in order, and then for the dimensions that some variables have
       besides, such as "time".
     - `variables`: name -> array over the grid; `status` is an array of words. Those of a table of more than 128 MB that
-      has a file stay there: each is read, and held against its checksums, whenever it is asked for.
+      has a file stay there: each is read, and checked against its checksums, whenever it is asked for.
     - `units`: name of a coordinate or variable -> its unit.
     - `attributes`: what was computed, with what versions: plain data.
     - `words`: variable that consists of words -> the words, in the order of the numbers that stand for them in a file.

@@ -6,6 +6,7 @@ from .meshes import ball as ball
 from .meshes import bar as bar
 from .meshes import box as box
 from .meshes import rod as rod
+from .meshes import striped as striped
 from .meshes import wheel as wheel
 from .page import NO_VIEW as NO_VIEW
 from .page import Page as Page
@@ -26,5 +27,6 @@ from .stage import Mesh as Mesh
 from .stage import Show as Show
 from .stage import Stage as Stage
 from .stage import Trace as Trace
+from .stage import told_by_colour as told_by_colour
 from .stage import turned as turned
 from .viewable import Viewable as Viewable

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .page import ANGLE, finite, view_from
+from .page import ANGLE, among, finite, view_from
 from .plot import new_figure
 from .stage import Show, Stage, css, matrices, nearest
 
@@ -116,6 +116,7 @@ class _Space:
         place, middle = np.array(camera[:3]), np.array(camera[3:6])
         away = place - middle
         distance = np.linalg.norm(away)
+        self.apart = among(np.stack([show.bodies[0].position[0] for show in stage.shows]))[1]
         self.reach, self.middle = 0.8 * distance * np.tan(np.radians(ANGLE) / 2.0), middle
         axes.view_init(np.degrees(np.arcsin(away[2] / distance)), np.degrees(np.arctan2(away[1], away[0])))
         axes.set_axis_off()
@@ -132,10 +133,14 @@ class _Space:
 
     def draw(self, frame: int) -> None:
         """The stage at one of its times."""
-        middle = self.stage.shows[0].bodies[0].position[self.frames[0][frame]] if self.follow else self.middle
+        middle, reach = self.middle, self.reach
+        if self.follow:
+            shown = zip(self.stage.shows, self.frames, strict=True)
+            middle, apart = among(np.stack([show.bodies[0].position[frames[frame]] for show, frames in shown]))
+            reach += apart - self.apart
         for axis, centre in zip("xyz", middle, strict=True):
-            getattr(self.axes, f"set_{axis}lim")(centre - self.reach, centre + self.reach)
-        near = [line for whole in self.stage.arena.lines for line in _pieces(whole, middle, 1.6 * self.reach)]
+            getattr(self.axes, f"set_{axis}lim")(centre - reach, centre + reach)
+        near = [line for whole in self.stage.arena.lines for line in _pieces(whole, middle, 1.6 * reach)]
         self.ground.set_segments(near)
         triangles, colours, traces, arrows = [], [], iter(self.traces), iter(self.arrows)
         for show, frames in zip(self.stage.shows, self.frames, strict=True):
@@ -148,9 +153,7 @@ class _Space:
                     colours.append(_shaded(corners, mesh.colour))
             for trace in show.traces:
                 points = finite(trace.points[: now + 1]) + (0.0 if trace.about is None else trace.about[now])
-                points = np.where(
-                    np.linalg.norm(points - middle, axis=-1, keepdims=True) < 1.6 * self.reach, points, np.nan
-                )
+                points = np.where(np.linalg.norm(points - middle, axis=-1, keepdims=True) < 1.6 * reach, points, np.nan)
                 next(traces).set_data_3d(*points.T)
             for arrow in show.arrows:
                 ends = np.stack([arrow.start[now], arrow.start[now] + arrow.vector[now]])

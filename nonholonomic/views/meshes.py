@@ -32,10 +32,15 @@ def of_grid(rows: int, columns: int) -> np.ndarray:
     return np.concatenate([np.stack([a, d, b], axis=-1), np.stack([b, d, c], axis=-1)])
 
 
-def ball(radius: float, colours: tuple[int, int], sectors: int = 6) -> tuple[Mesh, Mesh]:
+def ball(radius: float, colours: tuple[int, int]) -> tuple[Mesh, Mesh]:
     """A ball about the origin, in sectors about the z axis that are of two colours in turn."""
     polar = np.linspace(0.0, np.pi, 25)
-    whole = revolved(radius * np.stack([np.sin(polar), np.cos(polar)], axis=-1), colours[0])
+    return striped(radius * np.stack([np.sin(polar), np.cos(polar)], axis=-1), colours)
+
+
+def striped(profile: Float[np.ndarray, "points 2"], colours: tuple[int, int], sectors: int = 6) -> tuple[Mesh, Mesh]:
+    """What `revolved` makes of a profile, in sectors about the z axis that are of two colours in turn."""
+    whole = revolved(profile, colours[0])
     middles = whole.vertices[whole.triangles].mean(axis=1)
     first = np.floor(np.arctan2(middles[:, 1], middles[:, 0]) / np.pi * sectors / 2.0).astype(int) % 2 == 0
     return (

@@ -84,7 +84,7 @@
       curves: show.curves.map((one) => ({ ...one, values: array(one.values) })),
     }));
     const world = plot.getWorld();
-    stages.push({ plot, world, shows, follow: stage.follow, focus: null, find: (id) => world.ObjectsById[id] });
+    stages.push({ plot, world, shows, size: stage.size, follow: stage.follow, focus: null, span: null, find: (id) => world.ObjectsById[id] });
   }
 
   function show(stage, run, time) {
@@ -114,15 +114,16 @@
   const labels = [...new Set(stages.flatMap((s) => s.shows.flatMap((run) => run.curves.map((one) => one.label))))];
   const strips = labels.map((label) => {
     const box = element("div", stripsBox, { className: "strip" });
-    const value = element("span", box, { className: "value" });
-    element("span", box, { textContent: label });
+    const head = element("div", box, { className: "head" });
+    element("span", head, { textContent: label });
+    const value = element("span", head, { className: "value" });
     const canvas = element("canvas", box);
     const curves = stages.flatMap((s) => s.shows.flatMap((run) => run.curves.filter((one) => one.label === label)
       .map((one) => ({ times: run.times, values: one.values, colour: run.colour }))));
     let low = Infinity, high = -Infinity;
     for (const one of curves) for (const v of one.values) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
     // What is constant but for round-off is drawn as a constant.
-    const least = 1e-3 * Math.max(Math.abs(low), Math.abs(high), 1e-30);
+    const least = 1e-3 * Math.max(Math.abs(low), Math.abs(high)) || 1;
     if (!(high - low > least)) { low -= least; high += least; }
     return { canvas, curves, value, low, high, pale: null, strong: null };
   });
@@ -190,16 +191,20 @@
     time = Math.min(Math.max(wanted, 0), facts.duration);
     for (const stage of stages) {
       const places = stage.shows.map((run) => show(stage, run, time));
-      const focus = point(stage.shows[0].bodies[0].position, places[0]);
+      // The middle of all runs, and so far back that all are seen.
+      const at = stage.shows.map((run, k) => point(run.bodies[0].position, places[k]));
+      const focus = [0, 1, 2].map((k) => at.reduce((sum, one) => sum + one[k], 0) / at.length);
+      const span = 3.6 * stage.size + Math.max(...at.map((one) => Math.hypot(...one.map((x, k) => x - focus[k]))));
       if (stage.focus && follow.checked) {
         const { camera, controls: handle } = stage.world;
         ["x", "y", "z"].forEach((axis, k) => {
-          camera.position[axis] += focus[k] - stage.focus[k];
+          const away = (camera.position[axis] - handle.target[axis]) * span / stage.span;
           handle.target[axis] += focus[k] - stage.focus[k];
+          camera.position[axis] = handle.target[axis] + away;
         });
         handle.update();
       }
-      stage.focus = focus;
+      [stage.focus, stage.span] = [focus, span];
       stage.plot.render();
     }
     strips.forEach(draw);

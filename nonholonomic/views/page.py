@@ -1,16 +1,19 @@
 """One page that holds everything: a view in three dimensions that moves, drawn by K3D, and strips of curves (needs k3d)."""
 
 import base64
+import contextlib
 import html
 import io
 import json
 import zlib
+from collections.abc import Iterator
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from .meshes import revolved
 from .stage import Arrow, Mesh, Points, Show, Stage, css
@@ -18,7 +21,7 @@ from .stage import Arrow, Mesh, Points, Show, Stage, css
 #: How fast time may run.
 SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 
-#: What a page says that has no motion.
+#: What a page without motion says.
 NO_VIEW = "The page is without motion: k3d is not installed (pip install 'nonholonomic[view]')."
 
 LINES = 0x7C8896
@@ -41,7 +44,7 @@ class Page(NamedTuple):
         Path(path).write_text(self.html, encoding="utf-8")
 
     def _repr_html_(self) -> str:
-        return f'<iframe srcdoc="{html.escape(self.html)}" style="width:100%;height:820px;border:0"></iframe>'
+        return f'<iframe srcdoc="{html.escape(self.html)}" style="width:100%;height:820px;border:0" loading="lazy"></iframe>'
 
     def __repr__(self) -> str:
         return f"Page of {len(self.html) / 1e6:.2f} MB; save(path) writes it, and a notebook shows it"
@@ -100,7 +103,7 @@ def _coded(data: bytes) -> str:
 
 
 def _script(name: str, text: str, kind: str = "text/plain") -> str:
-    # A page ends a script where it reads so, whatever the script is.
+    # A browser takes "</script>" for the end of a script wherever it stands, even in data.
     safe = text.replace("</", "<\\/")
     return f'<script type="{kind}" id="{name}">{safe}</script>'
 
@@ -154,6 +157,25 @@ def _stage(stage: Stage, numbers: _Numbers) -> tuple[bytes, dict[str, Any]]:
     """K3D's snapshot of what a stage draws, and what the script needs to know of it."""
     import k3d
 
+    with _unseen():
+        return _drawn(k3d, stage, numbers)
+
+
+@contextlib.contextmanager
+def _unseen() -> Iterator[None]:
+    """K3D's widgets are not told to a notebook, which would keep megabytes of what the page holds anyway."""
+    import comm
+
+    told, comm.create_comm = comm.create_comm, comm.DummyComm
+    try:
+        yield
+    finally:
+        comm.create_comm = told
+
+
+def _drawn(k3d: Any, stage: Stage, numbers: "_Numbers") -> tuple[bytes, dict[str, Any]]:
+    from ipywidgets import Widget
+
     plot = k3d.plot(
         camera_auto_fit=False,
         grid_visible=False,
@@ -172,10 +194,17 @@ def _stage(stage: Stage, numbers: _Numbers) -> tuple[bytes, dict[str, Any]]:
     keys = [(stage.arena.spacing, "")]
     for show in stage.shows:
         keys += [(show.name, css(show.colour))] if len(stage.shows) > 1 else []
+    alone = len(stage.shows) == 1
     for show in stage.shows[:1]:
-        keys += [(one.name, css(one.colour)) for one in (*show.traces, *show.arrows)]
-    fact = {"title": stage.title, "keys": keys, "follow": follow, "shows": shows}
-    return plot.get_binary_snapshot(9), fact
+        # Traces of several runs have the runs' colours.
+        keys += [(one.name, css(one.colour)) for one in (*(show.traces if alone else ()), *show.arrows)]
+    fact = {"title": stage.title, "keys": keys, "follow": follow, "size": _size(stage), "shows": shows}
+    snapshot = plot.get_binary_snapshot(9)
+    # Widgets are kept until they are closed; a plot of K3D closes something else.
+    for one in (*plot.objects, plot):
+        Widget.close(one.layout)
+        Widget.close(one)
+    return snapshot, fact
 
 
 class _Drawn:
@@ -251,16 +280,27 @@ def _arrow(arrow: Arrow, drawn: _Drawn, numbers: _Numbers) -> dict[str, Any]:
     }
 
 
+def _size(stage: Stage) -> float:
+    return max(show.size for show in stage.shows)
+
+
+def among(points: Float[np.ndarray, "points 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
+    """The middle of some points, and how far they are from it."""
+    middle = points.mean(axis=0)
+    return middle, float(np.linalg.norm(points - middle, axis=-1).max())
+
+
 def view_from(stage: Stage) -> tuple[list[float], bool]:
     """Camera (its place, what it looks at, up), and whether it has to follow, as the body is small against its path."""
     paths = [finite(show.bodies[0].position) for show in stage.shows]
-    size = max(show.size for show in stage.shows)
+    size = _size(stage)
     points = np.concatenate(paths)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
     reach = np.linalg.norm(points - middle, axis=-1).max()
     follow = bool(reach > 4.0 * size)
     if follow:
-        middle, reach = paths[0][0], 2.0 * size
+        middle, apart = among(np.stack([path[0] for path in paths]))
+        reach = 2.0 * size + apart
     normal = stage.arena.normal
     aside = np.array([0.35, -1.0, 0.0])
     aside = aside - (aside @ normal) * normal

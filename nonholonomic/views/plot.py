@@ -66,12 +66,13 @@ def draw_table(
     figure = new_figure() if ax is None else None
     drawing = ax if figure is None else figure.add_subplot()
     drawing.set_xlabel(table.label(names[0]))
-    drawing.set_title(", ".join(_told(table, name, place) for name, place in cut.items()), fontsize="medium")
+    drawing.set_title(", ".join(_cut_text(table, name, place) for name, place in cut.items()), fontsize="medium")
     if len(names) == 1 or len(table.coords[names[1]]) <= MOST_LINES:
         _draw_lines(drawing, table, names, shown.reshape(len(shown), -1))
         drawing.set_ylabel(table.label(variable))
         if log:
             drawing.set_yscale("log")
+            _plain_numbers(drawing.yaxis)
     else:
         drawing.set_ylabel(table.label(names[1]))
         _draw_map(drawing, table, names, shown, table.label(variable), log)
@@ -116,7 +117,7 @@ def _slice(values: Any, dims: tuple[str, ...], names: list[str], cut: dict[str, 
     return values[tuple(cut.get(name, slice(None)) for name in dims)].transpose([left.index(name) for name in names])
 
 
-def _told(table: "Table", name: str, place: int) -> str:
+def _cut_text(table: "Table", name: str, place: int) -> str:
     """A coordinate's value as text: "θ(0) = 0.1 rad"."""
     value = table.coords[name][place]
     text = str(value) if isinstance(value, str) else f"{value:.4g}"
@@ -126,7 +127,7 @@ def _told(table: "Table", name: str, place: int) -> str:
 def _draw_lines(drawing: Any, table: "Table", names: list[str], lines: Any) -> None:
     marker = "o-" if len(lines) <= 100 else "-"
     for column, line in enumerate(lines.T):
-        label = _told(table, names[1], column) if len(names) > 1 else None
+        label = _cut_text(table, names[1], column) if len(names) > 1 else None
         drawing.plot(table.coords[names[0]], line, marker, markersize=3, label=label)
     if len(names) > 1:
         drawing.legend()
@@ -142,7 +143,17 @@ def _draw_map(drawing: Any, table: "Table", names: list[str], shown: Any, label:
     image = drawing.pcolormesh(x, y, shown.T, shading="nearest", norm=scale)
     beyond = known.size and (known.min() < low, known.max() > high)
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
-    drawing.figure.colorbar(image, ax=drawing, label=label, extend=extend)
+    bar = drawing.figure.colorbar(image, ax=drawing, label=label, extend=extend)
+    if log:
+        _plain_numbers(bar.ax.yaxis)
+
+
+def _plain_numbers(axis: Any) -> None:
+    """Write the numbers of a logarithmic axis as 12.5, not as 1.25 x 10^1, if none is very large or small."""
+    low, high = axis.get_view_interval()
+    if low >= 1e-4 and high <= 1e5:
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("{x:g}" if high < 10.0 * low else "")
 
 
 def _mark_words(drawing: Any, table: "Table", names: list[str], words: Any) -> None:
@@ -181,6 +192,9 @@ def draw_portrait(table: "Table", x: str, y: str, ax: Any = None) -> Any:
     drawing.plot(across[:1], up[:1], "o", color=line.get_color())
     drawing.set_xlabel(across_label)
     drawing.set_ylabel(up_label)
+    if {x, y} == {"position.x", "position.y"}:
+        # A path, as it is from above.
+        drawing.set_aspect("equal", adjustable="datalim")
     return drawing if figure is None else figure
 
 
@@ -192,7 +206,8 @@ def _column(table: "Table", argument: str, name: str) -> tuple[Any, str]:
         return table[variable], table.label(variable)
     if variable in table.variables and len(dims) == 1 and component in table.coords[dims[0]]:
         place = int(np.flatnonzero(table.coords[dims[0]] == component)[0])
-        return table[variable][:, place], f"{component} of {table.label(variable)}"
+        name, bracket, unit = table.label(variable).rpartition(" [")
+        return table[variable][:, place], f"{name}, {component}{bracket}{unit}" if bracket else f"{unit}, {component}"
     known = [one for one in table.variables if one not in table.inner]
     known += [f"{one}.{part}" for one, dims in table.inner.items() for part in table.coords[dims[0]]]
     raise ValueError(f"{argument} = {name!r} must be one of {', '.join(known)}")

@@ -85,12 +85,21 @@ class Stage(NamedTuple):
     shows: tuple[Show, ...]
 
 
-#: Colours of the runs of a stage: that of a run's curves and of one half of its body.
-COLOURS = (0xC8412B, 0x2A6FB0, 0x2E8B57, 0x8E4FA8, 0xC98A1B, 0x3B9AA8)
+#: Colours of the runs of a page, none of them an arrow's: that of a run's curves, and of one half of its body.
+COLOURS = (0xC8412B, 0x2A6FB0, 0x2E8B57, 0x8C5A3C, 0xD0679D, 0x3B9AA8)
 
 #: Colour of the other half.
 PALE = 0xF4E9D2
 DARK = 0x3A3A3E
+
+
+def told_by_colour(shows: tuple[Show, ...]) -> tuple[Show, ...]:
+    """The shows of one stage: where there are several, the traces of each have its colour."""
+    if len(shows) == 1:
+        return shows
+    return tuple(
+        show._replace(traces=tuple(trace._replace(colour=show.colour) for trace in show.traces)) for show in shows
+    )
 
 
 def css(colour: int) -> str:

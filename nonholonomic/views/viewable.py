@@ -1,4 +1,4 @@
-"""What a run can be asked to be seen: a page, an animation, a picture of its curves."""
+"""The ways in which a run can be shown: a page, an animation, a picture of its curves."""
 
 import abc
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ class Viewable(abc.ABC):
         **Example:** `examples/a_page.py`.
         """
         stages = self.stages(others, overlaid)
-        found = page(stages, ", ".join(stage.title for stage in stages), speed=0.5)
+        found = page(stages, "; ".join(stage.title for stage in stages), speed=0.5)
         if path is not None:
             found.save(path)
         return found

@@ -64,7 +64,7 @@ def level(case, q):
         s, c, sy, cy = sin(p2 * x), cos(p2 * x), sin(p2 * y), cos(p2 * y)
         hessian = p1 * p2 * p2 * np.array(((s * cy, c * sy, 0.0), (c * sy, s * cy, 0.0), (0.0, 0.0, 0.0)))
         return z - p1 * s * cy, np.array((-p1 * p2 * c * cy, p1 * p2 * s * sy, 1.0)), hessian
-    if case.arena in ("spheroid", "outside of a sphere"):
+    if case.arena in ("spheroid", "outside of a sphere", "outside of a spheroid"):
         weights = np.array((1 / p1**2, 1 / p1**2, 1 / p2**2)) * (1.0 if case.arena.startswith("outside") else -1.0)
         return q @ (weights * q) - np.sign(weights[0]), 2 * weights * q, np.diag(2 * weights)
     if case.arena == "torus":
@@ -183,6 +183,12 @@ def row(case):
     return {name: value if isinstance(value, str) else repr(float(value)) for name, value in found.items()}
 
 
+def recorded():
+    """The rows of the file, in the order of `cases`, numbers as numbers."""
+    rows = csv.DictReader(Path(__file__).with_name("arena_reference.csv").read_text().splitlines())
+    return [{k: v if k in ("arena", "status") else float(v) for k, v in row.items()} for row in rows]
+
+
 ARENAS = {
     "tilted plane": (0.35, 0.0, (0.1, 0.05, 0.0365)),
     "paraboloid": (0.3, 0.0, (0.1, -0.06, 0.023)),
@@ -202,6 +208,12 @@ def cases():
             v, w = random.uniform(-0.2, 0.2, 2), random.uniform(-10.0, 10.0, 3)
             mu = random.uniform(0.1, 0.3)
             found.append(Case(arena, p1, p2, mu, slip_speed, theta, azimuth, spin, *near, *v, *w, 0.6))
+    # Two that lose their contact: over the crest of a wave, and down the side of an egg.
+    turning = (3.0, -5.0, 2.0)
+    found.append(Case("graph", 0.04, 12.0, 0.2, 0.02, 0.8, 0.5, 90.0, -0.07, 0.05, -0.03, 2.1, -0.2, *turning, 0.15))
+    found.append(
+        Case("outside of a spheroid", 0.3, 0.5, 0.2, 0.02, 0.8, 0.5, 90.0, 0.05, 0.08, 0.48, 0.9, -0.2, *turning, 0.15)
+    )
     return found
 
 

@@ -3,7 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, rutstam_top
+from close import assert_close
+from tops import rutstam_top
 
 import tippe
 

@@ -5,8 +5,9 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, homogeneous_ball, rutstam_top
+from close import assert_close
 from scipy.special import ellipk
+from tops import homogeneous_ball, rutstam_top
 
 import tippe
 from nonholonomic.integration import Settings, follow

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, random_states, rutstam_top
+from close import assert_close
+from tops import random_states, rutstam_top
 
 import tippe
 from nonholonomic.integration import Settings

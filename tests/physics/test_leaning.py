@@ -7,7 +7,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close
+from close import assert_close
 from hop_reference import CASES, Case, contact, energy, gap, rate, watched
 from scipy.integrate import solve_ivp
 from test_hops import scene_of

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, homogeneous_ball, random_states, rutstam_top
+from close import assert_close
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
+from tops import homogeneous_ball, random_states, rutstam_top
 
 import tippe
 from nonholonomic.formulations import Multipliers

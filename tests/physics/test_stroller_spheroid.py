@@ -171,7 +171,9 @@ def test_motion_without_friction_has_an_invariant_measure():
     np.testing.assert_allclose(divergence / jnp.max(jnp.abs(jacobians), axis=(1, 2)), 0.0, atol=1e-14)
 
 
-@pytest.mark.parametrize(("side", "fork"), [("outside", "relative"), ("inside", "absolute")])
+@pytest.mark.parametrize(
+    ("side", "fork"), [pytest.param("outside", "relative", marks=pytest.mark.slow), ("inside", "absolute")]
+)
 def test_energy_is_the_work_done(side, fork):
     """Row 12: with every friction, a drive and a steering torque, E(t) = E(0) + work; and dE/dt is the power."""
     scene = Scene(BODY, Spheroid(2.0, 1.1), Damping(0.3, 0.2, 0.1, 0.15), side=side, fork=fork)

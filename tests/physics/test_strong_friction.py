@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close
+from close import assert_close
 from hop_reference import Case, contact, launch, rate, row
 from impact_reference import Body
 from impact_reference import strike as reference_strike
@@ -105,6 +105,7 @@ def test_impacts_in_which_friction_pulls_down_first():
     assert pulled >= 5
 
 
+@pytest.mark.slow
 def test_tables_go_through_such_impacts():
     """Inversion times behind them, mu = 0.8, against the reference of whole runs."""
     case = Case(0.02, 0.02, 0.016, 1.6e-6, 1.9e-6, 0.8, 1.5, 0.0, slip_speed=0.02, t1=0.4)

@@ -1,5 +1,7 @@
 """The vector form of the tippe top against formulations derived on their own: accelerations and trajectories."""
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -83,9 +85,12 @@ def relative_error(found, expected, lengths):
 
 
 @pytest.mark.parametrize(
-    "friction", ["frictionless", "viscous", pytest.param("coulomb", marks=pytest.mark.slow), "torques"]
+    ("arena", "friction"),
+    [
+        pytest.param(*pair, marks=[] if pair in (("plane", "viscous"), ("cylinder", "torques")) else pytest.mark.slow)
+        for pair in itertools.product(ARENAS, FRICTIONS)
+    ],
 )
-@pytest.mark.parametrize("arena", ARENAS)
 def test_lagrange_poincare_and_the_corrected_paper_give_the_accelerations_of_the_vector_form(arena, friction):
     """Four derivations, 1000 random tops, arenas and states each: q'' to 1e-10, and N to 1e-10 of the weight."""
     scenes, states = legal_cases(arena, friction)
@@ -269,6 +274,7 @@ def test_trajectories_of_all_formulations_on_the_plane_agree_for_five_seconds(fr
     np.testing.assert_allclose(scene.jellett(vector), constant, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_trajectories_of_all_formulations_in_the_cylinder_agree_for_five_seconds():
     """A top thrown up the wall: theta, eta and their rates from three formulations, to 1e-8."""
     scene = tippe.Scene(top(), tippe.Cylinder(0.3), tippe.Viscous(0.3))

@@ -90,6 +90,7 @@ def test_an_array_in_the_input_has_a_slope_for_each_entry():
         np.testing.assert_allclose(gradient[k], expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_random_rides_with_components_at_rest():
     """Steering, its rate, both or neither at rest, stiff and soft forks: gradients by every number against differences."""
     random = np.random.default_rng(3)
@@ -121,11 +122,15 @@ def test_random_rides_with_components_at_rest():
         assert np.all(error < 1e-6 * scale / sizes[:, k].clip(max=1.0)), (k, error / scale)
 
 
-def test_diffrax_differentiates_the_midpoint_rule_too():
+@pytest.mark.parametrize(
+    ("transform", "options"),
+    [(jax.grad, {}), pytest.param(jax.jacfwd, {"adjoint": diffrax.ForwardMode()}, marks=pytest.mark.slow)],
+)
+def test_the_midpoint_rule_is_differentiated_by_either_way(transform, options):
     """Its steps have a given length, whoever differentiates them."""
 
-    def end(torque, **options):
-        return sideways(torque, t1=1.0, solver=stroller.ImplicitMidpoint(0.1), **options)
+    def end(torque, **more):
+        return sideways(torque, t1=1.0, solver=stroller.ImplicitMidpoint(0.1), **more)
 
-    found = jax.jacfwd(lambda torque: end(torque, adjoint=diffrax.ForwardMode()))(0.1)
+    found = transform(lambda torque: end(torque, **options))(0.1)
     np.testing.assert_allclose(found, extrapolated(end, 0.1, 1e-4), rtol=1e-7)

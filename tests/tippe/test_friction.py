@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import lagrange_top
 import numpy as np
 import pytest
-from conftest import assert_close, random_states, rutstam_top
+from close import assert_close
 from hard.friction import hertz_disc
+from tops import random_states, rutstam_top
 
 import tippe
 from tippe.friction import ContactLoad, Slip

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, rutstam_top
+from close import assert_close
+from tops import rutstam_top
 
 import tippe
 

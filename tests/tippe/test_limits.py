@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import rutstam_top
+from tops import rutstam_top
 
 import tippe
 

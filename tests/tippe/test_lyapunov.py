@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from conftest import assert_close, rutstam_top
+from close import assert_close
+from tops import rutstam_top
 
 import tippe
 from tippe import steady

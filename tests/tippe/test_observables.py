@@ -3,7 +3,7 @@
 import logging
 
 import numpy as np
-from conftest import assert_close
+from close import assert_close
 
 import tippe
 

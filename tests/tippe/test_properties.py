@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close
+from close import assert_close
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
@@ -245,7 +245,7 @@ FEW = settings(COMMON, max_examples=3, derandomize=True)
 MANY = settings(COMMON, max_examples=180, print_blob=True)
 
 
-@pytest.mark.parametrize("arena", ARENAS)
+@pytest.mark.parametrize("arena", [pytest.param("plane", marks=pytest.mark.slow), "cylinder", "sphere"])
 def test_properties(arena):
     """Finite or flagged, energy, Jellett's constant, mirrors, units, time reversal, turning."""
 

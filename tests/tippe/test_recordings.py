@@ -6,7 +6,8 @@ import math
 import lagrange_top
 import numpy as np
 import pytest
-from conftest import assert_close, rutstam_top
+from close import assert_close
+from tops import rutstam_top
 from viscous_top import Body, azimuth, follow, start, theta
 
 import tippe

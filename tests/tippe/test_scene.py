@@ -6,7 +6,8 @@ from collections import Counter
 import jax
 import jax.numpy as jnp
 import pytest
-from conftest import assert_close, random_states, rutstam_top
+from close import assert_close
+from tops import random_states, rutstam_top
 
 import tippe
 from nonholonomic.validation import all_bounds, legal
@@ -14,6 +15,7 @@ from nonholonomic.validation import all_bounds, legal
 pytestmark = pytest.mark.newest
 
 GOOD = {"mass": 0.02, "radius": 0.02, "offset": 0.006, "I1": 3e-6, "I3": 3.2e-6}
+EGG = {"mass": 0.05, "equatorial": 0.02, "polar": 0.028, "I1": 1.184e-5, "I3": 8e-6}
 
 
 @pytest.mark.parametrize(
@@ -59,6 +61,24 @@ def test_impossible_tops_are_refused(change, message):
         (lambda: tippe.Scene(rutstam_top(), surface="plane"), "surface = 'plane' must be a Surface"),
         (lambda: tippe.Scene(rutstam_top(), friction=0.3), "friction = 0.3 must be a Friction"),
         (lambda: tippe.Scene("top"), "body = 'top' must be a Top"),
+        (lambda: tippe.SpheroidBody(**(EGG | {"polar": 0.0})), "polar = 0.0 must be greater than 0.0"),
+        (lambda: tippe.SpheroidBody(**(EGG | {"offset": 0.03})), "offset = 0.03 must be less than 0.028"),
+        (lambda: tippe.ConvexBody(0.05, 0.02, 1e-5, 8e-6), r"support = 0.02 must be a function of \(c\)"),
+        (
+            lambda: tippe.ConvexBody(0.05, lambda c: 0.02 - 0.03 * c, 1e-5, 8e-6),
+            r"least support = -0.0\d* must be greater than 0.0 \(the centre of mass",
+        ),
+        (
+            lambda: tippe.ConvexBody(0.05, lambda c: 0.02 - 0.01 * c * c, 1e-5, 8e-6),
+            "least radius of curvature by supp",
+        ),
+        (lambda: tippe.Scene(tippe.SpheroidBody(**EGG), tippe.Sphere(1.0)), "must be a Plane for a SpheroidBody"),
+        (lambda: tippe.Scene(tippe.SpheroidBody(**EGG), contact="hybrid"), "must be 'stop' for a SpheroidBody"),
+        (
+            lambda: tippe.Scene(tippe.SpheroidBody(**EGG), friction=tippe.SetValuedCoulomb(0.3)),
+            r"friction = SetValuedCoulomb\(mu=0.3\) must be a law without phases for a SpheroidBody",
+        ),
+        (lambda: tippe.steady.jellett_thresholds(tippe.Scene(tippe.SpheroidBody(**EGG))), "must be a Top"),
         (lambda: tippe.Launch(-0.1, 100.0), "theta = -0.1 must be at least 0.0"),
         (lambda: tippe.Launch(3.2, 100.0), "theta = 3.2 must be at most 3.14159"),
         (lambda: tippe.Launch(0.1, math.nan), "spin = nan must be finite"),
@@ -83,6 +103,8 @@ def test_traced_numbers_pass_the_checks():
         (lambda x: tippe.Top(**(GOOD | {"offset": x})), 0.0, 0.02),
         (lambda x: tippe.Top(**(GOOD | {"I1": x})), 3e-6, 1.5e-6),
         (lambda x: tippe.Stem(0.005, x), 0.018, 0.0),
+        (lambda x: tippe.SpheroidBody(**(EGG | {"equatorial": x})), 0.03, -0.03),
+        (lambda x: tippe.ConvexBody(0.05, lambda c: 0.02 - x * c, 1e-5, 8e-6), 0.019, 0.021),
         (lambda x: tippe.Launch(x, 100.0), math.pi, 3.2),
         (lambda x: tippe.Launch(0.1, x), -100.0, math.nan),
         (lambda x: tippe.Launch(0.1, 100.0, eta=x), -3.0, -4.0),

@@ -14,7 +14,8 @@ import jax
 import numpy as np
 import pytest
 import xarray
-from conftest import assert_close, rutstam_top
+from close import assert_close
+from tops import rutstam_top
 
 import tippe
 from nonholonomic.sweeps import running as sweeping
@@ -52,7 +53,7 @@ def test_every_cell_is_inversion_time(table, rutstam_scene_module):
     assert_close(table.end_theta, 0.95 * math.pi, atol=1e-7)
 
 
-@pytest.mark.parametrize("arena", [tippe.Plane(), tippe.Cylinder(0.3)])
+@pytest.mark.parametrize("arena", [tippe.Plane(), pytest.param(tippe.Cylinder(0.3), marks=pytest.mark.slow)])
 def test_the_same_table_by_vmapped_diffrax(arena):
     """Equal to ten times the tolerance; status in every cell, contact loss among them."""
     scene = tippe.Scene(rutstam_top(), arena, tippe.Viscous(0.3))
@@ -317,26 +318,28 @@ def test_mu_under_rolling_resistance_is_that_of_the_sliding_law():
 ARENAS = (tippe.Plane(), tippe.Cylinder(0.3), tippe.Sphere(0.3))
 LAWS = (tippe.Frictionless(), tippe.Viscous(0.3), tippe.Coulomb(0.3, 0.05), tippe.Contensou(0.3, 5e-4, 0.05))
 SCENES = [(arena, law) for arena in ARENAS for law in (*LAWS, *(tippe.Rolling(1e-4, 1.0, law) for law in LAWS))]
-#: Every arena, and a field of which components vanish identically.
-QUICK = (0, 17)
+#: What is compiled for a scene: a program that goes on beyond the event, one with slopes, and one by another method.
+ASKED = (
+    {"crossing": "both"},
+    {"crossing": "last", "sensitivities": ["offset", "spin"]},
+    {"solver": diffrax.Tsit5()},
+)
+#: A field of which components vanish identically, and the longest one.
+QUICK = ((0, 1), (0, 2), (17, 0))
 
 
 @pytest.mark.parametrize(
-    ("arena", "law"),
+    ("arena", "law", "asked"),
     [
-        pytest.param(*pair, marks=[pytest.mark.newest if place in QUICK else pytest.mark.slow])
+        pytest.param(*pair, asked, marks=[pytest.mark.newest if (place, kind) in QUICK else pytest.mark.slow])
         for place, pair in enumerate(SCENES)
+        for kind, asked in enumerate(ASKED)
     ],
 )
-def test_every_scene_compiles(arena, law):
+def test_every_scene_compiles(arena, law, asked):
     """XLA aborts on calls with arguments that they do not use: arenas and laws go through its single kernel here."""
     scene = tippe.Scene(rutstam_top(), arena, law)
-    for crossing, by in (("both", []), ("last", ["offset", "spin"])):
-        table = tippe.inversion_table(
-            scene, theta=[0.1, 0.2], spin=[90.0, 95.0], t1=0.02, crossing=crossing, sensitivities=by
-        )
-        assert (table.status == "not_inverted").all()
-    table = tippe.inversion_table(scene, theta=[0.1, 0.2], spin=[90.0, 95.0], t1=0.02, solver=diffrax.Tsit5())
+    table = tippe.inversion_table(scene, theta=[0.1, 0.2], spin=[90.0, 95.0], t1=0.02, **asked)
     assert (table.status == "not_inverted").all()
 
 
@@ -410,13 +413,13 @@ def test_first_and_last_crossing_come_from_one_run(arena):
     assert "time" not in both.variables
 
 
-def test_both_crossings_through_phases():
-    """Flights: the first crossing of a run that goes on, and the last."""
+@pytest.mark.parametrize("name", ["last", pytest.param("first", marks=pytest.mark.slow)])
+def test_both_crossings_through_phases(name):
+    """Flights: the crossing of a run that goes on."""
     scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), contact="hybrid")
     asked = {"theta": [0.1], "spin": 200.0, "t1": 8.0}
     both = tippe.inversion_table(scene, crossing="both", **asked)
-    for name in ("first", "last"):
-        assert_close(both.variables[f"{name}_time"], tippe.inversion_table(scene, crossing=name, **asked).time)
+    assert_close(both.variables[f"{name}_time"], tippe.inversion_table(scene, crossing=name, **asked).time)
 
 
 def test_both_crossings_have_no_one_derivative():

@@ -3,8 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, rutstam_top
+from close import assert_close
 from lagrange_top import inversion
+from tops import rutstam_top
 
 import tippe
 from nonholonomic.integration import Settings, compiled_march

@@ -5,7 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close, rutstam_top
+from close import assert_close
+from tops import rutstam_top
 
 import tippe
 
@@ -39,8 +40,9 @@ def test_an_upright_start_has_its_tangent_integrated_too():
 
 @pytest.mark.parametrize(
     "adjoint",
-    [pytest.param(diffrax.RecursiveCheckpointAdjoint(), marks=pytest.mark.slow), diffrax.ForwardMode()],
+    [diffrax.RecursiveCheckpointAdjoint(), diffrax.ForwardMode()],
 )
+@pytest.mark.slow
 def test_an_upright_start_by_diffrax(adjoint):
     transform = jax.jacfwd if isinstance(adjoint, diffrax.ForwardMode) else jax.grad
     assert_close(transform(lambda theta: axis_x(theta, adjoint=adjoint))(0.0), jax.grad(axis_x)(0.0), rtol=1e-6)

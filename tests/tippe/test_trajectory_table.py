@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray
-from conftest import assert_close, rutstam_top
+from close import assert_close
+from tops import rutstam_top
 
 import tippe
 from nonholonomic.sweeps import running as sweeping

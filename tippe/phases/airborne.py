@@ -42,10 +42,10 @@ SLIDING, FLYING = range(2)
 #: Components of a state, behind which others may ride along.
 OWN = 14
 
-#: A rebound slower than this part of sqrt(g R) is none: the contact closes, as in `sliding.py`.
+#: A rebound slower than this fraction of sqrt(g R) is none: the contact closes, as in `sliding.py`.
 CLOSING_SPEED = 1e-5
 
-#: The round-off that a sphere that has just left the arena is allowed, as a part of R.
+#: The round-off that a sphere that has just left the arena is allowed, as a fraction of R.
 ROUNDING = 1e-12
 
 
@@ -125,6 +125,10 @@ class Contact(AbstractProblem):
     scales: Float[Array, "components cells"]
     axial: Float[Array, "..."] | None
 
+    @property
+    def long(self) -> bool:
+        return self.dynamics.frame.long
+
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
 
@@ -195,7 +199,7 @@ class Slide(AbstractPhase):
         return jnp.concatenate([state, jnp.zeros_like(state[:2])])
 
     def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
-        """Fly where the contact is lost, end where it jams or the ball does not fit. Counted are the flights."""
+        """Fly where the contact is lost, end where it jams or the ball does not fit. It counts the flights."""
         body, frame, (u, e, L, place) = self.scene.body, carried_frame(self.scene), parts(state[:OWN])
         axes, zero = frame.own_axes(place), jnp.zeros_like(state[0])
         velocity = (*u, -body.offset * axis_rate(body, e, L)[2])
@@ -241,7 +245,7 @@ class Fly(AbstractPhase):
         return jnp.concatenate([in_contact(ground, free), *rows])
 
     def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
-        """Strike the arena; rebound, or slide on where the rebound would be slow. Counted are the flights that begin."""
+        """Strike the arena; rebound, or slide on where the rebound would be slow. It counts the flights that begin."""
         scene, flying = self.scene, aloft(state)
         ground = below(scene, flying)
         ball, free, zero = balls(scene.body)[0], freed(scene, flying, ground), jnp.zeros_like(state[0])

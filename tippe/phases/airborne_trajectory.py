@@ -7,26 +7,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from nonholonomic.derivatives import phased_samples
 from nonholonomic.integration import Settings, follow_phases
 
 from ..dynamics import LOSSES, NO_COSINE
 from ..inversion import InversionProblem
 from ..launch import Launch
 from ..observables import of_each_run
+from ..sampled import STATUS as CODES
 from ..sampled import TrajectoryProblem
 from ..scene import Scene
 from ..state import parts
 from .airborne import FLYING, phases
-from .flight_trajectory import STATUS, HybridTrajectory, flights_of
+from .flight_trajectory import STATUS, HybridTrajectory, flights_of, sampled_flights
 
 
 class ArenaTrajectory(HybridTrajectory):
     """A `HybridTrajectory` over any arena: `theta`, `azimuth` and `slip` refer to the frame at the foot, the nearest point of
-    the arena, and `distance` is that of the top's sphere from it. `cyclic` holds the vector c of `tippe/sampled.py`."""
-
-    @property
-    def _path(self) -> tuple[Array, ...]:
-        return ()
+    the arena, and `distance` is that of the top's sphere from it."""
 
     @of_each_run
     def energy(self) -> Float[Array, " times"]:
@@ -54,20 +52,36 @@ class ArenaTrajectory(HybridTrajectory):
 
     @staticmethod
     def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
-        return np.where(numbers == FLYING, -1, 0)
+        # Also of traced numbers, -1 after the end of a run.
+        return -1 * ((numbers == FLYING) | (numbers < 0))
+
+
+def arena_phases(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "19 1"]]:
+    """The phases of one launch of a hybrid scene on any arena, the number of the first, and the state there.
+
+    **Arguments:** `modules`: scene and launch; `tolerance`: no phase needs it.
+    """
+    run = TrajectoryProblem.of(*modules)
+    state, scales = run.start()
+    problem = InversionProblem(modules[0].dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
+    return (*phases(modules[0], problem, tolerance, last=False, rides=True), state[:, None])
 
 
 def simulate_airborne(
     scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver
 ) -> ArenaTrajectory:
     """Run one launch of a hybrid scene that is not on a level plane. **Arguments:** as for `simulate`, checked."""
-    run = TrajectoryProblem.of(scene, launch)
-    state, scales = run.start()
-    problem = InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
-    kinds, first = phases(scene, problem, tolerance, last=False, rides=True)
-    path = follow_phases(kinds, int(first[0]), state, t1, Settings(tolerance, solver), kinds=1)
+    kinds, first, state = arena_phases((scene, launch), tolerance)
+    path = follow_phases(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1)
     status = STATUS[path.status]
     if status == "jammed":
         status = LOSSES[int(scene.dynamics.loss(jnp.asarray(path.state[:14])))]
     hops = np.array([(one.begin, one.end) for one in path.stays if one.number == FLYING]).reshape(-1, 2)
     return flights_of(ArenaTrajectory, scene, path, status, hops, times)
+
+
+def sampled_airborne(scene: Scene, launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:
+    """Run one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, checked."""
+    found = phased_samples(arena_phases, (scene, launch), times, t1, settings, kinds=1)
+    codes = jnp.asarray([CODES.index(word) for word in LOSSES])
+    return sampled_flights(ArenaTrajectory, scene, times, found, codes[scene.dynamics.loss(found.end_state[:14])])

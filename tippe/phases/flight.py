@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import Vector, cross, dot, scale, subtract, sum_vectors
@@ -59,13 +60,14 @@ class Descent(NamedTuple):
 class Flight(NamedTuple):
     """How a flight ended: its length [s], whether a sphere landed and which.
 
-    `lost` says where the search for the landing gave up.
+    `lost` says where the search for the landing gave up; `log_rate` is the logarithm of the speed of landing.
     """
 
     duration: Cells
     landed: Bool[Array, " cells"]
     ball: Int[Array, " cells"]
     lost: Bool[Array, " cells"]
+    log_rate: Cells
 
 
 def angle_less_sine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -97,6 +99,24 @@ def flown(body: Top, gravity: Float[Array, "..."], free: FreeBody, time: Float[A
     return FreeBody((u1, u2, u3 - gravity * time), height, sum_vectors(*turned), free.momentum)
 
 
+def carried_aloft(body: Top, free: FreeBody, across: Vector, time: Float[Array, "..."]) -> Vector:
+    """A vector across the axis that turns with it and not about it, some time [s] later.
+
+    It turns at the rate L / I1 - (e.L / I1) e: about L, and less about e.
+    """
+    size = jnp.sqrt(dot(free.momentum, free.momentum))
+    direction = scale(1.0 / jnp.where(size == 0.0, 1.0, size), free.momentum)
+    about_axis = turned(across, free.axis, -dot(free.axis, free.momentum) / body.I1 * time)
+    return turned(about_axis, direction, size / body.I1 * time)
+
+
+def turned(vector: Vector, axis: Vector, angle: Float[Array, "..."]) -> Vector:
+    """A vector turned about a unit axis by an angle [rad]."""
+    along, ahead = scale(dot(axis, vector), axis), cross(axis, vector)
+    across = tuple(subtract(v, p) for v, p in zip(vector, along, strict=True))
+    return sum_vectors(along, scale(jnp.cos(angle), across), scale(jnp.sin(angle), ahead))
+
+
 def fly(
     body: Top,
     gravity: Float[Array, "..."],
@@ -119,17 +139,21 @@ def fly(
 
     **Returns:** a `Flight`.
     """
-    times, lost = [], jnp.zeros(most.shape, bool)
+    times, speeds, lost = [], [], jnp.zeros(most.shape, bool)
     for number, ball in enumerate(spheres):
         descent = _descent(body, gravity, ball, free, (parted == number) & ~rising, parted == number)
-        time, given_up = landing(descent, most)
-        times.append(time)
+        # The search is by halving, which has no derivative.
+        time, given_up = landing(*stop_gradient((descent, most)))
+        times.append(landed_at(descent, time))
+        speeds.append(-descent.slope(jnp.where(jnp.isfinite(time), times[-1], 0.0)))
         lost |= given_up
     first = jnp.argmin(jnp.stack(times), axis=0)
     time = jnp.min(jnp.stack(times), axis=0)
     landed = time <= most
     duration = jnp.where(landed, time, most)
-    return Flight(duration, landed, first, lost)
+    speed = jnp.take_along_axis(jnp.stack(speeds), first[None], axis=0)[0]
+    log_rate = jnp.log(jnp.maximum(speed, jnp.finfo(speed.dtype).tiny))
+    return Flight(duration, landed, first, lost, log_rate)
 
 
 def _descent(
@@ -200,6 +224,13 @@ def landing(descent: Descent, most: Cells) -> tuple[Cells, Bool[Array, " cells"]
     # At the very start the distance is zero: what counts is that it has been above since.
     time = halved(lambda t: descent.value(t) >= 0.0, low, high)[1]
     return jnp.where(found, time, jnp.inf), ~found & ~over
+
+
+def landed_at(descent: Descent, time: Cells) -> Cells:
+    """A time at which the distance is zero, with its derivatives (implicit function theorem)."""
+    value, slope = descent.value(time), stop_gradient(descent.slope(time))
+    known = jnp.isfinite(time) & (slope < 0.0)
+    return time - jnp.where(known, (value - stop_gradient(value)) / jnp.where(known, slope, 1.0), 0.0)
 
 
 def _roots(height: Cells, speed: Cells, gravity: Cells) -> tuple[Cells, Cells]:

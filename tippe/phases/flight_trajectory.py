@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from nonholonomic.derivatives import PhasedSamples, phased_samples
 from nonholonomic.integration import (
     BETWEEN,
     FAILED,
@@ -23,6 +24,8 @@ from ..dynamics import NO_COSINE
 from ..inversion import InversionProblem
 from ..launch import Launch
 from ..observables import AbstractTrajectory, of_each_run
+from ..sampled import STATUS as CODES
+from ..sampled import TrajectoryProblem
 from ..scene import Scene
 from .free_body import Ball, FreeBody, balls, energy, freed, standing_on
 from .impact import approach
@@ -41,7 +44,12 @@ class HybridTrajectory(AbstractTrajectory):
     the time of an impact the values are those before it. `distance` is that of the top's own sphere from the plane [m] with
     its rate [m/s]. `hops` has a row for each flight until `end_time`, its begin and its end [s]; a table counts those before
     the inversion. `work` is that of friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest
-    drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J].
+    drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J]. `rotation` and
+    `angular_velocity` are those of `Trajectory`.
+
+    Inside a transformation `status` is a code as for `Trajectory`, 6 for "unresolved"; `hops` is `None`, `stats["hops"]`
+    counts the flights. First derivatives by the scene and the launch go through flights and impacts; they are NaN behind an
+    event that is grazing, so that within the tolerance it may not happen at all.
 
     **Example:**
 
@@ -59,7 +67,7 @@ class HybridTrajectory(AbstractTrajectory):
     t: Float[np.ndarray, " times"]
     scene: Scene
     states: Float[np.ndarray, "8 times"]
-    cyclic: Float[np.ndarray, "2 times"]
+    cyclic: Float[np.ndarray, "5 times"]
     spin_angle: Float[np.ndarray, " times"]
     work: Float[np.ndarray, " times"]
     status: str
@@ -68,7 +76,7 @@ class HybridTrajectory(AbstractTrajectory):
     dense: PhasedPath
     distance: Float[np.ndarray, "2 times"]
     contact: Int[np.ndarray, " times"]
-    hops: Float[np.ndarray, "hops 2"]
+    hops: Float[np.ndarray, "hops 2"] | None
 
     unused = (*AbstractTrajectory.unused, "hops")
     by_time = (*AbstractTrajectory.by_time, "distance", "contact")
@@ -123,8 +131,8 @@ class HybridTrajectory(AbstractTrajectory):
 
     @staticmethod
     def parts_of(shown: Float[np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
-        """State, path, spin angle, work, and the distance with its rate, from what the phases show."""
-        return shown[:8], shown[8:10], shown[10], shown[11], shown[12:]
+        """State, cyclic coordinates, spin angle, work, and the distance with its rate, from what the phases show."""
+        return shown[:8], shown[8:13], shown[13], shown[14], shown[15:]
 
     @staticmethod
     def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
@@ -135,19 +143,48 @@ class HybridTrajectory(AbstractTrajectory):
         return f"{super().__str__()}\n  {len(self.hops)} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
 
 
+def level_phases(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "15 1"]]:
+    """The phases of one launch of a hybrid scene on a level plane, the number of the first, and the state there.
+
+    **Arguments:** `modules`: scene and launch; `tolerance`: no phase needs it.
+    """
+    scene = modules[0]
+    state, scales = TrajectoryProblem.of(*modules).start()
+    # The place is that of the centre of mass.
+    state = state.at[8:10].add(-scene.body.offset * state[2:4])
+    problem = InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
+    return (*phases(scene, problem, tolerance, last=False, rides=True), state[:, None])
+
+
 def simulate_hybrid(
     scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver
 ) -> HybridTrajectory:
     """Run one launch of a hybrid scene until `t1`. **Arguments:** as for `simulate`, checked."""
-    state, radius, weight = scene.state(launch), scene.body.radius, scene.body.mass * scene.gravity
-    zero = jnp.zeros(())
-    state = jnp.stack([*state, -scene.body.offset * state[2], -scene.body.offset * state[3], zero, zero])
-    scales = jnp.stack([*scene.scales(launch), radius, radius, jnp.ones(()), weight * radius])
-    problem = InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
-    kinds, first = phases(scene, problem, tolerance, last=False, rides=True)
-    path = follow_phases(kinds, int(first[0]), state, t1, Settings(tolerance, solver), kinds=1)
+    kinds, first, state = level_phases((scene, launch), tolerance)
+    path = follow_phases(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1)
     hops = np.array([(one.begin, one.end) for one in path.pieces if one.number == BETWEEN]).reshape(-1, 2)
     return flights_of(HybridTrajectory, scene, path, STATUS[path.status], hops, times)
+
+
+def sampled_hybrid(scene: Scene, launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
+    """Run one launch of a hybrid scene inside a transformation. **Arguments:** as for `simulate`, checked."""
+    found = phased_samples(level_phases, (scene, launch), times, t1, settings, kinds=1)
+    return sampled_flights(HybridTrajectory, scene, times, found, jnp.asarray(CODES.index("jammed")))
+
+
+def sampled_flights(
+    kind: type[HybridTrajectory], scene: Scene, times: Any, found: PhasedSamples, lost: Int[Array, ""]
+) -> Any:
+    """A trajectory of some kind from samples; `lost` is the code of how a run has ended that its guard has ended."""
+    states, place, spin_angle, work, distance = kind.parts_of(found.shown)
+    # After the end no sphere touches.
+    number = jnp.where(jnp.isnan(found.number), BETWEEN, found.number).astype(int)
+    ended = {code: jnp.asarray(CODES.index(word)) for code, word in STATUS.items()} | {GUARD_LOST: lost}
+    status = sum(jnp.where(found.status == code, index, 0) for code, index in ended.items())
+    stats = {"accepted": found.steps - found.rejected, "rejected": found.rejected, "hops": found.counts[0]}
+    stats = {name: count.astype(int) for name, count in stats.items()}
+    ends = (status, found.end_time, stats, None, distance, kind.touching(number), None)
+    return kind(times, scene, states, place, spin_angle, work, *ends)
 
 
 def flights_of(

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
 
+from ..body import Round
 from ..dynamics import Dynamics
 from ..state import joined, parts
 from ..top import Top
@@ -44,7 +45,7 @@ def balls(body: Top) -> tuple[Ball, ...]:
 def standing_on(dynamics: Dynamics, ball: Ball) -> Dynamics:
     """The equations of motion of a top that stands on another of its spheres: of the same form with its numbers."""
     coupling = dynamics.mass * ball.offset * dynamics.per_transverse
-    return dataclasses.replace(dynamics, offset=ball.offset, radius=ball.radius, coupling=coupling)
+    return dataclasses.replace(dynamics, outline=Round(ball.offset, ball.radius, coupling))
 
 
 def freed(body: Top, ball: Ball, state: Float[Array, "components ..."]) -> FreeBody:
@@ -62,18 +63,19 @@ def grounded(free: FreeBody) -> Float[Array, "components ..."]:
     return joined(free.velocity[:2], free.axis, free.momentum)
 
 
-def shown(body: Top, free: FreeBody, riding: Float[Array, "4 ..."]) -> Float[Array, "14 ..."]:
+def shown(body: Top, free: FreeBody, riding: Float[Array, "7 ..."]) -> Float[Array, "17 ..."]:
     """What a path shows of a body that may fly.
 
-    **Arguments:** `riding`: place (x, y) of the centre of mass [m], spin angle [rad], work [J].
+    **Arguments:** `riding`: place (x, y) of the centre of mass [m], the vector c of `tippe/sampled.py`, spin angle [rad],
+    work [J].
 
-    **Returns:** the state as in contact; place (x, y) of the sphere's centre, spin angle, work; and the distance of the
+    **Returns:** the state as in contact; place (x, y) of the sphere's centre, c, spin angle, work; and the distance of the
     top's own sphere from the plane [m] with its rate [m/s].
     """
     main = balls(body)[0]
     place = [x + main.offset * e for x, e in zip(riding[:2], free.axis[:2], strict=True)]
     distance = (gap(main, free), gap_rate(body, main, free))
-    rows = (*free.velocity[:2], *free.axis, *free.momentum, *place, riding[2], riding[3], *distance)
+    rows = (*free.velocity[:2], *free.axis, *free.momentum, *place, *riding[2:], *distance)
     return jnp.stack(jnp.broadcast_arrays(*rows))
 
 

@@ -35,13 +35,13 @@ from .free_body import FreeBody, balls, grounded
 #: The number of this kind of contact, next to those of the spheres, 0 and 1.
 BOTH = 2
 
-#: A contact ends where it would pull by this part of the weight. A top that comes to roll on its sphere presses its stem ever
-#: less, and never lifts it; the steps would go by the errors of a force that is next to zero. To let go so late changes
+#: A contact ends where it would pull by this fraction of the weight. A top that comes to roll on its sphere presses its stem
+#: ever less, and never lifts it; the steps would go by the errors of a force that is next to zero. To let go so late changes
 #: velocities by the square of this: ten times the value and a tenth of it move an inversion time by 4e-16.
 HOLDS = 1e-8
 
-#: Where m_1 - m_0 is less than this part of what it is without friction, rigid bodies do not say what follows. It decides on a
-#: status alone.
+#: Where m_1 - m_0 is less than this fraction of what it is without friction, rigid bodies do not say what follows. It decides
+#: on a status alone.
 INDEFINITE = 1e-6
 
 
@@ -49,8 +49,8 @@ class LeaningMotion(NamedTuple):
     """What the equations of motion give for one state: the rate of the state of `tippe/dynamics.py`, and both normal
     forces [N].
 
-    `friction_power` [W] is that of both contacts, `None` without friction; `definiteness` is m_1 - m_0 as a part of what it
-    is without friction.
+    `friction_power` [W] is that of both contacts, `None` without friction; `definiteness` is m_1 - m_0 as a fraction of what
+    it is without friction.
     """
 
     rate: tuple[Component, ...]
@@ -64,7 +64,7 @@ class LeaningDynamics(eqx.Module):
     """The equations of motion of a top with a stem while both of its spheres touch the plane.
 
     The state has the layout of `tippe/dynamics.py`. Its cos theta is constant to the bit, and the part of L along n x
-    e, which would change theta and is round-off, is carried along and not looked at.
+    e, which would change theta and is round-off, is carried along but not used.
     """
 
     body: Top
@@ -151,7 +151,7 @@ def at_rest(body: Top, free: FreeBody) -> FreeBody:
     e, L = free.axis, free.momentum
     c = jnp.broadcast_to((stem.radius - main.radius) / (stem.offset - main.offset), e[2].shape)
     square = e[0] ** 2 + e[1] ** 2
-    # What e was long it stays.
+    # The length of e stays what it was.
     factor = jnp.sqrt((square + e[2] ** 2 - c**2) / square)
     across = (-e[1], e[0])
     L = (*sum_vectors(L[:2], scale(-dot(across, L[:2]) / square, across)), L[2])

@@ -39,7 +39,7 @@ FIRST = 5.0
 #: follows the tolerance below this too; steps with an estimate of 1e-11 were found to err by 1e-13.
 ROUNDING = 1e-10
 
-#: Trials of the length, and iterations for each; where they do not do, the run has failed (one of 3300 slips of a table in
+#: Trials of the length, and iterations for each; where they are not enough, the run has failed (one of 3300 slips of a table in
 #: a sphere).
 TRIALS, ITERATIONS = 10, 10
 
@@ -92,7 +92,13 @@ class Onset(eqx.Module):
             above = one.at(middle)[0] > value
             return jnp.where(above, middle, low), jnp.where(above, high, middle)
 
-        return jax.lax.fori_loop(0, 52, halved, (first, jnp.ones_like(first)))[1]
+        found = jax.lax.stop_gradient(jax.lax.fori_loop(0, 52, halved, (first, jnp.ones_like(first)))[1])
+        # Halving has no derivative: that is by the implicit function theorem.
+        height, rise = jax.jvp(lambda at: one.at(at)[0], (found,), (jnp.ones_like(found),))
+        missing = height - value
+        inside = (found < 1.0) & (rise != 0.0)
+        shift = (missing - jax.lax.stop_gradient(missing)) / jax.lax.stop_gradient(jnp.where(inside, rise, 1.0))
+        return found - jnp.where(inside, shift, 0.0)
 
     @property
     def end(self) -> Float[Array, "components ..."]:

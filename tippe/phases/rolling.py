@@ -2,7 +2,7 @@
 
 The state has the layout of `tippe/dynamics.py`, so that a run can slip and roll in turn. While the top rolls, its velocity
 follows from axis and angular momentum, u = r x w with r = a e - R n from the centre of mass to the contact; the two
-components in the state are carried along and not looked at.
+components in the state are carried along but not used.
 """
 
 import equinox as eqx
@@ -73,7 +73,7 @@ class RollingDynamics(eqx.Module):
         return self._evaluate(state)[1]
 
     def grip(self, state: Float[Array, "components ..."], mu: Float[Array, "..."]) -> Float[Array, "..."]:
-        """What friction has in reserve, mu N - |F_t|, as a fraction of the weight; negative where the top cannot but slip.
+        """What friction has in reserve, mu N - |F_t|, as a fraction of the weight; negative where the top must slip.
 
         **Arguments:**
 

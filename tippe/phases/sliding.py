@@ -1,7 +1,8 @@
 """Sliding as a phase of the motion, on one sphere or on both, and what follows it: a flight, the other sphere, or the end.
 
-A single run whose path is kept carries four more numbers behind its state, which ride along: the place (x, y) of the centre of
-mass [m], the angle by which the top has turned about its axis [rad], and the work of friction and impacts [J].
+A single run whose path is kept carries seven more numbers behind its state, which ride along: the place (x, y) of the centre
+of mass [m], the vector c of `tippe/sampled.py`, the angle by which the top has turned about its axis [rad], and the work of
+friction and impacts [J].
 """
 
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.geometry import dot
+from nonholonomic.geometry import dot, multiply, scale
 from nonholonomic.integration import (
     CROSSED,
     FAILED,
@@ -29,22 +30,23 @@ from ..dynamics import COS_THETA, Dynamics, stacked
 from ..inversion import InversionProblem
 from ..scene import Scene
 from ..top import Top
-from .flight import angle_reached, cone, flown, fly
+from .flight import angle_reached, carried_aloft, cone, flown, fly
 from .free_body import Ball, FreeBody, balls, energy, freed, gap, gap_rate, grounded, shown, standing_on
 from .impact import strike
 from .leaning import LeaningDynamics, at_rest
 
 Cells = Float[Array, " cells"]
 
-#: A rebound slower than this part of sqrt(g R) is none: the contact closes. Its height would be half the square of it, in R.
-#: A top that rocks from one sphere to the other, ever less, comes so to lean on both. Where a top only bounces, ten times the
-#: value moves inversion times by 3e-12 and a tenth by 6e-14. Where it comes to lean the error is of first order, for the blows
-#: that are left out have friction too: an inversion after 7.3 s is late by 2.9e-7 of that, by 2.9e-6 with ten times the value.
-#: A lower value needs less round-off in `clearance`: 1e-7 with 1e-15 leaves 3e-9; 1e-6 with the 1e-12 there never closes.
+#: A rebound slower than this fraction of sqrt(g R) is none: the contact closes. Its height would be half the square of it, in
+#: R. A top that rocks from one sphere to the other, ever less, comes to lean on both. Where a top only bounces, ten times the
+#: value moves inversion times by 3e-12 and a tenth by 6e-14. Where it comes to lean the error is of first order, for the
+#: blows that are left out have friction too: an inversion after 7.3 s is late by 2.9e-7 of that, by 2.9e-6 with ten times the
+#: value. A lower value needs less round-off in `clearance`: 1e-7 with 1e-15 leaves 3e-9; 1e-6 with the 1e-12 there never
+#: closes.
 CLOSING_SPEED = 1e-5
 
-#: Two spheres are at the plane together if neither is farther from it than this part of R. Ten times the value and a tenth of
-#: it change no bit of a time.
+#: Two spheres are at the plane together if neither is farther from it than this fraction of R. Ten times the value and a
+#: tenth of it change no bit of a time.
 TOUCHING = 1e-9
 
 #: Bounces in a row after which a run is given up.
@@ -79,7 +81,9 @@ class Sliding(AbstractProblem):
         if self.axial is None:
             return self.dynamics.field(state)
         motion = self.dynamics.motion(state)
-        riding = (state[0], state[1], motion.spin_momentum / self.axial, motion.friction_power)
+        across, turning = tuple(state[OWN + 2 : OWN + 5]), motion.rate[2:5]
+        across_rate = scale(multiply(-1.0, dot(turning, across)), tuple(state[2:5]))
+        riding = (state[0], state[1], *across_rate, motion.spin_momentum / self.axial, motion.friction_power)
         return stacked((*motion.rate, *riding), state)
 
     def crossing(self, state: Float[Array, "components cells"]) -> Cells:
@@ -93,7 +97,7 @@ class Sliding(AbstractProblem):
 
 
 def clearance(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-    """Distance of the other sphere from the plane as a part of the own radius, plus the round-off of a change of spheres.
+    """Distance of the other sphere from the plane as a fraction of the own radius, plus the round-off of a change of spheres.
 
     Ten times that round-off moves inversion times over sphere and stem by 4e-11, a tenth of it by 3e-12; that of a top that
     comes to lean is off by 2e-9.
@@ -121,11 +125,11 @@ class Slide(AbstractPhase):
         dynamics, axial = standing_on(self.scene.dynamics, own), self.scene.body.I3 if self.rides else None
         return Sliding(dynamics, own, other, self.cos_angle, state, self.scales, axial)
 
-    def shown(self, state: Float[Array, "12 times"]) -> Float[Array, "14 times"]:
+    def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         own, _ = _own_and_other(balls(self.scene.body), self.number)
         return shown(self.scene.body, freed(self.scene.body, own, state), state[OWN:])
 
-    def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "14 times"]:
+    def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "17 times"]:
         free, riding = motion
         later = flown(self.scene.body, self.scene.gravity, free, passed)
         return shown(self.scene.body, later, _carried(self.scene.body, free, riding, passed))
@@ -133,7 +137,7 @@ class Slide(AbstractPhase):
     def leave(self, state: Float[Array, "components cells"], left: Cells) -> Passage:
         """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land where it is that which touches.
 
-        Counted are the flights.
+        It counts the flights.
         """
 
         def hop(carry: tuple[Air, Array, Record | None]) -> tuple[Air, Array, Record | None]:
@@ -157,7 +161,8 @@ class Slide(AbstractPhase):
         state = grounded(air.free)
         if air.riding is not None:
             state = jnp.concatenate([state, air.riding])
-        return Passage(air.ball, state, air.elapsed, status, air.crossing_time, air.flights[None], record)
+        found = (air.ball, state, air.elapsed, status, air.crossing_time, air.flights[None])
+        return Passage(*found, record, air.log_rates)
 
 
 class Lean(AbstractPhase):
@@ -172,7 +177,7 @@ class Lean(AbstractPhase):
         axial = self.scene.body.I3 if self.rides else None
         return Sliding(leaning(self.scene), None, None, self.cos_angle, state, self.scales, axial)
 
-    def shown(self, state: Float[Array, "12 times"]) -> Float[Array, "14 times"]:
+    def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         return shown(self.scene.body, freed(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])
 
     def leave(self, state: Float[Array, "components cells"], left: Cells) -> Passage:
@@ -217,6 +222,7 @@ class Air(NamedTuple):
     - `status`: `RUNNING`, or how the run ended, `GUARD_LOST` if it has jammed; `crossing_time` [s] of the event, infinite if
       there was none.
     - `flights`: so far; `open`: whether there is no contact and the run goes on.
+    - `log_rates`: of the landings, as in `Passage`.
     - `riding`: what rides along with a single run.
     """
 
@@ -229,7 +235,8 @@ class Air(NamedTuple):
     crossing_time: Cells
     flights: Int[Array, " cells"]
     open: Bool[Array, " cells"]
-    riding: Float[Array, "4 cells"] | None = None
+    log_rates: Cells
+    riding: Float[Array, "7 cells"] | None = None
 
 
 def lost_contact(scene: Scene, number: Int[Array, ""], state: Float[Array, "components cells"]) -> Air:
@@ -251,6 +258,7 @@ def lost_contact(scene: Scene, number: Int[Array, ""], state: Float[Array, "comp
         crossing_time=jnp.full_like(zero, jnp.inf),
         flights=jnp.zeros(zero.shape, int),
         open=~jams,
+        log_rates=zero,
     )
 
 
@@ -278,6 +286,7 @@ def take_flight(
         crossing_time=jnp.where(jnp.isfinite(reached), air.elapsed + reached, air.crossing_time),
         flights=air.flights + 1,
         open=landed,
+        log_rates=air.log_rates + jnp.where(landed, flight.log_rate, 0.0),
         riding=None if air.riding is None else _carried(body, air.free, air.riding, duration),
     )
     return after, landed
@@ -299,7 +308,7 @@ def land(scene: Scene, air: Air) -> Air:
         struck = _with_other(scene, struck, other, closing)
     if air.riding is not None:
         gained = energy(body, scene.gravity, struck.free) - energy(body, scene.gravity, air.free)
-        struck = struck._replace(riding=air.riding.at[3].add(gained))
+        struck = struck._replace(riding=air.riding.at[-1].add(gained))
     return struck._replace(open=struck.open & ~fails)
 
 
@@ -319,11 +328,14 @@ def _with_other(scene: Scene, air: Air, other: Ball, closing: Cells) -> Air:
 
 
 def _carried(
-    body: Top, free: FreeBody, riding: Float[Array, "4 ..."], time: Float[Array, "..."]
-) -> Float[Array, "4 ..."]:
+    body: Top, free: FreeBody, riding: Float[Array, "7 ..."], time: Float[Array, "..."]
+) -> Float[Array, "7 ..."]:
     """What rides along after some time [s] in flight."""
-    rates = (free.velocity[0], free.velocity[1], dot(free.axis, free.momentum) / body.I3, 0.0)
-    return jnp.stack([number + rate * time for number, rate in zip(riding, rates, strict=True)])
+    x, y, *across, angle, work = riding
+    u1, u2, _ = free.velocity
+    spin_rate = dot(free.axis, free.momentum) / body.I3
+    across = carried_aloft(body, free, tuple(across), time)
+    return jnp.stack([x + u1 * time, y + u2 * time, *across, angle + spin_rate * time, work + 0.0 * time])
 
 
 def _no_flights(start: Air) -> Record:

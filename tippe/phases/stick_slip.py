@@ -33,7 +33,7 @@ LEFT = 0.1
 AT_REST = 1e-10
 
 #: The round-off that rolling is allowed in its grip: a top that stands upright needs none. It delays a slip by this over the
-#: rate of the grip, some 1e-14 s.
+#: rate of the grip, about 1e-14 s.
 ROUNDING = 1e-13
 
 
@@ -70,7 +70,7 @@ class StickSlip(eqx.Module):
     @property
     def speed(self) -> Float[Array, "..."]:
         """The speed sqrt(g R) [m/s]."""
-        return jnp.sqrt(self.slipping.gravity * self.slipping.radius)
+        return jnp.sqrt(self.slipping.gravity * self.rolling.radius)
 
     @property
     def per_transverse(self) -> Float[Array, "..."]:
@@ -175,7 +175,7 @@ class Kind(eqx.Module):
     def slip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Slip speed above that at which a slip is over, in units of sqrt(g R). A slip that grows is never over."""
         speed, change = self._slowing(state)
-        way = LEFT * self.tolerance * self.both.slipping.radius
+        way = LEFT * self.tolerance * self.both.rolling.radius
         return (speed - jnp.sqrt(2.0 * way * jnp.maximum(-change, 0.0))) / self.both.speed
 
     def _slowing(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:

@@ -59,7 +59,7 @@ class StickSlipPhase(AbstractPhase):
         return onset.at((passed - wait) / jnp.where(onset.length > 0.0, onset.length, 1.0))
 
     def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
-        """Stick, slip, or end where the contact is lost. Counted is how often a slip has turned into rolling."""
+        """Stick, slip, or end where the contact is lost. It counts how often a slip has turned into rolling."""
         slipping = self._under(self.kind.both.slipping, state)
         change = self.kind.ended(state, self._size(state), lambda at: slipping.field(left, at), self.scales, left)
         onset, length = change.onset, change.onset.length

@@ -95,7 +95,7 @@ class TopSystem(AbstractSystem):
 
     **Arguments:**
 
-    - `scene`: a `Scene` on a `Plane` or a `Cylinder`. Its friction is not looked at: it needs the normal force.
+    - `scene`: a `Scene` on a `Plane` or a `Cylinder`. Its friction is not used: it needs the normal force.
     - `rolling`: whether the contact point is at rest, the one case in which the top is nonholonomic.
     """
 

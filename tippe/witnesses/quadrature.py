@@ -51,7 +51,7 @@ class FrictionlessNutation(AbstractNutation):
 
     **Arguments:**
 
-    - `scene`: a `Scene` on the plane; its friction is not looked at.
+    - `scene`: a `Scene` on the plane; its friction is not used.
     - `energy`: E [J].
     - `precession_momentum`, `spin_momentum`: p_phi = L.z and beta1 = L.e [kg m^2/s].
     """
@@ -88,7 +88,7 @@ class RollingNutation(AbstractNutation):
 
     **Arguments:**
 
-    - `scene`: a `Scene` on the plane; its friction is not looked at.
+    - `scene`: a `Scene` on the plane; its friction is not used.
     - `energy`: E [J].
     - `jellett`: lambda [kg m^3/s].
     - `routh`: D [kg m^2/s].
@@ -141,7 +141,7 @@ def rolling_rate(scene: Scene, state: Float[Array, " 6"]) -> Float[Array, " 6"]:
 
     **Arguments:**
 
-    - `scene`: a `Scene` on the plane; its friction is not looked at.
+    - `scene`: a `Scene` on the plane; its friction is not used.
     - `state`: axis e [1] and angular velocity w [rad/s], (6,).
 
     **Returns:** their rates, (6,).

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from conftest import assert_close
+from close import assert_close
 
 from nonholonomic.derivatives import exponent_of, growth
 from nonholonomic.integration import GUARD_LOST, REACHED_END, AbstractProblem, Settings

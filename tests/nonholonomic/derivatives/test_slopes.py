@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close
+from close import assert_close
 
 import nonholonomic.derivatives._adjoint as adjoint
 from nonholonomic.derivatives import directions_of
@@ -70,10 +70,10 @@ def found_and_expected(names=MOVED, patience=1e3, heights=HEIGHTS, cells=100, **
     ("names", "passes", "solver"),
     [
         (MOVED, False, diffrax.Dopri8()),
-        (MOVED, True, diffrax.Tsit5()),
+        pytest.param(MOVED, True, diffrax.Tsit5(), marks=pytest.mark.slow),
         (("height", "rate"), True, diffrax.Dopri8()),
-        (("height", "height"), False, diffrax.Tsit5()),
-        (("growth",), False, diffrax.Dopri8()),
+        pytest.param(("height", "height"), False, diffrax.Tsit5(), marks=pytest.mark.slow),
+        pytest.param(("growth",), False, diffrax.Dopri8(), marks=pytest.mark.slow),
         (("growth",), True, diffrax.Tsit5()),
     ],
 )
@@ -94,7 +94,7 @@ def test_a_cell_that_ends_otherwise_has_no_slope_and_leaves_the_others_theirs():
         assert_close(one, np.where(late, 0.0, other), rtol=1e-7)
 
 
-@pytest.mark.parametrize("cells", [0, 1, 70])
+@pytest.mark.parametrize("cells", [0, pytest.param(1, marks=pytest.mark.slow), 70])
 def test_padding_and_cells_beyond_the_event_have_no_slope(cells):
     """Some cells start beyond the event, and of the cells only some are run: fewer than lanes, and none."""
     heights = np.where(np.arange(100) % 3 == 0, 0.4, HEIGHTS)
@@ -105,7 +105,7 @@ def test_padding_and_cells_beyond_the_event_have_no_slope(cells):
         assert_close(one, np.where(run & (heights > 0.5), other, 0.0), rtol=1e-7)
 
 
-@pytest.mark.parametrize("kept", [2, 5])
+@pytest.mark.parametrize("kept", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_runs_longer_than_what_is_kept_are_repeated(kept, monkeypatch):
     """Periods of two iterations, of which the starts of a few are kept: the slopes are the same to the last digit."""
     _, whole, _ = found_and_expected(solver=diffrax.Dopri8())

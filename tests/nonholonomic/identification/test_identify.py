@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 import scipy.stats
-from conftest import assert_close
+from close import assert_close
 from terminal import Terminal
 
 from nonholonomic.identification import FitWarning, Free, Measurements, identify, levenberg_marquardt

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 import scipy.stats
-from conftest import assert_close
+from close import assert_close
 
 from nonholonomic.identification import Measurements, identify
 from nonholonomic.identification.likelihood import between

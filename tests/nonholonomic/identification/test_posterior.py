@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from conftest import assert_close
+from close import assert_close
 
 from nonholonomic.identification import Free, LogDensity, Measurements, identify, sample
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from conftest import assert_close
+from close import assert_close
 from matplotlib.figure import Figure
 
 from nonholonomic.identification import FitWarning, Free, Measurements, identify

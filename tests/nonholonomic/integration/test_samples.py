@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close
+from close import assert_close
 
 from nonholonomic.integration import GUARD_LOST, REACHED_END, AbstractProblem, Settings, march_with_samples
 

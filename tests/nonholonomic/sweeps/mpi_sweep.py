@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from conftest import rutstam_top
+from tops import rutstam_top
 
 import tippe
 from nonholonomic.sweeps import running

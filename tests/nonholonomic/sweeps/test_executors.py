@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import pytest
 from cheap_sweep import CELLS, CheapJob, cheap_sweep, finished_blocks, place, resumed
-from conftest import rutstam_top
+from tops import rutstam_top
 
 import nonholonomic
 import stroller
@@ -91,7 +91,7 @@ def test_mpi_gives_the_same_bits_too(tmp_path, by_threads):
     if mpirun is None:
         pytest.skip("no MPI is installed")
     tests = HERE.parents[1]
-    path = os.pathsep.join(str(folder) for folder in (tests.parent, tests, HERE))
+    path = os.pathsep.join(str(folder) for folder in (tests.parent, tests / "shared", HERE))
     environment = os.environ | {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu", "OMPI_MCA_rmaps_base_oversubscribe": "1"}
     environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     environment |= {"PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
@@ -128,8 +128,8 @@ def test_a_block_that_three_workers_die_of_is_failed_and_the_others_are_not(way,
     told = r"cells 16 to 23 \(x 0\.326\d* to 0\.469\d*\) are given up as failed: 3 workers or more died of them"
     with pytest.warns(RuntimeWarning, match=told):
         table = cheap_sweep(path, job=job, executor=request.getfixturevalue(way))
-    # Dask may blame a block that was only waiting at the worker that died; not for the last time.
-    assert len(set(job.begun(2))) in ((3,) if way == "processes" else (1, 2, 3))
+    # Dask blames blocks that only waited at a worker that died, too; nobody else kills workers here.
+    assert len(set(job.begun(2))) == len(job.begun(2)) == 3
     for found in (table, Table.load(path)):
         failed = found.status == "failed"
         assert np.flatnonzero(failed).tolist() == list(range(16, 24))

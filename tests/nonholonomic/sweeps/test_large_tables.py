@@ -8,7 +8,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from conftest import rutstam_top
+from tops import rutstam_top
 
 import tippe
 from nonholonomic.sweeps import Table, Variable, axis, running, sweep
@@ -151,3 +151,14 @@ def test_an_illegal_cell_inside_a_large_grid_ends_the_sweep_when_its_turn_comes(
     asked = {"theta": 0.1, "spin": np.linspace(80.0, 120.0, 128), "mu": [0.3, 0.25, 0.2], "t1": 0.1}
     with pytest.raises(ValueError, match=r"mu = 0\.25 must not be so odd"):
         tippe.inversion_table(scene, path=tmp_path / "table.h5", **asked)
+
+
+def test_more_cells_than_memory_holds_are_refused_at_once(tmp_path):
+    """10^10 of them: without a file for want of memory, with one for want of room on the disk, unless there is that much."""
+    many = [axis(name, name, "1", np.arange(1e5)) for name in ("x", "y")]
+    told = r"path = None: 1e\+10 cells take 2\d\d GB, and this machine has .* GB of memory; with path= they are held in a file"
+    with pytest.raises(ValueError, match=told):
+        sweep(
+            job, many, {"value": VARIABLES["value"], "count": Variable("1", np.int64), "more": VARIABLES["value"]}, {}
+        )
+    assert running.memory() > 1e8

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from nonholonomic.geometry import Cylinder, Graph, Implicit, Paraboloid, Plane, Sphere, Spheroid, Torus
-from nonholonomic.views import Arrow, Body, Curve, Show, Stage, Trace, arena, ball, page, turned
+from nonholonomic.views import Arrow, Body, Curve, Show, Stage, Trace, arena, ball, page, told_by_colour, turned
 from nonholonomic.views.animation import draw_curves, write_animation
 from nonholonomic.views.stage import matrices
 
@@ -93,8 +93,27 @@ def test_curves_are_drawn_and_what_is_constant_is_flat():
     assert high - low > 1e-5
 
 
+def test_a_page_leaves_no_widgets_behind():
+    """A notebook would keep each of them, with all its numbers."""
+    import comm
+    from ipywidgets.widgets.widget import _instances
+
+    told, before, opened = comm.create_comm, set(_instances), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(comm, "create_comm", lambda **options: opened.append(options) or told(**options))
+        assert "snapshot0" in page([rolling()], "a ball").html
+    assert (set(_instances), opened, comm.create_comm) == (before, [], told)
+
+
 def test_a_page_without_motion_has_no_script(tmp_path):
     text = page([], "a < b", above="<p>words</p>").html
     assert "a &lt; b" in text
     assert "<p>words</p>" in text
     assert "<script" not in text
+
+
+def test_traces_of_several_runs_have_their_colours():
+    (show,) = rolling().shows
+    assert told_by_colour((show,)) == (show,)
+    both = told_by_colour((show, show._replace(colour=0x2A6FB0)))
+    assert [one.traces[0].colour for one in both] == [0xC8412B, 0x2A6FB0]

@@ -9,6 +9,7 @@ import pytest
 import stroller
 import tippe
 from nonholonomic.views import page
+from nonholonomic.views.page import ANGLE
 
 BROWSER, DRIVER = (shutil.which(name) for name in ("chromium", "chromedriver"))
 
@@ -23,14 +24,25 @@ def top(rutstam_scene):
     return tippe.simulate(rutstam_scene, tippe.Launch(0.3, 150.0), 0.5)
 
 
+def ride_at(speed: float):
+    scene = stroller.Scene(stroller.Stroller(12.0, 0.7, 1.5, 0.05), stroller.Plane(0.05))
+    launch = stroller.Launch((0.0, 0.0), 1.2, speed, 0.2)
+    return stroller.simulate(scene, launch, 1.0, times=np.linspace(0.0, 1.0, 21))
+
+
 @pytest.fixture(scope="module")
 def ride():
-    scene = stroller.Scene(stroller.Stroller(12.0, 0.7, 1.5, 0.05), stroller.Plane(0.05))
-    return stroller.simulate(scene, stroller.Launch((0.0, 0.0), 1.2, 2.0, 0.2), 1.0, times=np.linspace(0.0, 1.0, 21))
+    return ride_at(2.0)
 
 
 @pytest.fixture(scope="module")
-def browser(top, ride, tmp_path_factory):
+def stages(top, ride):
+    """A top, and two rides in one place."""
+    return [*top.stages(), *ride.stages([ride_at(8.0)], overlaid=True)]
+
+
+@pytest.fixture(scope="module")
+def browser(stages, tmp_path_factory):
     from selenium.webdriver import Chrome, ChromeOptions
     from selenium.webdriver.chrome.service import Service
 
@@ -47,7 +59,7 @@ def browser(top, ride, tmp_path_factory):
         driver.execute_cdp_cmd("Network.emulateNetworkConditions", off)
         path = tmp_path_factory.mktemp("page") / "runs.html"
         # Small pictures, as a processor has to draw them here.
-        page([*top.stages(), *ride.stages()], "Both models", height=100).save(path)
+        page(stages, "Both models", height=100).save(path)
         driver.get(path.as_uri())
         wait(driver, "return !!window.player")
         yield driver
@@ -63,13 +75,15 @@ def wait(driver, script: str) -> None:
 
 
 def set_speed(driver, factor: float) -> None:
-    driver.execute_script(f"document.getElementById('speed').value = {factor}")
+    driver.execute_script(
+        f"const s = document.getElementById('speed'); s.add(new Option('', '{factor}')); s.value = '{factor}'"
+    )
 
 
-def poses(driver, at: float, stage: int, body: int = 0) -> np.ndarray:
-    """The matrix that takes a body to its place at a time, as the page's scene has it."""
-    script = f"player.seek({at!r}); return player.matrix({stage}, 0, {body})"
-    return np.array(driver.execute_script(script)).reshape(4, 4).T
+def poses(driver, at: float, stage: int, bodies: int = 1) -> np.ndarray:
+    """The matrices that take the first bodies to their places at a time, as the page's scene has them; it is drawn once."""
+    script = f"player.seek({at!r}); return [...Array({bodies}).keys()].map((body) => player.matrix({stage}, 0, body))"
+    return np.array(driver.execute_script(script)).reshape(bodies, 4, 4).swapaxes(1, 2)
 
 
 def test_nothing_is_missing_without_a_network(browser):
@@ -82,17 +96,17 @@ def test_the_top_is_where_the_run_is(browser, top):
     times = np.array([0.0, 0.1234, 0.3, 0.5])
     there = top.at(times)
     for number, at in enumerate(times):
-        pose = poses(browser, float(at), 0)
+        (pose,) = poses(browser, float(at), 0)
         np.testing.assert_allclose(pose[:3, 3], there.position[number], atol=SINGLE)
         # Between frames it is turned the short way, so its axis cuts a corner.
         np.testing.assert_allclose(pose[:3, 2], there.axis[number], atol=2e-3)
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=SINGLE)
 
 
-def test_the_top_spins_as_fast_as_the_run(browser, top):
-    frames = np.asarray(top.stages()[0].shows[0].times)
+def test_the_top_spins_as_fast_as_the_run(browser, top, stages):
+    frames = np.asarray(stages[0].shows[0].times)
     before, after = frames[200], frames[201]
-    turn = poses(browser, float(after), 0)[:3, :3] @ poses(browser, float(before), 0)[:3, :3].T
+    turn = poses(browser, float(after), 0)[0, :3, :3] @ poses(browser, float(before), 0)[0, :3, :3].T
     angle = np.arccos((np.trace(turn) - 1.0) / 2.0)
     rate = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     rate *= angle / (2.0 * np.sin(angle) * (after - before))
@@ -103,8 +117,8 @@ def test_the_top_spins_as_fast_as_the_run(browser, top):
 def test_the_stroller_and_its_wheels_are_where_the_ride_is(browser, ride):
     for number in (0, 10, 20):
         at = float(ride.t[number])
-        frame, front = poses(browser, at, 1, 0), poses(browser, at, 1, 3)
-        wheels = [poses(browser, at, 1, body)[:3, 3] for body in (1, 2)]
+        frame, left, right, front = poses(browser, at, 1, 4)
+        wheels = [left[:3, 3], right[:3, 3]]
         up = np.cross(frame[:3, 0], frame[:3, 1])
         np.testing.assert_allclose(frame[:3, 0], ride.direction[number], atol=SINGLE)
         np.testing.assert_allclose(frame[:3, 3], ride.position[number] + 0.14 * up, atol=SINGLE)
@@ -113,6 +127,23 @@ def test_the_stroller_and_its_wheels_are_where_the_ride_is(browser, ride):
         # The front wheel's axis has turned by the steering angle.
         turned = np.arctan2(-front[:3, 1] @ frame[:3, 0], front[:3, 1] @ frame[:3, 1])
         np.testing.assert_allclose(turned, ride.steering[number], atol=SINGLE)
+
+
+def test_the_camera_keeps_all_runs_of_a_place_in_sight(browser):
+    """They are 6 m apart in the end, and a vehicle is 0.7 m long."""
+    for at in (0.0, 0.5, 1.0):
+        browser.execute_script(f"player.seek({at!r})")
+        camera, target = np.array(
+            browser.execute_script(
+                "const { camera, controls } = player.stages[1].world;"
+                "return [camera.position.toArray(), controls.target.toArray()]"
+            )
+        )
+        ahead = (target - camera) / np.linalg.norm(target - camera)
+        for run in (0, 1):
+            matrix = browser.execute_script(f"return player.matrix(1, {run}, 0)")
+            away = np.array(matrix).reshape(4, 4)[3, :3] - camera
+            assert np.degrees(np.arccos(away @ ahead / np.linalg.norm(away))) < ANGLE / 2.0
 
 
 def test_the_slider_sets_the_time(browser):
@@ -124,8 +155,8 @@ def test_the_slider_sets_the_time(browser):
 
 
 def test_play_runs_to_the_end_and_pause_stops(browser):
-    # So slow that a busy machine does not reach the end meanwhile.
-    set_speed(browser, 0.05)
+    # So slow that a busy machine does not reach the end in the minute that it is given.
+    set_speed(browser, 0.01)
     browser.execute_script("player.seek(0.2); document.getElementById('play').click()")
     wait(browser, "return player.time() > 0.21")
     browser.execute_script("document.getElementById('play').click()")

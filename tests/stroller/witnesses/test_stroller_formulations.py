@@ -21,8 +21,8 @@ GROUNDS = {
     "intrinsic inside": dict(surface=Spheroid(2.0, 1.1), side="inside"),
     "projected": dict(surface=Spheroid(2.0, 1.1), heading="projected", side="inside"),
 }
-#: Every ground and both forks; the other pairs are slow.
-QUICK = [("plane", "absolute"), ("intrinsic inside", "absolute"), ("projected", "relative")]
+#: Both forks and both headings; the other pairs are slow.
+QUICK = [("intrinsic inside", "absolute"), ("projected", "relative")]
 CASES = [
     pytest.param(ground, fork, marks=[] if (ground, fork) in QUICK else [pytest.mark.slow])
     for ground in ("plane", "intrinsic inside", "projected")

@@ -1,0 +1,18 @@
+"""Two launches of one top, overlaid: above Jellett's threshold it turns over, below it does not (needs k3d)."""
+
+from pathlib import Path
+from typing import Any
+
+import tippe
+
+
+def draw() -> Any:
+    """The page of both."""
+    top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    fast, slow = (tippe.simulate(scene, tippe.Launch(theta=0.3, spin=spin), 8.0) for spin in (110.0, 60.0))
+    return fast.view(others=[slow], overlaid=True)
+
+
+if __name__ == "__main__":
+    draw().save(Path("fork_in_the_road.html"))

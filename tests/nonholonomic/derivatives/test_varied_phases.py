@@ -1,0 +1,187 @@
+"""Derivatives through changes of phase, on problems with closed forms: a bouncing ball, and a ball that grazes a slope."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from close import assert_close
+
+from nonholonomic.derivatives import directions_of, traced_travel_with_slopes, travel_with_slopes
+from nonholonomic.integration import CROSSED, REACHED_END, RUNNING, AbstractPhase, AbstractProblem, Passage, Settings
+
+CELLS = 8
+
+
+class Fall(AbstractProblem):
+    """Height [m], velocity [m/s] and number of bounces; the event is a level on the way down after some bounces."""
+
+    states: jax.Array
+    gravity: jax.Array
+    level: jax.Array
+    bounces: jax.Array
+
+    def start(self):
+        return self.states, jnp.ones_like(self.states)
+
+    def field(self, time, state):
+        return jnp.stack([state[1], -self.gravity + 0.0 * state[1], 0.0 * state[2]])
+
+    def crossing(self, state):
+        return jnp.where(state[2] >= self.bounces, state[0] - self.level, 1.0)
+
+    def guard(self, time, state):
+        return state[0]
+
+
+class Falls(AbstractPhase):
+    """Down to the ground, and up again in closed form to where the ball turns back."""
+
+    gravity: jax.Array
+    restitution: jax.Array
+    level: jax.Array
+    bounces: jax.Array
+
+    def problem(self, state):
+        return Fall(state, self.gravity, self.level, self.bounces)
+
+    def leave(self, state, left):
+        rebound = -self.restitution * state[1]
+        rise = jnp.minimum(rebound / self.gravity, left)
+        ends = rise < rebound / self.gravity
+        height = rebound * rise - 0.5 * self.gravity * rise**2
+        return Passage(
+            phase=jnp.zeros(rise.shape, int),
+            state=jnp.stack([height, rebound - self.gravity * rise, state[2] + 1.0]),
+            elapsed=rise,
+            status=jnp.where(ends, REACHED_END, RUNNING),
+            crossing_time=jnp.full_like(rise, jnp.inf),
+            counts=jnp.ones((1, *rise.shape), int),
+            log_rates=jnp.zeros_like(rise),
+        )
+
+
+def time_of_level(height, gravity, restitution, level, bounces):
+    """When the ball, dropped from a height [m], falls through the level for the first time after some bounces."""
+    speed = jnp.sqrt(2.0 * gravity * height)
+    bounced = speed / gravity * (1.0 + 2.0 * sum(restitution**k for k in range(1, bounces)))
+    rises = restitution**bounces * speed / gravity
+    return bounced + rises + jnp.sqrt(2.0 * (0.5 * gravity * rises**2 - level) / gravity)
+
+
+def settings_of(tolerance):
+    """What compiles fast."""
+    return Settings(tolerance, diffrax.Tsit5(), looped=True)
+
+
+HEIGHTS, RESTITUTIONS = np.linspace(0.5, 2.0, CELLS), np.linspace(0.9, 0.6, CELLS)
+
+
+@pytest.fixture(scope="module")
+def balls():
+    """Phases, directions, first phases and states of balls, and their slopes: by height, gravity, restitution and level."""
+    numbers, bounces = (jnp.asarray(HEIGHTS), jnp.asarray(9.81), jnp.asarray(RESTITUTIONS), jnp.asarray(0.01)), 5
+
+    def build(height, gravity, restitution, level):
+        states = jnp.stack([height, 0.0 * height, 0.0 * height])
+        return (Falls(gravity, restitution, level, jnp.asarray(float(bounces))),), states
+
+    tangents = [tuple(jnp.full_like(one, j == k) for j, one in enumerate(numbers)) for k in range(len(numbers))]
+    phases, states = build(*numbers)
+    expected = jax.vmap(jax.grad(time_of_level, (0, 1, 2, 3)), (0, None, 0, None, None))(*numbers, bounces)
+    given = (phases, directions_of(build, numbers, tangents), np.zeros(CELLS, int), np.asarray(states))
+    return given, time_of_level(*numbers, bounces), np.stack([np.broadcast_to(one, CELLS) for one in expected])
+
+
+@pytest.mark.slow
+def test_a_bouncing_ball(balls):
+    """By the height, gravity, the restitution and the level, through five impacts and what follows each."""
+    given, times, expected = balls
+    journey, found = travel_with_slopes(*given, 50.0, CELLS, settings_of(1e-10), kinds=1)
+    assert (journey.status == CROSSED).all()
+    assert (journey.counts == 5).all()
+    assert not found.grazing.any()
+    assert_close(journey.crossing_time, times, rtol=1e-9)
+    assert_close(found.slopes, expected, rtol=1e-9)
+
+
+def test_a_bouncing_ball_inside_a_transformation(balls):
+    """At the horizon, without an event there, the variations say the same; some of the balls rise then, in closed form."""
+    given, times, expected = balls
+
+    @eqx.filter_jit
+    def run(phases, directions, first, states, times):
+        settings = settings_of(1e-10)
+        first = jnp.asarray(first)
+        return traced_travel_with_slopes(
+            phases, directions, first, states, times, settings, kinds=1, ends_on_event=False
+        )
+
+    journey, found = run(*given, times)
+    assert (journey.status == REACHED_END).all()
+    assert (journey.counts == 5).all()
+    assert not found.grazing.any()
+    assert_close(found.slopes, expected, rtol=1e-8)
+
+
+class Over(AbstractProblem):
+    """Place and height of a ball that flies level, until it has lived; the ground rises as a cube, and is level at (1, 1)."""
+
+    states: jax.Array
+    lives: jax.Array
+
+    def start(self):
+        return self.states, jnp.ones_like(self.states)
+
+    def field(self, time, state):
+        return jnp.stack([jnp.ones_like(state[0]), 0.0 * state[1]])
+
+    def crossing(self, state):
+        return self.lives - state[0]
+
+    def guard(self, time, state):
+        return state[1] - 1.0 - (state[0] - 1.0) ** 3
+
+
+class Flies(AbstractPhase):
+    """Until it strikes the ground, where the ball begins anew, high up."""
+
+    lives: jax.Array
+
+    def problem(self, state):
+        return Over(state, self.lives)
+
+    def leave(self, state, left):
+        zero = jnp.zeros_like(left)
+        counts = jnp.ones((1, *left.shape), int)
+        running = jnp.full(left.shape, RUNNING)
+        return Passage(zero.astype(int), jnp.stack([zero, zero + 20.0]), zero, running, zero + jnp.inf, counts)
+
+
+def test_a_grazing_event_is_seen():
+    """The time is 1 + cbrt(y - 1) + 2 for a ball at the height y: its derivative is right, or it is marked, when traced too."""
+    heights, tolerance = 10.0 ** -np.arange(1.0, 13.0), 1e-9
+
+    def build(height):
+        return (Flies(jnp.asarray(2.0)),), jnp.stack([0.0 * height, height])
+
+    point = (jnp.asarray(1.0 + heights),)
+    phases, states = build(*point)
+    directions = directions_of(build, point, [(jnp.ones_like(heights),)])
+    first = jnp.zeros(len(heights), int)
+
+    @eqx.filter_jit
+    def run(phases, directions, first, states):
+        return traced_travel_with_slopes(
+            phases, directions, first, states, jnp.asarray(9.0), settings_of(tolerance), kinds=1
+        )
+
+    journey, found = jax.tree.map(np.asarray, run(phases, directions, first, states))
+    assert (journey.status == CROSSED).all()
+    assert (journey.counts == 1).all()
+    assert found.grazing[heights < 1e-8].all()
+    assert not found.grazing[heights > 1e-7].any()
+    good = ~found.grazing
+    assert_close(journey.crossing_time[good], 3.0 + np.cbrt(heights[good]), rtol=1e-9)
+    assert_close(found.slopes[0][good], np.cbrt(heights[good]) / heights[good] / 3.0, rtol=1e-2)

@@ -1,0 +1,84 @@
+"""Numbers, units and modules as a person reads them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import stroller
+import tippe
+from nonholonomic.parameters import as_html, as_text, in_lines, readable_unit, text_as_html, told_apart
+
+
+@pytest.mark.parametrize(
+    ("unit", "shown"),
+    [
+        ("1", ""),
+        ("s", "s"),
+        ("kg m2", "kg m²"),
+        ("rad s-1", "rad/s"),
+        ("m s-2", "m/s²"),
+        ("kg m3 s-1", "kg m³/s"),
+        ("s m-1", "s/m"),
+        ("s-1", "1/s"),
+        ("J kg-1 K-1", "J/(kg K)"),
+    ],
+)
+def test_units_are_written_as_people_write_them(unit, shown):
+    assert readable_unit(unit) == shown
+
+
+def test_values_are_told():
+    assert as_text(0.02, "kg") == "0.02 kg"
+    assert as_text(jnp.asarray(1 / 3), "m s-1") == "0.333333 m/s"
+    assert as_text(np.array([1.0, 2.0])) == "[1, 2]"
+    assert as_text(np.arange(6.0), "s") == "[0, 1, ..., 5, 6 numbers] s"
+    assert as_text((0.0, 1.0), "m") == "(0, 1) m"
+    assert as_text(readable_unit) == "readable_unit"
+    assert as_text("stop") == "'stop'"
+
+
+def test_traced_numbers_say_that_they_are():
+    seen = []
+    jax.jit(lambda mu: seen.append(repr(tippe.Viscous(mu))) or mu)(0.3)
+    assert seen == ["Viscous(mu=traced float64[])"]
+
+
+def test_html_escapes_and_lines_are_aligned():
+    assert "<td" in as_html("a < b", [("x", "<1>")])
+    assert "a &lt; b" in as_html("a < b", [("x", "<1>")])
+    assert "&lt;1&gt;" in as_html("a", [("x", "<1>")])
+    assert text_as_html("title\nx < 1").count("<pre>x &lt; 1</pre>") == 1
+    assert in_lines("T", [("a", "1"), ("long", "2")]) == "T\n  a     1\n  long  2"
+
+
+def test_runs_are_told_apart_by_what_differs():
+    body = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    scenes = [
+        tippe.Scene(body, tippe.Plane(), tippe.Viscous(0.3)),
+        tippe.Scene(body, tippe.Plane(), tippe.Viscous(0.2)),
+    ]
+    assert told_apart(["a", "a"], scenes) == ["a, mu 0.3 s/m", "a, mu 0.2 s/m"]
+    scenes[1] = tippe.Scene(body, tippe.Cylinder(0.3), tippe.Viscous(0.3))
+    assert told_apart(["a", "b"], scenes) == ["a, Plane", "b, Cylinder"]
+    assert told_apart(["a", "b", "a"], [scenes[0]] * 3) == ["a (1)", "b", "a (2)"]
+
+
+def test_no_public_object_shows_the_shapes_of_its_arrays():
+    launch = tippe.Launch(0.1, 155.0)
+    times = tippe.InversionTimes(tippe.Launch([0.1, 0.2], 100.0), [1.0, 2.0], 0.1, t1=5.0)
+    body = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    shown = [
+        repr(times),
+        repr(tippe.Recording(launch, [0.0, 0.5], [0.1, 0.2], 0.01)),
+        repr(stroller.Recording(stroller.Launch((0.0, 0.0), 0.0, 1.0), [1.0], np.ones((1, 3)), 0.1)),
+        repr(tippe.log_density(tippe.Scene(body), times, {"offset": 0.006})),
+        repr(stroller.ImplicitMidpoint(0.01)),
+    ]
+    assert "time=[1, 2] s" in shown[0]
+    assert "times=[0, 0.5] s" in shown[1]
+    assert shown[3:] == [
+        "LogDensity of scene.body.offset, given 2 measurements",
+        "ImplicitMidpoint(step_length=0.01 s)",
+    ]
+    assert not any("f64[" in one for one in shown)

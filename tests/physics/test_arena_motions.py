@@ -1,0 +1,290 @@
+"""Whole motions on grounds of any shape: an independent program, energy, drift, Clairaut's constant, derivatives, fits.
+
+The grounds are one family of which every number may be 0, and the friction is one law, so that one program runs them all.
+"""
+
+import math
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from arena_reference import SAMPLES, cases, recorded
+from close import assert_close
+from hypothesis import given, settings
+from hypothesis import strategies as some
+from make_gradient_reference import extrapolated
+from tops import rutstam_top
+
+import tippe
+from nonholonomic.integration import CROSSED, FAILED, Settings, compiled_march
+from nonholonomic.parameters import numbers, with_numbers
+from tippe.inversion import InversionProblem
+from tippe.sensitivities import slopes_of_cells
+
+REFERENCE = recorded()
+
+
+class Ground(eqx.Module):
+    """Two waves, a bowl, and a trough that narrows: z = sum h sin(a x + b y + c) + bowl (x^2 + y^2) / 2 + y^2 (t + u x)."""
+
+    first: tuple = (0.0, 0.0, 0.0, 0.0)
+    second: tuple = (0.0, 0.0, 0.0, 0.0)
+    bowl: float = 0.0
+    trough: tuple = (0.0, 0.0)
+
+    def __call__(self, x, y):
+        waves = sum(h * jnp.sin(a * x + b * y + c) for h, a, b, c in (self.first, self.second))
+        return waves + 0.5 * self.bowl * (x * x + y * y) + y * y * (self.trough[0] + self.trough[1] * x)
+
+
+def scene_on(ground, mu=0.3, slip_speed=0.05, gravity=9.81):
+    return tippe.Scene(rutstam_top(), tippe.Graph(ground), tippe.Coulomb(mu, slip_speed), gravity)
+
+
+def launched(place, velocity=(0.0, 0.0), turning=(0.0, 0.0, 0.0), theta=0.3, spin=100.0, azimuth=0.0):
+    """A launch with all its numbers, so that all are of one kind."""
+    return tippe.Launch(theta, spin, azimuth=azimuth, place=place, velocity=velocity, angular_velocity=turning)
+
+
+def moments(run):
+    """Moment about the vertical through the origin [kg m^2/s]: m (s x s')_z + L_z."""
+    body, e = run.scene.body, np.asarray(run.axis)
+    w = np.asarray(run.angular_velocity)
+    L = float(body.I1) * w + float(body.I3 - body.I1) * np.sum(w * e, axis=1, keepdims=True) * e
+    s = np.asarray(run.position) - float(body.offset) * e
+    s_rate = np.asarray(run.velocity) - float(body.offset) * np.cross(w, e)
+    return float(body.mass) * (s[:, 0] * s_rate[:, 1] - s[:, 1] * s_rate[:, 0]) + L[:, 2]
+
+
+WAVES = [k for k, case in enumerate(cases()) if case.arena == "graph" and case.slip_speed > 0.0]
+
+
+@pytest.mark.parametrize("number", WAVES, ids=lambda k: REFERENCE[k]["status"])
+def test_an_independent_program_sees_the_same_motion_over_waves(number):
+    """The rows of `arena_reference.csv` over waves, with Coulomb friction: centre, axis, normal force; how and when it ends."""
+    row, case = REFERENCE[number], cases()[number]
+    # sin(k x) cos(k y) is the sum of two waves of half the height.
+    half, k = 0.5 * case.p1, case.p2
+    scene = scene_on(Ground((half, k, k, 0.0), (half, k, -k, 0.0)), case.mu, case.slip_speed)
+    place = (row["q1"], row["q2"])
+    launch = launched(place, (case.v1, case.v2), (case.w1, case.w2, case.w3), case.theta, case.spin, case.azimuth)
+    run = tippe.simulate(scene, launch, row["t1"], row["t1"] * np.arange(1, SAMPLES + 1) / SAMPLES, 1e-11)
+    assert run.status == row["status"]
+    assert_close(run.end_time, row["end_time"], atol=1e-8)
+    assert len(run.t) >= 1
+    for sample in range(1, len(run.t) + 1):
+        assert_close(run.position[sample - 1], [row[f"O{i}_{sample}"] for i in range(3)], atol=1e-8)
+        assert_close(run.axis[sample - 1], [row[f"e{i}_{sample}"] for i in range(3)], atol=1e-8)
+        assert_close(run.normal_force[sample - 1], row[f"N_{sample}"], atol=1e-8)
+
+
+def test_clairauts_constant_of_a_whole_motion():
+    """Without friction, in a bowl, over two seconds of tumbling: the moment about the vertical, and the energy."""
+    scene = scene_on(Ground(bowl=1.0 / 0.3), mu=0.0)
+    run = tippe.simulate(scene, launched((0.1, -0.06), (0.2, 0.3), (4.0, -6.0, 2.0), 0.6), 2.0, tolerance=1e-11)
+    assert run.status == "reached t1"
+    found = moments(run)
+    assert np.ptp(run.position, axis=0).min() > 0.01
+    assert_close(found, found[0], atol=1e-9 * np.max(np.abs(found)))
+    assert_close(run.energy, run.energy[0], rtol=1e-9)
+
+
+def off_the_arena(run):
+    """The greatest distance of the foot from the arena, in units of R."""
+    frame = run.scene.frame
+    feet = tuple(jnp.asarray(run.states[8:11]))
+    return float(jnp.max(jnp.abs(frame.surface.offset(feet))) / run.scene.body.radius)
+
+
+def test_the_foot_stays_on_the_arena():
+    """The constraint drifts by less than the tolerance; in short for the thousand seconds below."""
+    scene = scene_on(Ground((0.01, 7.0, 7.0, 0.0), (0.01, 7.0, -7.0, 0.0), bowl=1.0), mu=0.02)
+    launch = launched((0.1, 0.05), (0.2, 0.1), spin=30.0)
+    run = tippe.simulate(scene, launch, 10.0, tolerance=1e-5)
+    assert run.status == "reached t1"
+    assert 1e-12 < off_the_arena(run) < 1e-5
+
+
+def into_a_narrow():
+    """A ball of 20 mm in a trough whose curvature grows beyond 1/R along it: the scene, and what its launch is made of."""
+    return scene_on(Ground(trough=(5.0, 150.0)), mu=0.0), {"theta": 0.0, "spin": 50.0}
+
+
+def test_the_run_ends_where_the_ball_no_longer_fits():
+    scene, launch = into_a_narrow()
+    run = tippe.simulate(scene, launched((0.0, 0.0), (0.4, 0.0), **launch), 1.0)
+    assert run.status == "does_not_fit"
+    assert float(run.end_time) < 1.0
+    # At the bottom of the trough the curvature is 10 + 300 x, so it is 1/R at x = 2/15.
+    assert_close(run.contact[-1], (2.0 / 15.0, 0.0, 0.0), atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_table_says_where_the_ball_no_longer_fits():
+    """The same time as the single run; the other way there is room."""
+    scene, launch = into_a_narrow()
+    run = tippe.simulate(scene, launched((0.0, 0.0), (0.4, 0.0), **launch), 1.0)
+    axes = {"launch.place[0]": [0.0], "launch.place[1]": 0.0, "launch.velocity[0]": [-0.4, 0.4]}
+    table = tippe.inversion_table(scene, **launch, t1=0.5, axes=axes)
+    assert table.status.tolist() == [["not_inverted", "does_not_fit"]]
+    assert_close(table.end_time[0, 1], float(run.end_time), rtol=1e-6)
+
+
+@settings(max_examples=12, deadline=None, derandomize=True)
+@given(some.integers(0, 2**32 - 1))
+def test_on_random_ground_energy_never_grows(seed):
+    """Finite or flagged; what energy is lost friction has taken."""
+    random = np.random.default_rng(seed)
+
+    def wave():
+        length, heading = 0.02 * math.exp(random.uniform(math.log(2.0), math.log(50.0))), random.uniform(-3.0, 3.0)
+        return (
+            length * random.uniform(0.0, 0.3),
+            math.cos(heading) / length,
+            math.sin(heading) / length,
+            random.uniform(-3, 3),
+        )
+
+    ground = Ground(wave(), wave(), random.uniform(-2.0, 3.0), tuple(random.uniform(-1.0, 1.0, 2)))
+    scene = scene_on(ground, random.uniform(0.0, 1.0), random.uniform(0.02, 1.0), random.uniform(1.0, 30.0))
+    drawn = random.uniform(-1.0, 1.0, 8)
+    launch = launched(
+        tuple(0.2 * drawn[:2]),
+        tuple(drawn[2:4]),
+        tuple(30.0 * drawn[4:7]),
+        3.0 * abs(drawn[7]),
+        random.uniform(-300, 300),
+    )
+    run = tippe.simulate(scene, launch, 0.3, tolerance=1e-9)
+    assert run.status in ("reached t1", "contact_lost", "does_not_fit", "jammed")
+    energy = np.asarray(run.energy)
+    size = np.ptp(energy) + float(scene.body.I3 * launch.spin**2 + scene.body.mass * scene.gravity * scene.body.radius)
+    assert np.all(np.isfinite(run.states))
+    assert np.all(np.diff(energy) <= 1e-9 * size)
+    assert run.stats["energy_residual"] < 1e-6 * size
+
+
+#: The angle that counts as inverted.
+ANGLE = 0.8 * math.pi
+
+#: What a time is differentiated by.
+NUMBERS = {
+    "scene.surface.height.bowl": 1.0 / 0.5,
+    "scene.surface.height.first[0]": 0.002,
+    "scene.friction.mu": 0.3,
+    "launch.place[0]": 0.05,
+    "launch.velocity[1]": 0.1,
+}
+
+
+def march(roots, columns, t1, tolerance):
+    """Inversion times of cells with numbers of their own, infinite where there is none."""
+    size = len(next(iter(columns.values())))
+    made = with_numbers(roots, columns)
+    problem = InversionProblem.of(made["scene"], made["launch"], ANGLE, size)
+    outcome, _ = compiled_march(problem, jnp.asarray(t1), jnp.asarray(size), Settings(tolerance, lanes=16))
+    assert not np.any(outcome.status == FAILED)
+    return np.where(outcome.status == CROSSED, outcome.crossing_time, np.inf)
+
+
+def scanned(roots, values, t1, step=1e-3, steps=8):
+    """Derivatives of an inversion time by some numbers: central differences over a scan of steps, extrapolated; and errors."""
+    shrunk = step / 1.6 ** np.arange(steps)
+    moves = np.concatenate([shrunk, -shrunk])
+    columns = {
+        name: np.concatenate([value * (1.0 + moves * (one == name)) for one in values])
+        for name, value in values.items()
+    }
+    times = march(roots, columns, t1, 1e-13).reshape(len(values), 2, steps)
+    assert np.all(np.isfinite(times))
+    limits = [
+        extrapolated((up - down) / (2.0 * value * shrunk))
+        for (up, down), value in zip(times, values.values(), strict=True)
+    ]
+    return (np.array(one) for one in zip(*limits, strict=True))
+
+
+def test_derivatives_of_the_forces_by_ground_friction_and_launch():
+    """Of the rates of the state and of the normal force, against scanned differences; in short for the runs below."""
+    roots = {
+        "scene": scene_on(Ground((0.002, 30.0, 10.0, 0.3), bowl=2.0)),
+        "launch": launched((0.05, 0.02), (0.0, 0.1)),
+    }
+
+    @jax.jit
+    def forces(*values):
+        made = with_numbers(roots, dict(zip(NUMBERS, values, strict=True)))
+        state = made["scene"].state(made["launch"])
+        return jnp.append(made["scene"].field(state), made["scene"].normal_force(state))
+
+    at = tuple(NUMBERS.values())
+    found = np.stack(jax.jit(jax.jacfwd(forces, tuple(range(len(at)))))(*at))
+    for k, value in enumerate(at):
+
+        def difference(step, k=k):
+            up, down = (forces(*at[:k], at[k] + sign * step, *at[k + 1 :]) for sign in (1.0, -1.0))
+            return (up - down) / (2.0 * step)
+
+        steps = 1e-2 * value / 1.6 ** np.arange(8)
+        differences = np.stack([difference(step) for step in steps])
+        expected, error = np.transpose([extrapolated(one) for one in differences.T])
+        size = np.max(np.abs(expected))
+        assert size > 1e-3
+        assert_close(found[k], expected, atol=1e-9 * size)
+        assert np.max(error) < 1e-9 * size
+
+
+#: An arena with the number of it that is varied, and a place on it.
+CURVED = {
+    "spheroid": (tippe.Spheroid(0.6, 0.45), "scene.surface.polar", (0.4, 0.2)),
+    "torus": (tippe.Torus(0.8, 0.5), "scene.surface.tube", (0.4, 0.2)),
+    "paraboloid": (tippe.Paraboloid(0.5), "scene.surface.p", (0.05, 0.02)),
+    "waves": (tippe.Graph(Ground((0.002, 30.0, 10.0, 0.3), bowl=2.0)), "scene.surface.height.first[0]", (0.05, 0.02)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["paraboloid", "torus", "waves"])
+def test_the_foot_stays_on_the_arena_for_a_thousand_seconds(name):
+    scene = tippe.Scene(rutstam_top(), CURVED[name][0], tippe.Viscous(0.02))
+    run = tippe.simulate(scene, launched(CURVED[name][2], (0.2, 0.1), spin=20.0), 1000.0, tolerance=1e-6)
+    assert run.status == "reached t1"
+    assert off_the_arena(run) < 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CURVED)
+def test_derivatives_and_a_fit_on_every_arena(name):
+    """By a number of the arena, friction, place and velocity, along with the run; and the arena's number from five times."""
+    surface, number, place = CURVED[name]
+    scene = tippe.Scene(rutstam_top(), surface, tippe.Viscous(0.3))
+    roots = {"scene": scene, "launch": launched(place, (0.0, 0.1), theta=0.5, spin=150.0)}
+    true = float(numbers("scene", scene)[number])
+    values = {number: true, "scene.friction.mu": 0.3, "launch.place[1]": place[1], "launch.velocity[1]": 0.1}
+    _, found = slopes_of_cells(
+        roots,
+        {one: np.array([value]) for one, value in values.items()},
+        list(values),
+        ANGLE,
+        8.0,
+        1e-11,
+        count=1,
+        size=1,
+        solver=diffrax.Dopri8(),
+        last=False,
+    )
+    expected, error = scanned(roots, values, 8.0)
+    assert_close([one[0] for one in found.values()], expected, rtol=1e-5)
+    assert np.all(error < 1e-6 * np.abs(expected))
+
+    spins = np.array([110.0, 125.0, 140.0, 155.0, 170.0])
+    given = {"theta": 0.3, "place": place, "velocity": (0.0, 0.1)}
+    times = [float(tippe.inversion_time(scene, tippe.Launch(spin=spin, **given), 12.0, ANGLE, 1e-11)) for spin in spins]
+    data = tippe.InversionTimes(tippe.Launch(spin=spins, **given), times, 0.02, t1=12.0, angle=ANGLE)
+    off = with_numbers({"scene": scene}, {number: 1.05 * true})["scene"]
+    result = tippe.identify(off, data, {number: 1.05 * true}, progress=False)
+    assert result.status == "converged"
+    assert_close(result.estimates[number], true, rtol=1e-3)

@@ -1,0 +1,94 @@
+"""Derivatives through flights, impacts, stick and slip, against central differences whose step was scanned."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from close import assert_close
+from test_hops import CASES, scene_of
+
+import tippe
+
+
+def test_a_table_through_flights_and_impacts():
+    """By spin and restitution, after some dozen flights: a difference in one is taken on both sides of the other.
+
+    The steps are from the middle of a range over which the differences agree.
+    """
+    scene, given = scene_of(CASES[0], 0.1), {"theta": 0.1, "t1": 20.0, "angle": 1.9, "progress": False}
+    step, other, bounces = 1e-3, 1e-5, np.array([0.2, 0.3])
+    # As many cells and the same axes as in `test_hops`: the programs are those.
+    spins, axes = [200.0 - step, 200.0 + step], {"scene.restitution": [b + d for b in bounces for d in (-other, other)]}
+    around = tippe.inversion_table(scene, spin=spins, axes=axes, tolerance=1e-11, **given)
+    time = around.time.reshape(2, 2, 2)
+    given |= {"spin": [200.0], "axes": {"scene.restitution": list(bounces)}, "solver": diffrax.Tsit5()}
+    table = tippe.inversion_table(scene, tolerance=1e-9, sensitivities=["spin", "restitution"], **given)
+    assert (table.status == "inverted").all()
+    assert (table.hops > 20).all()
+    assert (table.grazes == 0).all()
+    assert_close(table.time_by_spin[0], (np.diff(time, axis=0) / (2.0 * step)).mean(axis=(0, 2)), rtol=1e-5)
+    assert_close(table.time_by_restitution[0], (np.diff(time, axis=2) / (2.0 * other)).mean(axis=(0, 2)), rtol=1e-4)
+
+
+def scanned(function, at, steps):
+    """Central differences, each extrapolated from two steps: the one that differs least from that of the next step."""
+    found = []
+    for step in steps:
+        ends = [np.asarray(function(at + k * step)) for k in (-2, -1, 1, 2)]
+        found.append((8.0 * (ends[2] - ends[1]) - (ends[3] - ends[0])) / (12.0 * step))
+    found = np.array(found)
+    best = np.argmin(np.abs(np.diff(found, axis=0)), axis=0)
+    return np.take_along_axis(found, best[None], axis=0)[0]
+
+
+@pytest.mark.slow
+def test_samples_through_flights_and_impacts():
+    """In contact, in the air and between impacts: what `simulate` gives inside a transformation, and how it varies."""
+    scene, times = scene_of(CASES[0], 0.3), np.array([0.05, 4.0, 4.9, 4.95, 5.0, 5.05, 5.1, 5.2, 5.3])
+
+    def seen(run):
+        return jnp.stack([run.theta, run.distance[0], run.position[:, 0], run.spin_angle])
+
+    def traced(spin):
+        run = tippe.simulate(scene, tippe.Launch(0.1, spin), 5.3, times=times, tolerance=1e-10, solver=diffrax.Tsit5())
+        return seen(run), (run.contact, run.status, run.stats["hops"])
+
+    def told(spin):
+        return tippe.simulate(scene, tippe.Launch(0.1, spin), 5.3, times=times, tolerance=1e-12)
+
+    found, slopes, (contact, status, hops) = jax.jit(lambda spin: jax.jvp(traced, (spin,), (1.0,), has_aux=True))(200.0)
+    whole = told(200.0)
+    np.testing.assert_array_equal(contact, whole.contact)
+    assert set(whole.contact) == {-1, 0}
+    assert status == 0
+    assert hops == len(whole.hops)
+    assert_close(found, seen(whole), rtol=1e-6, atol=1e-8)
+    expected = scanned(lambda spin: seen(told(spin)), 200.0, [1e-2, 1e-3, 1e-4, 1e-5])
+    sizes = np.max(np.abs(expected), axis=1, keepdims=True)
+    assert np.max(np.abs(slopes - expected) / sizes) < 1e-4
+
+
+@pytest.mark.slow
+def test_a_time_inside_a_transformation():
+    """`inversion_time` finds what a table finds, and the same derivative; second derivatives are refused."""
+
+    def time(spin, restitution):
+        scene, launch = scene_of(CASES[0], restitution), tippe.Launch(0.1, spin)
+        return tippe.inversion_time(scene, launch, 20.0, 1.9, 1e-10, solver=diffrax.Tsit5())
+
+    found, slopes = jax.jit(jax.value_and_grad(time, (0, 1)))(200.0, 0.3)
+    table = tippe.inversion_table(
+        scene_of(CASES[0], 0.3),
+        theta=0.1,
+        spin=200.0,
+        t1=20.0,
+        angle=1.9,
+        tolerance=1e-10,
+        solver=diffrax.Tsit5(),
+        sensitivities=["spin", "restitution"],
+    )
+    assert_close(found, table.time, rtol=1e-8)
+    assert_close(slopes, (table.time_by_spin, table.time_by_restitution), rtol=1e-5)
+    with pytest.raises(ValueError, match="second derivatives do not go through changes of phase"):
+        jax.hessian(time)(200.0, 0.3)
