@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close
+from close import assert_close
 from test_hops import CASES, scene_of
 
 import tippe

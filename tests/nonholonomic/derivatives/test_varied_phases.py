@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import assert_close
+from close import assert_close
 
 from nonholonomic.derivatives import directions_of, traced_travel_with_slopes, travel_with_slopes
 from nonholonomic.integration import CROSSED, REACHED_END, RUNNING, AbstractPhase, AbstractProblem, Passage, Settings
