@@ -17,10 +17,10 @@ import sys
 import time
 from pathlib import Path
 
-from hard import friction, hybrid, limits, sensitive, sticking
+from hard import arenas, friction, hybrid, limits, sensitive, sticking
 from measure import machine, table, write_csv
 
-SUBJECTS = (limits, friction, hybrid, sticking, sensitive)
+SUBJECTS = (limits, friction, hybrid, arenas, sticking, sensitive)
 
 
 def main() -> int:

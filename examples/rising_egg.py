@@ -22,7 +22,7 @@ def launch(turning: float) -> tippe.Launch:
 
 
 def fast_limit(times: Any) -> Any:
-    """Moffatt and Shimomura's rise under viscous friction, for every great spin: tan(theta - pi/2) grows as exp(k t)."""
+    """Moffatt and Shimomura's rise under viscous friction, at every great spin: tan(theta - pi/2) grows as exp(k t)."""
     k = 2.5 * MU * 9.81 * (POLAR**2 - EQUATORIAL**2) / (POLAR**2 + EQUATORIAL**2)
     return math.pi / 2.0 + np.arctan(math.tan(RAISED) * np.exp(k * times))
 
@@ -38,10 +38,10 @@ def draw() -> Any:
         run = run.at(np.linspace(0.0, end, 1201))
         rows = (run.theta, run.jellett / run.jellett[0], run.normal_force / (MASS * 9.81))
         for ax, values in zip(axes, rows, strict=True):
-            ax.plot(run.t, values, lw=1.0, label=f"{spin:g} rad/s" + (", jumps" if run.status == "contact_lost" else ""))
+            ax.plot(run.t, values, lw=1.0, label=f"{spin:g} rad/s{', jumps' * (run.status == 'contact_lost')}")
     times = np.linspace(0.0, 3.0, 301)
     axes[0].plot(times, fast_limit(times), "k--", lw=1.0, label="limit of great spin")
-    for ax, label in zip(axes, ("theta [rad]", "Jellett's quantity, 1 at the start", "normal force / weight"), strict=True):
+    for ax, label in zip(axes, ("theta [rad]", "Jellett's quantity / start", "normal force / weight"), strict=True):
         ax.set(xlabel="time [s]", ylabel=label)
     axes[0].legend(fontsize=8)
     plt.close(figure)

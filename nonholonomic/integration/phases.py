@@ -7,6 +7,7 @@ of the state. The cells advance in rounds: in each, the cells that are now in a 
 """
 
 import abc
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -154,9 +155,7 @@ def travel(
     )
     found.status[cells:] = REACHED_END
     if cells == 0:
-        for one in phases:
-            _march(one, found, np.arange(0), t1, settings, options)
-            _pass_on(one, found, np.arange(0), t1)
+        _compile(phases, found, t1, settings, options)
     for _ in range(most_rounds):
         # Selected before the round: a cell that changes its phase during it waits for the next round.
         here = [np.flatnonzero((found.status == RUNNING) & (found.phase == number)) for number in range(len(phases))]
@@ -170,6 +169,22 @@ def travel(
             break
     found.status[found.status == RUNNING] = UNRESOLVED
     return found
+
+
+def _compile(
+    phases: tuple[AbstractPhase, ...],
+    found: Journey,
+    t1: Float[np.ndarray, " cells"],
+    settings: Settings,
+    options: dict[str, Any],
+) -> None:
+    """Compile all programs by running none of the cells: two at once, for the compiler uses little more than one core."""
+    none = np.arange(0)
+    with ThreadPoolExecutor(2) as threads:
+        marches = [threads.submit(_march, one, found, none, t1, settings, options) for one in phases]
+        leaving = [threads.submit(_pass_on, one, found, none, t1) for one in phases]
+        for program in (*marches, *leaving):
+            program.result()
 
 
 def _gather(

@@ -108,16 +108,27 @@ def test_the_foot_stays_on_the_arena():
     assert 1e-12 < off_the_arena(run) < 1e-5
 
 
+def into_a_narrow():
+    """A ball of 20 mm in a trough whose curvature grows beyond 1/R along it: the scene, and what its launch is made of."""
+    return scene_on(Ground(trough=(5.0, 150.0)), mu=0.0), {"theta": 0.0, "spin": 50.0}
+
+
 def test_the_run_ends_where_the_ball_no_longer_fits():
-    """A ball of 20 mm in a trough whose curvature grows beyond 1/R along it: the run ends there, in words, on every road."""
-    scene = scene_on(Ground(trough=(5.0, 150.0)), mu=0.0)
-    run = tippe.simulate(scene, launched((0.0, 0.0), (0.4, 0.0), theta=0.0, spin=50.0), 1.0)
+    scene, launch = into_a_narrow()
+    run = tippe.simulate(scene, launched((0.0, 0.0), (0.4, 0.0), **launch), 1.0)
     assert run.status == "does_not_fit"
     assert float(run.end_time) < 1.0
     # At the bottom of the trough the curvature is 10 + 300 x, so it is 1/R at x = 2/15.
     assert_close(run.contact[-1], (2.0 / 15.0, 0.0, 0.0), atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_table_says_where_the_ball_no_longer_fits():
+    """The same time as the single run; the other way there is room."""
+    scene, launch = into_a_narrow()
+    run = tippe.simulate(scene, launched((0.0, 0.0), (0.4, 0.0), **launch), 1.0)
     axes = {"launch.place[0]": [0.0], "launch.place[1]": 0.0, "launch.velocity[0]": [-0.4, 0.4]}
-    table = tippe.inversion_table(scene, theta=0.0, spin=50.0, t1=0.5, axes=axes)
+    table = tippe.inversion_table(scene, **launch, t1=0.5, axes=axes)
     assert table.status.tolist() == [["not_inverted", "does_not_fit"]]
     assert_close(table.end_time[0, 1], float(run.end_time), rtol=1e-6)
 
@@ -196,22 +207,34 @@ def scanned(roots, values, t1, step=1e-3, steps=8):
     return (np.array(one) for one in zip(*limits, strict=True))
 
 
-@pytest.mark.slow
-def test_derivatives_by_ground_friction_and_launch():
-    """Of an inversion time in a bowl with waves, back through the run, against scanned differences."""
-    ground = Ground((0.002, 30.0, 10.0, 0.3), bowl=2.0)
-    scene, launch = scene_on(ground), launched((0.05, 0.02), (0.0, 0.1), theta=0.5, spin=150.0)
-    roots = {"scene": scene, "launch": launch}
-    names = list(NUMBERS)
+def test_derivatives_of_the_forces_by_ground_friction_and_launch():
+    """Of the rates of the state and of the normal force, against scanned differences; in short for the runs below."""
+    roots = {
+        "scene": scene_on(Ground((0.002, 30.0, 10.0, 0.3), bowl=2.0)),
+        "launch": launched((0.05, 0.02), (0.0, 0.1)),
+    }
 
-    def time(values):
-        made = with_numbers(roots, dict(zip(names, values, strict=True)))
-        return tippe.inversion_time(made["scene"], made["launch"], 8.0, ANGLE, 1e-11)
+    @jax.jit
+    def forces(*values):
+        made = with_numbers(roots, dict(zip(NUMBERS, values, strict=True)))
+        state = made["scene"].state(made["launch"])
+        return jnp.append(made["scene"].field(state), made["scene"].normal_force(state))
 
-    found = jax.grad(time)([jnp.asarray(value) for value in NUMBERS.values()])
-    expected, error = scanned(roots, NUMBERS, 8.0)
-    assert_close(found, expected, rtol=1e-5)
-    assert np.all(error < 1e-6 * np.abs(expected))
+    at = tuple(NUMBERS.values())
+    found = np.stack(jax.jit(jax.jacfwd(forces, tuple(range(len(at)))))(*at))
+    for k, value in enumerate(at):
+
+        def difference(step, k=k):
+            up, down = (forces(*at[:k], at[k] + sign * step, *at[k + 1 :]) for sign in (1.0, -1.0))
+            return (up - down) / (2.0 * step)
+
+        steps = 1e-2 * value / 1.6 ** np.arange(8)
+        differences = np.stack([difference(step) for step in steps])
+        expected, error = np.transpose([extrapolated(one) for one in differences.T])
+        size = np.max(np.abs(expected))
+        assert size > 1e-3
+        assert_close(found[k], expected, atol=1e-9 * size)
+        assert np.max(error) < 1e-9 * size
 
 
 #: An arena with the number of it that is varied, and a place on it.
