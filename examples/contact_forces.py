@@ -13,7 +13,7 @@ def draw() -> Any:
     scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
     times = np.linspace(0.0, 7.0, 3501)
     table = tippe.trajectory_table(
-        scene, theta=0.1, spin=[120.0, 150.0, 180.0], times=times, quantities=["normal_force"], tolerance=1e-6
+        scene, theta=0.1, spin=[180.0, 150.0, 120.0], times=times, quantities=["normal_force"], tolerance=1e-6
     )
     figure = table.plot("normal_force")
     figure.axes[0].axhline(float(top.mass * scene.gravity), color="0.5", linewidth=0.8)

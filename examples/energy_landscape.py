@@ -20,6 +20,9 @@ def draw() -> Any:
         jellett = float(top.I3) * spin * (0.02 - 0.006)
         ax.plot(theta, np.asarray(steady.effective_energy(scene, theta, jellett)) / weight, label=f"{spin:g} rad/s")
     ax.set(xlabel="θ [rad]", ylabel="least energy / m g R", yscale="log")
+    ax.set_xticks([0.0, np.pi / 2.0, np.pi], ["0", "π/2", "π"])
+    ax.set_yticks([1.0, 2.0, 3.0, 4.0, 6.0], ["1", "2", "3", "4", "6"])
+    ax.minorticks_off()
     ax.legend(title="spin at θ = 0")
     plt.close(figure)
     return figure

@@ -25,13 +25,16 @@ def measured() -> tippe.InversionTimes:
     return tippe.InversionTimes(tippe.Launch(THETA, SPIN), noisy, ERROR, t1=60.0, angle=ANGLE)
 
 
-def main(path: str | None = None) -> None:
-    data = measured()
-    # Where I3 is known, I1 is known to 3 %, from weighing and measuring; friction is known beforehand to a third.
+def free_numbers() -> dict[str, tippe.Free]:
+    """I3 is known; I1 is known to 3 %, from weighing and measuring; friction is known beforehand to a third."""
     free = {"friction.mu": tippe.Free(0.3, 0.0, prior=(0.3, 0.1)), "offset": tippe.Free(0.0035, 0.0)}
-    free |= {"scene.body.I1": tippe.Free(I1, 0.0, prior=(I1, 0.03 * I1))}
-    fit = tippe.identify(scene(0.3, 0.0035), data, free, tolerance=1e-6)
-    density = tippe.log_density(scene(0.3, 0.0035), data, free, tolerance=1e-6)
+    return free | {"scene.body.I1": tippe.Free(I1, 0.0, prior=(I1, 0.03 * I1))}
+
+
+def main(path: str | None = None) -> None:
+    data, free = measured(), free_numbers()
+    fit = tippe.identify(scene(0.3, 0.0035), data, free)
+    density = tippe.log_density(scene(0.3, 0.0035), data, free)
     draws = sample(density, fit.coordinates, fit.coordinate_covariance)
     print(draws)
     replicas = density.replicate(draws.coordinates.reshape(-1, len(free))[::10])

@@ -56,8 +56,9 @@ UNITS = Stroller.units | Scene.units | Damping.units | RollingResistance.units |
 UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m", "ring": "m", "tube": "m", "p": "m"}
 
 #: What the axes are, in words.
-LONG_NAMES = {"steering_inertia": "inertia of the fork", "steering_spring": "spring of the fork", "steering": "φ(0)"}
+LONG_NAMES = {"steering_inertia": "inertia of the fork", "steering_spring": "spring of the fork"}
 LONG_NAMES |= {
+    "steering": "steering angle φ(0)",
     "speed": "speed v(0)",
     "heading": "heading ψ(0)",
     "steering_rate": "steering rate φ'(0)",

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.identification import AbstractRecording, Measurements, Quantities, as_quantity, predicted
-from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.parameters import numbers, one_line, with_numbers
 from nonholonomic.validation import as_number, require
 
 from .extended_times import extended_inversion_time
@@ -69,6 +69,10 @@ class InversionTimes(eqx.Module):
     until: Any = None
     angle: Float[Array, ""] = eqx.field(converter=as_number, default=0.95 * math.pi)
     student: float | None = None
+    units: ClassVar[dict[str, str]] = {"time": "s", "error": "s", "t1": "s", "until": "s", "angle": "rad"}
+
+    def __repr__(self) -> str:
+        return one_line(self)
 
     def __check_init__(self):
         shape = np.shape(self.time)

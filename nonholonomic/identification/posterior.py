@@ -34,6 +34,9 @@ class LogDensity(eqx.Module):
     priors: tuple[tuple[str, Any], ...] = eqx.field(static=True)
     open_series: tuple[int, ...] = eqx.field(static=True)
 
+    def __repr__(self) -> str:
+        return f"LogDensity of {', '.join(self.names)}, given {self.measurements.value.size} measurements"
+
     @classmethod
     def of(
         cls,
@@ -97,7 +100,10 @@ class LogDensity(eqx.Module):
         return predicted + np.asarray(errors) * drawn
 
     def __call__(self, coordinates: Float[Array, " unknowns"]) -> Float[Array, ""]:
-        prediction = self.predict(coordinates[None])[0]
+        return self.of_prediction(coordinates, self.predict(coordinates[None])[0])
+
+    def of_prediction(self, coordinates: Float[Array, " unknowns"], prediction: Float[Array, " n"]) -> Float[Array, ""]:
+        """The log density at some coordinates, given what the model predicts there."""
         return self._with_errors(coordinates).log_likelihood(prediction) + self._log_prior(coordinates)
 
     def value_and_gradient(

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..parameters import numbers
+from ..parameters import numbers, one_line
 from ..validation import as_number, require
 from .likelihood import Measurements
 
@@ -87,6 +87,10 @@ class AbstractRecording(eqx.Module):
     t0: eqx.AbstractVar[Float[Array, ""]]
     student: eqx.AbstractVar[float | None]
     quantities: eqx.AbstractClassVar[Quantities]
+    units: ClassVar[dict[str, str]] = {"times": "s", "t0": "s"}
+
+    def __repr__(self) -> str:
+        return one_line(self)
 
     def __check_init__(self):
         require(self.times, "times")

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..geometry import inverse
+from ..parameters import one_line
 from ..validation import as_number, require
 
 #: Simplified Newton iterations; each gains a factor of the order of (step times rate of change)^2.
@@ -43,8 +44,12 @@ class ImplicitMidpoint(diffrax.AbstractSolver):
 
     step_length: Float[Array, ""] = eqx.field(converter=as_number)
 
+    units: ClassVar[dict[str, str]] = {"step_length": "s"}
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+
+    def __repr__(self) -> str:
+        return one_line(self)
 
     def __check_init__(self):
         require(self.step_length, "step_length", above=0.0)

@@ -1,10 +1,12 @@
 """One page that holds everything: a view in three dimensions that moves, drawn by K3D, and strips of curves (needs k3d)."""
 
 import base64
+import contextlib
 import html
 import io
 import json
 import zlib
+from collections.abc import Iterator
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -155,6 +157,25 @@ def _stage(stage: Stage, numbers: _Numbers) -> tuple[bytes, dict[str, Any]]:
     """K3D's snapshot of what a stage draws, and what the script needs to know of it."""
     import k3d
 
+    with _unseen():
+        return _drawn(k3d, stage, numbers)
+
+
+@contextlib.contextmanager
+def _unseen() -> Iterator[None]:
+    """K3D's widgets are not told to a notebook, which would keep megabytes of what the page holds anyway."""
+    import comm
+
+    told, comm.create_comm = comm.create_comm, comm.DummyComm
+    try:
+        yield
+    finally:
+        comm.create_comm = told
+
+
+def _drawn(k3d: Any, stage: Stage, numbers: "_Numbers") -> tuple[bytes, dict[str, Any]]:
+    from ipywidgets import Widget
+
     plot = k3d.plot(
         camera_auto_fit=False,
         grid_visible=False,
@@ -178,7 +199,12 @@ def _stage(stage: Stage, numbers: _Numbers) -> tuple[bytes, dict[str, Any]]:
         # Traces of several runs have the runs' colours.
         keys += [(one.name, css(one.colour)) for one in (*(show.traces if alone else ()), *show.arrows)]
     fact = {"title": stage.title, "keys": keys, "follow": follow, "size": _size(stage), "shows": shows}
-    return plot.get_binary_snapshot(9), fact
+    snapshot = plot.get_binary_snapshot(9)
+    # Widgets are kept until they are closed; a plot of K3D closes something else.
+    for one in (*plot.objects, plot):
+        Widget.close(one.layout)
+        Widget.close(one)
+    return snapshot, fact
 
 
 class _Drawn:

@@ -72,6 +72,7 @@ def draw_table(
         drawing.set_ylabel(table.label(variable))
         if log:
             drawing.set_yscale("log")
+            _plain_numbers(drawing.yaxis)
     else:
         drawing.set_ylabel(table.label(names[1]))
         _draw_map(drawing, table, names, shown, table.label(variable), log)
@@ -142,7 +143,17 @@ def _draw_map(drawing: Any, table: "Table", names: list[str], shown: Any, label:
     image = drawing.pcolormesh(x, y, shown.T, shading="nearest", norm=scale)
     beyond = known.size and (known.min() < low, known.max() > high)
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
-    drawing.figure.colorbar(image, ax=drawing, label=label, extend=extend)
+    bar = drawing.figure.colorbar(image, ax=drawing, label=label, extend=extend)
+    if log:
+        _plain_numbers(bar.ax.yaxis)
+
+
+def _plain_numbers(axis: Any) -> None:
+    """Write the numbers of a logarithmic axis as 12.5, not as 1.25 x 10^1, if none is very large or small."""
+    low, high = axis.get_view_interval()
+    if low >= 1e-4 and high <= 1e5:
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("{x:g}" if high < 10.0 * low else "")
 
 
 def _mark_words(drawing: Any, table: "Table", names: list[str], words: Any) -> None:
@@ -181,6 +192,9 @@ def draw_portrait(table: "Table", x: str, y: str, ax: Any = None) -> Any:
     drawing.plot(across[:1], up[:1], "o", color=line.get_color())
     drawing.set_xlabel(across_label)
     drawing.set_ylabel(up_label)
+    if {x, y} == {"position.x", "position.y"}:
+        # A path, as it is from above.
+        drawing.set_aspect("equal", adjustable="datalim")
     return drawing if figure is None else figure
 
 
@@ -192,7 +206,8 @@ def _column(table: "Table", argument: str, name: str) -> tuple[Any, str]:
         return table[variable], table.label(variable)
     if variable in table.variables and len(dims) == 1 and component in table.coords[dims[0]]:
         place = int(np.flatnonzero(table.coords[dims[0]] == component)[0])
-        return table[variable][:, place], f"{component} of {table.label(variable)}"
+        name, bracket, unit = table.label(variable).rpartition(" [")
+        return table[variable][:, place], f"{name}, {component}{bracket}{unit}" if bracket else f"{unit}, {component}"
     known = [one for one in table.variables if one not in table.inner]
     known += [f"{one}.{part}" for one, dims in table.inner.items() for part in table.coords[dims[0]]]
     raise ValueError(f"{argument} = {name!r} must be one of {', '.join(known)}")

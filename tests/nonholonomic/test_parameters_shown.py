@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import stroller
 import tippe
 from nonholonomic.parameters import as_html, as_text, in_lines, readable_unit, text_as_html, told_apart
 
@@ -61,3 +62,23 @@ def test_runs_are_told_apart_by_what_differs():
     scenes[1] = tippe.Scene(body, tippe.Cylinder(0.3), tippe.Viscous(0.3))
     assert told_apart(["a", "b"], scenes) == ["a, Plane", "b, Cylinder"]
     assert told_apart(["a", "b", "a"], [scenes[0]] * 3) == ["a (1)", "b", "a (2)"]
+
+
+def test_no_public_object_shows_the_shapes_of_its_arrays():
+    launch = tippe.Launch(0.1, 155.0)
+    times = tippe.InversionTimes(tippe.Launch([0.1, 0.2], 100.0), [1.0, 2.0], 0.1, t1=5.0)
+    body = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    shown = [
+        repr(times),
+        repr(tippe.Recording(launch, [0.0, 0.5], [0.1, 0.2], 0.01)),
+        repr(stroller.Recording(stroller.Launch((0.0, 0.0), 0.0, 1.0), [1.0], np.ones((1, 3)), 0.1)),
+        repr(tippe.log_density(tippe.Scene(body), times, {"offset": 0.006})),
+        repr(stroller.ImplicitMidpoint(0.01)),
+    ]
+    assert "time=[1, 2] s" in shown[0]
+    assert "times=[0, 0.5] s" in shown[1]
+    assert shown[3:] == [
+        "LogDensity of scene.body.offset, given 2 measurements",
+        "ImplicitMidpoint(step_length=0.01 s)",
+    ]
+    assert not any("f64[" in one for one in shown)

@@ -192,7 +192,7 @@ def experiment():
     launch = tippe.Launch(np.repeat([0.005, 0.015], 5), np.tile([70.0, 80.0, 100.0, 120.0, 150.0], 2))
     data = tippe.InversionTimes(launch, np.full(10, 5.0), error, t1=60.0, angle=0.5 * np.pi)
     free = (("scene.friction.mu", Free(0.3, 0.0)), ("scene.body.offset", Free(0.0035, 0.0)))
-    problem = Problem(SceneModel(scene, (data,), data.seen, 1e-6), free)
+    problem = Problem(SceneModel(scene, (data,), data.seen, 1e-8), free)
     starts = zip(np.asarray(launch.theta), np.asarray(launch.spin), strict=True)
     exact = [independent_time(0.0035, a, w, 60.0, 0.5 * np.pi) for a, w in starts]
     return problem, true, np.array([exact]), error
@@ -207,7 +207,8 @@ def test_two_hundred_noisy_tables_give_unbiased_estimates_and_intervals_that_cov
     """200 realisations at once.
 
     The share of 200 intervals that cover has a standard deviation of 1.5 %, so 92 to 98 % is two of those either way, and a
-    right program would miss it once in twenty draws for either number: the draw was made once.
+    right program would miss it once in twenty draws for either number: the draw was made once. So with the bias, whose mean
+    over 200 has a standard deviation of 0.07 errors.
     """
     problem, true, exact, error = experiment
     draw = np.random.default_rng(0)
@@ -224,7 +225,7 @@ def test_two_hundred_noisy_tables_give_unbiased_estimates_and_intervals_that_cov
     # One in a hundred may go to and fro on a step of the time's staircase until its steps are used up.
     assert np.mean(ends.converged) >= 0.99
     assert np.all(there.deviance < TOO_MUCH)
-    assert np.all(np.abs(bias) < 3.0 / np.sqrt(200.0))
+    assert np.all(np.abs(bias) < 0.2)
     assert np.all((covered > 0.92) & (covered < 0.98))
 
 

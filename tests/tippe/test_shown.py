@@ -85,6 +85,7 @@ def test_a_portrait_draws_one_quantity_over_another(run):
     assert drawing.get_xlabel() == "inclination θ [rad]"
     path = run.portrait("position.x", "position.y").axes[0]
     assert_close(path.get_lines()[0].get_ydata(), run.position[:, 1])
+    assert path.get_aspect() == 1.0
     with pytest.raises(ValueError, match=r"y = 'position' must be one of theta, .*position\.x"):
         run.portrait("theta", "position")
 

@@ -66,7 +66,13 @@ def test_colours_lie_between_quantiles_and_may_be_logarithmic(table):
     assert image.get_clim() == pytest.approx(np.quantile(shown, (0.02, 0.98)))
     assert image.get_clim()[1] < 1e4
     assert type(table.plot(at={"mu": 0.1}, log=True).axes[0].collections[0].norm).__name__ == "LogNorm"
-    assert table.plot(log=True).axes[0].get_yscale() == "log"
+    lines = table.plot(log=True)
+    assert lines.axes[0].get_yscale() == "log"
+    # Numbers are written as such, not as powers of ten.
+    lines.draw_without_rendering()
+    ticks = [tick.get_text() for tick in lines.axes[0].get_yticklabels(which="both")]
+    assert any(ticks)
+    assert not any("10^" in tick for tick in ticks)
 
 
 def test_it_draws_in_given_axes_and_shows_itself(table):

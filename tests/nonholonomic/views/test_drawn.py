@@ -93,6 +93,18 @@ def test_curves_are_drawn_and_what_is_constant_is_flat():
     assert high - low > 1e-5
 
 
+def test_a_page_leaves_no_widgets_behind():
+    """A notebook would keep each of them, with all its numbers."""
+    import comm
+    from ipywidgets.widgets.widget import _instances
+
+    told, before, opened = comm.create_comm, set(_instances), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(comm, "create_comm", lambda **options: opened.append(options) or told(**options))
+        assert "snapshot0" in page([rolling()], "a ball").html
+    assert (set(_instances), opened, comm.create_comm) == (before, [], told)
+
+
 def test_a_page_without_motion_has_no_script(tmp_path):
     text = page([], "a < b", above="<p>words</p>").html
     assert "a &lt; b" in text
