@@ -65,10 +65,9 @@ def test_fields_of_the_top(arena, law):
     assert slow_in(dynamics.contact_margin, scene.state(launch)) == set()
 
 
-@pytest.mark.parametrize("law", LAWS[:5], ids=lambda part: type(part).__name__)
-def test_fields_of_an_egg(law):
+def test_the_field_of_an_egg():
     body = tippe.SpheroidBody(mass=0.05, equatorial=0.02, polar=0.028, I1=1.184e-5, I3=8e-6, offset=0.003)
-    scene, launch = tippe.Scene(body, tippe.Plane(0.1), law), tippe.Launch(1.3, 100.0)
+    scene, launch = tippe.Scene(body, tippe.Plane(0.1), LAWS[4]), tippe.Launch(1.3, 100.0)
     run = TrajectoryProblem.of(scene, launch)
     assert slow_in(run.field, jnp.zeros(()), run.start()[0]) == set()
 

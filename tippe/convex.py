@@ -47,7 +47,7 @@ class SpheroidBody(AbstractBody):
     >>> launch = tippe.Launch(theta=math.pi / 2 + 0.05, spin=0.0, angular_velocity=(0.0, 0.0, 200.0))
     >>> time = tippe.inversion_time(tippe.Scene(egg, friction=tippe.Viscous(0.3)), launch, t1=5.0, tolerance=1e-6)
     >>> print(f"it stands within 0.05 pi after {time:.1f} s")
-    it stands within 0.05 pi after 2.0 s
+    it stands within 0.05 pi after 2.4 s
 
     ```
     """

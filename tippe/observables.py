@@ -21,7 +21,7 @@ from nonholonomic.views import Stage, Viewable, draw_portrait
 from .quantities import table_of
 from .sampled import STATUS
 from .scene import Scene
-from .state import parts
+from .state import angular_velocity, parts
 from .view import as_stages
 
 
@@ -234,9 +234,8 @@ class AbstractTrajectory(eqx.Module, Viewable):
     @of_each_run
     def angular_velocity(self) -> Float[Array, "times 3"]:
         """Angular velocity of the body [rad/s]."""
-        body, (_, e, L, _) = self.scene.body, parts(self.states)
-        along = (1.0 / body.I3 - 1.0 / body.I1) * dot(L, e)
-        return self._fixed(sum_vectors(scale(1.0 / body.I1, L), scale(along, e)))
+        _, e, L, _ = parts(self.states)
+        return self._fixed(angular_velocity(self.scene.body, e, L))
 
     @of_each_run
     def rotation(self) -> Float[Array, "times 3 3"]:

@@ -4,12 +4,12 @@ In the arena's moving frame (t1, t2, n): velocity (u1, u2) of the centre of mass
 angular momentum (L1, L2, L3) about the centre of mass [kg m^2/s], then the arena's place. The components stand along axis 0.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import Component, Tangent, Vector
+from nonholonomic.geometry import Component, Tangent, Vector, dot, scale, sum_vectors
 
 #: Where the parts stand in a state.
 VELOCITY, AXIS, MOMENTUM, PLACE = slice(0, 2), slice(2, 5), slice(5, 8), slice(8, None)
@@ -41,3 +41,12 @@ def joined(*some: tuple[Component, ...]) -> Float[Array, "components ..."]:
 def inclination(axis: Vector) -> Float[Array, "..."]:
     """The angle theta [rad] from the arena's normal to the axis, in [0, pi]."""
     return jnp.arctan2(jnp.hypot(axis[0], axis[1]), axis[2])
+
+
+def angular_velocity(body: Any, axis: Vector, momentum: Vector) -> Vector:
+    """w = L / I1 + (1 / I3 - 1 / I1) (L.e) e [rad/s].
+
+    **Arguments:** `body`: with its moments of inertia `I1` and `I3` [kg m^2].
+    """
+    along = (1.0 / body.I3 - 1.0 / body.I1) * dot(momentum, axis)
+    return sum_vectors(scale(1.0 / body.I1, momentum), scale(along, axis))

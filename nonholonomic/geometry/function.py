@@ -22,14 +22,22 @@ class Plain(eqx.Module):
 
 
 class Closure(eqx.Module):
-    """A function with the traced numbers that it closes over as leaves; it was traced with single numbers."""
+    """A function with the traced numbers that it closes over as leaves; it was traced with single numbers, which may since
+    have become one for each lane."""
 
     numbers: tuple[Any, ...]
     # JAX's Jaxpr; the same only for the same construction.
     program: Any = eqx.field(static=True)
 
     def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
-        return jnp.vectorize(lambda *one: jax.core.eval_jaxpr(self.program, self.numbers, *one)[0])(*at)
+        single = [k for k, constant in enumerate(self.program.constvars) if constant.aval.shape == ()]
+
+        def one(*given: Float[Array, ""]) -> Float[Array, ""]:
+            there = dict(zip(single, given, strict=False))
+            numbers = [there.get(k, number) for k, number in enumerate(self.numbers)]
+            return jax.core.eval_jaxpr(self.program, numbers, *given[len(single) :])[0]
+
+        return jnp.vectorize(one)(*(self.numbers[k] for k in single), *at)
 
 
 def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module:

@@ -1,11 +1,10 @@
-"""Whole motions on grounds of any shape: an independent program, energy, drift, Clairaut's constant, derivatives, fits.
+"""Whole motions on grounds of any shape: an independent program, energy, drift, Clairaut's constant, derivatives.
 
 The grounds are one family of which every number may be 0, and the friction is one law, so that one program runs them all.
 """
 
 import math
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,10 +18,7 @@ from make_gradient_reference import extrapolated
 from tops import rutstam_top
 
 import tippe
-from nonholonomic.integration import CROSSED, FAILED, Settings, compiled_march
-from nonholonomic.parameters import numbers, with_numbers
-from tippe.inversion import InversionProblem
-from tippe.sensitivities import slopes_of_cells
+from nonholonomic.parameters import with_numbers
 
 REFERENCE = recorded()
 
@@ -100,7 +96,7 @@ def off_the_arena(run):
 
 
 def test_the_foot_stays_on_the_arena():
-    """The constraint drifts by less than the tolerance; in short for the thousand seconds below."""
+    """The constraint drifts by less than the tolerance; for a thousand seconds in `benchmarks/hard/arenas.py`."""
     scene = scene_on(Ground((0.01, 7.0, 7.0, 0.0), (0.01, 7.0, -7.0, 0.0), bowl=1.0), mu=0.02)
     launch = launched((0.1, 0.05), (0.2, 0.1), spin=30.0)
     run = tippe.simulate(scene, launch, 10.0, tolerance=1e-5)
@@ -167,10 +163,7 @@ def test_on_random_ground_energy_never_grows(seed):
     assert run.stats["energy_residual"] < 1e-6 * size
 
 
-#: The angle that counts as inverted.
-ANGLE = 0.8 * math.pi
-
-#: What a time is differentiated by.
+#: What the forces are differentiated by.
 NUMBERS = {
     "scene.surface.height.bowl": 1.0 / 0.5,
     "scene.surface.height.first[0]": 0.002,
@@ -180,35 +173,8 @@ NUMBERS = {
 }
 
 
-def march(roots, columns, t1, tolerance):
-    """Inversion times of cells with numbers of their own, infinite where there is none."""
-    size = len(next(iter(columns.values())))
-    made = with_numbers(roots, columns)
-    problem = InversionProblem.of(made["scene"], made["launch"], ANGLE, size)
-    outcome, _ = compiled_march(problem, jnp.asarray(t1), jnp.asarray(size), Settings(tolerance, lanes=16))
-    assert not np.any(outcome.status == FAILED)
-    return np.where(outcome.status == CROSSED, outcome.crossing_time, np.inf)
-
-
-def scanned(roots, values, t1, step=1e-3, steps=8):
-    """Derivatives of an inversion time by some numbers: central differences over a scan of steps, extrapolated; and errors."""
-    shrunk = step / 1.6 ** np.arange(steps)
-    moves = np.concatenate([shrunk, -shrunk])
-    columns = {
-        name: np.concatenate([value * (1.0 + moves * (one == name)) for one in values])
-        for name, value in values.items()
-    }
-    times = march(roots, columns, t1, 1e-13).reshape(len(values), 2, steps)
-    assert np.all(np.isfinite(times))
-    limits = [
-        extrapolated((up - down) / (2.0 * value * shrunk))
-        for (up, down), value in zip(times, values.values(), strict=True)
-    ]
-    return (np.array(one) for one in zip(*limits, strict=True))
-
-
 def test_derivatives_of_the_forces_by_ground_friction_and_launch():
-    """Of the rates of the state and of the normal force, against scanned differences; in short for the runs below."""
+    """Of the rates of the state and of the normal force, against scanned differences."""
     roots = {
         "scene": scene_on(Ground((0.002, 30.0, 10.0, 0.3), bowl=2.0)),
         "launch": launched((0.05, 0.02), (0.0, 0.1)),
@@ -235,56 +201,3 @@ def test_derivatives_of_the_forces_by_ground_friction_and_launch():
         assert size > 1e-3
         assert_close(found[k], expected, atol=1e-9 * size)
         assert np.max(error) < 1e-9 * size
-
-
-#: An arena with the number of it that is varied, and a place on it.
-CURVED = {
-    "spheroid": (tippe.Spheroid(0.6, 0.45), "scene.surface.polar", (0.4, 0.2)),
-    "torus": (tippe.Torus(0.8, 0.5), "scene.surface.tube", (0.4, 0.2)),
-    "paraboloid": (tippe.Paraboloid(0.5), "scene.surface.p", (0.05, 0.02)),
-    "waves": (tippe.Graph(Ground((0.002, 30.0, 10.0, 0.3), bowl=2.0)), "scene.surface.height.first[0]", (0.05, 0.02)),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["paraboloid", "torus", "waves"])
-def test_the_foot_stays_on_the_arena_for_a_thousand_seconds(name):
-    scene = tippe.Scene(rutstam_top(), CURVED[name][0], tippe.Viscous(0.02))
-    run = tippe.simulate(scene, launched(CURVED[name][2], (0.2, 0.1), spin=20.0), 1000.0, tolerance=1e-6)
-    assert run.status == "reached t1"
-    assert off_the_arena(run) < 1e-6
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CURVED)
-def test_derivatives_and_a_fit_on_every_arena(name):
-    """By a number of the arena, friction, place and velocity, along with the run; and the arena's number from five times."""
-    surface, number, place = CURVED[name]
-    scene = tippe.Scene(rutstam_top(), surface, tippe.Viscous(0.3))
-    roots = {"scene": scene, "launch": launched(place, (0.0, 0.1), theta=0.5, spin=150.0)}
-    true = float(numbers("scene", scene)[number])
-    values = {number: true, "scene.friction.mu": 0.3, "launch.place[1]": place[1], "launch.velocity[1]": 0.1}
-    _, found = slopes_of_cells(
-        roots,
-        {one: np.array([value]) for one, value in values.items()},
-        list(values),
-        ANGLE,
-        8.0,
-        1e-11,
-        count=1,
-        size=1,
-        solver=diffrax.Dopri8(),
-        last=False,
-    )
-    expected, error = scanned(roots, values, 8.0)
-    assert_close([one[0] for one in found.values()], expected, rtol=1e-5)
-    assert np.all(error < 1e-6 * np.abs(expected))
-
-    spins = np.array([110.0, 125.0, 140.0, 155.0, 170.0])
-    given = {"theta": 0.3, "place": place, "velocity": (0.0, 0.1)}
-    times = [float(tippe.inversion_time(scene, tippe.Launch(spin=spin, **given), 12.0, ANGLE, 1e-11)) for spin in spins]
-    data = tippe.InversionTimes(tippe.Launch(spin=spins, **given), times, 0.02, t1=12.0, angle=ANGLE)
-    off = with_numbers({"scene": scene}, {number: 1.05 * true})["scene"]
-    result = tippe.identify(off, data, {number: 1.05 * true}, progress=False)
-    assert result.status == "converged"
-    assert_close(result.estimates[number], true, rtol=1e-3)

@@ -72,8 +72,7 @@ def test_a_spheroid_by_its_support_function(polar):
     same_motion(tippe.Scene(body, friction=LAWS["coulomb"]), tippe.Scene(by_support(body), friction=LAWS["coulomb"]))
 
 
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("tilt", [0.0, 0.3])
+@pytest.mark.parametrize(("law", "tilt"), [("frictionless", 0.0), ("coulomb", 0.3), ("both", 0.0)])
 def test_rates_of_energy_and_jellett_at_random_states(law, tilt):
     """dE/dt = N (f.v_s + tau.w) <= 0; dJ/dt = -A' c' (L.e - c L.n) - N tau.r; frictionless L.e, and L_z on the level."""
     scene = tippe.Scene(egg(offset=0.003), tippe.Plane(tilt), LAWS[law])
@@ -95,7 +94,7 @@ def test_rates_of_energy_and_jellett_at_random_states(law, tilt):
     if law == "frictionless":
         axial = jnp.sum(rates[2:5] * L + e * rates[5:8], axis=0)
         assert_close(axial / 1e-2, 0.0, atol=1e-12)
-        assert tilt != 0.0 or np.all(np.asarray(rates[7]) == 0.0)
+        assert np.all(np.asarray(rates[7]) == 0.0)
 
 
 REFERENCE = Egg(0.05, 0.02, 0.028, 0.003, 1.184e-5, 8e-6, 0.3, 0.05)

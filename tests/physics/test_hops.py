@@ -18,8 +18,9 @@ from tops import rutstam_top
 import tippe
 from tippe.phases import first_contact, standing_spin
 from tippe.phases.flight import Descent, angle_reached, cone, flown, landing
-from tippe.phases.free_body import FreeBody, angular_velocity, balls, energy, gap_rate, jellett, standing_on
+from tippe.phases.free_body import FreeBody, balls, energy, gap_rate, jellett, standing_on
 from tippe.phases.impact import strike
+from tippe.state import angular_velocity
 
 REFERENCE = list(csv.DictReader(Path(__file__).with_name("hop_reference.csv").read_text().splitlines()))
 

@@ -14,10 +14,11 @@ from test_hops import scene_of
 
 import tippe
 from tippe.phases import first_contact
-from tippe.phases.free_body import FreeBody, angular_velocity, balls, freed, gap_rate, jellett
+from tippe.phases.free_body import FreeBody, balls, freed, gap_rate, jellett
 from tippe.phases.free_body import energy as energy_of
 from tippe.phases.leaning import BOTH, at_rest
 from tippe.phases.sliding import leaning
+from tippe.state import angular_velocity
 
 REFERENCE = list(csv.DictReader(Path(__file__).with_name("hop_reference.csv").read_text().splitlines()))
 

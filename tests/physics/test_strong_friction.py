@@ -13,8 +13,9 @@ from scipy.integrate import solve_ivp
 
 import tippe
 from tippe.dynamics import JAMMED
-from tippe.phases.free_body import FreeBody, angular_velocity, balls, energy, gap_rate, jellett
+from tippe.phases.free_body import FreeBody, balls, energy, gap_rate, jellett
 from tippe.phases.impact import strike
+from tippe.state import angular_velocity
 
 # Impacts
 

@@ -43,6 +43,8 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys):
         (["--theta", "4"], "theta = .*4.* must be at most 3.14159"),
         (["--mu", "nan"], "mu = nan must be finite"),
         (["--out", "/proc/nowhere"], "/proc/nowhere"),
+        (["--surface", "plane", "steep"], "--surface plane steep must be one of: sphere RADIUS, "),
+        (["--surface", "torus", "0.3", "0.01"], r"tube = 0.01 must be greater than 0.02 \(the body must fit inside\)"),
     ],
 )
 def test_bad_input_is_one_clear_line(arguments, message, capsys, tmp_path):

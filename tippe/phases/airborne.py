@@ -27,12 +27,13 @@ from nonholonomic.geometry import (
     sum_vectors,
     tangents,
 )
-from nonholonomic.integration import FAILED, GUARD_LOST, RUNNING, AbstractPhase, AbstractProblem, Passage
+from nonholonomic.integration import FAILED, GUARD_LOST, RUNNING, AbstractProblem, Passage
 
 from ..dynamics import COS_THETA, Dynamics, stacked
 from ..inversion import InversionProblem
 from ..scene import Scene
 from ..state import joined, parts
+from .flying_phase import AbstractFlyingPhase
 from .free_body import FreeBody, axis_rate, balls, energy, gap_rate
 from .impact import strike
 
@@ -182,18 +183,11 @@ class Flight(AbstractProblem):
         return (below(self.scene, flying).gap + 4.0 * jnp.finfo(far.dtype).eps * far) / radius + ROUNDING
 
 
-class Slide(AbstractPhase):
+class Slide(AbstractFlyingPhase):
     """Sliding on the arena."""
 
-    scene: Scene
-    scales: Float[Array, "components cells"]
-    cos_angle: Float[Array, "..."]
-    rides: bool = eqx.field(static=True)
-
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        return Contact(
-            self.scene.dynamics, self.cos_angle, state, self.scales, self.scene.body.I3 if self.rides else None
-        )
+        return Contact(self.scene.dynamics, self.cos_angle, state, self.scales, self.axial)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         return jnp.concatenate([state, jnp.zeros_like(state[:2])])
@@ -220,13 +214,8 @@ class Slide(AbstractPhase):
         )
 
 
-class Fly(AbstractPhase):
+class Fly(AbstractFlyingPhase):
     """Flying over the arena."""
-
-    scene: Scene
-    scales: Float[Array, "components cells"]
-    cos_angle: Float[Array, "..."]
-    rides: bool = eqx.field(static=True)
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         velocity, momentum = self.scales[0], self.scales[7]
@@ -273,7 +262,7 @@ class Fly(AbstractPhase):
 
 def phases(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
-) -> tuple[tuple[AbstractPhase, ...], Int[Array, " cells"]]:
+) -> tuple[tuple[AbstractFlyingPhase, ...], Int[Array, " cells"]]:
     """The phases of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`."""
     given = (scene, problem.scales, problem.cos_angle, rides)
     return (Slide(*given), Fly(*given)), jnp.zeros(problem.states.shape[1:], int)

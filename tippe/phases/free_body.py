@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
+from nonholonomic.geometry import Vector, cross, dot, scale
 
 from ..body import Round
 from ..dynamics import Dynamics
@@ -82,12 +82,6 @@ def shown(body: Top, free: FreeBody, riding: Float[Array, "7 ..."]) -> Float[Arr
 def axis_rate(body: Top, axis: Vector, momentum: Vector) -> Vector:
     """Rate of the axis e' = L x e / I1 [1/s]."""
     return scale(1.0 / body.I1, cross(momentum, axis))
-
-
-def angular_velocity(body: Top, axis: Vector, momentum: Vector) -> Vector:
-    """w = L / I1 + (1 / I3 - 1 / I1) (L.e) e [rad/s]."""
-    along = (1.0 / body.I3 - 1.0 / body.I1) * dot(momentum, axis)
-    return sum_vectors(scale(1.0 / body.I1, momentum), scale(along, axis))
 
 
 def gap(ball: Ball, free: FreeBody) -> Float[Array, "..."]:

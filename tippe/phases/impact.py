@@ -24,8 +24,9 @@ from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
 from nonholonomic.integration import GUARD_LOST, AbstractProblem, Settings, traced_march
 
 from ..friction import AbstractFriction, Slip
+from ..state import angular_velocity
 from ..top import Top
-from .free_body import Ball, FreeBody, angular_velocity
+from .free_body import Ball, FreeBody
 
 Cells = Float[Array, " cells"]
 

@@ -26,7 +26,7 @@ from nonholonomic.geometry import (
 
 from ..dynamics import Motion, stacked
 from ..friction import ContactLoad, Slip, length
-from ..state import joined, parts
+from ..state import angular_velocity, joined, parts
 from ..top import Top
 
 
@@ -86,7 +86,7 @@ class RollingDynamics(eqx.Module):
     def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """The state with the velocity that axis and angular momentum give the rolling top."""
         _, e, L, place = parts(state)
-        u = cross(self._contact(e), self._angular_velocity(e, L))
+        u = cross(self._contact(e), angular_velocity(self, e, L))
         return joined(u[:2], e, L, place)
 
     def _evaluate(self, state: Float[Array, "components ..."]) -> tuple[Motion, Vector]:
@@ -98,7 +98,7 @@ class RollingDynamics(eqx.Module):
         _, e, L, place = parts(state)
         R, a, m = self.radius, self.offset, self.mass
 
-        w = self._angular_velocity(e, L)
+        w = angular_velocity(self, e, L)
         e_dot = cross(w, e)
         V: Tangent = (R * w[1], -R * w[0])
         o, up, place_rate, room = self.frame.carriage(place, V)
@@ -139,7 +139,7 @@ class RollingDynamics(eqx.Module):
         """
         (u1, u2), e, L, place = parts(state)
         r = self._contact(e)
-        e_dot = cross(self._angular_velocity(e, L), e)
+        e_dot = cross(angular_velocity(self, e, L), e)
         u = (u1, u2, multiply(-self.offset, e_dot[2]))
         v = (slip.x, slip.y, None)
         lever = cross(r, sum_vectors(v, scale(-1.0, u)))
@@ -169,12 +169,7 @@ class RollingDynamics(eqx.Module):
     def angular_velocity(self, state: Float[Array, "components ..."]) -> Vector:
         """Angular velocity of the body [rad/s] in the moving frame."""
         _, e, L, _ = parts(state)
-        return self._angular_velocity(e, L)
-
-    def _angular_velocity(self, e: Vector, L: Vector) -> Vector:
-        """w = L / I1 + (1 / I3 - 1 / I1) (L.e) e [rad/s]."""
-        excess = (1.0 / self.I3 - 1.0 / self.I1) * dot(L, e)
-        return sum_vectors(scale(1.0 / self.I1, L), scale(excess, e))
+        return angular_velocity(self, e, L)
 
     def _over_inertia(self, e: Vector, r: Vector, torque: tuple[Component, ...]) -> Vector:
         """Solution x of (J + m (r^2 - r r^T)) x = torque, J = I1 + (I3 - I1) e e^T.

@@ -20,7 +20,6 @@ from nonholonomic.integration import (
     REACHED_END,
     RUNNING,
     UNRESOLVED,
-    AbstractPhase,
     AbstractProblem,
     Passage,
     Record,
@@ -31,6 +30,7 @@ from ..inversion import InversionProblem
 from ..scene import Scene
 from ..top import Top
 from .flight import angle_reached, carried_aloft, cone, flown, fly
+from .flying_phase import AbstractFlyingPhase
 from .free_body import Ball, FreeBody, balls, energy, freed, gap, gap_rate, grounded, shown, standing_on
 from .impact import strike
 from .leaning import LeaningDynamics, at_rest
@@ -106,24 +106,20 @@ def clearance(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> 
     return height / own.radius + 1e-12
 
 
-class Slide(AbstractPhase):
+class Slide(AbstractFlyingPhase):
     """Sliding on the sphere numbered `number`, in the order of `free_body.balls`, up to an angle of theta.
 
-    The number is an array, so that one program serves both spheres; `last` says whether the run goes on through the angle,
-    `rides` whether it is a single one that carries more than its state and records its flights.
+    The number is an array, so that one program serves both spheres; `last` says whether the run goes on through the angle. A
+    single run whose path is kept records its flights.
     """
 
-    scene: Scene
-    scales: Float[Array, "components cells"]
-    cos_angle: Float[Array, "..."]
     number: Int[Array, ""]
     last: bool = eqx.field(static=True)
-    rides: bool = eqx.field(static=True)
 
     def problem(self, state: Float[Array, "components cells"]) -> Sliding:
         own, other = _own_and_other(balls(self.scene.body), self.number)
-        dynamics, axial = standing_on(self.scene.dynamics, own), self.scene.body.I3 if self.rides else None
-        return Sliding(dynamics, own, other, self.cos_angle, state, self.scales, axial)
+        dynamics = standing_on(self.scene.dynamics, own)
+        return Sliding(dynamics, own, other, self.cos_angle, state, self.scales, self.axial)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         own, _ = _own_and_other(balls(self.scene.body), self.number)
@@ -165,17 +161,11 @@ class Slide(AbstractPhase):
         return Passage(*found, record, air.log_rates)
 
 
-class Lean(AbstractPhase):
+class Lean(AbstractFlyingPhase):
     """Sliding on both spheres; the phase after those of the spheres."""
 
-    scene: Scene
-    scales: Float[Array, "components cells"]
-    cos_angle: Float[Array, "..."]
-    rides: bool = eqx.field(static=True)
-
     def problem(self, state: Float[Array, "components cells"]) -> Sliding:
-        axial = self.scene.body.I3 if self.rides else None
-        return Sliding(leaning(self.scene), None, None, self.cos_angle, state, self.scales, axial)
+        return Sliding(leaning(self.scene), None, None, self.cos_angle, state, self.scales, self.axial)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         return shown(self.scene.body, freed(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])
@@ -192,20 +182,20 @@ class Lean(AbstractPhase):
 
 def phases(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
-) -> tuple[tuple[AbstractPhase, ...], Int[Array, " cells"]]:
+) -> tuple[tuple[AbstractFlyingPhase, ...], Int[Array, " cells"]]:
     """The phases of runs, sliding on each sphere and on both if there are two; and the number of that in which each starts.
 
     **Arguments:**
 
     - `scene`: with `contact="hybrid"`; `problem`: of its launches, which stand on their lower sphere.
-    - `tolerance`: no phase needs it; `last`: whether the last crossing counts; `rides`: as for `Slide`.
+    - `tolerance`: no phase needs it; `last`: whether the last crossing counts; `rides`: as for `AbstractFlyingPhase`.
     """
-    spheres, given = balls(scene.body), (scene, problem.scales, problem.cos_angle)
-    found = tuple(Slide(*given, jnp.asarray(number), last, rides) for number in range(len(spheres)))
+    spheres, given = balls(scene.body), (scene, problem.scales, problem.cos_angle, rides)
+    found = tuple(Slide(*given, jnp.asarray(number), last) for number in range(len(spheres)))
     if len(spheres) == 1:
         return found, jnp.zeros(problem.states.shape[1:], int)
     main, stem = spheres
-    return (*found, Lean(*given, rides)), (clearance(main, stem, problem.states) < 0.0).astype(int)
+    return (*found, Lean(*given)), (clearance(main, stem, problem.states) < 0.0).astype(int)
 
 
 def leaning(scene: Scene) -> LeaningDynamics:
