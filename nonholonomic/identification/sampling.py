@@ -92,15 +92,16 @@ def sample(
     kept, divergences, leaps = [], 0, 0
     with Progress(warmup + draws, "step", shown=progress) as shown:
         states = _begun(steered, points)
-        adaptation = begin(1.0 / len(steered.centre) ** 0.25)
+        # As arrays: a Python number in it would be compiled in.
+        adaptation = jax.tree.map(np.asarray, begin(1.0 / len(steered.centre) ** 0.25))
         length = jnp.exp(adaptation.log_step_size)
         for step in range(warmup + draws):
-            states, adapted, info = _advanced(steered, key, jnp.asarray(step), states, length, adaptation)
+            states, info = _advanced(steered, _keys(key, jnp.asarray(step), chains), states, jnp.asarray(length, float))
             leaps += int(np.max(info.num_integration_steps))
             if step == 0:
                 shown.begin()
             if step < warmup:
-                adaptation, length = adapted
+                adaptation, length = _adapted(adaptation, info.acceptance_rate)
                 length = settled(adaptation) if step == warmup - 1 else length
             else:
                 divergences += int(np.sum(info.is_divergent))
@@ -208,18 +209,24 @@ def _begun(steered: Steered, points: Float[Array, "chains unknowns"]) -> Any:
 
 
 @eqx.filter_jit
-def _advanced(
-    steered: Steered, key: Array, step: Any, states: Any, length: Float[Array, ""], adaptation: Any
-) -> tuple[Any, tuple[Any, Float[Array, ""]], Any]:
-    """The next states of all chains; what their acceptance makes of the leaps' length; and how they were found."""
+def _advanced(steered: Steered, keys: Array, states: Any, length: Float[Array, ""]) -> Any:
+    """The next states of all chains, and how they were found."""
     import blackjax
-    from blackjax.adaptation.step_size import dual_averaging_adaptation
 
     kernel, inverse_mass = blackjax.nuts.build_kernel(), jnp.ones(len(steered.centre))
-    keys = jax.random.split(jax.random.fold_in(key, step), len(states.position))
-    states, info = jax.vmap(lambda key, state: kernel(key, state, steered, length, inverse_mass))(keys, states)
-    adaptation = dual_averaging_adaptation(ACCEPTED)[1](adaptation, jnp.mean(info.acceptance_rate))
-    return states, (adaptation, jnp.exp(adaptation.log_step_size)), info
+    return jax.vmap(lambda key, state: kernel(key, state, steered, length, inverse_mass))(keys, states)
+
+
+@eqx.filter_jit
+def _adapted(adaptation: Any, accepted: Float[Array, " chains"]) -> tuple[Any, Float[Array, ""]]:
+    """What the acceptance of all chains makes of the leaps' length."""
+    from blackjax.adaptation.step_size import dual_averaging_adaptation
+
+    adaptation = dual_averaging_adaptation(ACCEPTED)[1](adaptation, jnp.mean(accepted))
+    return adaptation, jnp.exp(adaptation.log_step_size)
+
+
+_keys = eqx.filter_jit(lambda key, step, count: jax.random.split(jax.random.fold_in(key, step), count))
 
 
 def _whole(density: LogDensity, centre: Any, covariance: Any) -> tuple[Array, Array]:

@@ -26,7 +26,9 @@ LAUNCHES = list(zip(np.asarray(LAUNCH.theta).tolist(), np.asarray(LAUNCH.spin).t
 def independent_time(offset, theta, spin, t1, angle=0.95 * math.pi):
     """The inversion time [s] of Rutstam's top with some offset, by Lagrange's equations in SciPy."""
     top = rutstam_top()
-    scene = lagrange_top.Scene(top.mass, top.radius, offset, float(top.I1), float(top.I3), theta, spin, mu=0.3)
+    scene = lagrange_top.Scene(
+        float(top.mass), float(top.radius), offset, float(top.I1), float(top.I3), theta, spin, mu=0.3
+    )
     status, time, *_ = lagrange_top.follow(scene, t1, angle, rtol=1e-9)
     return time if status == "inverted" else math.inf
 
