@@ -55,11 +55,12 @@ def test_midpoint_rule_balances_energy_to_round_off(side, fork):
 
 def test_midpoint_rule_is_of_second_order(reference):
     """Halving the step divides the error by four."""
-    times = jnp.linspace(0.0, 10.0, 11)
     errors = []
-    for step in (0.02, 0.01):
-        run = stroller.simulate(FULL, LAUNCH, 10.0, push, times=times, solver=ImplicitMidpoint(step))
-        errors.append(float(jnp.linalg.norm(run.position[3] - reference.position[3])))
+    # As many steps in both, so that one program serves.
+    for step, end in ((0.02, 10.0), (0.01, 5.0)):
+        run = stroller.simulate(FULL, LAUNCH, end, push, times=jnp.linspace(0.0, end, 11), solver=ImplicitMidpoint(step))
+        at = int(jnp.searchsorted(run.t, 3.0 - 1e-9))
+        errors.append(float(jnp.linalg.norm(run.position[at] - reference.position[3])))
     np.testing.assert_allclose(errors[0] / errors[1], 4.0, rtol=0.03)
 
 
