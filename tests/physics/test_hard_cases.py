@@ -13,6 +13,7 @@ SLOW = (
     *("chaos_in_a_cylinder", "the_law_itself", "over_to_the_stem", "stick_and_slip_again", "leaning_on_the_stem"),
     *("explicit_at_a_tenth", "orderly_without_friction", "energy_through_hops", "bounces", "coulomb_hops"),
     *("leaning_for_ever", "over_the_crest", "no_room", "a_thousand_seconds_in_a_bowl"),
+    *("jellett_through_hops", "hops", "explicit_at_a_hundredth", "rate_of_the_rise", "just_above_the_threshold"),
 )
 
 ROWS = [

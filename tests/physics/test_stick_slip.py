@@ -37,6 +37,7 @@ def reference(body: tippe.Top, mu: float, theta: float, spin: float, t1: float) 
     return coulomb_top.follow(plain, coulomb_top.start(plain, theta, spin), t1)
 
 
+@pytest.mark.slow
 def test_cohens_top_stops_slipping_and_rolls():
     """The slip ends at t = 0.02879 s, theta = 0.0529, where rolling takes |F_t| = 0.0865 N; it never takes more than 0.0910 N
     and the energy stays at 2.153106e-2 J (row 10)."""

@@ -154,6 +154,7 @@ def test_path_at_locked_steering_does_not_depend_on_the_forces():
     np.testing.assert_allclose(along.direction, slow.direction[::40], atol=7e-11)
 
 
+@pytest.mark.slow
 def test_motion_without_friction_has_an_invariant_measure():
     """Row 11: h_eta h_mu sqrt(M(phi)) in (eta, mu, psi, phi, v, s), thus times cos(phi) in the front wheel's speed."""
     chart = Chart(Scene(BODY, Spheroid(2.0, 1.1)))

@@ -129,6 +129,7 @@ def test_rutstam_and_the_jellett_reduction_give_the_accelerations_of_the_vector_
     assert jnp.max(jellett) < 1e-10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arena", [pytest.param("plane", marks=pytest.mark.slow), "cylinder"])
 def test_the_general_formulations_give_the_accelerations_of_the_frictionless_top(arena):
     """Multipliers, Hamel, connection and bracket, from nothing but metric and potential, 1000 random states."""

@@ -52,6 +52,7 @@ def test_a_sprung_steering_in_the_middle():
     np.testing.assert_allclose(jax.grad(angle)(0.0), extrapolated(angle, 0.0, 1e-3), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_diffrax_differentiates_with_a_probe():
     adjoint = diffrax.RecursiveCheckpointAdjoint()
     gradient = jax.grad(lambda torque: sideways(torque, adjoint=adjoint))(0.0)
@@ -78,6 +79,7 @@ class Steps(eqx.Module):
         return 1.0, jnp.sum(weights * self.torques, axis=-1)
 
 
+@pytest.mark.slow
 def test_an_array_in_the_input_has_a_slope_for_each_entry():
     def end(torques):
         ride = stroller.simulate(DAMPED, Launch((0.0, 0.0), 0.3, 2.0), 10.0, input=Steps(torques), times=[5.0, 10.0])

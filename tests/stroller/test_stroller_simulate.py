@@ -58,7 +58,9 @@ def test_midpoint_rule_is_of_second_order(reference):
     errors = []
     # As many steps in both, so that one program serves.
     for step, end in ((0.02, 10.0), (0.01, 5.0)):
-        run = stroller.simulate(FULL, LAUNCH, end, push, times=jnp.linspace(0.0, end, 11), solver=ImplicitMidpoint(step))
+        run = stroller.simulate(
+            FULL, LAUNCH, end, push, times=jnp.linspace(0.0, end, 11), solver=ImplicitMidpoint(step)
+        )
         at = int(jnp.searchsorted(run.t, 3.0 - 1e-9))
         errors.append(float(jnp.linalg.norm(run.position[at] - reference.position[3])))
     np.testing.assert_allclose(errors[0] / errors[1], 4.0, rtol=0.03)
@@ -207,6 +209,7 @@ def test_every_number_of_the_scene_has_its_gradient_tested(sensitivities):
     assert len(jax.tree.leaves(scene)) == len(NUMBERS)
 
 
+@pytest.mark.slow
 def test_gradients_of_tilt_and_rolling_resistance_and_centre():
     """The numbers of the other scenes, forward mode."""
     body = Stroller(1.7, 0.7, 0.9, 0.05, centre=0.3)

@@ -91,6 +91,7 @@ def test_the_error_covers_the_spread_of_chaotic_runs():
     assert np.mean(found.exponent > 2.0 * found.error) > 0.8
 
 
+@pytest.mark.slow
 def test_contact_loss_is_told():
     """On the wall at the top of the cylinder the contact is lost: no exponent, and when it was."""
     found = tippe.lyapunov_exponent(cylinder_scene(), tippe.Launch([2.0, 0.3], 0.0, [2.5, 0.3], 0.5), 100.0)

@@ -245,7 +245,9 @@ FEW = settings(COMMON, max_examples=3, derandomize=True)
 MANY = settings(COMMON, max_examples=180, print_blob=True)
 
 
-@pytest.mark.parametrize("arena", [pytest.param("plane", marks=pytest.mark.slow), "cylinder", "sphere"])
+@pytest.mark.parametrize(
+    "arena", [*(pytest.param(one, marks=pytest.mark.slow) for one in ("plane", "cylinder")), "sphere"]
+)
 def test_properties(arena):
     """Finite or flagged, energy, Jellett's constant, mirrors, units, time reversal, turning."""
 

@@ -48,6 +48,7 @@ def test_an_upright_start_by_diffrax(adjoint):
     assert_close(transform(lambda theta: axis_x(theta, adjoint=adjoint))(0.0), jax.grad(axis_x)(0.0), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_upright_start_by_another_solver():
     assert_close(jax.grad(lambda theta: axis_x(theta, solver=diffrax.Tsit5()))(0.0), jax.grad(axis_x)(0.0), rtol=1e-6)
 
