@@ -78,7 +78,7 @@ def identify(
     **Returns:** an `Identification`, with its `verdict`; of which it warns (`FitWarning`) if it is not good.
 
     **Raises:** `ValueError` for arguments out of range, an unknown name, and, with exact slopes, a scene with
-    `contact="hybrid"` or `SetValuedCoulomb`, through whose phases the derivative does not go.
+    `contact="hybrid"` or `SetValuedCoulomb`, through whose phases a fit takes no derivative.
 
     **Example:**
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import Component, Vector, dot, scale, sum_vectors
-from nonholonomic.integration import Followed, PhasedPath
+from nonholonomic.integration import Followed, PhasedPath, padded
 from nonholonomic.parameters import text_as_html
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import is_traced, require
@@ -81,15 +81,8 @@ class AbstractTrajectory(eqx.Module, Viewable):
 
     def padded(self) -> Self:
         """The run with the last of its times repeated, up to a power of two; without what observables do not need."""
-        count = len(self.t)
-        more = (1 << (count - 1).bit_length()) - count
-
-        def longer(values: Any) -> Float[np.ndarray, "..."]:
-            values = np.asarray(values)
-            return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)], mode="edge")
-
-        unused = dict.fromkeys(self.unused, None)
-        return dataclasses.replace(self, **{name: longer(getattr(self, name)) for name in self.by_time}, **unused)
+        longer = {name: padded(np.asarray(getattr(self, name)), len(self.t)) for name in self.by_time}
+        return dataclasses.replace(self, **longer, **dict.fromkeys(self.unused, None))
 
     @property
     @abc.abstractmethod

@@ -75,9 +75,8 @@ def phased_samples(
     """
     numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(numbers)
-    bare = eqx.tree_at(lambda one: one.tolerance, settings, None, is_leaf=lambda leaf: leaf is None)
     # Arrays, such as those of the solver, may be traced, so they go among the leaves.
-    arrays, others = eqx.partition((rest, bare), eqx.is_array)
+    arrays, others = eqx.partition((rest, settings.with_tolerance(None)), eqx.is_array)
     held, places = jax.tree.flatten(arrays)
     question = PhasedSampling(len(leaves), build, structure, others, places, kinds)
     return ask(question, *leaves, _fixed(times), as_number(t1), settings.tolerance, *held)
@@ -141,8 +140,7 @@ class PhasedSampling(AbstractQuestion):
         last = self.movable + 3
         *given, tolerance = leaves[self.movable : last]
         rest, bare = eqx.combine(self.others, jax.tree.unflatten(self.places, leaves[last:]))
-        settings = eqx.tree_at(lambda one: one.tolerance, bare, tolerance, is_leaf=lambda leaf: leaf is None)
-        return leaves[: self.movable], tuple(given), rest, settings
+        return leaves[: self.movable], tuple(given), rest, bare.with_tolerance(tolerance)
 
     def _built(self, numbers: tuple[Array, ...], rest: Any, settings: Settings) -> Any:
         """The phases, the number of the first, and the state there."""

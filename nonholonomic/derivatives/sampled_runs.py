@@ -69,7 +69,7 @@ def sampled_run(
     leaves, structure = jax.tree.flatten(numbers)
     in_block = isinstance(settings.solver, diffrax.AbstractERK) and all(leaf.ndim == 0 for leaf in leaves)
     # Arrays, such as those of the solver, may be traced, so they go among the leaves.
-    arrays, recipe = eqx.partition(Recipe(build, structure, rest, _with_tolerance(settings, None), grid), eqx.is_array)
+    arrays, recipe = eqx.partition(Recipe(build, structure, rest, settings.with_tolerance(None), grid), eqx.is_array)
     held, places = jax.tree.flatten(arrays)
     question = (BlockSampling if in_block else SingleSampling)(len(leaves), recipe, places)
     found = ask(question, *leaves, jax.lax.stop_gradient(times), as_number(t1), settings.tolerance, *held)
@@ -113,10 +113,6 @@ def sampled_run_by_diffrax(
     path = sample(whole, times, t1, settings, grid=grid, adjoint=adjoint)
     status, *counts = (part.astype(float) for part in (_status(path, t1), path.accepted, path.rejected))
     return SampledRun(path.states[:size].T, path.end_time, path.end_state[:size], status, *counts)
-
-
-def _with_tolerance(settings: Settings, tolerance: Float[Array, ""] | None) -> Settings:
-    return eqx.tree_at(lambda one: one.tolerance, settings, tolerance, is_leaf=lambda leaf: leaf is None)
 
 
 def _status(path: Sampled, t1: Float[Array, ""]) -> Int[Array, ""]:
@@ -194,7 +190,7 @@ def _march(
         t1,
         jnp.asarray(varied.problem.start()[0].shape[1]),
         # One tolerance serves a block: the smallest of a batch.
-        dataclasses.replace(_with_tolerance(settings, jnp.min(tolerance)), looped=bool(varied.directions)),
+        dataclasses.replace(settings.with_tolerance(jnp.min(tolerance)), looped=bool(varied.directions)),
         parts=1 + len(varied.directions),
         one_kernel=one_kernel,
     )
@@ -261,6 +257,6 @@ def _follow(
 ) -> tuple[SampledRun, list[SampledRun]]:
     """What is found of a run, and its slope along each of the directions."""
     times, t1, tolerance = given
-    path = sample(varied, times, t1, _with_tolerance(recipe.settings, tolerance), grid=recipe.grid)
+    path = sample(varied, times, t1, recipe.settings.with_tolerance(tolerance), grid=recipe.grid)
     ends = (path.end_time, path.end_state, _status(path, t1))
     return _found(varied, path.states.T, ends, (path.accepted, path.rejected))

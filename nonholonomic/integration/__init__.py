@@ -42,6 +42,7 @@ from .settings import lanes_for as lanes_for
 from .single_run import Followed as Followed
 from .single_run import Sampled as Sampled
 from .single_run import follow as follow
+from .single_run import padded as padded
 from .single_run import sample as sample
 from .status import CROSSED as CROSSED
 from .status import FAILED as FAILED

@@ -1,5 +1,7 @@
 """How runs are integrated."""
 
+from typing import Self
+
 import diffrax
 import equinox as eqx
 import jax
@@ -30,6 +32,10 @@ class Settings(eqx.Module):
     max_steps: int = eqx.field(static=True, default=2_000_000)
     looped: bool = eqx.field(static=True, default=False)
     lanes: int | None = eqx.field(static=True, default=None)
+
+    def with_tolerance(self, tolerance: Float[Array, ""] | None) -> Self:
+        """The same with another tolerance, or without one, which is then kept elsewhere."""
+        return eqx.tree_at(lambda one: one.tolerance, self, tolerance, is_leaf=lambda leaf: leaf is None)
 
     def lanes_of(self, cells: int, parts: int = 1) -> int:
         """How many of the cells of a problem advance together, given the number of parts in its state."""

@@ -43,9 +43,10 @@ class Followed(NamedTuple):
         return states
 
 
-def padded(times: Float[np.ndarray, " times"], least: int) -> Float[np.ndarray, " more"]:
-    """Times with the last repeated, up to a power of two of at least `least`: a program serves many numbers of times."""
-    return np.pad(times, (0, (1 << (least - 1).bit_length()) - len(times)), mode="edge")
+def padded(values: Float[np.ndarray, "... times"], least: int) -> Float[np.ndarray, "... more"]:
+    """Values with those of the last time repeated, up to a power of two of at least `least`: a program serves many numbers."""
+    more = (1 << (least - 1).bit_length()) - values.shape[-1]
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)], mode="edge")
 
 
 @eqx.filter_jit
