@@ -59,10 +59,6 @@ class RideProblem(AbstractProblem):
         columns = {"states": spread(one.states), "scales": spread(one.scales)}
         return dataclasses.replace(one, **columns, watched=watched, guarded=guarded)
 
-    @property
-    def long(self) -> bool:
-        return self.dynamics.surface.differentiated
-
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
         return self.states, self.scales
 

@@ -11,12 +11,20 @@ from tops import rutstam_top
 import nonholonomic
 import tippe
 
+#: The tests that a plain `pytest` chooses (`pyproject.toml`).
+ORDINARY = "not slow"
+
 
 def pytest_configure(config: pytest.Config) -> None:
     """What one test compiles serves all others, in every worker and child process, and in the next run of the tests.
 
     `pytest --cache-clear` forgets it; a folder that `JAX_COMPILATION_CACHE_DIR` names is used instead.
+
+    The ordinary run compiles without LLVM's optimisations, as JAX's own tests do: compiling is most of its work, and takes
+    half the time then. The slow tests and those with the newest libraries run what users run; so do all with `XLA_FLAGS=`.
     """
+    if config.option.markexpr == ORDINARY:
+        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ and hasattr(config, "cache"):
         folder = nonholonomic.enable_compilation_cache(config.cache.mkdir("compiled"))
         if folder is not None:

@@ -107,7 +107,7 @@ class ExtendedQuestion(AbstractQuestion):
         """The extended times of every cell, and their derivatives along directions (as of `VariationalProblem`)."""
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         varied = VariationalProblem(problem, directions, True)
-        settings = Settings(tolerance, max_steps=MOST_STEPS, looped=bool(directions))
+        settings = Settings(tolerance, max_steps=MOST_STEPS)
         queue = Queue.of(varied, t1, jnp.asarray(cells), settings, one_kernel=not again, parts=1 + len(directions))
         outcome, _ = queue.outcome()
         state, *variations = varied.parts(outcome.state)

@@ -44,10 +44,6 @@ class InversionProblem(AbstractProblem):
         """The problem of the given number of cells; the numbers of scene and launch are scalars or one per cell."""
         return _problem(scene, launch, jnp.asarray(angle), cells)
 
-    @property
-    def long(self) -> bool:
-        return self.dynamics.frame.long
-
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
 

@@ -142,7 +142,7 @@ class InversionQuestion(AbstractQuestion):
             directions,
             t1,
             jnp.asarray(cells),
-            Settings(tolerance, self.solver, looped=True),
+            Settings(tolerance, self.solver),
             passes=self.last,
             one_kernel=not again,
         )
@@ -173,7 +173,7 @@ class PhasedInversionQuestion(InversionQuestion):
             # The slopes need the run up to the event alone, whose time is known then.
             whole = self.journey(phases, first, problem, t1, tolerance)
             t1 = jnp.where(jnp.isfinite(whole.crossing_time), whole.crossing_time, 0.0)
-        settings = Settings(tolerance, self.solver, looped=True)
+        settings = Settings(tolerance, self.solver)
 
         def run(some: tuple[Any, ...]) -> tuple[tuple[Journey, Array], list[Float[Array, " cells"]]]:
             moved = tuple((one[0], one[2].states) for one in some)

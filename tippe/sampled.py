@@ -40,10 +40,6 @@ class TrajectoryProblem(AbstractProblem):
         """The run of one launch, or the runs of some cells, whose numbers are scalars or one per cell."""
         return _problem(scene, launch, cells)
 
-    @property
-    def long(self) -> bool:
-        return self.dynamics.frame.long
-
     def start(self) -> tuple[Float[Array, "components ..."], Float[Array, "components ..."]]:
         rest = jnp.zeros((2, *self.state.shape[1:])) if self.rest is None else self.rest
         return jnp.concatenate([self.state, self.cyclic, rest]), self.scales

@@ -133,7 +133,7 @@ def phased_slopes_of_cells(
     (phases, first, states), directions, sizes = built
     directions = tuple((one[0], one[2]) for one in directions)
     # In a loop the stages compile in a third of the time, and there is a program for every phase.
-    settings = Settings(tolerance, solver, looped=True)
+    settings = Settings(tolerance, solver)
     given = (directions, np.asarray(first), np.asarray(states), t1, count, settings)
     journey, found = travel_with_slopes(phases, *given, kinds=1, ends_on_event=not last)
     slopes = [slope / np.asarray(size) for slope, size in zip(found.slopes, sizes, strict=True)]

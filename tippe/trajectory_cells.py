@@ -42,10 +42,6 @@ class SampledLaunches(AbstractProblem):
         """How many components the state has."""
         return len(self.run.state) + (len(self.run.cyclic) if self.with_cyclic else 0)
 
-    @property
-    def long(self) -> bool:
-        return self.run.long
-
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         states, scales = self.run.start()
         return states[: self.size], scales[: self.size]

@@ -32,10 +32,6 @@ class VariedProblem(AbstractProblem):
     states: Float[Array, "twice_components_and_one cells"]
     magnitudes: Float[Array, "components cells"]
 
-    @property
-    def long(self) -> bool:
-        return self.problem.long
-
     def start(self) -> tuple[Float[Array, "all cells"], Float[Array, "all cells"]]:
         ones = jnp.ones((self.states.shape[0] - len(self.magnitudes), *self.states.shape[1:]))
         return self.states, jnp.concatenate([self.magnitudes, ones])

@@ -1,6 +1,5 @@
 """Runs sampled at given times, as functions for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -190,7 +189,7 @@ def _march(
         t1,
         jnp.asarray(varied.problem.start()[0].shape[1]),
         # One tolerance serves a block: the smallest of a batch.
-        dataclasses.replace(settings.with_tolerance(jnp.min(tolerance)), looped=bool(varied.directions)),
+        settings.with_tolerance(jnp.min(tolerance)),
         parts=1 + len(varied.directions),
         one_kernel=one_kernel,
     )

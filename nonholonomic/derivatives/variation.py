@@ -37,10 +37,6 @@ class VariationalProblem(AbstractProblem):
     directions: tuple[Any, ...]
     ends_on_event: bool = eqx.field(static=True)
 
-    @property
-    def long(self) -> bool:
-        return self.problem.long
-
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         states, scales = self.problem.start()
 

@@ -43,10 +43,6 @@ class Clocked(AbstractProblem):
     problem: AbstractProblem
     began: Float[Array, " cells"]
 
-    @property
-    def long(self) -> bool:
-        return self.problem.long
-
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         states, scales = self.problem.start()
         return with_row(states, self.began), with_row(scales, jnp.full_like(self.began, UNMEASURED))

@@ -83,10 +83,6 @@ class CarriedFrame(AbstractFrame):
     pull: Float[Array, "..."]
     side: float = eqx.field(static=True, default=1.0)
 
-    @property
-    def long(self) -> bool:
-        return self.surface.differentiated
-
     def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
         eta = as_number(eta)
         zero = jnp.zeros_like(eta)

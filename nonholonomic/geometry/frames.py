@@ -52,11 +52,6 @@ class AbstractFrame(eqx.Module):
     The place is what the frame must integrate to know where it is; `cyclic` is what else it takes to draw it.
     """
 
-    @property
-    def long(self) -> bool:
-        """Whether it takes many operations to say what the frame does."""
-        return False
-
     @abc.abstractmethod
     def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
         """Place and cyclic coordinates at the angle `eta` [rad] from the lowest point, in the x-z plane."""

@@ -53,8 +53,6 @@ def _vector(components: Iterable[Component]) -> Vector:
 class AbstractDifferentiated(AbstractLevel):
     """A surface that gives only a function's first and second derivatives, which automatic differentiation finds."""
 
-    differentiated = True
-
     @abc.abstractmethod
     def gradient(self, position: Vector) -> Vector:
         """Gradient of the function at a position [m], along the normal."""

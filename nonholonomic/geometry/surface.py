@@ -56,9 +56,6 @@ class AbstractSurface(Bounded):
     #: The words for the side on which a body is, and the sign of n that points to it.
     sides: ClassVar[Mapping[str, float]] = CLOSED
 
-    #: Whether normal and curvature follow from a user's function by automatic differentiation, which makes them long.
-    differentiated: ClassVar[bool] = False
-
     #: Names and units of the numbers of a place.
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("mu", "rad"), ("eta", "rad"))
 

@@ -32,6 +32,7 @@ from .queue import Outcome as Outcome
 from .queue import Progress as Progress
 from .queue import Queue as Queue
 from .runge_kutta import Lanes as Lanes
+from .runge_kutta import Stages as Stages
 from .runge_kutta import States as States
 from .runge_kutta import explicit_tableau as explicit_tableau
 from .runge_kutta import moved_state as moved_state

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..xla_cpu import stored
 from .event import Search, dip, narrow
 from .problem import AbstractProblem, crossing_time, least_margin
-from .runge_kutta import Lanes, States, Step, explicit_step, inverse_root, looped_step, scaled_error
+from .runge_kutta import Lanes, States, Step, explicit_step, inverse_root, scaled_error
 from .status import CROSSED, FAILED, GUARD_LOST, REACHED_END, RUNNING
 
 #: Step control as in Diffrax's I controller with its defaults.
@@ -26,8 +26,7 @@ class Control(NamedTuple):
 
     `tableau` and `order` are the method's; `rtol` the relative tolerance; `t1` the horizon [s], one for all or one per lane;
     a lane that needs more than `max_steps` has failed; `passes` says whether a run goes on through its event; `parts` is the
-    number of equal parts in the state, such as a state and its variations: a step is judged by the part with the largest error;
-    `looped` says whether the stages of a step are done in a loop.
+    number of equal parts in the state, such as a state and its variations: a step is judged by the part with the largest error.
     """
 
     tableau: diffrax.ButcherTableau
@@ -37,7 +36,6 @@ class Control(NamedTuple):
     max_steps: int
     passes: bool
     parts: int
-    looped: bool
 
 
 class Block(NamedTuple):
@@ -91,8 +89,7 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
         return least_margin(problem, block.side, time, state)
 
     tried_length = length_to_try(control, block)
-    step = looped_step if control.looped else explicit_step
-    tried = step(control.tableau, problem.field, watch, block.time, block.state, block.rate, tried_length)
+    tried = explicit_step(control.tableau, problem.field, watch, block.time, block.state, block.rate, tried_length)
     running = block.status == RUNNING
     free = running & ~block.searching
     error = scaled_error(*stop_gradient((tried.error, block.state, tried.state)), control.rtol, atol, control.parts)

@@ -17,11 +17,6 @@ class AbstractProblem(eqx.Module):
     The leaves of a problem are scalars, or hold one number per cell in their last axis.
     """
 
-    @property
-    def long(self) -> bool:
-        """Whether the field is so long that the stages of a step are done in a loop, where it is compiled once."""
-        return False
-
     @abc.abstractmethod
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
         """State at the start of every cell, and the magnitudes by which its absolute errors are measured."""

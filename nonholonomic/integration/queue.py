@@ -78,8 +78,7 @@ class Queue(eqx.Module):
         **Arguments:** as for `march`, and `parts`: the number of equal parts of the state, as for `Control`.
         """
         solver, rtol = settings.solver, settings.tolerance
-        most, looped = settings.max_steps, settings.looped or problem.long
-        control = Control(explicit_tableau(solver), solver.order(None), rtol, t1, most, passes, parts, looped)
+        control = Control(explicit_tableau(solver), solver.order(None), rtol, t1, settings.max_steps, passes, parts)
         starts, scales = problem.start()
         zero = jnp.zeros_like(starts[0])
         rates, atols = problem.field(zero, starts), settings.absolute * rtol * scales

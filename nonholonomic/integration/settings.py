@@ -22,7 +22,6 @@ class Settings(eqx.Module):
     - `solver`: a solver of Diffrax, an explicit Runge-Kutta one for blocks of lanes.
     - `absolute`: absolute tolerance as a fraction of the relative one, in units of the problem's magnitudes.
     - `max_steps`: a run that needs more has failed.
-    - `looped`: whether the stages of a step are done in a loop, for blocks of lanes (`looped_step`).
     - `lanes`: how many cells of a block advance together; by default as many as suit the machine (`lanes_for`).
     """
 
@@ -30,7 +29,6 @@ class Settings(eqx.Module):
     solver: diffrax.AbstractSolver = diffrax.Dopri8()
     absolute: float = eqx.field(static=True, default=ABSOLUTE)
     max_steps: int = eqx.field(static=True, default=2_000_000)
-    looped: bool = eqx.field(static=True, default=False)
     lanes: int | None = eqx.field(static=True, default=None)
 
     def with_tolerance(self, tolerance: Float[Array, ""] | None) -> Self:

@@ -126,10 +126,6 @@ class Contact(AbstractProblem):
     scales: Float[Array, "components cells"]
     axial: Float[Array, "..."] | None
 
-    @property
-    def long(self) -> bool:
-        return self.dynamics.frame.long
-
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
 

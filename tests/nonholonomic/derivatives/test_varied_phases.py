@@ -72,7 +72,7 @@ def time_of_level(height, gravity, restitution, level, bounces):
 
 def settings_of(tolerance):
     """What compiles fast."""
-    return Settings(tolerance, diffrax.Tsit5(), looped=True)
+    return Settings(tolerance, diffrax.Tsit5())
 
 
 HEIGHTS, RESTITUTIONS = np.linspace(0.5, 2.0, CELLS), np.linspace(0.9, 0.6, CELLS)

@@ -135,7 +135,7 @@ def test_too_many_steps_and_nonsense_are_failures():
 def time_of(numbers):
     """When one oscillator reaches its level, w and level given; the exact time is acos(level) / w."""
     problem = Oscillators(numbers[:1], numbers[1:], jnp.asarray(2.0))
-    settings = Settings(1e-12, absolute=1.0, lanes=1, looped=True)
+    settings = Settings(1e-12, absolute=1.0, lanes=1)
     outcome, _ = march(problem, jnp.asarray(9.0), jnp.asarray(1), settings)
     return outcome.crossing_time[0]
 
