@@ -113,8 +113,8 @@ class Scene(Bounded):
             raise ValueError(
                 f"contact = 'hybrid' must be on a level Plane() for a top with a stem, not on {self.surface!r}"
             )
-        if self.contact == "hybrid" and not self.friction.acts_at_point:
-            raise ValueError(f"contact = 'hybrid' must be with friction at a point, not with {self.friction!r}")
+        if self.contact == "hybrid" and self.friction.set_valued:
+            raise ValueError(f"contact = 'hybrid' must be with a law without phases, not with {self.friction!r}")
         if self.contact == "stop" and self.body.stem is not None:
             raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
 
