@@ -71,11 +71,8 @@ HOPS = Case(0.02, 0.02, 0.016, 1.6e-6, 1.9e-6, 0.5, 1.5, 300.0, slip_speed=0.1, 
 TORQUES = {"contact_radius": 1e-3, "resistance": 1e-4, "turning_speed": 5.0}
 
 
-@pytest.mark.parametrize(
-    "surface",
-    [tippe.Plane(), pytest.param(tippe.Graph(lambda x, y: 0.0 * x), marks=pytest.mark.slow)],
-    ids=["plane", "graph"],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("surface", [tippe.Plane(), tippe.Graph(lambda x, y: 0.0 * x)], ids=["plane", "graph"])
 def test_inversion_times_through_flights_with_torques(surface):
     """A disc of contact and rolling resistance, after 3 flights and 2 impacts; a graph has the phases of every arena."""
     cases = [dataclasses.replace(HOPS, spin=spin, **TORQUES) for spin in (300.0, 350.0)]
