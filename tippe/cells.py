@@ -93,6 +93,15 @@ def driver_of(scene: Scene) -> Driver:
     return SMOOTH
 
 
+def check_differentiable(scene: Scene) -> None:
+    """Raise `ValueError` for a scene through whose phases no derivative goes."""
+    if driver_of(scene) is STICK_SLIP_FLY:
+        raise ValueError(
+            "friction = SetValuedCoulomb with contact = 'hybrid' has no derivatives: they do not go through impacts in which a "
+            "slip may stop"
+        )
+
+
 class CellRuns(NamedTuple):
     """What is asked of every cell of a table; see `inversion_table`."""
 

@@ -288,7 +288,8 @@ class SetValuedCoulomb(AbstractFriction):
 
     The run is made of phases. In a slip the force has its full size; a slip that stops turns into rolling, with the
     equations of `phases/rolling.py`, if the force needed for that is within the friction cone; the top slips again as soon
-    as it is not. While it rolls the energy is constant.
+    as it is not. While it rolls the energy is constant. With `contact="hybrid"` a top without a stem flies on where contact is
+    lost, and slips, rolls or rebounds behind an impact (`phases/airborne_stick_slip.py`).
 
     **Arguments:**
 

@@ -31,7 +31,7 @@ from nonholonomic.integration import (
 )
 from nonholonomic.validation import as_number, is_traced
 
-from .cells import driver_of
+from .cells import check_differentiable, driver_of
 from .inversion import InversionProblem, check_event, check_run, is_inverted, permitted
 from .launch import Launch
 from .phases.airborne import on_the_ground
@@ -70,7 +70,8 @@ def inversion_time(
     (`nonholonomic/derivatives/varied_phases.py`). Where an event on the way is grazing, so that within the tolerance it may
     not happen at all, the derivative is NaN; `inversion_table` says so in the variable `grazes`.
 
-    **Raises:** `ValueError` for arguments outside these ranges, and for second derivatives through changes of phase.
+    **Raises:** `ValueError` for arguments outside these ranges, for second derivatives through changes of phase, and for
+    derivatives with both, whose impacts may stop a slip.
 
     **Example:**
 
@@ -169,6 +170,7 @@ class PhasedInversionQuestion(InversionQuestion):
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         built = directions_by(self.phased, active, (*leaves[: self.movable], tolerance), cells)
         (phases, first, problem, scene), directions, gather = built
+        check_differentiable(scene)
         if self.last:
             # The slopes need the run up to the event alone, whose time is known then.
             whole = self.journey(phases, first, problem, scene, t1, tolerance)

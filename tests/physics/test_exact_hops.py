@@ -2,6 +2,7 @@
 
 import diffrax
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 from close import assert_close
@@ -112,3 +113,20 @@ def test_what_has_no_single_answer_is_refused():
         ValueError, match="must be a law without phases for a top with a stem, such as Coulomb: which of"
     ):
         tippe.Scene(stem, friction=tippe.SetValuedCoulomb(0.3), contact="hybrid")
+    scene, message = scene_of(0.2), "SetValuedCoulomb with contact = 'hybrid' has no derivatives"
+    with pytest.raises(ValueError, match=message):
+        tippe.inversion_table(scene, theta=1.5, spin=350.0, t1=0.1, sensitivities=["spin"])
+    with pytest.raises(ValueError, match=message):
+        jax.grad(lambda spin: tippe.inversion_time(scene, tippe.Launch(1.5, spin), 0.1))(350.0)
+
+
+@pytest.mark.slow
+def test_tables_go_through_flights_and_sticking():
+    """The times at which single runs are, and an error beside them."""
+    scene, given = scene_of(0.2), {"t1": 0.28, "tolerance": 1e-9, "solver": diffrax.Tsit5()}
+    table = tippe.inversion_table(scene, theta=THETA, spin=[300.0, SPIN], angle=2.05, **given)
+    assert list(table.status) == ["inverted", "inverted"]
+    assert (table.hops > 0).all()
+    for spin, time in zip((300.0, SPIN), table.time, strict=True):
+        run = tippe.simulate(scene, tippe.Launch(THETA, spin), times=[time], **given)
+        assert_close(run.theta, 2.05, atol=1e-7)
