@@ -8,6 +8,8 @@ import pytest
 from close import assert_close
 from coulomb_top import Body, start
 from exact_hop_reference import follow
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from impact_reference import Body as Solid
 from impact_reference import Law
 from impact_reference import strike as reference_strike
@@ -76,9 +78,11 @@ def check_against_reference(run: tippe.HybridTrajectory, arena: float | None) ->
     numbers = [piece.number for piece in stays]
     assert numbers == [kinds[one.kind] for one in (expected[0], *events)]
     begins = {piece.begin if piece.number != SLIPPING else None for piece in stays[1:]} - {None}
-    for one in events:
-        if one.kind != "slipping":
-            assert min(abs(one.begin - time) for time in begins) < 2e-9
+    for before, one in zip(expected, expected[1:], strict=False):
+        if one.kind not in ("slipping", before.kind):
+            # A slip is stopped where the way that is left is within the tolerance, earlier by its speed over its deceleration.
+            early = 1e-6 if (before.kind, one.kind) == ("slipping", "rolling") else 2e-9
+            assert min(abs(one.begin - time) for time in begins) < early
     assert_close(run.axis[-1], expected[-1].state[:3], atol=2e-8)
     assert_close(run.position[-1] - run.position[0], expected[-1].state[9:] - start(body, THETA, SPIN)[9:], atol=1e-9)
     assert_close(run.spin[-1], expected[-1].state[6:9] @ expected[-1].state[:3], rtol=1e-8)
@@ -107,6 +111,25 @@ def test_a_top_that_slips_flies_sticks_and_rolls(arena):
         assert_close(run.slip[rolls], 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
+@settings(max_examples=12, deadline=None)
+@given(
+    theta=st.floats(0.2, 2.9),
+    spin=st.floats(-400.0, 400.0),
+    mu=st.floats(0.05, 1.0),
+    restitution=st.floats(0.1, 1.0),
+)
+def test_any_motion_is_finite_or_flagged(theta, spin, mu, restitution):
+    """Energy never grows, nothing enters the arena and nothing pulls."""
+    scene = scene_of(0.2, mu, restitution)
+    run = tippe.simulate(scene, tippe.Launch(theta, spin), 0.2, tolerance=1e-8, solver=diffrax.Tsit5())
+    assert run.status in ("reached t1", "failed", "jammed", "unresolved")
+    assert np.isfinite(run.states).all()
+    assert np.max(np.diff(run.energy)) < 1e-8 * run.energy[0]
+    assert np.min(run.distance[0]) > -1e-9
+    assert np.min(run.normal_force) > -1e-6 * 0.02 * 9.81
+
+
 def test_what_has_no_single_answer_is_refused():
     stem = tippe.Top(6e-3, 0.015, 3e-3, 8e-7, 7e-7, stem=tippe.Stem(radius=5e-3, offset=0.016))
     with pytest.raises(
@@ -123,10 +146,10 @@ def test_what_has_no_single_answer_is_refused():
 @pytest.mark.slow
 def test_tables_go_through_flights_and_sticking():
     """The times at which single runs are, and an error beside them."""
-    scene, given = scene_of(0.2), {"t1": 0.28, "tolerance": 1e-9, "solver": diffrax.Tsit5()}
-    table = tippe.inversion_table(scene, theta=THETA, spin=[300.0, SPIN], angle=2.05, **given)
+    scene, options = scene_of(0.2), {"t1": 0.28, "tolerance": 1e-9, "solver": diffrax.Tsit5()}
+    table = tippe.inversion_table(scene, theta=THETA, spin=[300.0, SPIN], angle=2.05, **options)
     assert list(table.status) == ["inverted", "inverted"]
     assert (table.hops > 0).all()
     for spin, time in zip((300.0, SPIN), table.time, strict=True):
-        run = tippe.simulate(scene, tippe.Launch(THETA, spin), times=[time], **given)
+        run = tippe.simulate(scene, tippe.Launch(THETA, spin), times=[time], **options)
         assert_close(run.theta, 2.05, atol=1e-7)
