@@ -14,6 +14,7 @@ from impact_reference import Body as Solid
 from impact_reference import Law
 from impact_reference import strike as reference_strike
 from test_strong_friction import random_falls
+from tops import homogeneous_ball
 
 import tippe
 from tippe.phases.airborne import FLYING
@@ -128,6 +129,20 @@ def test_any_motion_is_finite_or_flagged(theta, spin, mu, restitution):
     assert np.max(np.diff(run.energy)) < 1e-8 * run.energy[0]
     assert np.min(run.distance[0]) > -1e-9
     assert np.min(run.normal_force) > -1e-6 * 0.02 * 9.81
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("speed", "word"), [(1.0, "reached t1"), (3.0, "contact_lost")])
+def test_a_contact_at_rest_that_need_not_push_parts_at_once(speed, word):
+    """A ball that rolls over the top of a sphere: it parts where V^2 / (rho + R) is more than g, at 1.77 m/s."""
+    ball = homogeneous_ball()
+    scene = tippe.Scene(ball, tippe.Sphere(0.3), tippe.SetValuedCoulomb(0.3), side="outside")
+    launch = tippe.Launch(
+        0.0, 0.0, place=(0.0, 0.0, 0.3), velocity=(speed, 0.0), angular_velocity=(0.0, speed / 0.02, 0.0)
+    )
+    run = tippe.simulate(scene, launch, 0.01, tolerance=1e-9, solver=diffrax.Tsit5())
+    assert run.status == word
+    assert run.end_time == (0.01 if speed == 1.0 else 0.0)
 
 
 def test_what_has_no_single_answer_is_refused():
