@@ -33,6 +33,7 @@ struck = eqx.filter_jit(
 )
 
 
+@pytest.mark.slow
 def test_impacts_that_stick_or_slip_on():
     """Of 1000 a third sticks; against an independent program with next to no slip speed, also where the slip turns round."""
     falls = random_falls(0.0, 1.0)

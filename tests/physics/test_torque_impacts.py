@@ -48,6 +48,7 @@ def test_impacts_with_torques():
         assert_close(turning[:, i], expected.turning, atol=1e-9 * speed / body.radius)
 
 
+@pytest.mark.slow
 def test_impacts_without_disc_or_lever_are_those_of_coulomb():
     """In the limit, and close by in proportion to the lever and, but for its torque, to the square of the disc's radius."""
     falls = random_falls(0.0, 1.0)
