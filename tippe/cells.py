@@ -30,7 +30,7 @@ from nonholonomic.sweeps import Variable
 
 from .dynamics import LOSSES
 from .inversion import InversionProblem, is_inverted
-from .phases import airborne
+from .phases import airborne, airborne_stick_slip
 from .phases.sliding import phases as hybrid_phases
 from .phases.stick_slip_runs import phases as stick_slip_phases
 from .scene import Scene
@@ -41,12 +41,13 @@ class Driver(NamedTuple):
     """How the runs of a kind of scene go: the words of their status, what is counted besides steps, and the phases.
 
     `phases` takes (scene, problem, tolerance, last) and gives the phases and the number of each cell's first; `None` for runs
-    of one smooth motion.
+    of one smooth motion. `aloft` is whether states may be those of flight, in a layout of their own.
     """
 
     words: tuple[str, ...]
     counts: tuple[str, ...]
     phases: Callable[..., tuple[tuple[AbstractPhase, ...], Int[Array, " cells"]]] | None
+    aloft: bool = False
 
     @property
     def smooth(self) -> bool:
@@ -75,7 +76,8 @@ WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_n
 SMOOTH = Driver(WORDS, (), None)
 STICK_SLIP = Driver((*WORDS, "unresolved"), ("sticks",), stick_slip_phases)
 HYBRID = Driver((*WORDS, "unresolved"), ("hops",), hybrid_phases)
-AIRBORNE = Driver((*WORDS, "unresolved"), ("hops",), airborne.phases)
+AIRBORNE = Driver((*WORDS, "unresolved"), ("hops",), airborne.phases, aloft=True)
+STICK_SLIP_FLY = Driver((*WORDS, "unresolved"), ("hops", "sticks"), airborne_stick_slip.phases, aloft=True)
 
 #: The word for a run's status if it has not inverted; `not_inverted` for all others.
 WORD_OF_STATUS = {GUARD_LOST: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
@@ -83,11 +85,21 @@ WORD_OF_STATUS = {GUARD_LOST: WORDS.index("contact_lost"), FAILED: WORDS.index("
 
 def driver_of(scene: Scene) -> Driver:
     """The driver for a scene."""
+    hybrid = scene.contact == "hybrid"
     if scene.friction.set_valued:
-        return STICK_SLIP
-    if scene.contact == "hybrid":
-        return HYBRID if scene.level else AIRBORNE
+        return STICK_SLIP_FLY if hybrid else STICK_SLIP
+    if hybrid:
+        return HYBRID if scene.flies_in_closed_form else AIRBORNE
     return SMOOTH
+
+
+def check_differentiable(scene: Scene) -> None:
+    """Raise `ValueError` for a scene through whose phases no derivative goes."""
+    if driver_of(scene) is STICK_SLIP_FLY:
+        raise ValueError(
+            "friction = SetValuedCoulomb with contact = 'hybrid' has no derivatives: they do not go through impacts in which a "
+            "slip may stop"
+        )
 
 
 class CellRuns(NamedTuple):
@@ -131,6 +143,7 @@ class CellRuns(NamedTuple):
         options = {"count": count, "size": size, "solver": self.solver, "last": self.last}
         numbers = (roots, columns, self.slopes_by, self.angle)
         if self.driver.phases is not None:
+            options |= {"kinds": len(self.driver.counts)}
             along = functools.partial(phased_slopes_of_cells, self.driver.phases, *numbers, **options)
             return self._travelled(scene, problem, tolerance, count, along)
         if not self.slopes_by:
@@ -152,7 +165,7 @@ class CellRuns(NamedTuple):
                 np.where(np.isfinite(found.crossing_time), found.crossing_time, 0.0), tolerance
             )
             grazing |= there.status != REACHED_END
-        if self.driver is AIRBORNE:
+        if self.driver.aloft:
             found = found._replace(state=np.asarray(_on_the_ground(scene, found.state, found.phase)))
         named = self._named(scene, problem, found) | dict(zip(self.driver.counts, found.counts, strict=True))
         if self.crossing == "both":
@@ -171,7 +184,7 @@ class CellRuns(NamedTuple):
         assert self.driver.phases is not None
         phases, first = self.driver.phases(scene, problem, tolerance, last)
         start, settings = (np.asarray(first), np.asarray(problem.states)), Settings(tolerance, self.solver)
-        return travel(phases, *start, self.t1, count, settings, kinds=1, passes=last)
+        return travel(phases, *start, self.t1, count, settings, kinds=len(self.driver.counts), passes=last)
 
     def _outcome(self, problem: InversionProblem, tolerance: float, count: int) -> Outcome:
         horizon, settings = jnp.asarray(self.t1), Settings(tolerance, self.solver)

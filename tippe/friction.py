@@ -46,6 +46,9 @@ class ContactLoad(NamedTuple):
 class AbstractFriction(Bounded):
     """A friction law whose force and torque are proportional to the normal force.
 
+    That is what makes it a law for impacts too: force and torque act during the normal impulse as they do under the normal
+    force.
+
     **Example:**
 
     ```
@@ -65,9 +68,6 @@ class AbstractFriction(Bounded):
 
     #: Whether the force of a contact at rest is whatever keeps it at rest, within limits.
     set_valued: ClassVar[bool] = False
-
-    #: Whether the load is a force that depends on the slip velocity alone, without a torque. Impacts need such a law.
-    acts_at_point: ClassVar[bool] = False
 
     @property
     def drills(self) -> bool:
@@ -100,8 +100,6 @@ class Frictionless(AbstractFriction):
     ```
     """
 
-    acts_at_point: ClassVar[bool] = True
-
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         return ContactLoad(force=(None, None))
 
@@ -126,7 +124,6 @@ class Viscous(AbstractFriction):
     """
 
     units: ClassVar[dict[str, str]] = {"mu": "s m-1"}
-    acts_at_point: ClassVar[bool] = True
 
     mu: Float[Array, "..."] = eqx.field(converter=as_number)
 
@@ -164,7 +161,6 @@ class Coulomb(AbstractFriction):
     """
 
     units: ClassVar[dict[str, str]] = {"mu": "1", "slip_speed": "m s-1"}
-    acts_at_point: ClassVar[bool] = True
 
     mu: Float[Array, "..."] = eqx.field(converter=as_number)
     slip_speed: Float[Array, "..."] = eqx.field(converter=as_number)
@@ -292,7 +288,8 @@ class SetValuedCoulomb(AbstractFriction):
 
     The run is made of phases. In a slip the force has its full size; a slip that stops turns into rolling, with the
     equations of `phases/rolling.py`, if the force needed for that is within the friction cone; the top slips again as soon
-    as it is not. While it rolls the energy is constant.
+    as it is not. While it rolls the energy is constant. With `contact="hybrid"` a top without a stem flies on where contact is
+    lost, and slips, rolls or rebounds behind an impact (`phases/airborne_stick_slip.py`).
 
     **Arguments:**
 

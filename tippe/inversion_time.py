@@ -31,7 +31,7 @@ from nonholonomic.integration import (
 )
 from nonholonomic.validation import as_number, is_traced
 
-from .cells import AIRBORNE, driver_of
+from .cells import check_differentiable, driver_of
 from .inversion import InversionProblem, check_event, check_run, is_inverted, permitted
 from .launch import Launch
 from .phases.airborne import on_the_ground
@@ -70,7 +70,8 @@ def inversion_time(
     (`nonholonomic/derivatives/varied_phases.py`). Where an event on the way is grazing, so that within the tolerance it may
     not happen at all, the derivative is NaN; `inversion_table` says so in the variable `grazes`.
 
-    **Raises:** `ValueError` for arguments outside these ranges, and for second derivatives through changes of phase.
+    **Raises:** `ValueError` for arguments outside these ranges, for second derivatives through changes of phase, and for
+    derivatives with both, whose impacts may stop a slip.
 
     **Example:**
 
@@ -157,7 +158,7 @@ class PhasedInversionQuestion(InversionQuestion):
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         phases, first, problem, scene = self.phased((*leaves[: self.movable], tolerance), cells)
-        return self.named(may, self.journey(phases, first, problem, t1, tolerance), problem, scene)
+        return self.named(may, self.journey(phases, first, problem, scene, t1, tolerance), problem, scene)
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
@@ -169,16 +170,18 @@ class PhasedInversionQuestion(InversionQuestion):
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         built = directions_by(self.phased, active, (*leaves[: self.movable], tolerance), cells)
         (phases, first, problem, scene), directions, gather = built
+        check_differentiable(scene)
         if self.last:
             # The slopes need the run up to the event alone, whose time is known then.
-            whole = self.journey(phases, first, problem, t1, tolerance)
+            whole = self.journey(phases, first, problem, scene, t1, tolerance)
             t1 = jnp.where(jnp.isfinite(whole.crossing_time), whole.crossing_time, 0.0)
         settings = Settings(tolerance, self.solver)
 
         def run(some: tuple[Any, ...]) -> tuple[tuple[Journey, Array], list[Float[Array, " cells"]]]:
             moved = tuple((one[0], one[2].states) for one in some)
             given = (phases, moved, first, problem.states, t1, settings)
-            journey, found = traced_travel_with_slopes(*given, kinds=1, ends_on_event=not self.last)
+            kinds = len(driver_of(scene).counts)
+            journey, found = traced_travel_with_slopes(*given, kinds=kinds, ends_on_event=not self.last)
             return (journey, found.grazing), list(found.slopes)
 
         (journey, grazing), slopes = in_groups(run, directions)
@@ -202,18 +205,19 @@ class PhasedInversionQuestion(InversionQuestion):
         phases: tuple[AbstractPhase, ...],
         first: Int[Array, " cells"],
         problem: InversionProblem,
+        scene: Scene,
         t1: Float[Array, "..."],
         tolerance: Float[Array, ""],
     ) -> Journey:
         """The runs of cells through their phases."""
-        settings = Settings(tolerance, self.solver)
-        return traced_travel(phases, first, problem.states, t1, settings, kinds=1, passes=self.last)
+        settings, kinds = Settings(tolerance, self.solver), len(driver_of(scene).counts)
+        return traced_travel(phases, first, problem.states, t1, settings, kinds=kinds, passes=self.last)
 
     def named(
         self, may: Bool[Array, "..."], ended: Journey, problem: InversionProblem, scene: Scene
     ) -> Float[Array, " cells"]:
         """The times of inversion."""
-        if driver_of(scene) is AIRBORNE:
+        if driver_of(scene).aloft:
             ended = ended._replace(state=on_the_ground(scene, ended.state, ended.phase))
         time = jnp.where(is_inverted(ended, problem, self.last), ended.crossing_time, jnp.inf)
         failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)

@@ -53,7 +53,7 @@ class Scene(Bounded):
     - `surface`: the arena: `Plane(tilt)`, `Cylinder(radius)`, `Sphere(radius)`, `Spheroid(equatorial, polar)`, `Torus(ring,
       tube)`, `Paraboloid(p)`, `Graph(height)` or `Implicit(function)`.
     - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
-      or `Rolling(resistance, turning_speed, sliding)` with one of them, or, with `contact="stop"`,
+      or `Rolling(resistance, turning_speed, sliding)` with one of them, or, for a top without a stem,
       `SetValuedCoulomb(mu)`.
     - `gravity`: acceleration of free fall [m/s^2], positive.
     - `contact`: "stop": a run ends where the contact is lost; "hybrid": it goes on through flights and impacts,
@@ -111,10 +111,14 @@ class Scene(Bounded):
             return
         if self.contact == "hybrid" and self.body.stem is not None and not self.level:
             raise ValueError(
-                f"contact = 'hybrid' must be on a level Plane() for a top with a stem, not on {self.surface!r}"
+                f"contact = 'hybrid' must be on a level Plane() for a top with a stem, not on {self.surface!r}: only there do "
+                "sphere and stem touch together at one angle, at which the top leans on both"
             )
-        if self.contact == "hybrid" and not self.friction.acts_at_point:
-            raise ValueError(f"contact = 'hybrid' must be with friction at a point, not with {self.friction!r}")
+        if self.friction.set_valued and self.body.stem is not None:
+            raise ValueError(
+                f"friction = {self.friction!r} must be a law without phases for a top with a stem, such as Coulomb: which of "
+                "two contacts sticks and which slips has no single answer"
+            )
         if self.contact == "stop" and self.body.stem is not None:
             raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
 
@@ -137,7 +141,7 @@ class Scene(Bounded):
     def frame(self) -> AbstractFrame:
         """The moving frame of the body on the arena."""
         side, pull = self.surface.sign(self.side, "inside"), PULL * jnp.sqrt(self.gravity / self.body.size)
-        if self.contact == "hybrid" and not self.level:
+        if self.contact == "hybrid" and not self.flies_in_closed_form:
             # A flight takes the top anywhere: the frame that knows where it is.
             return CarriedFrame(self.surface, self.body.size, pull, side)
         return frame_of(self.surface, side, self.body.size, pull)
@@ -146,6 +150,11 @@ class Scene(Bounded):
     def level(self) -> bool:
         """Whether the arena is a level plane."""
         return isinstance(self.surface, Plane) and self.surface.tilt is None
+
+    @property
+    def flies_in_closed_form(self) -> bool:
+        """Whether flights of a hybrid scene need no integration: over a level plane, under a law without phases of its own."""
+        return self.level and not self.friction.set_valued
 
     @property
     def dynamics(self) -> Dynamics | StickSlip:

@@ -117,6 +117,7 @@ def phased_slopes_of_cells(
     size: int,
     solver: diffrax.AbstractERK,
     last: bool,
+    kinds: int,
 ) -> tuple[Journey, dict[str, Any], Bool[np.ndarray, " size"]]:
     """What `slopes_of_cells` gives, for runs of several phases.
 
@@ -124,6 +125,7 @@ def phased_slopes_of_cells(
 
     - `phases_of`: the phases, as `Driver` has them.
     - `t1`: horizon [s]; where the `last` crossing counts, its time in every cell, at which the runs end.
+    - `kinds`: how many kinds of things are counted.
 
     **Returns:** the `Journey`; name of the variable -> derivatives (size,); and where these have no digits, because an event
     on the way was grazing. Source: saltation at every change of phase (`nonholonomic/derivatives/varied_phases.py`).
@@ -135,7 +137,7 @@ def phased_slopes_of_cells(
     # In a loop the stages compile in a third of the time, and there is a program for every phase.
     settings = Settings(tolerance, solver)
     given = (directions, np.asarray(first), np.asarray(states), t1, count, settings)
-    journey, found = travel_with_slopes(phases, *given, kinds=1, ends_on_event=not last)
+    journey, found = travel_with_slopes(phases, *given, kinds=kinds, ends_on_event=not last)
     slopes = [slope / np.asarray(size) for slope, size in zip(found.slopes, sizes, strict=True)]
     return journey, dict(zip(slope_names(names), slopes, strict=True)), found.grazing
 

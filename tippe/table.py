@@ -11,7 +11,7 @@ import numpy as np
 from nonholonomic.integration import explicit_tableau
 from nonholonomic.sweeps import Table, Variable, sweep
 
-from .cells import TIMES, CellRuns, driver_of
+from .cells import TIMES, CellRuns, check_differentiable, driver_of
 from .inversion import check_event
 from .launches import described, launches
 from .scene import Scene
@@ -68,17 +68,17 @@ def inversion_table(
       are the same, to the bit on the same kind of processor.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
-    "contact_lost", "failed", "jammed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was lost
-    or jammed, when and at what angle), `steps` and `rejected`. With `errors` also `time_error` [s], infinite where the two
-    runs disagree on the status or failed, 0 where they agree that there is no time; `Table.digits("time")` shows the digits
-    it leaves. With `sensitivities` also the derivative of `time` by each number, `time_by_mu` for `"scene.friction.mu"`, 0
-    where the top did not invert. It goes through flights, impacts, stick and slip; there `grazes` is 1 where an event on the
-    way, such as a landing, was grazing, so that within the tolerance it may not happen at all: the derivative is then NaN. A
-    scene with `contact="hybrid"` flies on where contact is lost, and the angle counts in
-    flight too; `hops` is the number of flights until the run ended, and `status` may be "unresolved" (10 000 of them in a
-    row, or sphere and stem on the plane together with so much friction that the forces are not determined). With
-    `SetValuedCoulomb`, `sticks` is how often a slip has turned into rolling, and `status` may be "unresolved" (too many
-    changes).
+    "contact_lost", "failed", "jammed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was
+    lost or jammed, when and at what angle), `steps` and `rejected`. With `errors` also `time_error` [s], infinite where
+    the two runs disagree on the status or failed, 0 where they agree that there is no time; `Table.digits("time")`
+    shows the digits it leaves. With `sensitivities` also the derivative of `time` by each number, `time_by_mu` for
+    `"scene.friction.mu"`, 0 where the top did not invert. It goes through flights, impacts, stick and slip; there
+    `grazes` is 1 where an event on the way, such as a landing, was grazing, so that within the tolerance it may not
+    happen at all: the derivative is then NaN (`SetValuedCoulomb` with `contact="hybrid"` has none). A scene with
+    `contact="hybrid"` flies on where contact is lost, and the angle counts in flight too; `hops` is the number of
+    flights until the run ended, and `status` may be "unresolved" (10 000 of them in a row, or sphere and stem on the
+    plane together with so much friction that the forces are not determined). With `SetValuedCoulomb`, `sticks` is how
+    often a slip has turned into rolling, impacts apart, and `status` may be "unresolved" (too many changes).
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
     `RuntimeError` for an executor that breaks down, or a worker with other versions.
@@ -117,6 +117,8 @@ def inversion_table(
     roots, grid, units = launches(scene, given, axes, t1, tolerance)
     paths = sensitivity_names(roots, sensitivities)
     driver = driver_of(scene)
+    if paths:
+        check_differentiable(scene)
     if not driver.smooth and method == "diffrax":
         raise ValueError("method = 'diffrax' is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
     runs = CellRuns(driver, float(t1), float(angle), crossing, solver, method, paths)

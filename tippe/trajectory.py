@@ -159,7 +159,7 @@ def simulate(
         return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
     if scene.contact == "hybrid":
         with Progress(1, "run", "simulating"):
-            follow_flights = simulate_hybrid if scene.level else simulate_airborne
+            follow_flights = simulate_hybrid if scene.flies_in_closed_form else simulate_airborne
             return follow_flights(scene, launch, float(t1), times, tolerance, solver)
     with Progress(1, "run", "simulating"):
         run = TrajectoryProblem.of(scene, launch)
@@ -217,7 +217,7 @@ def _traced(
         if adjoint is not None:
             raise ValueError(f"adjoint = {adjoint!r} must be left out for contact = 'hybrid'")
         explicit_tableau(solver)
-        return (sampled_hybrid if scene.level else sampled_airborne)(scene, launch, times, t1, settings)
+        return (sampled_hybrid if scene.flies_in_closed_form else sampled_airborne)(scene, launch, times, t1, settings)
     found = sampled(scene, launch, times, t1, settings, adjoint)
     status = found.status.astype(int)
     stats = {"accepted": found.accepted.astype(int), "rejected": found.rejected.astype(int)}

@@ -17,6 +17,7 @@ from .march import with_crossing_times as with_crossing_times
 from .midpoint import ImplicitMidpoint as ImplicitMidpoint
 from .phased_run import BETWEEN as BETWEEN
 from .phased_run import PhasedPath as PhasedPath
+from .phased_run import Piece as Piece
 from .phased_run import follow_phases as follow_phases
 from .phases import AbstractPhase as AbstractPhase
 from .phases import Journey as Journey

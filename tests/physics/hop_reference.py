@@ -6,10 +6,11 @@ at s + a e and radius R. In contact the normal forces are those that keep the he
 the accelerations are affine in the forces, so one evaluation without them and one for each give a linear system. It has
 two unknowns where the top leans, on ball and stem at once. Flight is the same equations without the force, integrated like
 everything else.
-Impact: d(velocities)/dp = the response to the force (f(v), 1), p the normal impulse, until the ball's normal velocity is
--restitution times what it was; for viscous friction that is a linear equation, solved by the matrix exponential, for
-Coulomb's regularised law it is integrated. A rebound slower than 1e-5 sqrt(g R) closes the contact; if the other ball is at the
-plane and no faster, both balls are put to rest along the normal, u_z = 0 and e_z' = 0, and stay if both forces are positive.
+Impact: d(velocities)/dp = the response to the force (f(v), 1) and to the torque tau(v, w), p the normal impulse, until
+the ball's normal velocity is -restitution times what it was; for viscous friction that is a linear equation, solved by
+the matrix exponential, for Coulomb's regularised law it is integrated. A rebound slower than 1e-5 sqrt(g R) closes the
+contact; if the other ball is at the plane and no faster, both balls are put to rest along the normal, u_z = 0 and e_z'
+= 0, and stay if both forces are positive.
 
 Run: python hop_reference.py   writes hop_reference.csv (some minutes). Nothing here is shared with the simulator.
 """
@@ -30,7 +31,8 @@ UP = np.array((0.0, 0.0, 1.0))
 
 @dataclass(frozen=True)
 class Case:
-    """Top, friction, restitution and launch; `stem_radius` 0 is a top without stem, `slip_speed` 0 viscous friction."""
+    """Top, friction, restitution and launch; `stem_radius` 0 is a top without stem, `slip_speed` 0 viscous friction, and
+    `contact_radius` and `resistance` 0 are friction without a torque."""
 
     mass: float
     radius: float
@@ -47,6 +49,9 @@ class Case:
     gravity: float = 9.81
     t1: float = 20.0
     angle: float = 0.95 * pi
+    contact_radius: float = 0.0
+    resistance: float = 0.0
+    turning_speed: float = 1.0
 
     @property
     def balls(self):
@@ -64,10 +69,13 @@ def split(state):
     return state[:3], state[3:6], state[6:9], state[9:12]
 
 
-def friction(case, slip):
-    """Tangential force per unit normal force."""
-    size = sqrt(slip @ slip + case.slip_speed**2) if case.slip_speed else 1.0
-    return -case.mu / size * slip
+def friction(case, slip, w):
+    """Tangential force and torque per unit normal force, for the contact point's velocity and the angular velocity."""
+    slip, lever = slip * (1.0 - UP), 3.0 * pi / 16.0 * case.contact_radius
+    size = sqrt(slip @ slip + (lever * w[2]) ** 2 + case.slip_speed**2) if case.slip_speed else 1.0
+    rolls = w * (1.0 - UP)
+    against = case.resistance / sqrt(rolls @ rolls + case.turning_speed**2) * rolls
+    return -case.mu / size * slip, -case.mu / size * lever**2 * w[2] * UP - against
 
 
 def solve_inertia(case, e, torque):
@@ -82,13 +90,13 @@ def arm(ball, e):
 
 
 def accelerations(case, state, loads=()):
-    """u' and w' under forces at the contact points of balls, (ball, force)."""
+    """u' and w' under forces and torques at the contact points of balls, (ball, force, torque)."""
     _, _, e, w = split(state)
     spin_momentum = case.I1 * w + (case.I3 - case.I1) * (w @ e) * e
     torque = -cross(w, spin_momentum)
-    for ball, force in loads:
-        torque = torque + cross(arm(ball, e), force)
-    return sum((force for _, force in loads), 0.0) / case.mass - case.gravity * UP, solve_inertia(case, e, torque)
+    for ball, force, own in loads:
+        torque = torque + cross(arm(ball, e), force) + own
+    return sum((force for _, force, _ in loads), 0.0) / case.mass - case.gravity * UP, solve_inertia(case, e, torque)
 
 
 def centre_acceleration(state, ball, u_dot, w_dot):
@@ -102,9 +110,8 @@ def contact(case, state, balls):
     _, u, e, w = split(state)
     units = []
     for ball in balls:
-        slip = u + cross(w, arm(ball, e))
-        slip[2] = 0.0
-        units.append((ball, friction(case, slip) + UP))
+        force, torque = friction(case, u + cross(w, arm(ball, e)), w)
+        units.append((ball, force + UP, torque))
     free = accelerations(case, state)
     rises = np.array([centre_acceleration(state, ball, *free) for ball in balls])
     pushed = [accelerations(case, state, [unit]) for unit in units]
@@ -113,7 +120,8 @@ def contact(case, state, balls):
         for ball, rise in zip(balls, rises, strict=True)
     ]
     forces = np.linalg.solve(matrix, -rises) if balls else rises
-    return forces, *accelerations(case, state, [(b, N * f) for N, (b, f) in zip(forces, units, strict=True)])
+    loads = [(ball, N * force, N * torque) for N, (ball, force, torque) in zip(forces, units, strict=True)]
+    return forces, *accelerations(case, state, loads)
 
 
 def rate(case, state, balls):
@@ -146,21 +154,25 @@ def strike(case, state, ball):
     response = np.array([d / case.mass + cross(solve_inertia(case, e, cross(r, d)), r) for d in np.eye(3)]).T
     bounces = -case.restitution * before[2] > CLOSING * sqrt(case.gravity * case.radius)
     wanted = -case.restitution * before[2] if bounces else 0.0
+    torque = np.zeros(3)
     if case.slip_speed:
+        # Impulses of the force and of the torque.
+        def moved(P):
+            turned = w + solve_inertia(case, e, cross(r, P[:3]) + P[3:])
+            return u + P[:3] / case.mass + cross(turned, r), turned
 
         def change(_, P):
-            velocity = before + response @ P
-            velocity[2] = 0.0
-            return friction(case, velocity) + UP
+            force, torque = friction(case, *moved(P))
+            return np.concatenate((force + UP, torque))
 
         def reaches(_, P):
-            return (before + response @ P)[2] - wanted
+            return moved(P)[0][2] - wanted
 
         reaches.terminal = True
         # Strong friction can at first pull the ball down.
         most = 1e3 * (wanted - before[2]) / response[2, 2]
-        run = solve_ivp(change, (0.0, most), np.zeros(3), method="DOP853", rtol=1e-12, atol=1e-18, events=reaches)
-        impulse = run.y_events[0][0]
+        run = solve_ivp(change, (0.0, most), np.zeros(6), method="DOP853", rtol=1e-12, atol=1e-18, events=reaches)
+        impulse, torque = np.split(run.y_events[0][0], 2)
     else:
         # P' = -mu (before + response P) along the plane, 1 along the normal: P(p) from one exponential.
         matrix = np.zeros((4, 4))
@@ -172,7 +184,8 @@ def strike(case, state, ball):
         most = 3.0 * (wanted - before[2]) / response[2, 2]
         p = brentq(lambda p: (before + response @ after(p))[2] - wanted, 0.0, most, xtol=1e-20, rtol=1e-15)
         impulse = after(p)
-    return np.concatenate((s, u + impulse / case.mass, e, w + solve_inertia(case, e, cross(r, impulse)))), bounces
+    turned = w + solve_inertia(case, e, cross(r, impulse) + torque)
+    return np.concatenate((s, u + impulse / case.mass, e, turned)), bounces
 
 
 def at_rest(state):

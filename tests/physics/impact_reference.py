@@ -1,10 +1,13 @@
 """Routh's impact with friction in plain NumPy and SciPy, for any friction however strong, SI units.
 
-The velocity v of the contact point obeys dv/dp = W (f, 1), with p the normal impulse, W the response to impulses and f the
-friction of Coulomb's regularised law, f = -mu v_t / sqrt(v_t^2 + slip_speed^2). The motion is followed in p, which always
-grows, by an implicit method, because a contact that sticks or reverses is stiff: first through compression, however the normal
-velocity goes to and fro, then until it is `restitution` times that of the approach, or until the energy is what it was before.
-W comes from the rigid body's mass matrix. Nothing here is shared with the simulator.
+The velocity v of the contact point and the angular velocity w obey d(v, w)/dp = W (f, 1, tau), with p the normal
+impulse, W the response to force and torque there, and f the friction of Coulomb's regularised law, f = -mu v_t /
+sqrt(v_t^2 + slip_speed^2). With a disc of contact x = (v_t, b w_n), b = 3 pi / 16 of its radius, stands in place of
+v_t, and what answers to b w_n is the torque about the normal over b; rolling resistance is a law of the same form for
+w_t. The motion is followed in p, which always grows, by an implicit method, because a contact that sticks or reverses
+is stiff: first through compression, however the normal velocity goes to and fro, then until it is `restitution` times
+that of the approach, or until the energy is what it was before. W comes from the rigid body's mass matrix.
+Nothing here is shared with the simulator.
 """
 
 from typing import NamedTuple
@@ -41,7 +44,24 @@ def skew(r):
     return np.array(((0.0, -r[2], r[1]), (r[2], 0.0, -r[0]), (-r[1], r[0], 0.0)))
 
 
-def strike(body, axis, velocity, turning, mu, slip_speed, restitution):
+class Law(NamedTuple):
+    """Coulomb's regularised law [1, m/s], the radius of its disc [m], and rolling resistance [m, rad/s]."""
+
+    mu: float
+    slip_speed: float
+    contact_radius: float = 0.0
+    resistance: float = 0.0
+    turning_speed: float = 1.0
+
+    def parts(self, speed):
+        """Where the law's two parts act in (v, w) / speed, how hard, and below which slip they yield."""
+        sliding, rolling = np.zeros((3, 6)), np.zeros((2, 6))
+        sliding[0, 0] = sliding[1, 1] = rolling[0, 3] = rolling[1, 4] = 1.0
+        sliding[2, 5] = 3.0 * np.pi / 16.0 * self.contact_radius
+        return (sliding, self.mu, self.slip_speed / speed), (rolling, self.resistance, self.turning_speed / speed)
+
+
+def strike(body, axis, velocity, turning, law, restitution):
     """The motion after an impact of the sphere on the plane z = 0, from the motion before.
 
     `axis`, `velocity` (of the centre of mass [m/s]) and `turning` (angular velocity [rad/s]) are vectors (3,).
@@ -49,27 +69,28 @@ def strike(body, axis, velocity, turning, mu, slip_speed, restitution):
     arm = body.offset * axis - body.radius * np.array((0.0, 0.0, 1.0))
     inertia = body.I1 * np.eye(3) + (body.I3 - body.I1) * np.outer(axis, axis)
     mass_matrix = np.block([[body.mass * np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), inertia]])
-    # The contact's velocity is J (velocity, turning); an impulse there changes both by M^-1 J^T.
-    jacobian = np.hstack([np.eye(3), -skew(arm)])
+    # (v, w) at the contact is J (velocity, turning); impulses of force and torque there change both by M^-1 J^T.
+    jacobian = np.block([[np.eye(3), -skew(arm)], [np.zeros((3, 3)), np.eye(3)]])
     lever = np.linalg.solve(mass_matrix, jacobian.T)
     response = jacobian @ lever
     before = jacobian @ np.concatenate([velocity, turning])
     speed = -before[2]
     # In units of the speed of approach, and of the impulse that it would take without friction.
-    start, matrix, slow = before / speed, response / response[2, 2], slip_speed / speed
-
-    def force(v):
-        factor = -mu / np.sqrt(v[0] ** 2 + v[1] ** 2 + slow**2)
-        return np.array((factor * v[0], factor * v[1], 1.0))
+    start, matrix, up = before / speed, response / response[2, 2], np.eye(6)[2]
 
     def rate(_, impulse):
-        return force(start + matrix @ impulse)
+        load, v = up, start + matrix @ impulse
+        for acts, most, slow in law.parts(speed):
+            slip = acts @ v
+            load = load - most / np.sqrt(slip @ slip + slow**2) * (acts.T @ slip)
+        return load
 
     def jacobian_of_rate(_, impulse):
-        v = start + matrix @ impulse
-        square = v[0] ** 2 + v[1] ** 2 + slow**2
-        slope = np.zeros((3, 3))
-        slope[:2, :2] = -mu / np.sqrt(square) * (np.eye(2) - np.outer(v[:2], v[:2]) / square)
+        slope, v = np.zeros((6, 6)), start + matrix @ impulse
+        for acts, most, slow in law.parts(speed):
+            slip = acts @ v
+            square = slip @ slip + slow**2
+            slope -= most / np.sqrt(square) * acts.T @ (np.eye(len(slip)) - np.outer(slip, slip) / square) @ acts
         return slope @ matrix
 
     def compressed(_, impulse):
@@ -93,7 +114,7 @@ def strike(body, axis, velocity, turning, mu, slip_speed, restitution):
         assert ends, "an impact without an end"
         return ends[0], least
 
-    impulse, least = until(np.zeros(3), [compressed])
+    impulse, least = until(np.zeros(6), [compressed])
     if restitution > 0.0:
         impulse, later = until(impulse, [rebounds, restores])
         least = min(least, later)

@@ -34,6 +34,9 @@ def scene_of(case: Case, restitution: float | None = None) -> tippe.Scene:
     """The scene of a reference case."""
     stem = tippe.Stem(case.stem_radius, case.stem_offset) if case.stem_radius else None
     friction = tippe.Coulomb(case.mu, case.slip_speed) if case.slip_speed else tippe.Viscous(case.mu)
+    if case.contact_radius:
+        disc = tippe.Contensou(case.mu, case.contact_radius, case.slip_speed)
+        friction = tippe.Rolling(case.resistance, case.turning_speed, disc)
     top = tippe.Top(case.mass, case.radius, case.offset, case.I1, case.I3, stem)
     given = case.restitution if restitution is None else restitution
     return tippe.Scene(top, tippe.Plane(), friction, case.gravity, contact="hybrid", restitution=given)

@@ -45,10 +45,13 @@ def leaning_states(body: tippe.Top, count: int, seed: int) -> np.ndarray:
     return np.concatenate([random.normal(scale=0.3, size=(2, count)), e, momentum])
 
 
-@pytest.mark.parametrize(("mu", "slip_speed"), [(0.0, 0.0), (0.3, 0.0), (0.3, 0.05)])
-def test_forces_and_accelerations(mu, slip_speed):
+TORQUES = {"slip_speed": 0.05, "contact_radius": 1e-3, "resistance": 3e-4, "turning_speed": 5.0}
+
+
+@pytest.mark.parametrize("law", [{"mu": 0.0}, {}, {"slip_speed": 0.05}, TORQUES])
+def test_forces_and_accelerations(law):
     """Both normal forces and the rates of u, e and L, with the reference's multipliers; so too the power of friction."""
-    case = Case(**{**CASES[SHORT].__dict__, "mu": mu, "slip_speed": slip_speed})
+    case = Case(**{**CASES[SHORT].__dict__, **law})
     scene = scene_of(case)
     states = leaning_states(scene.body, 20, 1)
     motion = leaning(scene).motion(jnp.asarray(states))

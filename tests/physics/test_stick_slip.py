@@ -205,10 +205,6 @@ def test_the_error_of_many_slips_falls_with_the_tolerance_and_is_known():
             lambda s: tippe.inversion_table(s, theta=0.1, spin=100.0, t1=1.0, method="diffrax"),
             "method = 'diffrax' is not for runs of several phases",
         ),
-        (
-            lambda s: tippe.Scene(s.body, friction=s.friction, contact="hybrid"),
-            "contact = 'hybrid' must be with friction at a point, not with SetValuedCoulomb",
-        ),
         (lambda s: tippe.SetValuedCoulomb(-0.1), "mu = -0.1 must be at least 0"),
     ],
 )

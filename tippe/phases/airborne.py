@@ -33,6 +33,7 @@ from ..dynamics import COS_THETA, Dynamics, stacked
 from ..inversion import InversionProblem
 from ..scene import Scene
 from ..state import joined, parts
+from .exact_impact import strike_exactly
 from .flying_phase import AbstractFlyingPhase
 from .free_body import FreeBody, axis_rate, balls, energy, gap_rate
 from .impact import strike
@@ -190,24 +191,29 @@ class Slide(AbstractFlyingPhase):
 
     def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
         """Fly where the contact is lost, end where it jams or the ball does not fit. It counts the flights."""
-        body, frame, (u, e, L, place) = self.scene.body, carried_frame(self.scene), parts(state[:OWN])
-        axes, zero = frame.own_axes(place), jnp.zeros_like(state[0])
-        velocity = (*u, -body.offset * axis_rate(body, e, L)[2])
-        centre = sum_vectors(place[:3], scale(body.radius, axes[2]))
-        s = sum_vectors(centre, scale(-body.offset, unseen(e, axes)))
-        flies = in_flight(s, axes, FreeBody(velocity, zero, e, L))
-        if self.rides:
-            across = unseen(tuple(state[OWN + k] for k in range(3)), axes)
-            flies = jnp.concatenate([flies, jnp.stack(across), state[OWN + 3 :]])
-        ends = self.scene.dynamics.loss(state[:OWN]) > 0
+        ends, zero = self.scene.dynamics.loss(state[:OWN]) > 0, jnp.zeros_like(state[0])
         return Passage(
             phase=jnp.where(ends, SLIDING, FLYING),
-            state=jnp.where(ends, state, flies),
+            state=jnp.where(ends, state, parted(self.scene, state, self.rides)),
             elapsed=zero,
             status=jnp.where(ends, GUARD_LOST, RUNNING),
             crossing_time=jnp.full_like(zero, jnp.inf),
             counts=(~ends).astype(int)[None],
         )
+
+
+def parted(scene: Scene, state: Float[Array, "components cells"], rides: bool) -> Float[Array, "components cells"]:
+    """The state of flight of a top that has lost the contact in which its state is given, with what rides along if any."""
+    body, frame, (u, e, L, place) = scene.body, carried_frame(scene), parts(state[:OWN])
+    axes = frame.own_axes(place)
+    velocity = (*u, -body.offset * axis_rate(body, e, L)[2])
+    centre = sum_vectors(place[:3], scale(body.radius, axes[2]))
+    s = sum_vectors(centre, scale(-body.offset, unseen(e, axes)))
+    flies = in_flight(s, axes, FreeBody(velocity, jnp.zeros_like(state[0]), e, L))
+    if not rides:
+        return flies
+    across = unseen(tuple(state[OWN + k] for k in range(3)), axes)
+    return jnp.concatenate([flies, jnp.stack(across), state[OWN + 3 :]])
 
 
 class Fly(AbstractFlyingPhase):
@@ -237,7 +243,8 @@ class Fly(AbstractFlyingPhase):
         speed = jnp.maximum(-gap_rate(scene.body, ball, free), 0.0)
         bounce = zero if scene.restitution is None else scene.restitution + zero
         rebounds = bounce * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
-        struck, fails = strike(scene.body, scene.friction, ball, free, jnp.where(rebounds, bounce, 0.0))
+        blow = strike_exactly if scene.friction.set_valued else strike
+        struck, fails = blow(scene.body, scene.friction, ball, free, jnp.where(rebounds, bounce, 0.0))
         # Where the landing was located a little below the arena, the next flight would end where it begins.
         lifted = tuple(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
         after = jnp.where(rebounds, in_flight(lifted, ground.axes, struck), in_contact(ground, struck))

@@ -1,4 +1,4 @@
-"""One run through contacts, flights and impacts on an arena that is no level plane, with its path."""
+"""One run through contacts, flights and impacts, with its path, where flights are integrated."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.derivatives import phased_samples
-from nonholonomic.integration import Settings, follow_phases
+from nonholonomic.integration import BETWEEN, Piece, Settings, follow_phases
 
 from ..dynamics import LOSSES, NO_COSINE
 from ..inversion import InversionProblem
@@ -19,6 +19,7 @@ from ..sampled import TrajectoryProblem
 from ..scene import Scene
 from ..state import parts
 from .airborne import FLYING, phases
+from .airborne_stick_slip import phases as stick_slip_phases
 from .flight_trajectory import STATUS, HybridTrajectory, flights_of, sampled_flights
 
 
@@ -56,28 +57,49 @@ class ArenaTrajectory(HybridTrajectory):
         return -1 * ((numbers == FLYING) | (numbers < 0))
 
 
+class StickSlipArenaTrajectory(ArenaTrajectory):
+    """An `ArenaTrajectory` under Coulomb's law as it stands; `stats` holds `sticks` too, how often a slip has turned into
+    rolling."""
+
+    @staticmethod
+    def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
+        # Between two phases a slip begins.
+        return -1 * (numbers == FLYING)
+
+    @staticmethod
+    def work_in(piece: Piece) -> float:
+        if piece.number == BETWEEN:
+            return float(np.diff(piece.at(np.array([piece.begin, piece.end]))[18])[0])
+        return ArenaTrajectory.work_in(piece)
+
+
 def arena_phases(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "19 1"]]:
     """The phases of one launch of a hybrid scene on any arena, the number of the first, and the state there.
 
-    **Arguments:** `modules`: scene and launch; `tolerance`: no phase needs it.
+    **Arguments:** `modules`: scene and launch; `tolerance`: relative, of the integration.
     """
     run = TrajectoryProblem.of(*modules)
     state, scales = run.start()
     problem = InversionProblem(modules[0].dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
-    return (*phases(modules[0], problem, tolerance, last=False, rides=True), state[:, None])
+    of_law = stick_slip_phases if modules[0].friction.set_valued else phases
+    return (*of_law(modules[0], problem, tolerance, last=False, rides=True), state[:, None])
 
 
 def simulate_airborne(
     scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver
 ) -> ArenaTrajectory:
-    """Run one launch of a hybrid scene that is not on a level plane. **Arguments:** as for `simulate`, checked."""
+    """Run one launch of a hybrid scene whose flights are integrated. **Arguments:** as for `simulate`, checked."""
     kinds, first, state = arena_phases((scene, launch), tolerance)
-    path = follow_phases(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1)
+    exact = scene.friction.set_valued
+    path = follow_phases(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1 + exact)
     status = STATUS[path.status]
     if status == "jammed":
         status = LOSSES[int(scene.dynamics.loss(jnp.asarray(path.state[:14])))]
     hops = np.array([(one.begin, one.end) for one in path.stays if one.number == FLYING]).reshape(-1, 2)
-    return flights_of(ArenaTrajectory, scene, path, status, hops, times)
+    run = flights_of(StickSlipArenaTrajectory if exact else ArenaTrajectory, scene, path, status, hops, times)
+    if exact:
+        run.stats["sticks"] = int(path.counts[1])
+    return run
 
 
 def sampled_airborne(scene: Scene, launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:

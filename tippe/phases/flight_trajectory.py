@@ -16,6 +16,7 @@ from nonholonomic.integration import (
     REACHED_END,
     UNRESOLVED,
     PhasedPath,
+    Piece,
     Settings,
     follow_phases,
 )
@@ -135,6 +136,11 @@ class HybridTrajectory(AbstractTrajectory):
         return shown[:8], shown[8:13], shown[13], shown[14], shown[15:]
 
     @staticmethod
+    def work_in(piece: Piece) -> float:
+        """The work [J] of friction in a piece of the path, that of impacts apart."""
+        return 0.0 if piece.number == BETWEEN else piece.motion.states[-1, -1] - piece.motion.states[-1, 0]
+
+    @staticmethod
     def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
         """Which sphere touches, for the numbers of the phases."""
         return numbers
@@ -200,7 +206,7 @@ def flights_of(
     states, place, spin_angle, work, distance = kind.parts_of(path.at(shown))
     ends = (status, path.end_time, {}, path, distance, kind.touching(path.numbers(shown)), hops)
     run = kind(shown, scene, states, place, spin_angle, work, *ends)
-    in_contact = sum(one.motion.states[-1, -1] - one.motion.states[-1, 0] for one in path.stays)
+    in_contact = sum(kind.work_in(one) for one in path.pieces)
     # What is left of the work is that of the impacts.
     run = run.with_stats(path, impact_loss=float(in_contact - path.state[-1]))
     return run if times is None else run.resampled(np.asarray(times)[np.asarray(times) <= run.end_time])

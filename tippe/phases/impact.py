@@ -1,16 +1,18 @@
-"""Impact of a sphere of the top on the plane, with the scene's own friction (Routh's incremental method).
+"""Impact of a sphere of the top on the plane, with the scene's own friction, torque included (Routh's incremental method).
 
-During an impact the configuration stands still and the contact force f N acts as in contact, f being the scene's friction per
-unit normal force: with the normal impulse p in place of time, d(tangential impulse)/dp = f(slip), the slip changing with
-the impulses (Routh, Dynamics of a System of Rigid Bodies, 1905, art. 198; Stronge, Impact Mechanics, ch. 4). It is the
-limit of a stiff contact with the same law, and so needs no law of its own: a stop of the slip, a reversal, and friction
-that depends on the speed come out by themselves. Newton's restitution e_N says when it ends: once the velocity along the normal
-is e_N times the speed of approach. With friction Newton's rule may ask for more energy than there was (Stronge, section 3.3);
-the impact then ends earlier, where the kinetic energy is what it was before.
+During an impact the configuration stands still and the contact load acts as in contact, f and tau being the scene's
+friction force and torque per unit normal force: with the normal impulse p in place of time, d(tangential impulse)/dp =
+f and d(impulse of the torque)/dp = tau, slip and angular velocity changing with the impulses (Routh, Dynamics of a
+System of Rigid Bodies, 1905, art. 198; Stronge, Impact Mechanics, ch. 4). It is the limit of a stiff contact with the
+same law, and so needs no law of its own: a stop of the slip, a reversal, and friction that depends on the speed come
+out by themselves. Newton's restitution e_N says when it ends: once the velocity along the normal is e_N times the speed
+of approach. With friction Newton's rule may ask for more energy than there was (Stronge, section 3.3); the impact then
+ends earlier, where the kinetic energy is what it was before.
 
 There is always an end. Strong friction can pull the sphere into the plane faster than the impulse pushes it out (a jam), so
 the velocity along the normal is no clock. But friction only takes energy, the slip comes to an end, and a contact that does
-not slip is pushed out, because the response to an impulse is positive definite.
+not slip is pushed out, because the response to an impulse is positive definite. So it is with a torque, which only takes
+energy too: velocity and angular velocity of the contact respond to force and torque by a positive definite matrix.
 """
 
 from typing import NamedTuple
@@ -23,7 +25,7 @@ from jaxtyping import Array, Bool, Float
 from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
 from nonholonomic.integration import GUARD_LOST, AbstractProblem, Settings, traced_march
 
-from ..friction import AbstractFriction, Slip
+from ..friction import AbstractFriction, ContactLoad, Slip
 from ..state import angular_velocity
 from ..top import Top
 from .free_body import Ball, FreeBody
@@ -44,23 +46,36 @@ MOST_STEPS = 100_000
 class Approach(NamedTuple):
     """A sphere about to strike: from the centre of mass to the contact point [m], velocity of that point [m/s].
 
-    `response` is the symmetric matrix W with (change of that velocity) = W (impulse) [1/kg], as three columns.
+    `response` is the symmetric matrix W with (change of that velocity) = W (impulse) [1/kg], as three columns. `axis` is that
+    of the body; `turning` its angular velocity [rad/s].
     """
 
     arm: Vector
     velocity: Vector
     response: tuple[Vector, Vector, Vector]
+    axis: Vector
+    turning: Vector
+
+
+class Blow(NamedTuple):
+    """Impulses at the contact: of the force [N s], and of the torque [N m s], `None` under a law that has no torque."""
+
+    force: Vector
+    torque: Vector | None
 
 
 class Impact(AbstractProblem):
-    """Impacts, with the normal impulse as the time and the tangential impulse as the state.
+    """Impacts, with the normal impulse as the time; the state is the tangential impulse and, where there is one, that of the
+    torque.
 
-    Both are in units of the impulse that would stop the sphere if there were no friction. `gained` is the velocity along the
-    normal [m/s] by which the impact is over.
+    Both are in units of the impulse that would stop the sphere if there were no friction, and of that times the sphere's
+    radius. `gained` is the velocity along the normal [m/s] by which the impact is over.
     """
 
+    body: Top
     friction: AbstractFriction
     approach: Approach
+    radius: Float[Array, "..."]
     gained: Cells
 
     @property
@@ -68,43 +83,62 @@ class Impact(AbstractProblem):
         """Speed along the normal before the impact [m/s]; positive, because a sphere at rest has none to be measured by."""
         return jnp.maximum(jnp.abs(self.approach.velocity[2]), 1e-12)
 
-    def impulse(self, normal: Cells, tangential: Float[Array, "2 cells"]) -> Vector:
-        """The impulse [N s] at a stage of the impact."""
+    def blow(self, normal: Cells, state: Float[Array, "rows cells"]) -> Blow:
+        """The impulses at a stage of the impact."""
         unit = self.speed / self.approach.response[2][2]
-        return (tangential[0] * unit, tangential[1] * unit, normal * unit)
+        force = (state[0] * unit, state[1] * unit, normal * unit)
+        return Blow(force, tuple(row * unit * self.radius for row in state[2:]) or None)
 
-    def start(self) -> tuple[Float[Array, "2 cells"], Float[Array, "2 cells"]]:
-        none = jnp.zeros((2, *self.gained.shape))
+    def changes(self, blow: Blow) -> tuple[Vector, Vector]:
+        """How the velocity of the contact point [m/s] and the angular velocity [rad/s] change by a blow."""
+        meets, torque = self.approach, cross(self.approach.arm, blow.force)
+        velocity = tuple(dot(column, blow.force) for column in meets.response)
+        if blow.torque is not None:
+            turned = angular_velocity(self.body, meets.axis, blow.torque)
+            velocity = sum_vectors(velocity, cross(turned, meets.arm))
+            torque = sum_vectors(torque, blow.torque)
+        return velocity, angular_velocity(self.body, meets.axis, torque)
+
+    def load(self, velocity: Vector, turning: Vector) -> ContactLoad:
+        """What friction does per unit normal impulse."""
+        drilling = turning[2] if self.friction.drills else None
+        return self.friction.per_normal_force(Slip(velocity[0], velocity[1], (turning[0], turning[1], drilling)))
+
+    def start(self) -> tuple[Float[Array, "rows cells"], Float[Array, "rows cells"]]:
+        turns = self.load(self.approach.velocity, self.approach.turning).torque != (None, None, None)
+        none = jnp.zeros((5 if turns else 2, *self.gained.shape))
         return none, jnp.ones_like(none)
 
-    def field(self, time: Cells, state: Float[Array, "2 cells"]) -> Float[Array, "2 cells"]:
-        impulse = self.impulse(time, state)
-        changes = [dot(self.approach.response[i], impulse) for i in (0, 1)]
-        slip = Slip(*(before + change for before, change in zip(self.approach.velocity[:2], changes, strict=True)))
-        force = self.friction.per_normal_force(slip).force
-        return jnp.stack([jnp.zeros_like(time) if component is None else component for component in force])
+    def field(self, time: Cells, state: Float[Array, "rows cells"]) -> Float[Array, "rows cells"]:
+        meets, (velocity, turning) = self.approach, self.changes(self.blow(time, state))
+        load = self.load(sum_vectors(meets.velocity, velocity), sum_vectors(meets.turning, turning))
+        torque = scale(1.0 / self.radius, load.torque) if len(state) > 2 else ()
+        rows = [jnp.zeros_like(time) if component is None else component for component in (*load.force, *torque)]
+        return jnp.stack(jnp.broadcast_arrays(*rows, time)[:-1])
 
-    def crossing(self, state: Float[Array, "2 cells"]) -> None:
+    def crossing(self, state: Float[Array, "rows cells"]) -> None:
         return None
 
-    def guard(self, time: Cells, state: Float[Array, "2 cells"]) -> Cells:
-        impulse, response = self.impulse(time, state), self.approach.response
-        change = tuple(dot(column, impulse) for column in response)
+    def guard(self, time: Cells, state: Float[Array, "rows cells"]) -> Cells:
+        blow, response = self.blow(time, state), self.approach.response
+        change, turned = self.changes(blow)
         missing = (self.gained - change[2]) / self.speed
         # In compression the sphere still approaches; in restitution the energy that was lost is not to come back in full.
         approaches = -(self.approach.velocity[2] + change[2]) / self.speed
-        gain = dot(impulse, self.approach.velocity) + 0.5 * dot(impulse, change)
+        gain = dot(blow.force, self.approach.velocity) + 0.5 * dot(blow.force, change)
+        if blow.torque is not None:
+            gain = gain + dot(blow.torque, self.approach.turning) + 0.5 * dot(blow.torque, turned)
         return jnp.minimum(missing, jnp.maximum(approaches, -gain * response[2][2] / self.speed**2))
 
-    def ended(self, time: Cells, state: Float[Array, "2 cells"]) -> Vector:
-        """The impulse [N s] of an impact whose end has been located: put right by one step of Newton's method.
+    def ended(self, time: Cells, state: Float[Array, "rows cells"]) -> Blow:
+        """The impulses of an impact whose end has been located: put right by one step of Newton's method.
 
         The search leaves an error of 1e-10, its square is round-off.
         """
         left, slope = jax.jvp(self.guard, (time, state), (jnp.ones_like(time), self.field(time, state)))
         step = -left / jnp.where(slope == 0.0, 1.0, slope)
         step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
-        return self.impulse(time + step, state + step * self.field(time, state))
+        return self.blow(time + step, state + step * self.field(time, state))
 
 
 def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
@@ -125,7 +159,8 @@ def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
         turned = angular_velocity(body, free.axis, cross(arm, impulse))
         return sum_vectors(scale(1.0 / body.mass, impulse), cross(turned, arm))
 
-    return Approach(arm, velocity, (gained((one, zero, zero)), gained((zero, one, zero)), gained((zero, zero, one))))
+    response = (gained((one, zero, zero)), gained((zero, one, zero)), gained((zero, zero, one)))
+    return Approach(arm, velocity, response, free.axis, turning)
 
 
 def strike(
@@ -133,7 +168,7 @@ def strike(
 ) -> tuple[FreeBody, Bool[Array, " cells"]]:
     """The body after a sphere of it has struck the plane; unchanged where the sphere does not approach the plane.
 
-    The impulse acts at the contact point, so Jellett's quantity of that sphere stays as it is.
+    An impulse at the contact point leaves Jellett's quantity of that sphere as it is; that of a torque changes it.
 
     **Arguments:**
 
@@ -145,7 +180,7 @@ def strike(
     """
     meets = approach(body, ball, free)
     gained = (1.0 + restitution) * jnp.maximum(-meets.velocity[2], 0.0)
-    problem = Impact(friction, meets, gained)
+    problem = Impact(body, friction, meets, ball.radius, gained)
     cells = gained.shape[0]
     outcome, _ = traced_march(
         problem,
@@ -153,7 +188,13 @@ def strike(
         jnp.asarray(cells),
         Settings(TOLERANCE, diffrax.Dopri5(), absolute=1.0, max_steps=MOST_STEPS),
     )
-    impulse = problem.ended(outcome.end_time, outcome.state)
-    velocity = sum_vectors(free.velocity, scale(1.0 / body.mass, impulse))
-    momentum = sum_vectors(free.momentum, cross(meets.arm, impulse))
-    return FreeBody(velocity, free.height, free.axis, momentum), outcome.status != GUARD_LOST
+    return struck(body, meets, free, problem.ended(outcome.end_time, outcome.state)), outcome.status != GUARD_LOST
+
+
+def struck(body: Top, meets: Approach, free: FreeBody, blow: Blow) -> FreeBody:
+    """A free body after a blow at its contact."""
+    velocity = sum_vectors(free.velocity, scale(1.0 / body.mass, blow.force))
+    momentum = sum_vectors(free.momentum, cross(meets.arm, blow.force))
+    if blow.torque is not None:
+        momentum = sum_vectors(momentum, blow.torque)
+    return FreeBody(velocity, free.height, free.axis, momentum)

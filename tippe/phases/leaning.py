@@ -9,9 +9,10 @@ b = L.e,
 and the slip of sphere j is v_j = u + (s R_j + W a_j) n x e. With the friction f_j per unit normal force, each from its own
 slip, nothing lifts the centre of mass and nothing raises the axis if
 
-    N_0 + N_1 = m g,   N_0 m_0 + N_1 m_1 = -A W (1 - c^2),   m_j = a_j (1 - c^2) + h f_j.e.
+    N_0 + N_1 = m g,   N_0 m_0 + N_1 m_1 = -A W (1 - c^2),   m_j = a_j (1 - c^2) + h f_j.e - tau_j.(n x e),
 
-Then m u' = N_0 f_0 + N_1 f_1, and with t_j = N_j f_j.(n x e) the momenta change by p' = sum a_j t_j and b' = sum R_j t_j.
+with tau_j the torque per unit normal force of a law that has one. Then m u' = N_0 f_0 + N_1 f_1, and with t_j = f_j.(n x e)
+the momenta change by p' = sum N_j (a_j t_j + tau_j.n) and b' = sum N_j (R_j t_j + tau_j.e).
 
 The slips differ across the direction of leaning only. So m_1 - m_0 is (a_1 - a_0) (1 - c^2) without friction and with
 viscous friction; Coulomb's law can make it vanish if mu h is more than (a_1 - a_0) sin theta. The first of two normal
@@ -89,11 +90,12 @@ class LeaningDynamics(eqx.Module):
         precession = (p - c * along) / I1
         rolling = along / I1 + (1.0 / I3 - 1.0 / I1) * b
 
-        slips = [Slip(*sum_vectors(u, scale(rolling * R + precession * a, across))) for a, R in spheres]
+        turning = (rolling * e[0], rolling * e[1], rolling * c + precession if self.friction.drills else None)
+        slips = [Slip(*sum_vectors(u, scale(rolling * R + precession * a, across)), turning) for a, R in spheres]
         loads = [self.friction.per_normal_force(slip) for slip in slips]
         height = spheres[0].radius - spheres[0].offset * c
         m_0, m_1 = (
-            add(ball.offset * sine2, multiply(height, dot(load.force, e[:2])))
+            subtract(add(ball.offset * sine2, multiply(height, dot(load.force, e[:2]))), dot(across, load.torque[:2]))
             for ball, load in zip(spheres, loads, strict=True)
         )
         weight = m * self.gravity
@@ -101,9 +103,10 @@ class LeaningDynamics(eqx.Module):
         normal = (weight - N_1, N_1)
 
         u_dot = scale(1.0 / m, sum_vectors(*(scale(N, load.force) for N, load in zip(normal, loads, strict=True))))
-        turning = [multiply(N, dot(across, load.force)) for N, load in zip(normal, loads, strict=True)]
-        p_dot = dot(tuple(ball.offset for ball in spheres), tuple(turning))
-        b_dot = dot(tuple(ball.radius for ball in spheres), tuple(turning))
+        pulls = [dot(across, load.force) for load in loads]
+        each = list(zip(spheres, pulls, loads, strict=True))
+        p_dot = dot(normal, tuple(add(multiply(ball.offset, t), load.torque[2]) for ball, t, load in each))
+        b_dot = dot(normal, tuple(add(multiply(ball.radius, t), dot(load.torque, e)) for ball, t, load in each))
         # L turns with the axis, whatever part of it is across; so b changes by its rate and by no more.
         growth = multiply(1.0 / sine2, subtract(b_dot, multiply(c, p_dot)))
         L_dot = sum_vectors(scale(growth, e[:2]), (-precession * L[1], precession * L[0]))

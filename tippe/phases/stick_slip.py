@@ -8,6 +8,7 @@ slip is begun by a step of its own (`onset.py`), whose estimated error is within
 (`tests/physics/test_stick_slip.py` has the figures).
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.geometry import AbstractFrame
 
 from ..dynamics import FITS, Dynamics, Motion, stacked
-from ..friction import AbstractFriction, SetValuedCoulomb, Slip, length
+from ..friction import AbstractFriction, Frictionless, SetValuedCoulomb, Slip, length
 from ..top import Top
 from .onset import Onset, begin
 from .rolling import RollingDynamics
@@ -115,6 +116,13 @@ class StickSlip(eqx.Module):
         nothing = jnp.zeros_like(state[0])
         return self.rolling.with_slip(state, Slip(nothing, nothing))
 
+    def lifts_off(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
+        """Where a contact at rest parts at once: without a force at the contact point, the arena need not push.
+
+        Unless the contact jams, the normal force of rolling's end, of the slip that follows and of no friction have one sign.
+        """
+        return dataclasses.replace(self.slipping, friction=Frictionless()).motion(state).normal_force <= 0.0
+
     def grip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """What a rolling top has left before it slips, as a fraction of the weight."""
         return self.rolling.grip(state, self.mu) + ROUNDING
@@ -207,9 +215,9 @@ class Kind(eqx.Module):
         nothing = jnp.zeros_like(own[0])
         if self.rolls:
             holds = nothing > 0.0
-            # What ended is either the grip or the room.
-            room = both.rolling.motion(own).room
-            lost = holds if room is None else room - FITS <= both.grip_left(own)
+            # What ended is either the grip or the room; or there was no contact to begin with, as behind an impact.
+            room, lost = both.rolling.motion(own).room, both.lifts_off(still)
+            lost = lost if room is None else lost | (room - FITS <= both.grip_left(own))
             wait = nothing
         else:
             holds = both.rolling.grip(still, both.mu) >= 0.0

@@ -1,0 +1,171 @@
+"""Flights under exact Coulomb friction: impacts that stick or slip on, and motions that slip, roll and fly."""
+
+import diffrax
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from close import assert_close
+from coulomb_top import Body, start
+from exact_hop_reference import follow
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from impact_reference import Body as Solid
+from impact_reference import Law
+from impact_reference import strike as reference_strike
+from test_strong_friction import random_falls
+from tops import homogeneous_ball
+
+import tippe
+from tippe.phases.airborne import FLYING
+from tippe.phases.airborne_stick_slip import ROLLING, SLIPPING
+from tippe.phases.exact_impact import strike_exactly
+from tippe.phases.free_body import balls, energy, gap_rate
+from tippe.phases.impact import approach
+from tippe.state import angular_velocity
+
+NUMBERS, MU, THETA, SPIN, T1 = (0.02, 0.02, 0.016, 1.6e-6, 1.9e-6), 0.5, 1.5, 350.0, 0.276
+
+struck = eqx.filter_jit(
+    lambda falls: strike_exactly(
+        falls.body, tippe.SetValuedCoulomb(falls.friction.mu), balls(falls.body)[0], falls.free, falls.restitution
+    )
+)
+
+
+@pytest.mark.slow
+def test_impacts_that_stick_or_slip_on():
+    """Of 1000 a third sticks; against an independent program with next to no slip speed, also where the slip turns round."""
+    falls = random_falls(0.0, 1.0)
+    after, fails = struck(falls)
+    assert not np.asarray(fails).any()
+    ball, free = balls(falls.body)[0], falls.free
+    gain = np.asarray(energy(falls.body, 9.81, after)) / np.asarray(energy(falls.body, 9.81, free))
+    assert np.max(gain) < 1.0 + 1e-13
+    slip = np.hypot(*np.asarray(approach(falls.body, ball, after).velocity)[:2])
+    # What sticks has no slip but for round-off.
+    assert not np.any((slip > 1e-12) & (slip < 1e-6))
+    assert 0.2 < np.mean(slip < 1e-12) < 0.5
+    rebound, arrival = np.asarray(gap_rate(falls.body, ball, after)), -np.asarray(gap_rate(falls.body, ball, free))
+    falling = np.flatnonzero(arrival > 1e-3)
+    assert np.all((rebound > -1e-13)[falling])
+    assert np.all((rebound <= falls.restitution * arrival + 1e-13)[falling])
+    velocity, turning = np.stack(after.velocity), np.stack(angular_velocity(falls.body, after.axis, after.momentum))
+    for i in falling[:15]:
+        body = Solid(*(float(getattr(falls.body, name)[i]) for name in Solid._fields))
+        motion = falls.axis[:, i], falls.velocity[:, i], falls.turning[:, i]
+        speed = np.linalg.norm(motion[1]) + body.radius * np.linalg.norm(motion[2])
+        expected = reference_strike(body, *motion, Law(float(falls.friction.mu[i]), 1e-9 * speed), falls.restitution[i])
+        # In proportion to the slip speed of the reference; the greatest difference seen is 5e-10.
+        assert_close(velocity[:, i], expected.velocity, atol=3e-9 * speed)
+        assert_close(turning[:, i], expected.turning, atol=3e-9 * speed / body.radius)
+
+
+def scene_of(arena: float | None, mu: float = MU, restitution: float = 0.0) -> tippe.Scene:
+    surface = tippe.Plane() if arena is None else tippe.Sphere(arena)
+    law = tippe.SetValuedCoulomb(mu)
+    return tippe.Scene(tippe.Top(*NUMBERS), surface, law, contact="hybrid", restitution=restitution)
+
+
+def check_against_reference(run: tippe.HybridTrajectory, arena: float | None) -> list[int]:
+    """Phase by phase, and at the end; returns the numbers of the phases."""
+    scene, curved = run.scene, (0.0, 0.0, 0.0) if arena is None else (1.0, 1.0, 1.0)
+    body = Body(*NUMBERS, float(scene.friction.mu), 9.81, arena, curved)
+    restitution = 0.0 if scene.restitution is None else float(scene.restitution)
+    expected = follow(body, start(body, THETA, SPIN), T1, restitution)
+    kinds = {"slipping": SLIPPING, "rolling": ROLLING, "flying": FLYING}
+    # The reference follows the beginning of a slip by another method, and has no bounces that are too short to see.
+    events = [one for k, one in enumerate(expected[1:]) if one.kind != expected[k].kind]
+    stays = run.dense.stays
+    numbers = [piece.number for piece in stays]
+    assert numbers == [kinds[one.kind] for one in (expected[0], *events)]
+    begins = {piece.begin if piece.number != SLIPPING else None for piece in stays[1:]} - {None}
+    for before, one in zip(expected, expected[1:], strict=False):
+        if one.kind not in ("slipping", before.kind):
+            # A slip is stopped where the way that is left is within the tolerance, earlier by its speed over its deceleration.
+            early = 1e-6 if (before.kind, one.kind) == ("slipping", "rolling") else 2e-9
+            assert min(abs(one.begin - time) for time in begins) < early
+    assert_close(run.axis[-1], expected[-1].state[:3], atol=2e-8)
+    assert_close(run.position[-1] - run.position[0], expected[-1].state[9:] - start(body, THETA, SPIN)[9:], atol=1e-9)
+    assert_close(run.spin[-1], expected[-1].state[6:9] @ expected[-1].state[:3], rtol=1e-8)
+    return numbers
+
+
+@pytest.mark.parametrize("arena", [0.2, pytest.param(None, marks=pytest.mark.slow)], ids=["sphere", "plane"])
+def test_a_top_that_slips_flies_sticks_and_rolls(arena):
+    """In a sphere it slips, flies, lands slipping, flies, and sticks as it lands, rolls and slips again; on the plane too."""
+    run = tippe.simulate(scene_of(arena), tippe.Launch(THETA, SPIN), T1, tolerance=1e-9, solver=diffrax.Tsit5())
+    assert run.status == "reached t1"
+    numbers = check_against_reference(run, arena)
+    assert numbers[:4] == [SLIPPING, FLYING, SLIPPING, FLYING]
+    assert numbers[-2:] == [ROLLING, SLIPPING] if arena else [SLIPPING, ROLLING]
+    assert len(run.hops) == 2
+    # A stop takes what is left of a slip, within the tolerance.
+    assert np.max(np.diff(run.energy)) < 1e-10 * run.energy[0]
+    assert run.stats["energy_residual"] < 1e-9 * run.energy[0]
+    assert 0.05 < run.stats["impact_loss"] / run.energy[0] < 0.2
+    aloft = run.contact < 0
+    assert_close(run.normal_force[aloft], 0.0)
+    assert_close(run.distance[0][~aloft], 0.0, atol=1e-12)
+    rolls = (run.t > run.dense.stays[-2].begin) & (run.t < run.dense.stays[-2].end)
+    if arena:
+        assert rolls.any()
+        assert_close(run.slip[rolls], 0.0, atol=1e-12)
+
+
+@pytest.mark.slow
+@settings(max_examples=12, deadline=None)
+@given(
+    theta=st.floats(0.2, 2.9),
+    spin=st.floats(-400.0, 400.0),
+    mu=st.floats(0.05, 1.0),
+    restitution=st.floats(0.1, 1.0),
+)
+def test_any_motion_is_finite_or_flagged(theta, spin, mu, restitution):
+    """Energy never grows, nothing enters the arena and nothing pulls."""
+    scene = scene_of(0.2, mu, restitution)
+    run = tippe.simulate(scene, tippe.Launch(theta, spin), 0.2, tolerance=1e-8, solver=diffrax.Tsit5())
+    assert run.status in ("reached t1", "failed", "jammed", "unresolved")
+    assert np.isfinite(run.states).all()
+    assert np.max(np.diff(run.energy)) < 1e-8 * run.energy[0]
+    assert np.min(run.distance[0]) > -1e-9
+    assert np.min(run.normal_force) > -1e-6 * 0.02 * 9.81
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("speed", "word"), [(1.0, "reached t1"), (3.0, "contact_lost")])
+def test_a_contact_at_rest_that_need_not_push_parts_at_once(speed, word):
+    """A ball that rolls over the top of a sphere: it parts where V^2 / (rho + R) is more than g, at 1.77 m/s."""
+    ball = homogeneous_ball()
+    scene = tippe.Scene(ball, tippe.Sphere(0.3), tippe.SetValuedCoulomb(0.3), side="outside")
+    launch = tippe.Launch(
+        0.0, 0.0, place=(0.0, 0.0, 0.3), velocity=(speed, 0.0), angular_velocity=(0.0, speed / 0.02, 0.0)
+    )
+    run = tippe.simulate(scene, launch, 0.01, tolerance=1e-9, solver=diffrax.Tsit5())
+    assert run.status == word
+    assert run.end_time == (0.01 if speed == 1.0 else 0.0)
+
+
+def test_what_has_no_single_answer_is_refused():
+    stem = tippe.Top(6e-3, 0.015, 3e-3, 8e-7, 7e-7, stem=tippe.Stem(radius=5e-3, offset=0.016))
+    with pytest.raises(
+        ValueError, match="must be a law without phases for a top with a stem, such as Coulomb: which of"
+    ):
+        tippe.Scene(stem, friction=tippe.SetValuedCoulomb(0.3), contact="hybrid")
+    scene, message = scene_of(0.2), "SetValuedCoulomb with contact = 'hybrid' has no derivatives"
+    with pytest.raises(ValueError, match=message):
+        tippe.inversion_table(scene, theta=1.5, spin=350.0, t1=0.1, sensitivities=["spin"])
+    with pytest.raises(ValueError, match=message):
+        jax.grad(lambda spin: tippe.inversion_time(scene, tippe.Launch(1.5, spin), 0.1))(350.0)
+
+
+@pytest.mark.slow
+def test_tables_go_through_flights_and_sticking():
+    """The times at which single runs are, and an error beside them."""
+    scene, options = scene_of(0.2), {"t1": 0.28, "tolerance": 1e-9, "solver": diffrax.Tsit5()}
+    table = tippe.inversion_table(scene, theta=THETA, spin=[300.0, SPIN], angle=2.05, **options)
+    assert list(table.status) == ["inverted", "inverted"]
+    assert (table.hops > 0).all()
+    for spin, time in zip((300.0, SPIN), table.time, strict=True):
+        run = tippe.simulate(scene, tippe.Launch(THETA, spin), times=[time], **options)
+        assert_close(run.theta, 2.05, atol=1e-7)
