@@ -92,7 +92,7 @@ def leaning_on_the_stem() -> Row:
     table = run.result
     error = abs(float(table.end_theta) - expected["end_theta"])
     happens = f"leans from {expected['leans']:.3f} to {expected['parted']:.3f} s, falls back"
-    return of_table("two spheres, 140 rad/s, 3 s", happens, error, 5e-7, "SciPy, theta [rad]", run)
+    return of_table("two spheres, 140 rad/s, 3 s", happens, error, 1e-8, "SciPy, theta [rad]", run)
 
 
 def leaning_for_ever() -> Row:

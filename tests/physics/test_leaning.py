@@ -136,6 +136,35 @@ def test_coming_to_rest_along_the_normal():
     assert_close(energy_of(scene.body, 9.81, before) - energy_of(scene.body, 9.81, after), lost, rtol=1e-8, atol=1e-17)
 
 
+def test_the_end_of_rocking():
+    """The last blows of both spheres: each impulse has its friction, both speeds end, and energy is not made.
+
+    Two tops, about to strike with one sphere and with the other: if the friction of one gave energy, that of the other
+    takes it.
+    """
+    scene = scene_of(CASES[SHORT])
+    spheres, states = balls(scene.body), leaning_states(scene.body, 50, 6)
+    free, taken = freed(scene.body, spheres[0], jnp.asarray(states)), []
+    for striking in (0, 1):
+        # The top turns about the sphere that stays.
+        stays, strikes = spheres[1 - striking], spheres[striking]
+        turned = -1e-6 / (strikes.offset - stays.offset)
+        across = np.stack([-states[3], states[2]]) / math.sin(float(first_contact(scene.body)))
+        sine2 = states[2] ** 2 + states[3] ** 2
+        tilt = turned * 8e-7 / np.sqrt(sine2)
+        momentum = (*(L - tilt * a for L, a in zip(free.momentum[:2], across, strict=True)), free.momentum[2])
+        before = FreeBody((*free.velocity[:2], -stays.offset * turned), free.height, free.axis, momentum)
+        assert_close(gap_rate(scene.body, strikes, before), -1e-6, rtol=1e-9)
+        assert_close(gap_rate(scene.body, stays, before), 0.0, atol=1e-15)
+        after, takes = leaning(scene).stopped(before)
+        assert_close([gap_rate(scene.body, ball, after) for ball in spheres], 0.0, atol=1e-15)
+        gained = energy_of(scene.body, 9.81, after) - energy_of(scene.body, 9.81, before)
+        assert np.all(np.asarray(gained)[np.asarray(takes)] < 0.0)
+        taken.append(np.asarray(takes))
+    assert np.all(taken[0] | taken[1])
+    assert not np.all(taken[0] & taken[1])
+
+
 @pytest.fixture(scope="module")
 def ride() -> tippe.HybridTrajectory:
     """A viscous top that rocks, leans for two seconds and falls back on its sphere."""
@@ -146,9 +175,10 @@ def ride() -> tippe.HybridTrajectory:
 def test_a_top_leans_and_falls_back(ride):
     """From the first moment of leaning on, the reference: when it ends, and state and work 0.5 s later."""
     case, piece = CASES[SHORT], next(piece for piece in ride.dense.pieces if piece.number == BOTH)
-    # The instant when rocking ends depends on the speed at which a contact counts as closed.
-    assert_close(piece.begin, float(REFERENCE[SHORT]["leans"]), atol=1e-5)
-    assert_close(piece.end, float(REFERENCE[SHORT]["parted"]), atol=4e-7)
+    # The blows that are not followed take 6e-5 s; what they do is done at once.
+    assert_close(piece.begin, float(REFERENCE[SHORT]["leans"]), atol=1e-4)
+    assert_close(piece.end, float(REFERENCE[SHORT]["parted"]), atol=5e-8)
+    assert_close(ride.theta[-1], float(REFERENCE[SHORT]["end_theta"]), atol=1e-9)
     start = states_of_the_reference(ride.scene, piece.motion.states[:8, :1])[:, 0]
     options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14}
     ends = [watched(lambda y, k=k: contact(case, y, case.balls)[0][k], -1.0) for k in (0, 1)]
@@ -190,11 +220,12 @@ def test_while_it_leans(ride):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [FALLS_BACK, SHORT, RISES])
 def test_tables_of_tops_that_lean(number):
-    """Through 42 to 55 changes of sphere; when the rocking ends depends on the speed at which a contact counts as closed."""
+    """Through 42 to 55 changes of sphere, most of them in the rocking that ends in leaning: the limit of the reference."""
     case, expected = CASES[number], REFERENCE[number]
     table = tippe.inversion_table(scene_of(case), theta=case.theta, spin=[case.spin], t1=case.t1, tolerance=1e-11)
     assert table.status[0] == expected["status"]
-    assert_close(table.end_theta[0], float(expected["end_theta"]), atol=1e-5)
+    # The reference knows its limit to 1e-8 where the ratio of the blows changes with the slip.
+    assert_close(table.end_theta[0], float(expected["end_theta"]), atol=5e-9)
     if np.isfinite(table.time[0]):
-        assert_close(table.time[0], float(expected["time"]), atol=1e-5)
+        assert_close(table.time[0], float(expected["time"]), rtol=1e-9)
     assert math.isfinite(float(expected["leans"]))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from close import assert_close
 from test_hops import CASES, scene_of
+from tops import rutstam_top
 
 import tippe
 
@@ -40,6 +41,33 @@ def scanned(function, at, steps):
     found = np.array(found)
     best = np.argmin(np.abs(np.diff(found, axis=0)), axis=0)
     return np.take_along_axis(found, best[None], axis=0)[0]
+
+
+def differences(scene, variable, at, step, **given):
+    """Central differences of an inversion time by one number, for that step and four more, each a tenth of the last."""
+    steps = step * 0.1 ** np.arange(5)
+    points = at + np.outer(steps, (-2, -1, 1, 2)).ravel()
+    given |= {"axes": {"scene.friction.mu": points}} if variable == "mu" else {variable: points}
+    t = tippe.inversion_table(scene, tolerance=1e-12, progress=False, **given).time.reshape(-1, 4).T
+    return (8.0 * (t[2] - t[1]) - (t[3] - t[0])) / (12.0 * steps)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("theta", "spin", "sticks"), [(0.35, 100.0, 1), (0.3, 126.0, 7), (0.3, 109.5, 28)])
+def test_a_time_through_sticks_and_slips(theta, spin, sticks):
+    """Tops in a cylinder that stick and slip until they reach 0.4 rad: the slopes by friction and by the launch."""
+    scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.2), tippe.SetValuedCoulomb(0.1))
+    given = {"theta": theta, "spin": [spin], "t1": 8.0, "angle": 0.4}
+    names = ["spin", "friction.mu", "theta"]
+    table = tippe.inversion_table(scene, sensitivities=names, tolerance=1e-10, progress=False, **given)
+    assert table.sticks[0] >= sticks
+    assert table.grazes[0] == 0
+    slopes = {"spin": table.time_by_spin, "mu": table.time_by_mu, "theta": table.time_by_theta}
+    at = {"spin": (spin, 1e-2), "mu": (0.1, 1e-4), "theta": (theta, 1e-4)}
+    for name, slope in slopes.items():
+        found = differences(scene, name, *at[name], **given)
+        best = found[np.argmin(np.abs(np.diff(found)))]
+        assert_close(np.ravel(slope)[0], best, rtol=2e-6)
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ In contact the velocity and the height of the centre of mass follow from the axi
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -15,6 +15,13 @@ from ..body import Round
 from ..dynamics import Dynamics
 from ..state import joined, parts
 from ..top import Top
+
+#: The round-off that a sphere that has just left the arena is allowed, as a fraction of R. As it is allowed to none that comes
+#: back, ten times the value and a tenth of it move no landing.
+ROUNDING = 1e-12
+
+#: A sphere comes back if it does so faster than this fraction of sqrt(g R). Until then it sinks by half the square, in R.
+COMES_BACK = 1e-8
 
 
 class Ball(NamedTuple):
@@ -92,6 +99,18 @@ def gap(ball: Ball, free: FreeBody) -> Float[Array, "..."]:
 def gap_rate(body: Top, ball: Ball, free: FreeBody) -> Float[Array, "..."]:
     """Rate of that distance [m/s]."""
     return free.velocity[2] + ball.offset * axis_rate(body, free.axis, free.momentum)[2]
+
+
+def still_parting(
+    rate: Float[Array, "..."], gravity: Float[Array, "..."], radius: Float[Array, "..."], rounding: Any = 0.0
+) -> Float[Array, "..."]:
+    """The round-off that the distance of a sphere is allowed, as a fraction of R.
+
+    It is all allowed while the sphere parts, and none when it comes back, for then it would put the landing too late.
+
+    **Arguments:** `rate`: of the distance [m/s]; `rounding`: what is allowed besides `ROUNDING`.
+    """
+    return (ROUNDING + rounding) * jnp.clip(1.0 + rate / (COMES_BACK * jnp.sqrt(gravity * radius)), 0.0, 1.0)
 
 
 def energy(body: Top, gravity: Float[Array, "..."], free: FreeBody) -> Float[Array, "..."]:

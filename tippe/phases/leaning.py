@@ -25,13 +25,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.geometry import Component, add, dot, multiply, scale, subtract, sum_vectors
+from nonholonomic.geometry import Component, add, cross, dot, multiply, scale, subtract, sum_vectors
 
 from ..dynamics import stacked
 from ..friction import AbstractFriction, Slip
-from ..state import parts
+from ..state import angular_velocity, parts
 from ..top import Top
-from .free_body import FreeBody, balls, grounded
+from .free_body import FreeBody, axis_rate, balls, gap_rate, grounded
+from .impact import approach
 
 #: The number of this kind of contact, next to those of the spheres, 0 and 1.
 BOTH = 2
@@ -127,6 +128,39 @@ class LeaningDynamics(eqx.Module):
         """The number of the sphere with the greater normal force: the one that stays when the other's vanishes."""
         N_0, N_1 = self.motion(state).normal_forces
         return (N_1 > N_0).astype(int)
+
+    def stopped(self, free: FreeBody) -> tuple[FreeBody, Bool[Array, "..."]]:
+        """The end of rocking: what all blows to come do together to a top whose spheres are both at the plane.
+
+        The top rocks from sphere to sphere, ever less, and infinitely many blows take a finite time T. Sphere j gets the
+        impulse P_j (f_j, 1), and P_j tau_j where the law has a torque, more than while it leans for T, and the sum stops both
+        speeds along the normal, g + G P = 0. In T both slips change by as little as the speeds g, so that this errs by their
+        square.
+
+        **Returns:** the body after these impulses, but for `at_rest`; and whether their friction takes energy. One P_j is
+        negative, what that sphere carries less in T; if it gives energy now, it takes some if the blow of the other sphere is
+        waited for (det G > 0).
+        """
+        spheres, zero = balls(self.body), jnp.zeros_like(free.height)
+        w1, w2, w3 = angular_velocity(self.body, free.axis, free.momentum)
+        forces, turns, gains = [], [], []
+        for ball in spheres:
+            meets = approach(self.body, ball, free)
+            slip = Slip(*meets.velocity[:2], (w1, w2, w3 if self.friction.drills else None))
+            load = self.friction.per_normal_force(slip)
+            forces.append(tuple(zero if part is None else part for part in (*load.force, 1.0 + zero)))
+            turns.append(sum_vectors(cross(meets.arm, forces[-1]), load.torque))
+            gains.append(zero if (power := load.power(slip)) is None else power)
+        speeds = [gap_rate(self.body, ball, free) for ball in spheres]
+        rates = [axis_rate(self.body, free.axis, turn)[2] for turn in turns]
+        (G_00, G_01), (G_10, G_11) = ([1.0 / self.body.mass + ball.offset * one for one in rates] for ball in spheres)
+        determinant = G_00 * G_11 - G_01 * G_10
+        per = 1.0 / jnp.where(determinant == 0.0, 1.0, determinant)
+        impulses = (per * (G_01 * speeds[1] - G_11 * speeds[0]), per * (G_10 * speeds[0] - G_00 * speeds[1]))
+        total = sum_vectors(*(scale(P, force) for P, force in zip(impulses, forces, strict=True)))
+        velocity = sum_vectors(free.velocity, scale(1.0 / self.body.mass, total))
+        momentum = sum_vectors(free.momentum, *(scale(P, turn) for P, turn in zip(impulses, turns, strict=True)))
+        return FreeBody(velocity, free.height, free.axis, momentum), dot(impulses, tuple(gains)) <= 0.0
 
     def settled(self, free: FreeBody) -> tuple[FreeBody, Int[Array, "..."], Bool[Array, "..."]]:
         """What holds a top at rest along the normal whose spheres are both at the plane.

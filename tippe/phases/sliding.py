@@ -28,21 +28,20 @@ from nonholonomic.integration import (
 from ..dynamics import COS_THETA, Dynamics, stacked
 from ..inversion import InversionProblem
 from ..scene import Scene
+from ..state import parts
 from ..top import Top
 from .flight import angle_reached, carried_aloft, cone, flown, fly
 from .flying_phase import AbstractFlyingPhase
-from .free_body import Ball, FreeBody, balls, energy, freed, gap, gap_rate, grounded, shown, standing_on
+from .free_body import Ball, FreeBody, balls, energy, freed, gap, gap_rate, grounded, shown, standing_on, still_parting
 from .impact import strike
 from .leaning import LeaningDynamics, at_rest
 
 Cells = Float[Array, " cells"]
 
-#: A rebound slower than this fraction of sqrt(g R) is none: the contact closes. Its height would be half the square of it, in
-#: R. A top that rocks from one sphere to the other, ever less, comes to lean on both. Where a top only bounces, ten times the
-#: value moves inversion times by 3e-12 and a tenth by 6e-14. Where it comes to lean the error is of first order, for the
-#: blows that are left out have friction too: an inversion after 7.3 s is late by 2.9e-7 of that, by 2.9e-6 with ten times the
-#: value. A lower value needs less round-off in `clearance`: 1e-7 with 1e-15 leaves 3e-9; 1e-6 with the 1e-12 there never
-#: closes.
+#: A rebound slower than this fraction of sqrt(g R) is none: the contact closes. In the time T that the bounces to come would
+#: take, the sliding top gets the impulse that they would give it, so the error is as small as its square: ten times the value
+#: moves inversion times by 3e-12 of themselves where a top bounces, and by 4e-11 where it rocks from sphere to sphere, ever
+#: less, until it leans on both (`LeaningDynamics.stopped`); the value itself errs by 3e-13. Contact begins too early by T.
 CLOSING_SPEED = 1e-5
 
 #: Two spheres are at the plane together if neither is farther from it than this fraction of R. Ten times the value and a
@@ -93,17 +92,20 @@ class Sliding(AbstractProblem):
         margin = self.dynamics.contact_margin(state)
         if self.own is None or self.other is None:
             return margin
-        return jnp.minimum(margin, clearance(self.own, self.other, state))
+        assert isinstance(self.dynamics, Dynamics)
+        return jnp.minimum(margin, clearance(self.dynamics, self.own, self.other, state))
 
 
-def clearance(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-    """Distance of the other sphere from the plane as a fraction of the own radius, plus the round-off of a change of spheres.
+def clearance(dynamics: Dynamics, own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    """Distance of the other sphere from the plane as a fraction of the own radius, plus the round-off of a parting."""
+    _, e, L, _ = parts(state[:OWN])
+    rate = (other.offset - own.offset) * dynamics.per_transverse * (L[0] * e[1] - L[1] * e[0])
+    return height(own, other, state) / own.radius + still_parting(rate, dynamics.gravity, own.radius)
 
-    Ten times that round-off moves inversion times over sphere and stem by 4e-11, a tenth of it by 3e-12; that of a top that
-    comes to lean is off by 2e-9.
-    """
-    height = own.radius - other.radius + (other.offset - own.offset) * state[COS_THETA]
-    return height / own.radius + 1e-12
+
+def height(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    """Distance [m] of the other sphere from the plane, where a top stands on its own one."""
+    return own.radius - other.radius + (other.offset - own.offset) * state[COS_THETA]
 
 
 class Slide(AbstractFlyingPhase):
@@ -195,7 +197,7 @@ def phases(
     if len(spheres) == 1:
         return found, jnp.zeros(problem.states.shape[1:], int)
     main, stem = spheres
-    return (*found, Lean(*given)), (clearance(main, stem, problem.states) < 0.0).astype(int)
+    return (*found, Lean(*given)), (height(main, stem, problem.states) < 0.0).astype(int)
 
 
 def leaning(scene: Scene) -> LeaningDynamics:
@@ -236,7 +238,7 @@ def lost_contact(scene: Scene, number: Int[Array, ""], state: Float[Array, "comp
     dynamics = standing_on(scene.dynamics, own)
     falls, ball, jams = None, jnp.broadcast_to(number, zero.shape), dynamics.loss(state) > 0
     if other is not None:
-        falls = clearance(own, other, state) <= dynamics.contact_margin(state)
+        falls = clearance(dynamics, own, other, state) <= dynamics.contact_margin(state)
         ball, jams = jnp.where(falls, 1 - number, number), jams & ~falls
     return Air(
         free=freed(scene.body, own, state),
@@ -295,25 +297,30 @@ def land(scene: Scene, air: Air) -> Air:
     free, fails = strike(body, scene.friction, own, air.free, jnp.where(rebounds, restitution, 0.0))
     struck = air._replace(free=free, rising=rebounds, open=rebounds, status=jnp.where(fails, FAILED, air.status))
     if other is not None:
-        struck = _with_other(scene, struck, other, closing)
+        struck = _with_other(scene, air, struck, other, (speed <= closing) & ~rebounds, closing)
     if air.riding is not None:
         gained = energy(body, scene.gravity, struck.free) - energy(body, scene.gravity, air.free)
         struck = struck._replace(riding=air.riding.at[-1].add(gained))
     return struck._replace(open=struck.open & ~fails)
 
 
-def _with_other(scene: Scene, air: Air, other: Ball, closing: Cells) -> Air:
-    """What an impact means to the other sphere if that is at the plane: it strikes too, or the top comes to rest on both."""
-    speed = gap_rate(scene.body, other, air.free)
+def _with_other(scene: Scene, air: Air, struck: Air, other: Ball, slow: Bool[Array, " cells"], closing: Cells) -> Air:
+    """What an impact means to the other sphere if that is at the plane: it strikes too, or the top comes to rest on both.
+
+    **Arguments:** `air`: before the impact; `struck`: after it; `slow`: where it is so slow that it may be the last.
+    """
     touches = gap(other, air.free) < TOUCHING * scene.body.radius
-    falls, rests = touches & (speed < -closing), touches & (jnp.abs(speed) <= closing) & ~air.rising
-    free, number, definite = leaning(scene).settled(air.free)
-    return air._replace(
-        free=_where(rests, free, air.free),
+    falls = touches & (gap_rate(scene.body, other, struck.free) < -closing)
+    stopped, takes = leaning(scene).stopped(air.free)
+    rests = touches & slow & (jnp.abs(gap_rate(scene.body, other, air.free)) <= closing) & takes
+    free, number, definite = leaning(scene).settled(stopped)
+    falls &= ~rests
+    return struck._replace(
+        free=_where(rests, free, struck.free),
         ball=jnp.where(rests, number, jnp.where(falls, 1 - air.ball, air.ball)),
         falls=falls,
-        status=jnp.where(rests & ~definite & (air.status == RUNNING), UNRESOLVED, air.status),
-        open=air.open | falls,
+        status=jnp.where(rests & ~definite & (struck.status == RUNNING), UNRESOLVED, struck.status),
+        open=struck.open | falls,
     )
 
 
