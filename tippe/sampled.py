@@ -44,6 +44,10 @@ class TrajectoryProblem(AbstractProblem):
     def long(self) -> bool:
         return self.dynamics.frame.long
 
+    @property
+    def leading(self) -> int:
+        return len(self.state)
+
     def start(self) -> tuple[Float[Array, "components ..."], Float[Array, "components ..."]]:
         rest = jnp.zeros((2, *self.state.shape[1:])) if self.rest is None else self.rest
         return jnp.concatenate([self.state, self.cyclic, rest]), self.scales
@@ -98,9 +102,11 @@ def ended(
 
 
 class Found(NamedTuple):
-    """What is found of a run: `states` are NaN after the end, `status` is a code in `STATUS`, a float."""
+    """What is found of a run: `states`, and as `riding` what else a `TrajectoryProblem` carries, are NaN after the end;
+    `status` is a code in `STATUS`, a float."""
 
     states: Float[Array, "components times"]
+    riding: Float[Array, "riders times"]
     end_time: Float[Array, ""]
     status: Float[Array, ""]
     accepted: Float[Array, ""]
@@ -130,4 +136,4 @@ def sampled(
     else:
         found = sampled_run_by_diffrax(run, times, t1, settings, adjoint)
     status = ended(run, found.end_state, found.status == GUARD_LOST, found.status == FAILED)
-    return Found(found.states.T, found.end_time, status, found.accepted, found.rejected)
+    return Found(found.states.T, found.riding.T, found.end_time, status, found.accepted, found.rejected)
