@@ -8,7 +8,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..integration import (
     FAILED,
@@ -22,8 +22,8 @@ from ..integration import (
     march_with_samples,
     sample,
 )
-from ..validation import as_number
-from .differentiable import AbstractQuestion, ask, directions_by
+from ._sampling import AbstractSampling, Recipe, ask_for_samples
+from .differentiable import directions_by
 from .lyapunov import probed
 from .variation import VariationalProblem, in_groups
 
@@ -71,14 +71,9 @@ def sampled_run(
 
     **Returns:** a `SampledRun`; its states and the time of its end have derivatives.
     """
-    numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
-    leaves, structure = jax.tree.flatten(numbers)
-    in_block = isinstance(settings.solver, diffrax.AbstractERK) and all(leaf.ndim == 0 for leaf in leaves)
-    # Arrays, such as those of the solver, may be traced, so they go among the leaves.
-    arrays, recipe = eqx.partition(Recipe(build, structure, rest, settings.with_tolerance(None), grid), eqx.is_array)
-    held, places = jax.tree.flatten(arrays)
-    question = (BlockSampling if in_block else SingleSampling)(len(leaves), recipe, places)
-    found = ask(question, *leaves, jax.lax.stop_gradient(times), as_number(t1), settings.tolerance, *held)
+    scalars = all(leaf.ndim == 0 for leaf in jax.tree.leaves(modules) if eqx.is_inexact_array(leaf))
+    kind = BlockSampling if scalars and isinstance(settings.solver, diffrax.AbstractERK) else SingleSampling
+    found = ask_for_samples(kind, build, modules, jax.lax.stop_gradient(times), t1, settings, grid)
     # One by one: what a custom derivative is given counts as read.
     states = _at_times(found.states, None, times, modules, build)
     riding = None if found.riding is None else _at_times(found.riding, found.states, times, modules, build)
@@ -155,40 +150,6 @@ def _status(path: Sampled, t1: Float[Array, ""]) -> Int[Array, ""]:
     return jnp.where(path.lost, GUARD_LOST, jnp.where(path.end_time < t1, FAILED, REACHED_END))
 
 
-class Recipe(eqx.Module):
-    """How a problem is made of leaves, and how it is integrated, all but the tolerance."""
-
-    build: Build = eqx.field(static=True)
-    # JAX's PyTreeDef, which type checkers take for a variable.
-    structure: Any = eqx.field(static=True)
-    rest: Any
-    settings: Settings
-    grid: Float[Array, " steps"] | None
-
-    def problem(self, leaves: tuple[Array, ...], cells: int | None) -> AbstractProblem:
-        """The problem of some cells, or of a single run."""
-        return self.build(eqx.combine(jax.tree.unflatten(self.structure, leaves), self.rest), cells)
-
-
-class AbstractSampling(AbstractQuestion):
-    """Samples of a run; the leaves are the modules' numbers, the times, the horizon, the tolerance and the recipe's arrays.
-
-    `recipe` is without its arrays, and `places` says where they belong in it.
-    """
-
-    recipe: eqx.AbstractVar[Recipe]
-    places: eqx.AbstractVar[Any]
-
-    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
-        return jnp.isnan(value)
-
-    def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, ...], Recipe]:
-        """The modules' numbers; times, horizon and tolerance; and the whole recipe."""
-        last = self.movable + 3
-        recipe = eqx.combine(self.recipe, jax.tree.unflatten(self.places, leaves[last:]))
-        return leaves[: self.movable], leaves[self.movable : last], recipe
-
-
 class BlockSampling(AbstractSampling):
     """Samples by the block of lanes, with what rides along or `alone`."""
 
@@ -223,7 +184,7 @@ class BlockSampling(AbstractSampling):
         numbers, given, recipe = self._sorted(leaves)
 
         def build(numbers: tuple[Array, ...], cells: int | None) -> AbstractProblem:
-            problem = recipe.problem(numbers, cells)
+            problem = recipe.made(numbers, cells)
             return leading_problem(problem) if self.alone else problem
 
         return build, numbers, given, recipe.settings
@@ -289,14 +250,14 @@ class SingleSampling(AbstractSampling):
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
         numbers, given, recipe = self._sorted(leaves)
-        found, _ = _follow(VariationalProblem(recipe.problem(numbers, None), (), False), given, recipe)
+        found, _ = _follow(VariationalProblem(recipe.made(numbers, None), (), False), given, recipe)
         return jax.tree.map(lambda part: part[None], found)
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[SampledRun, list[SampledRun]]:
         numbers, given, recipe = self._sorted(leaves)
-        problem, directions, gather = directions_by(recipe.problem, active, numbers, None)
+        problem, directions, gather = directions_by(recipe.made, active, numbers, None)
 
         def run(some: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
             return _follow(VariationalProblem(problem, some, False), given, recipe)
