@@ -40,6 +40,10 @@ class TrajectoryProblem(AbstractProblem):
         """The run of one launch, or the runs of some cells, whose numbers are scalars or one per cell."""
         return _problem(scene, launch, cells)
 
+    @property
+    def leading(self) -> int:
+        return len(self.state)
+
     def start(self) -> tuple[Float[Array, "components ..."], Float[Array, "components ..."]]:
         rest = jnp.zeros((2, *self.state.shape[1:])) if self.rest is None else self.rest
         return jnp.concatenate([self.state, self.cyclic, rest]), self.scales
@@ -94,9 +98,11 @@ def ended(
 
 
 class Found(NamedTuple):
-    """What is found of a run: `states` are NaN after the end, `status` is a code in `STATUS`, a float."""
+    """What is found of a run: `states`, and as `riding` what else a `TrajectoryProblem` carries, are NaN after the end;
+    `status` is a code in `STATUS`, a float."""
 
     states: Float[Array, "components times"]
+    riding: Float[Array, "riders times"]
     end_time: Float[Array, ""]
     status: Float[Array, ""]
     accepted: Float[Array, ""]
@@ -126,4 +132,4 @@ def sampled(
     else:
         found = sampled_run_by_diffrax(run, times, t1, settings, adjoint)
     status = ended(run, found.end_state, found.status == GUARD_LOST, found.status == FAILED)
-    return Found(found.states.T, found.end_time, status, found.accepted, found.rejected)
+    return Found(found.states.T, found.riding.T, found.end_time, status, found.accepted, found.rejected)

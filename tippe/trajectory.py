@@ -115,7 +115,8 @@ def simulate(
     """Run one launch until `t1`, or until contact is lost or jams; through flights and impacts if its contact is "hybrid".
 
     Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run are then
-    NaN, and `status` and `end_time` say so. A batch, as `vmap` makes it, runs as the cells of one block, as tables do.
+    NaN, and `status` and `end_time` say so. A batch, as `vmap` makes it, runs as the cells of one block, as tables do; where a
+    program under `jit` reads neither path nor rotation nor work, they are not integrated.
 
     **Arguments:**
 
@@ -221,9 +222,8 @@ def _traced(
     found = sampled(scene, launch, times, t1, settings, adjoint)
     status = found.status.astype(int)
     stats = {"accepted": found.accepted.astype(int), "rejected": found.rejected.astype(int)}
-    return Trajectory(
-        times, scene, *_parts(len(scene.state(launch)), found.states), status, found.end_time, stats, None
-    )
+    riding = (found.riding[:-2], found.riding[-2], found.riding[-1])
+    return Trajectory(times, scene, found.states, *riding, status, found.end_time, stats, None)
 
 
 def _parts(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:

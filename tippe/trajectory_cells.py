@@ -1,6 +1,6 @@
 """How the cells of a table of trajectories are run and read: samples of many launches, and what is observed at them."""
 
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import Plane
-from nonholonomic.integration import FAILED, GUARD_LOST, AbstractProblem, Outcome, Settings, march_with_samples
+from nonholonomic.integration import FAILED, GUARD_LOST, LeadingProblem, Outcome, Settings, march_with_samples
 from nonholonomic.xla_cpu import compiled_alone
 
 from .launch import Launch
@@ -21,67 +21,42 @@ from .trajectory import Trajectory
 OF_THE_STATE = {"theta", "azimuth", "spin", "energy", "jellett", "normal_force", "slip", "theta_rate"}
 
 
-class SampledLaunches(AbstractProblem):
-    """Launches with as much of a `TrajectoryProblem` as is asked for: its cyclic coordinates only where something needs them,
-    no spin angle, no work.
+def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> LeadingProblem:
+    """The runs of some cells with as much of a `TrajectoryProblem` as the named quantities need: its cyclic coordinates only
+    for some of them, no spin angle, no work. On the plane a run without them takes half the time."""
+    run = TrajectoryProblem.of(scene, launch, cells)
+    needed = {"position"} if isinstance(scene.surface, Plane) else set(QUANTITIES) - OF_THE_STATE
+    return LeadingProblem(run, len(run.state) + (0 if needed.isdisjoint(names) else len(run.cyclic)))
 
-    On the plane a run without them takes a fifth less time.
-    """
 
-    run: TrajectoryProblem
-    with_cyclic: bool = eqx.field(static=True)
+def _read(
+    run: TrajectoryProblem,
+    scene: Scene,
+    times: Float[Array, " times"],
+    samples: Float[Array, "cells times components"],
+    name: str,
+) -> Float[Array, "cells times ..."]:
+    """A quantity at every sample, not a number after the end of a run."""
+    riders = len(run.state) + len(run.cyclic) - samples.shape[-1]
 
-    @classmethod
-    def of(cls, scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> "SampledLaunches":
-        """The runs of some cells, of which the named quantities are to be read."""
-        needed = {"position"} if isinstance(scene.surface, Plane) else set(QUANTITIES) - OF_THE_STATE
-        return cls(TrajectoryProblem.of(scene, launch, cells), not needed.isdisjoint(names))
+    def one(scene: Scene, states: Float[Array, "times components"]) -> Float[Array, "times ..."]:
+        nothing = jnp.zeros(len(times))
+        state, cyclic = jnp.split(jnp.pad(states.T, ((0, riders), (0, 0))), [len(run.state)])
+        values = getattr(Trajectory(times, scene, state, cyclic, nothing, nothing, None, times[-1], {}, None), name)
+        # What does not depend on the state would be a number after the end too.
+        there = jnp.isfinite(states[:, 0]).reshape(-1, *[1] * (values.ndim - 1))
+        return jnp.where(there, values, jnp.nan)
 
-    @property
-    def size(self) -> int:
-        """How many components the state has."""
-        return len(self.run.state) + (len(self.run.cyclic) if self.with_cyclic else 0)
+    def cell_axis(leaf: Any) -> int | None:
+        return 0 if eqx.is_array(leaf) and leaf.ndim else None
 
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        states, scales = self.run.start()
-        return states[: self.size], scales[: self.size]
-
-    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        # What the rates do not depend on, and those that are left out, the compiler drops.
-        missing = jnp.zeros((len(self.run.scales) - self.size, *state.shape[1:]))
-        return self.run.field(time, jnp.concatenate([state, missing]))[: self.size]
-
-    def crossing(self, state: Float[Array, "components lanes"]) -> None:
-        return None
-
-    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
-        return self.run.guard(time, state)
-
-    def read(
-        self, scene: Scene, times: Float[Array, " times"], samples: Float[Array, "cells times components"], name: str
-    ) -> Float[Array, "cells times ..."]:
-        """A quantity at every sample, not a number after the end of a run."""
-        state_size, cyclic_size = len(self.run.state), len(self.run.cyclic)
-
-        def one(scene: Scene, states: Float[Array, "times components"]) -> Float[Array, "times ..."]:
-            state, cyclic = jnp.split(states.T, [state_size])
-            cyclic = cyclic if self.with_cyclic else jnp.zeros((cyclic_size, len(times)))
-            nothing = jnp.zeros(len(times))
-            values = getattr(Trajectory(times, scene, state, cyclic, nothing, nothing, None, times[-1], {}, None), name)
-            # What does not depend on the state would be a number after the end too.
-            there = jnp.isfinite(states[:, 0]).reshape(-1, *[1] * (values.ndim - 1))
-            return jnp.where(there, values, jnp.nan)
-
-        def cell_axis(leaf: Any) -> int | None:
-            return 0 if eqx.is_array(leaf) and leaf.ndim else None
-
-        return eqx.filter_vmap(one, in_axes=(cell_axis, 0))(scene, samples)
+    return eqx.filter_vmap(one, in_axes=(cell_axis, 0))(scene, samples)
 
 
 # On its own, not inside other transformed functions: only so does it get the compiler's options.
 @compiled_alone
 def _followed(
-    problem: SampledLaunches,
+    problem: LeadingProblem,
     scene: Scene,
     times: Float[Array, " times"],
     count: Int[Array, ""],
@@ -90,8 +65,9 @@ def _followed(
 ) -> tuple[Outcome, Int[Array, " cells"], dict[str, Float[Array, "cells times ..."]]]:
     """How the runs end, the codes of that in `sampled.STATUS`, and the named quantities on the way."""
     outcome, samples = march_with_samples(problem, times, times[-1], count, settings, one_kernel=True)
-    status = ended(problem.run, outcome.state, outcome.status == GUARD_LOST, outcome.status == FAILED)
-    return outcome, status, {name: problem.read(scene, times, samples, name) for name in names}
+    run = cast(TrajectoryProblem, problem.whole)
+    status = ended(run, outcome.state, outcome.status == GUARD_LOST, outcome.status == FAILED)
+    return outcome, status, {name: _read(run, scene, times, samples, name) for name in names}
 
 
 def follow_cells(
@@ -106,7 +82,7 @@ def follow_cells(
     **Returns:** name -> values, the cells first.
     """
     numbers = (jnp.asarray(times, float), jnp.asarray(count), Settings(tolerance))
-    problem = SampledLaunches.of(scene, launch, cells, names)
+    problem = launches_with(scene, launch, cells, names)
     outcome, status, values = _followed(problem, scene, *numbers, names)
     ending = {"status": status, "end_time": outcome.end_time, "steps": outcome.steps, "rejected": outcome.rejected}
     return jax.tree.map(jnp.asarray, values | ending)

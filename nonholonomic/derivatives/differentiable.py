@@ -8,7 +8,7 @@ A batch of answers, as `vmap` asks for, is found as the cells of one block.
 import abc
 import functools
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ._block import find
 from .slopes import directions_of
 from .variation import natural_size
 
@@ -50,6 +51,13 @@ class AbstractQuestion(eqx.Module):
         `cells`, `leaves`: as for `answer`.
         """
 
+    def for_parts(self, wanted: tuple[int, ...]) -> Self:
+        """A question that may leave out (as `None`) all but some parts of what is found; by default it leaves out none.
+
+        **Arguments:** `wanted`: numbers of parts of the answer, or of the answer and its slopes, one after the other.
+        """
+        return self
+
 
 def ask(question: AbstractQuestion, *leaves: Float[Array, "..."]) -> Answer:
     """The answer for one run. Where it is absent its derivative is 0, whatever is done with it afterwards.
@@ -61,7 +69,7 @@ def ask(question: AbstractQuestion, *leaves: Float[Array, "..."]) -> Answer:
 
     @jax.custom_jvp
     def found(*leaves):
-        return _in_block(question, question.answer)(*leaves)
+        return _of_one(question, lambda question, cells, *leaves: question.answer(cells, *leaves), *leaves)
 
     @functools.partial(found.defjvp, symbolic_zeros=True)
     def variation(leaves, tangents):
@@ -96,52 +104,20 @@ def _with_slopes(question: AbstractQuestion, active: tuple[int, ...]) -> Callabl
 
     @jax.custom_jvp
     def found(*leaves):
-        return _in_block(question, functools.partial(question.with_slopes, active, False))(*leaves)
+        return _of_one(question, lambda question, *given: question.with_slopes(active, False, *given), *leaves)
 
     @found.defjvp
     def second_variation(leaves, tangents):
-        # `_in_block` would mark the value as batched where only the variation is, so it is left out here.
+        # Differentiated operation by operation, which those of a block are not.
         once = functools.partial(question.with_slopes, active, True, 1)
         return jax.jvp(lambda *numbers: _only(once(*numbers)), leaves, tangents)
 
     return found
 
 
-def _in_block(question: AbstractQuestion, function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of (cells, leaves) as a function of a single cell's leaves; `vmap` makes it the cells of one block."""
-
-    def single(*leaves):
-        return _only(function(1, *leaves))
-
-    if not question.in_blocks:
-        return single
-    one = jax.custom_batching.custom_vmap(single)
-
-    @one.def_vmap
-    def many(size, batched, *leaves):
-        results = _block(function, size, tuple(batched))(*leaves)
-        return results, jax.tree.map(lambda _: True, results)
-
-    return one
-
-
-def _block(function: Callable[..., Any], cells: int, own: tuple[bool, ...]) -> Callable[..., Any]:
-    """A function of a block's leaves, of which some have their `own` value in every cell; a batch of blocks is one block."""
-    block = jax.custom_batching.custom_vmap(functools.partial(function, cells))
-
-    @block.def_vmap
-    def blocks(size, batched, *leaves):
-        def joined(leaf: Array, has_own: bool, is_batched: bool) -> Array:
-            if is_batched:
-                return leaf.reshape(size * cells, *leaf.shape[2:]) if has_own else jnp.repeat(leaf, cells, axis=0)
-            return jnp.tile(leaf, (size,) + (1,) * (leaf.ndim - 1)) if has_own else leaf
-
-        either = tuple(a or b for a, b in zip(own, batched, strict=True))
-        results = _block(function, size * cells, either)(*map(joined, leaves, own, batched))
-        apart = jax.tree.map(lambda result: result.reshape(size, cells, *result.shape[1:]), results)
-        return apart, jax.tree.map(lambda _: True, apart)
-
-    return block
+def _of_one(question: AbstractQuestion, way: Callable[..., Any], *leaves: Float[Array, "..."]) -> Any:
+    """What is found of one run, in one of the ways of `_block.Request`."""
+    return find(question, way, *leaves) if question.in_blocks else _only(way(question, 1, *leaves))
 
 
 def _only(results: Any) -> Any:

@@ -1,6 +1,7 @@
 """Single runs of several phases, sampled at given times inside other transformations, with their derivatives."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,8 +23,8 @@ from ..integration import (
     marched,
     passed_on,
 )
-from ..validation import as_number
-from .differentiable import AbstractQuestion, ask, directions_by
+from ._sampling import AbstractSampling, Recipe, ask_for_samples
+from .differentiable import directions_by
 from .variation import in_groups
 from .varied_phases import VariedPhase, varied_phases, varied_start
 
@@ -36,7 +37,7 @@ class PhasedSamples(NamedTuple):
     """A run through several phases at given times, all floats.
 
     - `shown`: what the phases show, NaN after the end of the run; `number`: of the phase at each time, or `BETWEEN`.
-    - `end_time`, `end_state`, `end_number`: when, where and in which phase the run ended; `status`: the code of how.
+    - `end_time`, `end_state`: when and where the run ended; `status`: the code of how.
     - `steps`, `rejected`; `counts`: what happened how often.
     """
 
@@ -44,7 +45,6 @@ class PhasedSamples(NamedTuple):
     number: Float[Array, " times"]
     end_time: Float[Array, ""]
     end_state: Float[Array, " components"]
-    end_number: Float[Array, ""]
     status: Float[Array, ""]
     steps: Float[Array, ""]
     rejected: Float[Array, ""]
@@ -73,13 +73,8 @@ def phased_samples(
 
     **Raises:** `ValueError` for derivatives by the times, and for second derivatives.
     """
-    numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
-    leaves, structure = jax.tree.flatten(numbers)
-    # Arrays, such as those of the solver, may be traced, so they go among the leaves.
-    arrays, others = eqx.partition((rest, settings.with_tolerance(None)), eqx.is_array)
-    held, places = jax.tree.flatten(arrays)
-    question = PhasedSampling(len(leaves), build, structure, others, places, kinds)
-    return ask(question, *leaves, _fixed(times), as_number(t1), settings.tolerance, *held)
+    question = functools.partial(PhasedSampling, kinds=kinds)
+    return ask_for_samples(question, build, modules, _fixed(times), t1, settings)
 
 
 @eqx.filter_custom_jvp
@@ -95,26 +90,20 @@ def _refused(primals: Any, tangents: Any) -> Any:
     return primals[0], jnp.zeros_like(primals[0])
 
 
-class PhasedSampling(AbstractQuestion):
-    """Samples of a run through phases; the leaves are the modules' numbers, the times, the horizon, the tolerance, and the
-    arrays that belong to `others`, the rest of the modules and the settings, at its `places`."""
+class PhasedSampling(AbstractSampling):
+    """Samples of a run through phases."""
 
     in_blocks = False
 
     movable: int
-    build: Build = eqx.field(static=True)
-    # JAX's PyTreeDef, which type checkers take for a variable.
-    structure: Any = eqx.field(static=True)
-    others: Any
+    recipe: Recipe
     places: Any = eqx.field(static=True)
     kinds: int = eqx.field(static=True)
 
-    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
-        return jnp.isnan(value)
-
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> PhasedSamples:
-        numbers, given, rest, settings = self._sorted(leaves)
-        found, _ = _follow(self._built(numbers, rest, settings), (), given, settings, self.kinds)
+        numbers, (*given, tolerance), recipe = self._sorted(leaves)
+        settings = recipe.settings.with_tolerance(tolerance)
+        found, _ = _follow(recipe.made(numbers, tolerance), (), given, settings, self.kinds)
         return jax.tree.map(lambda part: part[None], found)
 
     def with_slopes(
@@ -122,10 +111,11 @@ class PhasedSampling(AbstractQuestion):
     ) -> tuple[PhasedSamples, list[PhasedSamples]]:
         if again:
             raise ValueError("second derivatives do not go through changes of phase: contact = 'hybrid'")
-        numbers, given, rest, settings = self._sorted(leaves)
+        numbers, (*given, tolerance), recipe = self._sorted(leaves)
+        settings = recipe.settings.with_tolerance(tolerance)
 
         def build(numbers: tuple[Array, ...], cells: None) -> Any:
-            return self._built(numbers, rest, settings)
+            return recipe.made(numbers, tolerance)
 
         built, directions, gather = directions_by(build, active, numbers, None)
 
@@ -135,20 +125,9 @@ class PhasedSampling(AbstractQuestion):
         found, slopes = in_groups(run, directions)
         return jax.tree.map(lambda part: part[None], (found, gather(slopes)))
 
-    def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array], Any, Settings]:
-        """The modules' numbers; times and horizon; the rest of the modules; and the settings."""
-        last = self.movable + 3
-        *given, tolerance = leaves[self.movable : last]
-        rest, bare = eqx.combine(self.others, jax.tree.unflatten(self.places, leaves[last:]))
-        return leaves[: self.movable], tuple(given), rest, bare.with_tolerance(tolerance)
-
-    def _built(self, numbers: tuple[Array, ...], rest: Any, settings: Settings) -> Any:
-        """The phases, the number of the first, and the state there."""
-        return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), rest), settings.tolerance)
-
 
 def _follow(
-    built: Any, directions: tuple[Any, ...], given: tuple[Array, Array], settings: Settings, kinds: int
+    built: Any, directions: tuple[Any, ...], given: Sequence[Array], settings: Settings, kinds: int
 ) -> tuple[PhasedSamples, list[PhasedSamples]]:
     """The run, and its slope along each of the directions."""
     (phases, first, state), (times, t1) = built, given
@@ -250,11 +229,10 @@ def _found(
     # The variation of a time stands behind that of the state; a horizon does not move.
     later = [ended.state[k * (size + 1) + size, 0] for k in range(1, count + 1)]
     later = [jnp.where(status == REACHED_END, 0.0, jnp.where(grazed, jnp.nan, one)) for one in later]
-    numbers = (ended.phase[0], status, ended.steps[0], ended.rejected[0], ended.counts[:-1, 0])
-    phase, *others = (part.astype(float) for part in numbers)
-    found = PhasedSamples(filled.shown, filled.number, end_time, ended.state[:size, 0], phase, *others)
+    numbers = (status, ended.steps[0], ended.rejected[0], ended.counts[:-1, 0])
+    others = (part.astype(float) for part in numbers)
+    found = PhasedSamples(filled.shown, filled.number, end_time, ended.state[:size, 0], *others)
     slopes = [
-        PhasedSamples(filled.variations[k] + late, None, later[k], None, None, None, None, None, None)
-        for k in range(count)
+        PhasedSamples(filled.variations[k] + late, None, later[k], None, None, None, None, None) for k in range(count)
     ]
     return found, slopes

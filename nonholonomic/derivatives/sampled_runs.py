@@ -1,27 +1,28 @@
 """Runs sampled at given times, as functions for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..integration import (
     FAILED,
     GUARD_LOST,
     REACHED_END,
     AbstractProblem,
+    LeadingProblem,
     Sampled,
     Settings,
     event_time,
     march_with_samples,
     sample,
 )
-from ..validation import as_number
-from .differentiable import AbstractQuestion, ask, directions_by
+from ._sampling import AbstractSampling, Recipe, ask_for_samples
+from .differentiable import directions_by
 from .lyapunov import probed
 from .variation import VariationalProblem, in_groups
 
@@ -31,9 +32,14 @@ Build = Callable[[Any, int | None], AbstractProblem]
 
 class SampledRun(NamedTuple):
     """A run at given times, all floats: its states, NaN after its end; when and where it ended, the code of how
-    (`REACHED_END`, `GUARD_LOST` or `FAILED`), and how many steps were accepted and rejected."""
+    (`REACHED_END`, `GUARD_LOST` or `FAILED`), and how many steps were accepted and rejected.
+
+    `states` and `end_state` are those components on which the problem's `leading` ones depend, `riding` the others, `None` if
+    there are none. If a program reads `riding` nowhere, its blocks run without.
+    """
 
     states: Float[Array, "*cells times components"]
+    riding: Float[Array, "*cells times riders"] | None
     end_time: Float[Array, "*cells"]
     end_state: Float[Array, "*cells components"]
     status: Float[Array, "*cells"]
@@ -64,33 +70,55 @@ def sampled_run(
 
     **Returns:** a `SampledRun`; its states and the time of its end have derivatives.
     """
-    numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
-    leaves, structure = jax.tree.flatten(numbers)
-    in_block = isinstance(settings.solver, diffrax.AbstractERK) and all(leaf.ndim == 0 for leaf in leaves)
-    # Arrays, such as those of the solver, may be traced, so they go among the leaves.
-    arrays, recipe = eqx.partition(Recipe(build, structure, rest, settings.with_tolerance(None), grid), eqx.is_array)
-    held, places = jax.tree.flatten(arrays)
-    question = (BlockSampling if in_block else SingleSampling)(len(leaves), recipe, places)
-    found = ask(question, *leaves, jax.lax.stop_gradient(times), as_number(t1), settings.tolerance, *held)
-    return found._replace(states=_at_times(found.states, times, modules, build))
+    scalars = all(leaf.ndim == 0 for leaf in jax.tree.leaves(modules) if eqx.is_inexact_array(leaf))
+    kind = BlockSampling if scalars and isinstance(settings.solver, diffrax.AbstractERK) else SingleSampling
+    found = ask_for_samples(kind, build, modules, jax.lax.stop_gradient(times), t1, settings, grid)
+    # One by one: what a custom derivative is given counts as read.
+    states = _at_times(found.states, None, times, modules, build)
+    riding = None if found.riding is None else _at_times(found.riding, found.states, times, modules, build)
+    return found._replace(states=states, riding=riding)
 
 
 @eqx.filter_custom_jvp
 def _at_times(
-    states: Float[Array, "times components"], times: Float[Array, " times"], modules: Any, build: Build
-) -> Float[Array, "times components"]:
-    """The states themselves, which a small delay of their times moves along the field."""
-    return states
+    samples: Float[Array, "times rows"],
+    leading: Float[Array, "times components"] | None,
+    times: Float[Array, " times"],
+    modules: Any,
+    build: Build,
+) -> Float[Array, "times rows"]:
+    """The samples themselves, which a small delay of their times moves along the field: those of the leading components, or,
+    where these are given too, of those that ride along."""
+    return samples
 
 
 @_at_times.def_jvp
 def _later(primals: Any, tangents: Any) -> Any:
-    (states, times, modules, build), (moved, later, *_) = primals, tangents
-    moved = jnp.zeros_like(states) if moved is None else moved
+    (samples, leading, times, modules, build), (moved, _, later, *_) = primals, tangents
+    moved = jnp.zeros_like(samples) if moved is None else moved
     if later is None:
-        return states, moved
-    rates = jax.vmap(build(modules, None).field)(times, states)
-    return states, moved + jnp.where(jnp.isfinite(rates), rates * later[:, None], 0.0)
+        return samples, moved
+    problem, size = build(modules, None), samples.shape[-1]
+    whole = leading_problem(problem) if leading is None else problem
+    states = samples if leading is None else jnp.concatenate([leading, samples], axis=-1)
+    rates = jax.vmap(whole.field)(times, states)[:, -size:]
+    return samples, moved + jnp.where(jnp.isfinite(rates), rates * later[:, None], 0.0)
+
+
+def leading_problem(problem: AbstractProblem) -> AbstractProblem:
+    """A problem without what rides along."""
+    return problem if problem.leading is None else LeadingProblem(problem, problem.leading)
+
+
+#: Samples of the leading components and of those that ride along, `None` without these.
+Samples = tuple[Float[Array, "*cells times components"], Float[Array, "*cells times riders"] | None]
+
+
+def parted(problem: AbstractProblem, states: Float[Array, "*cells times components"]) -> Samples:
+    """The leading components, and those that ride along."""
+    if problem.leading is None:
+        return states, None
+    return states[..., : problem.leading], states[..., problem.leading :]
 
 
 def sampled_run_by_diffrax(
@@ -108,10 +136,12 @@ def sampled_run_by_diffrax(
     **Arguments:** as for `sampled_run`; `adjoint`: how Diffrax differentiates.
     """
     size = len(problem.start()[0])
+    leading = size if problem.leading is None else problem.leading
     whole = probed(problem) if grid is None else problem
     path = sample(whole, times, t1, settings, grid=grid, adjoint=adjoint)
     status, *counts = (part.astype(float) for part in (_status(path, t1), path.accepted, path.rejected))
-    return SampledRun(path.states[:size].T, path.end_time, path.end_state[:size], status, *counts)
+    states = parted(problem, path.states[:size].T)
+    return SampledRun(*states, path.end_time, path.end_state[:leading], status, *counts)
 
 
 def _status(path: Sampled, t1: Float[Array, ""]) -> Int[Array, ""]:
@@ -119,62 +149,44 @@ def _status(path: Sampled, t1: Float[Array, ""]) -> Int[Array, ""]:
     return jnp.where(path.lost, GUARD_LOST, jnp.where(path.end_time < t1, FAILED, REACHED_END))
 
 
-class Recipe(eqx.Module):
-    """How a problem is made of leaves, and how it is integrated, all but the tolerance."""
-
-    build: Build = eqx.field(static=True)
-    # JAX's PyTreeDef, which type checkers take for a variable.
-    structure: Any = eqx.field(static=True)
-    rest: Any
-    settings: Settings
-    grid: Float[Array, " steps"] | None
-
-    def problem(self, leaves: tuple[Array, ...], cells: int | None) -> AbstractProblem:
-        """The problem of some cells, or of a single run."""
-        return self.build(eqx.combine(jax.tree.unflatten(self.structure, leaves), self.rest), cells)
-
-
-class AbstractSampling(AbstractQuestion):
-    """Samples of a run; the leaves are the modules' numbers, the times, the horizon, the tolerance and the recipe's arrays.
-
-    `recipe` is without its arrays, and `places` says where they belong in it.
-    """
-
-    recipe: eqx.AbstractVar[Recipe]
-    places: eqx.AbstractVar[Any]
-
-    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
-        return jnp.isnan(value)
-
-    def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, ...], Recipe]:
-        """The modules' numbers; times, horizon and tolerance; and the whole recipe."""
-        last = self.movable + 3
-        recipe = eqx.combine(self.recipe, jax.tree.unflatten(self.places, leaves[last:]))
-        return leaves[: self.movable], leaves[self.movable : last], recipe
-
-
 class BlockSampling(AbstractSampling):
-    """Samples by the block of lanes."""
+    """Samples by the block of lanes, with what rides along or `alone`."""
 
     movable: int
     recipe: Recipe
     places: Any = eqx.field(static=True)
+    alone: bool = eqx.field(static=True, default=False)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
-        numbers, given, recipe = self._sorted(leaves)
-        return _march(VariationalProblem(recipe.problem(numbers, cells), (), False), given, recipe.settings)[0]
+        build, numbers, given, settings = self._builder(leaves)
+        return _march(VariationalProblem(build(numbers, cells), (), False), given, settings)[0]
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[SampledRun, list[SampledRun]]:
-        numbers, given, recipe = self._sorted(leaves)
-        problem, directions, gather = directions_by(recipe.problem, active, numbers, cells)
+        build, numbers, given, settings = self._builder(leaves)
+        problem, directions, gather = directions_by(build, active, numbers, cells)
 
         def run(some: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
-            return _march(VariationalProblem(problem, some, False), given, recipe.settings, not again)
+            return _march(VariationalProblem(problem, some, False), given, settings, not again)
 
         found, slopes = in_groups(run, directions)
         return found, gather(slopes)
+
+    def for_parts(self, wanted: tuple[int, ...]) -> Self:
+        fields = SampledRun._fields
+        riding = any(fields[part % len(fields)] == "riding" for part in wanted)
+        return self if riding else dataclasses.replace(self, alone=True)
+
+    def _builder(self, leaves: tuple[Array, ...]) -> tuple[Callable[..., AbstractProblem], Any, Any, Settings]:
+        """(the modules' numbers, cells) -> the problem; these numbers; times, horizon and tolerance; and the settings."""
+        numbers, given, recipe = self._sorted(leaves)
+
+        def build(numbers: tuple[Array, ...], cells: int | None) -> AbstractProblem:
+            problem = recipe.made(numbers, cells)
+            return leading_problem(problem) if self.alone else problem
+
+        return build, numbers, given, recipe.settings
 
 
 @eqx.filter_jit
@@ -217,11 +229,13 @@ def _found(
         else:
             later = eqx.filter_jvp(end_time, (varied.problem, end), (direction, at_end))[1]
             later = jnp.where((status == GUARD_LOST) & (time > 0.0), later, 0.0)
-        return SampledRun(jnp.where(jnp.isnan(states), 0.0, variation), later, None, None, None, None)
+        changes = parted(varied.problem, jnp.where(jnp.isnan(states), 0.0, variation))
+        return SampledRun(*changes, later, None, None, None, None)
 
     slopes = [slope(*one) for one in zip(varied.directions, variations, end_variations, strict=True)]
     numbers = (part.astype(float) for part in (status, *counts))
-    return SampledRun(states, time, jnp.moveaxis(end, 0, -1), *numbers), slopes
+    end, _ = parted(varied.problem, jnp.moveaxis(end, 0, -1))
+    return SampledRun(*parted(varied.problem, states), time, end, *numbers), slopes
 
 
 class SingleSampling(AbstractSampling):
@@ -235,14 +249,14 @@ class SingleSampling(AbstractSampling):
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
         numbers, given, recipe = self._sorted(leaves)
-        found, _ = _follow(VariationalProblem(recipe.problem(numbers, None), (), False), given, recipe)
+        found, _ = _follow(VariationalProblem(recipe.made(numbers, None), (), False), given, recipe)
         return jax.tree.map(lambda part: part[None], found)
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[SampledRun, list[SampledRun]]:
         numbers, given, recipe = self._sorted(leaves)
-        problem, directions, gather = directions_by(recipe.problem, active, numbers, None)
+        problem, directions, gather = directions_by(recipe.made, active, numbers, None)
 
         def run(some: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
             return _follow(VariationalProblem(problem, some, False), given, recipe)

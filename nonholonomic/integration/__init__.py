@@ -27,6 +27,7 @@ from .phases import marched as marched
 from .phases import passed_on as passed_on
 from .phases import travel as travel
 from .problem import AbstractProblem as AbstractProblem
+from .problem import LeadingProblem as LeadingProblem
 from .problem import crossing_time as crossing_time
 from .problem import event_time as event_time
 from .queue import Outcome as Outcome

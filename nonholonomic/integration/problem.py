@@ -17,6 +17,12 @@ class AbstractProblem(eqx.Module):
     The leaves of a problem are scalars, or hold one number per cell in their last axis.
     """
 
+    @property
+    def leading(self) -> int | None:
+        """How many components, from the first, are all that field, crossing function and guard depend on, and have a field of
+        their own without the rest; `None` for all of them."""
+        return None
+
     @abc.abstractmethod
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
         """State at the start of every cell, and the magnitudes by which its absolute errors are measured."""
@@ -32,6 +38,31 @@ class AbstractProblem(eqx.Module):
     @abc.abstractmethod
     def guard(self, time: Lanes, state: States) -> Lanes | None:
         """A function of order 1 that is positive while the model holds; `None` if it always does."""
+
+
+class LeadingProblem(AbstractProblem):
+    """A problem with the first components of its state alone, on which the others do not act."""
+
+    whole: AbstractProblem
+    size: int = eqx.field(static=True)
+
+    def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
+        state, scales = self.whole.start()
+        return state[: self.size], scales[: self.size]
+
+    def field(self, time: Lanes, state: States) -> States:
+        # What the rates do not depend on, and those that are left out, the compiler drops.
+        return self.whole.field(time, self._longer(state))[: self.size]
+
+    def crossing(self, state: States) -> Lanes | None:
+        return self.whole.crossing(self._longer(state))
+
+    def guard(self, time: Lanes, state: States) -> Lanes | None:
+        return self.whole.guard(time, self._longer(state))
+
+    def _longer(self, state: States) -> States:
+        missing = len(self.whole.start()[0]) - self.size
+        return jnp.concatenate([state, jnp.zeros((missing, *state.shape[1:]))])
 
 
 def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: States) -> Lanes:

@@ -20,8 +20,6 @@ MOST_LINES = 50
 LENGTHS = (1.0, 2.0, 5.0, 10.0)
 DEGREES = (1.0, 2.0, 5.0, 10.0, 15.0, 30.0)
 
-Grid = Float[np.ndarray, "rows columns 3"]
-
 
 def arena(
     surface: AbstractSurface,

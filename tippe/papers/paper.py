@@ -22,9 +22,6 @@ BETA1 = 2500.0 * GRAM * CENTIMETRE**2
 #: The same with the header taken at its word [kg m^2/s].
 BETA1_AS_PRINTED = 2500.0 * GRAM
 
-#: Columns of Table 1, "Initial state of TT". Its numbers are missing from the paper.
-TABLE_1_COLUMNS = ("I [g cm^2]", "I3 [g cm^2]", "m_total [g]", "R [cm]", "D [cm]")
-
 
 class Row(NamedTuple):
     """One row of Table 2 or 3.

@@ -1,0 +1,118 @@
+"""What is found of the cells of a block, as one operation of JAX: `vmap` adds cells to it, `jit` has it find what is read only.
+
+`custom_vmap` does the first, but all of its results are found as soon as one is read. The rule for unread results is JAX's
+`partial_eval.dce_rules`, as its own `scan` has it.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir, partial_eval
+from jaxtyping import Array, Float
+
+
+# Compared by identity: JAX looks for its hash, and what it holds may have none.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Request:
+    """What is asked of some cells.
+
+    - `question`: an `AbstractQuestion`; `way`: (question, cells, leaves) -> what is found, a tree of arrays, the cells first.
+    - `wanted`: the numbers of the parts of the tree that are to be found, all if `None`; parts that are `None` count.
+    """
+
+    question: Any
+    way: Callable[..., Any]
+    wanted: tuple[int, ...] | None = None
+
+    def tree(self, cells: int, *leaves: Float[Array, "..."]) -> Any:
+        """What is found of some cells."""
+        return self.way(self.question, cells, *leaves)
+
+    def parts(self, cells: int, *leaves: Float[Array, "..."]) -> list[Array]:
+        """The parts that are wanted and not `None`."""
+        found = _flat(self.tree(cells, *leaves))[0]
+        kept = found if self.wanted is None else [found[k] for k in self.wanted]
+        return [part for part in kept if part is not None]
+
+
+def find(question: Any, way: Callable[..., Any], *leaves: Float[Array, "..."]) -> Any:
+    """What is found of a single cell, without the axis of cells; under `vmap` the cells are those of one block.
+
+    **Arguments:** `question`, `way`: as for `Request`; `leaves`: numbers of a single cell.
+    """
+    request = Request(question, way)
+    shapes, structure = _flat(jax.eval_shape(functools.partial(request.tree, 1), *leaves))
+    present = [k for k, shape in enumerate(shapes) if shape is not None]
+    kinds = tuple(ShapedArray(shapes[k].shape[1:], shapes[k].dtype) for k in present)
+    request = dataclasses.replace(request, wanted=tuple(present))
+    found = iter(_found.bind(*leaves, request=request, cells=1, own=(False,) * len(leaves), kinds=kinds))
+    return jax.tree.unflatten(structure, [None if shape is None else next(found)[0] for shape in shapes])
+
+
+def _flat(tree: Any) -> tuple[list[Any], Any]:
+    """The parts of a tree and its structure, in which `None` counts as a part."""
+    return jax.tree.flatten(tree, is_leaf=lambda part: part is None)
+
+
+#: The parts that a `Request` wants of a number of cells. `own` says which leaves have a value for each cell, and `kinds` what
+#: the parts of one cell are.
+_found = Primitive("found_in_block")
+_found.multiple_results = True
+
+
+@_found.def_impl
+def _run(*leaves: Array, request: Request, cells: int, own: Any, kinds: Any) -> list[Array]:
+    return request.parts(cells, *leaves)
+
+
+@_found.def_abstract_eval
+def _shaped(*leaves: Any, request: Request, cells: int, own: Any, kinds: tuple[ShapedArray, ...]) -> list[ShapedArray]:
+    return [ShapedArray((cells, *kind.shape), kind.dtype) for kind in kinds]
+
+
+mlir.register_lowering(_found, mlir.lower_fun(_run, multiple_results=True))
+
+
+def _batched(
+    leaves: tuple[Array, ...], axes: Any, *, request: Request, cells: int, own: tuple[bool, ...], kinds: Any
+) -> tuple[list[Array], list[int]]:
+    """A batch of blocks is one block."""
+    size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
+
+    def joined(leaf: Array, has_own: bool, axis: Any) -> Array:
+        if axis is None:
+            return jnp.tile(leaf, (size,) + (1,) * (leaf.ndim - 1)) if has_own else leaf
+        leaf = jnp.moveaxis(leaf, axis, 0)
+        return leaf.reshape(size * cells, *leaf.shape[2:]) if has_own else jnp.repeat(leaf, cells, axis=0)
+
+    either = tuple(has or axis is not None for has, axis in zip(own, axes, strict=True))
+    whole = map(joined, leaves, own, axes)
+    found = _found.bind(*whole, request=request, cells=size * cells, own=either, kinds=kinds)
+    return [part.reshape(size, cells, *part.shape[1:]) for part in found], [0] * len(found)
+
+
+batching.primitive_batchers[_found] = _batched
+
+
+def _only_read(read: list[bool], *others: Any) -> tuple[list[bool], Any]:
+    """The operation with the parts that are read."""
+    # Since JAX 0.12 a list of inputs stands between the two.
+    equation = others[-1]
+    if not any(read):
+        return [False] * len(equation.invars), None
+    request, kinds = equation.params["request"], equation.params["kinds"]
+    wanted = tuple(k for k, is_read in zip(request.wanted, read, strict=True) if is_read)
+    smaller = Request(request.question.for_parts(wanted), request.way, wanted)
+    kept = tuple(kind for kind, is_read in zip(kinds, read, strict=True) if is_read)
+    outputs = [variable for variable, is_read in zip(equation.outvars, read, strict=True) if is_read]
+    new = equation.replace(outvars=outputs, params={**equation.params, "request": smaller, "kinds": kept})
+    return [True] * len(equation.invars), new
+
+
+partial_eval.dce_rules[_found] = _only_read

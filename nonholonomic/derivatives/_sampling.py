@@ -1,0 +1,68 @@
+"""Samples of a run as a question: what its leaves are, and how what is run is made of them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..integration import Settings
+from ..validation import as_number
+from .differentiable import AbstractQuestion, ask
+
+
+class Recipe(eqx.Module):
+    """How what is run is made of numbers, and how it is integrated, all but the tolerance."""
+
+    build: Callable[[Any, Any], Any] = eqx.field(static=True)
+    # JAX's PyTreeDef, which type checkers take for a variable.
+    structure: Any = eqx.field(static=True)
+    rest: Any
+    settings: Settings
+    grid: Float[Array, " steps"] | None
+
+    def made(self, numbers: tuple[Array, ...], given: Any) -> Any:
+        """What is built from the modules with some numbers, and from what else `build` is given."""
+        return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), self.rest), given)
+
+
+class AbstractSampling(AbstractQuestion):
+    """Samples of a run; the leaves are the modules' numbers, the times, the horizon, the tolerance and the recipe's arrays.
+
+    `recipe` is without its arrays, and `places` says where they belong in it.
+    """
+
+    recipe: eqx.AbstractVar[Recipe]
+    places: eqx.AbstractVar[Any]
+
+    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
+        return jnp.isnan(value)
+
+    def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array, Array], Recipe]:
+        """The modules' numbers; times, horizon and tolerance; and the whole recipe."""
+        numbers, (times, t1, tolerance, *held) = leaves[: self.movable], leaves[self.movable :]
+        return numbers, (times, t1, tolerance), eqx.combine(self.recipe, jax.tree.unflatten(self.places, held))
+
+
+def ask_for_samples(
+    question: Callable[[int, Recipe, Any], AbstractSampling],
+    build: Callable[[Any, Any], Any],
+    modules: Any,
+    times: Float[Array, " times"],
+    t1: Float[Array, ""],
+    settings: Settings,
+    grid: Float[Array, " steps"] | None = None,
+) -> Any:
+    """What a question about samples finds.
+
+    **Arguments:** `question`: makes it of its first three fields; `build`: from modules and what the question adds to what is
+    run, compared by identity; the others as for `sampled_run`.
+    """
+    numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(numbers)
+    # Arrays, such as those of the solver, may be traced, so they go among the leaves.
+    arrays, recipe = eqx.partition(Recipe(build, structure, rest, settings.with_tolerance(None), grid), eqx.is_array)
+    held, places = jax.tree.flatten(arrays)
+    return ask(question(len(leaves), recipe, places), *leaves, times, as_number(t1), settings.tolerance, *held)

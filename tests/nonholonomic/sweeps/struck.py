@@ -1,0 +1,53 @@
+"""Sweeps that are struck down at a chosen operation on the disk."""
+
+import io
+import itertools
+import os
+
+import numpy as np
+import pytest
+from cheap_sweep import cheap_sweep, finished_blocks
+
+from nonholonomic.sweeps import Table
+
+
+class Blow(BaseException):
+    """The end of the process at a chosen moment."""
+
+
+#: What is done on the disk: for the folder of the blocks and what it is for, for each block, and for the table's file.
+FOR_THE_FOLDER, FOR_A_BLOCK, FOR_THE_FILE = 4, 4, 3
+
+
+def strike(monkeypatch, moment, torn, error):
+    """Have a sweep end at an operation on the disk: before a sync or a renaming, or in a block, of which a part is written."""
+    count = itertools.count()
+
+    def struck(function):
+        def operation(*arguments):
+            if next(count) == moment:
+                raise error
+            return function(*arguments)
+
+        return operation
+
+    def saved(stream, savez=np.savez, **arrays):
+        whole = io.BytesIO()
+        savez(whole, **arrays)
+        falls = next(count) == moment
+        stream.write(whole.getvalue()[: int(torn * len(whole.getvalue())) if falls else None])
+        if falls:
+            raise error
+
+    monkeypatch.setattr(os, "fsync", struck(os.fsync))
+    monkeypatch.setattr(os, "replace", struck(os.replace))
+    monkeypatch.setattr(np, "savez", saved)
+
+
+def half_finished(path):
+    """A sweep that was struck down after three blocks."""
+    with pytest.MonkeyPatch.context() as patch:
+        strike(patch, FOR_THE_FOLDER + 3 * FOR_A_BLOCK, torn=0.5, error=Blow())
+        with pytest.raises(Blow):
+            cheap_sweep(path)
+    assert len(finished_blocks(Table.load(path))) == 3

@@ -1,0 +1,188 @@
+"""Files that are cut, changed or foreign: no wrong number read, none of another's bytes changed."""
+
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from cheap_sweep import BLOCK, cheap_sweep, resumed
+from struck import half_finished
+
+from nonholonomic.sweeps import Table
+
+pytestmark = pytest.mark.newest
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    """The bytes of a finished file and of a saved table."""
+    folder = tmp_path_factory.mktemp("images")
+    cheap_sweep(folder / "whole.h5").save(folder / "saved.h5")
+    return {name: (folder / f"{name}.h5").read_bytes() for name in ("whole", "saved")}
+
+
+def contents(path):
+    """Everything that a table holds, or `None` if it is refused."""
+    try:
+        table = Table.load(path)
+    except OSError as error:
+        assert f"cannot read {path}" in str(error)  # noqa: PT017
+        return None
+    arrays = {name: (values.dtype.str, values.tobytes()) for name, values in (table.coords | table.variables).items()}
+    return arrays, table.units, table.words, table.attributes
+
+
+def check_flips(images, folder, places_of):
+    """A file with one bit flipped is read as it was, or refused."""
+    refused = 0
+    for name, image in images.items():
+        path = folder / f"{name}.h5"
+        path.write_bytes(image)
+        right = contents(path)
+        for place, bit in places_of(image):
+            changed = bytearray(image)
+            changed[place] ^= 1 << bit
+            path.write_bytes(changed)
+            found = contents(path)
+            refused += found is None
+            assert found in (None, right), place
+    return refused
+
+
+def test_a_flipped_bit(images, tmp_path):
+    random = np.random.default_rng(1)
+    refused = check_flips(
+        images,
+        tmp_path,
+        lambda image: zip(random.integers(len(image), size=60), random.integers(8, size=60), strict=True),
+    )
+    assert 20 < refused < 100
+
+
+@pytest.mark.slow
+def test_a_bit_flipped_in_every_byte(images, tmp_path):
+    random = np.random.default_rng(2)
+    refused = check_flips(
+        images, tmp_path, lambda image: ((place, int(random.integers(8))) for place in range(len(image)))
+    )
+    assert refused > 5000
+
+
+def check_flips_of_blocks(folder, places_of):
+    """One bit flipped in what there is of an unfinished table: a reader has the truth or refuses it, a sweep mends it."""
+    start = folder / "start" / "table.h5"
+    start.parent.mkdir()
+    half_finished(start)
+    right, refused = contents(start), 0
+    for file in sorted((folder / "start" / "table.h5.blocks").iterdir()):
+        for place, bit in places_of(file.read_bytes()):
+            shutil.rmtree(folder / "now", ignore_errors=True)
+            shutil.copytree(folder / "start", folder / "now")
+            path = folder / "now" / "table.h5"
+            changed = bytearray(file.read_bytes())
+            changed[place] ^= 1 << bit
+            (folder / "now" / "table.h5.blocks" / file.name).write_bytes(changed)
+            found = contents(path)
+            assert found in (None, right), (file.name, place)
+            refused += found is None
+            if file.suffix == ".npz":
+                assert len(resumed(path)) == 4 + (found is None)
+    return refused
+
+
+def test_a_bit_flipped_in_a_block(tmp_path):
+    random = np.random.default_rng(6)
+    places = lambda image: zip(random.integers(len(image), size=3), random.integers(8, size=3), strict=True)  # noqa: E731
+    assert 4 < check_flips_of_blocks(tmp_path, places) <= 12
+
+
+@pytest.mark.slow
+def test_a_bit_flipped_in_every_byte_of_a_block(tmp_path):
+    random = np.random.default_rng(7)
+    places = lambda image: ((place, int(random.integers(8))) for place in range(0, len(image), 7))  # noqa: E731
+    assert check_flips_of_blocks(tmp_path, places) > 300
+
+
+def test_a_changed_number_is_refused_by_a_reader_and_repaired_by_a_sweep(tmp_path):
+    """Wherever in the numbers of a block: the sweep says so and computes that block again, and no other."""
+    path = tmp_path / "table.h5"
+    cheap_sweep(path)
+    with h5py.File(path, "r+") as file:
+        file["value"][2 * BLOCK + 1] += 1e-16
+    with pytest.raises(OSError, match=r"cannot read .*table\.h5: it is damaged: 1 of its 7 blocks do not match"):
+        Table.load(path)
+    with pytest.warns(RuntimeWarning, match=r"table\.h5 is damaged: 1 finished blocks .* computed again"):
+        cheap_sweep(path)
+    with h5py.File(path, "r+") as file:
+        file["value"][2 * BLOCK + 1] += 1e-16
+    assert resumed(path) == {2}
+
+
+def check_cuts(images, folder, lengths_of):
+    """A file cut short is refused, by a reader and by a sweep, which computes nothing."""
+    for name, image in images.items():
+        path = folder / f"{name}.h5"
+        for length in lengths_of(image):
+            path.write_bytes(image[:length])
+            assert contents(path) is None
+            with pytest.raises(OSError, match=f"cannot read .*{name}"):
+                cheap_sweep(path, pytest.fail)
+
+
+def test_a_file_cut_short(images, tmp_path):
+    random = np.random.default_rng(4)
+    check_cuts(images, tmp_path, lambda image: [0, 1, len(image) - 1, *random.integers(len(image), size=7)])
+
+
+@pytest.mark.slow
+def test_a_file_cut_at_a_hundred_lengths(images, tmp_path):
+    random = np.random.default_rng(5)
+    check_cuts(images, tmp_path, lambda image: random.integers(len(image), size=100))
+
+
+def test_a_file_with_a_hole(images, tmp_path):
+    """Zeros where the numbers of finished blocks were, as after a copy that broke off: refused, and repaired by a sweep."""
+    path = tmp_path / "whole.h5"
+    path.write_bytes(images["whole"])
+    with h5py.File(path, "r") as file:
+        place = file["value"].id.get_offset()
+    image = bytearray(images["whole"])
+    image[place : place + 8 * 2 * BLOCK] = bytes(8 * 2 * BLOCK)
+    path.write_bytes(image)
+    assert contents(path) is None
+    assert resumed(path) == {0, 1}
+
+
+def test_foreign_files_and_folders_are_left_alone(images, tmp_path):
+    """Refused by name, and not changed."""
+    text = tmp_path / "text.h5"
+    text.write_text("not a table")
+    empty = tmp_path / "empty.h5"
+    empty.touch()
+    foreign = tmp_path / "foreign.h5"
+    with h5py.File(foreign, "w") as file:
+        file["x"] = np.arange(3.0)
+    half = tmp_path / "half.h5"
+    with h5py.File(half, "w") as file:
+        file.attrs["request"] = file.attrs["axes"] = "{}"
+        file.create_group("checksums")
+    for path in (text, empty, foreign, half):
+        before = path.read_bytes()
+        assert contents(path) is None
+        with pytest.raises(OSError, match=f"cannot read {path}"):
+            cheap_sweep(path, pytest.fail)
+        assert path.read_bytes() == before
+    saved = tmp_path / "saved.h5"
+    saved.write_bytes(images["saved"])
+    with pytest.raises(ValueError, match=r"saved\.h5 holds .*: it was not written by a sweep in 7 blocks"):
+        cheap_sweep(saved, pytest.fail)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    with pytest.raises(OSError, match="folder: it is a folder"):
+        cheap_sweep(folder, pytest.fail)
+    assert saved.read_bytes() == images["saved"]
+    # No one may write in the first; the second is no folder.
+    for path in (Path("/proc/table.h5"), text / "table.h5"):
+        with pytest.raises(OSError, match=f"cannot write {path}"):
+            cheap_sweep(path, pytest.fail)
