@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from close import assert_close
 from tops import rutstam_top
 from viscous_top import Body, azimuth, follow, start, theta
 
