@@ -90,6 +90,8 @@ class Surrogate(eqx.Module):
     ) -> "Surrogate":
         """The same with the polynomials that come closest to the predictions of some runs, most so to likely ones."""
         known = np.all(np.isfinite(predictions), axis=1)
+        if not np.any(known):
+            raise ValueError("density: the model predicts nothing within the covariance around the centre")
         predictions = self._near(predictions, predictions[np.argmax(np.where(known, log_densities, -np.inf))])
         below = np.max(log_densities[known]) - log_densities[known]
         weights = 1.0 / np.sqrt(1.0 + below / len(self.centre))

@@ -109,7 +109,10 @@ def test_draws_are_from_a_density_that_the_surrogate_misses():
     values = {name: np.asarray(value) for name, value in density.values(flat).items()}
     assert found.accepted < 0.8
     # The roughness itself: its share of the density, which a smooth stand-in would give as 0.
-    for name, of in (*((name, lambda v, n=name: v[n]) for name in values), ("wave", lambda v: np.sin(40.0 * v["rate"]))):
+    for name, of in (
+        *((name, lambda v, n=name: v[n]) for name in values),
+        ("wave", lambda v: np.sin(40.0 * v["rate"])),
+    ):
         mean = np.sum(weights * of(values))
         spread = np.sqrt(np.sum(weights * (of(values) - mean) ** 2))
         ess = min(found.ess.values())
