@@ -44,10 +44,10 @@ def main(path: str | None = None) -> None:
         from matplotlib.figure import Figure
 
         axes = Figure(layout="constrained").subplots()
-        axes.violinplot(replicas, positions=range(len(data.time)), showextrema=False)
-        axes.plot(data.time, "k_", markersize=12)
+        axes.violinplot(1e3 * (replicas - data.time), positions=range(len(data.time)), showextrema=False)
+        axes.axhline(0.0, color="k", linewidth=0.8)
         axes.set_xticks(range(len(data.time)), data.labels, rotation=60, fontsize=7)
-        axes.set_ylabel("inversion time [s]: measured (bars), predicted (violins)")
+        axes.set_ylabel("predicted less measured inversion time [ms]")
         axes.figure.savefig(path)
 
 

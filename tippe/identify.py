@@ -11,6 +11,7 @@ from nonholonomic import identification as generic
 from nonholonomic.identification import Free, Identification, of_data
 from nonholonomic.parameters import numbers, with_numbers
 
+from .cells import driver_of
 from .inversion import check_run, check_smooth
 from .launch import Launch
 from .measured import InversionTimes, Recording, Values, predict_recordings
@@ -56,7 +57,7 @@ def identify(
     seed: int = 0,
     tolerance: float = 1e-8,
     max_steps: int = 60,
-    slopes: str = "exact",
+    slopes: str | None = None,
     progress: bool = True,
 ) -> Identification:
     """Parameters of a scene and its launches from measurements, with their errors and with what is not determined.
@@ -70,15 +71,15 @@ def identify(
       the launch, is the same in all data; `"data[1].launch.azimuth"` is that of the second, and `"data[*].t0"` stands for one
       of each recording. Parameters that cannot be negative are fitted in their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
-    - `slopes`: "exact", those of the equations; or "differences", central ones of 1 % in every parameter, which smooth over the
-      staircase of the times and go through flights, impacts, stick and slip: 2 k + 1 runs for k parameters, recordings one by
-      one.
+    - `slopes`: "exact", those of the equations; or "differences", central ones of 1 % in every parameter, 2 k + 1 runs for k
+      parameters, recordings one by one, which smooth over the staircase of the times. By default exact ones where a run is one
+      smooth motion, and differences through flights, impacts, stick and slip.
     - `tolerance`: relative tolerance of the integration.
 
     **Returns:** an `Identification`, with its `verdict`; of which it warns (`FitWarning`) if it is not good.
 
-    **Raises:** `ValueError` for arguments out of range, an unknown name, and, with exact slopes, a scene with
-    `contact="hybrid"` or `SetValuedCoulomb`, through whose phases a fit takes no derivative.
+    **Raises:** `ValueError` for arguments out of range, an unknown name, and for exact slopes through phases: the time of a top
+    that hops has a slope, but with steps of every flight it may point the other way than the trend.
 
     **Example:**
 
@@ -94,11 +95,10 @@ def identify(
 
     ```
     """
-    exact = None if slopes == "differences" else "identify with slopes = 'exact'"
-    data = checked_data(scene, data, tolerance, exact)
+    data = checked_data(scene, data, tolerance, "identify with slopes = 'exact'" if slopes == "exact" else None)
     unknowns = unknowns_of(scene, data, free)
     measurements, labels, seen = generic.joined(data)
-    smooth = scene.contact != "hybrid" and not scene.friction.set_valued
+    smooth = driver_of(scene).smooth
     kind = SceneModel if smooth else PhasedModel
     return generic.identify(
         kind(scene, data, seen, tolerance),
@@ -108,7 +108,7 @@ def identify(
         spread=spread,
         seed=seed,
         max_steps=max_steps,
-        slopes=slopes,
+        slopes=slopes or ("exact" if smooth else "differences"),
         labels=labels,
         progress=progress,
     )

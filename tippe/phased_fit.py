@@ -1,4 +1,4 @@
-"""Predictions for fits of runs with phases, which have no derivative: each run by itself, outside of transformations."""
+"""Predictions for fits of runs with phases, by whose differences they are fitted: outside of transformations."""
 
 from typing import Any, NamedTuple
 

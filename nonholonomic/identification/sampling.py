@@ -1,28 +1,41 @@
-"""Draws from a posterior by the no-U-turn sampler of BlackJAX (the extra `bayes`)."""
+"""Draws from a posterior by the no-U-turn sampler of BlackJAX (the extra `bayes`), with few runs of the model.
 
-import dataclasses
-import math
+Walks are taken in a surrogate whose predictions are polynomials, learned from runs where the posterior is. Where a walk ends is
+proposed to the posterior itself, and accepted with the probability min(1, p(new) q(old) / (p(old) q(new))), p being the
+posterior and q the surrogate. Because walks of the sampler satisfy detailed balance with respect to q, the draws are from p,
+whatever q is like (surrogate transitions: J. S. Liu, Monte Carlo Strategies in Scientific Computing (2001), chapter 9; Christen
+and Fox, J. Comput. Graph. Stat. 14 (2005) 795). A bad surrogate shows in the share of proposals that are accepted.
+
+That is what event times ask for: they are rough on the scale of a nutation period, so slopes at a place say little of the next
+one, and walks that follow them take hundreds of steps.
+"""
+
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..progress import Progress
 from .posterior import LogDensity
+from .surrogate import Surrogate
 
 #: The share of accepted proposals that the length of the leaps is adapted to (Hoffman and Gelman, J. Mach. Learn. Res. 15
-#: (2014) 1593).
-ACCEPTED = 0.8
+#: (2014) 1593), and how often a walk doubles at most.
+ACCEPTED, DOUBLINGS = 0.8, 8
 
-#: How far the chains start from one another, in standard errors of the fit.
-DISPERSED = 1.5
+#: How many draws of the surrogate a walk consists of, so that its end has forgotten its beginning.
+MOVES = 16
 
-#: How often the ellipse is made rounder, and the least curvature that is believed in one go. Slopes that are a little wrong
-#: make a direction look determined that the data hardly determine.
-ROUNDS, LEAST = 2, 1e-2
+#: Powers of the surrogate in which it learns, and from which draws are proposed: a surrogate that falls off faster than the
+#: posterior would never propose, and never leave, its tails.
+LEARNING, PROPOSING = 0.35, 0.75
+
+#: Learning ends with the round whose runs the polynomials foretold to this standard deviation of the log density, so that
+#: nine tenths of the proposals would be accepted. Rounds are at least and at most so many.
+FORETOLD, LEAST, ROUNDS = 0.3, 2, 6
 
 
 class Draws(NamedTuple):
@@ -31,21 +44,33 @@ class Draws(NamedTuple):
     - `values`: name -> (chains, draws); `coordinates`: (chains, draws, unknowns).
     - `r_hat`, `ess`: name -> number: the potential scale reduction, which should be below 1.01, and the effective number of
       independent draws.
-    - `divergences`: how many trajectories left the region in which the density can be followed.
-    - `leaps`: how many times the density was evaluated, by every chain.
+    - `accepted`: which share of the proposals was accepted; `runs`: how many sets of numbers the model was run for.
     """
 
     values: dict[str, Float[np.ndarray, "chains draws"]]
     coordinates: Float[np.ndarray, "chains draws unknowns"]
     r_hat: dict[str, float]
     ess: dict[str, float]
-    divergences: int
-    leaps: int
+    accepted: float
+    runs: int
+
+    @classmethod
+    def of(
+        cls, density: LogDensity, coordinates: Float[np.ndarray, "chains draws unknowns"], accepted: float, runs: int
+    ) -> "Draws":
+        """Draws at some coordinates, with their diagnostics."""
+        import blackjax
+
+        values = {name: np.asarray(value) for name, value in density.values(jnp.asarray(coordinates)).items()}
+        r_hat = np.asarray(blackjax.diagnostics.potential_scale_reduction(coordinates)).tolist()
+        ess = np.asarray(blackjax.diagnostics.effective_sample_size(coordinates)).tolist()
+        named = (dict(zip(density.names, numbers, strict=True)) for numbers in (r_hat, ess))
+        return cls(values, coordinates, *named, accepted=accepted, runs=runs)
 
     def __str__(self) -> str:
         width = max(map(len, self.values))
         chains, draws = next(iter(self.values.values())).shape
-        lines = [f"{chains} chains of {draws} draws, {self.divergences} divergences, {self.leaps} leaps"]
+        lines = [f"{chains} chains of {draws} draws, {100.0 * self.accepted:.0f} % accepted, {self.runs} runs"]
         for name, value in self.values.items():
             low, middle, high = np.quantile(value, (0.025, 0.5, 0.975))
             quality = f"R-hat {self.r_hat[name]:.4f}, ESS {self.ess[name]:.0f}"
@@ -59,187 +84,134 @@ def sample(
     covariance: Any,
     *,
     chains: int = 4,
-    warmup: int = 100,
-    draws: int = 250,
+    warmup: int = 25,
+    draws: int = 500,
     seed: int = 0,
     progress: bool = True,
 ) -> Draws:
     """Draw from a posterior, from where a fit has ended.
-
-    The coordinates are measured in the fit's standard errors along its own directions, so that the density is nearly round and
-    needs no adaptation but of the length of the leaps; all chains advance together. The leaps follow the slopes that the
-    predictions have around the fit, so that each costs a run, and no derivative of it.
 
     **Arguments:**
 
     - `density`: a `LogDensity`.
     - `centre`, `covariance`: (unknowns,), (unknowns, unknowns), of a fit in its coordinates: `Identification.coordinates` and
       `coordinate_covariance`. Unknown errors, which are not among the unknowns of a fit, start from their first guess.
-    - `chains`, `warmup`, `draws`: how many chains, and steps of each before those that are kept.
+    - `chains`, `warmup`, `draws`: how many chains, and draws of each before those that are kept. The chains start from draws of
+      the surrogate.
     - `seed`: of the draw; `progress`: whether to show it, on a terminal or in a notebook.
 
     **Returns:** `Draws`.
 
     **Raises:** `ValueError` for a covariance that is not finite and positive; `ImportError` without BlackJAX.
     """
-    import blackjax
+    random = np.random.default_rng(seed)
+    kept, accepted = [], 0.0
+    with Progress(warmup + draws, "step", shown=progress) as shown:
+        surrogate, walk, runs = learn(Surrogate.around(density, centre, covariance), chains, random)
+        surrogate = surrogate.to_power(PROPOSING)
+        at, here = _seen(surrogate, walk.points)
+        shown.begin()
+        for step in range(warmup + draws):
+            ahead = _walked(surrogate, _key(random), walk, jnp.asarray(False))
+            tried, there = _seen(surrogate, ahead.points)
+            taken = np.log(random.uniform(size=chains)) < there - here
+            at, here = np.where(taken[:, None], tried, at), np.where(taken, there, here)
+            walk = walk._replace(points=jnp.where(taken[:, None], ahead.points, walk.points))
+            if step >= warmup:
+                accepted += float(np.mean(taken)) / draws
+                kept.append(at)
+            shown.advance(1)
+    return Draws.of(density, np.stack(kept, axis=1), accepted, runs + chains * (warmup + draws + 1))
+
+
+class Walk(NamedTuple):
+    """Where the chains are in a surrogate, and the state of the adaptation of their leaps."""
+
+    points: Float[Array, "chains unknowns"]
+    adaptation: Any
+
+
+def learn(surrogate: Surrogate, chains: int, random: np.random.Generator) -> tuple[Surrogate, Walk, int]:
+    """Let a surrogate learn from runs where its own draws are.
+
+    The first runs are drawn from the fit's error ellipse.
+
+    **Returns:** the surrogate, a `Walk` in it whose leaps suit it, and how many runs it took.
+    """
     from blackjax.adaptation.step_size import dual_averaging_adaptation
 
-    steered = Steered.of(density, *_whole(density, centre, covariance))
-    key, first = jax.random.split(jax.random.key(seed))
-    points = DISPERSED * jax.random.normal(first, (chains, len(steered.centre)))
-    begin, _, settled = dual_averaging_adaptation(ACCEPTED)
-    kept, divergences, leaps = [], 0, 0
-    with Progress(warmup + draws, "step", shown=progress) as shown:
-        states = _begun(steered, points)
+    surrogate, density, runs = surrogate.to_power(LEARNING), surrogate.density, surrogate.runs_a_round
+    begin = dual_averaging_adaptation(ACCEPTED)[0]
+    points = random.normal(size=(runs, len(surrogate.centre)))
+    drawn, pool = np.asarray(surrogate.at(jnp.asarray(points))), []
+    for turn in range(ROUNDS):
+        chosen = random.permutation(drawn)[:runs]
+        predicted = np.asarray(_predicted(density, chosen))
+        true = np.asarray(_log_density(density, chosen, predicted))
+        if turn >= LEAST and np.std(true - _log_density(density, chosen, _foretold(surrogate, chosen))) < FORETOLD:
+            break
+        pool.append((chosen, predicted, true))
+        surrogate = surrogate.learned(*(np.concatenate(parts) for parts in zip(*pool, strict=True)))
+        if turn > 0:
+            surrogate, points = surrogate.among(drawn)
         # As arrays: a Python number in it would be compiled in.
-        adaptation = jax.tree.map(np.asarray, begin(1.0 / len(steered.centre) ** 0.25))
-        length = jnp.exp(adaptation.log_step_size)
-        for step in range(warmup + draws):
-            states, info = _advanced(steered, _keys(key, jnp.asarray(step), chains), states, jnp.asarray(length, float))
-            leaps += int(np.max(info.num_integration_steps))
-            if step == 0:
-                shown.begin()
-            if step < warmup:
-                adaptation, length = _adapted(adaptation, info.acceptance_rate)
-                length = settled(adaptation) if step == warmup - 1 else length
-            else:
-                divergences += int(np.sum(info.is_divergent))
-                kept.append(np.asarray(states.position))
-            shown.advance(1)
-    coordinates = np.asarray(steered.at(jnp.asarray(np.stack(kept, axis=1))))
-    values = {name: np.asarray(value) for name, value in density.values(jnp.asarray(coordinates)).items()}
-    r_hat = blackjax.diagnostics.potential_scale_reduction(coordinates)
-    ess = blackjax.diagnostics.effective_sample_size(coordinates)
-    of = {"r_hat": np.asarray(r_hat).tolist(), "ess": np.asarray(ess).tolist()}
-    named = {kind: dict(zip(density.names, numbers, strict=True)) for kind, numbers in of.items()}
-    return Draws(values, coordinates, **named, divergences=divergences, leaps=leaps)
+        adaptation = jax.tree.map(np.asarray, begin(1.0 / len(surrogate.centre) ** 0.25))
+        walk, path = Walk(jnp.asarray(points[-chains:]), adaptation), []
+        for _ in range(-(-2 * runs // chains)):
+            walk = _walked(surrogate, _key(random), walk, jnp.asarray(True))
+            path.append(np.asarray(surrogate.at(walk.points)))
+        # The first half is on its way.
+        drawn = np.concatenate(path[len(path) // 2 :])
+    return surrogate, walk, runs * (1 + turn)
 
 
-class Steered(eqx.Module):
-    """A density in coordinates in which a fit's error ellipse is a sphere; its gradient costs no derivative of the model.
+def _key(random: np.random.Generator) -> Array:
+    """A key for JAX's random numbers."""
+    return jax.random.key(int(random.integers(2**31)))
 
-    The slopes of the predictions are those of secants over one standard error either way, found once; the rest of the density
-    is differentiated exactly. With any field of force a leap keeps volumes and can be taken back, and leaps are accepted by
-    the density itself: the draws are from it, whatever the slopes (Li et al., Comput. Stat. 34 (2019) 281).
 
-    Where the data fix one combination far better than another, the ellipse is a thin ridge, and bent: along a loose direction
-    the tight ones are moved with the square of the distance, which keeps volumes, too.
-
-    - `centre`, `root`, `bend`: coordinates of the density are `centre` + `root` (point + `bend` point^2); column k of `bend` is
-      0 but for directions tighter than k. The directions are sorted, the tightest first.
-    - `middle`: (n,), predictions at the centre; `slopes`: (n, unknowns), their slopes by the point.
-    """
-
-    density: LogDensity
-    centre: Float[Array, " unknowns"]
-    root: Float[Array, "unknowns unknowns"]
-    bend: Float[Array, "unknowns unknowns"]
-    middle: Float[Array, " n"]
-    slopes: Float[Array, "n unknowns"]
-
-    @classmethod
-    def of(
-        cls, density: LogDensity, centre: Float[Array, " unknowns"], root: Float[Array, "unknowns unknowns"]
-    ) -> "Steered":
-        """The density around a fit, its ellipse made rounder: secants see further than the slopes at the fit."""
-        count = len(centre)
-        flat = cls(density, centre, root, jnp.zeros((count, count)), jnp.zeros(0), jnp.zeros((0, count)))
-        found, _ = flat._seen()
-        for _ in range(ROUNDS):
-            found, curves = found._rounder()._seen()
-            found, _ = found._bent(curves)._seen()
-        return found
-
-    @eqx.filter_jit
-    def _rounder(self) -> "Steered":
-        """The same with an ellipse as wide as the slopes say, along its own axes, not bent."""
-        count = len(self.centre)
-        # Directions that are flat or curved the other way are stretched, and looked at again.
-        values, directions = jnp.linalg.eigh(-jax.hessian(self._straight)(jnp.zeros(count), 0.0))
-        spread = self.root @ (directions / jnp.sqrt(jnp.clip(values, LEAST, 1.0 / LEAST)))
-        axes, sizes, _ = jnp.linalg.svd(spread)
-        return dataclasses.replace(self, root=(axes * sizes)[:, ::-1], bend=jnp.zeros((count, count)))
-
-    @eqx.filter_jit
-    def _bent(self, curves: Float[Array, "unknowns n"]) -> "Steered":
-        """The same with the tight directions moved as far as the curved predictions pull them."""
-        by_point, middle = jax.grad(self._straight), jnp.zeros(len(self.centre))
-        pulls = jax.vmap(lambda curve: by_point(middle, curve) - by_point(middle, 0.0))(curves)
-        return dataclasses.replace(self, bend=jnp.triu(pulls.T, 1))
-
-    def _seen(self) -> tuple["Steered", Float[Array, "unknowns n"]]:
-        """The same with the predictions and slopes of secants of length 1 either way, and how far these are curved."""
-        count = len(self.centre)
-        points = self.at(jnp.concatenate([jnp.zeros((1, count)), jnp.eye(count), -jnp.eye(count)]))
-        found = _predicted(self.density, points)
-        middle, ahead, behind = jnp.split(jnp.where(jnp.isfinite(found), found, found[0]), [1, 1 + count])
-        seen = dataclasses.replace(self, middle=middle[0], slopes=0.5 * (ahead - behind).T)
-        return seen, 0.5 * (ahead + behind) - middle
-
-    def _straight(self, point: Float[Array, " unknowns"], off: Any) -> Float[Array, ""]:
-        """The density if predictions were straight lines, moved by `off`."""
-        return self.density.of_prediction(self.centre + self.root @ point, self.middle + off + self.slopes @ point)
-
-    def at(self, point: Float[Array, "... unknowns"]) -> Float[Array, "... unknowns"]:
-        """The coordinates of a point."""
-        return self.centre + (point + point**2 @ self.bend.T) @ self.root.T
-
-    def __call__(self, point: Float[Array, " unknowns"]) -> Float[Array, ""]:
-        @jax.custom_jvp
-        def predict(point: Float[Array, " unknowns"]) -> Float[Array, " n"]:
-            return self.density.predict(self.at(point)[None])[0]
-
-        @predict.defjvp
-        def along(primals: Any, tangents: Any) -> Any:
-            return predict(*primals), self.slopes @ tangents[0]
-
-        return self.density.of_prediction(self.at(point), predict(point))
+def _seen(
+    surrogate: Surrogate, points: Float[Array, "chains unknowns"]
+) -> tuple[Float[np.ndarray, "chains unknowns"], Float[np.ndarray, " chains"]]:
+    """The coordinates of some points, and there the log of the posterior over what the surrogate proposes from."""
+    density, coordinates = surrogate.density, np.asarray(surrogate.at(points))
+    true = _log_density(density, coordinates, _predicted(density, coordinates))
+    foretold = _log_density(density, coordinates, _foretold(surrogate, coordinates))
+    return coordinates, np.asarray(true - surrogate.power * foretold)
 
 
 _predicted = eqx.filter_jit(LogDensity.predict)
+_foretold = eqx.filter_jit(Surrogate.predict)
 
 
 @eqx.filter_jit
-def _begun(steered: Steered, points: Float[Array, "chains unknowns"]) -> Any:
-    """The states of chains at some points."""
+def _log_density(
+    density: LogDensity, coordinates: Float[Array, "rows unknowns"], predictions: Float[Array, "rows n"]
+) -> Float[Array, " rows"]:
+    """The log density of every row, given what is predicted there."""
+    return jax.vmap(density.of_prediction)(coordinates, predictions)
+
+
+@eqx.filter_jit
+def _walked(surrogate: Surrogate, key: Array, walk: Walk, adapting: Bool[Array, ""]) -> Walk:
+    """Where all chains are some draws later; with leaps that are adapted on the way, or as they have settled."""
     import blackjax
-
-    return jax.vmap(lambda point: blackjax.nuts.init(point, steered))(points)
-
-
-@eqx.filter_jit
-def _advanced(steered: Steered, keys: Array, states: Any, length: Float[Array, ""]) -> Any:
-    """The next states of all chains, and how they were found."""
-    import blackjax
-
-    kernel, inverse_mass = blackjax.nuts.build_kernel(), jnp.ones(len(steered.centre))
-    return jax.vmap(lambda key, state: kernel(key, state, steered, length, inverse_mass))(keys, states)
-
-
-@eqx.filter_jit
-def _adapted(adaptation: Any, accepted: Float[Array, " chains"]) -> tuple[Any, Float[Array, ""]]:
-    """What the acceptance of all chains makes of the leaps' length."""
     from blackjax.adaptation.step_size import dual_averaging_adaptation
 
-    adaptation = dual_averaging_adaptation(ACCEPTED)[1](adaptation, jnp.mean(accepted))
-    return adaptation, jnp.exp(adaptation.log_step_size)
+    kernel, round_mass = blackjax.nuts.build_kernel(), jnp.ones(len(surrogate.centre))
+    adapted = dual_averaging_adaptation(ACCEPTED)[1]
 
+    def move(walk: Walk, key: Array) -> tuple[Walk, None]:
+        state = walk.adaptation
+        length = jnp.exp(jnp.where(adapting, state.log_step_size, state.log_step_size_avg))
 
-_keys = eqx.filter_jit(lambda key, step, count: jax.random.split(jax.random.fold_in(key, step), count))
+        def one(key: Array, point: Float[Array, " unknowns"]) -> tuple[Array, Array]:
+            begun = blackjax.nuts.init(point, surrogate)
+            ended, info = kernel(key, begun, surrogate, length, round_mass, max_num_doublings=DOUBLINGS)
+            return ended.position, info.acceptance_rate
 
+        points, accepted = jax.vmap(one)(jax.random.split(key, len(walk.points)), walk.points)
+        new = adapted(state, jnp.mean(accepted))
+        return Walk(points, jax.tree.map(lambda new, old: jnp.where(adapting, new, old), new, state)), None
 
-def _whole(density: LogDensity, centre: Any, covariance: Any) -> tuple[Array, Array]:
-    """Where the density is centred, and a root of its covariance; an unknown error of n values has the variance 1 / 2n."""
-    covariance = np.asarray(covariance, float)
-    numbers = len(density.problem.free)
-    if covariance.shape != (numbers, numbers) or not np.all(np.isfinite(covariance)):
-        raise ValueError(
-            f"covariance must be finite and of shape {(numbers, numbers)}: the data do not determine all numbers"
-        )
-    series, open_ = np.asarray(density.measurements.series), np.asarray(density.measurements.estimated)
-    sizes = [math.sqrt(0.5 / np.sum(open_ & (series == one))) for one in density.open_series]
-    root = np.zeros((numbers + len(sizes),) * 2)
-    root[:numbers, :numbers] = np.linalg.cholesky(covariance)
-    root[numbers:, numbers:] = np.diag(sizes)
-    return jnp.concatenate([jnp.asarray(centre, float), jnp.zeros(len(sizes))]), jnp.asarray(root)
+    return jax.lax.scan(move, walk, jax.random.split(key, MOVES))[0]

@@ -1,12 +1,9 @@
 """Recorded motion of tops: fitted from start to end, read from files, refused."""
 
-import dataclasses
 import math
 
-import lagrange_top
 import numpy as np
 import pytest
-from close import assert_close
 from tops import rutstam_top
 from viscous_top import Body, azimuth, follow, start, theta
 
@@ -80,26 +77,6 @@ def test_missing_samples_are_left_out_and_unknown_errors_are_found(fit):
         assert 0.6 * NOISE < errors.pop() < 1.5 * NOISE
     assert math.isnan(fit.verdict.p_value)
     assert len(fit.verdict.series) == 4
-
-
-@pytest.mark.slow
-def test_friction_of_a_top_that_may_fly_by_differences(rutstam_scene):
-    """Through phases no derivative goes; the times are of the independent program, whose tops stay on the plane."""
-    scene = dataclasses.replace(rutstam_scene, contact="hybrid")
-    top, launch = rutstam_top(), tippe.Launch([0.3, 0.2], [110.0, 140.0])
-    times = [
-        lagrange_top.follow(
-            lagrange_top.Scene(top.mass, top.radius, top.offset, float(top.I1), float(top.I3), a, w, mu=0.3),
-            6.0,
-            0.8,
-            1e-9,
-        )[1]
-        for a, w in ((0.3, 110.0), (0.2, 140.0))
-    ]
-    data = tippe.InversionTimes(launch, times, 0.01, t1=6.0, angle=0.8)
-    fit = tippe.identify(scene, data, {"mu": 0.24}, slopes="differences", tolerance=1e-7)
-    assert abs(fit.estimates["scene.friction.mu"] - 0.3) < 1e-3
-    assert_close([row.prediction for row in fit.residuals], times, atol=0.01)
 
 
 HEADERS = "t,tilt,x\n0.0,5,1\n0.1,6,2\n"

@@ -95,3 +95,12 @@ def test_the_picture_has_data_residuals_profiles_and_correlation():
     assert [axes.get_xlabel() for axes in profiles] == ["height", "rate"]
     assert_close(correlation.images[0].get_array(), fit.correlation)
     assert_close(np.diag(fit.correlation), 1.0)
+
+
+def test_an_angle_is_drawn_on_the_turn_of_its_prediction():
+    """A camera sees it up to whole turns."""
+    exact = 3.0 * T + 0.1 * np.random.default_rng(5).normal(size=T.size)
+    seen = Measurements((exact + math.pi) % (2.0 * math.pi) - math.pi, 0.1, period=2.0 * math.pi)
+    fit = identify(lambda p: p["rate"][:, None] * T, seen, {"rate": 3.01})
+    drawn = fit.plot().axes[0].containers[0].lines[0].get_ydata()
+    assert_close(drawn, exact, atol=1e-9)

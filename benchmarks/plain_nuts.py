@@ -1,0 +1,73 @@
+"""The no-U-turn samplers of BlackJAX and NumPyro on a density itself, to compare `nonholonomic.identification.sample` with."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic.identification import Draws, LogDensity
+from nonholonomic.identification.sampling import learn
+from nonholonomic.identification.surrogate import Surrogate
+
+#: How often a walk doubles at most.
+DEEPEST = 6
+
+
+class InPoints(eqx.Module):
+    """A density as a function of a surrogate's points, whose volumes are those of coordinates but for a factor."""
+
+    density: LogDensity
+    surrogate: Surrogate
+
+    def __call__(self, point: Float[Array, " unknowns"]) -> Float[Array, ""]:
+        return self.density(self.surrogate.at(point))
+
+
+def plain(library: str, density: LogDensity, fit: Any, warmup: int, draws: int) -> tuple[Draws, int]:
+    """Draws by the no-U-turn sampler of a library, with the density's own gradient, and the leaps of the kept draws."""
+    around = Surrogate.around(density, fit.coordinates, fit.coordinate_covariance)
+    surrogate, walk, runs = learn(around, 4, np.random.default_rng(0))
+    points, leaps = BY[library](InPoints(density, surrogate), walk.points, warmup, draws)
+    coordinates = np.asarray(surrogate.at(jnp.asarray(points)))
+    return Draws.of(density, coordinates, math.nan, runs + leaps), leaps
+
+
+def by_numpyro(density: InPoints, starts: Any, warmup: int, draws: int) -> tuple[np.ndarray, int]:
+    """Points (chains, draws, unknowns) by NumPyro, and how many leaps of all chains they took."""
+    from numpyro.infer import MCMC, NUTS
+
+    chains = {"num_chains": len(starts), "chain_method": "vectorized", "progress_bar": False}
+    kernel = NUTS(potential_fn=lambda point: -density(point), dense_mass=True, max_tree_depth=DEEPEST)
+    run = MCMC(kernel, num_warmup=warmup, num_samples=draws, **chains)
+    run.run(jax.random.key(1), init_params=starts, extra_fields=("num_steps",))
+    steps = np.asarray(run.get_extra_fields(group_by_chain=True)["num_steps"])
+    return np.asarray(run.get_samples(group_by_chain=True)), int(np.sum(steps))
+
+
+def by_blackjax(density: InPoints, starts: Any, warmup: int, draws: int) -> tuple[np.ndarray, int]:
+    """The same by BlackJAX."""
+    import blackjax
+
+    def chain(key: Any, start: Any) -> tuple[Array, Array]:
+        adaptation = blackjax.window_adaptation(
+            blackjax.nuts, density, is_mass_matrix_diagonal=False, max_num_doublings=DEEPEST
+        )
+        first, then = jax.random.split(key)
+        (state, found), _ = adaptation.run(first, start, warmup)
+        step = blackjax.nuts(density, **found).step
+
+        def one(state: Any, key: Any) -> Any:
+            state, info = step(key, state)
+            return state, (state.position, info.num_integration_steps)
+
+        return jax.lax.scan(one, state, jax.random.split(then, draws))[1]
+
+    points, steps = jax.jit(jax.vmap(chain))(jax.random.split(jax.random.key(1), len(starts)), starts)
+    return np.asarray(points), int(np.sum(steps))
+
+
+BY = {"numpyro": by_numpyro, "blackjax": by_blackjax}

@@ -1,0 +1,146 @@
+"""A posterior whose predictions are polynomials: cheap to walk in, and close enough to propose draws from."""
+
+import itertools
+import math
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .posterior import LogDensity
+
+#: Polynomials are of the first degree, but of 2 at least, and of a lower one where they would have more terms than the second.
+HIGHEST, MOST_TERMS = 4, 90
+
+#: The highest power by which points are bent.
+BENT = 3
+
+#: Runs for every term of the polynomials, in each round of learning.
+RUNS_PER_TERM = 2
+
+
+class Surrogate(eqx.Module):
+    """A log density whose predictions are polynomials of the coordinates; priors and likelihood are those of the density.
+
+    It is a function of points: the coordinates of the density are `centre` + the sum of `bends[k]` point^(k + 1). Where the
+    data fix one combination far better than another, the posterior is a thin ridge, and bent; in points it is about round.
+    Along the axes of `among` the bends are triangular, so volumes differ by a factor only. An unknown error, which no
+    prediction depends on, is among the coordinates, too.
+
+    - `power`: which power of the density it is; less than 1 makes it wider.
+    - `origin`, `scale`: (numbers,), (numbers, numbers): the polynomials are in `scale` (coordinates - `origin`).
+    - `coefficients`: (terms, n).
+    """
+
+    density: LogDensity
+    centre: Float[Array, " unknowns"]
+    bends: Float[Array, "powers unknowns unknowns"]
+    power: Float[Array, ""]
+    origin: Float[Array, " numbers"]
+    scale: Float[Array, "numbers numbers"]
+    coefficients: Float[Array, "terms n"]
+
+    @classmethod
+    def around(cls, density: LogDensity, centre: Any, covariance: Any) -> "Surrogate":
+        """One that has learned nothing yet, with points in units of a fit's errors along its own directions.
+
+        An unknown error of n values has the variance 1 / 2n.
+        """
+        covariance = np.asarray(covariance, float)
+        numbers = len(density.problem.free)
+        if covariance.shape != (numbers, numbers) or not np.all(np.isfinite(covariance)):
+            raise ValueError(
+                f"covariance must be finite and of shape {(numbers, numbers)}: the data do not determine all numbers"
+            )
+        series, open_ = np.asarray(density.measurements.series), np.asarray(density.measurements.estimated)
+        sizes = [math.sqrt(0.5 / np.sum(open_ & (series == one))) for one in density.open_series]
+        root = np.zeros((numbers + len(sizes),) * 2)
+        root[:numbers, :numbers] = np.linalg.cholesky(covariance)
+        root[numbers:, numbers:] = np.diag(sizes)
+        whole = np.concatenate([np.asarray(centre, float), np.zeros(len(sizes))])
+        coefficients = jnp.zeros((len(_factors(numbers)), density.measurements.value.size))
+        scale = np.linalg.inv(root[:numbers, :numbers])
+        bends = np.concatenate([root[None], np.zeros((BENT - 1, *root.shape))])
+        return cls(density, *map(jnp.asarray, (whole, bends, 1.0, whole[:numbers], scale)), coefficients)
+
+    @property
+    def runs_a_round(self) -> int:
+        """How many runs a round of learning takes."""
+        return RUNS_PER_TERM * len(self.coefficients)
+
+    def at(self, point: Float[Array, "... unknowns"]) -> Float[Array, "... unknowns"]:
+        """The coordinates of a point."""
+        return self.centre + sum(point ** (k + 1) @ self.bends[k].T for k in range(BENT))
+
+    def predict(self, coordinates: Float[Array, "... unknowns"]) -> Float[Array, "... n"]:
+        """The predictions of the polynomials."""
+        return self._terms(coordinates) @ self.coefficients
+
+    def __call__(self, point: Float[Array, " unknowns"]) -> Float[Array, ""]:
+        coordinates = self.at(point)
+        return self.power * self.density.of_prediction(coordinates, self.predict(coordinates))
+
+    def learned(
+        self,
+        coordinates: Float[np.ndarray, "runs unknowns"],
+        predictions: Float[np.ndarray, "runs n"],
+        log_densities: Float[np.ndarray, " runs"],
+    ) -> "Surrogate":
+        """The same with the polynomials that come closest to the predictions of some runs, most so to likely ones."""
+        known = np.all(np.isfinite(predictions), axis=1)
+        if not np.any(known):
+            raise ValueError("density: the model predicts nothing within the covariance around the centre")
+        predictions = self._near(predictions, predictions[np.argmax(np.where(known, log_densities, -np.inf))])
+        below = np.max(log_densities[known]) - log_densities[known]
+        weights = 1.0 / np.sqrt(1.0 + below / len(self.centre))
+        terms = np.asarray(self._terms(jnp.asarray(coordinates[known])))
+        found, *_ = np.linalg.lstsq(terms * weights[:, None], predictions[known] * weights[:, None])
+        return eqx.tree_at(lambda one: one.coefficients, self, jnp.asarray(found))
+
+    def among(
+        self, coordinates: Float[np.ndarray, "draws unknowns"]
+    ) -> tuple["Surrogate", Float[np.ndarray, "draws unknowns"]]:
+        """The same with points in which some draws are about round, and these points.
+
+        Along the principal axes of the draws, the widest first, what the powers of the points before foretell is taken away.
+        """
+        centre = coordinates.mean(axis=0)
+        axes = np.linalg.eigh(np.atleast_2d(np.cov(coordinates.T)))[1][:, ::-1]
+        count, unknowns = coordinates.shape
+        along, points = (coordinates - centre) @ axes, np.zeros((count, unknowns))
+        bends, shift = np.zeros((BENT, unknowns, unknowns)), np.zeros(unknowns)
+        for k in range(unknowns):
+            powers = np.concatenate([points[:, :k] ** (p + 1) for p in range(BENT)], axis=1)
+            terms = np.concatenate([np.ones((count, 1)), powers], axis=1)
+            found, *_ = np.linalg.lstsq(terms, along[:, k])
+            rest = along[:, k] - terms @ found
+            bends[0, k, k], shift[k] = np.std(rest), found[0]
+            points[:, k] = rest / bends[0, k, k]
+            bends[:, k, :k] = found[1:].reshape(BENT, k)
+        new = (centre + axes @ shift, axes @ bends)
+        return eqx.tree_at(lambda one: (one.centre, one.bends), self, tuple(map(jnp.asarray, new))), points
+
+    def to_power(self, power: float) -> "Surrogate":
+        """The same, but another power of the density."""
+        return eqx.tree_at(lambda one: one.power, self, jnp.asarray(power))
+
+    def _near(
+        self, predictions: Float[np.ndarray, "runs n"], middle: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "runs n"]:
+        """Predictions moved by whole periods close to those of one run: an angle that jumps by a turn is no polynomial."""
+        period = np.asarray(self.density.measurements.period)
+        turns = np.round((predictions - middle) / period)
+        return predictions - np.where(np.isfinite(period), period, 0.0) * np.where(np.isfinite(turns), turns, 0.0)
+
+    def _terms(self, coordinates: Float[Array, "... unknowns"]) -> Float[Array, "... terms"]:
+        x = (coordinates[..., : len(self.origin)] - self.origin) @ self.scale.T
+        one = jnp.ones_like(x[..., :1])
+        return jnp.prod(jnp.concatenate([one, x], axis=-1)[..., _factors(len(self.origin))], axis=-1)
+
+
+def _factors(numbers: int) -> np.ndarray:
+    """Which numbers the terms of a polynomial are products of, (terms, degree); 0 stands for a factor of 1."""
+    degree = next((d for d in range(HIGHEST, 2, -1) if math.comb(numbers + d, d) <= MOST_TERMS), 2)
+    return np.array(list(itertools.combinations_with_replacement(range(numbers + 1), degree)))
