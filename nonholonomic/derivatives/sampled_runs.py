@@ -1,5 +1,6 @@
 """Runs sampled at given times, as functions for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple, Self
 
