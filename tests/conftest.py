@@ -35,10 +35,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 #: Memory mappings that a process may collect before it forgets its compiled programs; Linux allows 65 530, and a compiler that
 #: gets no more of them crashes.
-MOST_MAPPINGS = 45_000
+MOST_MAPPINGS = 35_000
+
+# Tracing makes many long-lived objects, through which Python would look for cycles again and again.
+gc.set_threshold(100_000, 50, 100)
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="module")
 def forget_compiled_programs():
     """Let go of compiled programs before they exhaust the memory mappings that a process may have."""
     yield

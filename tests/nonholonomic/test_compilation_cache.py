@@ -37,7 +37,7 @@ SMALL = "result = jax.jit(lambda x: (x * x).sum())(np.arange(4.0)).item()"
 
 def run(program, home, **settings):
     """What `COUNTED` tells in a process of its own, in which every warning is an error, and what else it says."""
-    own = ("JAX_COMPILATION_CACHE_DIR", "NONHOLONOMIC_CACHE", "XLA_FLAGS")
+    own = ("JAX_COMPILATION_CACHE_DIR", "NONHOLONOMIC_CACHE")
     settings = {name: value for name, value in os.environ.items() if name not in own} | settings
     settings |= {"XDG_CACHE_HOME": str(home), "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-W", "error", "-c", COUNTED.format(program=program)]

@@ -95,6 +95,7 @@ def test_a_flat_graph_is_the_plane():
     assert_close(graph.end_theta, plane.end_theta, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_top_jumps_over_a_hill():
     """It leaves the ground before the crest and slides on in the next valley: the same program, and energy at every time."""
     case = CASES[1]

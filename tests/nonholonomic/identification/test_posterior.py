@@ -121,6 +121,7 @@ def test_draws_are_from_a_density_that_the_surrogate_misses():
     assert abs(np.sum(weights * np.sin(40.0 * values["rate"]))) > 0.2
 
 
+@pytest.mark.slow
 def test_numpyro_draws_the_same(draws):
     """The other library, whose figures stand beside in `benchmarks/posterior.py`, on the same density in the same points."""
     fit, density, found = draws
