@@ -1,6 +1,7 @@
 """One step of a Runge-Kutta method."""
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -42,3 +43,22 @@ def test_a_step_is_that_of_diffrax(solver):
     assert step.first_negative[0] == 2.0
     between = [fraction for fraction in explicit_tableau(solver).c if fraction < 1.0]
     assert step.first_negative[2] in between or (not between and step.first_negative[2] == 2.0)
+
+
+def test_an_accelerator_gets_the_stages_written_out(monkeypatch):
+    """The same step, and no loop in it, in which it would wait for the host at every branch."""
+    tableau, time, length = explicit_tableau(diffrax.Bosh3()), jnp.array([0.0, 0.5]), jnp.array([0.1, 0.4])
+    state = jnp.array([[1.0, 0.3], [0.0, 0.4]])
+
+    def compiled():
+        def step(state):
+            return explicit_step(tableau, field, lambda time, at: at[0], time, state, field(time, state), length)
+
+        return jax.jit(step)
+
+    here = compiled()(state)
+    assert "while" in compiled().lower(state).as_text()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert "while" not in compiled().lower(state).as_text()
+    for name, value in compiled()(state)._asdict().items():
+        np.testing.assert_allclose(getattr(here, name), value, rtol=1e-13, atol=1e-15, err_msg=name)
