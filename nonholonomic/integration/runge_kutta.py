@@ -58,7 +58,7 @@ def explicit_step(
     - `tableau`: the method.
     - `field`: (time [s], state) -> rate of the state.
     - `watch`: (time, state) -> a number per lane that should stay positive. It is looked at in the end and at
-      three stages between, and computed there only.
+      three stages between, together with `field`, so that what both need is computed once.
       If it is negative for less than a quarter of a step, that may go unnoticed.
     - `time`, `state`, `rate`: where the step starts, and the field there.
     - `length`: length of the step [s], one per lane.
@@ -75,7 +75,7 @@ def explicit_step(
         rates, first_negative = carry
         there = moved_state(stage, tableau.a_lower[:inner], state, length, rates)
         at = time + places[stage] * length
-        negative = jax.lax.cond(looked[stage], lambda: watch(at, there) < 0.0, lambda: jnp.zeros(length.shape, bool))
+        negative = looked[stage] & (watch(at, there) < 0.0)
         first_negative = jnp.minimum(first_negative, jnp.where(negative, places[stage], 2.0))
         return written_by_component(rates, field(at, there), at=stage + 1), first_negative
 
