@@ -32,6 +32,7 @@ from ..integration import (
     attempt,
     length_to_try,
     moved_state,
+    over_stages,
 )
 from ..xla_cpu import uncounted, written_by_component, written_in_place
 from ._shared_values import sharing_values
@@ -328,7 +329,7 @@ def step_taken_back(
 
     none = jnp.zeros((stages, *state.shape), state.dtype)
     begun = written_in_place(none, state, at=jnp.zeros((), int)), none[1:]
-    along, _ = jax.lax.fori_loop(0, stages - 1, stage_made, begun)
+    along, _ = over_stages(stages - 1, stage_made, begun)
 
     def pull(at: Lanes, numbers: Any, parts: tuple[Lanes, ...], by_rate: tuple[Lanes, ...]) -> tuple[Lanes, ...]:
         def field(numbers: Any, parts: tuple[Lanes, ...]) -> States:
@@ -337,8 +338,8 @@ def step_taken_back(
         by_number, by_part = jax.vjp(field, numbers, parts)[1](jnp.stack(by_rate))
         return (*by_part, *jax.tree.leaves(by_number))
 
-    def stage_taken_back(carry: Any) -> Any:
-        stage, by_stage, total = carry
+    def stage_taken_back(done: Int[Array, ""], carry: Any) -> Any:
+        stage, (by_stage, total) = stages - 1 - done, carry
         by_rate = jax.lax.optimization_barrier(moved_state(stage, weights.shares, nothing, length, by_stage))
         at = time + fractions[stage] * length
         pulled = sharing_values(pull)(
@@ -346,11 +347,10 @@ def step_taken_back(
         )
         # Where no step was made, nothing can be assumed finite.
         pulled = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(pulled), 0.0))
-        return stage - 1, written_in_place(by_stage, pulled[:components], at=stage + 1), total + pulled
+        return written_in_place(by_stage, pulled[:components], at=stage + 1), total + pulled
 
     nothing, ends = jnp.zeros_like(state), written_in_place(room, adjoint[:components], at=jnp.zeros((), int))
-    carry = (jnp.asarray(stages - 1), ends, jnp.zeros_like(adjoint))
-    _, room, total = jax.lax.while_loop(lambda carry: carry[0] >= 0, stage_taken_back, carry)
+    room, total = over_stages(stages, stage_taken_back, (ends, jnp.zeros_like(adjoint)))
     return adjoint + total, room
 
 

@@ -130,12 +130,16 @@ class Measurements(eqx.Module):
         flat = jnp.where(small, 1.0 - 0.5 * share, jnp.log1p(share) / jnp.where(small, 1.0, share))
         return jnp.where(heavy, z * jnp.sqrt((freedom + 1.0) / freedom * flat), z)
 
-    def standardised(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
-        """(prediction - value) / error, moved by whole periods to the least; 0 for limits."""
+    def whole_periods(self, off: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """How much of some differences are whole periods, to the nearest; without a slope."""
         wraps = jnp.isfinite(self.period)
         period = jnp.where(wraps, self.period, 1.0)
+        return jnp.where(wraps, period * jax.lax.stop_gradient(jnp.round(off / period)), 0.0)
+
+    def standardised(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """(prediction - value) / error, moved by whole periods to the least; 0 for limits."""
         off = jnp.where(self.censored, 0.0, prediction - self.value)
-        off = jnp.where(wraps, off - period * jax.lax.stop_gradient(jnp.round(off / period)), off)
+        off = off - self.whole_periods(off)
         return off / self.error
 
     def information(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:

@@ -92,7 +92,9 @@ class Surrogate(eqx.Module):
         known = np.all(np.isfinite(predictions), axis=1)
         if not np.any(known):
             raise ValueError("density: the model predicts nothing within the covariance around the centre")
-        predictions = self._near(predictions, predictions[np.argmax(np.where(known, log_densities, -np.inf))])
+        # An angle that jumps by a turn is no polynomial.
+        middle = predictions[np.argmax(np.where(known, log_densities, -np.inf))]
+        predictions = predictions - np.asarray(self.density.measurements.whole_periods(predictions - middle))
         below = np.max(log_densities[known]) - log_densities[known]
         weights = 1.0 / np.sqrt(1.0 + below / len(self.centre))
         terms = np.asarray(self._terms(jnp.asarray(coordinates[known])))
@@ -125,14 +127,6 @@ class Surrogate(eqx.Module):
     def to_power(self, power: float) -> "Surrogate":
         """The same, but another power of the density."""
         return eqx.tree_at(lambda one: one.power, self, jnp.asarray(power))
-
-    def _near(
-        self, predictions: Float[np.ndarray, "runs n"], middle: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, "runs n"]:
-        """Predictions moved by whole periods close to those of one run: an angle that jumps by a turn is no polynomial."""
-        period = np.asarray(self.density.measurements.period)
-        turns = np.round((predictions - middle) / period)
-        return predictions - np.where(np.isfinite(period), period, 0.0) * np.where(np.isfinite(turns), turns, 0.0)
 
     def _terms(self, coordinates: Float[Array, "... unknowns"]) -> Float[Array, "... terms"]:
         x = (coordinates[..., : len(self.origin)] - self.origin) @ self.scale.T

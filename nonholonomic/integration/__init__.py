@@ -38,6 +38,7 @@ from .runge_kutta import Stages as Stages
 from .runge_kutta import States as States
 from .runge_kutta import explicit_tableau as explicit_tableau
 from .runge_kutta import moved_state as moved_state
+from .runge_kutta import over_stages as over_stages
 from .samples import march_with_samples as march_with_samples
 from .settings import ABSOLUTE as ABSOLUTE
 from .settings import Settings as Settings

@@ -3,7 +3,7 @@
 import functools
 import operator
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -81,14 +81,19 @@ def explicit_step(
 
     none = jnp.zeros((1 + inner, *rate.shape), rate.dtype)
     start = written_in_place(none, rate, at=jnp.zeros((), int)), jnp.full_like(length, 2.0)
-    # An accelerator would wait for the host at every branch.
-    rates, first_negative = jax.lax.fori_loop(0, inner, do, start, unroll=jax.default_backend() != "cpu")
+    rates, first_negative = over_stages(inner, do, start)
     stages = list(jnp.unstack(rates))
     # Stored, for the step, its error and the event all depend on it.
     end = jax.lax.optimization_barrier(state + length * weighted_sum(tableau.b_sol[: 1 + inner], stages))
     last_rate, watched = jax.lax.optimization_barrier((field(time + length, end), watch(time + length, end)))
     stages += [last_rate] if tableau.fsal else []
     return Step(end, last_rate, length * weighted_sum(tableau.b_error, stages), watched, first_negative)
+
+
+def over_stages(stages: int, do: Callable[[Int[Array, ""], Any], Any], start: Any) -> Any:
+    """What is carried on when something is done in every stage, in a loop; on an accelerator, which would wait for the host at
+    every branch, one after the other."""
+    return jax.lax.fori_loop(0, stages, do, start, unroll=jax.default_backend() != "cpu")
 
 
 def _places_to_look(fractions: Float[np.ndarray, " stages"]) -> set[int]:

@@ -53,9 +53,7 @@ def _draw_data(fit: "Identification", axes: Any) -> None:
     errors, predicted = (np.array([getattr(row, name) for row in rows]) for name in ("error", "prediction"))
     censored = np.array([row.censored for row in rows])
     # An angle is drawn on the turn on which the prediction is.
-    period = np.asarray(fit.measurements.period)
-    turns = np.where(np.isfinite(period), np.round((predicted - value) / period), 0.0)
-    value = value + turns * np.where(np.isfinite(period), period, 0.0)
+    value = value + np.asarray(fit.measurements.whole_periods(predicted - value))
     for k, here in enumerate(_series(fit)):
         colour, exact, limits = f"C{k}", here[~censored[here]], here[censored[here]]
         name = rows[here[0]].label.split("(")[0]
