@@ -24,7 +24,7 @@ from .status import CROSSED, GUARD_LOST, REACHED_END, RUNNING
 
 #: What it costs to refill a block, in steps of the whole block. It is refilled when as much has been lost to idle lanes, which
 #: is never more than twice what the best moment would have cost.
-REFILL = 2
+REFILL = 0.25
 
 
 class Outcome(NamedTuple):
