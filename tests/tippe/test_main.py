@@ -2,10 +2,11 @@
 
 import json
 
+import jax
 import pytest
 import xarray
 
-from tippe.__main__ import main, parser
+from tippe.__main__ import drawn, main, parser
 
 SMALL = ["--theta", "0.1", "0.3", "--eta", "0", "--t1", "12", "--tolerance", "1e-7"]
 
@@ -32,6 +33,18 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys):
     assert main([*SMALL, "--mu", "0.2", "--out", str(tmp_path / "out")]) == 2
     printed = capsys.readouterr().err
     assert "scene.friction.mu is 0.3 there and 0.2 here" in printed
+
+
+def test_picture_and_page_share_their_programs(caplog):
+    """The page shows a shorter time, and a table another tolerance; neither is compiled anew."""
+    drawn(parser().parse_args(SMALL), 12.0)
+    with jax.log_compiles():
+        times, runs = drawn(parser().parse_args([*SMALL, "--tolerance", "1e-6"]), 2.0)
+        assert runs["plane"].theta.shape == (2, len(times))
+    assert "ompil" not in caplog.text
+    with jax.log_compiles():
+        jax.jit(lambda number: number + 1.0)(2.0)
+    assert "ompil" in caplog.text
 
 
 @pytest.mark.parametrize(
