@@ -11,8 +11,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import diffrax
-import equinox as eqx
 import jax
 import numpy as np
 
@@ -23,6 +21,7 @@ from nonholonomic.progress import Progress
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
+from nonholonomic.xla_cpu import compiled_quickly
 
 from .friction import AbstractFriction, Coulomb, Viscous
 from .launch import Launch
@@ -236,17 +235,10 @@ def _friction(law: AbstractFriction) -> str:
     return f"viscous mu = {float(law.mu):g} s/m"
 
 
-@eqx.filter_jit
+@compiled_quickly
 def moving(scene: Scene, launches: Launch, times: Any, tolerance: Any) -> Motion:
-    """What is drawn of every launch until the last of the times, in one batched run.
-
-    Tsit5 has half as many stages as Dopri8 to compile, and few runs are drawn.
-    """
-
-    def moved(launch: Launch) -> Motion:
-        return Motion.of(simulate(scene, launch, times[-1], times, tolerance, diffrax.Tsit5()))
-
-    return jax.vmap(moved)(launches)
+    """What is drawn of every launch until the last of the times, in one batched run."""
+    return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
 
 
 def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, Motion]]:
