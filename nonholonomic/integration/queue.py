@@ -21,7 +21,6 @@ from .runge_kutta import explicit_tableau, first_length
 from .settings import Settings
 from .status import CROSSED, GUARD_LOST, REACHED_END, RUNNING
 
-
 #: What it costs to refill a block, in steps of the whole block. It is refilled when as much has been lost to idle lanes, which
 #: is never more than twice what the best moment would have cost.
 REFILL = 0.25

@@ -250,7 +250,9 @@ def test_a_frame_that_turns_with_the_top_saves_digits_and_changes_none(rutstam_s
     exact = ends(at_rest, 1e-13)
     sizes = np.abs(exact).max(axis=1, keepdims=True)
     assert_close(ends(tables, 1e-13) / sizes, exact / sizes, atol=1e-9)
-    wrong = {name: np.abs((ends(one, 1e-8) - exact) / sizes).max() for name, one in (("turning", tables), ("rest", at_rest))}
+    wrong = {
+        name: np.abs((ends(one, 1e-8) - exact) / sizes).max() for name, one in (("turning", tables), ("rest", at_rest))
+    }
     assert 3.0 * wrong["turning"] < wrong["rest"], wrong
     # The frame has turned: only what has no direction is the same.
     turned, fixed = (one.dynamics.field(tables.states + 0.1 * tables.scales) for one in (tables, at_rest))
