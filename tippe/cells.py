@@ -29,7 +29,7 @@ from nonholonomic.sweeps import Variable
 
 from .dynamics import LOSSES
 from .inversion import InversionProblem, is_inverted
-from .phases import airborne, airborne_stick_slip
+from .phases import airborne, airborne_stem, airborne_stick_slip
 from .phases.sliding import phases as hybrid_phases
 from .phases.stick_slip_runs import phases as stick_slip_phases
 from .scene import Scene
@@ -70,6 +70,7 @@ TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_t
 # Compiled once for all blocks.
 _on_the_ground = eqx.filter_jit(airborne.on_the_ground)
 _loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
+_loss_aloft = eqx.filter_jit(airborne.loss)
 
 
 @eqx.filter_jit
@@ -85,6 +86,7 @@ SMOOTH = Driver(WORDS, (), None)
 STICK_SLIP = Driver((*WORDS, "unresolved"), ("sticks",), stick_slip_phases)
 HYBRID = Driver((*WORDS, "unresolved"), ("hops",), hybrid_phases)
 AIRBORNE = Driver((*WORDS, "unresolved"), ("hops",), airborne.phases, aloft=True)
+ON_STEM_TOO = Driver((*WORDS, "unresolved"), ("hops",), airborne_stem.phases, aloft=True)
 STICK_SLIP_FLY = Driver((*WORDS, "unresolved"), ("hops", "sticks"), airborne_stick_slip.phases, aloft=True)
 
 #: The word for a run's status if it has not inverted; `not_inverted` for all others.
@@ -96,8 +98,10 @@ def driver_of(scene: Scene) -> Driver:
     hybrid = scene.contact == "hybrid"
     if scene.friction.set_valued:
         return STICK_SLIP_FLY if hybrid else STICK_SLIP
+    if hybrid and not scene.flies_in_closed_form:
+        return AIRBORNE if scene.body.stem is None else ON_STEM_TOO
     if hybrid:
-        return HYBRID if scene.flies_in_closed_form else AIRBORNE
+        return HYBRID
     return SMOOTH
 
 
@@ -155,9 +159,9 @@ class CellRuns(NamedTuple):
             along = functools.partial(phased_slopes_of_cells, self.driver.phases, *numbers, **options)
             return self._travelled(scene, problem, tolerance, count, along)
         if not self.slopes_by:
-            return self._named(scene, problem, self._outcome(problem, tolerance, count))
+            return self._ended(scene, problem, self._outcome(problem, tolerance, count))
         outcome, slopes = slopes_of_cells(*numbers, self.t1, tolerance, **options)
-        return self._named(scene, problem, outcome) | slopes
+        return self._ended(scene, problem, outcome) | slopes
 
     def _travelled(
         self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, along: Callable[..., Any]
@@ -173,9 +177,10 @@ class CellRuns(NamedTuple):
                 np.where(np.isfinite(found.crossing_time), found.crossing_time, 0.0), tolerance
             )
             grazing |= there.status != REACHED_END
+        loss = functools.partial(self._loss, scene, found.state)
         if self.driver.aloft:
             found = found._replace(state=np.asarray(_on_the_ground(scene, found.state, found.phase)))
-        named = self._named(scene, problem, found) | dict(zip(self.driver.counts, found.counts, strict=True))
+        named = self._named(scene, problem, found, loss) | dict(zip(self.driver.counts, found.counts, strict=True))
         if self.crossing == "both":
             # Through phases the first crossing takes a journey of its own, which ends there.
             first = self._journey(scene, problem, tolerance, count, False)
@@ -200,7 +205,20 @@ class CellRuns(NamedTuple):
             return march_by_diffrax(problem, horizon, settings)
         return compiled_march(problem, horizon, jnp.asarray(count), settings, passes=self.last)[0]
 
-    def _named(self, scene: Scene, problem: InversionProblem, ended: Outcome | Journey) -> dict[str, Any]:
+    def _ended(self, scene: Scene, problem: InversionProblem, outcome: Outcome) -> dict[str, Any]:
+        """The variables of cells whose runs are one smooth motion."""
+        return self._named(scene, problem, outcome, functools.partial(self._loss, scene, outcome.state))
+
+    def _loss(self, scene: Scene, state: Any) -> Any:
+        """How contacts have ended in which runs have ended: codes in `LOSSES`; or 0 for the one way of hybrid runs on a plane."""
+        if self.driver is HYBRID:
+            return 0
+        state = jnp.asarray(state)
+        return np.asarray(_loss_aloft(scene, state) if self.driver.aloft else _loss(scene.dynamics, state))
+
+    def _named(
+        self, scene: Scene, problem: InversionProblem, ended: Outcome | Journey, loss: Callable[[], Any]
+    ) -> dict[str, Any]:
         inverted, theta = _at_the_end(scene, problem, ended, self.last)
         others = [np.asarray(ended.status) == status for status in WORD_OF_STATUS]
         code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
@@ -208,8 +226,7 @@ class CellRuns(NamedTuple):
         if lost.any():
             # A hybrid run flies on where contact is lost.
             losses = ("jammed",) if self.driver is HYBRID else LOSSES
-            loss = 0 if self.driver is HYBRID else np.asarray(_loss(scene.dynamics, jnp.asarray(ended.state)))
-            code = np.where(lost, np.array([WORDS.index(word) for word in losses])[loss], code)
+            code = np.where(lost, np.array([WORDS.index(word) for word in losses])[loss()], code)
         times = {self.times[-1]: np.where(inverted, ended.crossing_time, np.inf)}
         if isinstance(ended, Outcome) and self.crossing == "both":
             times["first_time"] = np.asarray(ended.first_crossing)

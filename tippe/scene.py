@@ -109,11 +109,6 @@ class Scene(Bounded):
         if not isinstance(self.body, Top):
             self._check_convex(type(self.body).__name__)
             return
-        if self.contact == "hybrid" and self.body.stem is not None and not self.level:
-            raise ValueError(
-                f"contact = 'hybrid' must be on a level Plane() for a top with a stem, not on {self.surface!r}: only there do "
-                "sphere and stem touch together at one angle, at which the top leans on both"
-            )
         if self.friction.set_valued and self.body.stem is not None:
             raise ValueError(
                 f"friction = {self.friction!r} must be a law without phases for a top with a stem, such as Coulomb: which of "

@@ -1,14 +1,16 @@
-"""Contact lost and found on any arena: phases of sliding and of flight, for a top without a stem.
+"""Contact lost and found on any arena: phases of sliding and of flight, for a top without a stem (`airborne_stem.py` has one).
 
 In contact the state is that of `tippe/state.py` with a `CarriedFrame`, 14 components. In flight it is, in the surface's
 axes, the place of the centre of mass [m], its velocity [m/s], the axis, the angular momentum about it, and two zeros. A flight
-ends where the distance of the sphere's centre from the arena has come back to R; then the sphere strikes the tangent plane
-(`impact.py`).
+ends where the distance of the centre of a sphere from the arena has come back to its radius; then that sphere strikes the
+tangent plane there (`impact.py`). theta counts from the normal below the top's own sphere, whichever touches.
 
 A single run whose path is kept carries five more: the vector c of `tippe/sampled.py`, in the frame in contact, in the surface's
 axes in flight; the angle by which the top has turned about its axis [rad]; and the work of friction and impacts [J].
 """
 
+import dataclasses
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -35,11 +37,11 @@ from ..scene import Scene
 from ..state import joined, parts
 from .exact_impact import strike_exactly
 from .flying_phase import AbstractFlyingPhase
-from .free_body import FreeBody, axis_rate, balls, energy, gap_rate, still_parting
+from .free_body import Ball, FreeBody, axis_rate, balls, energy, gap_rate, standing_on, still_parting
 from .impact import strike
 
-#: The numbers of the phases.
-SLIDING, FLYING = range(2)
+#: The numbers of the phases; a top with a stem has the last one too, in which that slides.
+SLIDING, FLYING, ON_STEM = range(3)
 
 #: Components of a state, behind which others may ride along.
 OWN = 14
@@ -65,21 +67,21 @@ def aloft(state: Float[Array, "components ..."]) -> Aloft:
 
 
 class Below(NamedTuple):
-    """The arena below a flying top: the foot of its sphere's centre, the frame (t1, t2, n) there, and the gap [m]."""
+    """The arena below a sphere of a flying top: the foot of its centre, the frame (t1, t2, n) there, and the gap [m]."""
 
     foot: Vector
     axes: tuple[Vector, Vector, Vector]
     gap: Component
 
 
-def below(scene: Scene, flying: Aloft) -> Below:
-    """What a flying top has below it."""
-    frame = carried_frame(scene)
-    centre = sum_vectors(flying.place, scale(scene.body.offset, flying.axis))
+def below(scene: Scene, flying: Aloft, ball: Ball | None = None) -> Below:
+    """What a flying top has below one of its spheres, by default its own."""
+    frame, ball = carried_frame(scene), balls(scene.body)[0] if ball is None else ball
+    centre = sum_vectors(flying.place, scale(ball.offset, flying.axis))
     foot = tuple(0.0 * centre[0] if part is None else part for part in scene.surface.nearest(centre))
     n = frame.normal(foot)
     away = dot(tuple(subtract(a, b) for a, b in zip(centre, foot, strict=True)), n)
-    return Below(foot, (*tangents(n), n), away - scene.body.radius)
+    return Below(foot, (*tangents(n), n), away - ball.radius)
 
 
 def carried_frame(scene: Scene) -> CarriedFrame:
@@ -98,10 +100,11 @@ def unseen(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
     return tuple(sum_vectors(*(scale(part, axis) for part, axis in zip(vector, axes, strict=True))))
 
 
-def freed(scene: Scene, flying: Aloft, ground: Below) -> FreeBody:
-    """A flying top as a free body above the tangent plane below it."""
+def freed(scene: Scene, flying: Aloft, ground: Below, ball: Ball | None = None) -> FreeBody:
+    """A flying top as a free body above the tangent plane below one of its spheres, by default its own."""
     velocity, axis, momentum = (seen(part, ground.axes) for part in flying[1:])
-    height = scene.body.radius + ground.gap - scene.body.offset * axis[2]
+    ball = balls(scene.body)[0] if ball is None else ball
+    height = ball.radius + ground.gap - ball.offset * axis[2]
     return FreeBody(velocity, height, axis, momentum)
 
 
@@ -114,6 +117,24 @@ def in_flight(place: Vector, axes: tuple[Vector, Vector, Vector], free: FreeBody
     """The state of flight of a body whose velocity, axis and momentum are given in a frame."""
     zero = jnp.zeros_like(place[0])
     return joined(place, *(unseen(part, axes) for part in (free.velocity, free.axis, free.momentum)), (zero, zero))
+
+
+def standing(scene: Scene, ball: Ball) -> Dynamics:
+    """The equations of motion of a top that stands on one of its spheres."""
+    frame = dataclasses.replace(carried_frame(scene), distance=ball.radius)
+    return dataclasses.replace(standing_on(scene.dynamics, ball), frame=frame)
+
+
+def nearing(scene: Scene, flying: Aloft, ball: Ball, rounding: float = 0.0) -> Float[Array, "..."]:
+    """Distance of a sphere from the arena as a fraction of R, plus the round-off of a parting.
+
+    **Arguments:** `rounding`: what is allowed besides that.
+    """
+    body, ground = scene.body, below(scene, flying, ball)
+    rate = gap_rate(body, ball, freed(scene, flying, ground, ball))
+    far = sum(jnp.abs(part) for part in flying.place)
+    rounding = rounding + 4.0 * jnp.finfo(far.dtype).eps * far / body.radius
+    return ground.gap / body.radius + still_parting(rate, scene.gravity, body.radius, rounding)
 
 
 class Contact(AbstractProblem):
@@ -146,7 +167,7 @@ class Contact(AbstractProblem):
 
 
 class Flight(AbstractProblem):
-    """Flying until theta, counted from the normal below, reaches an angle or the sphere is back at the arena."""
+    """Flying until theta reaches an angle or a sphere is back at the arena."""
 
     scene: Scene
     cos_angle: Float[Array, "..."]
@@ -173,12 +194,9 @@ class Flight(AbstractProblem):
         return dot(flying.axis, below(self.scene, flying).axes[2]) - self.cos_angle
 
     def guard(self, time, state):
-        flying, body = aloft(state), self.scene.body
-        ground = below(self.scene, flying)
-        rate = gap_rate(body, balls(body)[0], freed(self.scene, flying, ground))
-        far = sum(jnp.abs(part) for part in flying.place)
-        rounding = 4.0 * jnp.finfo(far.dtype).eps * far / body.radius
-        return ground.gap / body.radius + still_parting(rate, self.scene.gravity, body.radius, rounding)
+        flying = aloft(state)
+        margins = (nearing(self.scene, flying, ball) for ball in balls(self.scene.body))
+        return functools.reduce(jnp.minimum, margins)
 
 
 class Slide(AbstractFlyingPhase):
@@ -203,15 +221,21 @@ class Slide(AbstractFlyingPhase):
         )
 
 
-def parted(scene: Scene, state: Float[Array, "components cells"], rides: bool) -> Float[Array, "components cells"]:
-    """The state of flight of a top that has lost the contact in which its state is given, with what rides along if any."""
+def parted(
+    scene: Scene, state: Float[Array, "components ..."], rides: bool, ball: Ball | None = None
+) -> Float[Array, "components ..."]:
+    """The state of flight of a top that has lost the contact in which its state is given, with what rides along if any.
+
+    **Arguments:** `ball`: the sphere that touched, by default the top's own.
+    """
     body, frame, (u, e, L, place) = scene.body, carried_frame(scene), parts(state[:OWN])
+    ball = balls(body)[0] if ball is None else ball
     # Errors of the steps take the foot off the arena: a flight that began below it would end where it begins.
     place = (*scene.surface.nearest(place[:3]), *place[3:])
     axes = frame.own_axes(place)
-    velocity = (*u, -body.offset * axis_rate(body, e, L)[2])
-    centre = sum_vectors(place[:3], scale(body.radius, axes[2]))
-    s = sum_vectors(centre, scale(-body.offset, unseen(e, axes)))
+    velocity = (*u, -ball.offset * axis_rate(body, e, L)[2])
+    centre = sum_vectors(place[:3], scale(ball.radius, axes[2]))
+    s = sum_vectors(centre, scale(-ball.offset, unseen(e, axes)))
     flies = in_flight(s, axes, FreeBody(velocity, jnp.zeros_like(state[0]), e, L))
     if not rides:
         return flies
@@ -277,7 +301,23 @@ def phases(
 def on_the_ground(
     scene: Scene, state: Float[Array, "components cells"], phase: Int[Array, " cells"]
 ) -> Float[Array, "14 cells"]:
-    """States of runs in the layout of contact, those of flight as they are seen from the foot below."""
-    flying = aloft(state)
+    """States of runs in the layout of contact of the top's own sphere, those of flight, and of a contact of the stem, as they are
+    seen from the foot below."""
+    flies, flown = phase == FLYING, state[:OWN]
+    if scene.body.stem is not None:
+        on_stem = phase == ON_STEM
+        flies, flown = flies | on_stem, jnp.where(on_stem, parted(scene, flown, False, balls(scene.body)[1]), flown)
+    flying = aloft(flown)
     ground = below(scene, flying)
-    return jnp.where(phase == FLYING, in_contact(ground, freed(scene, flying, ground)), state[:OWN])
+    return jnp.where(flies, in_contact(ground, freed(scene, flying, ground)), state[:OWN])
+
+
+def loss(scene: Scene, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+    """How a contact has ended that was not merely lost: a code in `tippe.dynamics.LOSSES`."""
+    own, state = scene.dynamics, state[:OWN]
+    if scene.body.stem is None:
+        return own.loss(state)
+    # It is the sphere that touched whose margin has vanished.
+    stem = standing(scene, balls(scene.body)[1])
+    on_stem = jnp.abs(stem.contact_margin(state)) < jnp.abs(own.contact_margin(state))
+    return jnp.where(on_stem, stem.loss(state), own.loss(state))
