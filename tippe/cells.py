@@ -210,7 +210,7 @@ class CellRuns(NamedTuple):
         return self._named(scene, problem, outcome, functools.partial(self._loss, scene, outcome.state))
 
     def _loss(self, scene: Scene, state: Any) -> Any:
-        """How contacts have ended in which runs have ended: codes in `LOSSES`; or 0 for the one way of hybrid runs on a plane."""
+        """How the contacts ended with which runs ended: codes in `LOSSES`, or 0 for the one way of runs on a level plane."""
         if self.driver is HYBRID:
             return 0
         state = jnp.asarray(state)

@@ -40,8 +40,9 @@ from .flying_phase import AbstractFlyingPhase
 from .free_body import Ball, FreeBody, axis_rate, balls, energy, gap_rate, standing_on, still_parting
 from .impact import strike
 
-#: The numbers of the phases; a top with a stem has the last one too, in which that slides.
-SLIDING, FLYING, ON_STEM = range(3)
+#: The numbers of the phases; the last two are those of a top with a stem. In the last a sphere is about to strike, and the state
+#: is that of a flight.
+SLIDING, FLYING, ON_STEM, STRIKING = range(4)
 
 #: Components of a state, behind which others may ride along.
 OWN = 14
@@ -301,12 +302,11 @@ def phases(
 def on_the_ground(
     scene: Scene, state: Float[Array, "components cells"], phase: Int[Array, " cells"]
 ) -> Float[Array, "14 cells"]:
-    """States of runs in the layout of contact of the top's own sphere, those of flight, and of a contact of the stem, as they are
-    seen from the foot below."""
+    """States of runs in the layout of a contact of the top's own sphere; others as they are seen from the foot below that."""
     flies, flown = phase == FLYING, state[:OWN]
     if scene.body.stem is not None:
         on_stem = phase == ON_STEM
-        flies, flown = flies | on_stem, jnp.where(on_stem, parted(scene, flown, False, balls(scene.body)[1]), flown)
+        flies, flown = phase != SLIDING, jnp.where(on_stem, parted(scene, flown, False, balls(scene.body)[1]), flown)
     flying = aloft(flown)
     ground = below(scene, flying)
     return jnp.where(flies, in_contact(ground, freed(scene, flying, ground)), state[:OWN])

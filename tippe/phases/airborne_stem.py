@@ -8,8 +8,6 @@ leaning are those of the plane (`leaning.py`).
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -25,13 +23,17 @@ from .airborne import (
     ON_STEM,
     OWN,
     SLIDING,
+    STRIKING,
     Aloft,
+    Below,
     Contact,
+    Flight,
     Fly,
     aloft,
     below,
     freed,
     in_contact,
+    in_flight,
     nearing,
     parted,
     seen,
@@ -47,9 +49,6 @@ TOUCHING = 1e-9
 
 #: How far the other sphere may be in the arena while it parts, as a fraction of R: where its landing was located a little late.
 OVERLAP = 1e-11
-
-#: Blows at one instant after which a run is given up.
-MOST_BLOWS = 1000
 
 
 class OneOfTwo(AbstractProblem):
@@ -109,126 +108,117 @@ class SlideOnOne(AbstractFlyingPhase):
         return jnp.where(self.number == 1, beside, jnp.concatenate([state, jnp.zeros_like(state[:2])]))
 
     def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
-        """Fly where the contact is lost, let the other sphere strike where it is at the arena, end where the contact jams or the
-        sphere does not fit. It counts the flights."""
+        """Fly where the contact is lost, strike with the other sphere where that is at the arena, end where the contact jams or
+        the sphere does not fit. It counts the flights."""
         own, other = self.spheres
         dynamics, zero = standing(self.scene, own), jnp.zeros_like(state[0])
         lands = clearance(self.scene, own, other, state) <= dynamics.contact_margin(state[:OWN])
         ends = (dynamics.loss(state[:OWN]) > 0) & ~lands
-        flies = parted(self.scene, state, self.rides, own)
-        landed = after_landing(self.scene, flies, jnp.broadcast_to(1 - self.number, zero.shape), self.rides)
-        number = jnp.where(self.number == 0, SLIDING, ON_STEM)
-        status = jnp.where(ends, GUARD_LOST, RUNNING)
-        phase = jnp.where(lands, landed.phase, jnp.where(ends, number, FLYING))
-        return landed._replace(
-            phase=phase,
-            state=jnp.where(lands, landed.state, jnp.where(ends, state, flies)),
-            status=jnp.where(lands, landed.status, status),
-            counts=(phase == FLYING).astype(int)[None],
+        return Passage(
+            phase=jnp.where(ends, jnp.where(self.number == 0, SLIDING, ON_STEM), jnp.where(lands, STRIKING, FLYING)),
+            state=jnp.where(ends, state, parted(self.scene, state, self.rides, own)),
+            elapsed=zero,
+            status=jnp.where(ends, GUARD_LOST, RUNNING),
+            crossing_time=jnp.full_like(zero, jnp.inf),
+            counts=(~ends & ~lands).astype(int)[None],
         )
 
 
+class FlightToBlow(AbstractProblem):
+    """A flight that is over as it begins where a sphere is at the arena already (`strikes`)."""
+
+    flight: Flight
+    strikes: Bool[Array, ""]
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        return self.flight.start()
+
+    def field(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
+        return self.flight.field(time, state)
+
+    def crossing(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+        return self.flight.crossing(state)
+
+    def guard(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+        return jnp.where(self.strikes, -1.0, self.flight.guard(time, state))
+
+
 class FlyBoth(Fly):
-    """Flying over the arena, with two spheres that can land."""
+    """Flying over the arena, with two spheres that can land; or the instant before a blow, if it `strikes`.
+
+    That is an array, so that one program serves both.
+    """
+
+    strikes: Bool[Array, ""]
+
+    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+        return FlightToBlow(super().problem(state), self.strikes)
 
     def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
-        """Strike the arena with the sphere that is there. It counts the flights that begin."""
-        main, stem = (nearing(self.scene, aloft(state), ball) for ball in balls(self.scene.body))
-        return after_landing(self.scene, state, (stem < main).astype(int), self.rides)
+        """Strike the arena with the sphere that is there; rebound, or slide on it where the rebound would be slow.
+
+        If the blow throws the other sphere into the arena, that strikes next. It counts the flights that begin.
+        """
+        scene, flying, zero = self.scene, aloft(state), jnp.zeros_like(state[0])
+        main, stem = (nearing(scene, flying, ball) for ball in balls(scene.body))
+        number = (stem < main).astype(int)
+        own, other = own_and_other(scene, number)
+        ground = below(scene, flying, own)
+        # Where the landing was located a little below the arena, the next phase would end where it begins.
+        flying = flying._replace(place=tuple(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
+        ground = ground._replace(gap=zero)
+        blow = struck(scene, flying, ground, own, other)
+        flies = blow.rebounds | blow.throws
+        after = in_flight(flying.place, ground.axes, blow.free)
+        after = jnp.where(flies, after, in_contact(ground, blow.free))
+        if self.rides:
+            across = tuple(state[OWN + k] for k in range(3))
+            across = jnp.where(flies, jnp.stack(across), jnp.stack(seen(across, ground.axes)))
+            gained = energy(scene.body, 0.0, blow.free) - energy(scene.body, 0.0, freed(scene, flying, ground, own))
+            after = jnp.concatenate([after, across, state[OWN + 3 :].at[1].add(gained)])
+        slides = jnp.where(number == 0, SLIDING, ON_STEM)
+        return Passage(
+            phase=jnp.where(blow.throws, STRIKING, jnp.where(blow.rebounds, FLYING, slides)),
+            state=after,
+            elapsed=zero,
+            status=jnp.where(blow.fails, FAILED, jnp.where(blow.rests, UNRESOLVED, RUNNING)),
+            crossing_time=jnp.full_like(zero, jnp.inf),
+            counts=(blow.rebounds & ~blow.throws).astype(int)[None],
+        )
 
 
 class Blow(NamedTuple):
-    """A top one of whose spheres is at the arena, between blows.
+    """What a blow does.
 
-    - `flying`: the top; `ball`: the number of that sphere.
-    - `strikes`: whether it is about to strike; else `rebounds` says whether the top flies off, and `rests` whether it is at rest
-      on both spheres.
-    - `fails`: where a blow could not be computed.
+    - `free`: the top after it, above the tangent plane.
+    - `rebounds`: whether it flies off; `throws`: whether the other sphere is thrown into the arena; `rests`: whether the top is
+      at rest on both; `fails`: whether the blow could not be computed.
     """
 
-    flying: Aloft
-    ball: Int[Array, " cells"]
-    strikes: Bool[Array, " cells"]
+    free: FreeBody
     rebounds: Bool[Array, " cells"]
+    throws: Bool[Array, " cells"]
     rests: Bool[Array, " cells"]
     fails: Bool[Array, " cells"]
 
 
-def after_landing(
-    scene: Scene, state: Float[Array, "components cells"], ball: Int[Array, " cells"], rides: bool
-) -> Passage:
-    """What follows where a sphere is at the arena: its blow, those of both spheres in turn while the blow of one throws the
-    other into the arena, and a flight or sliding on the sphere that struck last. It counts the flights that begin.
+def struck(scene: Scene, flying: Aloft, ground: Below, own: Ball, other: Ball) -> Blow:
+    """The blow of one sphere, on the tangent plane at its foot; slow rebounds are none.
 
-    **Arguments:** `state`: of flight; `ball`: the number of the sphere.
+    **Arguments:** `flying`: the top, its sphere `own` at the arena; `ground`: below that sphere; `other`: the other one.
     """
-    body, flying, zero = scene.body, aloft(state), jnp.zeros_like(state[0])
-    own, _ = own_and_other(scene, ball)
-    ground, never = below(scene, flying, own), jnp.zeros(zero.shape, bool)
-    # Where the landing was located a little below the arena, the next phase would end where it begins.
-    lifted = flying._replace(place=moved(flying.place, -ground.gap, ground.axes[2]))
-    first = Blow(lifted, ball, ~never, never, never, never)
-
-    def under_way(carry: tuple[Blow, Array]) -> Array:
-        return jnp.any(carry[0].strikes) & (carry[1] < MOST_BLOWS)
-
-    def once_more(carry: tuple[Blow, Array]) -> tuple[Blow, Array]:
-        was, count = carry
-        return jax.tree.map(lambda new, old: jnp.where(was.strikes, new, old), struck(scene, was), was), count + 1
-
-    last, _ = jax.lax.while_loop(under_way, once_more, (first, jnp.zeros((), int)))
-    own, _ = own_and_other(scene, last.ball)
-    ground = below(scene, last.flying, own)
-    closed = in_contact(ground, freed(scene, last.flying, ground, own))
-    whole = jnp.where(last.rebounds, jnp.stack([*sum(last.flying, ()), zero, zero]), closed)
-    if rides:
-        across = tuple(state[OWN + k] for k in range(3))
-        across = jnp.where(last.rebounds, jnp.stack(across), jnp.stack(seen(across, ground.axes)))
-        gained = kinetic(scene, last.flying) - kinetic(scene, flying)
-        whole = jnp.concatenate([whole, across, state[OWN + 3 :].at[1].add(gained)])
-    status = jnp.where(last.rests | last.strikes, UNRESOLVED, RUNNING)
-    return Passage(
-        phase=jnp.where(last.rebounds, FLYING, jnp.where(last.ball == 0, SLIDING, ON_STEM)),
-        state=whole,
-        elapsed=zero,
-        status=jnp.where(last.fails, FAILED, status),
-        crossing_time=jnp.full_like(zero, jnp.inf),
-        counts=last.rebounds.astype(int)[None],
-    )
-
-
-def struck(scene: Scene, was: Blow) -> Blow:
-    """A top after the blow of one sphere, on the tangent plane at its foot; slow rebounds are none.
-
-    The other sphere strikes next if it is at the arena too and the blow has thrown it there. The top rests on both if neither
-    of them is fast.
-    """
-    body, flying, (own, other) = scene.body, was.flying, own_and_other(scene, was.ball)
-    ground, closing = below(scene, flying, own), CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
+    body, closing = scene.body, CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
     free = freed(scene, flying, ground, own)
     speed = jnp.maximum(-gap_rate(body, own, free), 0.0)
-    bounce = jnp.zeros_like(speed) if scene.restitution is None else scene.restitution + 0.0 * speed
+    bounce = jnp.zeros_like(speed) if scene.restitution is None else scene.restitution
     rebounds = bounce * speed > closing
     after, fails = strike(body, scene.friction, own, free, jnp.where(rebounds, bounce, 0.0))
-    thrown = flying._replace(
-        velocity=unseen(after.velocity, ground.axes), momentum=unseen(after.momentum, ground.axes)
-    )
+    thrown = flying._replace(velocity=unseen(after.velocity, ground.axes), momentum=unseen(after.momentum, ground.axes))
     beside = below(scene, flying, other)
     before, now = (gap_rate(body, other, freed(scene, one, beside, other)) for one in (flying, thrown))
     touches = beside.gap < TOUCHING * body.radius
     rests = touches & ~rebounds & (speed <= closing) & (jnp.abs(before) <= closing)
-    strikes = touches & ~rests & ~fails & (now < -closing)
-    return Blow(thrown, jnp.where(strikes, 1 - was.ball, was.ball), strikes, rebounds & ~strikes, rests, fails)
-
-
-def kinetic(scene: Scene, flying: Aloft) -> Float[Array, "..."]:
-    """Kinetic energy [J]."""
-    return energy(scene.body, 0.0, FreeBody(flying.velocity, flying.place[2], flying.axis, flying.momentum))
-
-
-def moved(place: Any, by: Float[Array, "..."], along: Any) -> Any:
-    """A place moved by a length [m] along a unit vector."""
-    return tuple(sum_vectors(place, scale(by, along)))
+    return Blow(after, rebounds, touches & ~rests & (now < -closing), rests, fails)
 
 
 def own_and_other(scene: Scene, number: Int[Array, "..."]) -> tuple[Ball, Ball]:
@@ -246,6 +236,8 @@ def phases(
     A launch in which the stem would be in the arena starts on the stem: its place and its theta are those of the stem's foot.
     """
     given, (main, stem) = (scene, problem.scales, problem.cos_angle, rides), balls(scene.body)
-    flies = aloft(parted(scene, problem.states[:OWN], False, main))
-    first = jnp.where(below(scene, flies, stem).gap < 0.0, ON_STEM, SLIDING)
-    return (SlideOnOne(*given, jnp.asarray(0)), FlyBoth(*given), SlideOnOne(*given, jnp.asarray(1))), first
+    started = aloft(parted(scene, problem.states[:OWN], False, main))
+    first = jnp.where(below(scene, started, stem).gap < 0.0, ON_STEM, SLIDING)
+    slides = [SlideOnOne(*given, jnp.asarray(number)) for number in (0, 1)]
+    flies, strikes = (FlyBoth(*given, jnp.asarray(strikes)) for strikes in (False, True))
+    return (slides[0], flies, slides[1], strikes), first

@@ -22,7 +22,7 @@ from ..sampled import TrajectoryProblem
 from ..scene import Scene
 from ..state import parts
 from . import airborne, airborne_stem
-from .airborne import FLYING, ON_STEM, aloft, below, carried_frame, freed, in_contact, loss, parted, standing
+from .airborne import FLYING, ON_STEM, STRIKING, aloft, below, carried_frame, freed, in_contact, loss, parted, standing
 from .airborne_stick_slip import phases as stick_slip_phases
 from .flight_trajectory import STATUS, HybridTrajectory, flights_of, sampled_flights
 from .free_body import Ball, balls
@@ -62,8 +62,8 @@ class ArenaTrajectory(HybridTrajectory):
 
     @of_each_run
     def slip(self) -> Float[Array, "times 2"]:
-        """Velocity along the tangent plane of the point of a sphere that is closest to the arena [m/s]: of the stem's while that
-        touches, else of the top's own."""
+        """Velocity along the tangent plane of the point of a sphere that is closest to the arena [m/s]: of the stem's sphere
+        while that touches, else of the top's own."""
         slip = self.scene.slip_velocity(self.states)
         if self.scene.body.stem is not None:
             of_stem = self._on_stem.slip
@@ -90,7 +90,7 @@ class ArenaTrajectory(HybridTrajectory):
     @staticmethod
     def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
         # Also of traced numbers, -1 after the end of a run.
-        return (numbers == ON_STEM) - 1 * ((numbers == FLYING) | (numbers < 0))
+        return (numbers == ON_STEM) - 1 * ((numbers == FLYING) | (numbers == STRIKING) | (numbers < 0))
 
 
 class StickSlipArenaTrajectory(ArenaTrajectory):
