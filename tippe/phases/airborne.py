@@ -40,8 +40,8 @@ from .flying_phase import AbstractFlyingPhase
 from .free_body import Ball, FreeBody, axis_rate, balls, energy, gap_rate, standing_on, still_parting
 from .impact import strike
 
-#: The numbers of the phases; the last two are those of a top with a stem. In the last a sphere is about to strike, and the state
-#: is that of a flight.
+#: The numbers of the phases. The last two are those of a top with a stem: that slides; or a sphere is about to strike, and the
+#: state is that of a flight.
 SLIDING, FLYING, ON_STEM, STRIKING = range(4)
 
 #: Components of a state, behind which others may ride along.

@@ -1,0 +1,183 @@
+"""A top with a stem that flies, and bounces on both of its spheres, in a bowl: plain NumPy and SciPy, SI units, viscous friction.
+
+Each sphere slides, flies and strikes as that of `arena_hop_reference.py` does, with its own foot and its own normal. The body in
+between is carried as the centre of mass, its velocity, axis and angular velocity. A contact ends where its normal force
+vanishes or the other sphere is at the arena. That one then strikes, and after it whichever of the two the last blow has thrown into
+the arena, until none is.
+
+Run: python arena_stem_reference.py   writes arena_stem_reference.csv (two minutes). Nothing is shared with the simulator.
+"""
+
+import csv
+from dataclasses import dataclass, replace
+from math import sqrt
+from pathlib import Path
+
+import arena_hop_reference
+import numpy as np
+from arena_hop_reference import CLOSING, OPTIONS, SAMPLES, Hopper, watched
+from arena_reference import Case, level
+from scipy.integrate import solve_ivp
+
+
+@dataclass(frozen=True)
+class StemCase(Case):
+    """A case with the numbers of a stem, and the coefficient of restitution."""
+
+    stem_radius: float = 0.0
+    stem_offset: float = 0.0
+    restitution: float = 0.0
+
+
+class TwoSpheres:
+    """A top with two spheres; its state is (s, u, e, w)."""
+
+    def __init__(self, case):
+        self.case = case
+        stem = replace(case, radius=case.stem_radius, offset=case.stem_offset)
+        self.spheres = [Hopper(case), Hopper(stem)]
+
+    def start(self):
+        """The state and the sphere that touches: the one at whose foot the launch's place is."""
+        for number in (0, 1):
+            y = self.spheres[number].start()
+            y[:3] -= self.spheres[number].case.offset * y[6:9]
+            self.spheres[1 - number].near = self.spheres[number].near.copy()
+            # The velocity of the launch is that of the centre of the top's own sphere; that of the one that touches has no part
+            # along the normal.
+            (t1, t2, n), e_dot = self.frame(number), np.cross(y[9:], y[6:9])
+            along = self.case.v1 * t1 + self.case.v2 * t2 - self.case.offset * e_dot
+            y[3:6] = along - n * (n @ along) - self.spheres[number].case.offset * n * (n @ e_dot)
+            if self.gap(1 - number, y) > 0.0:
+                return y, number
+        raise ValueError(self.case)
+
+    def frame(self, number):
+        """The axes t1, t2 and n at the start."""
+        sphere = self.spheres[number]
+        g = level(sphere.case, sphere.near)[1]
+        n = g / np.linalg.norm(g)
+        t1 = np.array((1.0, 0.0, 0.0)) - n[0] * n
+        t1 /= np.linalg.norm(t1)
+        return t1, np.cross(n, t1), n
+
+    def of(self, number, y):
+        """The state as a sphere counts it, from its centre."""
+        return np.concatenate([y[:3] + self.spheres[number].case.offset * y[6:9], y[3:]])
+
+    def gap(self, number, y):
+        return self.spheres[number].below(self.of(number, y)[:3])[0]
+
+    def speed(self, number, y):
+        return self.spheres[number].speed(self.of(number, y))
+
+    def rates(self, touching, y):
+        """Rates of the state; in flight `touching` is `None`."""
+        number = touching or 0
+        sphere, own = self.spheres[number], self.of(number, y)
+        slope = sphere.aloft(own) if touching is None else sphere.motion(own)[0]
+        # Of a sphere's centre.
+        slope[:3] = y[3:6]
+        return slope
+
+    def force(self, number, y):
+        return self.spheres[number].motion(self.of(number, y))[1]
+
+    def struck(self, number, y):
+        """The state after the blow of a sphere, and whether it bounces."""
+        after, bounces = self.spheres[number].strike(self.of(number, y))
+        return np.concatenate([y[:3], after[3:]]), bounces
+
+    def landed(self, number, y):
+        """The state after the blows that follow the landing of a sphere, and the one that touches then, `None` in flight."""
+        c, blows = self.case, 0
+        closing = CLOSING * sqrt(c.gravity * c.radius)
+        while True:
+            y, bounces = self.struck(number, y)
+            blows += 1
+            other = 1 - number
+            if self.gap(other, y) < 1e-9 * c.radius and self.speed(other, y) < -closing:
+                number = other
+                continue
+            return y, None if bounces else number, blows
+
+
+def follow(case):
+    """The motion at `SAMPLES`, the start, and the events: (time, number of the sphere, blows) of each landing, and the flights."""
+    arena_hop_reference.RESTITUTION = case.restitution
+    top = TwoSpheres(case)
+    y, touching = top.start()
+    place, samples, landings, hops, time = top.spheres[touching].near.copy(), [], [], [], 0.0
+    wanted = list(np.array(SAMPLES) * case.t1)
+    if top.force(touching, y) <= 0.0:
+        touching = None
+    while True:
+        free = [number for number in (0, 1) if number != touching]
+        events = [watched(lambda y, k=k: top.gap(k, y)) for k in free]
+        if touching is not None:
+            events.append(watched(lambda y: top.force(touching, y)))  # noqa: B023
+        parting = [speed for k in free if top.gap(k, y) < 1e-6 and (speed := top.speed(k, y)) > 0.0]
+        first = min([0.2 * max(min(parting, default=1.0), 1e-7) / case.gravity, 1e-3, case.t1 - time])
+        run = solve_ivp(
+            lambda _, y: top.rates(touching, y),  # noqa: B023
+            (time, case.t1),
+            y,
+            first_step=first,
+            max_step=5e-4,
+            events=events,
+            dense_output=True,
+            **OPTIONS,
+        )
+        while wanted and wanted[0] <= run.t[-1]:
+            samples.append(run.sol(wanted.pop(0)))
+        if touching is None:
+            hops.append((time, run.t[-1]))
+        time, y = run.t[-1], run.y[:, -1]
+        y[6:9] /= np.linalg.norm(y[6:9])
+        which = [k for k, times in enumerate(run.t_events) if times.size]
+        if not which:
+            return samples, place, landings, hops
+        if which[0] < len(free):
+            y, touching, blows = top.landed(free[which[0]], y)
+            landings.append((time, free[which[0]], blows))
+            if touching is not None and top.force(touching, y) <= 0.0:
+                touching = None
+        else:
+            touching = None
+
+
+def row(case):
+    """What the file holds of a case."""
+    samples, place, landings, hops = follow(case)
+    found = dict(zip(("q1", "q2", "q3"), place, strict=True)) | {"hops": len(hops), "landings": len(landings)}
+    found |= {f"landings_{k}": sum(one == k for _, one, _ in landings) for k in (0, 1)}
+    found |= {"blows": sum(blows for *_, blows in landings), "last": landings[-1][0]}
+    for k, y in enumerate(samples, 1):
+        O = y[:3] + case.offset * y[6:9]
+        found |= {f"O{i}_{k}": O[i] for i in range(3)} | {f"e{i}_{k}": y[6 + i] for i in range(3)}
+    print(case, found, landings[:60], sep="\n", flush=True)
+    return {name: repr(float(value)) for name, value in found.items()}
+
+
+def recorded():
+    """The rows of the file, in the order of `CASES`."""
+    rows = csv.DictReader(Path(__file__).with_name("arena_stem_reference.csv").read_text().splitlines())
+    return [{name: float(value) for name, value in row.items()} for row in rows]
+
+
+LEINE_GLOCKER = dict(mass=6e-3, radius=0.015, offset=3e-3, I1=8e-7, I3=7e-7, stem_radius=5e-3, stem_offset=0.016)
+BOWL = ("paraboloid", 0.3, 0.0, 0.3, 0.0)
+
+#: A top thrown over onto its stem, in whose flights both spheres land; and one that starts on its stem.
+CASES = (
+    StemCase(*BOWL, 2.3, 0.0, 100.0, 0.1, -0.06, 0.023, 0.1, 0.3, 40.0, -60.0, 0.0, 0.2, **LEINE_GLOCKER, restitution=0.4),
+    StemCase(*BOWL, 2.7, 1.0, 150.0, 0.1, -0.06, 0.023, -0.1, 0.2, 20.0, 10.0, 0.0, 0.2, **LEINE_GLOCKER, restitution=0.1),
+)
+
+
+if __name__ == "__main__":
+    rows = [row(case) for case in CASES]
+    with Path(__file__).with_name("arena_stem_reference.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
