@@ -56,8 +56,9 @@ class Scene(Bounded):
       or `Rolling(resistance, turning_speed, sliding)` with one of them, or, for a top without a stem,
       `SetValuedCoulomb(mu)`.
     - `gravity`: acceleration of free fall [m/s^2], positive.
-    - `contact`: "stop": a run ends where the contact is lost; "hybrid": it goes on through flights and impacts,
-      and on the level plane through changes to the stem and back (`phases/`). A top with a stem needs the latter.
+    - `contact`: "stop": a run ends where the contact is lost; "hybrid": it goes on through flights, impacts, and changes to
+      the stem and back (`phases/`). A top with a stem needs the latter. One that comes to rest on its sphere and its stem at
+      once leans on both on the level plane; on any other arena its run ends there as "unresolved".
     - `restitution`: Newton's coefficient e_N of impacts [1], in [0, 1], for "hybrid" only; `None` is 0.
     - `side`: "inside" or "outside" of a closed surface, "above" an open one; `None` is inside, or above.
 

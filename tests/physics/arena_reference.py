@@ -57,6 +57,8 @@ def level(case, q):
     p1, p2 = case.p1, case.p2
     if case.arena == "tilted plane":
         return z * cos(p1) - x * sin(p1), np.array((-sin(p1), 0.0, cos(p1))), np.zeros((3, 3))
+    if case.arena == "cylinder":
+        return p1 * p1 - x * x - z * z, np.array((-2 * x, 0.0, -2 * z)), np.diag((-2.0, 0.0, -2.0))
     if case.arena == "paraboloid":
         return z - (x * x + y * y) / (2 * p1), np.array((-x / p1, -y / p1, 1.0)), np.diag((-1 / p1, -1 / p1, 0.0))
     if case.arena == "graph":

@@ -111,13 +111,3 @@ def test_a_top_jumps_over_a_hill():
     assert run.stats["energy_residual"] < 1e-9 * float(run.energy[0])
     assert_close(run.distance[0][~aloft], 0.0, atol=1e-12)
     assert_close(run.normal_force[aloft], 0.0)
-
-
-def test_what_a_flight_does_not_know_is_refused():
-    stem = tippe.Top(6e-3, 0.015, 3e-3, 8e-7, 7e-7, stem=tippe.Stem(radius=5e-3, offset=0.016))
-    for make, message in (
-        (lambda: tippe.Scene(stem, tippe.Sphere(0.3), contact="hybrid"), "must be on a level Plane"),
-        (lambda: tippe.Scene(stem, tippe.Plane(0.1), contact="hybrid"), "must be on a level Plane"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            make()

@@ -30,6 +30,7 @@ from nonholonomic.geometry import (
     tangents,
 )
 from nonholonomic.integration import FAILED, GUARD_LOST, RUNNING, AbstractProblem, Passage
+from nonholonomic.xla_cpu import compiled_setup
 
 from ..dynamics import COS_THETA, Dynamics, stacked
 from ..inversion import InversionProblem
@@ -126,6 +127,8 @@ def standing(scene: Scene, ball: Ball) -> Dynamics:
     return dataclasses.replace(standing_on(scene.dynamics, ball), frame=frame)
 
 
+# A single run asks before every phase, outside of its programs, whether it is over as it begins.
+@compiled_setup
 def nearing(scene: Scene, flying: Aloft, ball: Ball, rounding: float = 0.0) -> Float[Array, "..."]:
     """Distance of a sphere from the arena as a fraction of R, plus the round-off of a parting.
 

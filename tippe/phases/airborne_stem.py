@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import dot, scale, sum_vectors
 from nonholonomic.integration import FAILED, GUARD_LOST, RUNNING, UNRESOLVED, AbstractProblem, Passage
+from nonholonomic.xla_cpu import compiled_setup
 
 from ..inversion import InversionProblem
 from ..scene import Scene
@@ -79,6 +80,7 @@ class OneOfTwo(AbstractProblem):
         return jnp.minimum(self.contact.guard(time, state), clearance(self.scene, self.own, self.other, state))
 
 
+@compiled_setup
 def clearance(scene: Scene, own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
     """Distance of the other sphere from the arena as a fraction of R, plus the round-off of a parting."""
     return nearing(scene, aloft(parted(scene, state[:OWN], False, own)), other, OVERLAP)

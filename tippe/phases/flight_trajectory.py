@@ -40,8 +40,8 @@ class HybridTrajectory(AbstractTrajectory):
     """A run through contacts, flights and impacts; vectors are arrays (times, 3) in the fixed frame (x, y, z).
 
     `status` is "reached t1", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a row or
-    2000 contacts, or sphere and stem on the plane together with so much friction that the forces are not determined); the
-    run ends at `end_time`. `contact` says at each time which sphere touches: 0 the top's, 1 its stem's, 2 both, -1 none. At
+    2000 contacts; sphere and stem on the plane together with so much friction that the forces are not determined; sphere and
+    stem at rest together on another arena); the run ends at `end_time`. `contact` says at each time which sphere touches: 0 the top's, 1 its stem's, 2 both, -1 none. At
     the time of an impact the values are those before it. `distance` is that of the top's own sphere from the plane [m] with
     its rate [m/s]. `hops` has a row for each flight until `end_time`, its begin and its end [s]; a table counts those before
     the inversion. Bounces that shrink by the restitution e are followed down to 1e-5 sqrt(g R); from there on the top counts as

@@ -1,0 +1,139 @@
+"""A top with a stem over any arena: an independent program, the plane as a limit, slopes, and where it leans."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from arena_hop_reference import SAMPLES
+from arena_stem_reference import CASES, StemCase, recorded
+from close import assert_close
+from hop_reference import CASES as ON_THE_PLANE
+from test_leaning import REFERENCE as FOUND_ON_THE_PLANE
+
+import tippe
+
+REFERENCE = recorded()
+STEM = tippe.Stem(radius=5e-3, offset=0.016)
+TOP = tippe.Top(6e-3, 0.015, 3e-3, 8e-7, 7e-7, stem=STEM)
+
+#: A restitution with which no rebound is fast enough to be one, in the same program as those with rebounds.
+NONE_TO_SPEAK_OF = 1e-9
+
+
+def stem_scene(surface: tippe.Cylinder | tippe.Paraboloid, restitution: float) -> tippe.Scene:
+    return tippe.Scene(TOP, surface, tippe.Viscous(0.3), contact="hybrid", restitution=restitution)
+
+
+def check_against_the_program(number: int, surface: tippe.Cylinder | tippe.Paraboloid) -> tippe.HybridTrajectory:
+    """Places and axes of a case to 1e-10, and as many flights but for those too short to be followed."""
+    case, row = CASES[number], REFERENCE[number]
+    assert isinstance(case, StemCase)
+    launch = tippe.Launch(
+        case.theta,
+        case.spin,
+        azimuth=case.azimuth,
+        place=(row["q1"], row["q2"], row["q3"]),
+        velocity=(case.v1, case.v2),
+        angular_velocity=(case.w1, case.w2, case.w3),
+    )
+    scene = stem_scene(surface, case.restitution)
+    run = tippe.simulate(scene, launch, case.t1, tolerance=1e-12, solver=diffrax.Tsit5())
+    assert run.status == "reached t1"
+    seen = run.at(case.t1 * np.array(SAMPLES))
+    for name, values, size in (("O", seen.position, case.radius), ("e", seen.axis, 1.0)):
+        wanted = [[row[f"{name}{i}_{k}"] for i in range(3)] for k in range(1, len(SAMPLES) + 1)]
+        assert_close(values, wanted, atol=1e-10 * size)
+    assert 10 < len(run.hops) <= row["hops"]
+    assert {-1, 0} <= set(run.contact)
+    # Friction and blows take energy only, and it is all accounted for.
+    assert run.stats["energy_residual"] < 1e-12 * float(run.energy[0])
+    assert np.diff(run.energy).max() < 1e-12 * float(run.energy[0])
+    return run
+
+
+def test_both_spheres_bounce_in_a_cylinder():
+    """A top thrown over onto its stem, and one that starts on it, against NumPy and SciPy."""
+    thrown = check_against_the_program(0, tippe.Cylinder(CASES[0].p1))
+    assert thrown.contact[0] == 0
+    started = check_against_the_program(1, tippe.Cylinder(CASES[1].p1))
+    on_stem = started.contact == 1
+    assert on_stem.any()
+    assert min(REFERENCE[k][f"landings_{sphere}"] for k in (0, 1) for sphere in (0, 1)) > 0
+    # The top's own sphere is off the arena while the stem slides, which carries what the arena asks for.
+    assert (started.distance[0][on_stem] > 0.0).all()
+    assert (np.asarray(started.normal_force)[on_stem] > -1e-9).all()
+
+
+def test_a_top_that_leans_ends_as_unresolved():
+    """In a huge cylinder it rocks from sphere to sphere until both are at rest, when it would on the plane."""
+    number = next(k for k, case in enumerate(ON_THE_PLANE) if case.theta == 2.4)
+    case, found = ON_THE_PLANE[number], FOUND_ON_THE_PLANE[number]
+    scene, leans = stem_scene(tippe.Cylinder(1e3), NONE_TO_SPEAK_OF), float(found["leans"])
+    # As in the test above, a place, a velocity and an angular velocity are given: the program is the same.
+    launch = tippe.Launch(
+        case.theta, case.spin, place=(0.0, 0.0, -1e3), velocity=(0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)
+    )
+    run = tippe.simulate(scene, launch, 2.0 * leans, tolerance=1e-12, solver=diffrax.Tsit5())
+    assert run.status == "unresolved"
+    assert_close(run.end_time, leans, atol=1e-4)
+    assert_close(run.theta[-1], np.arccos((STEM.radius - TOP.radius) / (STEM.offset - TOP.offset)), atol=1e-4)
+
+
+@pytest.mark.slow
+def test_both_spheres_bounce_in_a_bowl():
+    check_against_the_program(2, tippe.Paraboloid(CASES[2].p1))
+
+
+@pytest.mark.slow
+def test_a_huge_cylinder_is_the_plane():
+    """Tables: what differs falls as the curvature does, to 1e-7 of the times."""
+    given = {"theta": 0.1, "spin": [180.0, 190.0], "t1": 1.6, "tolerance": 1e-11}
+    friction, errors = tippe.Coulomb(0.3, 0.05), []
+    plane = tippe.inversion_table(tippe.Scene(TOP, friction=friction, contact="hybrid"), **given)
+    assert (plane.status == "inverted").any()
+    for radius in (1e3, 1e4):
+        scene = tippe.Scene(TOP, tippe.Cylinder(radius), friction, contact="hybrid")
+        table = tippe.inversion_table(scene, **given)
+        np.testing.assert_array_equal(table.status, plane.status)
+        errors.append(np.abs(table.end_theta - plane.end_theta).max() + np.abs(table.end_time - plane.end_time).max())
+    assert errors[1] < 0.2 * errors[0]
+    assert errors[1] < 1e-5
+
+
+@pytest.mark.slow
+def test_slopes_go_through_the_blows_of_both():
+    """Derivatives of inversion times in a cylinder, against central differences."""
+    given = {"theta": 2.3, "angle": 2.7, "t1": 0.7, "progress": False}
+    scene = tippe.Scene(TOP, tippe.Cylinder(0.3), tippe.Coulomb(0.3, 0.05), contact="hybrid", restitution=0.2)
+    table = tippe.inversion_table(scene, spin=[180.0, 200.0], tolerance=1e-11, sensitivities=["spin", "mu"], **given)
+    assert (table.status == "inverted").all()
+    assert (table.hops > 0).all()
+    assert (table.grazes == 0).all()
+    step, other = 2e-3, 3e-6
+    spins = [spin + d for spin in (180.0, 200.0) for d in (-step, step)]
+    time = tippe.inversion_table(scene, spin=spins, tolerance=1e-12, **given).time.reshape(2, 2)
+    assert_close(table.time_by_spin, np.diff(time, axis=1)[:, 0] / (2.0 * step), rtol=1e-5)
+    mus = [0.3 - other, 0.3 + other]
+    time = tippe.inversion_table(scene, spin=[180.0, 200.0], mu=mus, tolerance=1e-12, **given).time
+    assert_close(table.time_by_mu, np.diff(time, axis=1)[:, 0] / (2.0 * other), rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_torques_and_other_arenas():
+    """Rolling resistance and a disc of contact, down a tilted plane and off a ball: energy closes; the same inside `jit`."""
+    friction = tippe.Rolling(3e-4, 5.0, tippe.Contensou(0.3, 1e-3, 0.05))
+    for surface, place, side in (
+        (tippe.Plane(0.3), (0.0, 0.0), None),
+        (tippe.Sphere(0.3), (0.0, 0.0, 0.3), "outside"),
+    ):
+        scene = tippe.Scene(TOP, surface, friction, contact="hybrid", restitution=0.3, side=side)
+        launch = tippe.Launch(2.3, 150.0, place=place, velocity=(0.0, 0.2), angular_velocity=(40.0, -60.0, 0.0))
+        run = tippe.simulate(scene, launch, 0.15, tolerance=1e-11)
+        assert run.status == "reached t1"
+        assert 1 in run.contact or len(run.hops) > 0
+        assert run.stats["energy_residual"] < 1e-9 * float(run.energy[0])
+        assert np.diff(run.energy).max() < 1e-9 * float(run.energy[0])
+        times = jnp.linspace(0.01, 0.15, 8)
+        traced = jax.jit(lambda launch, scene=scene, times=times: tippe.simulate(scene, launch, 0.15, times))(launch)
+        assert_close(traced.axis, run.at(times).axis, atol=1e-6)
