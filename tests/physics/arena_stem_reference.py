@@ -83,6 +83,12 @@ class TwoSpheres:
     def force(self, number, y):
         return self.spheres[number].motion(self.of(number, y))[1]
 
+    def slip(self, number, y):
+        """Speed of the contact point."""
+        sphere, (centre, u, e, w) = self.spheres[number], self.of(number, y).reshape(4, 3)
+        n = sphere.below(centre)[1]
+        return np.linalg.norm(u + np.cross(w, sphere.case.offset * e - sphere.case.radius * n))
+
     def struck(self, number, y):
         """The state after the blow of a sphere, and whether it bounces."""
         after, bounces = self.spheres[number].strike(self.of(number, y))
@@ -102,7 +108,8 @@ class TwoSpheres:
 
 
 def follow(case):
-    """The motion at `SAMPLES`, the start, the landings as (time, number of the sphere, blows), and the flights."""
+    """The motion, normal force and slip at `SAMPLES`; the start; the landings, (time, number of the sphere, blows); and the
+    flights."""
     arena_hop_reference.RESTITUTION = case.restitution
     top = TwoSpheres(case)
     y, touching = top.start()
@@ -128,7 +135,10 @@ def follow(case):
             **OPTIONS,
         )
         while wanted and wanted[0] <= run.t[-1]:
-            samples.append(run.sol(wanted.pop(0)))
+            seen = run.sol(wanted.pop(0))
+            samples.append(
+                (seen, *((0.0, 0.0) if touching is None else (top.force(touching, seen), top.slip(touching, seen))))
+            )
         if touching is None:
             hops.append((time, run.t[-1]))
         time, y = run.t[-1], run.y[:, -1]
@@ -151,7 +161,8 @@ def row(case):
     found = dict(zip(("q1", "q2", "q3"), place, strict=True)) | {"hops": len(hops), "landings": len(landings)}
     found |= {f"landings_{k}": sum(one == k for _, one, _ in landings) for k in (0, 1)}
     found |= {"blows": sum(blows for *_, blows in landings), "last": landings[-1][0]}
-    for k, y in enumerate(samples, 1):
+    for k, (y, force, slip) in enumerate(samples, 1):
+        found |= {f"N_{k}": force, f"slip_{k}": slip}
         centre = y[:3] + case.offset * y[6:9]
         found |= {f"O{i}_{k}": centre[i] for i in range(3)} | {f"e{i}_{k}": y[6 + i] for i in range(3)}
     return {name: repr(float(value)) for name, value in found.items()}

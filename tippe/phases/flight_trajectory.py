@@ -41,13 +41,14 @@ class HybridTrajectory(AbstractTrajectory):
 
     `status` is "reached t1", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a row or
     2000 contacts; sphere and stem on the plane together with so much friction that the forces are not determined; sphere and
-    stem at rest together on another arena); the run ends at `end_time`. `contact` says at each time which sphere touches: 0 the top's, 1 its stem's, 2 both, -1 none. At
-    the time of an impact the values are those before it. `distance` is that of the top's own sphere from the plane [m] with
-    its rate [m/s]. `hops` has a row for each flight until `end_time`, its begin and its end [s]; a table counts those before
-    the inversion. Bounces that shrink by the restitution e are followed down to 1e-5 sqrt(g R); from there on the top counts as
-    in contact, though all that are left would take e / (1 - e) of the last one's time. `work` is that of friction and of the
-    impacts [J]. `stats` holds accepted and rejected steps, the greatest drift of |e|, the greatest energy residual
-    |E - E(0) - work| and the energy lost in impacts [J]. `rotation` and `angular_velocity` are those of `Trajectory`.
+    stem at rest together on another arena); the run ends at `end_time`. `contact` says at each time which sphere touches: 0
+    the top's, 1 its stem's, 2 both, -1 none. At the time of an impact the values are those before it. `distance` is that of
+    the top's own sphere from the plane [m] with its rate [m/s]. `hops` has a row for each flight until `end_time`, its begin
+    and its end [s]; a table counts those before the inversion. Bounces that shrink by the restitution e are followed down to
+    1e-5 sqrt(g R); from there on the top counts as in contact, though all that are left would take e / (1 - e) of the last
+    one's time. `work` is that of friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest
+    drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J]. `rotation` and
+    `angular_velocity` are those of `Trajectory`.
 
     Inside a transformation `status` is a code as for `Trajectory`, 6 for "unresolved"; `hops` is `None`, `stats["hops"]`
     counts the flights. First derivatives by the scene and the launch go through flights and impacts; they are NaN behind an
