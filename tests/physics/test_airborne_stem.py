@@ -1,17 +1,23 @@
 """A top with a stem over any arena: an independent program, the plane as a limit, slopes, and where it leans."""
 
+import dataclasses
+
+import arena_hop_reference
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from arena_hop_reference import SAMPLES
-from arena_stem_reference import CASES, StemCase, recorded
+from arena_stem_reference import CASES, StemCase, TwoSpheres, recorded
 from close import assert_close
 from hop_reference import CASES as ON_THE_PLANE
 from test_leaning import REFERENCE as FOUND_ON_THE_PLANE
 
 import tippe
+from tippe.phases.airborne import ON_STEM, STRIKING
+from tippe.phases.airborne_stem import FlyBoth
 
 REFERENCE = recorded()
 STEM = tippe.Stem(radius=5e-3, offset=0.016)
@@ -120,7 +126,7 @@ def test_slopes_go_through_the_blows_of_both():
     assert_close(table.time_by_spin, np.diff(time, axis=1)[:, 0] / (2.0 * step), rtol=1e-5)
     mus = [0.3 - other, 0.3 + other]
     time = tippe.inversion_table(scene, spin=[180.0, 200.0], mu=mus, tolerance=1e-12, **given).time
-    assert_close(table.time_by_mu, np.diff(time, axis=1)[:, 0] / (2.0 * other), rtol=1e-4)
+    assert_close(table.time_by_mu, np.diff(time.reshape(2, 2), axis=0)[0] / (2.0 * other), rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -138,6 +144,40 @@ def test_torques_and_other_arenas():
         assert 1 in run.contact or len(run.hops) > 0
         assert run.stats["energy_residual"] < 1e-9 * float(run.energy[0])
         assert np.diff(run.energy).max() < 1e-9 * float(run.energy[0])
-        times = jnp.linspace(0.01, 0.15, 8)
-        traced = jax.jit(lambda launch, scene=scene, times=times: tippe.simulate(scene, launch, 0.15, times))(launch)
-        assert_close(traced.axis, run.at(times).axis, atol=1e-6)
+    times = jnp.linspace(0.01, 0.15, 8)
+    traced = jax.jit(lambda launch: tippe.simulate(scene, launch, 0.15, times))(launch)
+    assert_close(traced.axis, run.at(times).axis, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_one_blow_may_throw_the_other_sphere_into_the_arena(monkeypatch):
+    """Strong friction does it: what strikes next, and the motion after the blow, for tops that lean along a cylinder."""
+    monkeypatch.setattr(arena_hop_reference, "RESTITUTION", 0.0)
+    case, random, cells = CASES[0], np.random.default_rng(3), 60
+    case = dataclasses.replace(case, mu=8.0)
+    scene = tippe.Scene(
+        TOP, tippe.Cylinder(case.p1), tippe.Viscous(case.mu), contact="hybrid", restitution=NONE_TO_SPEAK_OF
+    )
+    theta = np.arccos((STEM.radius - TOP.radius) / (STEM.offset - TOP.offset)) + 1e-13
+    e = np.array((0.0, np.sin(theta), np.cos(theta)))
+    place = np.array((0.0, 0.0, float(STEM.radius - STEM.offset * e[2]) - case.p1))
+    u, w = random.normal(size=(3, cells)) * [[0.3], [0.3], [0.1]], random.normal(scale=50.0, size=(3, cells))
+    L = float(TOP.I1) * w + float(TOP.I3 - TOP.I1) * (e @ w) * e[:, None]
+    rest = np.zeros((2, cells))
+    states = np.concatenate([np.tile(place[:, None], cells), u, np.tile(e[:, None], cells), L, rest])
+    flies = FlyBoth(scene, jnp.ones((14, cells)), jnp.asarray(-2.0), False, jnp.asarray(True))
+    passage = eqx.filter_jit(flies.leave)(jnp.asarray(states), jnp.ones(cells))
+    top, seen = TwoSpheres(case), []
+    for sphere in top.spheres:
+        sphere.near = np.array((0.0, 0.0, -case.p1))
+    for k in range(cells):
+        y = np.concatenate([place, u[:, k], e, w[:, k]])
+        if top.speed(1, y) > -1e-3:
+            continue
+        after, _ = top.struck(1, y)
+        throws = top.speed(0, after) < -1e-4
+        assert int(passage.phase[k]) == (STRIKING if throws else ON_STEM)
+        seen.append(throws)
+        if throws:
+            assert_close(passage.state[3:6, k], after[3:6], atol=1e-10)
+    assert {True, False} == set(seen)
