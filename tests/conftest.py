@@ -5,7 +5,6 @@ import os
 from pathlib import Path
 
 import jax
-import jaxlib
 import pytest
 from tops import rutstam_top
 
@@ -21,14 +20,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
     `pytest --cache-clear` forgets it; a folder that `JAX_COMPILATION_CACHE_DIR` names is used instead.
 
-    The ordinary run compiles without LLVM's optimisations, as JAX's own tests do, and with the older of jaxlib 0.10's two ways
-    for fused operations: compiling is most of its work, and takes a quarter of the time then. The slow tests and those with
-    the newest libraries run what users run; so do all with `XLA_FLAGS=`.
+    The ordinary run compiles without LLVM's optimisations, as JAX's own tests do: compiling is most of its work, and takes
+    half the time then. The slow tests and those with the newest libraries run what users run; so do all with `XLA_FLAGS=`.
     """
     if config.option.markexpr == ORDINARY:
-        # Other versions end the process for a flag that they do not know.
-        older = " --xla_cpu_use_fusion_emitters=false" if jaxlib.__version__.startswith("0.10.") else ""
-        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0" + older)
+        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ and hasattr(config, "cache"):
         folder = nonholonomic.enable_compilation_cache(config.cache.mkdir("compiled"))
         if folder is not None:
