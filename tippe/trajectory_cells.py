@@ -26,14 +26,14 @@ WITHOUT_DIRECTION = {"theta", "theta_rate", "eta", "spin", "energy", "jellett", 
 
 
 def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> LeadingProblem:
-    """The runs of some cells with as much of a `TrajectoryProblem` as the named quantities need: its cyclic coordinates only
-    for some of them, no spin angle, no work. On the plane a run without them takes half the time, and has samples a hundred
-    times as accurate in a frame that turns, if none of them has a direction."""
+    """The runs of some cells with as much of a `TrajectoryProblem` as the named quantities need: its path only for some of them,
+    and neither rotation nor work. On the plane a run without them takes half the time, and has samples a hundred times as
+    accurate in a frame that turns, if none of them has a direction."""
     run = TrajectoryProblem.of(scene, launch, cells)
     if scene.level and WITHOUT_DIRECTION.issuperset(names):
         return LeadingProblem(dataclasses.replace(run, dynamics=scene.turning_dynamics), len(run.state))
     needed = {"position"} if isinstance(scene.surface, Plane) else set(QUANTITIES) - OF_THE_STATE
-    return LeadingProblem(run, len(run.state) + (0 if needed.isdisjoint(names) else len(run.cyclic)))
+    return LeadingProblem(run, run.leading if needed.isdisjoint(names) else run.up_to_path)
 
 
 def _read(
