@@ -1,8 +1,9 @@
 """The beginning of a slip from rolling, where the force turns fast beside the little slip that there is yet."""
 
-import jax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from close import assert_close
 from tops import rutstam_top
 
@@ -20,25 +21,52 @@ ROLLING = np.array(
 )
 
 
+#: A fast top of great offset whose slip has come to rest where rolling would need to pull on the arena: far beyond the cone.
+BEYOND = np.array(
+    [
+        *(-1.0751523764063413, 1.2790396691697707),
+        *(-0.4362820771503579, 0.727332568489388, -0.5297596473637689),
+        *(-0.0001299848587330859, 3.6481092965903644e-05, -0.0001997719177719805),
+        *(-0.6756609251490091, -0.10990177782826853, 0.7289745629697728),
+    ]
+)
+
+
+@eqx.filter_jit
+def beginning(scene, start, scales, tolerance):
+    """A slip's beginning from a contact at rest, and the slip's velocity at its middle and end."""
+    both = scene.dynamics
+    state = both.stopped(start)
+    onset = begin(
+        both.slipping, both.rolling, both.mu, both.slipping.field, state, 11, scales, jnp.asarray(0.1), tolerance
+    )
+    slips = [both.slipping.motion(at).slip for at in (onset.at(jnp.asarray(0.5)), onset.end)]
+    return onset, [jnp.stack([slip.x, slip.y]) for slip in slips]
+
+
+def begun(scene, launch, start):
+    """The beginning at a tolerance of 1e-9, with its slips, after a comparison with that at 1e-11."""
+    scales, start = scene.scales(launch), jnp.asarray(start)
+    (long, slips), (short, _) = (beginning(scene, start, scales, jnp.asarray(tol)) for tol in (1e-9, 1e-11))
+    assert bool(long.found)
+    assert bool(short.found)
+    assert float(long.length) > float(short.length) > 1e-4
+    assert_close(long.at(short.length / long.length) / scales, short.end / scales, atol=1e-10)
+    return long, *slips
+
+
+@pytest.mark.newest
 def test_a_slip_begins_at_every_tolerance():
     """The direction of the force turns by 0.14 rad in the first trial; the state later is that of a shorter step."""
     scene = tippe.Scene(rutstam_top(), tippe.Sphere(0.3), tippe.SetValuedCoulomb(0.2))
-    both, scales = scene.dynamics, scene.scales(tippe.Launch(0.43, 26.0, 0.4))
-    state = both.stopped(jnp.asarray(ROLLING))
-
-    @jax.jit
-    def beginning(tolerance):
-        onset = begin(
-            both.slipping, both.rolling, both.mu, both.slipping.field, state, 11, scales, jnp.asarray(0.1), tolerance
-        )
-        speed = both.slip_speed(onset.end)
-        return onset, speed
-
-    (long, speed), (short, _) = beginning(1e-9), beginning(1e-11)
-    assert bool(long.found)
-    assert bool(short.found)
-    assert float(long.length) > float(short.length) > 1e-3
-    assert_close(long.at(short.length / long.length) / scales, short.end / scales, atol=1e-10)
+    _, middle, end = begun(scene, tippe.Launch(0.43, 26.0, 0.4), ROLLING)
     # The slip's speed grows as the square of the time, by half the rate at which the grip is lost over the contact's mass.
-    middle = both.slip_speed(long.at(jnp.asarray(0.5)))
-    assert_close(speed / middle, 4.0, rtol=0.1)
+    assert_close(jnp.hypot(*end) / jnp.hypot(*middle), 4.0, rtol=0.1)
+
+
+def test_a_slip_begins_far_beyond_the_cone():
+    """It grows in proportion to the time, in the one direction in which friction that opposes it lets it grow."""
+    scene = tippe.Scene(tippe.Top(0.02, 0.02, 0.016, 1.6e-6, 1.9e-6), tippe.Sphere(0.2), tippe.SetValuedCoulomb(0.6))
+    _, middle, end = begun(scene, tippe.Launch(0.76, 600.0, 0.8), BEYOND)
+    assert_close(jnp.hypot(*end) / jnp.hypot(*middle), 2.0, rtol=0.1)
+    assert_close(end / jnp.hypot(*end), middle / jnp.hypot(*middle), atol=0.1)

@@ -1,11 +1,14 @@
 """Numbers of a top and of its arena, on arenas of the general form, from what an independent program saw there."""
 
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from arena_reference import SAMPLES, Case, cases, recorded
+from arena_reference import SAMPLES, Case, Top, cases, recorded
 from close import assert_close
+from scipy.integrate import solve_ivp
 from tops import rutstam_top
 
 import tippe
@@ -60,3 +63,43 @@ def test_friction_and_shape(arena):
     assert found.status == "converged"
     assert_close(list(found.estimates.values()), [case.mu, case.p1], rtol=1e-5)
     assert 0.0 < found.standard_errors["scene.friction.mu"] < 0.1 * case.mu
+
+
+#: Launches at a place of the bowl z = (x^2 + y^2) / (2 p), p = 0.25 m, and when theta is 0.6 pi there (`independent_time`).
+BOWL, ANGLE, PLACE = 0.25, 0.6 * math.pi, (0.05, 0.02)
+THETA, SPIN = [0.1, 0.3, 0.3, 0.6], [150.0, 150.0, 170.0, 160.0]
+TIMES = [3.51969430631434, 2.9824320158330484, 2.8399916101924654, 2.415615397994213]
+
+
+def independent_time(theta, spin):
+    """When the axis of a top in the bowl is at the angle from the normal at its foot [s], by Newton-Euler in SciPy."""
+    place = (*PLACE, (PLACE[0] ** 2 + PLACE[1] ** 2) / (2.0 * BOWL))
+    case = Case("paraboloid", BOWL, 0.0, 0.3, 0.0, theta, 0.0, spin, *place, *5 * (0.0,), 6.0)
+    top = Top(case)
+
+    def reached(_, y):
+        centre, u, e, w = y.reshape(4, 3)
+        normal, _ = top.contact(centre, u + case.offset * np.cross(w, e))
+        return normal @ e - math.cos(ANGLE)
+
+    reached.terminal = True
+    start = top.start()
+    run = solve_ivp(lambda _, y: top.motion(y)[0], (0.0, 6.0), start, "DOP853", rtol=1e-10, atol=1e-11, events=reached)
+    return float(run.t_events[0][0])
+
+
+@pytest.mark.slow
+def test_the_times_in_a_bowl_are_those_of_the_independent_program():
+    assert_close([independent_time(theta, spin) for theta, spin in zip(THETA, SPIN, strict=True)], TIMES, rtol=1e-8)
+
+
+def test_the_shape_of_a_bowl_from_inversion_times():
+    """From a bowl a tenth too wide, in which every top inverts 0.2 to 0.4 s later; of exact times nothing is left."""
+    launch = tippe.Launch(theta=THETA, spin=SPIN, place=PLACE)
+    data = tippe.InversionTimes(launch, TIMES, error=0.01, t1=6.0, angle=ANGLE)
+    scene = tippe.Scene(rutstam_top(), tippe.Paraboloid(1.1 * BOWL), tippe.Viscous(0.3))
+    found = tippe.identify(scene, data, {"surface.p": 1.1 * BOWL}, slopes="differences", progress=False)
+    assert found.status == "converged"
+    assert_close(found.estimates["scene.surface.p"], BOWL, rtol=1e-6)
+    assert max(abs(row.residual) for row in found.residuals) < 1e-3
+    assert 0.0 < found.standard_errors["scene.surface.p"] < 0.01 * BOWL

@@ -206,6 +206,8 @@ class Slide(AbstractFlyingPhase):
 def parted(scene: Scene, state: Float[Array, "components cells"], rides: bool) -> Float[Array, "components cells"]:
     """The state of flight of a top that has lost the contact in which its state is given, with what rides along if any."""
     body, frame, (u, e, L, place) = scene.body, carried_frame(scene), parts(state[:OWN])
+    # Errors of the steps take the foot off the arena: a flight that began below it would end where it begins.
+    place = (*scene.surface.nearest(place[:3]), *place[3:])
     axes = frame.own_axes(place)
     velocity = (*u, -body.offset * axis_rate(body, e, L)[2])
     centre = sum_vectors(place[:3], scale(body.radius, axes[2]))

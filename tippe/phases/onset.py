@@ -12,7 +12,8 @@ and no explicit method can begin there. A collocation method can: it asks nothin
 smooth solution's polynomial satisfies the equations wherever it is asked. This is one step of Radau IIA (Hairer and Wanner,
 Solving ODEs II, section IV.5), its equations solved by Newton's method in the slip velocity, which alone is stiff, and by
 iteration in the rest. A contact at rest whose rolling force is beyond the cone from the first begins with v = b t d +
-O(t^2); the same step serves it.
+O(t^2), d the direction in which friction that opposes it lets it grow, near that against the force of rolling; the same step
+serves it.
 """
 
 from collections.abc import Callable
@@ -47,7 +48,8 @@ TRIALS, ITERATIONS = 10, 10
 def _radau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The nodes in (0, 1], what the integrals up to `x` are made of (coefficients of x, stage), and the row of the highest
     Legendre coefficient."""
-    nodes = (np.sort(legendre.legroots([0.0] * (STAGES - 1) + [-1.0, 1.0])) + 1.0) / 2.0
+    # The roots are real, but since NumPy 2.5 their type is complex.
+    nodes = (np.sort(legendre.legroots([0.0] * (STAGES - 1) + [-1.0, 1.0]).real) + 1.0) / 2.0
     nodes[-1] = 1.0
     integrals = []
     for k in range(STAGES):
@@ -181,7 +183,7 @@ class _Contact(eqx.Module):
 
     - `direction`: against the force of rolling; `rise`: the slip's acceleration [m/s^2] and half its rate [m/s^3] at once.
     - `inverse_mass`: M [1/kg] as (M11, M12, M22); `lifted`: n, the change of N by the force along the arena.
-    - `mu`; `normal_force` [N]; `speed`: sqrt(g R) [m/s]; `unit`: of time [s].
+    - `mu`; `unloaded`: N if there were no force along the arena [N]; `speed`: sqrt(g R) [m/s]; `unit`: of time [s].
     """
 
     direction: Float[Array, "2 ..."]
@@ -189,7 +191,7 @@ class _Contact(eqx.Module):
     inverse_mass: tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]
     lifted: Float[Array, "2 ..."]
     mu: Float[Array, "..."]
-    normal_force: Float[Array, "..."]
+    unloaded: Float[Array, "..."]
     speed: Float[Array, "..."]
     unit: Float[Array, "..."]
 
@@ -217,7 +219,8 @@ class _Contact(eqx.Module):
         speed = jnp.sqrt(rolling.gravity * rolling.radius)
         spin = jnp.sqrt(sum(x * x for x in rolling.angular_velocity(state)))
         unit = 1.0 / jnp.maximum(spin, speed / rolling.radius)
-        return cls(d, rise, (c / determinant, -b / determinant, a / determinant), lifted, mu, N, speed, unit)
+        inverse_mass = (c / determinant, -b / determinant, a / determinant)
+        return cls(d, rise, inverse_mass, lifted, mu, N + lifted[0] * F1 + lifted[1] * F2, speed, unit)
 
     def first_guess(self, times: Float[Array, "stages ..."]) -> Float[Array, "2 stages ..."]:
         """The slip velocity that the limit of the equations says [m/s]."""
@@ -228,16 +231,17 @@ class _Contact(eqx.Module):
     ) -> Float[Array, "2 stages ..."]:
         """Newton's correction of the slip velocities: only the slip's direction makes the equations stiff.
 
-        With F = -mu N d along the arena and N = const - n . F, a turn of d by eta changes the acceleration by
-        -eta mu N M (1 - mu d n^T)^-1 d', d' across d.
+        With F = -mu N d along the arena and N = N0 - n . F, so that N = N0 / (1 - mu n . d), a turn of d by eta changes the
+        acceleration by -eta mu N M (1 - mu d n^T)^-1 d', d' across d. Beyond the cone that N is not the one of rolling.
         """
         size = length(v[0], v[1])
         size = jnp.where(size > 0.0, size, 1.0)
         along = v / size
         across = jnp.stack([-along[1], along[0]])
         n, (M11, M12, M22) = self.lifted, self.inverse_mass
-        share = self.mu * (n[0] * across[0] + n[1] * across[1]) / (1.0 - self.mu * (n[0] * along[0] + n[1] * along[1]))
-        x, y = self.mu * self.normal_force * (across + share * along)
+        stiffness = 1.0 - self.mu * (n[0] * along[0] + n[1] * along[1])
+        share = self.mu * (n[0] * across[0] + n[1] * across[1]) / stiffness
+        x, y = self.mu * self.unloaded / stiffness * (across + share * along)
         pull = jnp.stack([M11 * x + M12 * y, M12 * x + M22 * y])
         # Stage by stage: across_j . pull_k, times what the step gives stage j of stage k.
         matrix = age * jnp.einsum("jk,ij...,ik...->jk...", WEIGHTS, across, pull)
