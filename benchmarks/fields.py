@@ -14,7 +14,8 @@ class Functions(NamedTuple):
 
 
 class Top(NamedTuple):
-    """The numbers of a top's scene; `slip_speed` 0 is viscous friction, `rho` 0 the plane."""
+    """The numbers of a top's scene; `slip_speed` 0 is viscous friction, `rho` 0 the plane, `turns` the fraction of L3 / I1 at
+    which the frame turns there."""
 
     mass: float
     radius: float
@@ -25,6 +26,7 @@ class Top(NamedTuple):
     gravity: float = 9.81
     slip_speed: float = 0.0
     rho: float = 0.0
+    turns: float = 0.0
 
 
 class Ride(NamedTuple):
@@ -59,7 +61,12 @@ def plane(y, p, functions):
     k = p.mass * p.offset * i1
     N = (p.mass * p.gravity - k * (L1 * d2 - L2 * d1)) / (1.0 + k * (t1 * e2 - t2 * e1))
     n = N / p.mass
-    return (n * f1, n * f2, d1, d2, d3, N * t1, N * t2, N * t3)
+    rate = (n * f1, n * f2, d1, d2, d3, N * t1, N * t2, N * t3)
+    if p.turns == 0.0:
+        return rate
+    turn = p.turns * i1 * L3
+    a1, a2, d1, d2, d3, b1, b2, b3 = rate
+    return (a1 + turn * u2, a2 - turn * u1, d1 + turn * e2, d2 - turn * e1, d3, b1 + turn * L2, b2 - turn * L1, b3)
 
 
 def cylinder(y, p, functions):

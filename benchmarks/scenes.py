@@ -1,5 +1,6 @@
 """The scenes of `work_precision.py`, each as this package runs it and as plain numbers for the peers."""
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -39,7 +40,9 @@ def scenes(launches: int) -> dict[str, Case]:
     slope = tippe.Launch(theta, 100.0, eta=0.3)
     drum = tippe.Cylinder(0.3)
     return {
+        # The same in the frame that turns, which all programs get, and in one at rest.
         "plane, viscous": of_top(tippe.Scene(top, tippe.Plane(), tippe.Viscous(0.3)), flat, 30.0, ANGLE),
+        "plane, frame at rest": of_top(tippe.Scene(top, tippe.Plane(), tippe.Viscous(0.3)), flat, 30.0, ANGLE, False),
         # First crossings jump by whole oscillations in a cylinder, so the axis is compared there.
         "cylinder, viscous": of_top(tippe.Scene(top, drum, tippe.Viscous(0.3)), slope, 3.0, None),
         "cylinder, Coulomb 1e-2": of_top(tippe.Scene(top, drum, tippe.Coulomb(0.3, 1e-2)), slope, 0.5, None),
@@ -48,10 +51,12 @@ def scenes(launches: int) -> dict[str, Case]:
     }
 
 
-def of_top(scene: tippe.Scene, launch: tippe.Launch, t1: float, angle: float | None) -> Case:
-    """A top that ends where theta reaches an angle, or, with `None`, at the horizon `t1` [s]."""
+def of_top(scene: tippe.Scene, launch: tippe.Launch, t1: float, angle: float | None, turns: bool = True) -> Case:
+    """A top that ends where theta reaches an angle, or, with `None`, at the horizon `t1` [s]; `turns`: as tables have it."""
     body, law, cells = scene.body, scene.friction, launch.theta.shape[0]
     problem = InversionProblem.of(scene, launch, ANGLE if angle is None else angle, cells)
+    if not turns:
+        problem = dataclasses.replace(problem, dynamics=scene.dynamics)
     if angle is None:
         # No angle has a cosine of -2: every run goes on to the horizon.
         problem = InversionProblem(problem.dynamics, jnp.asarray(-2.0), problem.states, problem.scales)
@@ -60,6 +65,7 @@ def of_top(scene: tippe.Scene, launch: tippe.Launch, t1: float, angle: float | N
         *(float(value) for value in (body.mass, body.radius, body.offset, body.I1, body.I3, law.mu, scene.gravity)),
         slip_speed=float(getattr(law, "slip_speed", 0.0)),
         rho=float(scene.surface.radius - body.radius) if inside else 0.0,
+        turns=problem.dynamics.turns or 0.0,
     )
     return case(fields.cylinder if inside else fields.plane, numbers, problem, t1, angle, AXIS)
 

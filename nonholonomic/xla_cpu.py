@@ -22,6 +22,13 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 #: go when XLA prefers 512 bits by itself; without AVX-512 it does nothing.
 compiled_alone = eqx.filter_jit(compiler_options={"xla_cpu_prefer_vector_width": 512})
 
+#: For programs that are called on their own and run for a moment only: jaxlib 0.10 compiles them in half of the time if told to
+#: leave out the newer of its two ways to compile fused operations. Loops may run slower, a table by two numbers by a quarter.
+#: It can go with 0.10: later versions have a single way, and refuse the option.
+compiled_quickly = eqx.filter_jit(
+    compiler_options={"xla_cpu_use_fusion_emitters": False} if jaxlib.__version__.startswith("0.10.") else {}
+)
+
 #: For what is done once before a run: called on its own it is one program and not dozens of small ones, each of which takes
 #: 40 ms to compile; inside other programs it leaves no trace.
 compiled_setup = eqx.filter_jit(inline=True)

@@ -168,7 +168,7 @@ def table(options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory])
 
 
 def write_page(
-    options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory], words: list[str], figure: Any
+    options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory], words: list[str], drawing: Path | None
 ) -> Path:
     """The page of the main job: the rides in motion where K3D is installed, the audit, and the picture if there is one."""
     groups: dict[str, list[tuple[int, Trajectory]]] = {}
@@ -183,7 +183,7 @@ def write_page(
         ]
     above = "" if drawn else f'<p class="note">{NO_VIEW}</p>'
     below = "<h2>Energy against work</h2><pre>" + escape("\n".join(words)) + "</pre>"
-    below += "" if figure is None else "<h2>Paths, speeds, energies, side forces</h2>" + picture_as_html(figure, 70)
+    below += "" if drawing is None else "<h2>Paths, speeds, energies, side forces</h2>" + picture_as_html(drawing)
     path = options.out / "index.html"
     page(drawn, "Rides of a stroller", 1.0, above, below).save(path)
     return path
@@ -217,16 +217,16 @@ def main(arguments: list[str] | None = None) -> int:
             print("\n".join(audits[-len(runs) :]), flush=True)
         curve = tolerance_curve(options, helm)
         print("\n" + "\n".join(curve))
-        written, figure = [options.out / "rides.h5"], None
+        written, drawing = [options.out / "rides.h5"], None
         table(options, rides).save(written[0])
         if find_spec("matplotlib") is None:
             print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
         else:
-            written.append(options.out / "rides.png")
+            drawing = options.out / "rides.png"
             grounds = {ground: scene.surface for (ground, _), (scene, _) in asked.items()}
-            figure = draw_rides(grounds, rides)
-            figure.savefig(written[1], dpi=110)
-        shown = write_page(options, rides, [heading, *audits, "", *curve], figure)
+            draw_rides(grounds, rides).savefig(drawing, dpi=110)
+            written.append(drawing)
+        shown = write_page(options, rides, [heading, *audits, "", *curve], drawing)
     except (ValueError, OSError) as error:
         print(f"python -m stroller: {error}", file=sys.stderr)
         return 2

@@ -1,25 +1,27 @@
 """The main job, `python -m tippe`: the papers' two inversion tables, and the same launches on the plane."""
 
 import argparse
+import gc
 import math
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from html import escape
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import diffrax
-import equinox as eqx
 import jax
 import numpy as np
 
 from nonholonomic import __version__
 from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
+from nonholonomic.progress import Progress
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
+from nonholonomic.xla_cpu import compiled_quickly
 
 from .friction import AbstractFriction, Coulomb, Viscous
 from .launch import Launch
@@ -233,13 +235,23 @@ def _friction(law: AbstractFriction) -> str:
     return f"viscous mu = {float(law.mu):g} s/m"
 
 
-@eqx.filter_jit
-def moving(scene: Scene, launches: Launch, t1: Any, times: Any, tolerance: float) -> Motion:
-    """What is drawn of every launch, in one batched run; the picture and the page share its program.
+@compiled_quickly
+def moving(scene: Scene, launches: Launch, times: Any, tolerance: Any) -> Motion:
+    """What is drawn of every launch until the last of the times, in one batched run."""
+    return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
 
-    Tsit5 has half as many stages as Dopri8 to compile, and few runs are drawn.
+
+def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, Motion]]:
+    """The times that are drawn, up to `t1` [s], and what is drawn of every launch in each arena.
+
+    All numbers are arrays: a program is compiled anew for another Python number, so the picture and the page would not share
+    theirs. The arenas' programs are compiled side by side, for the compiler uses little more than one core.
     """
-    return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, t1, times, tolerance, diffrax.Tsit5())))(launches)
+    arenas, times = scenes(options), np.linspace(0.0, t1, SAMPLES)
+    tolerance = np.asarray(options.tolerance)
+    with Progress(len(arenas), "arena", "compiling what is drawn"), ThreadPoolExecutor(2) as threads:
+        found = threads.map(lambda scene: moving(scene, starts(options, scene)[1], times, tolerance), arenas.values())
+        return times, dict(zip(arenas, found, strict=True))
 
 
 def starts(options: argparse.Namespace, scene: Scene) -> tuple[list[float], Launch]:
@@ -251,12 +263,11 @@ def starts(options: argparse.Namespace, scene: Scene) -> tuple[list[float], Laun
 
 def picture(options: argparse.Namespace, found: dict[str, Table]) -> Any:
     """theta(t) of every launch."""
-    times = np.linspace(0.0, options.t1, SAMPLES)
+    times, runs = drawn(options, options.t1)
     panels, thetas = [], np.asarray(options.theta)
     for arena, scene in scenes(options).items():
-        etas, launches = starts(options, scene)
-        shown = np.asarray(moving(scene, launches, options.t1, times, options.tolerance).theta)
-        shown = shown.reshape(len(etas), len(thetas), -1)
+        etas, _ = starts(options, scene)
+        shown = np.asarray(runs[arena].theta).reshape(len(etas), len(thetas), -1)
         ends = found[arena].last_time.reshape(len(thetas), len(etas))
         for i, eta in enumerate(etas):
             name = shown_name(options, arena)
@@ -273,15 +284,14 @@ def motions(options: argparse.Namespace, found: dict[str, Table]) -> list[Stage]
     tilt = np.where(ends + 0.5 <= longest, options.theta, np.inf)
     row = int(np.argmin(tilt if np.isfinite(tilt).any() else ends))
     last = min(options.t1, longest, float(ends[row]) + 0.5)
-    times, groups = np.linspace(0.0, last, SAMPLES), []
+    (_, runs), groups = drawn(options, last), []
     for arena, scene in scenes(options).items():
-        run = moving(scene, starts(options, scene)[1], last, times, options.tolerance)
         name = f"{shown_name(options, arena)}, θ(0) = {options.theta[row]:.4g} rad"
-        groups.append([(name, scene, Motion(*(np.asarray(part)[row] for part in run)))])
+        groups.append([(name, scene, Motion(*(np.asarray(part)[row] for part in runs[arena])))])
     return stages(groups)
 
 
-def write_page(options: argparse.Namespace, found: dict[str, Table], figure: Any) -> Path:
+def write_page(options: argparse.Namespace, found: dict[str, Table], drawing: Path | None) -> Path:
     """The page of the main job: two tops in motion where K3D is installed, the tables, and the picture if there is one."""
     intro, rows = (
         described(options),
@@ -290,7 +300,7 @@ def write_page(options: argparse.Namespace, found: dict[str, Table], figure: Any
     rows += [list(row) for row in zip(*(entries for _, entries in columns(options, found)), strict=True)]
     below = "<h2>Inversion times</h2>" + table_as_html(rows, 2)
     below += "".join(f'<p class="note">{escape(line)}</p>' for line in intro)
-    below += "" if figure is None else "<h2>θ(t) of every launch</h2>" + picture_as_html(figure)
+    below += "" if drawing is None else "<h2>θ(t) of every launch</h2>" + picture_as_html(drawing)
     above = "" if can_view() else f'<p class="note">{NO_VIEW}</p>'
     path = options.out / "index.html"
     page(motions(options, found) if can_view() else [], "A tippe top turns over", 0.5, above, below).save(path)
@@ -310,22 +320,27 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         found = tables(options)
         print(report(options, found))
-        written, figure = [str(options.out / f"{arena}.h5") for arena in found], None
+        written, drawing = [options.out / f"{arena}.h5" for arena in found], None
         if find_spec("matplotlib") is None:
             print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
         else:
-            written.append(str(options.out / "theta.png"))
-            figure = picture(options, found)
-            figure.savefig(written[-1], dpi=130)
-        shown = write_page(options, found, figure)
+            drawing = options.out / "theta.png"
+            picture(options, found).savefig(drawing, dpi=130)
+            written.append(drawing)
+        shown = write_page(options, found, drawing)
     except (ValueError, OSError) as error:
         print(f"python -m tippe: {error}", file=sys.stderr)
         return 2
     cells = sum(table.status.size for table in found.values())
-    print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. Wrote {', '.join(written)}.")
+    print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
+    print(f"Wrote {', '.join(map(str, written))}.")
     print(f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    # A job of seconds: a fifth of them would go into looking for garbage among all that JAX holds, here and at the end.
+    gc.disable()
+    status = main()
+    gc.freeze()
+    sys.exit(status)

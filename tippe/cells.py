@@ -6,10 +6,9 @@ from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.integration import (
     CROSSED,
@@ -71,6 +70,15 @@ TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_t
 # Compiled once for all blocks.
 _on_the_ground = eqx.filter_jit(airborne.on_the_ground)
 _loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
+
+
+@eqx.filter_jit
+def _at_the_end(
+    scene: Scene, problem: InversionProblem, ended: Outcome | Journey, last: bool
+) -> tuple[Bool[Array, " cells"], Float[Array, " cells"]]:
+    """Which cells count as inverted, and theta [rad] at the end of each."""
+    return is_inverted(ended, problem, last), scene.theta(jnp.asarray(ended.state))
+
 
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit")
 SMOOTH = Driver(WORDS, (), None)
@@ -193,8 +201,8 @@ class CellRuns(NamedTuple):
         return compiled_march(problem, horizon, jnp.asarray(count), settings, passes=self.last)[0]
 
     def _named(self, scene: Scene, problem: InversionProblem, ended: Outcome | Journey) -> dict[str, Any]:
-        inverted = is_inverted(ended, problem, self.last)
-        others = [np.asarray(ended.status == status) for status in WORD_OF_STATUS]
+        inverted, theta = _at_the_end(scene, problem, ended, self.last)
+        others = [np.asarray(ended.status) == status for status in WORD_OF_STATUS]
         code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
         lost = code == WORDS.index("contact_lost")
         if lost.any():
@@ -208,7 +216,7 @@ class CellRuns(NamedTuple):
         return times | {
             "status": code.astype(np.int8),
             "end_time": np.asarray(ended.end_time),
-            "end_theta": np.asarray(jax.vmap(scene.theta, 1)(jnp.asarray(ended.state))),
+            "end_theta": np.asarray(theta),
             "steps": np.asarray(ended.steps),
             "rejected": np.asarray(ended.rejected),
         }

@@ -5,7 +5,8 @@ The velocity along n follows from the axis, because the contact persists. Cyclic
 part of it.
 """
 
-from typing import NamedTuple
+import dataclasses
+from typing import NamedTuple, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from nonholonomic.geometry import (
     AbstractFrame,
     Component,
     Tangent,
+    Vector,
     add,
     carried,
     cross,
@@ -45,6 +47,10 @@ JAMMED = 1e-4
 #: the root of the time left, so a run ends too early by the square of this in units of 0.1 s or so.
 FITS = 1e-4
 
+#: Rate of a frame that turns with the top, as a fraction of L_n / I1 (`Dynamics.turning`). Of 0.5, 0.7, 0.85 and 1 it is the
+#: fastest at equal error, or as fast as the fastest, in five scenes on the plane: 1.2 to 2.6 times as fast as a frame at rest.
+TURNING = 0.7
+
 #: How a contact can end; the index stands for the word.
 LOSSES = ("contact_lost", "jammed", "does_not_fit")
 
@@ -74,7 +80,10 @@ class Motion(NamedTuple):
 
 
 class Dynamics(eqx.Module):
-    """A scene with the combinations of its numbers that every evaluation needs, computed once."""
+    """A scene with the combinations of its numbers that every evaluation needs, computed once.
+
+    `turns` is the rate at which the frame turns about n besides, as a fraction of L_n / I1; `None` if it does not.
+    """
 
     frame: AbstractFrame
     friction: AbstractFriction
@@ -84,6 +93,7 @@ class Dynamics(eqx.Module):
     per_mass: Float[Array, "..."]
     per_transverse: Float[Array, "..."]
     axial_excess: Float[Array, "..."]
+    turns: float | None = eqx.field(static=True, default=None)
 
     @classmethod
     def of(
@@ -103,6 +113,14 @@ class Dynamics(eqx.Module):
             per_transverse=1.0 / body.I1,
             axial_excess=1.0 / body.I3 - 1.0 / body.I1,
         )
+
+    def turning(self) -> Self:
+        """The same equations in a frame that turns about n, for an arena on which all directions across n are alike.
+
+        In a frame at rest L keeps its direction almost, and the axis runs around it at L / I1. In this one each turns at a part
+        of that rate: steps are longer, and their errors, which no longer add up along a circle, are far smaller.
+        """
+        return dataclasses.replace(self, turns=TURNING)
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
         """Evaluate the equations of motion, with the normal force solved for including friction.
@@ -157,6 +175,10 @@ class Dynamics(eqx.Module):
         u2_dot = add(multiply(thrust, f2), multiply(-self.gravity, up[1]), multiply(o[1], u3))
         e_dot = sum_vectors(e_dot, carried(e, o))
         L_dot = sum_vectors(scale(N, (M1, M2, M3)), carried(L, o))
+        if self.turns is not None:
+            turn = self.turns * self.per_transverse * L[2]
+            u1_dot, u2_dot = add(u1_dot, turn * u2), subtract(u2_dot, turn * u1)
+            e_dot, L_dot = sum_vectors(e_dot, turned(e, turn)), sum_vectors(L_dot, turned(L, turn))
         rate = (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate)
         return Motion(rate, N, friction, slip, path, o, spin_momentum, stiffness, room)
 
@@ -183,6 +205,11 @@ class Dynamics(eqx.Module):
         motion = self.motion(state)
         lost, jammed = motion.normal_force / (self.mass * self.gravity) + 1e-12, motion.stiffness - JAMMED
         return (lost, jammed) if motion.room is None else (lost, jammed, motion.room - FITS)
+
+
+def turned(vector: Vector, rate: Float[Array, "..."]) -> Vector:
+    """Rate of the components of a fixed vector in a frame that turns about n at some rate [rad/s]."""
+    return rate * vector[1], -(rate * vector[0]), None
 
 
 def stacked(rate: tuple[Component, ...], state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:

@@ -32,7 +32,10 @@ LOOSEST = 1e-2
 
 
 class InversionProblem(AbstractProblem):
-    """Launches that end when theta reaches an angle or the contact is lost or jams."""
+    """Launches that end when theta reaches an angle or the contact is lost or jams.
+
+    The states are those of `Scene.turning_dynamics`.
+    """
 
     dynamics: Dynamics | StickSlip | Kind
     cos_angle: Float[Array, "..."]
@@ -63,7 +66,7 @@ def _problem(scene: Scene, launch: Launch, angle: Float[Array, "..."], cells: in
     shape = (states.shape[0], cells)
     states = jnp.broadcast_to(states.reshape(shape[0], -1), shape)
     scales = jnp.broadcast_to(scene.scales(launch).reshape(shape[0], -1), shape)
-    return InversionProblem(scene.dynamics, jnp.cos(angle), states, scales)
+    return InversionProblem(scene.turning_dynamics, jnp.cos(angle), states, scales)
 
 
 @eqx.filter_jit

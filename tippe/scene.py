@@ -162,6 +162,15 @@ class Scene(Bounded):
         equations = StickSlip if self.friction.set_valued else Dynamics
         return equations.of(self.body, self.frame, self.friction, self.gravity)
 
+    @property
+    def turning_dynamics(self) -> Dynamics | StickSlip:
+        """The equations of motion for questions about angles, times, energies or forces, whose answers are cheaper so.
+
+        On a level plane the frame turns with the top, and how far it has turned is not known afterwards.
+        """
+        equations = self.dynamics
+        return equations.turning() if self.level and isinstance(equations, Dynamics) else equations
+
     def check_start(self, launch: Launch) -> None:
         """Raise `ValueError` if a launch has no place on this arena."""
         require_all(self.start_bounds(launch))

@@ -1,5 +1,6 @@
 """How the cells of a table of trajectories are run and read: samples of many launches, and what is observed at them."""
 
+import dataclasses
 from typing import Any, cast
 
 import equinox as eqx
@@ -20,13 +21,19 @@ from .trajectory import Trajectory
 #: What can be read off the state alone; all else needs the path, except on the plane, where only the position does.
 OF_THE_STATE = {"theta", "azimuth", "spin", "energy", "jellett", "normal_force", "slip", "theta_rate"}
 
+#: What is the same in a frame that has turned about n, by no matter how much.
+WITHOUT_DIRECTION = {"theta", "theta_rate", "eta", "spin", "energy", "jellett", "normal_force"}
+
 
 def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> LeadingProblem:
-    """The runs of some cells with as much of a `TrajectoryProblem` as the named quantities need: its cyclic coordinates only
-    for some of them, no spin angle, no work. On the plane a run without them takes half the time."""
+    """The runs of some cells with as much of a `TrajectoryProblem` as the named quantities need: its path only for some of them,
+    and neither rotation nor work. On the plane a run without them takes half the time, and has samples a hundred times as
+    accurate in a frame that turns, if none of them has a direction."""
     run = TrajectoryProblem.of(scene, launch, cells)
+    if scene.level and WITHOUT_DIRECTION.issuperset(names):
+        return LeadingProblem(dataclasses.replace(run, dynamics=scene.turning_dynamics), len(run.state))
     needed = {"position"} if isinstance(scene.surface, Plane) else set(QUANTITIES) - OF_THE_STATE
-    return LeadingProblem(run, len(run.state) + (0 if needed.isdisjoint(names) else len(run.cyclic)))
+    return LeadingProblem(run, run.leading if needed.isdisjoint(names) else run.up_to_path)
 
 
 def _read(

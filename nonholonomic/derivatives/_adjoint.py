@@ -197,16 +197,16 @@ def _recorded(queue: Queue, progress: Progress) -> tuple[Progress, Record, Int[A
     here = queue.here(progress.block)
 
     def going(carry: Any) -> Bool[Array, ""]:
-        block, _, count = carry
-        return queue.enough_active(block, progress.queued) & (count < PERIOD)
+        block, _, idle, count = carry
+        return queue.goes_on(block, idle, progress.queued) & (count < PERIOD)
 
     def step(carry: Any) -> Any:
-        block, record, count = carry
+        block, record, idle, count = carry
         after = attempt(*here, block)
         length = jnp.where(after.time > block.time, length_to_try(here[1], block), 0.0)
         made = Record(block.time, _without_probe(block).state, length)
         record = jax.tree.map(functools.partial(written_in_place, at=count), record, made)
-        return after, record, count + 1
+        return after, record, idle + queue.idle(block), count + 1
 
     def loop(start: Block) -> Any:
         empty = Record(
@@ -215,9 +215,9 @@ def _recorded(queue: Queue, progress: Progress) -> tuple[Progress, Record, Int[A
                 for leaf in (start.time, _without_probe(start).state, start.length)
             )
         )
-        return jax.lax.while_loop(going, step, (start, empty, jnp.zeros((), int)))
+        return jax.lax.while_loop(going, step, (start, empty, jnp.zeros((), int), jnp.zeros((), int)))
 
-    block, record, count = queue.in_kernel(loop)(progress.block)
+    block, record, _, count = queue.in_kernel(loop)(progress.block)
     return Progress(block, progress.queued, progress.iterations + count), record, count
 
 

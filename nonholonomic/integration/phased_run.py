@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..xla_cpu import compiled_quickly
 from .phases import MOST_ROUNDS, AbstractPhase, Passage
 from .problem import AbstractProblem
 from .settings import Settings
@@ -110,7 +111,7 @@ def _problem(phase: AbstractPhase, state: Float[Array, " components"]) -> Abstra
     return lone.problem(state)
 
 
-@eqx.filter_jit
+@compiled_quickly
 def _leave(phase: AbstractPhase, state: Float[Array, " components"], left: Float[Array, ""]) -> Passage:
     return phase.leave(state[:, None], left[None])
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..xla_cpu import compiled_quickly
 from .march import compiled_march
 from .problem import AbstractProblem
 from .queue import Outcome
@@ -105,7 +106,7 @@ def _problem(phase: AbstractPhase, state: Float[Array, "components cells"]) -> A
     return phase.problem(state)
 
 
-@eqx.filter_jit
+@compiled_quickly
 def _leave(phase: AbstractPhase, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
     return phase.leave(state, left)
 

@@ -21,6 +21,10 @@ from .runge_kutta import explicit_tableau, first_length
 from .settings import Settings
 from .status import CROSSED, GUARD_LOST, REACHED_END, RUNNING
 
+#: What it costs to refill a block, in steps of the whole block. It is refilled when as much has been lost to idle lanes, which
+#: is never more than twice what the best moment would have cost.
+REFILL = 0.25
+
 
 class Outcome(NamedTuple):
     """How every cell ended.
@@ -125,23 +129,33 @@ class Queue(eqx.Module):
         """Whether a lane is running or a cell waiting."""
         return jnp.any(progress.block.status == RUNNING) | (progress.queued < self.cells)
 
-    def enough_active(self, block: Block, queued: Int[Array, ""]) -> Bool[Array, ""]:
-        """Whether the block should go on: while cells wait, it stops to refill once a sixteenth of the lanes is idle."""
-        least_active = jnp.where(queued < self.cells, self.lanes - max(1, self.lanes // 16), 0)
-        return jnp.sum(block.status == RUNNING) > least_active
+    def idle(self, block: Block) -> Int[Array, ""]:
+        """How many lanes have nothing to do."""
+        return jnp.sum(block.status != RUNNING)
+
+    def goes_on(self, block: Block, idle: Int[Array, ""], queued: Int[Array, ""]) -> Bool[Array, ""]:
+        """Whether a block goes on; while cells wait it stops to be refilled as soon as that is worth it.
+
+        **Arguments:** `idle`: of how many lanes steps have come to nothing since it was filled; `queued`: how many cells have
+        left the queue.
+        """
+        refill = (queued < self.cells) & (idle >= REFILL * self.lanes)
+        return jnp.any(block.status == RUNNING) & ~refill
 
     def run(self, progress: Progress) -> Progress:
         """Let the block go on until it should be refilled, or ends."""
         here = self.here(progress.block)
 
-        def loop(carry: tuple[Block, Int[Array, ""]]) -> tuple[Block, Int[Array, ""]]:
-            return jax.lax.while_loop(
-                lambda inner: self.enough_active(inner[0], progress.queued),
-                lambda inner: (attempt(*here, inner[0]), inner[1] + 1),
-                carry,
-            )
+        def goes_on(carry: tuple[Block, Int[Array, ""], Int[Array, ""]]) -> Bool[Array, ""]:
+            block, idle, _ = carry
+            return self.goes_on(block, idle, progress.queued)
 
-        block, iterations = self.in_kernel(loop)((progress.block, progress.iterations))
+        def step(carry: tuple[Block, Int[Array, ""], Int[Array, ""]]) -> tuple[Block, Int[Array, ""], Int[Array, ""]]:
+            block, idle, iterations = carry
+            return attempt(*here, block), idle + self.idle(block), iterations + 1
+
+        start = (progress.block, jnp.zeros((), int), progress.iterations)
+        block, _, iterations = self.in_kernel(lambda carry: jax.lax.while_loop(goes_on, step, carry))(start)
         return Progress(block, progress.queued, iterations)
 
     def in_kernel(self, loop: Callable[[Any], Any]) -> Callable[[Any], Any]:

@@ -100,11 +100,12 @@ def _recorded(
     horizon = jnp.broadcast_to(control.t1, progress.block.time.shape)
 
     def going(carry: Any) -> Any:
-        block, _, _, iteration = carry
-        return queue.enough_active(block, progress.queued) & (iteration < PERIOD)
+        block, _, _, idle, iteration = carry
+        return queue.goes_on(block, idle, progress.queued) & (iteration < PERIOD)
 
     def step(carry: Any) -> Any:
-        block, sample, record, iteration = carry
+        block, sample, record, idle, iteration = carry
+        idle = idle + queue.idle(block)
         next_time = _next_time(times, sample)
         stop = jnp.where(sample < count, jnp.minimum(next_time, horizon), horizon)
         block = block._replace(length=_even(block.length, stop - block.time, block.searching))
@@ -115,16 +116,16 @@ def _recorded(
         after = after._replace(status=jnp.where(goes_on, RUNNING, after.status))
         made = Record(after.state, jnp.where(is_sample, sample, count))
         record = jax.tree.map(functools.partial(written_in_place, at=iteration), record, made)
-        return after, sample + is_sample, record, iteration + 1
+        return after, sample + is_sample, record, idle, iteration + 1
 
     def loop(start: tuple[Block, Int[Array, " lanes"]]) -> Any:
         block, sample = start
         empty = Record(
             jnp.zeros((PERIOD, *block.state.shape), block.state.dtype), jnp.full((PERIOD, *sample.shape), count)
         )
-        return jax.lax.while_loop(going, step, (block, sample, empty, jnp.zeros((), int)))
+        return jax.lax.while_loop(going, step, (block, sample, empty, jnp.zeros((), int), jnp.zeros((), int)))
 
-    block, sample, record, iterations = queue.in_kernel(loop)((progress.block, sample))
+    block, sample, record, _, iterations = queue.in_kernel(loop)((progress.block, sample))
     return Progress(block, progress.queued, progress.iterations + iterations), sample, record
 
 

@@ -3,7 +3,6 @@
 import base64
 import contextlib
 import html
-import io
 import json
 import zlib
 from collections.abc import Iterator
@@ -87,11 +86,9 @@ def table_as_html(rows: list[list[str]], heads: int) -> str:
     return f"<table>{''.join(parts)}</table>"
 
 
-def picture_as_html(figure: Any, dots: int = 110) -> str:
-    """A matplotlib figure as an HTML image that carries its data."""
-    image = io.BytesIO()
-    figure.savefig(image, format="png", dpi=dots)
-    return f'<img style="max-width:100%" alt="" src="data:image/png;base64,{_coded(image.getvalue())}">'
+def picture_as_html(path: Path) -> str:
+    """A PNG file as an HTML image that carries its data."""
+    return f'<img style="max-width:100%" alt="" src="data:image/png;base64,{_coded(path.read_bytes())}">'
 
 
 def _template(name: str) -> str:

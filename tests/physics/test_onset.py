@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from close import assert_close
 from tops import rutstam_top
 
@@ -54,6 +55,7 @@ def begun(scene, launch, start):
     return long, *slips
 
 
+@pytest.mark.newest
 def test_a_slip_begins_at_every_tolerance():
     """The direction of the force turns by 0.14 rad in the first trial; the state later is that of a shorter step."""
     scene = tippe.Scene(rutstam_top(), tippe.Sphere(0.3), tippe.SetValuedCoulomb(0.2))

@@ -1,8 +1,10 @@
 """`inversion_time` as a function: its transformations, its derivatives, its answers where there is no inversion."""
 
+import dataclasses
 import math
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,8 @@ from close import assert_close
 from tops import rutstam_top
 
 import tippe
+from nonholonomic.integration import CROSSED, Settings, compiled_march
+from tippe.inversion import InversionProblem
 
 
 def time_of(mu=0.3, theta=0.1, spin=155.0, offset=0.006, tolerance=1e-11, crossing="first", t1=20.0):
@@ -226,3 +230,30 @@ def test_float32_works_at_its_own_tolerance():
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
     expected = tippe.inversion_table(scene, theta=[0.3, 0.4], spin=[155.0, 160.0], t1=8.0)
     assert_close([float(time) for time in done.stdout.split(",")], expected.time.ravel(), rtol=2e-2)
+
+
+def test_a_frame_that_turns_with_the_top_saves_digits_and_changes_none(rutstam_scene):
+    """Tops on the plane under a law with torques too, slow and fast, by equations at rest and by those of the tables."""
+    disc = tippe.Contensou(np.array([0.3, 0.3, 0.1, 0.5]), np.array([0.0, 1e-3, 2e-3, 0.0]), 0.2)
+    scene = eqx.tree_at(lambda one: one.friction, rutstam_scene, disc)
+    launch = tippe.Launch(np.array([0.1, 0.4, 0.2, 1.0]), np.array([150.0, -180.0, 200.0, 40.0]), azimuth=1.0)
+
+    def ends(problem, tolerance):
+        outcome, _ = compiled_march(problem, jnp.asarray(2.0), jnp.asarray(4), Settings(tolerance))
+        assert (outcome.status != CROSSED).all()
+        state = np.asarray(outcome.state)
+        u, e, L = np.vstack([state[:2], 0.0 * state[:1]]), state[2:5], state[5:]
+        return np.stack([e[2], (L * e).sum(0), L[2], (u * e).sum(0), (u * L).sum(0), (u * u).sum(0)])
+
+    tables = dataclasses.replace(InversionProblem.of(scene, launch, jnp.pi, 4), cos_angle=jnp.asarray(-2.0))
+    at_rest = dataclasses.replace(tables, dynamics=scene.dynamics)
+    exact = ends(at_rest, 1e-13)
+    sizes = np.abs(exact).max(axis=1, keepdims=True)
+    assert_close(ends(tables, 1e-13) / sizes, exact / sizes, atol=1e-9)
+    wrong = {
+        name: np.abs((ends(one, 1e-8) - exact) / sizes).max() for name, one in (("turning", tables), ("rest", at_rest))
+    }
+    assert 3.0 * wrong["turning"] < wrong["rest"], wrong
+    # The frame has turned: only what has no direction is the same.
+    turned, fixed = (one.dynamics.field(tables.states + 0.1 * tables.scales) for one in (tables, at_rest))
+    assert not np.allclose(turned[2], fixed[2])

@@ -2,10 +2,11 @@
 
 import json
 
+import jax
 import pytest
 import xarray
 
-from tippe.__main__ import main, parser
+from tippe.__main__ import drawn, main, parser
 
 SMALL = ["--theta", "0.1", "0.3", "--eta", "0", "--t1", "12", "--tolerance", "1e-7"]
 
@@ -32,6 +33,19 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys):
     assert main([*SMALL, "--mu", "0.2", "--out", str(tmp_path / "out")]) == 2
     printed = capsys.readouterr().err
     assert "scene.friction.mu is 0.3 there and 0.2 here" in printed
+
+
+def test_picture_and_page_share_their_programs(caplog):
+    """The page shows a shorter time, and other jobs have another tolerance; neither is compiled anew."""
+    drawn(parser().parse_args(SMALL), 12.0)
+    # For all threads, which `jax.log_compiles` is not.
+    jax.config.update("jax_log_compiles", True)
+    try:
+        times, runs = drawn(parser().parse_args([*SMALL, "--tolerance", "1e-6"]), 2.0)
+    finally:
+        jax.config.update("jax_log_compiles", False)
+    assert runs["plane"].theta.shape == (2, len(times))
+    assert "Compiling" not in caplog.text
 
 
 @pytest.mark.parametrize(

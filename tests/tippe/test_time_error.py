@@ -83,8 +83,8 @@ def test_digits_of_a_table(near_threshold):
         unit = 10.0 ** -len(number.split(".")[1])
         assert abs(float(number) - time) <= 0.5 * unit * (1.0 + 1e-9)
         assert (int(digit) - 1) * unit < error <= int(digit) * unit
-    # The nearer to the threshold, the fewer digits.
-    assert len(texts[3]) < len(texts[-1])
+    # The nearer to the threshold, the greater the error.
+    assert near_threshold.time_error[3] > near_threshold.time_error[-1]
 
 
 def test_the_rest_of_the_table_is_that_without_errors(near_threshold):

@@ -59,8 +59,11 @@ def test_every_cell_is_a_single_run(table, scene):
 
 
 def test_a_batch_by_vmap_is_the_same(table, scene):
-    """It steps like the table, which needs no path for its quantities: `jit` leaves out what is not read."""
+    """It steps like a table that needs directions and no path: `jit` leaves out what is not read."""
     table, _ = table
+    with_direction = tippe.trajectory_table(
+        scene, theta=0.2, spin=SPIN, mu=0.3, times=TIMES, quantities=["theta", "azimuth"]
+    )
 
     @jax.jit
     @jax.vmap
@@ -71,8 +74,11 @@ def test_a_batch_by_vmap_is_the_same(table, scene):
     theta, end, accepted = read(jnp.asarray(table.coords["launch.spin"]))
     assert_close(table.theta[1, 1], theta, atol=1e-7)
     assert_close(table.end_time[1, 1], end, atol=1e-7)
+    assert_close(table.theta[1, 1], with_direction.theta, atol=1e-7)
     # With the path they would be 516 and not 524 in one of the cells.
-    assert np.all(np.abs(table.steps[1, 1] - table.rejected[1, 1] - accepted) <= 2)
+    assert np.all(np.abs(with_direction.steps - with_direction.rejected - accepted) <= 2)
+    # Without directions the frame turns with the top.
+    assert np.all(np.abs(table.steps[1, 1] - table.rejected[1, 1] - accepted) > 2)
 
 
 @pytest.mark.parametrize(

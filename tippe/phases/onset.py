@@ -48,7 +48,8 @@ TRIALS, ITERATIONS = 10, 10
 def _radau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The nodes in (0, 1], what the integrals up to `x` are made of (coefficients of x, stage), and the row of the highest
     Legendre coefficient."""
-    nodes = (np.sort(legendre.legroots([0.0] * (STAGES - 1) + [-1.0, 1.0])) + 1.0) / 2.0
+    # The roots are real, but since NumPy 2.5 their type is complex.
+    nodes = (np.sort(legendre.legroots([0.0] * (STAGES - 1) + [-1.0, 1.0]).real) + 1.0) / 2.0
     nodes[-1] = 1.0
     integrals = []
     for k in range(STAGES):

@@ -23,6 +23,7 @@ from nonholonomic.geometry import (
     subtract,
     sum_vectors,
 )
+from nonholonomic.xla_cpu import stored
 
 from ..dynamics import Motion, stacked
 from ..friction import ContactLoad, Slip, length
@@ -185,4 +186,4 @@ class RollingDynamics(eqx.Module):
         ex = (self.I1 * te + m * er * tr) / determinant
         rx = ((self.I3 + m * r2) * tr - excess * er * te) / determinant
         rest = sum_vectors(torque, scale(subtract(None, excess * ex), e), scale(m * rx, r))
-        return scale(1.0 / A, rest)
+        return stored(*scale(1.0 / A, rest))

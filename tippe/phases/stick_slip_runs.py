@@ -18,6 +18,7 @@ from nonholonomic.integration import (
     Settings,
     follow_phases,
 )
+from nonholonomic.xla_cpu import compiled_setup
 
 from ..dynamics import COS_THETA, NO_COSINE, Dynamics
 from ..inversion import InversionProblem
@@ -119,9 +120,14 @@ def phases(
     both = problem.dynamics
     assert isinstance(both, StickSlip)
     kinds = (Kind(both, jnp.asarray(tolerance, float), rolls) for rolls in (False, True))
-    rests = both.slip_speed(problem.states) <= AT_REST * both.speed
     found = tuple(StickSlipPhase(kind, problem.cos_angle, problem.scales, last, axial, size) for kind in kinds)
-    return found, jnp.where(rests, ROLLING, SLIPPING)
+    return found, _first_phase(both, problem.states)
+
+
+@compiled_setup
+def _first_phase(both: StickSlip, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+    """The number of the phase in which each cell starts."""
+    return jnp.where(both.slip_speed(states) <= AT_REST * both.speed, ROLLING, SLIPPING)
 
 
 def follow_stick_slip(run: TrajectoryProblem, t1: float, settings: Settings) -> PhasedPath:

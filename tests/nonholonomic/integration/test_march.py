@@ -73,6 +73,15 @@ def test_the_first_crossing_is_located():
     assert int(outcome.steps.sum()) <= int(iterations) * 8
 
 
+def test_cells_of_like_cost_leave_no_lane_idle():
+    """Two rounds of a block are two rounds, although its lanes do not end at the same step."""
+    outcome, iterations = run(np.linspace(9.0, 10.0, 128), level=-2.0, lanes=64)
+    assert (np.asarray(outcome.status) == REACHED_END).all()
+    steps = np.asarray(outcome.steps)
+    assert steps.min() < steps.max()
+    assert int(iterations) * 64 < 1.1 * steps.sum()
+
+
 def test_the_guard_ends_a_run_where_it_vanishes():
     """y = -sin(w t) falls to -0.3 before x falls to 1/2."""
     outcome, _ = run([1.0, 3.0], floor=0.3)
