@@ -26,7 +26,7 @@ WITHOUT_DIRECTION = {"theta", "theta_rate", "eta", "spin", "energy", "jellett", 
 
 
 def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> LeadingProblem:
-    """The runs of some cells with as much of a `TrajectoryProblem` as the named quantities need: its path only for some of them,
+    """The runs of some cells with as much of a `TrajectoryProblem` as the named quantities need: the path for some of them only,
     and neither rotation nor work. On the plane a run without them takes half the time, and has samples a hundred times as
     accurate in a frame that turns, if none of them has a direction."""
     run = TrajectoryProblem.of(scene, launch, cells)
