@@ -1,6 +1,7 @@
 """The main job, `python -m stroller`: rides on some surfaces, with and without friction, and their audit."""
 
 import argparse
+import gc
 import sys
 import time
 from collections.abc import Callable
@@ -237,4 +238,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    # A job of seconds: a tenth of them would go into looking for garbage among all that JAX holds, here and at the end.
+    gc.disable()
+    status = main()
+    gc.freeze()
+    sys.exit(status)

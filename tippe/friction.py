@@ -74,6 +74,12 @@ class AbstractFriction(Bounded):
         """Whether the law depends on the body's angular velocity about the normal."""
         return False
 
+    @property
+    def isotropic(self) -> bool:
+        """Whether the law is the same in all directions along the arena. Tables on the level plane are faster and more accurate
+        if it says so (`Scene.turning_dynamics`), and wrong if it says so and is not."""
+        return False
+
     @abc.abstractmethod
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         """The load per unit normal force.
@@ -99,6 +105,10 @@ class Frictionless(AbstractFriction):
 
     ```
     """
+
+    @property
+    def isotropic(self) -> bool:
+        return True
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         return ContactLoad(force=(None, None))
@@ -129,6 +139,10 @@ class Viscous(AbstractFriction):
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.mu, "mu", at_least=0.0)
+
+    @property
+    def isotropic(self) -> bool:
+        return True
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         return ContactLoad(force=(-self.mu * slip.x, -self.mu * slip.y))
@@ -168,6 +182,10 @@ class Coulomb(AbstractFriction):
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.mu, "mu", at_least=0.0)
         yield Bound(self.slip_speed, "slip_speed", above=0.0)
+
+    @property
+    def isotropic(self) -> bool:
+        return True
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         speed = jnp.sqrt(slip.x * slip.x + slip.y * slip.y + self.slip_speed * self.slip_speed)
@@ -216,6 +234,10 @@ class Contensou(AbstractFriction):
 
     @property
     def drills(self) -> bool:
+        return True
+
+    @property
+    def isotropic(self) -> bool:
         return True
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
@@ -274,6 +296,10 @@ class Rolling(AbstractFriction):
     @property
     def drills(self) -> bool:
         return self.sliding.drills
+
+    @property
+    def isotropic(self) -> bool:
+        return self.sliding.isotropic
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
         w1, w2, _ = slip.turning

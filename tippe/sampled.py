@@ -44,6 +44,11 @@ class TrajectoryProblem(AbstractProblem):
     def leading(self) -> int:
         return len(self.state)
 
+    @property
+    def up_to_path(self) -> int:
+        """How many components, from the first, state and path have; what is behind them is for rotation and work."""
+        return len(self.state) + len(self.cyclic) - 3
+
     def start(self) -> tuple[Float[Array, "components ..."], Float[Array, "components ..."]]:
         rest = jnp.zeros((2, *self.state.shape[1:])) if self.rest is None else self.rest
         return jnp.concatenate([self.state, self.cyclic, rest]), self.scales

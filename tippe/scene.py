@@ -162,10 +162,12 @@ class Scene(Bounded):
     def turning_dynamics(self) -> Dynamics | StickSlip:
         """The equations of motion for questions about angles, times, energies or forces, whose answers are cheaper so.
 
-        On a level plane the frame turns with the top, and how far it has turned is not known afterwards.
+        On a level plane under an isotropic law the frame turns with the top, and how far it has turned is not known afterwards.
         """
         equations = self.dynamics
-        return equations.turning() if self.level and isinstance(equations, Dynamics) else equations
+        if isinstance(equations, Dynamics) and self.level and self.friction.isotropic:
+            return equations.turning()
+        return equations
 
     def check_start(self, launch: Launch) -> None:
         """Raise `ValueError` if a launch has no place on this arena."""

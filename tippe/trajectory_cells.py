@@ -26,14 +26,16 @@ WITHOUT_DIRECTION = {"theta", "theta_rate", "eta", "spin", "energy", "jellett", 
 
 
 def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> LeadingProblem:
-    """The runs of some cells with as much of a `TrajectoryProblem` as the named quantities need: its cyclic coordinates only
-    for some of them, no spin angle, no work. On the plane a run without them takes half the time, and has samples a hundred
-    times as accurate in a frame that turns, if none of them has a direction."""
+    """The runs of some cells with as much of a `TrajectoryProblem` as the named quantities need.
+
+    That is the path for some of them only, and neither rotation nor work: on the plane a run without them takes half the time.
+    If none of them has a direction, the frame turns there, and samples are a hundred times as accurate.
+    """
     run = TrajectoryProblem.of(scene, launch, cells)
     if scene.level and WITHOUT_DIRECTION.issuperset(names):
         return LeadingProblem(dataclasses.replace(run, dynamics=scene.turning_dynamics), len(run.state))
     needed = {"position"} if isinstance(scene.surface, Plane) else set(QUANTITIES) - OF_THE_STATE
-    return LeadingProblem(run, len(run.state) + (0 if needed.isdisjoint(names) else len(run.cyclic)))
+    return LeadingProblem(run, run.leading if needed.isdisjoint(names) else run.up_to_path)
 
 
 def _read(

@@ -43,6 +43,13 @@ class AbstractQuadric(AbstractSurface):
         along = scale(subtract(None, dot(normal, turning)), normal)
         return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), sum_vectors(turning, along))
 
+    def bending(self, position: Vector, a: Vector, b: Vector) -> tuple[Component, Component, Component]:
+        # Along the surface the change of the gradient's size is across a and b.
+        gradient, by_a = self.gradient(position), self.gradient(a)
+        per_size = 1.0 / jnp.sqrt(dot(gradient, gradient))
+        aa, ab, bb = dot(a, by_a), dot(b, by_a), dot(b, self.gradient(b))
+        return per_size * aa, per_size * ab, per_size * bb
+
     def elevation(self, position: Vector) -> Component:
         return position[2] + self.semi_axes[1]
 

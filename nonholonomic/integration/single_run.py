@@ -185,6 +185,17 @@ def _loss(
     return halved(holds, looks[first], looks[first + 1])[0]
 
 
+class _GivenSteps(diffrax.StepTo):
+    """Steps that end at given times, growing, without Diffrax's checks: these call Python back, and a program that does so is
+    not kept on disk."""
+
+    def wrap(self, direction: Any) -> "_GivenSteps":
+        return self
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: None, args: Any, func: Any, error_order: Any) -> Any:
+        return self.ts[1], 2
+
+
 class Sampled(NamedTuple):
     """A run at given times: its states, NaN after its end; when and where it ended, and whether the guard ended it."""
 
@@ -198,7 +209,7 @@ class Sampled(NamedTuple):
 
 def sample(
     problem: AbstractProblem,
-    times: Float[Array, " times"],
+    times: Float[Array, " times"] | None,
     t1: Float[Array, ""],
     settings: Settings,
     *,
@@ -210,8 +221,9 @@ def sample(
     The guard is checked at the ends of steps, and the run ends where it is zero on the dense output. Steps end on the times
     asked for, where interpolation would lose a digit or two.
 
-    **Arguments:** as for `follow`; `times`: growing, in [0, t1]; `grid`: the ends of the steps [s], for a solver without an
-    error estimate; `adjoint`: how Diffrax differentiates, by default forwards.
+    **Arguments:** as for `follow`; `times`: growing, in [0, t1], or `None` for those of the grid; `grid`: the ends of the steps
+    [s], 0 the first and t1 the last, for a solver without an error estimate; `adjoint`: how Diffrax differentiates, by default
+    forwards.
 
     **Returns:** a `Sampled`.
     """
@@ -220,11 +232,15 @@ def sample(
     event = diffrax.Event(
         lambda t, y, args, **_: args.guard(t, y), optimistix.Newton(1e-13, 1e-13) if watched else None
     )
-    times_inside = jnp.minimum(times, t1)
-    if grid is None:
-        controller = diffrax.ClipStepSizeController(_control(settings, scales), step_ts=times_inside)
+    if times is None:
+        assert grid is not None
+        times, every, most = grid, diffrax.SubSaveAt(t0=True, steps=True), grid.size - 1
     else:
-        controller = diffrax.StepTo(grid)
+        every, most = diffrax.SubSaveAt(ts=jnp.minimum(times, t1)), settings.max_steps
+    if grid is None:
+        controller = diffrax.ClipStepSizeController(_control(settings, scales), step_ts=jnp.minimum(times, t1))
+    else:
+        controller = _GivenSteps(grid)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
         settings.solver,
@@ -234,8 +250,8 @@ def sample(
         state,
         args=problem,
         stepsize_controller=controller,
-        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=times_inside), diffrax.SubSaveAt(t1=True)]),
-        max_steps=settings.max_steps,
+        saveat=diffrax.SaveAt(subs=[every, diffrax.SubSaveAt(t1=True)]),
+        max_steps=most,
         event=event if watched else None,
         adjoint=diffrax.ForwardMode() if adjoint is None else adjoint,
         throw=False,

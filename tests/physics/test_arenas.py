@@ -66,7 +66,7 @@ def test_an_independent_program_sees_the_same_motion(number):
     run = tippe.simulate(scene, launch, row["t1"], times, 1e-11)
     assert run.status == row["status"]
     assert_close(run.end_time, row["end_time"], atol=1e-8)
-    assert len(run.t) >= SAMPLES - 1
+    assert len(run.t) == np.sum(times <= row["end_time"])
     for k in range(1, len(run.t) + 1):
         assert_close(run.position[k - 1], [row[f"O{i}_{k}"] for i in range(3)], atol=1e-8)
         assert_close(run.axis[k - 1], [row[f"e{i}_{k}"] for i in range(3)], atol=1e-8)

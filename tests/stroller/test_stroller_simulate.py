@@ -11,6 +11,7 @@ import pytest
 from terminal import Terminal
 
 import stroller
+from nonholonomic.integration import Settings, sample
 from stroller import (
     Damping,
     ImplicitMidpoint,
@@ -23,6 +24,7 @@ from stroller import (
     Steady,
     Stroller,
 )
+from stroller.ride import RideProblem
 
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
 FULL = Scene(BODY, Spheroid(2.0, 1.1), Damping(0.3, 0.2, 0.1, 0.15), side="inside", fork="absolute")
@@ -71,6 +73,16 @@ def test_midpoint_steps_end_on_the_times_asked_for():
     np.testing.assert_allclose(run.t, [0.0, 0.333, 1.0], rtol=1e-15)
     assert int(run.stats.steps) == 4 + 7
     np.testing.assert_allclose(run.energy_residual, 0.0, atol=1e-13)
+
+
+def test_a_ride_by_the_midpoint_rule_can_be_kept_on_disk():
+    """JAX keeps no program that calls Python back, as Diffrax's checks of given steps do."""
+    problem, grid = RideProblem.single(FULL, LAUNCH, None), jnp.linspace(0.0, 0.1, 3)
+    settings = Settings(1e-9, ImplicitMidpoint(0.05))
+    given = jax.make_jaxpr(lambda t1: sample(problem, None, t1, settings, grid=grid).states)(0.1)
+    asked = jax.make_jaxpr(lambda t1: sample(problem, grid, t1, settings, grid=grid).states)(0.1)
+    assert "callback" not in str(given)
+    assert "callback" in str(asked)
 
 
 def test_adaptive_energy_error_follows_the_tolerance():

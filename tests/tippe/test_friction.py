@@ -116,3 +116,38 @@ def test_a_law_of_ones_own_flies_on():
     scene = tippe.Scene(rutstam_top(), friction=OwnLaw(), contact="hybrid")
     state = scene.state(tippe.Launch(0.3, 100.0))
     assert_close(scene.friction_power(state) / scene.normal_force(state), -0.2 * scene.slip_velocity(state)[1] ** 2)
+
+
+def test_a_law_that_prefers_a_direction():
+    """Tables on the plane must not turn their frame for it: they see what a single run sees, which depends on the azimuth."""
+
+    class Brushed(tippe.AbstractFriction):
+        def per_normal_force(self, slip):
+            return ContactLoad((-0.1 * slip.x, -0.6 * slip.y))
+
+    scene, azimuths = tippe.Scene(rutstam_top(), friction=Brushed()), np.array([0.0, 1.5])
+    table = tippe.inversion_table(
+        scene, theta=0.5, spin=150.0, azimuth=azimuths, t1=0.5, angle=0.9, crossing="last", progress=False
+    )
+    ends = [
+        float(tippe.simulate(scene, tippe.Launch(0.5, 150.0, azimuth=azimuth), 0.5).theta[-1]) for azimuth in azimuths
+    ]
+    assert_close(table.end_theta, ends, rtol=1e-7)
+    assert abs(ends[0] - ends[1]) > 1e-4
+
+
+@pytest.mark.parametrize(
+    "law", [tippe.Viscous(0.3), tippe.Coulomb(0.3, 0.05), BOTH.sliding, BOTH], ids=lambda law: type(law).__name__
+)
+def test_an_isotropic_law_turns_with_the_slip(law):
+    assert law.isotropic
+    cosine, sine = np.cos(0.7), np.sin(0.7)
+
+    def turned(x, y):
+        return cosine * x - sine * y, sine * x + cosine * y
+
+    load = law.per_normal_force(Slip(0.1, -0.3, (5.0, 7.0, 90.0)))
+    other = law.per_normal_force(Slip(*turned(0.1, -0.3), (*turned(5.0, 7.0), 90.0)))
+    assert_close(other.force, turned(*load.force), rtol=1e-12)
+    if load.torque[0] is not None:
+        assert_close(other.torque, (*turned(*load.torque[:2]), load.torque[2]), rtol=1e-12)

@@ -168,3 +168,17 @@ def test_one_function_serves_one_state_and_a_block():
         assert_close(scene.field(states[:, lane]), block[:, lane], rtol=1e-12, atol=1e-12)
     wide = tippe.Scene(rutstam_top(), tippe.Cylinder(jnp.full(5, 0.3)), tippe.Coulomb(jnp.full(5, 0.3), 0.1))
     assert_close(wide.field(states), block, rtol=1e-12, atol=1e-12)
+
+
+def test_the_margin_of_a_contact_has_its_slope_however_it_is_compiled(rutstam_scene):
+    """A compiler may compute a margin again, with another rounding: a slope that asks which one is the least is lost then."""
+    states, ways = (random_states(rutstam_scene, 100, seed) for seed in (1, 2))
+    margin = rutstam_scene.dynamics.contact_margin
+
+    @jax.jit
+    def slopes(state, way):
+        one = jax.grad(margin)(state) @ way
+        return one, (margin(state + 1e-6 * way) - margin(state - 1e-6 * way)) / 2e-6
+
+    found, expected = jax.vmap(slopes, in_axes=-1)(states, ways)
+    assert_close(found, expected, rtol=1e-5, atol=1e-5)

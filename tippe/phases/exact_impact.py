@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from nonholonomic.geometry import Vector, dot, scale, sum_vectors
 from nonholonomic.integration import GUARD_LOST, AbstractProblem, Settings, traced_march
 
+from ..dynamics import least
 from ..friction import SetValuedCoulomb, length
 from ..top import Top
 from .free_body import Ball, FreeBody
@@ -60,7 +61,7 @@ class Skid(AbstractProblem):
         return None
 
     def guard(self, time: Cells, state: Float[Array, "3 cells"]) -> Cells:
-        return jnp.minimum(self.impact.guard(state[2], state[:2]), self.slip_left(state))
+        return least(self.impact.guard(state[2], state[:2]), self.slip_left(state))
 
     def slip_left(self, state: Float[Array, "3 cells"]) -> Cells:
         """Slip speed above that at which a slip has stopped, as a part of the speed of arrival."""

@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
 from nonholonomic.integration import GUARD_LOST, AbstractProblem, Settings, traced_march
 
+from ..dynamics import least
 from ..friction import AbstractFriction, ContactLoad, Slip
 from ..state import angular_velocity
 from ..top import Top
@@ -128,7 +129,8 @@ class Impact(AbstractProblem):
         gain = dot(blow.force, self.approach.velocity) + 0.5 * dot(blow.force, change)
         if blow.torque is not None:
             gain = gain + dot(blow.torque, self.approach.turning) + 0.5 * dot(blow.torque, turned)
-        return jnp.minimum(missing, jnp.maximum(approaches, -gain * response[2][2] / self.speed**2))
+        short = -gain * response[2][2] / self.speed**2
+        return least(missing, jnp.where(approaches > short, approaches, short))
 
     def ended(self, time: Cells, state: Float[Array, "rows cells"]) -> Blow:
         """The impulses of an impact whose end has been located: put right by one step of Newton's method.

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import Component, add, cross, dot, multiply, scale, subtract, sum_vectors
 
-from ..dynamics import stacked
+from ..dynamics import least, stacked
 from ..friction import AbstractFriction, Slip
 from ..state import angular_velocity, parts
 from ..top import Top
@@ -122,7 +122,7 @@ class LeaningDynamics(eqx.Module):
 
     def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """The lesser of both normal forces as a fraction of the weight, plus `HOLDS`."""
-        return jnp.minimum(*self.motion(state).normal_forces) / (self.body.mass * self.gravity) + HOLDS
+        return least(*self.motion(state).normal_forces) / (self.body.mass * self.gravity) + HOLDS
 
     def heavier(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
         """The number of the sphere with the greater normal force: the one that stays when the other's vanishes."""

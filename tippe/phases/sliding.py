@@ -25,7 +25,7 @@ from nonholonomic.integration import (
     Record,
 )
 
-from ..dynamics import COS_THETA, Dynamics, stacked
+from ..dynamics import COS_THETA, Dynamics, least, stacked
 from ..inversion import InversionProblem
 from ..scene import Scene
 from ..state import parts
@@ -93,7 +93,7 @@ class Sliding(AbstractProblem):
         if self.own is None or self.other is None:
             return margin
         assert isinstance(self.dynamics, Dynamics)
-        return jnp.minimum(margin, clearance(self.dynamics, self.own, self.other, state))
+        return least(margin, clearance(self.dynamics, self.own, self.other, state))
 
 
 def clearance(dynamics: Dynamics, own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import AbstractFrame
 
-from ..dynamics import FITS, Dynamics, Motion, stacked
+from ..dynamics import FITS, Dynamics, Motion, least, stacked
 from ..friction import AbstractFriction, Frictionless, SetValuedCoulomb, Slip, length
 from ..top import Top
 from .onset import Onset, begin
@@ -100,7 +100,7 @@ class StickSlip(eqx.Module):
         room that is left, if that is less."""
         motion = self.motion(state)
         margin = motion.normal_force / (self.slipping.mass * self.slipping.gravity) + 1e-12
-        return margin if motion.room is None else jnp.minimum(margin, motion.room - FITS)
+        return margin if motion.room is None else least(margin, motion.room - FITS)
 
     def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
         """How a contact has ended whose margin is zero: a code in `LOSSES`. Only one that slips can jam."""
@@ -177,8 +177,8 @@ class Kind(eqx.Module):
         """Positive while this kind of motion lasts. Rolling leaves the friction cone before the normal force is zero."""
         if self.rolls:
             grip, room = self.both.grip_left(state), self.both.rolling.motion(state).room
-            return grip if room is None else jnp.minimum(grip, room - FITS)
-        return jnp.minimum(self.both.slipping.contact_margin(state), self.slip_left(state))
+            return grip if room is None else least(grip, room - FITS)
+        return least(self.both.slipping.contact_margin(state), self.slip_left(state))
 
     def slip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Slip speed above that at which a slip is over, in units of sqrt(g R). A slip that grows is never over."""
