@@ -29,8 +29,8 @@ def test_a_scene_tells_its_numbers_with_units():
     assert "Coulomb(mu=0.3, slip_speed=0.01 m/s)" in printed
     assert "gravity   9.81 m/s²" in printed
     assert "Cylinder(radius=0.3 m)" in scene._repr_html_()
-    with pytest.raises(ValueError, match=re.escape("not on Cylinder(radius=0.3 m)")):
-        tippe.Scene(tippe.Top(**GOOD, stem=tippe.Stem(0.005, 0.024)), tippe.Cylinder(0.3), contact="hybrid")
+    with pytest.raises(ValueError, match=re.escape("friction = Cylinder(radius=0.3 m) must be")):
+        tippe.Scene(tippe.Top(**GOOD), friction=tippe.Cylinder(0.3))
 
 
 @pytest.mark.parametrize(
