@@ -65,7 +65,7 @@ def of_top(scene: tippe.Scene, launch: tippe.Launch, t1: float, angle: float | N
         *(float(value) for value in (body.mass, body.radius, body.offset, body.I1, body.I3, law.mu, scene.gravity)),
         slip_speed=float(getattr(law, "slip_speed", 0.0)),
         rho=float(scene.surface.radius - body.radius) if inside else 0.0,
-        turns=problem.dynamics.turns or 0.0,
+        turns=0.0 if problem.dynamics.turns is None else float(problem.dynamics.turns),
     )
     return case(fields.cylinder if inside else fields.plane, numbers, problem, t1, angle, AXIS)
 

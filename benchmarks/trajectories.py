@@ -50,7 +50,7 @@ def simulated(thetas: Any, times: Any, mu: Any = MU) -> Any:
 def by_diffrax(thetas: Any, times: Any) -> Any:
     """theta at every sample of every launch, by `vmap(diffeqsolve)` as one writes it, with this package's field."""
     top = scene()
-    dynamics = top.dynamics
+    dynamics = top.turning_dynamics
 
     def one(theta: Any) -> Any:
         launch = tippe.Launch(theta, SPIN)

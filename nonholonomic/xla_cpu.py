@@ -23,8 +23,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 compiled_alone = eqx.filter_jit(compiler_options={"xla_cpu_prefer_vector_width": 512})
 
 #: For programs that are called on their own and run for a moment only: jaxlib 0.10 compiles them in half of the time if told to
-#: leave out the newer of its two ways to compile fused operations. Loops may run slower, a table by two numbers by a quarter.
-#: It can go with 0.10: later versions have a single way, and refuse the option.
+#: leave out the newer of its two ways to compile fused operations. Loops may run slower, a table with two derivatives by a
+#: quarter. It can go with 0.10: later versions have a single way, and refuse the option.
 compiled_quickly = eqx.filter_jit(
     compiler_options={"xla_cpu_use_fusion_emitters": False} if jaxlib.__version__.startswith("0.10.") else {}
 )

@@ -48,8 +48,8 @@ JAMMED = 1e-4
 #: the root of the time left, so a run ends too early by the square of this in units of 0.1 s or so.
 FITS = 1e-4
 
-#: Rate of a frame that turns with the top, as a fraction of L_n / I1 (`Dynamics.turning`). Of 0.5, 0.7, 0.85 and 1 it is the
-#: fastest at equal error, or as fast as the fastest, in five scenes on the plane: 1.2 to 2.6 times as fast as a frame at rest.
+#: Rate of a frame that turns with a top that inverts, as a fraction of L_n / I1 (`Dynamics.turning`). Of 0.5, 0.7, 0.85 and 1
+#: it is the fastest at equal error, or as fast as the fastest, in five scenes on the plane: 1 to 2.6 times as fast as at rest.
 TURNING = 0.7
 
 #: How a contact can end; the index stands for the word.
@@ -94,7 +94,7 @@ class Dynamics(eqx.Module):
     per_mass: Float[Array, "..."]
     per_transverse: Float[Array, "..."]
     axial_excess: Float[Array, "..."]
-    turns: float | None = eqx.field(static=True, default=None)
+    turns: Float[Array, "..."] | None = None
 
     @classmethod
     def of(
@@ -115,13 +115,13 @@ class Dynamics(eqx.Module):
             axial_excess=1.0 / body.I3 - 1.0 / body.I1,
         )
 
-    def turning(self) -> Self:
+    def turning(self, turns: Float[Array, "..."]) -> Self:
         """The same equations in a frame that turns about n, for an arena on which all directions across n are alike.
 
-        In a frame at rest L keeps its direction almost, and the axis runs around it at L / I1. In this one each turns at a part
-        of that rate: steps are longer, and their errors, which no longer add up along a circle, are far smaller.
+        While a top inverts, L keeps its direction almost in a frame at rest, and the axis runs around it at L / I1. In this
+        frame each turns at a part of that rate: steps are longer, and errors, which no longer add up along a circle, smaller.
         """
-        return dataclasses.replace(self, turns=TURNING)
+        return dataclasses.replace(self, turns=turns)
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
         """Evaluate the equations of motion, with the normal force solved for including friction.

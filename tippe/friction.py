@@ -3,7 +3,7 @@
 import abc
 import math
 from collections.abc import Iterator
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -66,6 +66,12 @@ class AbstractFriction(Bounded):
     ```
     """
 
+    def __init_subclass__(cls, **options: Any):
+        super().__init_subclass__(**options)
+        # A law made from another must say it anew.
+        if "per_normal_force" in cls.__dict__ and "isotropic" not in cls.__dict__:
+            cls.isotropic = property(lambda self: False)
+
     #: Whether the force of a contact at rest is whatever keeps it at rest, within limits.
     set_valued: ClassVar[bool] = False
 
@@ -76,8 +82,8 @@ class AbstractFriction(Bounded):
 
     @property
     def isotropic(self) -> bool:
-        """Whether the law is the same in all directions along the arena. Tables on the level plane are faster and more accurate
-        if it says so (`Scene.turning_dynamics`), and wrong if it says so and is not."""
+        """Whether the law is the same in all directions along the arena: tables on the level plane are then faster and more
+        accurate (`Scene.turning_dynamics`). A law that claims this wrongly gives wrong tables."""
         return False
 
     @abc.abstractmethod

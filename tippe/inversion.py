@@ -32,10 +32,7 @@ LOOSEST = 1e-2
 
 
 class InversionProblem(AbstractProblem):
-    """Launches that end when theta reaches an angle or the contact is lost or jams.
-
-    The states are those of `Scene.turning_dynamics`.
-    """
+    """Launches that end when theta reaches an angle or the contact is lost or jams."""
 
     dynamics: Dynamics | StickSlip | Kind
     cos_angle: Float[Array, "..."]
@@ -44,7 +41,10 @@ class InversionProblem(AbstractProblem):
 
     @classmethod
     def of(cls, scene: Scene, launch: Launch, angle: Float[ArrayLike, "..."], cells: int) -> "InversionProblem":
-        """The problem of the given number of cells; the numbers of scene and launch are scalars or one per cell."""
+        """The problem of the given number of cells; the numbers of scene and launch are scalars or one per cell.
+
+        Its frame is that of `Scene.turning_dynamics`: nothing with a direction can be read off its final states.
+        """
         return _problem(scene, launch, jnp.asarray(angle), cells)
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:

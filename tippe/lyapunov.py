@@ -110,7 +110,7 @@ def lyapunov_exponent(
     cells = int(np.prod(shape, dtype=int))
     # No angle has a cosine of 2, so only a contact that is lost or jams ends a run before the horizon.
     problem = InversionProblem.of(scene, launch, jnp.pi, cells)
-    # In a frame that turns, by how much depends on the state, two launches diverge by what it has turned as well.
+    # A turning frame turns by another angle for each launch, and that difference would count as divergence.
     problem = dataclasses.replace(problem, dynamics=scene.dynamics, cos_angle=jnp.asarray(-2.0))
     found = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, Settings(tolerance, solver))
     exponent, error = exponent_of(found.logarithm, float(t1))

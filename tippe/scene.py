@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -28,7 +29,7 @@ from nonholonomic.geometry import (
 from nonholonomic.validation import Bound, Bounded, as_number, require_all
 
 from .body import AbstractBody
-from .dynamics import Dynamics
+from .dynamics import TURNING, Dynamics
 from .friction import AbstractFriction, Frictionless
 from .launch import Launch
 from .phases import StickSlip
@@ -164,10 +165,13 @@ class Scene(Bounded):
 
         On a level plane under an isotropic law the frame turns with the top, and how far it has turned is not known afterwards.
         """
-        equations = self.dynamics
-        if isinstance(equations, Dynamics) and self.level and self.friction.isotropic:
-            return equations.turning()
-        return equations
+        equations, body = self.dynamics, self.body
+        alike = isinstance(equations, Dynamics) and self.level and self.friction.isotropic
+        if not (alike and isinstance(body, Top)):
+            return equations
+        # The other tops, of group I (`steady.py`), soon stand upright with their axis beside L: turning would move both.
+        may_invert = 1.0 - body.offset / body.radius < body.I1 / body.I3
+        return equations.turning(jax.lax.stop_gradient(jnp.where(may_invert, TURNING, 0.0)))
 
     def check_start(self, launch: Launch) -> None:
         """Raise `ValueError` if a launch has no place on this arena."""

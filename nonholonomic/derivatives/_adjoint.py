@@ -41,6 +41,9 @@ from .variation import VariationalProblem
 #: Iterations of a period: as many as fit the caches with their record.
 PERIOD = 128
 
+#: What it costs to refill a block here, in steps of the whole block: a period ends with it.
+REFILL = 2.0
+
 #: Periods whose starts are kept; beyond that some are dropped, and computed again from further back. With the 64
 #: lanes of a CPU that takes 5 MB, with the 32768 of an accelerator 2 GB.
 KEPT = 256
@@ -198,7 +201,7 @@ def _recorded(queue: Queue, progress: Progress) -> tuple[Progress, Record, Int[A
 
     def going(carry: Any) -> Bool[Array, ""]:
         block, _, idle, count = carry
-        return queue.goes_on(block, idle, progress.queued) & (count < PERIOD)
+        return queue.goes_on(block, idle, progress.queued, REFILL) & (count < PERIOD)
 
     def step(carry: Any) -> Any:
         block, record, idle, count = carry

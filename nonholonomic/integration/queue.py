@@ -21,8 +21,8 @@ from .runge_kutta import explicit_tableau, first_length
 from .settings import Settings
 from .status import CROSSED, GUARD_LOST, REACHED_END, RUNNING
 
-#: What it costs to refill a block, in steps of the whole block. It is refilled when as much has been lost to idle lanes, which
-#: is never more than twice what the best moment would have cost.
+#: What it costs to refill a block, in steps of the whole block, measured on a CPU. It is refilled when idle lanes have missed
+#: as many, so what is lost is at most twice what the best moment would have cost.
 REFILL = 0.25
 
 
@@ -133,13 +133,15 @@ class Queue(eqx.Module):
         """How many lanes have nothing to do."""
         return jnp.sum(block.status != RUNNING)
 
-    def goes_on(self, block: Block, idle: Int[Array, ""], queued: Int[Array, ""]) -> Bool[Array, ""]:
+    def goes_on(
+        self, block: Block, idle: Int[Array, ""], queued: Int[Array, ""], price: float = REFILL
+    ) -> Bool[Array, ""]:
         """Whether a block goes on; while cells wait it stops to be refilled as soon as that is worth it.
 
-        **Arguments:** `idle`: of how many lanes steps have come to nothing since it was filled; `queued`: how many cells have
-        left the queue.
+        **Arguments:** `idle`: steps that idle lanes have missed since it was filled; `queued`: how many cells have left the
+        queue; `price`: what it costs to refill it, in steps of the whole block.
         """
-        refill = (queued < self.cells) & (idle >= REFILL * self.lanes)
+        refill = (queued < self.cells) & (idle >= price * self.lanes)
         return jnp.any(block.status == RUNNING) & ~refill
 
     def run(self, progress: Progress) -> Progress:

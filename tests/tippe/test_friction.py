@@ -121,11 +121,16 @@ def test_a_law_of_ones_own_flies_on():
 def test_a_law_that_prefers_a_direction():
     """Tables on the plane must not turn their frame for it: they see what a single run sees, which depends on the azimuth."""
 
-    class Brushed(tippe.AbstractFriction):
+    class Brushed(tippe.Viscous):
         def per_normal_force(self, slip):
             return ContactLoad((-0.1 * slip.x, -0.6 * slip.y))
 
-    scene, azimuths = tippe.Scene(rutstam_top(), friction=Brushed()), np.array([0.0, 1.5])
+    class New(tippe.AbstractFriction):
+        def per_normal_force(self, slip):
+            return ContactLoad((-0.1 * slip.x, -0.6 * slip.y))
+
+    assert not New().isotropic
+    scene, azimuths = tippe.Scene(rutstam_top(), friction=Brushed(0.3)), np.array([0.0, 1.5])
     table = tippe.inversion_table(
         scene, theta=0.5, spin=150.0, azimuth=azimuths, t1=0.5, angle=0.9, crossing="last", progress=False
     )
