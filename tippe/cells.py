@@ -98,11 +98,11 @@ def driver_of(scene: Scene) -> Driver:
     hybrid = scene.contact == "hybrid"
     if scene.friction.set_valued:
         return STICK_SLIP_FLY if hybrid else STICK_SLIP
-    if hybrid and not scene.flies_in_closed_form:
-        return AIRBORNE if scene.body.stem is None else ON_STEM_TOO
-    if hybrid:
+    if not hybrid:
+        return SMOOTH
+    if scene.flies_in_closed_form:
         return HYBRID
-    return SMOOTH
+    return AIRBORNE if scene.body.stem is None else ON_STEM_TOO
 
 
 def check_differentiable(scene: Scene) -> None:
@@ -210,9 +210,10 @@ class CellRuns(NamedTuple):
         return self._named(scene, problem, outcome, functools.partial(self._loss, scene, outcome.state))
 
     def _loss(self, scene: Scene, state: Any) -> Any:
-        """How the contacts ended with which runs ended: codes in `LOSSES`, or 0 for the one way of runs on a level plane."""
+        """How the contacts ended with which runs ended: codes in `LOSSES`."""
         if self.driver is HYBRID:
-            return 0
+            # It flies on where contact is lost, and fits everywhere.
+            return LOSSES.index("jammed")
         state = jnp.asarray(state)
         return np.asarray(_loss_aloft(scene, state) if self.driver.aloft else _loss(scene.dynamics, state))
 
@@ -224,9 +225,7 @@ class CellRuns(NamedTuple):
         code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
         lost = code == WORDS.index("contact_lost")
         if lost.any():
-            # A hybrid run flies on where contact is lost.
-            losses = ("jammed",) if self.driver is HYBRID else LOSSES
-            code = np.where(lost, np.array([WORDS.index(word) for word in losses])[loss()], code)
+            code = np.where(lost, np.array([WORDS.index(word) for word in LOSSES])[loss()], code)
         times = {self.times[-1]: np.where(inverted, ended.crossing_time, np.inf)}
         if isinstance(ended, Outcome) and self.crossing == "both":
             times["first_time"] = np.asarray(ended.first_crossing)
