@@ -10,6 +10,7 @@ import time
 import h5py
 import numpy as np
 import pytest
+import written_blocks
 import xarray
 from close import assert_close
 from tops import rutstam_top
@@ -72,30 +73,15 @@ def test_an_interrupted_sweep_resumes_and_recomputes_no_finished_block(rutstam_s
         tmp_path / "table.h5",
         {"theta": np.linspace(0.05, 0.3, 8), "spin": [80.0, 100.0, 120.0], "t1": 2.0},
     )
-    written = sweeping.Blocks.write
-    done = []
-
-    def until_the_second(self, block, values):
-        if len(done) == 1:
-            raise KeyboardInterrupt
-        done.append(block)
-        written(self, block, values)
-
-    monkeypatch.setattr(sweeping.Blocks, "write", until_the_second)
+    done = written_blocks.recorded(monkeypatch, most=1)
     with pytest.raises(KeyboardInterrupt):
         tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
     part = tippe.Table.load(path)
     assert (part.status == "pending").sum() == 16
-    again = []
-
-    def counted(self, block, values):
-        again.append(block)
-        written(self, block, values)
-
-    monkeypatch.setattr(sweeping.Blocks, "write", counted)
+    again = written_blocks.recorded(monkeypatch)
     whole = tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
     assert sorted(again + done) == [0, 1, 2]
-    monkeypatch.setattr(sweeping.Blocks, "write", written)
+    monkeypatch.setattr(sweeping.Blocks, "write", written_blocks.WRITE)
     fresh = tippe.inversion_table(rutstam_scene_module, **arguments)
     np.testing.assert_array_equal(whole.status, fresh.status)
     assert_close(whole.end_theta, fresh.end_theta, atol=1e-12)

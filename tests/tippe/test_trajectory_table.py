@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import written_blocks
 import xarray
 from close import assert_close
 from tops import rutstam_top
@@ -148,16 +149,10 @@ def test_the_file_opens_in_xarray_as_the_table_does(table):
 def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(sweeping, "block_for", lambda cells: 64)
     monkeypatch.setattr(sweeping, "workers", lambda: 1)
-    path, written, done = tmp_path / "table.h5", sweeping.Blocks.write, []
+    path = tmp_path / "table.h5"
     arguments = {"theta": np.linspace(0.1, 1.6, 20), "spin": [*SPIN, 90.0, 130.0], "mu": MU, "times": TIMES}
 
-    def until_the_second(self, block, values):
-        if len(done) == 1:
-            raise KeyboardInterrupt
-        done.append(block)
-        written(self, block, values)
-
-    monkeypatch.setattr(sweeping.Blocks, "write", until_the_second)
+    done = written_blocks.recorded(monkeypatch, most=1)
     with pytest.raises(KeyboardInterrupt):
         tippe.trajectory_table(scene, path=path, **arguments)
     part = tippe.Table.load(path)
@@ -165,20 +160,16 @@ def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scen
     assert np.isfinite(part.theta[part.status == "reached_end"]).all()
     assert np.isnan(part.theta[part.status == "pending"]).all()
 
-    def counted(self, block, values):
-        done.append(block)
-        written(self, block, values)
-
-    monkeypatch.setattr(sweeping.Blocks, "write", counted)
+    again = written_blocks.recorded(monkeypatch)
     whole = tippe.trajectory_table(scene, path=path, **arguments)
-    assert sorted(done) == [0, 1, 2]
+    assert sorted(done + again) == [0, 1, 2]
     with h5py.File(path, "r+") as file:
         file["theta"][9, 1, 3, 7] += 1e-12
     with pytest.raises(OSError, match="1 of its 3 blocks do not match"):
         tippe.Table.load(path)
     with pytest.warns(RuntimeWarning, match="1 finished blocks"):
         mended = tippe.trajectory_table(scene, path=path, **arguments)
-    assert sorted(done) == [0, 0, 1, 1, 2, 2]
+    assert sorted(done + again) == [0, 0, 1, 1, 2, 2]
     fresh = tippe.trajectory_table(scene, **arguments)
     for table in (whole, mended, tippe.Table.load(path)):
         np.testing.assert_array_equal(table.theta, fresh.theta)

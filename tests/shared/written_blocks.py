@@ -1,0 +1,19 @@
+"""Which blocks of a table are written, and runs that are interrupted between two of them."""
+
+from nonholonomic.sweeps import running
+
+WRITE = running.Blocks.write
+
+
+def recorded(monkeypatch, most=None):
+    """The list of the blocks that are written from now on; with `most` of them written the run is interrupted."""
+    done = []
+
+    def write(self, block, values):
+        if len(done) == most:
+            raise KeyboardInterrupt
+        done.append(block)
+        WRITE(self, block, values)
+
+    monkeypatch.setattr(running.Blocks, "write", write)
+    return done
