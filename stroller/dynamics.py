@@ -120,6 +120,7 @@ class Dynamics(eqx.Module):
         wheel = P * gauge
         velocity = scale(wheel * cosine, d)
         turning = surface.normal_rate(r, velocity)
+        normal_force = self.normal_force(n, turning, velocity)
         front_speed = multiply(wheel, lead)
         yaw_rate = front_speed * sine / body.wheelbase
         motion = Motion(
@@ -131,8 +132,6 @@ class Dynamics(eqx.Module):
             yaw_rate=yaw_rate,
             steering_rate=subtract(fork_rate, multiply(self.absolute, yaw_rate)),
         )
-        weight = multiply(side, body.mass * self.gravity, dot(n, self.up))
-        normal_force = subtract(weight, multiply(side, body.mass, dot(turning, velocity)))
         share = None if body.centre is None else body.centre / body.wheelbase
         return Geometry(
             motion=motion,
@@ -150,6 +149,11 @@ class Dynamics(eqx.Module):
             normal_force=normal_force,
             front_load=multiply(normal_force, share),
         )
+
+    def normal_force(self, normal: Vector, turning: Vector, velocity: Vector) -> Component:
+        """Force [N] of the ground along its normal: it carries the weight and bends the path."""
+        weight = multiply(self.side, self.body.mass * self.gravity, dot(normal, self.up))
+        return subtract(weight, multiply(self.side, self.body.mass, dot(turning, velocity)))
 
     def forces(self, t: Float[Array, "..."], geometry: Geometry, controls: Input | None) -> Forces:
         """The forces of input and friction at a time [s]."""
@@ -223,6 +227,13 @@ class Dynamics(eqx.Module):
     def contact(self, state: State) -> Float[Array, "..."]:
         """Force of the ground on the stroller along its normal [N]; negative where the ground would have to pull."""
         return jnp.broadcast_to(multiply(1.0, self.geometry(state).normal_force), state[0].shape)
+
+    def contact_along(self, state: State, rate: State) -> Float[Array, "..."]:
+        """As `contact`, where the field is known: the velocity is part of it, and costs most."""
+        place, velocity = padded(state[: self.surface.axes]), padded(rate[: self.surface.axes])
+        normal = self.surface.normal(place)
+        force = self.normal_force(normal, self.surface.normal_rate(place, velocity), velocity)
+        return jnp.broadcast_to(multiply(1.0, force), state[0].shape)
 
     def side_force(
         self, t: Float[Array, "..."], state: State, controls: Input | None

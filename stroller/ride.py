@@ -68,6 +68,9 @@ class RideProblem(AbstractProblem):
     def crossing(self, state: State) -> Any:
         return self.dynamics.contact(state) / self.press + CONTACT_ROUND_OFF if self.watched else None
 
+    def crossing_along(self, state: State, rate: State) -> Any:
+        return self.dynamics.contact_along(state, rate) / self.press + CONTACT_ROUND_OFF if self.watched else None
+
     def guard(self, time: Float[Array, "..."], state: State) -> Any:
         return self.dynamics.rank(state) / RANK_LOST - 1.0 if self.guarded else None
 

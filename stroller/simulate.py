@@ -48,7 +48,8 @@ def simulate(
     - `input`: a function `(t, motion) -> (drive force [N], steering torque [N m])` (see `input.py`), or `None`.
     - `times`: times [s] to report, increasing, within [0, t1]; by default 201 equally spaced ones.
     - `tolerance`: relative tolerance, and absolute tolerance in units of the scene's magnitudes, of an adaptive solver.
-    - `solver`: any Diffrax solver, by default `diffrax.Dopri8()`, or an `ImplicitMidpoint`.
+    - `solver`: any Diffrax solver, or an `ImplicitMidpoint`; by default `diffrax.Dopri8()`, inside transformations
+      `Oscillatory8()`.
     - `max_steps`: a run that needs more has failed.
     - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
       parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax differentiates, which pays if a loss
@@ -83,7 +84,6 @@ def simulate(
     if not is_traced(times) and np.any(np.diff(np.asarray(times)) <= 0.0):
         raise ValueError(f"times = {times!r} must be increasing")
     check_input(input, scene, launch)
-    solver = diffrax.Dopri8() if solver is None else solver
     end, grid = as_number(t1), None
     if isinstance(solver, ImplicitMidpoint):
         grid = even_steps(times, end, solver.step_length)
@@ -99,7 +99,7 @@ def simulate(
 def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
     """The run of concrete numbers."""
     recipe = Recipe.of(ride)
-    if not isinstance(ride.settings.solver, diffrax.AbstractERK | ImplicitMidpoint):
+    if not isinstance(ride.settings.for_single_runs, diffrax.AbstractERK | ImplicitMidpoint):
         return _read_off(recipe, times, *_sampled(ride, times))
     steps, stats = followed(recipe)
     return dataclasses.replace(_read_off(recipe, times, steps.at(recipe, np.asarray(times)), stats), steps=steps)

@@ -49,7 +49,7 @@ class Steps(NamedTuple):
         def field(times: Lanes, states: States) -> States:
             return in_blocks(lambda *at: _field(recipe, *at), times, states)
 
-        time, start, solver = self.times[which], self.states[:, which], recipe.ride.settings.solver
+        time, start, solver = self.times[which], self.states[:, which], recipe.ride.settings.for_single_runs
         rates = [field(time, start)]
         if not isinstance(solver, diffrax.AbstractERK):
             # The cubic through states and rates at both ends; an implicit step cannot be repeated so cheaply.

@@ -14,6 +14,7 @@ from nonholonomic.geometry import AbstractSurface
 from nonholonomic.integration import (
     FAILED,
     GUARD_LOST,
+    Oscillatory8,
     Settings,
     compiled_march,
     explicit_tableau,
@@ -98,7 +99,7 @@ def sweep(
       parts of the place are `"launch.place[0]"` and `"launch.place[1]"`, the parameters of an input that is a module are
       under `"input."`. The first axis varies slowest.
     - `tolerance`: relative tolerance of the integration.
-    - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, `Oscillatory8()` by default.
     - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
     - `progress`: whether to show it, on a terminal or in a notebook.
     - `executor`: who computes: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a
@@ -128,7 +129,7 @@ def sweep(
 
     ```
     """
-    solver = diffrax.Dopri8() if solver is None else solver
+    solver = Oscillatory8() if solver is None else solver
     explicit_tableau(solver)
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")

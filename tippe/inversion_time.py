@@ -24,6 +24,7 @@ from nonholonomic.integration import (
     UNRESOLVED,
     AbstractPhase,
     Journey,
+    Oscillatory8,
     Settings,
     explicit_tableau,
     traced_march,
@@ -61,7 +62,7 @@ def inversion_time(
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
     - `crossing`: "first" for the first time theta reaches the angle, "last" for the up-crossing after which theta stays
       above it until `t1`.
-    - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, `Oscillatory8()` by default.
 
     **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before; NaN
     if the integration failed, or if numbers inside a transformation are out of range.
@@ -85,7 +86,7 @@ def inversion_time(
 
     ```
     """
-    solver = diffrax.Dopri8() if solver is None else solver
+    solver = Oscillatory8() if solver is None else solver
     check_run(scene, launch, t1, tolerance)
     check_event(angle, crossing)
     explicit_tableau(solver)

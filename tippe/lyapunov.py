@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from nonholonomic.derivatives import exponent_of, growth
 from nonholonomic.geometry import cross
-from nonholonomic.integration import GUARD_LOST, REACHED_END, Settings, explicit_tableau
+from nonholonomic.integration import GUARD_LOST, REACHED_END, Oscillatory8, Settings, explicit_tableau
 from nonholonomic.validation import require
 
 from .cells import driver_of
@@ -73,7 +73,7 @@ def lyapunov_exponent(
     - `scene`, `launch`: every number a scalar or one per launch, of shape (n,).
     - `t1`: time [s] to follow the motion, positive.
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
-    - `solver`: an explicit Runge-Kutta solver of Diffrax, `Dopri8()` by default.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, `Oscillatory8()` by default.
 
     **Returns:** a `LyapunovExponent`, its arrays of shape () or (n,).
 
@@ -91,7 +91,7 @@ def lyapunov_exponent(
 
     ```
     """
-    solver = diffrax.Dopri8() if solver is None else solver
+    solver = Oscillatory8() if solver is None else solver
     explicit_tableau(solver)
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")

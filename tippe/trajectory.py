@@ -125,7 +125,7 @@ def simulate(
     - `times`: times of the result [s], increasing, within [0, t1]; by default those of the accepted steps. Outside of
       transformations those after the end of the run are left out, and `Trajectory.at` gives others.
     - `tolerance`: relative tolerance; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
-    - `solver`: any solver of Diffrax, `Dopri8()` by default.
+    - `solver`: any solver of Diffrax; by default `Dopri8()`, inside transformations `Oscillatory8()`.
     - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
       parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax integrates a traced run, which pays if a
       loss is differentiated by many parameters.
@@ -149,8 +149,7 @@ def simulate(
     ```
     """
     check_run(scene, launch, t1, tolerance)
-    solver = diffrax.Dopri8() if solver is None else solver
-    if not isinstance(solver, diffrax.AbstractSolver):
+    if not isinstance(solver, diffrax.AbstractSolver | None):
         raise ValueError(f"solver = {solver!r} must be a solver of Diffrax, such as Dopri8()")
     if times is not None:
         times = as_number(times)
@@ -204,7 +203,7 @@ def _traced(
     times: Any,
     t1: Any,
     tolerance: float,
-    solver: diffrax.AbstractSolver,
+    solver: diffrax.AbstractSolver | None,
     adjoint: diffrax.AbstractAdjoint | None,
 ) -> Trajectory | HybridTrajectory:
     if scene.friction.set_valued:
@@ -217,7 +216,7 @@ def _traced(
     if scene.contact == "hybrid":
         if adjoint is not None:
             raise ValueError(f"adjoint = {adjoint!r} must be left out for contact = 'hybrid'")
-        explicit_tableau(solver)
+        explicit_tableau(settings.for_lanes)
         return (sampled_hybrid if scene.flies_in_closed_form else sampled_airborne)(scene, launch, times, t1, settings)
     found = sampled(scene, launch, times, t1, settings, adjoint)
     status = found.status.astype(int)

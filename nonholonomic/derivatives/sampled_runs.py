@@ -72,7 +72,7 @@ def sampled_run(
     **Returns:** a `SampledRun`; its states and the time of its end have derivatives.
     """
     scalars = all(leaf.ndim == 0 for leaf in jax.tree.leaves(modules) if eqx.is_inexact_array(leaf))
-    kind = BlockSampling if scalars and isinstance(settings.solver, diffrax.AbstractERK) else SingleSampling
+    kind = BlockSampling if scalars and isinstance(settings.for_lanes, diffrax.AbstractERK) else SingleSampling
     found = ask_for_samples(kind, build, modules, jax.lax.stop_gradient(times), t1, settings, grid)
     # One by one: what a custom derivative is given counts as read.
     states = _at_times(found.states, None, times, modules, build)

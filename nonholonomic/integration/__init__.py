@@ -15,6 +15,7 @@ from .march import compiled_march as compiled_march
 from .march import traced_march as traced_march
 from .march import with_crossing_times as with_crossing_times
 from .midpoint import ImplicitMidpoint as ImplicitMidpoint
+from .oscillatory import Oscillatory8 as Oscillatory8
 from .phased_run import BETWEEN as BETWEEN
 from .phased_run import PhasedPath as PhasedPath
 from .phased_run import Piece as Piece

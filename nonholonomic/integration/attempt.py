@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..xla_cpu import stored
 from .event import Search, dip, narrow
-from .problem import AbstractProblem, crossing_time, least_margin
+from .problem import AbstractProblem, crossing_time, side_of
 from .runge_kutta import Lanes, States, Step, explicit_step, inverse_root, scaled_error
 from .status import CROSSED, FAILED, GUARD_LOST, REACHED_END, RUNNING
 
@@ -85,11 +85,10 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     **Returns:** the block after the attempt.
     """
 
-    def watch(time: Lanes, state: States) -> Lanes:
-        return least_margin(problem, block.side, time, state)
-
     tried_length = length_to_try(control, block)
-    tried = explicit_step(control.tableau, problem.field, watch, block.time, block.state, block.rate, tried_length)
+    crossing = side_of(problem, block.side)
+    start = (block.time, block.state, block.rate, tried_length)
+    tried = explicit_step(control.tableau, problem.field, problem.guard, crossing, *start)
     running = block.status == RUNNING
     free = running & ~block.searching
     error = scaled_error(*stop_gradient((tried.error, block.state, tried.state)), control.rtol, atol, control.parts)

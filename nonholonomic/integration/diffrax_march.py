@@ -45,7 +45,7 @@ def march_by_diffrax(
         event = diffrax.Event(list(conditions.values()), root_finder=optimistix.Newton(1e-13, 1e-13))
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-            settings.solver,
+            settings.for_single_runs,
             0.0,
             t1,
             None,

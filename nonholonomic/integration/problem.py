@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .runge_kutta import Lanes, States
+from .runge_kutta import Lanes, States, lesser
 
 
 class AbstractProblem(eqx.Module):
@@ -34,6 +34,10 @@ class AbstractProblem(eqx.Module):
     @abc.abstractmethod
     def crossing(self, state: States) -> Lanes | None:
         """A smooth function of order 1, positive before the event, negative after it; `None` if there is no event."""
+
+    def crossing_along(self, state: States, rate: States) -> Lanes | None:
+        """The crossing function where the field is known too, for problems to which that saves work."""
+        return self.crossing(state)
 
     @abc.abstractmethod
     def guard(self, time: Lanes, state: States) -> Lanes | None:
@@ -65,12 +69,20 @@ class LeadingProblem(AbstractProblem):
         return jnp.concatenate([state, jnp.zeros((missing, *state.shape[1:]))])
 
 
-def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: States) -> Lanes:
-    """The least of the problem's crossing function, counted positive on the lane's side of the event, and its guard."""
-    crossing, guard = problem.crossing(state), problem.guard(time, state)
-    if crossing is None:
-        return jnp.ones_like(side) if guard is None else guard
-    return side * crossing if guard is None else jnp.minimum(side * crossing, guard)
+def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: States, rate: States) -> Lanes:
+    """The least of the problem's crossing function, counted positive on the lane's side of the event, and its guard, where the
+    field is known."""
+    return lesser(problem.guard(time, state), side_of(problem, side)(state, rate), side)
+
+
+def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States], Lanes | None]:
+    """The problem's crossing function by state and rate, counted positive on the lane's side of the event."""
+
+    def crossing(state: States, rate: States) -> Lanes | None:
+        found = problem.crossing_along(state, rate)
+        return None if found is None else side * found
+
+    return crossing
 
 
 def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes:

@@ -81,7 +81,7 @@ class Queue(eqx.Module):
 
         **Arguments:** as for `march`, and `parts`: the number of equal parts of the state, as for `Control`.
         """
-        solver, rtol = settings.solver, settings.tolerance
+        solver, rtol = settings.for_lanes, settings.tolerance
         control = Control(explicit_tableau(solver), solver.order(None), rtol, t1, settings.max_steps, passes, parts)
         starts, scales = problem.start()
         zero = jnp.zeros_like(starts[0])
@@ -221,7 +221,7 @@ def _fresh_block(
         rate=rates,
         length=lengths,
         side=side,
-        margin=stop_gradient(least_margin(problem, side, zero, states)),
+        margin=stop_gradient(least_margin(problem, side, zero, states, rates)),
         first_crossing=jnp.where(beyond, zero, jnp.inf),
         crossing_time=jnp.where(beyond, zero, jnp.inf),
         searching=no,

@@ -42,7 +42,8 @@ def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
 def explicit_step(
     tableau: diffrax.ButcherTableau,
     field: Callable[[Lanes, States], States],
-    watch: Callable[[Lanes, States], Lanes],
+    guard: Callable[[Lanes, States], Lanes | None],
+    crossing: Callable[[States, States], Lanes | None],
     time: Lanes,
     state: States,
     rate: States,
@@ -57,37 +58,60 @@ def explicit_step(
 
     - `tableau`: the method.
     - `field`: (time [s], state) -> rate of the state.
-    - `watch`: (time, state) -> a number per lane that should stay positive. It is looked at in the end and at
-      three stages between, together with `field`, so that what both need is computed once.
-      If it is negative for less than a quarter of a step, that may go unnoticed.
+    - `guard`, `crossing`: (time, state) and (state, rate) -> a number per lane that should stay positive, or `None`. They are
+      looked at in the end and at three stages between: the guard, which may need all of the state, in a branch of those
+      stages; the crossing, which may need few components, after the stages. If one is negative for less than a quarter of a
+      step, that may go unnoticed.
     - `time`, `state`, `rate`: where the step starts, and the field there.
     - `length`: length of the step [s], one per lane.
 
-    **Returns:** a `Step`. `watched` is the watched number at the end; `first_negative` the fraction of the step of the
-    first stage at which it was negative, 2 if it never was.
+    **Returns:** a `Step`. `watched` is the lesser number at the end; `first_negative` the fraction of the step of the first
+    stage at which one was negative, 2 if none was.
     """
     # The last stage of a method whose steps end with a stage is the end of the step, below.
     inner = len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
-    looks = np.isin(np.arange(inner), list(_places_to_look(tableau.c)))
-    places, looked = jnp.asarray(tableau.c[:inner]), jnp.asarray(looks)
+    looks = _places_to_look(tableau.c)
+    places, looked = jnp.asarray(tableau.c[:inner]), jnp.asarray(np.isin(np.arange(inner), list(looks)))
 
     def do(stage: Int[Array, ""], carry: tuple[Stages, Lanes]) -> tuple[Stages, Lanes]:
         rates, first_negative = carry
         there = moved_state(stage, tableau.a_lower[:inner], state, length, rates)
         at = time + places[stage] * length
-        negative = looked[stage] & (watch(at, there) < 0.0)
-        first_negative = jnp.minimum(first_negative, jnp.where(negative, places[stage], 2.0))
+
+        def look(first_negative: Lanes) -> Lanes:
+            return jnp.minimum(first_negative, _where_negative(guard(at, there), places[stage], length))
+
+        # A branch, for the other stages not to pay for it: a tenth of a step of a top in a cylinder.
+        first_negative = jax.lax.cond(looked[stage], look, lambda first_negative: first_negative, first_negative)
         return written_by_component(rates, field(at, there), at=stage + 1), first_negative
 
     none = jnp.zeros((1 + inner, *rate.shape), rate.dtype)
     start = written_in_place(none, rate, at=jnp.zeros((), int)), jnp.full_like(length, 2.0)
     rates, first_negative = over_stages(inner, do, start)
     stages = list(jnp.unstack(rates))
+    for stage in looks:
+        there = state + length * weighted_sum(tableau.a_lower[stage], stages[: stage + 1])
+        negative = _where_negative(crossing(there, stages[stage + 1]), tableau.c[stage], length)
+        first_negative = jnp.minimum(first_negative, negative)
     # Stored, for the step, its error and the event all depend on it.
     end = jax.lax.optimization_barrier(state + length * weighted_sum(tableau.b_sol[: 1 + inner], stages))
-    last_rate, watched = jax.lax.optimization_barrier((field(time + length, end), watch(time + length, end)))
+    last_rate = jax.lax.optimization_barrier(field(time + length, end))
+    watched = jax.lax.optimization_barrier(lesser(guard(time + length, end), crossing(end, last_rate), length))
     stages += [last_rate] if tableau.fsal else []
     return Step(end, last_rate, length * weighted_sum(tableau.b_error, stages), watched, first_negative)
+
+
+def lesser(guard: Lanes | None, crossing: Lanes | None, like: Lanes) -> Lanes:
+    """The lesser of two numbers per lane, of which each may be `None`; 1 if both are."""
+    if guard is None:
+        return jnp.ones_like(like) if crossing is None else crossing
+    return guard if crossing is None else jnp.minimum(crossing, guard)
+
+
+def _where_negative(watched: Lanes | None, place: Any, like: Lanes) -> Lanes:
+    """A place in the step in the lanes in which the number there is negative, 2 in the others."""
+    never = jnp.full_like(like, 2.0)
+    return never if watched is None else jnp.where(watched < 0.0, place, never)
 
 
 def over_stages(stages: int, do: Callable[[Int[Array, ""], Any], Any], start: Any) -> Any:

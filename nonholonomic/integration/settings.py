@@ -8,6 +8,7 @@ import jax
 from jaxtyping import Array, Float
 
 from ..validation import as_number
+from .oscillatory import Oscillatory8
 
 #: The absolute tolerance as a fraction of the relative one, in units of a problem's own magnitudes.
 ABSOLUTE = 0.1
@@ -19,17 +20,35 @@ class Settings(eqx.Module):
     **Arguments:**
 
     - `tolerance`: relative tolerance.
-    - `solver`: a solver of Diffrax, an explicit Runge-Kutta one for blocks of lanes.
+    - `solver`: a solver of Diffrax, an explicit Runge-Kutta one for blocks of lanes; `None` for `Oscillatory8` in blocks and
+      `Dopri8` in single runs, which need its dense output.
     - `absolute`: absolute tolerance as a fraction of the relative one, in units of the problem's magnitudes.
     - `max_steps`: a run that needs more has failed.
     - `lanes`: how many cells of a block advance together; by default as many as suit the machine (`lanes_for`).
     """
 
     tolerance: Float[Array, ""] = eqx.field(converter=as_number)
-    solver: diffrax.AbstractSolver = diffrax.Dopri8()
+    solver: diffrax.AbstractSolver | None = None
     absolute: float = eqx.field(static=True, default=ABSOLUTE)
     max_steps: int = eqx.field(static=True, default=2_000_000)
     lanes: int | None = eqx.field(static=True, default=None)
+
+    @property
+    def for_lanes(self) -> diffrax.AbstractSolver:
+        """The solver of blocks of lanes."""
+        return Oscillatory8() if self.solver is None else self.solver
+
+    @property
+    def for_single_runs(self) -> diffrax.AbstractSolver:
+        """The solver of single runs, of which the states within steps are read off.
+
+        **Raises:** `ValueError` for one whose dense output is less accurate than its steps.
+        """
+        if isinstance(self.solver, Oscillatory8):
+            raise ValueError(
+                f"solver = {self.solver!r} must have a dense output of its order, as Dopri8() has, for a single run"
+            )
+        return diffrax.Dopri8() if self.solver is None else self.solver
 
     def with_tolerance(self, tolerance: Float[Array, ""] | None) -> Self:
         """The same with another tolerance, or without one, which is then kept elsewhere."""

@@ -86,7 +86,7 @@ def _piece(
     watched = problem.guard(t0, state) is not None
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-        settings.solver,
+        settings.for_single_runs,
         t0,
         t1,
         first,
@@ -243,7 +243,7 @@ def sample(
         controller = _GivenSteps(grid)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-        settings.solver,
+        settings.for_single_runs,
         jnp.zeros_like(t1),
         t1,
         None,

@@ -124,7 +124,7 @@ def arena_phases(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, In
 
 
 def simulate_airborne(
-    scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver
+    scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver | None
 ) -> ArenaTrajectory:
     """Run one launch of a hybrid scene whose flights are integrated. **Arguments:** as for `simulate`, checked."""
     kinds, first, state = arena_phases((scene, launch), tolerance)

@@ -165,7 +165,7 @@ def level_phases(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, In
 
 
 def simulate_hybrid(
-    scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver
+    scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver | None
 ) -> HybridTrajectory:
     """Run one launch of a hybrid scene until `t1`. **Arguments:** as for `simulate`, checked."""
     kinds, first, state = level_phases((scene, launch), tolerance)

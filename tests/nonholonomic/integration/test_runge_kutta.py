@@ -24,7 +24,8 @@ def test_a_step_is_that_of_diffrax(solver):
     step = explicit_step(
         explicit_tableau(solver),
         field,
-        lambda time, at: at[0],
+        lambda time, at: None,
+        lambda at, rate: at[0],
         jnp.asarray(time),
         state,
         field(time, state),
@@ -52,7 +53,9 @@ def test_an_accelerator_gets_the_stages_written_out(monkeypatch):
 
     def compiled():
         def step(state):
-            return explicit_step(tableau, field, lambda time, at: at[0], time, state, field(time, state), length)
+            return explicit_step(
+                tableau, field, lambda time, at: at[0], lambda at, rate: None, time, state, field(time, state), length
+            )
 
         return jax.jit(step)
 

@@ -1,0 +1,105 @@
+"""Steps along motions of tops and strollers, and the errors that a pair makes in them."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scenes import ANGLE, TOP, Case, of_top, scenes
+
+import tippe
+from nonholonomic.integration import AbstractProblem, Settings, compiled_march
+
+from .family import STAGES, Unknowns, pair_of, unknowns_of
+
+#: The tolerance whose steps are taken, and how much longer than those of `Dopri8` the steps are: at equal error they may be.
+TOLERANCE, STRETCHES = 1e-9, (1.2, 1.8)
+
+PLAIN = unknowns_of(diffrax.Dopri8().tableau)
+
+States = Float[Array, "components launches"]
+
+
+class Steps(NamedTuple):
+    """Steps of one motion: the problem, where they start, their lengths [s], where they lead, the units of errors, and how much
+    each step counts."""
+
+    problem: AbstractProblem
+    starts: States
+    lengths: Float[Array, " launches"]
+    ends: States
+    units: States
+    share: Float[Array, " launches"]
+
+
+def motions(launches: int) -> dict[str, Case]:
+    """The scenes of `work_precision.py` without the stiff one, a top in a sphere, and a faster one with dry friction."""
+    top, theta = tippe.Top(*TOP), np.linspace(0.05, 0.6, launches)
+    ball = tippe.Scene(top, tippe.Sphere(0.3), tippe.Viscous(0.3))
+    dry = tippe.Scene(top, friction=tippe.Coulomb(0.3, 1e-2))
+    found = {name: case for name, case in scenes(launches).items() if name != "cylinder, Coulomb 1e-3"}
+    found["sphere, viscous"] = of_top(ball, tippe.Launch(theta, 120.0, eta=0.2), 3.0, None)
+    found["plane, Coulomb 1e-2"] = of_top(dry, tippe.Launch(theta, 150.0, eta=0.5), 3.0, ANGLE, False)
+    return found
+
+
+def steps_of(case: Case, seed: int) -> list[Steps]:
+    """Steps from random times of a motion, one set for each of `STRETCHES`."""
+    problem, launches = case.problem, case.task.launches
+    when = np.random.default_rng(seed).uniform(0.02, 1.0, launches) * min(case.task.t1, 6.0)
+    starts = compiled_march(problem, jnp.asarray(when), jnp.asarray(launches), Settings(1e-11))[0].state
+    scales = problem.start()[1]
+    absolute = 0.1 * TOLERANCE * jnp.broadcast_to(scales.reshape(len(scales), -1), starts.shape)
+    lengths = jnp.full(launches, 1e-4)
+    for _ in range(12):
+        ends, error = moved(PLAIN, problem, starts, lengths)
+        ratio = error / (absolute + TOLERANCE * jnp.maximum(jnp.abs(starts), jnp.abs(ends)))
+        lengths = lengths * jnp.clip(0.9 * jnp.mean(ratio**2, axis=0) ** (-1.0 / 16.0), 0.2, 5.0)
+    found = []
+    for stretch in STRETCHES:
+        ends = starts
+        for _ in range(16):
+            ends, _ = moved(PLAIN, problem, ends, stretch * lengths / 16.0)
+        units = absolute + TOLERANCE * jnp.maximum(jnp.abs(starts), jnp.abs(ends))
+        found.append(shared(Steps(problem, starts, stretch * lengths, ends, units, jnp.ones(launches))))
+    return found
+
+
+@eqx.filter_jit
+def moved(unknowns: Unknowns, problem: AbstractProblem, starts: States, lengths: Any) -> tuple[States, States]:
+    """Where one step leads, and its estimate of the error."""
+    pair = pair_of(unknowns)
+
+    def rate(state: States) -> States:
+        return jnp.stack(list(problem.field(jnp.zeros_like(lengths), state)))
+
+    rates = [rate(starts)]
+    for stage in range(1, STAGES):
+        rates.append(rate(starts + lengths * _sum(pair.stages[stage], rates)))
+    return starts + lengths * _sum(pair.eighth, rates), lengths * _sum(pair.eighth - pair.seventh, rates)
+
+
+def _sum(weights: Float[Array, " stages"], rates: list[States]) -> States:
+    return sum((weight * one for weight, one in zip(weights, rates, strict=False)), jnp.zeros_like(rates[0]))
+
+
+@eqx.filter_jit
+def errors(unknowns: Unknowns, steps: Steps) -> Float[Array, "components launches"]:
+    """The errors of the steps, in their units, each with its share."""
+    ends, _ = moved(unknowns, steps.problem, steps.starts, steps.lengths)
+    return jnp.where(steps.share > 0.0, (ends - steps.ends) / steps.units, 0.0) * steps.share
+
+
+#: Their slopes by the unknowns.
+slopes = eqx.filter_jit(jax.jacfwd(errors))
+
+
+def shared(steps: Steps) -> Steps:
+    """The steps with such shares that the errors of `Dopri8` have the norm 1, and no step counts much more than another."""
+    plain = jnp.sum(errors(PLAIN, steps) ** 2, axis=0)
+    good = jnp.isfinite(plain)
+    share = jnp.where(good, 1.0 / jnp.sqrt((plain + 0.1 * jnp.nanmedian(plain)) * jnp.sum(good)), 0.0)
+    return steps._replace(share=share)

@@ -1,0 +1,68 @@
+"""Rooted trees, each with its condition on a Runge-Kutta method (Hairer, Norsett and Wanner, Solving ODEs I, section II.2).
+
+A tree is the tuple of the subtrees at its root, so a leaf is `()`. A method with stages A and weights b is of order p if
+b . Phi(t) = 1/gamma(t) for every tree t of at most p vertices.
+"""
+
+import math
+from collections import Counter
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+#: The subtrees at the root; a tree of trees, which has no type of its own.
+Tree = tuple[Any, ...]
+
+
+def trees(order: int) -> list[list[Tree]]:
+    """All trees with 1, 2, ..., `order` vertices."""
+    found: list[list[Tree]] = [[()]]
+    for vertices in range(2, order + 1):
+        found.append(sorted({tuple(sorted(some)) for some in _forests(found, vertices - 1, vertices - 1)}))
+    return found
+
+
+def _forests(known: list[list[Tree]], vertices: int, largest: int) -> list[list[Tree]]:
+    """All lists of trees with so many vertices in all, none of them with more than `largest`."""
+    if vertices == 0:
+        return [[]]
+    return [
+        [tree, *rest]
+        for size in range(min(vertices, largest), 0, -1)
+        for rest in _forests(known, vertices - size, size)
+        for tree in known[size - 1]
+    ]
+
+
+def vertices(tree: Tree) -> int:
+    """How many vertices a tree has: its order."""
+    return 1 + sum(map(vertices, tree))
+
+
+def density(tree: Tree) -> int:
+    """gamma(t): the product of the numbers of vertices of all subtrees."""
+    return vertices(tree) * math.prod(map(density, tree))
+
+
+def symmetry(tree: Tree) -> int:
+    """sigma(t): how many rearrangements leave the tree as it is."""
+    return math.prod(math.factorial(count) * symmetry(branch) ** count for branch, count in Counter(tree).items())
+
+
+def error_coefficients(
+    stages: Float[Array, "stages stages"], weights: Float[Array, " stages"], order: int
+) -> Float[Array, " trees"]:
+    """(b . Phi(t) - 1/gamma(t)) / sigma(t) of every tree of an order: all vanish if the method is of that order."""
+    known, grown = trees(order), {}
+
+    def phi(tree: Tree) -> Float[Array, " stages"]:
+        """The elementary weights of a tree, one per stage."""
+        value = jnp.ones_like(weights)
+        for branch in tree:
+            if branch not in grown:
+                grown[branch] = stages @ phi(branch)
+            value = value * grown[branch]
+        return value
+
+    return jnp.stack([(weights @ phi(tree) - 1.0 / density(tree)) / symmetry(tree) for tree in known[order - 1]])

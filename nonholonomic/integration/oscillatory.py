@@ -1,0 +1,165 @@
+"""An explicit Runge-Kutta pair of orders 8 and 7 for motions that oscillate or turn, the default of blocks of lanes.
+
+It has the thirteen stages, and all simplifying assumptions, of Prince and Dormand's pair RK8(7)13M (High order embedded
+Runge-Kutta formulae, J. Comput. Appl. Math. 7, 1981), which is Diffrax's `Dopri8`. These leave eleven coefficients free. Prince
+and Dormand chose them for a small error in ninth order, whatever the field. Here they are those of the smallest error of a
+step along the motions of tops and strollers, for lengths at which the error is about the tolerance, and with small weights, for
+these magnify round-off; `benchmarks/tune_pair.py` finds them. At equal error a run takes 0.65 to 0.95 as many steps
+(`docs/performance.md`).
+"""
+
+from typing import Any, ClassVar
+
+import diffrax
+import numpy as np
+
+#: Weights of the earlier stages in each stage from the second one on.
+STAGES = (
+    (0.0264095066184915732,),
+    (-0.0951454276156460437, 0.197205113615956537),
+    (0.0382723822501164349, 0.0, 0.114817146750349305),
+    (0.340728385923567229, 0.0, -1.26253835950274032, 1.29391268982535148),
+    (0.0471260472771719265, 0.0, 0.0, 0.224498367395226173, 0.171561106054512757),
+    (0.0590440082255451129, 0.0, 0.0, 0.114071422618731564, -0.0378378059023787798, 0.0193348261944475019),
+    (
+        0.0365572331237326326,
+        0.0,
+        0.0,
+        -0.112785750737816087,
+        -0.0200197217913811437,
+        0.264698482467943486,
+        0.382401591582088885,
+    ),
+    (
+        0.0312431119539113663,
+        0.0,
+        0.0,
+        -0.443529080982225846,
+        -0.10818930354249574,
+        0.350096078879088549,
+        0.737630684802208065,
+        0.00787200162208728345,
+    ),
+    (
+        0.042764965171270215,
+        0.0,
+        0.0,
+        -2.53964965878014884,
+        -0.571698691275378902,
+        1.79445409889859033,
+        2.82849237522023631,
+        -4.96648616535426679,
+        4.20195310626063492,
+    ),
+    (
+        0.0712249803769250457,
+        0.0,
+        0.0,
+        3.62459374291150017,
+        0.496667275243315152,
+        -0.576837581060020108,
+        -3.50883297238221082,
+        2.2736134998603225,
+        -1.75656570363706242,
+        0.242059382831136652,
+    ),
+    (
+        -0.0144214661765158586,
+        0.0,
+        0.0,
+        -3.21289854991586515,
+        -0.112518252256146923,
+        -0.43451245326096399,
+        3.68058102755531946,
+        2.0755550674528871,
+        -1.19903319755159555,
+        -0.202181099181946328,
+        0.419428923334827252,
+    ),
+    (
+        -0.000771650282691543097,
+        0.0,
+        0.0,
+        -5.05354235492386614,
+        -0.396102202384168035,
+        0.988007249557581917,
+        5.48601431176446598,
+        -4.1866828800804233,
+        4.11694818529066285,
+        -0.440284412075300004,
+        0.486413753133738266,
+        0.0,
+    ),
+)
+
+#: Weights of the stages in the step of eighth order, and in that of seventh order.
+EIGHTH = (
+    0.045186734193491599,
+    0.0,
+    0.0,
+    0.0,
+    0.0,
+    0.374631675945570157,
+    0.241042042205639336,
+    -0.785379104914705101,
+    0.842718956957207442,
+    0.0661256911852675056,
+    0.173343529298248974,
+    -0.0395809059802784134,
+    0.0819113811095585014,
+)
+SEVENTH = (
+    0.0446709993784027482,
+    0.0,
+    0.0,
+    0.0,
+    0.0,
+    0.322977089262369396,
+    0.243738492583544485,
+    -0.388427706120021815,
+    0.47002164363416725,
+    0.119780424707444228,
+    0.141883617244297665,
+    0.0453554393097960418,
+    0.0,
+)
+
+#: The error of a step is estimated by this times the difference of the two. With 2, runs take about as many steps as with
+#: Prince and Dormand's pair at the same tolerance, and err less.
+CAUTION = 2.0
+
+#: Where the stages lie in the step, but for the first one, and with its end, at which the next step begins.
+PLACES = np.array([*(sum(row) for row in STAGES), 1.0])
+
+
+class Oscillatory8(diffrax.AbstractERK):
+    """A Runge-Kutta pair of orders 8 and 7 with thirteen stages, for motions that oscillate or turn.
+
+    Its dense output is the cubic through states and rates at both ends, far less accurate than its steps: it is for runs that
+    end, or are sampled, at the ends of steps, as those of tables are. A single run by `simulate` refuses it.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> from nonholonomic.integration import Oscillatory8
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> launch = tippe.Launch(0.1, 155.0)
+    >>> time = tippe.inversion_time(scene, launch, t1=8.0, tolerance=1e-6, solver=Oscillatory8())
+    >>> print(f"{time:.2f} s")
+    5.97 s
+
+    ```
+    """
+
+    tableau: ClassVar[diffrax.ButcherTableau] = diffrax.ButcherTableau(
+        a_lower=tuple(map(np.array, (*STAGES, EIGHTH))),
+        b_sol=np.array([*EIGHTH, 0.0]),
+        b_error=np.array([*(CAUTION * np.subtract(EIGHTH, SEVENTH)), 0.0]),
+        c=PLACES,
+    )
+    interpolation_cls: ClassVar[Any] = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
+
+    def order(self, terms: Any) -> int:
+        return 8
