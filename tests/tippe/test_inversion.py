@@ -235,8 +235,12 @@ def test_float32_works_at_its_own_tolerance():
 def test_a_frame_that_turns_with_the_top_saves_digits_and_changes_none(rutstam_scene):
     """Tops on the plane under a law with torques too, slow and fast, by equations at rest and by those of the tables."""
     disc = tippe.Contensou(np.array([0.3, 0.3, 0.1, 0.5]), np.array([0.0, 1e-3, 2e-3, 0.0]), 0.2)
-    scene = eqx.tree_at(lambda one: one.friction, rutstam_scene, disc)
     launch = tippe.Launch(np.array([0.1, 0.4, 0.2, 1.0]), np.array([150.0, -180.0, 200.0, 40.0]), azimuth=1.0)
+
+    def problems(law):
+        scene = eqx.tree_at(lambda one: one.friction, rutstam_scene, law)
+        tables = dataclasses.replace(InversionProblem.of(scene, launch, jnp.pi, 4), cos_angle=jnp.asarray(-2.0))
+        return tables, dataclasses.replace(tables, dynamics=scene.dynamics)
 
     def ends(problem, tolerance):
         outcome, _ = compiled_march(problem, jnp.asarray(2.0), jnp.asarray(4), Settings(tolerance))
@@ -245,15 +249,17 @@ def test_a_frame_that_turns_with_the_top_saves_digits_and_changes_none(rutstam_s
         u, e, L = np.vstack([state[:2], 0.0 * state[:1]]), state[2:5], state[5:]
         return np.stack([e[2], (L * e).sum(0), L[2], (u * e).sum(0), (u * L).sum(0), (u * u).sum(0)])
 
-    tables = dataclasses.replace(InversionProblem.of(scene, launch, jnp.pi, 4), cos_angle=jnp.asarray(-2.0))
-    at_rest = dataclasses.replace(tables, dynamics=scene.dynamics)
-    exact = ends(at_rest, 1e-13)
-    sizes = np.abs(exact).max(axis=1, keepdims=True)
-    assert_close(ends(tables, 1e-13) / sizes, exact / sizes, atol=1e-9)
+    for law in (disc, rutstam_scene.friction):
+        tables, at_rest = problems(law)
+        exact = ends(at_rest, 1e-13)
+        sizes = np.abs(exact).max(axis=1, keepdims=True)
+        assert_close(ends(tables, 1e-13) / sizes, exact / sizes, atol=1e-9)
+    # The fast ones under viscous friction, where nothing but the turning limits the steps.
     wrong = {
-        name: np.abs((ends(one, 1e-8) - exact) / sizes).max() for name, one in (("turning", tables), ("rest", at_rest))
+        name: np.abs((ends(one, 1e-8) - exact) / sizes).max(axis=0)[:3]
+        for name, one in (("turning", tables), ("rest", at_rest))
     }
-    assert 3.0 * wrong["turning"] < wrong["rest"], wrong
+    assert (2.0 * wrong["turning"] < wrong["rest"]).all(), wrong
     # The frame has turned: only what has no direction is the same.
     turned, fixed = (one.dynamics.field(tables.states + 0.1 * tables.scales) for one in (tables, at_rest))
     assert not np.allclose(turned[2], fixed[2])
