@@ -2,7 +2,7 @@
 
     python benchmarks/tune_pair.py [--starts 40] [--launches 64] [--seed 0]
 
-The family (`tuning/family.py`) leaves eleven weights free. From the pair of Prince and Dormand, and then from random
+The family (`tuning/family.py`) leaves ten weights free. From the pair of Prince and Dormand, and then from random
 neighbours of the best ones found, the sum of the logarithms of the errors along seven motions (`tuning/motions.py`) is made
 smaller, with a share of the squares of the weights, which magnify round-off. It prints every pair that is better than those
 before: its errors over those of `Dopri8`, the norms of what is left in ninth order, and at last the weights. There are many
@@ -16,6 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from measure import machine
+from scenes import Case
 from tuning.family import Unknowns, free_directions, pair_of, returned
 from tuning.motions import PLAIN, Steps, errors, motions, slopes, steps_of
 from tuning.trees import error_coefficients
@@ -37,11 +38,9 @@ SMALLNESS = 0.03**2
 class Aim:
     """What is made smaller: the logarithms of the errors of each motion, weighted, and the weights of the pair."""
 
-    def __init__(self, launches: int, seed: int):
+    def __init__(self, cases: dict[str, Case], seed: int):
         self.motions: list[tuple[str, float, Steps]] = [
-            (name, WEIGHTS.get(name, 1.0), steps)
-            for name, case in motions(launches).items()
-            for steps in steps_of(case, seed)
+            (name, WEIGHTS.get(name, 1.0), steps) for name, case in cases.items() for steps in steps_of(case, seed)
         ]
 
     def sizes(self, unknowns: Unknowns) -> list[float]:
@@ -114,7 +113,7 @@ def main() -> None:
     options = command.parse_args()
     print(machine())
     random, started = np.random.default_rng(options.seed), time.perf_counter()
-    aim, best = Aim(options.launches, options.seed), []
+    aim, best = Aim(motions(options.launches), options.seed), []
     for start in range(options.starts):
         first = neighbour(best[random.integers(min(3, len(best)))][1], random) if best else PLAIN
         found, height = descended(aim, first)

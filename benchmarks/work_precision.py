@@ -4,7 +4,7 @@
 
 For each scene and tolerance: the error is the greatest over the launches, against heyoka at 1e-16 (SciPy's DOP853 at 1e-13
 where heyoka is missing): of the inversion time [s] where the scene has one, otherwise of the end, which has a column of its
-own (a top's axis, a stroller's position [m]). The time is the least CPU time of three runs after a warm-up (one run of the
+own (a top's axis, a stroller's position [m]). The time is the least CPU time of nine runs after a warm-up (one run of the
 slow peers), per launch. Compilation is given apart. Peers that are not installed are named and skipped. It writes a CSV, a
 picture and the README's table.
 """
@@ -25,6 +25,9 @@ from scenes import Case, misprint, scenes
 from nonholonomic.integration import CROSSED, Oscillatory8, Settings, compiled_march
 
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
+
+#: How often a fast program is timed.
+RUNS = 9
 
 SOLVERS = {"Oscillatory8": Oscillatory8(), "Dopri8": diffrax.Dopri8(), "Tsit5": diffrax.Tsit5()}
 
@@ -127,7 +130,7 @@ def measure(name: str, case: Case, quick: bool) -> list[dict[str, str]]:
         for tolerance in tolerances:
             if solver_name == "Tsit5" and tolerance < 1e-10:
                 continue
-            measured = timed(lambda run=run, tolerance=tolerance: run(tolerance), 3)
+            measured = timed(lambda run=run, tolerance=tolerance: run(tolerance), RUNS)
             rows.append(row(name, f"nonholonomic {solver_name}", tolerance, task, measured, reference))
             print(rows[-1], flush=True)
     for peer, (packages, make, bears) in PEERS.items():
@@ -143,7 +146,7 @@ def measure(name: str, case: Case, quick: bool) -> list[dict[str, str]]:
             print(f"{peer}: {reason}, skipped")
             continue
         for tolerance in tolerances if "heyoka" in peer else tolerances[::2]:
-            measured = timed(lambda run=run, tolerance=tolerance: run(tolerance), 3 if "heyoka" in peer else 1)
+            measured = timed(lambda run=run, tolerance=tolerance: run(tolerance), RUNS if "heyoka" in peer else 1)
             rows.append(row(name, peer, tolerance, few, measured, right))
             print(rows[-1], flush=True)
     return rows

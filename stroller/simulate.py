@@ -48,8 +48,8 @@ def simulate(
     - `input`: a function `(t, motion) -> (drive force [N], steering torque [N m])` (see `input.py`), or `None`.
     - `times`: times [s] to report, increasing, within [0, t1]; by default 201 equally spaced ones.
     - `tolerance`: relative tolerance, and absolute tolerance in units of the scene's magnitudes, of an adaptive solver.
-    - `solver`: any Diffrax solver, or an `ImplicitMidpoint`; by default `diffrax.Dopri8()`, inside transformations
-      `Oscillatory8()`.
+    - `solver`: any Diffrax solver, or an `ImplicitMidpoint`; by default `diffrax.Dopri8()`, inside transformations,
+      without `adjoint` and where every number is a scalar, `nonholonomic.integration.Oscillatory8()`.
     - `max_steps`: a run that needs more has failed.
     - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
       parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax differentiates, which pays if a loss

@@ -99,7 +99,8 @@ def sweep(
       parts of the place are `"launch.place[0]"` and `"launch.place[1]"`, the parameters of an input that is a module are
       under `"input."`. The first axis varies slowest.
     - `tolerance`: relative tolerance of the integration.
-    - `solver`: an explicit Runge-Kutta solver of Diffrax, `Oscillatory8()` by default.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
+      `nonholonomic.integration.Oscillatory8()`.
     - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
     - `progress`: whether to show it, on a terminal or in a notebook.
     - `executor`: who computes: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a

@@ -1,9 +1,11 @@
 """No field that is integrated calls a function that XLA has no fast double-precision version of."""
 
+import functools
 import itertools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from jax.extend.core import ClosedJaxpr, Jaxpr
 from tops import rutstam_top
@@ -91,5 +93,9 @@ def test_fields_of_the_stroller(ground, friction, spring, heading):
     problem = RideProblem.of(scene, launch, None, 1, watched=True)
     states = problem.start()[0]
     assert slow_in(problem.field, jnp.zeros(1), states) == allowed
-    for watch in (lambda state: problem.guard(jnp.zeros(1), state), problem.crossing):
+    rates = problem.field(jnp.zeros(1), states)
+    along = functools.partial(problem.crossing_along, rate=rates)
+    for watch in (lambda state: problem.guard(jnp.zeros(1), state), problem.crossing, along):
         assert watch(states) is None or slow_in(watch, states) == set()
+    if problem.watched:
+        np.testing.assert_allclose(along(states), problem.crossing(states), rtol=1e-14)

@@ -62,7 +62,8 @@ def inversion_time(
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
     - `crossing`: "first" for the first time theta reaches the angle, "last" for the up-crossing after which theta stays
       above it until `t1`.
-    - `solver`: an explicit Runge-Kutta solver of Diffrax, `Oscillatory8()` by default.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
+      `nonholonomic.integration.Oscillatory8()`.
 
     **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before; NaN
     if the integration failed, or if numbers inside a transformation are out of range.

@@ -73,7 +73,8 @@ def lyapunov_exponent(
     - `scene`, `launch`: every number a scalar or one per launch, of shape (n,).
     - `t1`: time [s] to follow the motion, positive.
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
-    - `solver`: an explicit Runge-Kutta solver of Diffrax, `Oscillatory8()` by default.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
+      `nonholonomic.integration.Oscillatory8()`.
 
     **Returns:** a `LyapunovExponent`, its arrays of shape () or (n,).
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import diffrax
 import numpy as np
 
-from nonholonomic.integration import Oscillatory8, explicit_tableau
+from nonholonomic.integration import Settings, explicit_tableau
 from nonholonomic.sweeps import Table, Variable, sweep
 
 from .cells import TIMES, CellRuns, check_differentiable, driver_of
@@ -56,7 +56,8 @@ def inversion_table(
       one run, in the variables `first_time` and `last_time` in place of `time`, the status being that of the last.
     - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
     - `axes`: further axes, full name of a parameter -> values, such as `{"scene.body.offset": [0.005, 0.006]}`.
-    - `solver`: an explicit Runge-Kutta solver of Diffrax, by default `Oscillatory8()`, or `Dopri8()` for method "diffrax".
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
+      `nonholonomic.integration.Oscillatory8()`, or `Dopri8()` for method "diffrax".
     - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which supports first
       crossings only.
     - `errors`: whether to run every cell again at ten times the tolerance, for an estimate of the error of its time.
@@ -100,14 +101,14 @@ def inversion_table(
 
     ```
     """
-    if solver is None:
-        solver = diffrax.Dopri8() if method == "diffrax" else Oscillatory8()
     check_event(angle, crossing, ("first", "last", "both"))
-    explicit_tableau(solver)
     if not isinstance(errors, bool):
         raise ValueError(f"errors = {errors!r} must be True or False")
     if method not in ("ensemble", "diffrax"):
         raise ValueError(f"method = {method!r} must be 'ensemble' or 'diffrax'")
+    settings = Settings(tolerance, solver)
+    solver = settings.for_single_runs if method == "diffrax" else settings.for_lanes
+    explicit_tableau(solver)
     if method == "diffrax" and sensitivities:
         raise ValueError("method = 'diffrax' must be 'ensemble' for sensitivities")
     if crossing == "both" and sensitivities:

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
-#: Ratio of the second run's tolerance to the first one's. With Dopri8, of eighth order, it costs three quarters of the first.
+#: Ratio of the second run's tolerance to the first one's. With a pair of eighth order it costs three quarters of the first.
 COARSER = 10.0
 
 #: Ratio of the estimate to the difference of the two runs. The error grows as the tolerance, so the difference is nine times

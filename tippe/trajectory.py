@@ -125,7 +125,8 @@ def simulate(
     - `times`: times of the result [s], increasing, within [0, t1]; by default those of the accepted steps. Outside of
       transformations those after the end of the run are left out, and `Trajectory.at` gives others.
     - `tolerance`: relative tolerance; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
-    - `solver`: any solver of Diffrax; by default `Dopri8()`, inside transformations `Oscillatory8()`.
+    - `solver`: any solver of Diffrax; by default `Dopri8()`, inside transformations and without `adjoint`
+      `nonholonomic.integration.Oscillatory8()`.
     - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
       parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax integrates a traced run, which pays if a
       loss is differentiated by many parameters.

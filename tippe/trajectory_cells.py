@@ -29,7 +29,7 @@ def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ..
     """The runs of some cells with as much of a `TrajectoryProblem` as the named quantities need.
 
     That is the path for some of them only, and neither rotation nor work: on the plane a run without them takes half the time.
-    If none of them has a direction, the frame turns on the level plane, and samples are a hundred times as accurate.
+    If none of them has a direction, the frame turns on the level plane, and samples are some thirty times as accurate.
     """
     run = TrajectoryProblem.of(scene, launch, cells)
     if scene.level and WITHOUT_DIRECTION.issuperset(names):

@@ -111,6 +111,7 @@ def trajectory_table(
     variables |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
     variables |= {name: Variable("1", np.int64, long_name=COUNTED[name]) for name in ("steps", "rejected")}
     request = described(roots, grid) | {"quantities": list(names), "tolerance": float(tolerance)}
+    request |= {"solver": "Oscillatory8"}
     # A run has a dozen components or so.
     most = max(16, 1 << (MOST_SAMPLED // (12 * len(times))).bit_length() - 1)
     job = SamplingJob(roots, times, float(tolerance), names)

@@ -1,7 +1,7 @@
 """The family of Runge-Kutta pairs of orders 8 and 7 to which Prince and Dormand's RK8(7)13M belongs.
 
 Thirteen stages, of which the second and the third help only to begin, with all simplifying assumptions of that pair. The
-weights that may differ from 0 are the unknowns; the equations leave eleven of them free.
+weights that may differ from 0 are the unknowns; the equations leave ten of them free.
 """
 
 from typing import NamedTuple
@@ -51,13 +51,14 @@ def pair_of(unknowns: Unknowns) -> Pair:
     )
 
 
-def unknowns_of(tableau: diffrax.ButcherTableau) -> Unknowns:
-    """The weights of a pair of this family, whose last stage in Diffrax is the end of the step."""
+def unknowns_of(tableau: diffrax.ButcherTableau, caution: float = 1.0) -> Unknowns:
+    """The weights of a pair of this family, whose last stage in Diffrax is the end of the step; `caution`: its estimate of the
+    error over the difference of the two steps."""
     stages = np.zeros((STAGES, STAGES))
     for stage, row in enumerate(tableau.a_lower[: STAGES - 1], 1):
         stages[stage, :stage] = row
     eighth = tableau.b_sol[:STAGES]
-    seventh = eighth - tableau.b_error[:STAGES]
+    seventh = eighth - tableau.b_error[:STAGES] / caution
     return jnp.concatenate([stages[tuple(AT)], eighth[WEIGHTED], seventh[WEIGHTED]])
 
 

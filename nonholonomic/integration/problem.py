@@ -36,7 +36,7 @@ class AbstractProblem(eqx.Module):
         """A smooth function of order 1, positive before the event, negative after it; `None` if there is no event."""
 
     def crossing_along(self, state: States, rate: States) -> Lanes | None:
-        """The crossing function where the field is known too, for problems to which that saves work."""
+        """The crossing function where the field is known too: what `crossing` is, for problems to which that saves work."""
         return self.crossing(state)
 
     @abc.abstractmethod

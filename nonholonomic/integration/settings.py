@@ -40,13 +40,13 @@ class Settings(eqx.Module):
 
     @property
     def for_single_runs(self) -> diffrax.AbstractSolver:
-        """The solver of single runs, of which the states within steps are read off.
+        """The solver where Diffrax integrates, and finds events and some of the states within steps.
 
         **Raises:** `ValueError` for one whose dense output is less accurate than its steps.
         """
         if isinstance(self.solver, Oscillatory8):
             raise ValueError(
-                f"solver = {self.solver!r} must have a dense output of its order, as Dopri8() has, for a single run"
+                f"solver = {self.solver!r} must have a dense output of its order, as Dopri8() has, where Diffrax integrates"
             )
         return diffrax.Dopri8() if self.solver is None else self.solver
 

@@ -4,15 +4,18 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tuning.family import pair_of, unknowns_of
+from scenes import scenes
+from tune_pair import Aim, descended
+from tuning.family import equations, free_directions, pair_of, unknowns_of
 from tuning.trees import error_coefficients, trees
 
 import tippe
 from nonholonomic.integration import Oscillatory8, Settings, compiled_march
+from nonholonomic.integration.oscillatory import CAUTION
 from tippe.inversion import InversionProblem
 
-PAIR = pair_of(unknowns_of(Oscillatory8().tableau))
-PLAIN = pair_of(unknowns_of(diffrax.Dopri8().tableau))
+OWN = unknowns_of(Oscillatory8().tableau, CAUTION)
+PAIR, PLAIN = pair_of(OWN), pair_of(unknowns_of(diffrax.Dopri8().tableau))
 TOP = tippe.Top(0.02, 0.02, 0.006, 131.0 / 350.0 * 8e-6, 0.4 * 8e-6)
 
 
@@ -29,6 +32,22 @@ def test_every_condition_of_order_holds(order):
     assert seventh < 1e-15 if order < 8 else seventh > 1e-7
 
 
+def test_it_belongs_to_the_family_which_leaves_ten_weights_free():
+    assert np.abs(equations(OWN)).max() < 1e-14
+    assert free_directions(OWN).shape[1] == free_directions(unknowns_of(diffrax.Dopri8().tableau)).shape[1] == 10
+
+
+def test_its_errors_along_a_motion_are_small_and_could_not_be_found_by_chance():
+    """Steps of Rutstam's top, as the weights were tuned; descending from Prince and Dormand's lowers the errors too."""
+    aim = Aim({"plane, viscous": scenes(4)["plane, viscous"]}, seed=0)
+    plain = unknowns_of(diffrax.Dopri8().tableau)
+    assert max(aim.sizes(OWN)) < 0.6
+    assert min(aim.sizes(plain)) > 0.8
+    found, height = descended(aim, plain, passes=2)
+    assert height < aim(plain) - 0.1
+    assert np.abs(equations(found)).max() < 1e-10
+
+
 def test_it_is_no_more_than_of_eighth_order_and_no_worse_in_ninth_than_the_pair_it_replaces():
     ninth, plain = (jnp.linalg.norm(error_coefficients(one.stages, one.eighth, 9)) for one in (PAIR, PLAIN))
     assert 1e-7 < ninth < plain
@@ -41,9 +60,11 @@ def test_its_weights_magnify_round_off_less():
         assert np.abs(own).sum(axis=-1).max() < np.abs(plain).sum(axis=-1).max()
 
 
-def test_in_a_cylinder_it_reaches_the_same_error_in_three_quarters_of_the_steps():
-    """A tenth of the error of `Dopri8` for the same steps: with an error of eighth order that is three quarters of them."""
-    scene = tippe.Scene(TOP, tippe.Cylinder(0.3), tippe.Viscous(0.3))
+@pytest.mark.parametrize("arena", [tippe.Cylinder(0.3), tippe.Torus(0.3, 0.2)], ids=lambda one: type(one).__name__)
+def test_off_the_plane_it_reaches_the_same_error_in_fewer_steps(arena):
+    """A third of the error of `Dopri8` for the same steps, or less, in an arena and for a top that it was not tuned to too."""
+    top = tippe.Top(0.05, 0.03, 0.008, 0.38 * 4.5e-5, 0.4 * 4.5e-5) if isinstance(arena, tippe.Torus) else TOP
+    scene = tippe.Scene(top, arena, tippe.Viscous(0.3))
     problem = InversionProblem.of(scene, tippe.Launch(np.linspace(0.05, 0.15, 8), 100.0, eta=0.3), 3.0, 8)
 
     def run(solver, tolerance):
@@ -53,9 +74,20 @@ def test_in_a_cylinder_it_reaches_the_same_error_in_three_quarters_of_the_steps(
     reference, _ = run(None, 1e-12)
     (own, steps), (plain, more) = run(None, 1e-9), run(diffrax.Dopri8(), 1e-9)
     assert steps < 1.05 * more
-    assert np.abs(own - reference).max() < 0.1 * np.abs(plain - reference).max()
+    assert np.abs(own - reference).max() < 0.3 * np.abs(plain - reference).max()
 
 
 def test_a_single_run_with_it_is_refused_as_its_dense_output_is_a_cubic():
     with pytest.raises(ValueError, match="solver = Oscillatory8"):
         tippe.simulate(tippe.Scene(TOP), tippe.Launch(0.1, 100.0), t1=0.1, tolerance=1e-6, solver=Oscillatory8())
+
+
+def test_a_rotation_keeps_its_amplitude_and_its_phase():
+    """The step of y' = i y: what is left of exp(i z) at z = 1, to a tenth of what it is with the pair it replaces."""
+
+    def left(pair):
+        first = np.linalg.solve(np.eye(13) - 1j * np.asarray(pair.stages), np.ones(13))
+        return abs((1.0 + 1j * np.asarray(pair.eighth) @ first) * np.exp(-1j) - 1.0)
+
+    assert left(PAIR) < 1e-9
+    assert left(PAIR) < 0.1 * left(PLAIN)

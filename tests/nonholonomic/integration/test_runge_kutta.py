@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from nonholonomic.integration import Oscillatory8
 from nonholonomic.integration.runge_kutta import explicit_step, explicit_tableau
 
 
@@ -15,7 +16,9 @@ def field(time, state):
 
 
 @pytest.mark.parametrize(
-    "solver", [diffrax.Dopri8(), diffrax.Tsit5(), diffrax.Bosh3(), diffrax.Heun()], ids=lambda one: type(one).__name__
+    "solver",
+    [Oscillatory8(), diffrax.Dopri8(), diffrax.Tsit5(), diffrax.Bosh3(), diffrax.Heun()],
+    ids=lambda one: type(one).__name__,
 )
 def test_a_step_is_that_of_diffrax(solver):
     """In three lanes: where it leads, its error estimate, and what was seen on the way."""
@@ -24,7 +27,7 @@ def test_a_step_is_that_of_diffrax(solver):
     step = explicit_step(
         explicit_tableau(solver),
         field,
-        lambda time, at: None,
+        lambda time, at: 10.0 + at[1],
         lambda at, rate: at[0],
         jnp.asarray(time),
         state,
