@@ -188,7 +188,8 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
     columns = min(len(names) + 1, 3)
     lines = -(-(len(names) + 1) // columns)
     figure = Figure(figsize=(4.6 * columns, 3.9 * lines), layout="constrained")
-    *drawings, legend = figure.subplots(lines, columns, squeeze=False).flat[: len(names) + 1]
+    panels = list(figure.subplots(lines, columns, squeeze=False).flat)
+    drawings, legend = panels[: len(names)], panels[len(names)]
     for drawing, name in zip(drawings, names, strict=True):
         for number, program in enumerate(programs):
             points = [
@@ -208,7 +209,8 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
         drawing.set_xlabel("error [s], of the axis, or [m]")
         drawing.set_ylabel("CPU ms per launch, one core")
         drawing.grid(alpha=0.3)
-    legend.axis("off")
+    for panel in panels[len(names) :]:
+        panel.axis("off")
     legend.legend(*drawings[0].get_legend_handles_labels(), loc="center", frameon=False)
     figure.savefig(path, dpi=90)
 
