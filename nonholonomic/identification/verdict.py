@@ -14,6 +14,9 @@ POOR = 0.01
 #: A measurement whose residual exceeds this cannot be explained.
 FAR = 4.0
 
+#: Residuals all smaller than this are not noise, but round-off and the errors of integration, which may keep their sign.
+NEGLIGIBLE = 1e-3
+
 #: Ends whose -2 log likelihoods differ by less than this are the same minimum; another one within `RIVAL` of the best explains
 #: the data nearly as well, as a parameter two standard errors off does.
 SAME, RIVAL = 0.1, 4.0
@@ -105,8 +108,9 @@ def judge(
     estimated = bool(np.any(np.asarray(measurements.estimated)))
     p_value = math.nan if estimated or degrees < 1 else chi_squared_tail(float(np.sum(scores[exact] ** 2)), degrees)
     numbers = np.asarray(measurements.series)
-    series = [runs_of_signs(scores[exact & (numbers == one)]) for one in np.unique(numbers)]
-    seen = tuple(one for one in series if one.count > 1)
+    parts = [scores[exact & (numbers == one)] for one in np.unique(numbers)]
+    seen = tuple(found for found in map(runs_of_signs, parts) if found.count > 1)
+    noisy = [runs_of_signs(part).p_value for part in parts if np.any(np.abs(part) > NEGLIGIBLE)]
     agree, rivals, starts = agreement
     limits = np.abs(residual[~exact])
     concerns = []
@@ -122,7 +126,7 @@ def judge(
         )
     if np.any(limits > FAR):
         concerns.append(f"{int(np.sum(limits > FAR))} limits are violated by more than {FAR:.0f} errors")
-    few = min((one.p_value for one in seen), default=1.0) * max(len(seen), 1)
+    few = min(noisy, default=1.0) * max(len(noisy), 1)
     if few < POOR:
         concerns.append(
             f"the residuals keep their sign for too long (p = {few:.2g}): the model misses a trend, or errors are correlated"

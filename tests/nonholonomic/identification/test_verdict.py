@@ -68,6 +68,14 @@ def test_a_trend_that_the_model_misses_shows_in_the_runs_where_the_errors_are_to
     assert fit.verdict.series[0].p_value < 1e-6
 
 
+def test_residuals_far_below_the_errors_may_keep_their_sign():
+    """As those of a recording without noise do, which are the errors of integration."""
+    line = Measurements(T + 1e-6 * T**2, 0.5)
+    fit = identify(lambda p: p["slope"][:, None] * T, line, {"slope": 1.0})
+    assert fit.verdict.series[0].p_value < 1e-6
+    assert fit.verdict.good
+
+
 def test_estimated_errors_are_those_of_the_scatter():
     value = np.concatenate([1.0 + 0.1 * np.random.default_rng(1).normal(size=40), np.full(40, 5.0)])
     value[40:] += 0.7 * np.random.default_rng(2).normal(size=40)
