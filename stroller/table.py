@@ -14,7 +14,6 @@ from nonholonomic.geometry import AbstractSurface
 from nonholonomic.integration import (
     FAILED,
     GUARD_LOST,
-    Oscillatory8,
     Settings,
     compiled_march,
     explicit_tableau,
@@ -130,13 +129,13 @@ def sweep(
 
     ```
     """
-    solver = Oscillatory8() if solver is None else solver
-    explicit_tableau(solver)
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
     scene.check(launch)
     require(t1, "t1", above=0.0)
     require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+    solver = Settings(tolerance, solver).for_lanes
+    explicit_tableau(solver)
     check_input(input, scene, launch)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
     grid = named_axes(axes, scene.surface, launch)

@@ -121,7 +121,7 @@ class CellRuns(NamedTuple):
     t1: float
     angle: float
     crossing: str
-    solver: diffrax.AbstractERK
+    solver: diffrax.AbstractERK | None
     method: str
     slopes_by: list[str]
 

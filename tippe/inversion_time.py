@@ -24,7 +24,6 @@ from nonholonomic.integration import (
     UNRESOLVED,
     AbstractPhase,
     Journey,
-    Oscillatory8,
     Settings,
     explicit_tableau,
     traced_march,
@@ -87,9 +86,9 @@ def inversion_time(
 
     ```
     """
-    solver = Oscillatory8() if solver is None else solver
     check_run(scene, launch, t1, tolerance)
     check_event(angle, crossing)
+    solver = Settings(tolerance, solver).for_lanes
     explicit_tableau(solver)
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
     unchecked = any(is_traced(leaf) for leaf in leaves)

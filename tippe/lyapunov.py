@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from nonholonomic.derivatives import exponent_of, growth
 from nonholonomic.geometry import cross
-from nonholonomic.integration import GUARD_LOST, REACHED_END, Oscillatory8, Settings, explicit_tableau
+from nonholonomic.integration import GUARD_LOST, REACHED_END, Settings, explicit_tableau
 from nonholonomic.validation import require
 
 from .cells import driver_of
@@ -92,8 +92,6 @@ def lyapunov_exponent(
 
     ```
     """
-    solver = Oscillatory8() if solver is None else solver
-    explicit_tableau(solver)
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
     if not isinstance(launch, Launch):
@@ -104,6 +102,8 @@ def lyapunov_exponent(
         )
     require(t1, "t1", above=0.0)
     require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+    settings = Settings(tolerance, solver)
+    explicit_tableau(settings.for_lanes)
     shapes = {np.shape(leaf) for leaf in jax.tree.leaves((scene, launch))} - {()}
     if len(shapes) > 1 or any(len(shape) > 1 for shape in shapes):
         raise ValueError(f"scene and launch must hold scalars or one number per launch, not arrays of shapes {shapes}")
@@ -113,7 +113,7 @@ def lyapunov_exponent(
     problem = InversionProblem.of(scene, launch, jnp.pi, cells)
     # A turning frame turns by another angle for each launch, and that difference would count as divergence.
     problem = dataclasses.replace(problem, dynamics=scene.dynamics, cos_angle=jnp.asarray(-2.0))
-    found = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, Settings(tolerance, solver))
+    found = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, settings)
     exponent, error = exponent_of(found.logarithm, float(t1))
     whole = found.status == REACHED_END
     lost = np.asarray(LOSSES)[np.asarray(problem.dynamics.loss(jnp.asarray(found.state)))]

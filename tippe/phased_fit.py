@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float
 
 from nonholonomic.identification import of_data
-from nonholonomic.integration import Oscillatory8
 from nonholonomic.parameters import numbers, with_numbers
 
 from .cells import CellRuns, driver_of
@@ -71,7 +70,7 @@ class PhasedModel(NamedTuple):
         }
         columns |= {name: np.repeat([row[name] for row in rows], launches) for name in rows[0] if name != "t0"}
         t1, angle = float(data.t1), float(data.angle)
-        runs = CellRuns(driver_of(self.scene), t1, angle, "first", Oscillatory8(), "ensemble", [])
+        runs = CellRuns(driver_of(self.scene), t1, angle, "first", None, "ensemble", [])
         count = launches * len(rows)
         found = runs.results({"scene": self.scene, "launch": data.launch}, columns, self.tolerance, count)
         missing = np.log(angle / np.clip(np.asarray(found["end_theta"]), LEAST_ANGLE, angle))

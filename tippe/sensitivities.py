@@ -65,7 +65,7 @@ def slopes_of_cells(
     *,
     count: int,
     size: int,
-    solver: diffrax.AbstractERK,
+    solver: diffrax.AbstractERK | None,
     last: bool,
 ) -> tuple[Outcome, dict[str, Any]]:
     """How every cell ended, and the derivative of its inversion time by every number, 0 where the top did not invert.
@@ -115,7 +115,7 @@ def phased_slopes_of_cells(
     *,
     count: int,
     size: int,
-    solver: diffrax.AbstractERK,
+    solver: diffrax.AbstractERK | None,
     last: bool,
     kinds: int,
 ) -> tuple[Journey, dict[str, Any], Bool[np.ndarray, " size"]]:

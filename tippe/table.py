@@ -106,9 +106,6 @@ def inversion_table(
         raise ValueError(f"errors = {errors!r} must be True or False")
     if method not in ("ensemble", "diffrax"):
         raise ValueError(f"method = {method!r} must be 'ensemble' or 'diffrax'")
-    settings = Settings(tolerance, solver)
-    solver = settings.for_single_runs if method == "diffrax" else settings.for_lanes
-    explicit_tableau(solver)
     if method == "diffrax" and sensitivities:
         raise ValueError("method = 'diffrax' must be 'ensemble' for sensitivities")
     if crossing == "both" and sensitivities:
@@ -117,6 +114,9 @@ def inversion_table(
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     given = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
     roots, grid, units = launches(scene, given, axes, t1, tolerance)
+    settings = Settings(tolerance, solver)
+    solver = settings.for_single_runs if method == "diffrax" else settings.for_lanes
+    explicit_tableau(solver)
     paths = sensitivity_names(roots, sensitivities)
     driver = driver_of(scene)
     if paths:

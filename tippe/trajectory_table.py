@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from nonholonomic.integration import Settings
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
 from nonholonomic.validation import as_number, require, require_all
@@ -111,7 +112,7 @@ def trajectory_table(
     variables |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
     variables |= {name: Variable("1", np.int64, long_name=COUNTED[name]) for name in ("steps", "rejected")}
     request = described(roots, grid) | {"quantities": list(names), "tolerance": float(tolerance)}
-    request |= {"solver": "Oscillatory8"}
+    request |= {"solver": type(Settings(tolerance).for_lanes).__name__}
     # A run has a dozen components or so.
     most = max(16, 1 << (MOST_SAMPLED // (12 * len(times))).bit_length() - 1)
     job = SamplingJob(roots, times, float(tolerance), names)

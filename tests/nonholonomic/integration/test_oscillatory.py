@@ -91,3 +91,10 @@ def test_a_rotation_keeps_its_amplitude_and_its_phase():
 
     assert left(PAIR) < 1e-9
     assert left(PAIR) < 0.1 * left(PLAIN)
+
+
+def test_a_table_by_diffrax_refuses_it_before_anything_is_written(tmp_path):
+    given = {"theta": [0.1], "spin": 155.0, "t1": 1.0, "method": "diffrax", "path": tmp_path / "table.h5"}
+    with pytest.raises(ValueError, match="solver = Oscillatory8"):
+        tippe.inversion_table(tippe.Scene(TOP), solver=Oscillatory8(), **given)
+    assert not list(tmp_path.iterdir())
