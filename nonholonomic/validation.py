@@ -33,6 +33,14 @@ def as_number(value: Any) -> Float[Array, "..."]:
         return value
 
 
+def as_known(value: Any) -> Float[Array, "..."]:
+    """As `as_number`, but what is known stays known inside a transformation: `jax.jit` traces every array that is made in it."""
+    if any(is_traced(leaf) for leaf in jax.tree.leaves(value)):
+        return as_number(value)
+    with jax.ensure_compile_time_eval():
+        return as_number(value)
+
+
 def is_traced(value: Any) -> bool:
     """Whether the value is known only while JAX runs a transformation."""
     return isinstance(value, Tracer)

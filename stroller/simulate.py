@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.integration import ImplicitMidpoint, Settings
 from nonholonomic.progress import Progress
-from nonholonomic.validation import Bound, as_number, is_traced, legal, nan_unless, require_all
+from nonholonomic.validation import Bound, as_known, is_traced, legal, nan_unless, require_all
 
 from .input import Input, check_input
 from .launch import Launch
@@ -77,19 +77,20 @@ def simulate(
         raise ValueError(f"scene = {scene!r} must be a Scene")
     scene.check(launch)
     require_all(run_bounds(t1, tolerance))
-    times = jnp.linspace(0.0, t1, DEFAULT_TIMES) if times is None else as_number(times)
+    end, grid = as_known(t1), None
+    times = _evenly_spaced(end) if times is None else as_known(times)
     if times.ndim != 1 or times.size < 1:
         raise ValueError(f"times = {times!r} must be a list of at least one time")
     require_all(times_bounds(times, t1))
     if not is_traced(times) and np.any(np.diff(np.asarray(times)) <= 0.0):
         raise ValueError(f"times = {times!r} must be increasing")
     check_input(input, scene, launch)
-    end, grid = as_number(t1), None
     if isinstance(solver, ImplicitMidpoint):
         grid = even_steps(times, end, solver.step_length)
         max_steps = grid.size
     settings = Settings(tolerance, solver, max_steps=max_steps)
-    ride = Ride(scene, launch, as_module(input, scene, launch), end, settings, grid)
+    # Inside a transformation numbers become its own here, even if all are known.
+    ride = Ride(scene, launch, as_module(input, scene, launch), jnp.add(end, 0.0), settings, grid)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((ride, times))):
         return _legal_or_nan(ride, times, adjoint)
     with Progress(1, "ride", "simulating"):
@@ -137,10 +138,21 @@ def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
     yield Bound(times, "times", at_least=0.0, at_most=t1)
 
 
+def _evenly_spaced(t1: Float[Array, ""]) -> Float[Array, " times"]:
+    """The times of output if none are asked for; known inside a transformation if `t1` is."""
+    return jnp.linspace(0.0, t1, DEFAULT_TIMES) if is_traced(t1) else as_known(np.linspace(0.0, t1, DEFAULT_TIMES))
+
+
 def even_steps(
     times: Float[Array, " times"], t1: Float[Array, ""], longest: Float[Array, ""]
 ) -> Float[Array, " steps"]:
-    """Times from 0 to `t1` at most `longest` apart that fall on every one of `times`, evenly between them."""
+    """Times from 0 to `t1` at most `longest` apart that fall on every one of `times`, evenly between them.
+
+    **Raises:** `ValueError` if one of the three is traced: how many steps there are is part of the program.
+    """
+    for name, number in {"t1": t1, "times": times, "step_length": longest}.items():
+        if is_traced(number):
+            raise ValueError(f"{name} is traced and must be known for ImplicitMidpoint, whose steps have a given length")
     knots = np.union1d(np.asarray(times), [0.0, float(t1)])
     counts = np.ceil(np.diff(knots) / float(longest) * (1.0 - 1e-12)).astype(int)
     pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots, knots[1:], counts, strict=False)]

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..geometry import inverse
 from ..parameters import one_line
-from ..validation import as_number, require
+from ..validation import as_known, require
 
 #: Simplified Newton iterations; each gains a factor of the order of (step times rate of change)^2.
 ITERATIONS = 8
@@ -42,7 +42,7 @@ class ImplicitMidpoint(diffrax.AbstractSolver):
     ```
     """
 
-    step_length: Float[Array, ""] = eqx.field(converter=as_number)
+    step_length: Float[Array, ""] = eqx.field(converter=as_known)
 
     units: ClassVar[dict[str, str]] = {"step_length": "s"}
     term_structure: ClassVar = diffrax.AbstractTerm

@@ -329,6 +329,12 @@ BAD = [
         r"place\[1\] = .* must differ from 0 for heading = 'projected'",
     ),
     (lambda: ImplicitMidpoint(0.0), r"step_length = 0\.0 must be greater than 0\.0"),
+    (
+        lambda: jax.jit(lambda t1: stroller.simulate(FULL, LAUNCH, t1, solver=ImplicitMidpoint(0.1)).speed)(1.0),
+        "t1 is traced and must be known for ImplicitMidpoint",
+    ),
+    # What is known is checked inside a transformation too.
+    (lambda: jax.jit(lambda x: x * stroller.simulate(FULL, LAUNCH, -1.0).speed)(1.0), r"t1 = -1\.0 must be greater"),
 ]
 
 
