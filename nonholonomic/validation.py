@@ -34,7 +34,7 @@ def as_number(value: Any) -> Float[Array, "..."]:
 
 
 def as_known(value: Any) -> Float[Array, "..."]:
-    """As `as_number`, but what is known stays known inside a transformation: `jax.jit` traces every array that is made in it."""
+    """As `as_number`, but what is known stays known inside a transformation; `jax.jit` would trace the array."""
     if any(is_traced(leaf) for leaf in jax.tree.leaves(value)):
         return as_number(value)
     with jax.ensure_compile_time_eval():

@@ -140,7 +140,7 @@ class Scene(Bounded):
         side, pull = self.surface.sign(self.side, "inside"), PULL * jnp.sqrt(self.gravity / self.body.size)
         if self.contact == "hybrid" and not self.flies_in_closed_form:
             # A flight takes the top anywhere: the frame that knows where it is.
-            return CarriedFrame(self.surface, self.body.size, pull, side)
+            return CarriedFrame.of(self.surface, self.body.size, pull, side)
         return frame_of(self.surface, side, self.body.size, pull)
 
     @property

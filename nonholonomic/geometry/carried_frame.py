@@ -56,7 +56,7 @@ def frame_of(
     if isinstance(surface, Cylinder | Sphere):
         own = CylinderFrame if isinstance(surface, Cylinder) else SphereFrame
         return own(-side * surface.radius - distance, distance, side < 0.0)
-    return CarriedFrame(surface, distance, pull, side)
+    return CarriedFrame.of(surface, distance, pull, side)
 
 
 def room_bounds(surface: AbstractSurface, side: float, distance: Float[Array, "..."]) -> Iterator[Bound]:
@@ -76,12 +76,22 @@ class CarriedFrame(AbstractFrame):
     - `surface`: what the ball touches; `side`: 1 where the room is on the side of the surface's normal, else -1.
     - `distance`: R [m].
     - `pull`: rate [1/s] at which the foot is drawn back to the surface, should round-off and step errors take it off.
+    - `up`: the upward vertical in the surface's axes.
     """
 
     surface: AbstractSurface
     distance: Float[Array, "..."]
     pull: Float[Array, "..."]
+    up: Vector
     side: float = eqx.field(static=True, default=1.0)
+
+    @classmethod
+    def of(
+        cls, surface: AbstractSurface, distance: Float[Array, "..."], pull: Float[Array, "..."], side: float = 1.0
+    ) -> "CarriedFrame":
+        """The frame of a ball on a surface. **Arguments:** the fields but `up`."""
+        # Found once: a tilted plane knows its tilt as an angle, and no step is to take the sine of it.
+        return cls(surface, distance, pull, surface.up, side)
 
     def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
         eta = as_number(eta)
@@ -130,7 +140,7 @@ class CarriedFrame(AbstractFrame):
 
     def _seen(self, *axes: Fixed) -> Vector:
         """The upward vertical in the frame."""
-        return tuple(dot(axis, self.surface.up) for axis in axes)
+        return tuple(dot(axis, self.up) for axis in axes)
 
     def own_axes(self, place: Place) -> tuple[Fixed, Fixed, Fixed]:
         """The vectors t1, t2 and n in the surface's axes."""
@@ -141,7 +151,7 @@ class CarriedFrame(AbstractFrame):
         return self._seen(*self.own_axes(place))
 
     def height(self, place: Place) -> Component:
-        return self.surface.elevation(place[:3]) + self.distance * dot(self.normal(place[:3]), self.surface.up)
+        return self.surface.elevation(place[:3]) + self.distance * dot(self.normal(place[:3]), self.up)
 
     def cyclic_rate(self, cyclic: Place, velocity: Tangent, turning: Tangent) -> Place:
         return ()

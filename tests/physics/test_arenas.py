@@ -111,7 +111,7 @@ def test_the_forms_of_their_own_move_as_the_general_one(name):
     scene = tippe.Scene(rutstam_top(), surface, tippe.Coulomb(0.3, 0.1), side=side)
     launch = tippe.Launch(0.8, 100.0, azimuth=0.5, velocity=(0.1, -0.05), angular_velocity=(3.0, -2.0, 1.0), **place)
     state, (own_place, own_path) = scene.state(launch), scene.start(launch)
-    general = CarriedFrame(surface, scene.body.radius, jnp.asarray(20.0), surface.sign(side, "inside"))
+    general = CarriedFrame.of(surface, scene.body.radius, jnp.asarray(20.0), surface.sign(side, "inside"))
     axes = scene.frame.axes(own_place, own_path)
     centre, normal = scene.frame.position(own_place, own_path), axes[2]
     foot = tuple(c - scene.body.radius * n for c, n in zip(centre, normal, strict=True))

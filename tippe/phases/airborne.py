@@ -171,12 +171,13 @@ class Contact(AbstractProblem):
 
 
 class Flight(AbstractProblem):
-    """Flying until theta reaches an angle or a sphere is back at the arena."""
+    """Flying until theta reaches an angle or a sphere is back at the arena; `falls` is the acceleration [m/s^2]."""
 
     scene: Scene
     cos_angle: Float[Array, "..."]
     states: Float[Array, "components cells"]
     scales: Float[Array, "components cells"]
+    falls: Vector
     rides: bool = eqx.field(static=True)
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
@@ -185,8 +186,7 @@ class Flight(AbstractProblem):
     def field(self, time, state):
         flying, body = aloft(state), self.scene.body
         turning = axis_rate(body, flying.axis, flying.momentum)
-        falls = scale(-1.0 * self.scene.gravity, self.scene.surface.up)
-        rates = (*flying.velocity, *falls, *turning, None, None, None, None, None)
+        rates = (*flying.velocity, *self.falls, *turning, None, None, None, None, None)
         if self.rides:
             across = tuple(state[OWN + k] for k in range(3))
             carry = scale(-1.0 * dot(turning, across), flying.axis)
@@ -255,7 +255,8 @@ class Fly(AbstractFlyingPhase):
         one = jnp.ones_like(velocity)
         rows = [one * self.scene.body.radius] * 3 + [velocity] * 3 + [one] * 3 + [momentum] * 3 + [one] * 2
         scales = jnp.concatenate([jnp.stack(rows), self.scales[OWN:]])
-        return Flight(self.scene, self.cos_angle, state, scales, self.rides)
+        falls = scale(-1.0 * self.scene.gravity, self.scene.surface.up)
+        return Flight(self.scene, self.cos_angle, state, scales, falls, self.rides)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         flying = aloft(state)

@@ -46,7 +46,7 @@ FOOT = (0.11, -0.07)
 
 
 def carried_frame(surface, side):
-    return CarriedFrame(surface, DISTANCE, PULL, side)
+    return CarriedFrame.of(surface, DISTANCE, PULL, side)
 
 
 def foot_of(name):
@@ -143,7 +143,7 @@ def test_the_foot_is_drawn_back_to_the_surface():
 def test_room_is_left_where_the_ball_fits_and_ends_at_the_curvature_of_the_ball():
     """On a paraboloid the curvature is greatest at the bottom, 1/p."""
     for p, fits in ((0.021, True), (0.019, False)):
-        frame = CarriedFrame(Paraboloid(p), DISTANCE, PULL)
+        frame = CarriedFrame.of(Paraboloid(p), DISTANCE, PULL)
         place, _ = frame.at_foot((jnp.zeros(()),) * 3)
         room = float(frame.carriage(place, (jnp.asarray(0.1), jnp.asarray(0.0))).room)
         assert (room > 0.0) is fits
