@@ -78,7 +78,8 @@ def ask(question: AbstractQuestion, *leaves: Float[Array, "..."]) -> Answer:
         if not active:
             answer = found(*leaves)
             return answer, jax.tree.map(jnp.zeros_like, answer)
-        answer, slopes = _with_slopes(question, active)(*leaves)
+        # Copied: under `jit` JAX refuses a function with a rule, called in a rule, the NumPy arrays that `vmap` hands on.
+        answer, slopes = _with_slopes(question, active)(*map(jnp.array, leaves))
         moved = [tangents[i] for i in active]
         # Slopes have `None` where the answer has an array that is not differentiated.
         return answer, jax.tree.map(lambda value, *by: _change(question, value, by, moved), answer, *slopes)

@@ -51,7 +51,8 @@ def test_the_same_table_by_vmapped_diffrax(arena):
     scene = tippe.Scene(rutstam_top(), arena, tippe.Viscous(0.3))
     arguments = {"theta": THETA, "spin": [60.0, 110.0, 190.0], "t1": 12.0, "tolerance": 1e-9}
     fast = tippe.inversion_table(scene, **arguments)
-    slow = tippe.inversion_table(scene, method="diffrax", **arguments)
+    # Its pair errs a hundred times as much at the same tolerance.
+    slow = tippe.inversion_table(scene, method="diffrax", **arguments | {"tolerance": 1e-11})
     assert (fast.status == slow.status).all()
     assert set(np.unique(fast.status)) == {"not_inverted", "inverted", "contact_lost"}
     inverted = fast.status == "inverted"
