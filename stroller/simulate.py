@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.integration import ImplicitMidpoint, Settings
-from nonholonomic.progress import Progress
+from nonholonomic.progress import telling
 from nonholonomic.validation import Bound, as_known, is_traced, legal, nan_unless, require_all
 
 from .input import Input, check_input
@@ -27,6 +27,7 @@ from .trajectory import Trajectory, read_off
 DEFAULT_TIMES = 201
 
 
+@telling("simulating")
 def simulate(
     scene: Scene,
     launch: Launch,
@@ -93,8 +94,7 @@ def simulate(
     ride = Ride(scene, launch, as_module(input, scene, launch), jnp.add(end, 0.0), settings, grid)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((ride, times))):
         return _legal_or_nan(ride, times, adjoint)
-    with Progress(1, "ride", "simulating"):
-        return _concrete(ride, times)
+    return _concrete(ride, times)
 
 
 def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
