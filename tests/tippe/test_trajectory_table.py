@@ -191,9 +191,9 @@ def test_it_is_drawn_over_time(table):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"times": []}, "times must be a non-empty list"),
-        ({"times": 1.0}, "times must be a non-empty list"),
-        ({"times": [0.0, 1.0, 0.5]}, "times must increase"),
+        ({"times": []}, "times = [] must be a list of at least one number"),
+        ({"times": 1.0}, "times = 1.0 must be a list of at least one number"),
+        ({"times": [0.0, 1.0, 0.5]}, "times[2] = 0.5 must be greater than times[1] = 1.0: times must increase"),
         ({"times": [-0.1, 1.0]}, "times = -0.1 must be at least 0.0"),
         ({"times": [0.0, float("nan")]}, "times = nan must be finite"),
         ({"times": [0.0]}, "times[-1] = 0.0 must be greater than 0.0 (it is the horizon)"),
