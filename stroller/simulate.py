@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.integration import ImplicitMidpoint, Settings
+from nonholonomic.integration import LOOSEST, ImplicitMidpoint, Settings
 from nonholonomic.progress import Progress
 from nonholonomic.validation import as_known, is_traced, legal, nan_unless
 
 from .checks import check_run, check_steps, check_times, run_bounds, times_bounds
 from .input import Input
 from .launch import Launch
-from .ride import Recipe, Ride, as_module, traced_ride
+from .ride import Ride, RideRecipe, as_module, traced_ride
 from .scene import Scene
 from .steps import followed
 from .trajectory import Trajectory, read_off
@@ -94,7 +94,7 @@ def simulate(
 
 def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
     """The run of concrete numbers."""
-    recipe = Recipe.of(ride)
+    recipe = RideRecipe.of(ride)
     if not isinstance(ride.settings.for_single_runs, diffrax.AbstractERK | ImplicitMidpoint):
         return _read_off(recipe, times, *_sampled(ride, times))
     steps, stats = followed(recipe)
@@ -116,8 +116,13 @@ def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.Ab
     # A run of illegal numbers might never reach its end, so it is not begun, unless its steps have a given length.
     begins = may | (ride.grid is not None)
     run_times = jnp.where(begins, times, 0.0)
-    begun = ride._replace(t1=jnp.where(begins, ride.t1, 0.0))
-    run = read_off(Recipe.of(ride), run_times, *traced_ride(begun, run_times, adjoint))
+    # Nor is its tolerance that of its block.
+    settings = ride.settings.with_tolerance(jnp.where(may, ride.settings.tolerance, LOOSEST))
+    begun = ride._replace(t1=jnp.where(begins, ride.t1, 0.0), settings=settings)
+    if adjoint is not None:
+        # Diffrax would differentiate the run that is not begun.
+        begun = begun._replace(**nan_unless(may, {"scene": ride.scene, "launch": ride.launch, "input": ride.input}))
+    run = read_off(RideRecipe.of(ride), run_times, *traced_ride(begun, run_times, adjoint))
     stats = run.stats._replace(finished=run.stats.finished & may)
     return eqx.tree_at(lambda one: (one.t, one.stats), nan_unless(may, run), (times, stats))
 
