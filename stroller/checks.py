@@ -21,7 +21,7 @@ def check_run(scene: Any, launch: Any, t1: Any, input: Any, tolerance: Any) -> N
     if not isinstance(launch, Launch):
         raise ValueError(f"launch = {launch!r} must be a Launch")
     require_all(run_bounds(t1, tolerance))
-    values = numbers("scene", scene) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
+    values = numbers("scene", scene, functions=False) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
     for name, value in values.items():
         if value is not None and np.ndim(value) != 0:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; axes of sweep take lists")

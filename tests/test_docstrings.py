@@ -40,6 +40,15 @@ def members(module: ModuleType) -> dict[str, Any]:
 NAMES = {id(value): (f"{package}.{name}", value) for package in PACKAGES for name, value in public(package).items()}
 NAMES = {key: named for key, named in NAMES.items() if not isinstance(named[1], str)}
 
+#: Those of their methods that have an example.
+METHODS = [
+    (f"{home}.{name}", method)
+    for home, value in NAMES.values()
+    if inspect.isclass(value)
+    for name, method in inspect.getmembers(value, inspect.isroutine)
+    if not name.startswith("_") and ">>>" in (inspect.getdoc(method) or "")
+]
+
 #: What the modules among them hand out, with the module, whose example theirs go on from.
 MEMBERS = [
     (f"{home}.{name}", value, module)
@@ -74,7 +83,9 @@ def folders_of_its_own(tmp_path, monkeypatch):
         compilation_cache.reset_cache()
 
 
-@pytest.mark.parametrize(("name", "value"), NAMES.values(), ids=[name for name, _ in NAMES.values()])
+@pytest.mark.parametrize(
+    ("name", "value"), [*NAMES.values(), *METHODS], ids=[name for name, _ in (*NAMES.values(), *METHODS)]
+)
 def test_its_example_gives_what_it_says(name, value):
     assert not complaints(inspect.getdoc(value) or "", {})
 

@@ -24,6 +24,7 @@ from stroller import (
     Steady,
     Stroller,
 )
+from stroller.checks import check_run
 from stroller.ride import RideProblem
 
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
@@ -362,6 +363,23 @@ BAD = [
     # What is known is checked inside a transformation too.
     (lambda: jax.jit(lambda x: x * stroller.simulate(FULL, LAUNCH, -1.0).speed)(1.0), r"t1 = -1\.0 must be greater"),
 ]
+
+
+class Hill(eqx.Module):
+    """A ground whose numbers are an array."""
+
+    bends: jax.Array
+
+    def __call__(self, x, y):
+        return self.bends[0] * x * x + self.bends[1] * y * y
+
+
+def test_the_function_of_a_ground_may_hold_arrays():
+    """Of the scene itself every number is one; what a function holds is its own affair."""
+    ground = stroller.Graph(Hill(jnp.array([0.05, 0.1])))
+    check_run(Scene(BODY, ground), Launch((0.1, 0.2), 0.3, 1.0), 1.0, None, 1e-6)
+    with pytest.raises(ValueError, match="scene.gravity must be one number, not of shape"):
+        check_run(Scene(BODY, ground, gravity=[9.8, 1.6]), Launch((0.1, 0.2), 0.3, 1.0), 1.0, None, 1e-6)
 
 
 @pytest.mark.parametrize(("build", "message"), BAD)
