@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from nonholonomic.integration import ImplicitMidpoint, require_adaptive, tolerance_bound
+from nonholonomic.integration import ImplicitMidpoint, require_adaptive, require_adjoint, tolerance_bound
 from nonholonomic.parameters import numbers
 from nonholonomic.validation import Bound, require_all, require_increasing, require_whole
 
@@ -35,11 +35,12 @@ def check_times(times: Any, t1: Any) -> None:
     require_increasing(times, "times")
 
 
-def check_steps(solver: Any, max_steps: Any) -> None:
-    """Raise `ValueError` unless the solver can choose its steps or is an `ImplicitMidpoint`, and `max_steps` counts some."""
+def check_options(solver: Any, max_steps: Any, adjoint: Any) -> None:
+    """Raise `ValueError` unless the solver chooses its steps or is an `ImplicitMidpoint`, and the others are in range too."""
     if not isinstance(solver, ImplicitMidpoint):
         require_adaptive(solver, ", or an ImplicitMidpoint")
     require_whole(max_steps, "max_steps", 1)
+    require_adjoint(adjoint)
 
 
 def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:

@@ -14,7 +14,7 @@ from nonholonomic.integration import LOOSEST, ImplicitMidpoint, Settings
 from nonholonomic.progress import Progress
 from nonholonomic.validation import as_known, is_traced, legal, nan_unless
 
-from .checks import check_run, check_steps, check_times, run_bounds, times_bounds
+from .checks import check_options, check_run, check_times, run_bounds, times_bounds
 from .input import Input
 from .launch import Launch
 from .ride import Ride, RideRecipe, as_module, traced_ride
@@ -76,7 +76,7 @@ def simulate(
     ```
     """
     check_run(scene, launch, t1, input, tolerance)
-    check_steps(solver, max_steps)
+    check_options(solver, max_steps, adjoint)
     end, grid = as_known(t1), None
     times = _evenly_spaced(end) if times is None else as_known(times)
     check_times(times, t1)

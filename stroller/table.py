@@ -131,7 +131,7 @@ def sweep(
     ```
     """
     check_run(scene, launch, t1, input, tolerance)
-    if not isinstance(axes, dict):
+    if not isinstance(axes, dict) or not all(isinstance(number, str) for number in axes):
         raise ValueError(f"axes = {axes!r} must be a dictionary, full name of a parameter -> values")
     solver = Settings(tolerance, solver).for_lanes
     explicit_tableau(solver)

@@ -19,6 +19,7 @@ from nonholonomic.integration import (
     explicit_tableau,
     follow,
     require_adaptive,
+    require_adjoint,
 )
 from nonholonomic.progress import Progress
 from nonholonomic.validation import (
@@ -168,6 +169,7 @@ def simulate(
     """
     check_run(scene, launch, t1, tolerance)
     require_adaptive(solver)
+    require_adjoint(adjoint)
     if times is not None:
         times = as_number(times)
         require_all(times_bounds(times, t1))

@@ -46,6 +46,7 @@ from .settings import LOOSEST as LOOSEST
 from .settings import Settings as Settings
 from .settings import lanes_for as lanes_for
 from .settings import require_adaptive as require_adaptive
+from .settings import require_adjoint as require_adjoint
 from .settings import tolerance_bound as tolerance_bound
 from .single_run import Followed as Followed
 from .single_run import Sampled as Sampled

@@ -81,6 +81,12 @@ def require_adaptive(solver: Any, others: str = "") -> None:
         )
 
 
+def require_adjoint(adjoint: Any) -> None:
+    """Raise `ValueError` unless this is `None` or a way of Diffrax to differentiate."""
+    if not isinstance(adjoint, diffrax.AbstractAdjoint | None):
+        raise ValueError(f"adjoint = {adjoint!r} must be one of Diffrax, such as RecursiveCheckpointAdjoint(), or None")
+
+
 def lanes_for(cells: int, parts: int = 1) -> int:
     """How many cells should advance together, given their number and the number of equal parts in the state.
 

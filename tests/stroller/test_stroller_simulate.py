@@ -324,6 +324,10 @@ BAD = [
         lambda: stroller.simulate(FULL, LAUNCH, 1.0, times=[0.5, 0.2]),
         r"times\[1\] = 0\.2 must be greater than times\[0\] = 0\.5",
     ),
+    (
+        lambda: stroller.simulate(FULL, LAUNCH, 1.0, adjoint="backwards"),
+        r"adjoint = 'backwards' must be one of Diffrax",
+    ),
     (lambda: stroller.simulate(FULL, LAUNCH, 1.0, times="soon"), r"times = 'soon' is not a number"),
     (lambda: stroller.simulate(FULL, LAUNCH, [1.0, 2.0]), r"t1 must be one number, not of shape \(2,\)"),
     (lambda: stroller.simulate(FULL, Launch((0.0, 0.1), 0.0, [1.0, 2.0]), 1.0), r"launch\.speed must be one number"),
@@ -378,7 +382,7 @@ def test_the_function_of_a_ground_may_hold_arrays():
     """Of the scene itself every number is one; what a function holds is its own affair."""
     ground = stroller.Graph(Hill(jnp.array([0.05, 0.1])))
     check_run(Scene(BODY, ground), Launch((0.1, 0.2), 0.3, 1.0), 1.0, None, 1e-6)
-    with pytest.raises(ValueError, match="scene.gravity must be one number, not of shape"):
+    with pytest.raises(ValueError, match=r"scene\.gravity must be one number, not of shape"):
         check_run(Scene(BODY, ground, gravity=[9.8, 1.6]), Launch((0.1, 0.2), 0.3, 1.0), 1.0, None, 1e-6)
 
 

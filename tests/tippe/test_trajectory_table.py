@@ -207,6 +207,7 @@ def test_it_is_drawn_over_time(table):
         ({"quantities": ()}, "quantities = () must be a list of names"),
         ({"quantities": ["theta", "mood"]}, "quantities: 'mood' must be one of theta, eta"),
         ({"quantities": ["theta", "theta"]}, "quantities: 'theta' must be there once only"),
+        ({"axes": {3: [1.0]}}, "axes = {3: [1.0]} must be a dictionary"),
         ({"axes": {"scene.body.colour": [1.0]}}, "unknown axis 'scene.body.colour'"),
         ({"axes": {"launch.theta": [0.1]}}, "'launch.theta' is an argument of its own"),
         ({"scene": "a top"}, "scene = 'a top' must be a Scene"),
