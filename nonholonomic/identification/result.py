@@ -162,8 +162,6 @@ class Identification:
         """
         k = self._place(name)
         free = self.problem.free[k][1]
-        if len(self.problem.free) == 1:
-            raise ValueError(f"name = {name!r} is the only free parameter: there is nothing to fit again")
         if values is None:
             if not np.isfinite(self.standard_errors[name]):
                 raise ValueError(f"values must be given for {name!r}, whose standard error is infinite")

@@ -59,12 +59,12 @@ class Draws(NamedTuple):
         cls, density: LogDensity, coordinates: Float[np.ndarray, "chains draws unknowns"], accepted: float, runs: int
     ) -> "Draws":
         """Draws at some coordinates, with their diagnostics."""
-        import blackjax
+        from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
 
         values = {name: np.asarray(value) for name, value in density.values(jnp.asarray(coordinates)).items()}
-        r_hat = np.asarray(blackjax.diagnostics.potential_scale_reduction(coordinates)).tolist()
-        ess = np.asarray(blackjax.diagnostics.effective_sample_size(coordinates)).tolist()
-        named = (dict(zip(density.names, numbers, strict=True)) for numbers in (r_hat, ess))
+        found = map(np.asarray, (measure(coordinates) for measure in (potential_scale_reduction, effective_sample_size)))
+        # Of a single unknown they are numbers, not lists of one.
+        named = (dict(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in found)
         return cls(values, coordinates, *named, accepted=accepted, runs=runs)
 
     def __str__(self) -> str:

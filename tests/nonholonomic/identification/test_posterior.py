@@ -72,6 +72,25 @@ def test_draws_have_the_mean_and_the_covariance_of_the_regression(draws):
     assert_close(replicas.std(axis=0), spread, rtol=0.1)
 
 
+def test_a_single_unknown_is_drawn_profiled_and_shown_like_several():
+    """The mean of 12 numbers, whose draws are normal with a standard deviation of the error / sqrt(12)."""
+    data, error = measured(slope=0.0), ERROR / np.sqrt(X.size)
+
+    def level(p):
+        return jnp.repeat(p["height"][:, None], X.size, axis=1)
+
+    fit = identify(level, data, {"height": 0.5})
+    density = LogDensity.of(level, data, {"height": 0.5})
+    found = sample(density, fit.coordinates, fit.coordinate_covariance, chains=2, draws=100, warmup=5, progress=False)
+    assert found.values["height"].shape == (2, 100)
+    assert abs(found.values["height"].mean() - np.mean(data.value)) < 4.0 * error / np.sqrt(found.ess["height"])
+    assert f"R-hat {found.r_hat['height']:.4f}, ESS {found.ess['height']:.0f}" in str(found)
+    profile = fit.profile("height")
+    assert_close(profile.deviance, ((profile.values - np.mean(data.value)) / error) ** 2, atol=1e-9)
+    assert profile.estimates == {}
+    assert [axes.get_xlabel() for axes in fit.plot().axes].count("height") == 1
+
+
 def test_unknown_errors_are_drawn_too():
     value = 1.0 + 0.3 * np.random.default_rng(4).normal(size=60)
     data = Measurements(value, 1.0, estimated=True)
