@@ -33,6 +33,11 @@ def as_number(value: Any) -> Float[Array, "..."]:
         return value
 
 
+def as_number_or_none(value: Any) -> Float[Array, "..."] | None:
+    """As `as_number`, for a number that may be left out."""
+    return None if value is None else as_number(value)
+
+
 def as_known(value: Any) -> Float[Array, "..."]:
     """As `as_number`, but what is known stays known inside a transformation; `jax.jit` would trace the array."""
     if any(is_traced(leaf) for leaf in jax.tree.leaves(value)):

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from nonholonomic import identification as generic
 from nonholonomic.identification import Free, Identification, of_data, predicted
 from nonholonomic.parameters import numbers, with_numbers
-from nonholonomic.validation import require
+from nonholonomic.validation import as_number, require
 
 from .recording import Recording
 from .scene import Scene
@@ -26,7 +26,7 @@ class SceneModel(eqx.Module):
     scene: Scene
     data: tuple[Recording, ...]
     seen: Int[Array, " n"]
-    tolerance: float = eqx.field(static=True)
+    tolerance: Float[Array, ""] = eqx.field(converter=as_number)
 
     def __call__(self, parameters: dict[str, Float[Array, " rows"]]) -> Float[Array, "rows n"]:
         rows = len(next(iter(parameters.values())))

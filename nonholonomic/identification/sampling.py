@@ -62,7 +62,9 @@ class Draws(NamedTuple):
         from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
 
         values = {name: np.asarray(value) for name, value in density.values(jnp.asarray(coordinates)).items()}
-        found = map(np.asarray, (measure(coordinates) for measure in (potential_scale_reduction, effective_sample_size)))
+        found = map(
+            np.asarray, (measure(coordinates) for measure in (potential_scale_reduction, effective_sample_size))
+        )
         # Of a single unknown they are numbers, not lists of one.
         named = (dict(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in found)
         return cls(values, coordinates, *named, accepted=accepted, runs=runs)

@@ -49,7 +49,7 @@ class Surrogate(eqx.Module):
         An unknown error of n values has the variance 1 / 2n.
         """
         covariance = np.asarray(covariance, float)
-        numbers = len(density.problem.free)
+        numbers = len(density.problem.names)
         if covariance.shape != (numbers, numbers) or not np.all(np.isfinite(covariance)):
             raise ValueError(
                 f"covariance must be finite and of shape {(numbers, numbers)}: the data do not determine all numbers"

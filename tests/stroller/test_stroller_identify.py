@@ -1,5 +1,6 @@
 """Numbers of a stroller from a recorded ride."""
 
+import jax
 import numpy as np
 import pytest
 from close import assert_close
@@ -15,7 +16,7 @@ def scene(rolling=2.0, wheelbase=0.7):
     return stroller.Scene(body, friction=stroller.Damping(rolling))
 
 
-def test_damping_from_recorded_speeds(tmp_path):
+def test_damping_from_recorded_speeds(tmp_path, caplog):
     """From a file, whose clock was started at an unknown time; a speed of rolling resistance falls as exp(-c t / m)."""
     clock, path = np.array([1.0, 1.25, 1.5, 2.0]), tmp_path / "ride.csv"
     speeds = stroller.simulate(scene(), LAUNCH, 1.1, times=clock - 0.9).speed
@@ -25,6 +26,10 @@ def test_damping_from_recorded_speeds(tmp_path):
     found = stroller.identify(scene(), data, {"rolling": 1.0, "t0": 0.8})
     assert found.status == "converged"
     assert_close(list(found.estimates.values()), [2.0, 0.9], rtol=1e-4)
+    with jax.log_compiles():
+        again = stroller.identify(scene(), data, {"rolling": 1.5, "t0": 0.85}, tolerance=1e-7)
+    assert not [text for text in caplog.messages if "Finished XLA compilation" in text]
+    assert_close(list(again.estimates.values()), [2.0, 0.9], rtol=1e-4)
 
 
 @pytest.mark.slow

@@ -48,6 +48,27 @@ def test_the_density_is_that_of_bayes_in_the_coordinates():
     assert_close(several, [gradient, gradient], rtol=1e-12)
 
 
+def test_densities_that_differ_in_numbers_share_a_program(caplog):
+    """The same with other starts, bounds and priors has other values, and compiles nothing."""
+
+    def density(start, lower, slope, prior, data):
+        free = {"height": Free(start, lower), "slope": Free(0.0, prior=slope)}
+        return LogDensity.of(line, data, free, {"height": prior})
+
+    at, first = np.zeros(2), density(1.5, 0.0, (-2.0, 1.0), PRIOR, measured())
+    first.value_and_gradient(at)
+    other = density(1.7, 0.1, (-3.0, 2.0), (1.1, 0.2), measured(seed=1))
+    with jax.log_compiles():
+        value, gradient = other.value_and_gradient(at)
+    assert not [text for text in caplog.messages if "Finished XLA compilation" in text]
+    # At the coordinate 0 the height is 1 above its bound, the slope is where it started.
+    residuals = (1.1 + 0.0 * X - np.asarray(measured(seed=1).value)) / ERROR
+    expected = -0.5 * np.sum(residuals**2) - X.size * np.log(ERROR)
+    expected += scipy.stats.norm.logpdf(1.1, 1.1, 0.2) + scipy.stats.norm.logpdf(0.0, -3.0, 2.0) + np.log(2.0)
+    assert_close(value, expected, rtol=1e-12)
+    assert_close(gradient[0], -np.sum(residuals) / ERROR + 1.0, rtol=1e-12)
+
+
 @pytest.fixture(scope="module")
 def draws():
     data, free = measured(), {"height": 0.5, "slope": -2.0}
