@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.integration import ImplicitMidpoint, Settings
+from nonholonomic.integration import LOOSEST, ImplicitMidpoint, Settings
 from nonholonomic.progress import Progress
 from nonholonomic.validation import Bound, as_known, is_traced, legal, nan_unless, require_all
 
@@ -121,7 +121,12 @@ def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.Ab
     # A run of illegal numbers might never reach its end, so it is not begun, unless its steps have a given length.
     begins = may | (ride.grid is not None)
     run_times = jnp.where(begins, times, 0.0)
-    begun = ride._replace(t1=jnp.where(begins, ride.t1, 0.0))
+    # Nor is its tolerance that of its block.
+    settings = ride.settings.with_tolerance(jnp.where(may, ride.settings.tolerance, LOOSEST))
+    begun = ride._replace(t1=jnp.where(begins, ride.t1, 0.0), settings=settings)
+    if adjoint is not None:
+        # Diffrax would differentiate the run that is not begun.
+        begun = begun._replace(**nan_unless(may, {"scene": ride.scene, "launch": ride.launch, "input": ride.input}))
     run = read_off(Recipe.of(ride), run_times, *traced_ride(begun, run_times, adjoint))
     stats = run.stats._replace(finished=run.stats.finished & may)
     return eqx.tree_at(lambda one: (one.t, one.stats), nan_unless(may, run), (times, stats))

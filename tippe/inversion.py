@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from nonholonomic.integration import (
     CROSSED,
+    LOOSEST,
     REACHED_END,
     AbstractProblem,
     Journey,
@@ -26,9 +27,6 @@ from .launch import Launch
 from .phases import Kind, StickSlip
 from .scene import Scene
 from .state import COS_THETA
-
-#: The greatest relative tolerance that is accepted.
-LOOSEST = 1e-2
 
 
 class InversionProblem(AbstractProblem):

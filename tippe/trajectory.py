@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import scale, sum_vectors
-from nonholonomic.integration import Followed, PhasedPath, Settings, explicit_tableau, follow
+from nonholonomic.integration import LOOSEST, Followed, PhasedPath, Settings, explicit_tableau, follow
 from nonholonomic.progress import Progress
 from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require_all
 from nonholonomic.xla_cpu import on_device
@@ -179,11 +179,19 @@ def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
-def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: Any, *options: Any) -> Any:
+def _legal_or_nan(
+    scene: Scene,
+    launch: Launch,
+    times: Any,
+    t1: Any,
+    tolerance: Any,
+    solver: diffrax.AbstractSolver | None,
+    adjoint: diffrax.AbstractAdjoint | None,
+) -> Trajectory | HybridTrajectory:
     """What `_traced` gives, or NaN and the status "illegal" where a traced number is out of range."""
     if times is None:
         # It raises the error that says so.
-        return _traced(scene, launch, times, t1, tolerance, *options)
+        return _traced(scene, launch, times, t1, tolerance, solver, adjoint)
     bounds = (
         *all_bounds(scene),
         *all_bounds(launch),
@@ -192,8 +200,12 @@ def _legal_or_nan(scene: Scene, launch: Launch, times: Any, t1: Any, tolerance: 
         *times_bounds(times, t1),
     )
     may = jnp.all(legal(bounds)) & jnp.all(jnp.diff(times) > 0.0)
-    # A run of illegal numbers might never reach its end, so it is given the horizon 0.
-    found = _traced(scene, launch, times, jnp.where(may, t1, 0.0), tolerance, *options)
+    # A run of illegal numbers might never reach its end, so it is given the horizon 0, and its tolerance is not its block's.
+    t1, tolerance = jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
+    if adjoint is not None:
+        # Diffrax would differentiate the run of no length.
+        scene, launch = nan_unless(may, (scene, launch))
+    found = _traced(scene, launch, times, t1, tolerance, solver, adjoint)
     status = jnp.where(may, found.status, STATUS.index("illegal"))
     return eqx.tree_at(lambda one: (one.t, one.status), nan_unless(may, found), (times, status))
 

@@ -42,6 +42,7 @@ from .runge_kutta import moved_state as moved_state
 from .runge_kutta import over_stages as over_stages
 from .samples import march_with_samples as march_with_samples
 from .settings import ABSOLUTE as ABSOLUTE
+from .settings import LOOSEST as LOOSEST
 from .settings import Settings as Settings
 from .settings import lanes_for as lanes_for
 from .single_run import Followed as Followed

@@ -13,6 +13,9 @@ from .oscillatory import Oscillatory8
 #: The absolute tolerance as a fraction of the relative one, in units of a problem's own magnitudes.
 ABSOLUTE = 0.1
 
+#: The greatest relative tolerance that is accepted.
+LOOSEST = 1e-2
+
 
 class Settings(eqx.Module):
     """How runs are integrated, whatever is asked of them.

@@ -152,15 +152,18 @@ def test_runs_are_vmapped_and_scene_numbers_too():
 def test_illegal_numbers_in_a_batch_of_rides_give_nothing_that_looks_right():
     """Numbers that constructors cannot look at: the ride has failed, and all that is read off is not a number."""
 
-    def ride(mass, steering, latitude, damping):
+    def ride(mass, steering, latitude, damping, tolerance):
         scene = Scene(Stroller(mass, 0.7, 0.4, 0.05), Sphere(2.0), Damping(damping), side="inside")
-        return stroller.simulate(scene, Launch((0.3, latitude), 0.5, 1.5, steering), 0.1, push, times=[0.0, 0.1])
+        launch, options = Launch((0.3, latitude), 0.5, 1.5, steering), {"times": [0.0, 0.1], "tolerance": tolerance}
+        return stroller.simulate(scene, launch, 0.1, push, **options)
 
-    good, columns = (1.7, 0.2, -0.6, 0.3), [(1.7, 0.2, -0.6, 0.3)]
-    for which, values in ((0, (-1.7, np.nan)), (1, (np.pi / 2,)), (2, (2.0,)), (3, (-0.3,))):
+    good = (1.7, 0.2, -0.6, 0.3, 1e-9)
+    columns = [good]
+    for which, values in ((0, (-1.7, np.nan)), (1, (np.pi / 2,)), (2, (2.0,)), (3, (-0.3,)), (4, (-1.0, np.nan))):
         columns += [tuple(value if i == which else one for i, one in enumerate(good)) for value in values]
     rides = jax.jit(jax.vmap(ride))(*jnp.array(columns).T)
-    assert rides.stats.finished.tolist() == [True] + 5 * [False]
+    assert rides.stats.finished.tolist() == [True] + 7 * [False]
+    assert jax.vmap(ride)(*jnp.array(columns).T[:, :0]).speed.shape == (0, 2)
     for read in (rides.position, rides.steering, rides.energy, rides.work, rides.normal_force, rides.load):
         assert np.all(np.isfinite(read[0]))
         assert np.all(np.isnan(read[1:]))
