@@ -113,6 +113,18 @@ def require(
             raise ValueError(message + remark)
 
 
+def require_whole(value: Any, name: str, at_least: int) -> None:
+    """Raise `ValueError` unless this is a whole number of at least so much."""
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < at_least:
+        raise ValueError(f"{name} = {value!r} must be a whole number of at least {at_least}")
+
+
+def require_flag(value: Any, name: str) -> None:
+    """Raise `ValueError` unless this is true or false; a word such as "no" would count as true."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} = {value!r} must be True or False")
+
+
 def require_folder(path: Path, name: str) -> None:
     """Make a folder if it is not there, and raise `OSError` unless files can be written in it."""
     try:

@@ -98,6 +98,7 @@ def identify(
 
     ```
     """
+    generic.check_search(starts, spread, seed, max_steps, progress)
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
     data = tuple(data) if isinstance(data, list | tuple) else (data,)

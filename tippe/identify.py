@@ -96,6 +96,7 @@ def identify(
 
     ```
     """
+    generic.check_search(starts, spread, seed, max_steps, progress)
     data = checked_data(scene, data, tolerance, "identify with slopes = 'exact'" if slopes == "exact" else None)
     unknowns = unknowns_of(scene, data, free)
     measurements, labels, seen = generic.joined(data)

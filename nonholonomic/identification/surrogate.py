@@ -54,6 +54,8 @@ class Surrogate(eqx.Module):
             raise ValueError(
                 f"covariance must be finite and of shape {(numbers, numbers)}: the data do not determine all numbers"
             )
+        if np.shape(centre) != (numbers,):
+            raise ValueError(f"centre = {centre!r} must be of shape {(numbers,)}")
         series, open_ = np.asarray(density.measurements.series), np.asarray(density.measurements.estimated)
         sizes = [math.sqrt(0.5 / np.sum(open_ & (series == one))) for one in density.open_series]
         root = np.zeros((numbers + len(sizes),) * 2)

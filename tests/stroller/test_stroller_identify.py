@@ -48,6 +48,8 @@ def test_what_cannot_be_fitted_is_refused():
     for free, message in (({"drag": 1.0}, "must be one of"), ({"wheelbase": -1.0}, "wheelbase")):
         with pytest.raises(ValueError, match=message):
             stroller.identify(scene(), data, free)
+    with pytest.raises(ValueError, match="starts = 0 must be"):
+        stroller.identify(scene(), "no data", {"wheelbase": 1.0}, starts=0)
     with pytest.raises(ValueError, match="must be a Recording"):
         stroller.identify(scene(), 1.0, {"wheelbase": 1.0})
     with pytest.raises(ValueError, match="quantity = 'theta'"):

@@ -180,6 +180,12 @@ def test_bad_unknowns_are_refused_before_anything_runs(rutstam_scene, free, mess
         tippe.identify(rutstam_scene, 3.0, {"mu": 0.2})
 
 
+def test_how_to_search_is_checked_before_the_data_are(rutstam_scene):
+    for change, message in (({"starts": 0}, "starts = 0"), ({"progress": 1}, "progress = 1 must be True or False")):
+        with pytest.raises(ValueError, match=message):
+            tippe.identify(rutstam_scene, "no data", {"mu": 0.2}, **change)
+
+
 @pytest.mark.parametrize(
     ("phases", "message"),
     [

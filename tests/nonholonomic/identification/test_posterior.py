@@ -112,6 +112,24 @@ def test_a_single_unknown_is_drawn_profiled_and_shown_like_several():
     assert [axes.get_xlabel() for axes in fit.plot().axes].count("height") == 1
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"chains": 1}, "chains = 1 must be a whole number of at least 2"),
+        ({"draws": 1}, "draws = 1 must be"),
+        ({"warmup": -1}, "warmup = -1 must be"),
+        ({"seed": 0.5}, "seed = 0.5 must be"),
+        ({"progress": "no"}, "progress = 'no' must be True or False"),
+        ({"centre": [0.0]}, r"centre = \[0.0\] must be of shape \(2,\)"),
+        ({"covariance": np.diag([1.0, np.inf])}, "covariance must be finite"),
+    ],
+)
+def test_draws_that_could_not_be_judged_are_refused_at_once(change, message):
+    density = LogDensity.of(line, measured(), {"height": 0.5, "slope": -2.0})
+    with pytest.raises(ValueError, match=message):
+        sample(**({"density": density, "centre": np.zeros(2), "covariance": np.eye(2)} | change))
+
+
 def test_unknown_errors_are_drawn_too():
     value = 1.0 + 0.3 * np.random.default_rng(4).normal(size=60)
     data = Measurements(value, 1.0, estimated=True)
