@@ -33,6 +33,11 @@ def as_number(value: Any) -> Float[Array, "..."]:
         return value
 
 
+def as_number_or_none(value: Any) -> Float[Array, "..."] | None:
+    """As `as_number`, for a number that may be left out."""
+    return None if value is None else as_number(value)
+
+
 def as_known(value: Any) -> Float[Array, "..."]:
     """As `as_number`, but what is known stays known inside a transformation; `jax.jit` would trace the array."""
     if any(is_traced(leaf) for leaf in jax.tree.leaves(value)):
@@ -116,6 +121,7 @@ def require_whole(value: Any, name: str, at_least: int) -> None:
         raise ValueError(f"{name} = {value!r} must be a whole number of at least {at_least}")
 
 
+<<<<<<< HEAD
 def require_increasing(values: Any, name: str) -> None:
     """Raise `ValueError` unless this is a list of one number or more, each greater than the one before it.
 
@@ -135,6 +141,12 @@ def require_increasing(values: Any, name: str) -> None:
             f"{name}[{k}] = {shown(known[k])} must be greater than {name}[{k - 1}] = {shown(known[k - 1])}: "
             f"{name} must increase"
         )
+=======
+def require_flag(value: Any, name: str) -> None:
+    """Raise `ValueError` unless this is true or false; a word such as "no" would count as true."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} = {value!r} must be True or False")
+>>>>>>> w_ident
 
 
 def require_folder(path: Path, name: str) -> None:

@@ -11,6 +11,10 @@ from nonholonomic import identification as generic
 from nonholonomic.identification import Free, Identification, of_data, predicted
 from nonholonomic.integration import tolerance_bound
 from nonholonomic.parameters import numbers, with_numbers
+<<<<<<< HEAD
+=======
+from nonholonomic.validation import as_number, require
+>>>>>>> w_ident
 
 from .recording import Recording
 from .scene import Scene
@@ -26,7 +30,7 @@ class SceneModel(eqx.Module):
     scene: Scene
     data: tuple[Recording, ...]
     seen: Int[Array, " n"]
-    tolerance: float = eqx.field(static=True)
+    tolerance: Float[Array, ""] = eqx.field(converter=as_number)
 
     def __call__(self, parameters: dict[str, Float[Array, " rows"]]) -> Float[Array, "rows n"]:
         rows = len(next(iter(parameters.values())))
@@ -98,6 +102,7 @@ def identify(
 
     ```
     """
+    generic.check_search(starts, spread, seed, max_steps, progress)
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
     data = tuple(data) if isinstance(data, list | tuple) else (data,)

@@ -97,7 +97,7 @@ def sweep(
     - `t1`: end of every ride [s].
     - `axes`: full name of a parameter -> values, such as `{"launch.speed": [1.0, 2.0], "scene.surface.polar": [0.8, 0.9]}`; the
       parts of the place are `"launch.place[0]"` and `"launch.place[1]"`, the parameters of an input that is a module are
-      under `"input."`. The first axis varies slowest.
+      under `"input."`. The first axis varies slowest; without any, `{}`, the table has a single ride.
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`.

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 from nonholonomic import identification as generic
 from nonholonomic.identification import Free, Identification, of_data
 from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.validation import as_number
 
 from .cells import driver_of
 from .inversion import check_run, check_smooth
@@ -28,7 +29,7 @@ class SceneModel(eqx.Module):
     scene: Scene
     data: tuple[Any, ...]
     seen: Int[Array, " n"]
-    tolerance: float = eqx.field(static=True)
+    tolerance: Float[Array, ""] = eqx.field(converter=as_number)
 
     def __call__(self, parameters: Values) -> Float[Array, "rows n"]:
         rows = len(next(iter(parameters.values())))
@@ -95,6 +96,7 @@ def identify(
 
     ```
     """
+    generic.check_search(starts, spread, seed, max_steps, progress)
     data = checked_data(scene, data, tolerance, "identify with slopes = 'exact'" if slopes == "exact" else None)
     unknowns = unknowns_of(scene, data, free)
     measurements, labels, seen = generic.joined(data)

@@ -10,6 +10,7 @@ import numpy as np
 
 from nonholonomic.integration import Settings, explicit_tableau
 from nonholonomic.sweeps import Table, Variable, sweep
+from nonholonomic.validation import require_flag
 
 from .cells import TIMES, CellRuns, check_differentiable, driver_of
 from .inversion import check_event
@@ -102,8 +103,7 @@ def inversion_table(
     ```
     """
     check_event(angle, crossing, ("first", "last", "both"))
-    if not isinstance(errors, bool):
-        raise ValueError(f"errors = {errors!r} must be True or False")
+    require_flag(errors, "errors")
     if method not in ("ensemble", "diffrax"):
         raise ValueError(f"method = {method!r} must be 'ensemble' or 'diffrax'")
     if method == "diffrax" and sensitivities:

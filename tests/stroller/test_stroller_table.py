@@ -68,6 +68,14 @@ def test_table_is_labelled_and_its_file_opens_in_xarray(bowl):
     np.testing.assert_array_equal(Table.load(path).x, table.x)
 
 
+def test_a_sweep_without_axes_is_a_single_ride():
+    """Straight on, on a level plane without friction, as far as speed times time."""
+    table = stroller.sweep(Scene(BODY), Launch((0.0, 0.0), 0.0, 2.0), 0.5, axes={})
+    assert table.shape == ()
+    assert table.status == "completed"
+    np.testing.assert_allclose([table.x, table.y, table.end_speed], [1.0, 0.0, 2.0], atol=1e-12)
+
+
 @pytest.mark.newest
 def test_lost_contact_is_marked_with_its_time():
     """Outside a sphere from its top: contact ends at cos = 2/3 (1 + v0^2 / (2 g R)), the time is that of `simulate`."""
