@@ -1,6 +1,7 @@
 """Design: which offset and inertia turn a top over fastest at a given spin, with a least normal force kept throughout?
 
-Sequential quadratic programming from the best tops of a grid, then the conditions of an optimum and the tops around it.
+Sequential quadratic programming from the best tops of a grid, then the tops around it: beside the best top another dip of the
+normal force becomes the deepest, so slopes alone do not show that it is the best.
 """
 
 import diffrax
@@ -45,14 +46,11 @@ def main() -> None:
         fits.append(minimize(lambda at: here(at)[0], start, method="SLSQP", **options).x)
         print("from", start.round(3), "to", fits[-1].round(4), "time and force", np.round(here(fits[-1]), 4))
     best = min(fits, key=lambda at: here(at)[0] if here(at)[1] > LEAST - 1e-4 else np.inf)
-    (time, force), (by_time, by_force) = np.asarray(here(best)), np.asarray(slopes(best))
-    price = by_time @ by_force / (by_force @ by_force)
+    time, force = np.asarray(here(best))
     print(f"fastest: offset / radius {best[0]:.4f}, I1 / I3 {best[1]:.4f}: {time:.3f} s, least force {force:.4f} mg")
-    rest = np.linalg.norm(by_time - price * by_force) / np.linalg.norm(by_time)
-    print(f"{LEAST} was asked: {0.01 * price:.3f} s for 0.01. The limit leaves {rest:.1%} of the time's slope open;")
     turn = 2.0 * np.pi * np.arange(64) / 64.0
     times, forces = np.asarray(many(best + 0.005 * np.stack([np.cos(turn), np.sin(turn)], axis=-1))).T
-    print(f"of 64 tops around it {np.sum((times < time) & (forces >= LEAST))} are faster and keep the limit.")
+    print(f"Of 64 tops around it {np.sum((times < time) & (forces >= LEAST))} are faster and keep the limit.")
 
 
 if __name__ == "__main__":

@@ -5,10 +5,12 @@ processor and set of XLA flags, because code compiled for one processor may not 
 because a process that is killed while writing leaves half an entry, which JAX would warn about forever.
 """
 
+import errno
 import hashlib
 import logging
 import os
 import platform
+import uuid
 import warnings
 import zlib
 from importlib.metadata import version
@@ -18,11 +20,14 @@ from typing import Any
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
-#: Empty file whose modification time says when the entries were last checked, and the file that replaces it.
-LOOKED_AT, LOOKING = ".looked_at", ".looking"
+#: The file that tells which entries were found sound, a line for each.
+LOOKED_AT = ".looked_at"
 
-#: How coarse a file system's clock may be [s].
-COARSE = 2.0
+#: What forbids the cache, as the value of `NONHOLONOMIC_CACHE`.
+OFF = ("0", "off", "false", "no")
+
+#: How writing fails where there is no room: the disk is full, or the user's share of it, or a file may not be so long.
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 _log = logging.getLogger(__name__)
 
@@ -31,26 +36,38 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
     """Keep compiled programs on disk, where later processes find them.
 
     Call it before the first computation. A folder that was already chosen, by JAX's own `jax_compilation_cache_dir` or by an
-    earlier call, is kept unless another is given. An entry that is cut short or damaged is removed and costs a compilation
-    (entries compressed by zstandard, where that package is installed, are left for JAX to refuse). Nothing else is ever
-    removed: delete the folder to reclaim its space. It holds code, so it should be where nobody else can write.
+    earlier call, is kept unless another is given. With one of JAX's own its limits stay: unless
+    `jax_persistent_cache_min_compile_time_secs` is 0, programs that compile in less than a second are not kept.
+
+    An entry that was written since the last call, in any process, is looked at once: if it does not decompress, because its
+    writer was killed or its copy is damaged, it is removed, and costs one compilation. What cannot be seen so stays, and costs
+    a compilation in every process: an entry that the disk damages later without a trace, one that decompresses to something
+    else, and a bad one compressed by zstandard, which JAX uses where that package is installed. Nothing else is ever removed:
+    delete the folder to be rid of such entries, and to reclaim its space. It holds code, so it should be where nobody else
+    can write.
 
     **Arguments:** `folder`: where to keep them, by default `nonholonomic` in the user's cache folder (`XDG_CACHE_HOME`, or
     `~/.cache`). In it there is a folder for every version of jaxlib, kind of processor and set of XLA flags.
 
-    **Returns:** the folder in use; `None` if `NONHOLONOMIC_CACHE=0` forbids it or it cannot be written, which is logged as a
-    warning.
+    **Returns:** the folder in use; `None` if `NONHOLONOMIC_CACHE` (0, off, false or no) forbids it or it cannot be written,
+    which is logged as a warning. So is a full disk, from which programs are still read.
+
+    **Raises:** `ValueError` for a folder that is no path.
 
     **Example:**
 
     ```
     >>> import tempfile
     >>> import nonholonomic
-    >>> folder = nonholonomic.enable_compilation_cache(tempfile.mkdtemp())  # doctest: +SKIP
+    >>> folder = nonholonomic.enable_compilation_cache(tempfile.mkdtemp())
+    >>> folder.name.split("-")[0], folder.is_dir()
+    ('jaxlib', True)
 
     ```
     """
-    if os.environ.get("NONHOLONOMIC_CACHE") == "0":
+    if folder is not None and (not isinstance(folder, str | os.PathLike) or folder == ""):
+        raise ValueError(f"folder = {folder!r} must be a path")
+    if os.environ.get("NONHOLONOMIC_CACHE", "").strip().lower() in OFF:
         return None
     settings: Any = jax.config
     chosen = settings.jax_compilation_cache_dir
@@ -107,22 +124,39 @@ def processor() -> str:
 
 
 def remove_damaged(folder: Path) -> None:
-    """Remove the entries that do not decompress, among those changed since the last check.
+    """Remove the entries that do not decompress, among those written since they were last looked at.
 
-    **Raises:** `OSError` if the folder cannot be written.
+    **Raises:** `OSError` if the folder cannot be written; a full disk is only logged.
     """
-    looking, looked_at = folder / LOOKING, folder / LOOKED_AT
-    looking.write_bytes(b"")
-    last = looked_at.stat().st_mtime - COARSE if looked_at.exists() else 0.0
+    looked_at = folder / LOOKED_AT
+    known = set(looked_at.read_bytes().split(b"\n")) if looked_at.exists() else set()
+    found = []
     for entry in folder.glob("*-cache"):
         # Another process may remove one, too.
         try:
-            if entry.stat().st_mtime >= last and not sound(entry.read_bytes()):
+            line = _line(entry)
+            if line in known or sound(entry.read_bytes()):
+                found.append(line)
+            else:
                 entry.unlink()
         except FileNotFoundError:
             pass
-    # What is written from here on is later than `looking`.
-    os.replace(looking, looked_at)
+    # Under a name of its own: of processes that start together each writes one, and the last one stays.
+    looking = folder / f"{LOOKED_AT}-{uuid.uuid4().hex}"
+    try:
+        looking.write_bytes(b"\n".join([b"sound:", *found]))
+        os.replace(looking, looked_at)
+    except OSError as error:
+        looking.unlink(missing_ok=True)
+        if error.errno not in NO_ROOM:
+            raise
+        _log.warning("no more compiled programs are kept in %s: %s", folder, error)
+
+
+def _line(entry: Path) -> bytes:
+    """An entry's name, and what changes when it is written, even if its modification time is set back: that of its state."""
+    state = entry.stat()
+    return f"{entry.name} {state.st_size} {state.st_mtime_ns} {state.st_ctime_ns}".encode()
 
 
 def sound(entry: bytes) -> bool:

@@ -9,9 +9,10 @@ from jaxtyping import Array, Float, Int
 
 from nonholonomic import identification as generic
 from nonholonomic.identification import Free, Identification, of_data, predicted
+from nonholonomic.integration import tolerance_bound
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.progress import telling
-from nonholonomic.validation import require
+from nonholonomic.validation import as_number
 
 from .recording import Recording
 from .scene import Scene
@@ -27,7 +28,7 @@ class SceneModel(eqx.Module):
     scene: Scene
     data: tuple[Recording, ...]
     seen: Int[Array, " n"]
-    tolerance: float = eqx.field(static=True)
+    tolerance: Float[Array, ""] = eqx.field(converter=as_number)
 
     def __call__(self, parameters: dict[str, Float[Array, " rows"]]) -> Float[Array, "rows n"]:
         rows = len(next(iter(parameters.values())))
@@ -99,13 +100,14 @@ def identify(
 
     ```
     """
+    generic.check_search(starts, spread, seed, max_steps, progress)
     with telling("fitting", progress):
         if not isinstance(scene, Scene):
             raise ValueError(f"scene = {scene!r} must be a Scene")
         data = tuple(data) if isinstance(data, list | tuple) else (data,)
         if not data or not all(isinstance(one, Recording) for one in data):
             raise ValueError(f"data = {data!r} must be a Recording, or a list of them")
-        require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+        tolerance_bound(tolerance).require()
         for one in data:
             scene.check(one.launch)
         unknowns = _unknowns_of(scene, data, free)

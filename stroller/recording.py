@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from nonholonomic.identification import AbstractRecording, Quantities, as_quantity, read_columns
-from nonholonomic.validation import as_number
+from nonholonomic.validation import as_number, as_number_or_none
 
 from .input import Input
 from .launch import Launch
@@ -52,7 +52,7 @@ class Recording(AbstractRecording):
     quantity: str | tuple[str, ...] = eqx.field(static=True, default="position", converter=as_quantity)
     input: Input | None = None
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
-    student: float | None = None
+    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     quantities: ClassVar[Quantities] = QUANTITIES
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from nonholonomic.derivatives import AbstractQuestion, VariationalProblem, ask, directions_by, in_groups
 from nonholonomic.integration import CROSSED, FAILED, Queue, Settings, crossing_time
 from nonholonomic.progress import telling
-from nonholonomic.validation import as_number, is_traced
+from nonholonomic.validation import as_number, is_traced, nan_unless
 
 from .inversion import InversionProblem, check_event, check_run, check_smooth, permitted
 from .launch import Launch
@@ -63,7 +63,9 @@ def extended_inversion_time(
     check_event(angle, "first")
     check_smooth(scene, "extended_inversion_time")
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
-    return ask(ExtendedQuestion(len(leaves) - 2, structure, any(is_traced(leaf) for leaf in leaves)), *leaves)
+    unchecked = any(is_traced(leaf) for leaf in leaves)
+    found = ask(ExtendedQuestion(len(leaves) - 2, structure, unchecked), *leaves)
+    return nan_unless(permitted(structure, unchecked, leaves)[0], found)
 
 
 class ExtendedQuestion(AbstractQuestion):
@@ -76,7 +78,8 @@ class ExtendedQuestion(AbstractQuestion):
     unchecked: bool = eqx.field(static=True)
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
-        return jnp.isnan(value)
+        # Every run has one. A select on NaN would make the derivative of a run that failed zero.
+        return jnp.zeros(jnp.shape(value), bool)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         return self._found((), self._problem(leaves[: self.movable], cells), leaves, cells)[0]

@@ -11,6 +11,7 @@ from nonholonomic import identification as generic
 from nonholonomic.identification import Free, Identification, of_data
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.progress import telling
+from nonholonomic.validation import as_number
 
 from .cells import driver_of
 from .inversion import check_run, check_smooth
@@ -29,7 +30,7 @@ class SceneModel(eqx.Module):
     scene: Scene
     data: tuple[Any, ...]
     seen: Int[Array, " n"]
-    tolerance: float = eqx.field(static=True)
+    tolerance: Float[Array, ""] = eqx.field(converter=as_number)
 
     def __call__(self, parameters: Values) -> Float[Array, "rows n"]:
         rows = len(next(iter(parameters.values())))
@@ -96,6 +97,7 @@ def identify(
 
     ```
     """
+    generic.check_search(starts, spread, seed, max_steps, progress)
     with telling("fitting", progress):
         data = checked_data(scene, data, tolerance, "identify with slopes = 'exact'" if slopes == "exact" else None)
         unknowns = unknowns_of(scene, data, free)

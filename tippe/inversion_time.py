@@ -30,7 +30,7 @@ from nonholonomic.integration import (
     traced_travel,
 )
 from nonholonomic.progress import telling
-from nonholonomic.validation import as_number, is_traced
+from nonholonomic.validation import as_number, is_traced, nan_unless
 
 from .cells import check_differentiable, driver_of
 from .inversion import InversionProblem, check_event, check_run, is_inverted, permitted
@@ -96,7 +96,8 @@ def inversion_time(
     unchecked = any(is_traced(leaf) for leaf in leaves)
     question = InversionQuestion if driver_of(scene).smooth else PhasedInversionQuestion
     # The last two leaves, horizon and tolerance, do not move the event.
-    return ask(question(len(leaves) - 2, structure, solver, crossing == "last", unchecked), *leaves)
+    found = ask(question(len(leaves) - 2, structure, solver, crossing == "last", unchecked), *leaves)
+    return nan_unless(permitted(structure, unchecked, leaves)[0], found)
 
 
 class InversionQuestion(AbstractQuestion):

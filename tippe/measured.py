@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.identification import AbstractRecording, Measurements, Quantities, as_quantity, predicted
 from nonholonomic.parameters import numbers, one_line, with_numbers
-from nonholonomic.validation import as_number, require
+from nonholonomic.validation import as_number, as_number_or_none, require
 
 from .extended_times import extended_inversion_time
 from .inversion import check_event
@@ -66,9 +66,9 @@ class InversionTimes(eqx.Module):
     time: Float[Array, "launches *two"] = eqx.field(converter=as_number)
     error: Float[Array, "..."] = eqx.field(converter=as_number)
     t1: Float[Array, ""] = eqx.field(converter=as_number)
-    until: Any = None
+    until: Any = eqx.field(converter=as_number_or_none, default=None)
     angle: Float[Array, ""] = eqx.field(converter=as_number, default=0.95 * math.pi)
-    student: float | None = None
+    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     units: ClassVar[dict[str, str]] = {"time": "s", "error": "s", "t1": "s", "until": "s", "angle": "rad"}
 
     def __repr__(self) -> str:
@@ -175,7 +175,7 @@ class Recording(AbstractRecording):
     launch: Launch
     quantity: str | tuple[str, ...] = eqx.field(static=True, default="theta", converter=as_quantity)
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
-    student: float | None = None
+    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     quantities: ClassVar[Quantities] = QUANTITIES
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from nonholonomic.integration import Settings, explicit_tableau
 from nonholonomic.sweeps import Table, Variable, sweep
+from nonholonomic.validation import require_flag
 
 from .cells import TIMES, CellRuns, check_differentiable, driver_of
 from .inversion import check_event
@@ -102,8 +103,7 @@ def inversion_table(
     ```
     """
     check_event(angle, crossing, ("first", "last", "both"))
-    if not isinstance(errors, bool):
-        raise ValueError(f"errors = {errors!r} must be True or False")
+    require_flag(errors, "errors")
     if method not in ("ensemble", "diffrax"):
         raise ValueError(f"method = {method!r} must be 'ensemble' or 'diffrax'")
     if method == "diffrax" and sensitivities:
@@ -160,7 +160,9 @@ class InversionJob(NamedTuple):
         found = runs.results(self.roots, columns, self.tolerance, count)
         if self.errors:
             coarse = runs._replace(slopes_by=[]).results(self.roots, columns, COARSER * self.tolerance, count)
-            agreed = (found["status"] == coarse["status"]) & (found["status"] != words.index("failed"))
+            # Two runs that ended before their answer agree on nothing.
+            silent = [words.index(word) for word in ("failed", "unresolved") if word in words]
+            agreed = (found["status"] == coarse["status"]) & ~np.isin(found["status"], silent)
             for name in runs.times:
                 alike = agreed & (np.isfinite(found[name]) == np.isfinite(coarse[name]))
                 found[f"{name}_error"] = time_error(found[name], coarse[name], alike)

@@ -84,6 +84,8 @@ def _batched(
 ) -> tuple[list[Array], list[int]]:
     """A batch of blocks is one block."""
     size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
+    if size == 0:
+        return [jnp.zeros((0, cells, *kind.shape), kind.dtype) for kind in kinds], [0] * len(kinds)
 
     def joined(leaf: Array, has_own: bool, axis: Any) -> Array:
         if axis is None:

@@ -14,7 +14,7 @@ from jax.extend.core import Literal
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from ..integration import AbstractProblem, Block, Outcome, Queue, Settings, with_crossing_times
+from ..integration import CROSSED, REACHED_END, AbstractProblem, Block, Outcome, Queue, Settings, with_crossing_times
 from ..xla_cpu import compiled_alone
 from ._adjoint import march_with_gradient
 from .variation import VariationalProblem, in_groups, slopes_by_variations
@@ -61,7 +61,9 @@ def march_with_slopes(
         outcome = with_crossing_times(problem, there)
     # At the very start the event is there at once, whatever moves.
     happened = jnp.isfinite(outcome.crossing_time) & (there.end_time > 0.0)
-    return outcome, [jnp.where(happened, slope, 0.0) for slope in slopes]
+    # The run with its variations takes other steps: where it does not arrive, there is no slope.
+    arrived = there.status == (REACHED_END if passes else CROSSED)
+    return outcome, [jnp.where(happened, jnp.where(arrived, slope, jnp.nan), 0.0) for slope in slopes]
 
 
 def _slopes_by_adjoint(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..progress import telling
-from ..validation import require
+from ..validation import require, require_flag, require_whole
 from .levenberg_marquardt import Ends, minimise
 from .likelihood import Measurements, estimated_errors, muted
 from .problem import Linearised, Problem, linearise
@@ -75,18 +75,15 @@ def identify(
     >>> print(f"{fit.estimates['half_life']:.2f} +- {fit.standard_errors['half_life']:.2f}, good: {fit.verdict.good}")
     0.99 +- 0.03, good: True
     """
-    unknowns = as_free(free)
+    check_search(starts, spread, seed, max_steps, progress)
+    step, unknowns = step_of(slopes), as_free(free)
     if not isinstance(measurements, Measurements) or measurements.value.ndim != 1:
         raise ValueError(f"measurements = {measurements!r} must be Measurements of shape (n,)")
-    for name, value, least in (("starts", starts, 1), ("max_steps", max_steps, 1)):
-        if not isinstance(value, int | np.integer) or value < least:
-            raise ValueError(f"{name} = {value!r} must be a whole number of at least {least}")
-    require(spread, "spread", above=1.0)
     count = measurements.value.size
     labels = tuple(f"#{i + 1}" for i in range(count)) if labels is None else tuple(labels)
     if len(labels) != count:
         raise ValueError(f"labels must be {count}, one for each measurement, not {len(labels)}")
-    problem = Problem(model, tuple(unknowns.items()), step_of(slopes))
+    problem = Problem(model, tuple(unknowns.items()), step)
     with telling("fitting", progress):
         begins = draw_starts(unknowns, starts, spread, seed)
         ends, there = _fitted(problem, begins, measurements, max_steps, progress)
@@ -132,6 +129,14 @@ def _fitted(
         return np.where(better.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
 
     return jax.tree.map(chosen, others, ends), jax.tree.map(chosen, by_parts, there)
+
+
+def check_search(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: Any) -> None:
+    """Raise `ValueError` unless these are as `identify` takes them: a model checks them before it prepares its data."""
+    for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("max_steps", max_steps, 1)):
+        require_whole(value, name, least)
+    require(spread, "spread", above=1.0)
+    require_flag(progress, "progress")
 
 
 def step_of(slopes: str) -> float | None:

@@ -8,7 +8,6 @@ Source: Madsen, Nielsen and Tingleff, "Methods for non-linear least squares prob
 scaling is More's (Lecture Notes in Mathematics 630 (1978) 105).
 """
 
-import math
 from typing import Any, NamedTuple
 
 import jax
@@ -80,7 +79,7 @@ def minimise(
     rows, unknowns = at.shape
     measurements = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (rows, leaf.shape[-1])), measurements)
     moving = np.array([k for k in range(unknowns) if k != held], int)
-    bounded = [math.isfinite(one.lower) or math.isfinite(one.upper) for _, one in problem.free]
+    bounded = [one.has_lower or one.has_upper for one in problem.unknowns]
     reach = np.where(bounded, FARTHEST, np.inf)[moving]
     done, steps = np.zeros(rows, bool), np.zeros(rows, int)
     with Progress(rows, "fit", shown=progress) as shown:

@@ -32,7 +32,7 @@ class LogDensity(eqx.Module):
 
     problem: Problem
     measurements: Measurements
-    priors: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+    priors: dict[str, Any]
     open_series: tuple[int, ...] = eqx.field(static=True)
 
     def __repr__(self) -> str:
@@ -62,7 +62,7 @@ class LogDensity(eqx.Module):
                     )
                 require(prior[1], f"standard deviation of the prior of {name}", above=0.0)
         series, open_ = np.asarray(measurements.series), np.asarray(measurements.estimated)
-        kept = tuple((name, prior if callable(prior) else tuple(map(float, prior))) for name, prior in given.items())
+        kept = {name: _as_leaves(prior) for name, prior in given.items()}
         return cls(
             Problem(model, tuple(unknowns.items())), measurements, kept, tuple(np.unique(series[open_]).tolist())
         )
@@ -70,24 +70,24 @@ class LogDensity(eqx.Module):
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the unknowns; those of errors are numbered by their series."""
-        return (*(name for name, _ in self.problem.free), *(f"error[{k}]" for k in self.open_series))
+        return (*self.problem.names, *(f"error[{k}]" for k in self.open_series))
 
     @property
     def start(self) -> Float[Array, " unknowns"]:
         """The coordinates from which to start."""
-        values = [float(one.coordinate(one.start)) for _, one in self.problem.free]
+        values = [float(one.coordinate(one.start)) for one in self.problem.unknowns]
         return jnp.array([*values, *(0.0 for _ in self.open_series)])
 
     def values(self, coordinates: Float[Array, "... unknowns"]) -> dict[str, Float[Array, "..."]]:
         """The unknowns at some coordinates: name -> (...,); of the errors, the factor on their first guess."""
-        numbers = len(self.problem.free)
+        numbers = len(self.problem.names)
         found = self.problem.values(coordinates[..., :numbers])
         errors = jnp.exp(coordinates[..., numbers:])
         return dict(zip(self.names, jnp.moveaxis(jnp.concatenate([found, errors], axis=-1), -1, 0), strict=True))
 
     def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
         """What the model predicts for every measurement, at several coordinates."""
-        return self.problem.predict(coordinates[:, : len(self.problem.free)])
+        return self.problem.predict(coordinates[:, : len(self.problem.names)])
 
     @telling("simulating")
     def replicate(self, coordinates: Float[Array, "rows unknowns"], seed: int = 0) -> Float[np.ndarray, "rows n"]:
@@ -118,17 +118,17 @@ class LogDensity(eqx.Module):
 
     def _with_errors(self, coordinates: Float[Array, " unknowns"]) -> Measurements:
         errors = self.measurements.error
-        for coordinate, series in zip(coordinates[len(self.problem.free) :], self.open_series, strict=True):
+        for coordinate, series in zip(coordinates[len(self.problem.names) :], self.open_series, strict=True):
             own = self.measurements.estimated & (self.measurements.series == series)
             errors = jnp.where(own, errors * jnp.exp(coordinate), errors)
         return self.measurements.with_errors(errors)
 
     def _log_prior(self, coordinates: Float[Array, " unknowns"]) -> Float[Array, ""]:
         """The log density of the priors in the coordinates: that of a parameter, and how the coordinate stretches it."""
-        priors, total = dict(self.priors), jnp.zeros(())
-        for k, (name, free) in enumerate(self.problem.free):
-            if (prior := priors.get(name)) is not None:
-                value, slope = jax.value_and_grad(free.value)(coordinates[k])
+        total = jnp.zeros(())
+        for k, (name, one) in enumerate(self.problem.free):
+            if (prior := self.priors.get(name)) is not None:
+                value, slope = jax.value_and_grad(one.value)(coordinates[k])
                 total += (prior(value) if callable(prior) else _normal(value, *prior)) + jnp.log(jnp.abs(slope))
         return total
 
@@ -144,6 +144,13 @@ def _value_and_gradient(density: LogDensity, coordinates: Float[Array, "*batch u
     return function(coordinates) if coordinates.ndim == 1 else jax.vmap(function)(coordinates)
 
 
-def _normal(value: Float[Array, ""], mean: float, deviation: float) -> Float[Array, ""]:
+def _as_leaves(prior: Prior) -> Any:
+    """A prior whose numbers are handed to compiled programs, and whose function, if it is one, is part of them."""
+    if not callable(prior):
+        return np.asarray(prior, float)
+    return prior if isinstance(prior, eqx.Module) else jax.tree_util.Partial(prior)
+
+
+def _normal(value: Float[Array, ""], mean: Float[Array, ""], deviation: Float[Array, ""]) -> Float[Array, ""]:
     """Logarithm of the normal density. `jax.scipy.stats` has it too, and takes 0.15 s to import."""
-    return -0.5 * ((value - mean) / deviation) ** 2 - math.log(deviation * math.sqrt(2.0 * math.pi))
+    return -0.5 * ((value - mean) / deviation) ** 2 - jnp.log(deviation * math.sqrt(2.0 * math.pi))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .likelihood import Measurements
-from .unknown import Free
+from .unknown import Free, Unknown
 
 Rows = Float[np.ndarray, "rows unknowns"]
 
@@ -19,29 +19,34 @@ class Problem(eqx.Module):
     """A model and its free parameters.
 
     - `model`: parameters, name -> (rows,), to predictions (rows, n).
-    - `free`: name -> `Free`, as pairs.
+    - `names`, `unknowns`: of the free parameters; `free` has both, as pairs.
     - `step`: `None` for derivatives by automatic differentiation, forwards; otherwise the coordinates are moved by so much
       either way, and the model need not be differentiable; nor traceable, if it has `on_host = True`.
     """
 
     model: Callable[[dict[str, Float[Array, " rows"]]], Float[Array, "rows n"]]
-    free: tuple[tuple[str, Free], ...] = eqx.field(static=True)
-    step: float | None = eqx.field(static=True, default=None)
+    names: tuple[str, ...] = eqx.field(static=True)
+    unknowns: tuple[Unknown, ...]
+    step: float | None = eqx.field(static=True)
+
+    def __init__(self, model: Callable[..., Any], free: tuple[tuple[str, Free], ...], step: float | None = None):
+        self.model, self.step = model, step
+        self.names = tuple(name for name, _ in free)
+        self.unknowns = tuple(Unknown.of(one) for _, one in free)
+
+    @property
+    def free(self) -> tuple[tuple[str, Unknown], ...]:
+        """The free parameters, each with its name."""
+        return tuple(zip(self.names, self.unknowns, strict=True))
 
     def values(self, coordinates: Float[Array, "... unknowns"]) -> Float[Array, "... unknowns"]:
         """The parameters at given coordinates."""
-        return jnp.stack([one.value(coordinates[..., k]) for k, (_, one) in enumerate(self.free)], axis=-1)
+        return jnp.stack([one.value(coordinates[..., k]) for k, one in enumerate(self.unknowns)], axis=-1)
 
     def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
         """What the model predicts in every row."""
         values = self.values(coordinates)
-        return self.model({name: values[:, k] for k, (name, _) in enumerate(self.free)})
-
-    def prior(self, coordinates: Float[Array, " unknowns"]) -> Float[Array, " priors"]:
-        """Residuals of the priors, in one row."""
-        priors = [(k, *one.prior) for k, (_, one) in enumerate(self.free) if one.prior is not None]
-        values = self.values(coordinates)
-        return jnp.array([(values[k] - mean) / deviation for k, mean, deviation in priors])
+        return self.model({name: values[:, k] for k, name in enumerate(self.names)})
 
 
 class Linearised(NamedTuple):
@@ -146,7 +151,7 @@ def linearise(problem: Problem, coordinates: Any, measurements: Measurements, as
     if prediction.shape != wanted:
         raise ValueError(f"model must predict {wanted} for {wanted[0]} sets, not {prediction.shape}")
     residual, by_prediction, root = map(np.asarray, _residuals(measurements, prediction))
-    prior, by_coordinate = map(np.asarray, _priors(problem.free, jnp.asarray(coordinates, float)))
+    prior, by_coordinate = map(np.asarray, _priors(problem.unknowns, jnp.asarray(coordinates, float)))
     return Linearised(
         prediction, residual, by_prediction[..., None] * slopes, root[..., None] * slopes, prior, by_coordinate
     )
@@ -160,11 +165,11 @@ def _residuals(measurements: Measurements, prediction: Float[Array, "rows n"]) -
 
 
 @eqx.filter_jit
-def _priors(free: tuple[tuple[str, Free], ...], coordinates: Float[Array, "rows unknowns"]) -> tuple[Array, Array]:
+def _priors(unknowns: tuple[Unknown, ...], coordinates: Float[Array, "rows unknowns"]) -> tuple[Array, Array]:
     """Residuals of the priors, and their slopes by the coordinates."""
-    problem = Problem(_nothing, free)
-    return jax.vmap(problem.prior)(coordinates), jax.vmap(jax.jacfwd(problem.prior))(coordinates)
 
+    def of(row: Float[Array, " unknowns"]) -> Float[Array, " priors"]:
+        given = [(one.value(row[k]), *one.prior) for k, one in enumerate(unknowns) if one.prior is not None]
+        return jnp.array([(value - mean) / deviation for value, mean, deviation in given])
 
-def _nothing(_: Any) -> Any:
-    """The model of a problem that has none."""
+    return jax.vmap(of)(coordinates), jax.vmap(jax.jacfwd(of))(coordinates)

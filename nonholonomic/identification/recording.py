@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..parameters import numbers, one_line
-from ..validation import as_number, require
+from ..validation import as_number, as_number_or_none, require
 from .likelihood import Measurements
 
 #: Model times of samples before the launch: so close to it, and to one another [s], that nothing moves.
@@ -82,10 +82,10 @@ class AbstractRecording(eqx.Module):
     launch: Any
     times: Float[Array, " times"] = eqx.field(converter=as_number)
     value: Float[Array, "times *columns"] = eqx.field(converter=as_number)
-    error: Any = eqx.field(converter=lambda error: error if error is None else as_number(error))
+    error: Any = eqx.field(converter=as_number_or_none)
     quantity: eqx.AbstractVar[str | tuple[str, ...]]
     t0: eqx.AbstractVar[Float[Array, ""]]
-    student: eqx.AbstractVar[float | None]
+    student: eqx.AbstractVar[Float[Array, ""] | None]
     quantities: eqx.AbstractClassVar[Quantities]
     units: ClassVar[dict[str, str]] = {"times": "s", "t0": "s"}
 

@@ -144,7 +144,7 @@ class Identification:
         **Raises:** `ValueError` for a name that was not free.
         """
         k = self._place(name)
-        free = self.problem.free[k][1]
+        free = self.problem.unknowns[k]
         reach = deviations * np.sqrt(self.coordinate_covariance[k, k])
         with np.errstate(over="ignore"):
             return tuple(float(free.value(np.asarray(self.coordinates[k] + side * reach))) for side in (-1.0, 1.0))
@@ -163,9 +163,7 @@ class Identification:
         **Raises:** `ValueError` for a name that was not free, or without `values` for a parameter of infinite error.
         """
         k = self._place(name)
-        free = self.problem.free[k][1]
-        if len(self.problem.free) == 1:
-            raise ValueError(f"name = {name!r} is the only free parameter: there is nothing to fit again")
+        free = self.problem.unknowns[k]
         if values is None:
             if not np.isfinite(self.standard_errors[name]):
                 raise ValueError(f"values must be given for {name!r}, whose standard error is infinite")
@@ -179,7 +177,7 @@ class Identification:
         ends = minimise(self.problem, starts, self.measurements, held=k)
         found = np.asarray(self.problem.values(jnp.asarray(ends.coordinates)))
         deviance = deviance_of(self.problem, ends.coordinates, self.measurements) - self.deviance
-        others = {other: found[:, i] for i, (other, _) in enumerate(self.problem.free) if i != k}
+        others = {other: found[:, i] for i, other in enumerate(self.problem.names) if i != k}
         return Profile(values, deviance, others, ends.converged)
 
     @property
@@ -270,9 +268,7 @@ def identifiability(problem: Problem, estimates: Any, slopes: Any, jacobian: Any
     **Arguments:** `estimates`: (unknowns,); `slopes`: (unknowns,), of the parameters by their coordinates; `jacobian`: (n,
     unknowns), of the residuals by the coordinates.
     """
-    units = np.array(
-        [abs(x) if one.positive else one.unit for x, (_, one) in zip(estimates, problem.free, strict=True)]
-    )
+    units = np.array([abs(x) if one.positive else one.unit for x, one in zip(estimates, problem.unknowns, strict=True)])
     scaled = np.asarray(jacobian) * units / np.where(slopes == 0.0, 1.0, slopes)
     values, directions = _singular(scaled)
     words = tuple(_in_words(problem, direction) for direction in directions)
@@ -306,9 +302,9 @@ def summarise(
         for deviance, there in zip(deviances, converged, strict=True)
     )
     best = int(np.argmin(deviances))
-    here, names = ends[best], [name for name, _ in problem.free]
+    here, names = ends[best], problem.names
     values = np.asarray(problem.values(jnp.asarray(ends)))
-    slopes = np.array([float(jax.grad(one.value)(at)) for at, (_, one) in zip(here, problem.free, strict=True)])
+    slopes = np.array([float(jax.grad(one.value)(at)) for at, one in zip(here, problem.unknowns, strict=True)])
     covariance = coordinate_covariance(at_ends.whole_information[best])
     with np.errstate(invalid="ignore"):
         by_value = np.where(covariance == 0.0, 0.0, covariance * np.outer(slopes, slopes))

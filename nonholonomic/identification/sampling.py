@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..progress import Progress, telling
+from ..validation import require_flag, require_whole
 from .posterior import LogDensity
 from .surrogate import Surrogate
 
@@ -59,12 +60,14 @@ class Draws(NamedTuple):
         cls, density: LogDensity, coordinates: Float[np.ndarray, "chains draws unknowns"], accepted: float, runs: int
     ) -> "Draws":
         """Draws at some coordinates, with their diagnostics."""
-        import blackjax
+        from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
 
         values = {name: np.asarray(value) for name, value in density.values(jnp.asarray(coordinates)).items()}
-        r_hat = np.asarray(blackjax.diagnostics.potential_scale_reduction(coordinates)).tolist()
-        ess = np.asarray(blackjax.diagnostics.effective_sample_size(coordinates)).tolist()
-        named = (dict(zip(density.names, numbers, strict=True)) for numbers in (r_hat, ess))
+        found = map(
+            np.asarray, (measure(coordinates) for measure in (potential_scale_reduction, effective_sample_size))
+        )
+        # Of a single unknown they are numbers, not lists of one.
+        named = (dict(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in found)
         return cls(values, coordinates, *named, accepted=accepted, runs=runs)
 
     def __str__(self) -> str:
@@ -96,14 +99,18 @@ def sample(
     - `density`: a `LogDensity`.
     - `centre`, `covariance`: (unknowns,), (unknowns, unknowns), of a fit in its coordinates: `Identification.coordinates` and
       `coordinate_covariance`. Unknown errors, which are not among the unknowns of a fit, start from their first guess.
-    - `chains`, `warmup`, `draws`: how many chains, and draws of each before those that are kept. The chains start from draws of
-      the surrogate.
+    - `chains`, `warmup`, `draws`: how many chains, at least 2, which R-hat compares; and draws of each, before those that are
+      kept and of those, at least 2. The chains start from draws of the surrogate.
     - `seed`: of the draw; `progress`: whether to show it, on a terminal or in a notebook.
 
     **Returns:** `Draws`.
 
-    **Raises:** `ValueError` for a covariance that is not finite and positive; `ImportError` without BlackJAX.
+    **Raises:** `ValueError` for numbers out of range and a covariance that is not finite and positive; `ImportError` without
+    BlackJAX.
     """
+    for name, value, least in (("chains", chains, 2), ("warmup", warmup, 0), ("draws", draws, 2), ("seed", seed, 0)):
+        require_whole(value, name, least)
+    require_flag(progress, "progress")
     random = np.random.default_rng(seed)
     kept, accepted = [], 0.0
     with Progress(warmup + draws, "step", shown=progress) as shown:

@@ -49,11 +49,13 @@ class Surrogate(eqx.Module):
         An unknown error of n values has the variance 1 / 2n.
         """
         covariance = np.asarray(covariance, float)
-        numbers = len(density.problem.free)
+        numbers = len(density.problem.names)
         if covariance.shape != (numbers, numbers) or not np.all(np.isfinite(covariance)):
             raise ValueError(
                 f"covariance must be finite and of shape {(numbers, numbers)}: the data do not determine all numbers"
             )
+        if np.shape(centre) != (numbers,):
+            raise ValueError(f"centre = {centre!r} must be of shape {(numbers,)}")
         series, open_ = np.asarray(density.measurements.series), np.asarray(density.measurements.estimated)
         sizes = [math.sqrt(0.5 / np.sum(open_ & (series == one))) for one in density.open_series]
         root = np.zeros((numbers + len(sizes),) * 2)

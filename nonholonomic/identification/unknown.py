@@ -3,6 +3,7 @@
 import math
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,22 +50,58 @@ class Free(NamedTuple):
 
     def value(self, coordinate: Float[Array, "..."]) -> Float[Array, "..."]:
         """The parameter at a coordinate."""
-        if math.isfinite(self.lower) and math.isfinite(self.upper):
+        return Unknown.of(self).value(coordinate)
+
+    def coordinate(self, value: Any) -> Float[Array, "..."]:
+        """The coordinate of a value strictly within the bounds; the inverse of `value`."""
+        return Unknown.of(self).coordinate(value)
+
+
+class Unknown(eqx.Module):
+    """A `Free` as compiled programs take it: they depend on which bounds and prior it has, and are handed their numbers.
+
+    - `start`, `unit`, `lower`, `upper`: as of the `Free`; `has_lower`, `has_upper`: which bounds are finite.
+    - `prior`: mean and standard deviation, or `None`.
+    """
+
+    start: Float[Array, ""]
+    unit: Float[Array, ""]
+    lower: Float[Array, ""]
+    upper: Float[Array, ""]
+    prior: Float[Array, " 2"] | None
+    has_lower: bool = eqx.field(static=True)
+    has_upper: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, free: Free) -> "Unknown":
+        """A `Free` whose numbers are arrays: Python numbers would be compiled in."""
+        numbers = (np.asarray(number, float) for number in (free.start, free.unit, free.lower, free.upper))
+        prior = None if free.prior is None else np.asarray(free.prior, float)
+        return cls(*numbers, prior, math.isfinite(free.lower), math.isfinite(free.upper))
+
+    @property
+    def positive(self) -> bool:
+        """Whether the parameter cannot be negative."""
+        return bool(self.lower >= 0.0)
+
+    def value(self, coordinate: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The parameter at a coordinate."""
+        if self.has_lower and self.has_upper:
             return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(coordinate)
-        if math.isfinite(self.lower):
+        if self.has_lower:
             return self.lower + jnp.exp(coordinate)
-        if math.isfinite(self.upper):
+        if self.has_upper:
             return self.upper - jnp.exp(-coordinate)
         return self.start + self.unit * coordinate
 
     def coordinate(self, value: Any) -> Float[Array, "..."]:
         """The coordinate of a value strictly within the bounds; the inverse of `value`."""
         value = jnp.asarray(value, float)
-        if math.isfinite(self.lower) and math.isfinite(self.upper):
+        if self.has_lower and self.has_upper:
             return jnp.log(value - self.lower) - jnp.log(self.upper - value)
-        if math.isfinite(self.lower):
+        if self.has_lower:
             return jnp.log(value - self.lower)
-        if math.isfinite(self.upper):
+        if self.has_upper:
             return -jnp.log(self.upper - value)
         return (value - self.start) / self.unit
 

@@ -1,5 +1,7 @@
 """The outcome of every cell by vmapped `diffrax.diffeqsolve`: slow, and independent of the lockstep driver."""
 
+import functools
+
 import diffrax
 import equinox as eqx
 import jax
@@ -7,8 +9,8 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Float
 
-from .march import Outcome
 from .problem import AbstractProblem
+from .queue import Outcome
 from .settings import Settings
 from .single_run import saved
 from .status import CROSSED, FAILED, GUARD_LOST, REACHED_END
@@ -42,12 +44,15 @@ def march_by_diffrax(
             else (lambda t, y, args, **_: args.guard(t, y)),
         }
         conditions = {code: condition for code, condition in conditions.items() if condition is not None}
+        # Diffrax sees an event where a condition changes its sign: a cell that starts beyond one has ended.
+        at_once = [condition(jnp.zeros(()), state, here) <= 0.0 for condition in conditions.values()]
+        ends_at_once = functools.reduce(jnp.logical_or, at_once, jnp.asarray(False))
         event = diffrax.Event(list(conditions.values()), root_finder=optimistix.Newton(1e-13, 1e-13))
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
             settings.for_single_runs,
             0.0,
-            t1,
+            jnp.where(ends_at_once, 0.0, t1),
             None,
             state,
             args=here,
@@ -59,8 +64,8 @@ def march_by_diffrax(
         ends, finals = saved(solution)
         end, final = ends[0], finals[0]
         status = jnp.where(end >= t1, REACHED_END, FAILED)
-        for code, happened in zip(conditions, solution.event_mask or [], strict=True):
-            status = jnp.where(happened, code, status)
+        for code, happened, begun in zip(conditions, solution.event_mask or [], at_once, strict=True):
+            status = jnp.where(happened | begun, code, status)
         return Outcome(
             status,
             jnp.where(status == CROSSED, end, jnp.inf),

@@ -228,7 +228,11 @@ def sample(
     **Returns:** a `Sampled`.
     """
     state, scales = problem.start()
-    watched = problem.guard(jnp.zeros_like(t1), state) is not None
+    margin = problem.guard(jnp.zeros_like(t1), state)
+    watched = margin is not None
+    # Diffrax sees an event where the guard changes its sign: a run that starts beyond it has ended.
+    at_once = jnp.zeros((), bool) if margin is None else margin <= 0.0
+    t1 = jnp.where(at_once, 0.0, t1)
     event = diffrax.Event(
         lambda t, y, args, **_: args.guard(t, y), optimistix.Newton(1e-13, 1e-13) if watched else None
     )
@@ -256,7 +260,7 @@ def sample(
         adjoint=diffrax.ForwardMode() if adjoint is None else adjoint,
         throw=False,
     )
-    lost = jnp.zeros((), bool) if solution.event_mask is None else solution.event_mask
+    lost = at_once if solution.event_mask is None else at_once | solution.event_mask
     (_, ends), (states, ends_at) = saved(solution)
     end = ends[0]
     # NaN rather than infinite: an angle computed from infinite components would look like an angle.

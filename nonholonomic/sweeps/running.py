@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..progress import Progress
+from ..validation import require_flag
 from ._blocks import Blocks
 from ._file import LONG_NAMES, Stored
 from .grid import Axis, Variable, columns, size_of
@@ -62,10 +63,13 @@ def sweep(
 
     **Returns:** the `Table`.
 
-    **Raises:** `ValueError` if there is no file, and less memory than the table takes; `OSError` or `ValueError` if the file
-    cannot be written or holds another request; `RuntimeError` if the executor breaks down or a worker has other versions: what
-    had finished is in the file.
+    **Raises:** `ValueError` for an executor that is none, and if there is no file, and less memory than the table takes;
+    `OSError` or `ValueError` if the file cannot be written or holds another request; `RuntimeError` if the executor breaks
+    down or a worker has other versions: what had finished is in the file.
     """
+    require_flag(progress, "progress")
+    if executor is not None and not isinstance(executor, Executor):
+        raise ValueError(f"executor = {executor!r} must be a concurrent.futures.Executor, or None")
     cells = size_of(axes)
     given = block_for(cells) if block is None else block
     given = given if most is None else min(given, most)

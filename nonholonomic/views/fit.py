@@ -20,9 +20,8 @@ def draw_fit(fit: "Identification") -> Any:
     from matplotlib.figure import Figure
 
     names = list(fit.estimates)
-    determined = [name for name in names if np.isfinite(fit.standard_errors[name])][:MOST_PROFILES]
-    profiled = determined if len(names) > 1 else []
-    lower = max(1, len(profiled) + 1)
+    profiled = [name for name in names if np.isfinite(fit.standard_errors[name])][:MOST_PROFILES]
+    lower = len(profiled) + 1
     figure = Figure(figsize=(max(9.0, 2.6 * lower), 8.5), layout="constrained")
     grid = figure.add_gridspec(3, lower, height_ratios=(2.0, 1.0, 1.6))
     _draw_data(fit, figure.add_subplot(grid[0, :]))

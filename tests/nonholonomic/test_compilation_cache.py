@@ -1,16 +1,21 @@
 """Compiled programs on disk: a second process compiles nothing, and a bad entry costs a compilation, nothing else."""
 
+import concurrent.futures
 import json
 import logging
 import os
+import resource
 import subprocess
 import sys
+import threading
+import warnings
 
 import jax
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from nonholonomic import enable_compilation_cache
-from nonholonomic.compilation_cache import environment_name
+from nonholonomic.compilation_cache import LOOKED_AT, environment_name
 
 pytestmark = pytest.mark.newest
 
@@ -66,8 +71,11 @@ def test_a_bad_entry_costs_a_compilation_and_nothing_else(tmp_path):
     first, _ = run(SMALL, tmp_path)
     folder = tmp_path / "nonholonomic" / environment_name()
     (entry,) = folder.glob("*-cache")
-    for way, content in damaged(entry.read_bytes()).items():
+    for k, (way, content) in enumerate(damaged(entry.read_bytes()).items()):
         entry.write_bytes(content)
+        if k % 2:
+            # As from a copy that kept the times.
+            os.utime(entry, (0, 0))
         mended, said = run(SMALL, tmp_path)
         assert (mended["result"], mended["found"], said) == (first["result"], 0, ""), way
     assert run(SMALL, tmp_path)[0]["found"] == 1
@@ -96,13 +104,73 @@ def test_without_a_folder_everything_goes_on(forbidden, tmp_path):
     assert forbidden or str(tmp_path / "nonholonomic") in said
 
 
-def test_a_folder_that_was_chosen_before_stands(tmp_path, monkeypatch, caplog):
+SETTINGS = (
+    "jax_compilation_cache_dir",
+    "jax_compilation_cache_max_size",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_persistent_cache_min_entry_size_bytes",
+)
+
+
+@pytest.fixture
+def unset(monkeypatch):
+    """No folder is chosen or forbidden, and what is set after that is forgotten."""
     monkeypatch.delenv("NONHOLONOMIC_CACHE", raising=False)
-    before = jax.config.jax_compilation_cache_dir
+    before = {name: getattr(jax.config, name) for name in SETTINGS}
+    jax.config.update("jax_compilation_cache_dir", None)
+    with warnings.catch_warnings():
+        yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+def test_those_who_start_together_all_have_the_folder(unset, tmp_path):
+    threads, barrier = 6, threading.Barrier(6)
+
+    def start(_):
+        barrier.wait()
+        return [enable_compilation_cache(tmp_path) for _ in range(20)]
+
+    with concurrent.futures.ThreadPoolExecutor(threads) as pool:
+        found = {folder for some in pool.map(start, range(threads)) for folder in some}
+    assert found == {tmp_path / environment_name()}
+    assert [one.name for one in (tmp_path / environment_name()).iterdir()] == [LOOKED_AT]
+
+
+@pytest.mark.parametrize("folder", [5, True, b"x", ""])
+def test_what_is_no_folder_is_refused(folder, unset):
+    with pytest.raises(ValueError, match=f"folder = {folder!r} must be a path"):
+        enable_compilation_cache(folder)
+    assert jax.config.jax_compilation_cache_dir is None
+
+
+def test_words_that_forbid_it(unset, tmp_path, monkeypatch):
+    for word in ("off", "FALSE", "No"):
+        monkeypatch.setenv("NONHOLONOMIC_CACHE", word)
+        assert enable_compilation_cache(tmp_path) is None
+    monkeypatch.setenv("NONHOLONOMIC_CACHE", "1")
+    assert enable_compilation_cache(tmp_path) == tmp_path / environment_name()
+
+
+def test_a_full_disk_is_told_and_still_read(unset, tmp_path, caplog):
+    """Stood in for by the shell's limit on the length of a file."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
     try:
-        jax.config.update("jax_compilation_cache_dir", str(tmp_path / "mine"))
-        with caplog.at_level(logging.WARNING):
-            assert enable_compilation_cache() == tmp_path / "mine"
-        assert not caplog.records
+        assert enable_compilation_cache(tmp_path) == tmp_path / environment_name()
     finally:
-        jax.config.update("jax_compilation_cache_dir", before)
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    (said,) = caplog.messages
+    assert said.startswith(f"no more compiled programs are kept in {tmp_path}")
+    assert not list((tmp_path / environment_name()).iterdir())
+
+
+def test_a_folder_that_was_chosen_before_stands(unset, tmp_path, caplog):
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "mine"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.7)
+    with caplog.at_level(logging.WARNING):
+        assert enable_compilation_cache() == tmp_path / "mine"
+    assert not caplog.records
+    # With JAX's limits.
+    assert jax.config.jax_persistent_cache_min_compile_time_secs == 0.7

@@ -1,5 +1,6 @@
 """Numbers of a stroller from a recorded ride."""
 
+import jax
 import numpy as np
 import pytest
 from close import assert_close
@@ -15,7 +16,7 @@ def scene(rolling=2.0, wheelbase=0.7):
     return stroller.Scene(body, friction=stroller.Damping(rolling))
 
 
-def test_damping_from_recorded_speeds(tmp_path):
+def test_damping_from_recorded_speeds(tmp_path, caplog):
     """From a file, whose clock was started at an unknown time; a speed of rolling resistance falls as exp(-c t / m)."""
     clock, path = np.array([1.0, 1.25, 1.5, 2.0]), tmp_path / "ride.csv"
     speeds = stroller.simulate(scene(), LAUNCH, 1.1, times=clock - 0.9).speed
@@ -25,6 +26,10 @@ def test_damping_from_recorded_speeds(tmp_path):
     found = stroller.identify(scene(), data, {"rolling": 1.0, "t0": 0.8})
     assert found.status == "converged"
     assert_close(list(found.estimates.values()), [2.0, 0.9], rtol=1e-4)
+    with jax.log_compiles():
+        again = stroller.identify(scene(), data, {"rolling": 1.5, "t0": 0.85}, tolerance=1e-7)
+    assert not [text for text in caplog.messages if "Finished XLA compilation" in text]
+    assert_close(list(again.estimates.values()), [2.0, 0.9], rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -43,6 +48,8 @@ def test_what_cannot_be_fitted_is_refused():
     for free, message in (({"drag": 1.0}, "must be one of"), ({"wheelbase": -1.0}, "wheelbase")):
         with pytest.raises(ValueError, match=message):
             stroller.identify(scene(), data, free)
+    with pytest.raises(ValueError, match="starts = 0 must be"):
+        stroller.identify(scene(), "no data", {"wheelbase": 1.0}, starts=0)
     with pytest.raises(ValueError, match="must be a Recording"):
         stroller.identify(scene(), 1.0, {"wheelbase": 1.0})
     with pytest.raises(ValueError, match="quantity = 'theta'"):

@@ -63,6 +63,17 @@ def test_friction_from_exact_times(found):
     assert "theta 0.3, spin 110" in str(result)
 
 
+def test_another_start_other_bounds_data_and_tolerance_compile_nothing(found, rutstam_scene, caplog):
+    times, _ = found
+    other = tippe.InversionTimes(LAUNCH, [1.01 * time for time in times], 0.04, t1=6.5, angle=0.94 * math.pi)
+    with jax.log_compiles():
+        again = tippe.identify(rutstam_scene, other, {"friction.mu": Free(0.25, 0.05)}, tolerance=1e-7)
+    assert not [text for text in caplog.messages if "Finished XLA compilation" in text]
+    # Each of these numbers counted.
+    assert again.problem.unknowns[0].lower == 0.05
+    assert again.estimates["scene.friction.mu"] < 0.298
+
+
 def test_noisy_times_give_unbiased_friction_within_its_errors(found):
     """Twelve tables, in short for the 200 below; what the launches have in common is compiled once.
 
@@ -167,6 +178,12 @@ def test_bad_unknowns_are_refused_before_anything_runs(rutstam_scene, free, mess
         tippe.identify(rutstam_scene, data, free)
     with pytest.raises(ValueError, match="must be an InversionTimes or a Recording"):
         tippe.identify(rutstam_scene, 3.0, {"mu": 0.2})
+
+
+def test_how_to_search_is_checked_before_the_data_are(rutstam_scene):
+    for change, message in (({"starts": 0}, "starts = 0"), ({"progress": 1}, "progress = 1 must be True or False")):
+        with pytest.raises(ValueError, match=message):
+            tippe.identify(rutstam_scene, "no data", {"mu": 0.2}, **change)
 
 
 @pytest.mark.parametrize(

@@ -61,13 +61,31 @@ def test_transformations_agree():
     assert_close(value, times[1], rtol=1e-8)
     slopes = jax.jit(jax.vmap(jax.grad(time_of)))(mus)
     assert_close(slopes[1], slope, rtol=1e-6)
+    assert jax.vmap(time_of)(mus[:0]).shape == (0,)
+
+
+@pytest.mark.parametrize("time", [tippe.inversion_time, tippe.extended_inversion_time])
+def test_arrays_of_numpy_in_a_batch_inside_jit(time):
+    """Measured launches are NumPy arrays, which `vmap` hands on as they are, and models are differentiated inside `jit`."""
+    thetas = np.array([0.2, 0.3])
+
+    def times(mu):
+        scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(mu))
+        return jax.vmap(lambda theta: time(scene, tippe.Launch(theta, 155.0), 8.0, tolerance=1e-6))(thetas)
+
+    values, slopes = jax.jit(lambda mu: jax.jvp(times, (mu,), (jnp.ones(()),)))(0.3)
+    assert np.all(np.isfinite(values))
+    assert_close(jax.jit(times)(0.3), values, rtol=1e-6)
+    assert_close(slopes, jax.jvp(times, (0.3,), (1.0,))[1], rtol=1e-9)
 
 
 def test_second_derivative():
     """jax.hessian against differences of the gradient."""
     slope = jax.jit(jax.grad(time_of))
     expected = central_difference(slope, 0.3, [2e-5, 1e-5, 5e-6, 2.5e-6])
-    assert_close(jax.hessian(time_of)(0.3), expected, rtol=1e-4)
+    second = jax.jit(jax.hessian(time_of))
+    assert_close(second(0.3), expected, rtol=1e-4)
+    assert np.isnan(second(-0.3))
 
 
 def test_no_inversion_is_infinite_with_derivative_zero():
@@ -113,6 +131,12 @@ def test_illegal_numbers_inside_transformations_give_nothing_that_looks_right():
     assert np.all(np.isnan(times[1:]))
     for mu in (-0.3, math.nan):
         assert np.all(np.isnan(jax.value_and_grad(time_of)(mu)))
+
+    def extended(mu):
+        scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(mu))
+        return tippe.extended_inversion_time(scene, tippe.Launch(0.1, 155.0), 0.1, tolerance=1e-6)
+
+    assert np.all(np.isnan(jax.value_and_grad(extended)(-0.3)))
 
 
 def test_a_run_that_fails_inside_a_transformation_is_not_a_number():

@@ -61,6 +61,16 @@ def test_the_same_table_by_vmapped_diffrax(arena):
     assert np.all(fast.end_time <= slow.end_time + 1e-7)
 
 
+def test_starts_beyond_the_end_by_vmapped_diffrax():
+    """On the ceiling of a cylinder and beyond the angle a run is over as it begins, by either method."""
+    scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Viscous(0.3))
+    arguments = {"theta": [0.1, 3.1], "eta": [0.0, 3.0], "spin": 150.0, "t1": 0.1, "tolerance": 1e-6}
+    fast, slow = (tippe.inversion_table(scene, method=method, **arguments) for method in ("ensemble", "diffrax"))
+    assert slow.status.tolist() == [["not_inverted", "contact_lost"], ["inverted", "contact_lost"]]
+    for name in ("status", "time", "end_time"):
+        np.testing.assert_array_equal(slow[name], fast[name])
+
+
 def test_contact_is_lost_where_the_normal_force_first_vanishes(rutstam_scene_module):
     table = tippe.inversion_table(rutstam_scene_module, theta=[0.1], spin=[190.0], t1=12.0, tolerance=1e-10)
     run = tippe.simulate(rutstam_scene_module, tippe.Launch(0.1, 190.0), 12.0, tolerance=1e-10)

@@ -42,20 +42,41 @@ def test_given_times_and_dense_output_agree(rutstam_scene):
 def test_illegal_numbers_in_a_batch_of_runs_give_nothing_that_looks_right(rutstam_scene):
     """Numbers that constructors cannot look at: the status says it, and all else is not a number."""
 
-    def run(mu, theta, t1):
+    def run(mu, theta, t1, tolerance):
         scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(mu))
-        return tippe.simulate(scene, tippe.Launch(theta, 155.0), t1, times=[0.0, 0.05])
+        return tippe.simulate(scene, tippe.Launch(theta, 155.0), t1, times=[0.0, 0.05], tolerance=tolerance)
 
-    good, columns = (0.3, 0.1, 0.05), [(0.3, 0.1, 0.05)]
-    for which, values in ((0, (-0.3, math.nan)), (1, (10.0, -0.1)), (2, (-0.05, 0.01, math.nan))):
+    good = (0.3, 0.1, 0.05, 1e-9)
+    bad = ((0, (-0.3, math.nan)), (1, (10.0, -0.1)), (2, (-0.05, 0.01, math.nan)), (3, (-1.0, 0.0, math.nan)))
+    columns = [good]
+    for which, values in bad:
         columns += [tuple(value if i == which else one for i, one in enumerate(good)) for value in values]
     runs = jax.jit(jax.vmap(run))(*jnp.array(columns).T)
-    assert runs.status.tolist() == [0] + 7 * [4]
+    assert runs.status.tolist() == [0] + 10 * [4]
+    assert jax.vmap(run)(*jnp.array(columns).T[:, :0]).theta.shape == (0, 2)
     alone = tippe.simulate(rutstam_scene, LAUNCH, 0.05, times=[0.0, 0.05])
     assert_close(runs.theta[0], alone.theta, rtol=1e-8)
     for read in (runs.theta, runs.energy, runs.position, runs.normal_force, runs.work, runs.end_time):
         assert np.all(np.isfinite(read[0]))
         assert np.all(np.isnan(read[1:]))
+
+
+@pytest.mark.parametrize("options", [{}, {"adjoint": diffrax.ForwardMode()}, {"solver": diffrax.Kvaerno3()}], ids=str)
+def test_a_run_without_contact_at_its_start_ends_there(options):
+    """On the ceiling of a cylinder, whoever integrates; nothing looks right of a run by an illegal number, nor its slopes."""
+
+    def run(mu, eta):
+        scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Viscous(mu))
+        return tippe.simulate(scene, tippe.Launch(0.1, 155.0, eta=eta), 0.1, [0.0, 0.1], 1e-6, **options)
+
+    both = jax.jit(jax.vmap(run))(jnp.array([0.3, 0.3]), jnp.array([0.0, 3.0]))
+    assert both.status.tolist() == [0, 1]
+    assert_close(both.end_time, [0.1, 0.0])
+    assert np.isfinite(both.theta).tolist() == [[True, True], [True, False]]
+    if "solver" not in options:
+        slope = jax.jit(jax.jacfwd(lambda mu: run(mu, 0.0).theta[-1]))
+        assert np.isfinite(slope(0.3))
+        assert np.isnan(slope(-0.3))
 
 
 def test_more_steps_than_a_piece_holds(rutstam_scene):
@@ -133,9 +154,15 @@ def test_a_ceiling_start_has_no_contact(rutstam_scene):
     [
         ({"t1": -1.0}, "t1 = -1.0 must be greater than 0"),
         ({"times": [0.5, 2.0]}, "times = .* must be at most 1.0"),
-        ({"times": [0.5, 0.4]}, "times must increase"),
-        ({"times": []}, "times must be a non-empty list"),
-        ({"solver": "Dopri8"}, "solver = 'Dopri8' must be a solver of Diffrax"),
+        ({"times": [0.5, 0.4]}, r"times\[1\] = 0.4 must be greater than times\[0\] = 0.5: times must increase"),
+        ({"times": []}, r"times = \[\] must be a list of at least one number"),
+        ({"solver": "Dopri8"}, "solver = 'Dopri8' must be an adaptive solver of Diffrax"),
+        ({"solver": diffrax.Euler()}, r"solver = Euler\(\) must be an adaptive solver of Diffrax"),
+        (
+            {"solver": diffrax.KenCarp4()},
+            r"solver = KenCarp4\(.* must be an adaptive .* for ordinary differential equations",
+        ),
+        ({"adjoint": "backwards"}, "adjoint = 'backwards' must be one of Diffrax"),
         ({"launch": 3}, "launch = 3 must be a Launch"),
         ({"tolerance": math.nan}, "tolerance = nan must be finite"),
     ],

@@ -183,6 +183,8 @@ def test_a_direction_that_the_data_cannot_see_is_named():
         ({"free": {"x": Free(1.0, prior=3.0)}}, "must be a mean and a standard deviation"),
         ({"starts": 0}, "starts = 0"),
         ({"spread": 1.0}, "spread = 1.0"),
+        ({"seed": -1}, "seed = -1"),
+        ({"progress": "no"}, "progress = 'no' must be True or False"),
         ({"max_steps": 2.5}, "max_steps = 2.5"),
         ({"labels": ("a",)}, "labels must be 2"),
         ({"measurements": 3.0}, "must be Measurements"),

@@ -48,6 +48,27 @@ def test_the_density_is_that_of_bayes_in_the_coordinates():
     assert_close(several, [gradient, gradient], rtol=1e-12)
 
 
+def test_densities_that_differ_in_numbers_share_a_program(caplog):
+    """The same with other starts, bounds and priors has other values, and compiles nothing."""
+
+    def density(start, lower, slope, prior, data):
+        free = {"height": Free(start, lower), "slope": Free(0.0, prior=slope)}
+        return LogDensity.of(line, data, free, {"height": prior})
+
+    at, first = np.zeros(2), density(1.5, 0.0, (-2.0, 1.0), PRIOR, measured())
+    first.value_and_gradient(at)
+    other = density(1.7, 0.1, (-3.0, 2.0), (1.1, 0.2), measured(seed=1))
+    with jax.log_compiles():
+        value, gradient = other.value_and_gradient(at)
+    assert not [text for text in caplog.messages if "Finished XLA compilation" in text]
+    # At the coordinate 0 the height is 1 above its bound, the slope is where it started.
+    residuals = (1.1 + 0.0 * X - np.asarray(measured(seed=1).value)) / ERROR
+    expected = -0.5 * np.sum(residuals**2) - X.size * np.log(ERROR)
+    expected += scipy.stats.norm.logpdf(1.1, 1.1, 0.2) + scipy.stats.norm.logpdf(0.0, -3.0, 2.0) + np.log(2.0)
+    assert_close(value, expected, rtol=1e-12)
+    assert_close(gradient[0], -np.sum(residuals) / ERROR + 1.0, rtol=1e-12)
+
+
 @pytest.fixture(scope="module")
 def draws():
     data, free = measured(), {"height": 0.5, "slope": -2.0}
@@ -70,6 +91,43 @@ def test_draws_have_the_mean_and_the_covariance_of_the_regression(draws):
     replicas = density.replicate(flat, seed=1)
     spread = np.sqrt(ERROR**2 + np.var(np.asarray(density.predict(jnp.asarray(flat))), axis=0))
     assert_close(replicas.std(axis=0), spread, rtol=0.1)
+
+
+def test_a_single_unknown_is_drawn_profiled_and_shown_like_several():
+    """The mean of 12 numbers, whose draws are normal with a standard deviation of the error / sqrt(12)."""
+    data, error = measured(slope=0.0), ERROR / np.sqrt(X.size)
+
+    def level(p):
+        return jnp.repeat(p["height"][:, None], X.size, axis=1)
+
+    fit = identify(level, data, {"height": 0.5})
+    density = LogDensity.of(level, data, {"height": 0.5})
+    found = sample(density, fit.coordinates, fit.coordinate_covariance, chains=2, draws=100, warmup=5, progress=False)
+    assert found.values["height"].shape == (2, 100)
+    assert abs(found.values["height"].mean() - np.mean(data.value)) < 4.0 * error / np.sqrt(found.ess["height"])
+    assert f"R-hat {found.r_hat['height']:.4f}, ESS {found.ess['height']:.0f}" in str(found)
+    profile = fit.profile("height")
+    assert_close(profile.deviance, ((profile.values - np.mean(data.value)) / error) ** 2, atol=1e-9)
+    assert profile.estimates == {}
+    assert [axes.get_xlabel() for axes in fit.plot().axes].count("height") == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"chains": 1}, "chains = 1 must be a whole number of at least 2"),
+        ({"draws": 1}, "draws = 1 must be"),
+        ({"warmup": -1}, "warmup = -1 must be"),
+        ({"seed": 0.5}, "seed = 0.5 must be"),
+        ({"progress": "no"}, "progress = 'no' must be True or False"),
+        ({"centre": [0.0]}, r"centre = \[0.0\] must be of shape \(2,\)"),
+        ({"covariance": np.diag([1.0, np.inf])}, "covariance must be finite"),
+    ],
+)
+def test_draws_that_could_not_be_judged_are_refused_at_once(change, message):
+    density = LogDensity.of(line, measured(), {"height": 0.5, "slope": -2.0})
+    with pytest.raises(ValueError, match=message):
+        sample(**({"density": density, "centre": np.zeros(2), "covariance": np.eye(2)} | change))
 
 
 def test_unknown_errors_are_drawn_too():

@@ -306,6 +306,22 @@ def test_blocks_are_handed_out_as_others_finish():
     assert sorted(block for block, future in hands.futures.items() if future.cancelled()) == [2, 4]
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"executor": 3}, "executor = 3 must be a concurrent.futures.Executor"),
+        ({"progress": "no"}, "progress = 'no' must be True or False"),
+    ],
+)
+def test_who_computes_and_what_is_shown_is_checked_before_a_file_is_there(change, message, tmp_path):
+    path = tmp_path / "table.h5"
+    with pytest.raises(ValueError, match=message):
+        cheap_sweep(path, **change)
+    with pytest.raises(ValueError, match=message):
+        tippe.inversion_table(TOP, path=path, **TIMES, **change)
+    assert not path.exists()
+
+
 def test_an_executor_that_is_shut_down_takes_no_blocks():
     pool = ThreadPoolExecutor(1)
     pool.shutdown()
