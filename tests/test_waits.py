@@ -104,5 +104,5 @@ def test_sampling_says_what_it_does_after_its_last_step(monkeypatch):
     monkeypatch.setattr(module.Draws, "of", waits)
     terminal = watched(monkeypatch)
     with pytest.raises(Enough):
-        module.sample(None, None, None, warmup=1, draws=1)
+        module.sample(None, None, None, warmup=1, draws=2)
     assert words(terminal)[-1] == "diagnosing"
