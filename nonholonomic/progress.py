@@ -27,7 +27,8 @@ COMPILERS = (
 class Progress:
     """A line that says what is being done, and once items are counted, how many are done, how fast, and how many are left.
 
-    It is a context. Of several, one inside the other, the innermost that counts has the line, or else the outermost.
+    It is a context. Of several, one inside the other, the innermost that counts has the line, or else the outermost. What is
+    left of the line in the end is nothing, or what the outermost has counted.
     A separate thread writes the line, because compiling blocks the caller's for many seconds. Nothing is
     written where standard error is neither a terminal nor a notebook's, nor with `NONHOLONOMIC_PROGRESS=0`.
     """
@@ -73,7 +74,9 @@ class Progress:
         self._caller, self._start = threading.get_ident(), time.time()
         if self._heard:
             with _LINE.lock:
-                self._shown &= all(one._shown for one in _LINE.speakers if one._caller == self._caller)
+                outer = [one for one in _LINE.speakers if one._caller == self._caller]
+                self._shown &= all(one._shown for one in outer)
+                self._inner = bool(outer)
                 if self._shown:
                     self._tqdm = bar_class()
                 _LINE.add(self)
@@ -104,7 +107,7 @@ class Progress:
     def _line(self) -> Any:
         """The line in its present state, not yet written."""
         # With a delay, or tqdm writes the line before all is known of it.
-        options = {"delay": 1e-9, "leave": self._since is not None}
+        options = {"delay": 1e-9, "leave": self._since is not None and not self._inner}
         if self._since is None:
             bar = self._tqdm(bar_format="{desc} [{elapsed}]", **options)
             bar.start_t = self._start
@@ -154,8 +157,8 @@ class _Line:
                 self._update()
 
     def _update(self) -> None:
-        shown = [one for one in self.speakers if one._shown]
-        if not shown or time.time() - shown[0]._start < INTERVAL:
+        shown = [one for one in self.speakers if one._shown and time.time() - one._start >= INTERVAL]
+        if not shown:
             return
         told = next((one for one in reversed(shown) if one._total is not None), shown[0])
         for other in shown:

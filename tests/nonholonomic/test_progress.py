@@ -112,8 +112,7 @@ def test_a_line_within_a_line_does_not_garble_it(monkeypatch):
     assert "simulating" not in told
     assert told[0] == told[-1] == "fitting"
     assert [text for _, text in terminal.lines if "fit/s" in text]
-    assert left(terminal).startswith("100%")
-    assert left(terminal).count("fit") == 1
+    assert left(terminal) == ""
 
 
 def test_what_is_to_be_quiet_quiets_what_it_calls(monkeypatch):
