@@ -10,13 +10,14 @@ import jax
 import numpy as np
 
 
-def numbers(root: str, tree: Any) -> dict[str, Any]:
+def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
     """Every number of a tree of modules under its dotted name.
 
     **Arguments:**
 
     - `root`: name of the tree itself.
     - `tree`: an `equinox.Module`.
+    - `functions`: whether to go into modules that are functions, whose numbers may be arrays.
 
     **Returns:** dotted name -> number, in the order in which the modules declare them; `None` for a number that is left out.
     """
@@ -24,7 +25,7 @@ def numbers(root: str, tree: Any) -> dict[str, Any]:
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
         if isinstance(value, eqx.Module):
-            found |= numbers(name, value)
+            found |= numbers(name, value, functions) if functions or not callable(value) else {}
         elif isinstance(value, tuple):
             found |= {f"{name}[{k}]": part for k, part in enumerate(value) if _is_number(part)}
         elif value is None or _is_number(value):

@@ -53,6 +53,8 @@ def is_traced(value: Any) -> bool:
 
 def shown(value: Any) -> str:
     """The value as a message should show it: a plain number if it is one."""
+    if any(is_traced(leaf) for leaf in jax.tree.leaves(value)):
+        return as_text(value)
     array = np.asarray(value)
     return repr(array.item()) if array.ndim == 0 and array.dtype != object else as_text(value)
 
@@ -119,10 +121,32 @@ def require_whole(value: Any, name: str, at_least: int) -> None:
         raise ValueError(f"{name} = {value!r} must be a whole number of at least {at_least}")
 
 
+<<<<<<< HEAD
+def require_increasing(values: Any, name: str) -> None:
+    """Raise `ValueError` unless this is a list of one number or more, each greater than the one before it.
+
+    **Arguments:** `values`: numbers; traced ones pass, if they are a list; `name`: what to call them in the message.
+    """
+    if np.ndim(values) != 1 or np.shape(values)[0] == 0:
+        raise ValueError(
+            f"{name} = {shown(values)} must be a list of at least one number, not of shape {np.shape(values)}"
+        )
+    if is_traced(values):
+        return
+    known = np.asarray(values)
+    wrong = np.flatnonzero(~(np.diff(known) > 0.0))
+    if wrong.size:
+        k = int(wrong[0]) + 1
+        raise ValueError(
+            f"{name}[{k}] = {shown(known[k])} must be greater than {name}[{k - 1}] = {shown(known[k - 1])}: "
+            f"{name} must increase"
+        )
+=======
 def require_flag(value: Any, name: str) -> None:
     """Raise `ValueError` unless this is true or false; a word such as "no" would count as true."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} = {value!r} must be True or False")
+>>>>>>> w_ident
 
 
 def require_folder(path: Path, name: str) -> None:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from nonholonomic.integration import few_trials
 
 from .dynamics import State
-from .ride import Recipe
+from .ride import RideRecipe
 from .steps import Lanes, States, Steps, in_blocks
 
 #: What can be watched: the normal force [N], the cosine of the steering angle, and the relative reduced mass.
@@ -29,7 +29,7 @@ CLOSEST = 1e-14
 class Between(NamedTuple):
     """A watched quantity, less a level, at any time of a run."""
 
-    recipe: Recipe
+    recipe: RideRecipe
     steps: Steps
     name: str
     level: float
@@ -40,19 +40,19 @@ class Between(NamedTuple):
         return np.where(np.isfinite(value), value, -np.inf)
 
 
-def watched(recipe: Recipe, states: States, name: str) -> Lanes:
+def watched(recipe: RideRecipe, states: States, name: str) -> Lanes:
     """A quantity of `WATCHED` at some states."""
     return in_blocks(lambda at: _watched(recipe, at), states)[WATCHED.index(name)]
 
 
 @eqx.filter_jit
-def _watched(recipe: Recipe, states: State) -> Float[Array, "watched lanes"]:
+def _watched(recipe: RideRecipe, states: State) -> Float[Array, "watched lanes"]:
     dynamics = recipe.ride.scene.dynamics
     found = (dynamics.contact(states), dynamics.geometry(states).cosine, dynamics.rank(states))
     return jnp.stack(jnp.broadcast_arrays(*found))
 
 
-def crossings(recipe: Recipe, steps: Steps, name: str, level: float) -> Float[np.ndarray, " times"]:
+def crossings(recipe: RideRecipe, steps: Steps, name: str, level: float) -> Float[np.ndarray, " times"]:
     """Times [s] at which a watched quantity passes a level, in either direction, in increasing order."""
     time, value = steps.times, watched(recipe, steps.states, name) - level
     which = np.flatnonzero(_may_cross(value))

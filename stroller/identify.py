@@ -9,8 +9,12 @@ from jaxtyping import Array, Float, Int
 
 from nonholonomic import identification as generic
 from nonholonomic.identification import Free, Identification, of_data, predicted
+from nonholonomic.integration import tolerance_bound
 from nonholonomic.parameters import numbers, with_numbers
+<<<<<<< HEAD
+=======
 from nonholonomic.validation import as_number, require
+>>>>>>> w_ident
 
 from .recording import Recording
 from .scene import Scene
@@ -104,7 +108,7 @@ def identify(
     data = tuple(data) if isinstance(data, list | tuple) else (data,)
     if not data or not all(isinstance(one, Recording) for one in data):
         raise ValueError(f"data = {data!r} must be a Recording, or a list of them")
-    require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+    tolerance_bound(tolerance).require()
     for one in data:
         scene.check(one.launch)
     unknowns = _unknowns_of(scene, data, free)

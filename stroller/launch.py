@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import Bound, Bounded, as_number
+from nonholonomic.validation import Bound, Bounded, as_number, shown
 
 
 def as_place(value: Any) -> Any:
@@ -61,7 +61,7 @@ class Launch(Bounded):
 
     def __check_init__(self):
         if not (isinstance(self.place, tuple) and len(self.place) in (2, 3)):
-            raise ValueError(f"place = {self.place!r} must be a pair of numbers, or (x, y, z) [m]")
+            raise ValueError(f"place = {shown(self.place)} must be a pair of numbers, or (x, y, z) [m]")
 
     def bounds(self) -> Iterator[Bound]:
         for k, number in enumerate(self.place):

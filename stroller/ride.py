@@ -94,14 +94,14 @@ class Ride(NamedTuple):
     grid: Float[Array, " steps"] | None
 
 
-class Recipe(eqx.Module):
+class RideRecipe(eqx.Module):
     """A `Ride` as it can leave a transformation: its numbers are leaves and everything else is static."""
 
     numbers: Any
     rest: Any = eqx.field(static=True)
 
     @classmethod
-    def of(cls, ride: Ride) -> "Recipe":
+    def of(cls, ride: Ride) -> "RideRecipe":
         """The recipe of a ride."""
         return cls(*eqx.partition(ride, eqx.is_array_like))
 

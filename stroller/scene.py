@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane
-from nonholonomic.validation import Bound, Bounded, all_bounds, as_number, is_traced, legal, require_all
+from nonholonomic.validation import Bound, Bounded, all_bounds, as_number, is_traced, legal, require_all, shown
 
 from .dynamics import Dynamics, State, stacked
 from .friction import AbstractFriction, Frictionless
@@ -96,7 +96,9 @@ class Scene(Bounded):
         require_word(self.heading, "heading", HEADINGS)
         self.surface.sign(self.side, DRIVES)
         if not isinstance(self.surface, Plane) and self.body.centre is not None:
-            raise ValueError(f"centre = {self.body.centre!r} must be 0.0 on a curved surface, where it is not exact")
+            raise ValueError(
+                f"centre = {shown(self.body.centre)} must be 0.0 on a curved surface, where it is not exact"
+            )
         if self.heading == "projected" and not isinstance(self.surface, Plane | AbstractQuadric):
             raise ValueError(f"heading = 'projected' must be 'intrinsic' on a {type(self.surface).__name__}")
 
@@ -124,12 +126,12 @@ class Scene(Bounded):
         require_all(self.start_bounds(launch))
         if _holds_somewhere(self.sideways(launch)):
             raise ValueError(
-                f"steering = {launch.steering!r} must differ from a right angle for speed = {launch.speed!r}: "
+                f"steering = {shown(launch.steering)} must differ from a right angle for speed = {shown(launch.speed)}: "
                 "the rear axle stands still when the front wheel stands across"
             )
         if _holds_somewhere(self.level(launch)):
             raise ValueError(
-                f"place[1] = {launch.place[1]!r} must differ from 0 for heading = 'projected': on the equator no "
+                f"place[1] = {shown(launch.place[1])} must differ from 0 for heading = 'projected': on the equator no "
                 "horizontal speed belongs to a motion along the ground, and the constraints may lose rank"
             )
 

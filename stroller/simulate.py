@@ -2,8 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterator
-from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -14,11 +12,12 @@ from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.integration import LOOSEST, ImplicitMidpoint, Settings
 from nonholonomic.progress import Progress
-from nonholonomic.validation import Bound, as_known, is_traced, legal, nan_unless, require_all
+from nonholonomic.validation import as_known, is_traced, legal, nan_unless
 
-from .input import Input, check_input
+from .checks import check_options, check_run, check_times, run_bounds, times_bounds
+from .input import Input
 from .launch import Launch
-from .ride import Recipe, Ride, as_module, traced_ride
+from .ride import Ride, RideRecipe, as_module, traced_ride
 from .scene import Scene
 from .steps import followed
 from .trajectory import Trajectory, read_off
@@ -47,18 +46,21 @@ def simulate(
     - `t1`: end of the run [s], positive.
     - `input`: a function `(t, motion) -> (drive force [N], steering torque [N m])` (see `input.py`), or `None`.
     - `times`: times [s] to report, increasing, within [0, t1]; by default 201 equally spaced ones.
-    - `tolerance`: relative tolerance, and absolute tolerance in units of the scene's magnitudes, of an adaptive solver.
-    - `solver`: any Diffrax solver, or an `ImplicitMidpoint`; by default `diffrax.Dopri8()`, inside transformations,
-      without `adjoint` and where every number is a scalar, `nonholonomic.integration.Oscillatory8()`.
-    - `max_steps`: a run that needs more has failed.
+    - `tolerance`: relative tolerance of an adaptive solver, in [1e-14, 1e-2]; a tenth of it is the absolute tolerance, in units
+      of the scene's magnitudes.
+    - `solver`: any adaptive solver of Diffrax for ordinary differential equations, or an `ImplicitMidpoint`; by default
+      `diffrax.Dopri8()`, inside transformations, without `adjoint` and where every number is a scalar,
+      `nonholonomic.integration.Oscillatory8()`, which is refused elsewhere for its poor dense output.
+    - `max_steps`: a run that needs more has failed; at least 1.
     - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
       parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax differentiates, which pays if a loss
       is differentiated by many parameters, such as the weights of an input.
 
     **Returns:** a `Trajectory`; its `status` says whether the run reached its end and what happened on the way.
 
-    **Raises:** `ValueError` for a launch that the scene cannot start from, times that are not increasing, and an input that is
-    no function, cannot be traced, or is not finite at the start.
+    **Raises:** `ValueError` for arguments out of range, a number that is a list, a launch that the scene cannot start from,
+    times that are not increasing, a solver without an error estimate, and an input that is no function, cannot be traced, or
+    is not finite at the start.
 
     **Example:**
 
@@ -73,18 +75,11 @@ def simulate(
 
     ```
     """
-    if not isinstance(scene, Scene):
-        raise ValueError(f"scene = {scene!r} must be a Scene")
-    scene.check(launch)
-    require_all(run_bounds(t1, tolerance))
+    check_run(scene, launch, t1, input, tolerance)
+    check_options(solver, max_steps, adjoint)
     end, grid = as_known(t1), None
     times = _evenly_spaced(end) if times is None else as_known(times)
-    if times.ndim != 1 or times.size < 1:
-        raise ValueError(f"times = {times!r} must be a list of at least one time")
-    require_all(times_bounds(times, t1))
-    if not is_traced(times) and np.any(np.diff(np.asarray(times)) <= 0.0):
-        raise ValueError(f"times = {times!r} must be increasing")
-    check_input(input, scene, launch)
+    check_times(times, t1)
     if isinstance(solver, ImplicitMidpoint):
         grid = even_steps(times, end, solver.step_length)
         max_steps = grid.size
@@ -99,7 +94,7 @@ def simulate(
 
 def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
     """The run of concrete numbers."""
-    recipe = Recipe.of(ride)
+    recipe = RideRecipe.of(ride)
     if not isinstance(ride.settings.for_single_runs, diffrax.AbstractERK | ImplicitMidpoint):
         return _read_off(recipe, times, *_sampled(ride, times))
     steps, stats = followed(recipe)
@@ -127,20 +122,9 @@ def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.Ab
     if adjoint is not None:
         # Diffrax would differentiate the run that is not begun.
         begun = begun._replace(**nan_unless(may, {"scene": ride.scene, "launch": ride.launch, "input": ride.input}))
-    run = read_off(Recipe.of(ride), run_times, *traced_ride(begun, run_times, adjoint))
+    run = read_off(RideRecipe.of(ride), run_times, *traced_ride(begun, run_times, adjoint))
     stats = run.stats._replace(finished=run.stats.finished & may)
     return eqx.tree_at(lambda one: (one.t, one.stats), nan_unless(may, run), (times, stats))
-
-
-def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:
-    """The ranges of the horizon [s] and of the tolerance."""
-    yield Bound(t1, "t1", above=0.0)
-    yield Bound(tolerance, "tolerance", above=0.0, below=1.0)
-
-
-def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
-    """The range of the times of output [s]."""
-    yield Bound(times, "times", at_least=0.0, at_most=t1)
 
 
 def _evenly_spaced(t1: Float[Array, ""]) -> Float[Array, " times"]:
@@ -157,7 +141,9 @@ def even_steps(
     """
     for name, number in {"t1": t1, "times": times, "step_length": longest}.items():
         if is_traced(number):
-            raise ValueError(f"{name} is traced and must be known for ImplicitMidpoint, whose steps have a given length")
+            raise ValueError(
+                f"{name} is traced and must be known for ImplicitMidpoint, whose steps have a given length"
+            )
     knots = np.union1d(np.asarray(times), [0.0, float(t1)])
     counts = np.ceil(np.diff(knots) / float(longest) * (1.0 - 1e-12)).astype(int)
     pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots, knots[1:], counts, strict=False)]

@@ -17,7 +17,7 @@ from nonholonomic.integration import explicit_tableau, follow, sample
 from nonholonomic.xla_cpu import compiled_quickly
 
 from .dynamics import State
-from .ride import Recipe, RideProblem, Stats
+from .ride import RideProblem, RideRecipe, Stats
 
 Lanes = Float[np.ndarray, " lanes"]
 States = Float[np.ndarray, "components lanes"]
@@ -32,7 +32,7 @@ class Steps(NamedTuple):
     times: Float[np.ndarray, " steps"]
     states: Float[np.ndarray, "components steps"]
 
-    def at(self, recipe: Recipe, times: Lanes) -> States:
+    def at(self, recipe: RideRecipe, times: Lanes) -> States:
         """The states at the given times [s]; not a number after the end of the run."""
         which = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         ends = np.where(times == self.times[which], which, which + 1)
@@ -43,7 +43,7 @@ class Steps(NamedTuple):
         states[:, times > self.times[-1]] = np.nan
         return states
 
-    def _between(self, recipe: Recipe, which: Any, length: Lanes) -> States:
+    def _between(self, recipe: RideRecipe, which: Any, length: Lanes) -> States:
         """The states some time [s] after the starts of some steps."""
 
         def field(times: Lanes, states: States) -> States:
@@ -66,7 +66,7 @@ class Steps(NamedTuple):
 
 
 @eqx.filter_jit
-def _field(recipe: Recipe, times: Float[Array, " lanes"], states: State) -> State:
+def _field(recipe: RideRecipe, times: Float[Array, " lanes"], states: State) -> State:
     ride = recipe.ride
     return ride.scene.dynamics.field(times, states, ride.input)
 
@@ -81,7 +81,7 @@ def in_blocks(function: Callable[..., Any], *columns: Any) -> Any:
     return np.concatenate(found, axis=-1)[..., :count]
 
 
-def followed(recipe: Recipe) -> tuple[Steps, Stats]:
+def followed(recipe: RideRecipe) -> tuple[Steps, Stats]:
     """Run a ride outside of transformations, and keep its steps."""
     ride = recipe.ride
     problem = _problem(recipe)
@@ -101,13 +101,13 @@ def _counted(accepted: int, rejected: int, finished: bool) -> Stats:
 
 
 @eqx.filter_jit
-def _problem(recipe: Recipe) -> RideProblem:
+def _problem(recipe: RideRecipe) -> RideProblem:
     ride = recipe.ride
     return RideProblem.single(ride.scene, ride.launch, ride.input)
 
 
 @compiled_quickly
-def _on_grid(problem: RideProblem, recipe: Recipe) -> Any:
+def _on_grid(problem: RideProblem, recipe: RideRecipe) -> Any:
     """A ride with given steps, sampled at their ends."""
     ride = recipe.ride
     return sample(problem, None, ride.t1, ride.settings, grid=ride.grid)

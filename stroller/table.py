@@ -21,11 +21,12 @@ from nonholonomic.integration import (
 from nonholonomic.parameters import description, with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, cells_to_check
 from nonholonomic.sweeps import sweep as computed
-from nonholonomic.validation import as_number, require
+from nonholonomic.validation import as_number
 
+from .checks import check_run
 from .dynamics import State
 from .friction import Damping, RollingResistance
-from .input import Input, Steady, check_input
+from .input import Input, Steady
 from .launch import Launch
 from .ride import RideProblem, as_module
 from .scene import Scene
@@ -97,7 +98,7 @@ def sweep(
     - `axes`: full name of a parameter -> values, such as `{"launch.speed": [1.0, 2.0], "scene.surface.polar": [0.8, 0.9]}`; the
       parts of the place are `"launch.place[0]"` and `"launch.place[1]"`, the parameters of an input that is a module are
       under `"input."`. The first axis varies slowest; without any, `{}`, the table has a single ride.
-    - `tolerance`: relative tolerance of the integration.
+    - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`.
     - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
@@ -129,14 +130,11 @@ def sweep(
 
     ```
     """
-    if not isinstance(scene, Scene):
-        raise ValueError(f"scene = {scene!r} must be a Scene")
-    scene.check(launch)
-    require(t1, "t1", above=0.0)
-    require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+    check_run(scene, launch, t1, input, tolerance)
+    if not isinstance(axes, dict) or not all(isinstance(number, str) for number in axes):
+        raise ValueError(f"axes = {axes!r} must be a dictionary, full name of a parameter -> values")
     solver = Settings(tolerance, solver).for_lanes
     explicit_tableau(solver)
-    check_input(input, scene, launch)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
     grid = named_axes(axes, scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.

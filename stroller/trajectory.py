@@ -20,7 +20,7 @@ from .crossings import crossings, watched
 from .dynamics import Power, State, padded
 from .input import Input
 from .quantities import table_of_one
-from .ride import CONTACT_ROUND_OFF, RANK_LOST, Recipe, Stats
+from .ride import CONTACT_ROUND_OFF, RANK_LOST, RideRecipe, Stats
 from .scene import Scene
 from .steps import Steps, followed
 from .view import as_stages
@@ -78,7 +78,7 @@ class Trajectory(eqx.Module, Viewable):
     departure: Float[Array, " times"]
     state: Float[Array, "times components"]
     stats: Stats
-    recipe: Recipe
+    recipe: RideRecipe
     steps: Steps | None
 
     @property
@@ -264,7 +264,7 @@ def side_force(
 
 
 def read_off(
-    recipe: Recipe,
+    recipe: RideRecipe,
     t: Float[Array, " times"],
     states: Float[Array, "components times"],
     stats: Stats,

@@ -17,9 +17,12 @@ import tippe
 from stroller.table import RideProblem
 from tippe.cells import driver_of
 from tippe.inversion import InversionProblem
+from tippe.phases.airborne_trajectory import arena_phases
 from tippe.phases.exact_impact import Skid
+from tippe.phases.flight_trajectory import level_phases
 from tippe.phases.free_body import FreeBody, balls
 from tippe.phases.impact import Impact, approach
+from tippe.phases.stick_slip_runs import contact_phases
 from tippe.trajectory import TrajectoryProblem
 
 #: 16 to 44 ns for each number on a CPU, where a product takes one.
@@ -75,12 +78,23 @@ def table_problems(scene, launch):
     return tuple(phase.problem(problem.states) for phase in phases)
 
 
+def trajectory_problems(scene, launch):
+    """The problems that `simulate` integrates, with all that rides along: one, or that of every phase."""
+    if scene.contact == "hybrid":
+        phases_of = level_phases if scene.flies_in_closed_form else arena_phases
+        phases, _, state = phases_of((scene, launch), 1e-9)
+    else:
+        run = TrajectoryProblem.of(scene, launch)
+        if not scene.friction.set_valued:
+            return (run,)
+        phases, _, state = contact_phases(run, 1e-9)
+    return tuple(phase.problem(state) for phase in phases)
+
+
 def slow_in_scene(scene, launch):
-    """Which slow functions are called in the steps of a table of the scene, and of a smooth trajectory; nothing compiles."""
-    smooth = driver_of(scene).smooth
-    problems = eqx.filter_eval_shape(table_problems, scene, launch)
-    whole = (eqx.filter_eval_shape(TrajectoryProblem.of, scene, launch),) if smooth else ()
-    return set().union(*map(slow_in_problem, (*problems, *whole)))
+    """Which slow functions are called in the steps of a table of the scene, and of `simulate`; nothing compiles."""
+    both = (eqx.filter_eval_shape(problems, scene, launch) for problems in (table_problems, trajectory_problems))
+    return set().union(*map(slow_in_problem, itertools.chain(*both)))
 
 
 #: Functions of the user's are what they are; these have no slow function, and the package adds none.
@@ -104,6 +118,7 @@ LAWS = (
     tippe.SetValuedCoulomb(0.3),
 )
 EGG = tippe.SpheroidBody(mass=0.05, equatorial=0.02, polar=0.028, I1=1.184e-5, I3=8e-6, offset=0.003)
+BLUNT = tippe.ConvexBody(mass=0.05, support=lambda c: 0.02 - 1e-3 * c * (1.0 + c * c), I1=1.2e-5, I3=8e-6)
 ON_A_STEM = tippe.Top(6e-3, 0.015, 3e-3, 8e-7, 7e-7, stem=tippe.Stem(radius=5e-3, offset=0.016))
 
 
@@ -123,10 +138,20 @@ SCENES = [*itertools.product(ARENAS, LAWS[4:]), *itertools.product((ARENAS[0], A
 
 @pytest.mark.parametrize(("arena", "law"), SCENES, ids=name_of)
 def test_fields_of_the_top(arena, law):
-    """In contact, in flight, while it slips and while it rolls."""
-    for contact in ("stop", "hybrid"):
-        scene = tippe.Scene(rutstam_top(), arena, law, contact=contact)
-        assert slow_in_scene(scene, launched_in(arena)) == set(), contact
+    """In contact, while it slips and while it rolls."""
+    scene = tippe.Scene(rutstam_top(), arena, law)
+    assert slow_in_scene(scene, launched_in(arena)) == set()
+
+
+#: Every arena is flown over, and both laws with and without two kinds of motion are landed under.
+FLIGHTS = [*itertools.product(ARENAS, LAWS[4:5]), *itertools.product((ARENAS[0], ARENAS[4]), LAWS[5:])]
+
+
+@pytest.mark.parametrize(("arena", "law"), FLIGHTS, ids=name_of)
+def test_fields_of_a_top_that_flies(arena, law):
+    """In contact as it is seen from there, and in flight."""
+    scene = tippe.Scene(rutstam_top(), arena, law, contact="hybrid")
+    assert slow_in_scene(scene, launched_in(arena)) == set()
 
 
 @pytest.mark.parametrize("arena", ARENAS[:4], ids=name_of)
@@ -147,9 +172,10 @@ def test_fields_of_impacts(law):
     assert slow_in_problem(eqx.filter_eval_shape(impact, rutstam_top())) == set()
 
 
-def test_fields_of_an_egg():
+@pytest.mark.parametrize("body", [EGG, BLUNT], ids=name_of)
+def test_fields_of_an_egg(body):
     for arena in ARENAS[:2]:
-        assert slow_in_scene(tippe.Scene(EGG, arena, LAWS[4]), tippe.Launch(1.3, 100.0)) == set()
+        assert slow_in_scene(tippe.Scene(body, arena, LAWS[4]), tippe.Launch(1.3, 100.0)) == set()
 
 
 GROUNDS = (stroller.Plane(), stroller.Plane(0.3), stroller.Sphere(2.0), stroller.Spheroid(2.0, 1.1))
@@ -161,7 +187,9 @@ OTHERS = (
     stroller.Graph(lambda x, y: 0.1 * x * x - 0.2 * y * y),
     stroller.Implicit(lambda x, y, z: x * x + y * y + z * z - 4.0),
 )
-PARTS = list(itertools.product(GROUNDS, FRICTIONS, (0.0, 20.0), ("intrinsic", "projected")))
+#: Every ground with every heading and friction; a fork without a spring needs no other ground.
+PARTS = list(itertools.product(GROUNDS, FRICTIONS, (20.0,), ("intrinsic", "projected")))
+PARTS += itertools.product(GROUNDS[1:2], FRICTIONS[:2], (0.0,), ("intrinsic",))
 PARTS += itertools.product(OTHERS, FRICTIONS[1:2], (20.0,), ("intrinsic",))
 
 

@@ -17,6 +17,7 @@ from nonholonomic.integration import (
     AbstractProblem,
     Journey,
     Outcome,
+    tolerance_bound,
 )
 from nonholonomic.parameters import numbers
 from nonholonomic.validation import Bound, all_bounds, legal, require_all
@@ -118,7 +119,7 @@ def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any) -> None:
 def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:
     """The ranges of the horizon [s] and of the tolerance."""
     yield Bound(t1, "t1", above=0.0)
-    yield Bound(tolerance, "tolerance", at_least=1e-14, at_most=LOOSEST)
+    yield tolerance_bound(tolerance)
 
 
 def event_bounds(angle: Any) -> Iterator[Bound]:

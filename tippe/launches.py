@@ -63,7 +63,7 @@ def launches(
     """
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
-    if axes is not None and not isinstance(axes, dict):
+    if axes is not None and not (isinstance(axes, dict) and all(isinstance(number, str) for number in axes)):
         raise ValueError(f"axes = {axes!r} must be a dictionary, path of a number -> values")
     known = numbers("scene.friction", scene.friction)
     of_mu = next((number for number in known if number.endswith(".mu")), "scene.friction.mu")

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from nonholonomic.derivatives import exponent_of, growth
 from nonholonomic.geometry import cross
-from nonholonomic.integration import GUARD_LOST, REACHED_END, Settings, explicit_tableau
+from nonholonomic.integration import GUARD_LOST, REACHED_END, Settings, explicit_tableau, tolerance_bound
 from nonholonomic.validation import require
 
 from .cells import driver_of
@@ -101,7 +101,7 @@ def lyapunov_exponent(
             "contact = 'hybrid' and SetValuedCoulomb have no exponents: variations end at a change of phase"
         )
     require(t1, "t1", above=0.0)
-    require(tolerance, "tolerance", at_least=1e-14, at_most=1e-2)
+    tolerance_bound(tolerance).require()
     settings = Settings(tolerance, solver)
     explicit_tableau(settings.for_lanes)
     shapes = {np.shape(leaf) for leaf in jax.tree.leaves((scene, launch))} - {()}

@@ -15,7 +15,7 @@ from nonholonomic.geometry import Component, Vector, dot, scale, sum_vectors
 from nonholonomic.integration import Followed, PhasedPath, padded
 from nonholonomic.parameters import text_as_html
 from nonholonomic.sweeps import Table
-from nonholonomic.validation import is_traced, require
+from nonholonomic.validation import is_traced, require, require_increasing
 from nonholonomic.views import Stage, Viewable, draw_portrait
 
 from .quantities import table_of
@@ -46,14 +46,6 @@ def of_each_run(function: Callable[[Any], Array]) -> property:
 def unit(vectors: Float[Array, "times 3"]) -> Float[Array, "times 3"]:
     """Vectors at unit length."""
     return vectors / jnp.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
-def check_increasing(times: Any) -> None:
-    """Raise `ValueError` unless these are times, one at least, that increase."""
-    if np.ndim(times) != 1 or np.shape(times)[0] == 0:
-        raise ValueError(f"times must be a non-empty list, not of shape {np.shape(times)}")
-    if not is_traced(times) and np.any(np.diff(times) <= 0.0):
-        raise ValueError("times must increase")
 
 
 class AbstractTrajectory(eqx.Module, Viewable):
@@ -167,7 +159,7 @@ class AbstractTrajectory(eqx.Module, Viewable):
             raise ValueError("a run made inside jit, vmap or grad has no dense output: hand `times` to simulate")
         times = np.asarray(times, dtype=float)
         require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
-        check_increasing(times)
+        require_increasing(times, "times")
         return self.resampled(times)
 
     def to_table(self) -> Table:

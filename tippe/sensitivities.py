@@ -87,7 +87,7 @@ def slopes_of_cells(
         passes=last,
     )
     inverted = is_inverted(outcome, problem, last)
-    found = [np.where(inverted, slope / size, 0.0) for slope, size in zip(slopes, sizes, strict=True)]
+    found = [np.where(inverted, slope / moved, 0.0) for slope, moved in zip(slopes, sizes, strict=True)]
     return outcome, dict(zip(slope_names(names), found, strict=True))
 
 
@@ -134,11 +134,10 @@ def phased_slopes_of_cells(
     built = _phases_and_directions(phases_of, roots, columns, names, *numbers, size, last)
     (phases, first, states), directions, sizes = built
     directions = tuple((one[0], one[2]) for one in directions)
-    # In a loop the stages compile in a third of the time, and there is a program for every phase.
     settings = Settings(tolerance, solver)
     given = (directions, np.asarray(first), np.asarray(states), t1, count, settings)
     journey, found = travel_with_slopes(phases, *given, kinds=kinds, ends_on_event=not last)
-    slopes = [slope / np.asarray(size) for slope, size in zip(found.slopes, sizes, strict=True)]
+    slopes = [slope / np.asarray(moved) for slope, moved in zip(found.slopes, sizes, strict=True)]
     return journey, dict(zip(slope_names(names), slopes, strict=True)), found.grazing
 
 

@@ -47,6 +47,12 @@ def proportions(body: Top) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """The two numbers that classify a top: alpha = a / R and gamma = I1 / I3.
 
     **Raises:** `ValueError` for a body that is no `Top`, of which these formulas do not hold.
+
+    **Example:** of the module's scene.
+
+    >>> alpha, gamma = steady.proportions(top)
+    >>> print(f"{alpha:.2f} {gamma:.3f}")
+    0.30 0.936
     """
     if not isinstance(body, Top):
         raise ValueError(f"body = {body!r} must be a Top: the formulas are those of a sphere")
@@ -58,6 +64,11 @@ def group(body: Top) -> str:
 
     **Returns:** "I" if gamma < 1 - alpha: it stands upright at every spin and never inverts; "III" if gamma > 1 +
     alpha: it never stands inverted, and ends tumbling; "II" between: it inverts if Jellett's constant is large enough.
+
+    **Example:** of the module's scene.
+
+    >>> steady.group(top)
+    'II'
     """
     alpha, gamma = (float(number) for number in proportions(body))
     return "I" if gamma <= 1.0 - alpha else "III" if gamma >= 1.0 + alpha else "II"
@@ -67,6 +78,11 @@ def folds(body: Top) -> bool:
     """Whether Jellett's constant has an extremum over the tumbling angles of a top of group II, and so hysteresis.
 
     It has none if gamma > 1 - delta, delta = (1 + 6 alpha + alpha^2 - (1 - alpha) sqrt(1 + 14 alpha + alpha^2)) / 8.
+
+    **Example:** of the module's scene.
+
+    >>> steady.folds(top), steady.folds(tippe.Top(0.02, 0.02, 0.006, I1=2.5e-6, I3=3.2e-6))
+    (False, True)
     """
     alpha, gamma = proportions(body)
     delta = (1.0 + 6.0 * alpha + alpha**2 - (1.0 - alpha) * jnp.sqrt(1.0 + 14.0 * alpha + alpha**2)) / 8.0
@@ -85,6 +101,11 @@ def upright_critical_spin(scene: Scene) -> Float[Array, "..."]:
     """Spin [rad/s] above which the upright top on the plane is unstable; infinite if it never is.
 
     omega^2 = m g a (1 - alpha)^2 / (I3 (gamma - 1 + alpha)).
+
+    **Example:** of the module's scene.
+
+    >>> print(f"{steady.upright_critical_spin(scene):.1f} rad/s")
+    27.7 rad/s
     """
     alpha, gamma = proportions(scene.body)
     weight = scene.body.mass * scene.gravity * scene.body.offset
@@ -95,6 +116,11 @@ def inverted_critical_spin(scene: Scene) -> Float[Array, "..."]:
     """Spin [rad/s] above which the inverted top on the plane is stable; infinite if it never is.
 
     omega^2 = m g a (1 + alpha)^2 / (I3 (1 + alpha - gamma)).
+
+    **Example:** of the module's scene.
+
+    >>> print(f"{steady.inverted_critical_spin(scene):.1f} rad/s")
+    41.3 rad/s
     """
     alpha, gamma = proportions(scene.body)
     weight = scene.body.mass * scene.gravity * scene.body.offset
@@ -105,6 +131,11 @@ def jellett_thresholds(scene: Scene) -> tuple[Float[Array, "..."], Float[Array, 
     """Jellett's constant [kg m^3/s] of the standing tops at their critical spins, upright and inverted.
 
     Below the first, the upright top is stable; above the second, the inverted one is (Rutstam's lambda_thres).
+
+    **Example:** of the module's scene.
+
+    >>> print(" ".join(f"{jellett:.2e}" for jellett in steady.jellett_thresholds(scene)))
+    1.24e-06 3.44e-06
     """
     (alpha, _), body = proportions(scene.body), scene.body
     upright = (1.0 - alpha) * body.radius * body.I3 * upright_critical_spin(scene)
@@ -120,6 +151,11 @@ def standing_state(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = Fa
     - `scene`: a `Scene` on any arena.
     - `spin`: angular velocity about the axis [rad/s].
     - `inverted`: whether the stem points into the arena.
+
+    **Example:** of the module's scene.
+
+    >>> print(f"{scene.theta(steady.standing_state(scene, 100.0, inverted=True)):.4f} rad")
+    3.1416 rad
     """
     state = scene.state(Launch(0.0, spin))
     # The axis and the angular momentum point along n; only their components 4 and 7 are not 0.
@@ -135,6 +171,11 @@ def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = F
     **Arguments:** as for `standing_state`.
 
     **Returns:** (k, k), for the velocity, axis, angular momentum and place across n, in the units of `Scene.scales`.
+
+    **Example:** of the module's scene.
+
+    >>> steady.standing_matrix(scene, 50.0, inverted=True).shape
+    (6, 6)
     """
     state = standing_state(scene, spin, inverted)
     across = [0, 1, 2, 3, 5, 6, *range(8, state.size - 1)]
@@ -153,6 +194,12 @@ class Tumbling(NamedTuple):
     - `precession`: phi' [rad/s].
     - `spin`: omega3 [rad/s].
     - `jellett`: Jellett's constant [kg m^3/s].
+
+    **Example:** of the module's scene.
+
+    >>> motion = steady.tumbling(scene, 1.0)
+    >>> print(f"it turns about its axis at {motion.spin:.2f} rad/s")
+    it turns about its axis at 8.95 rad/s
     """
 
     theta: Float[Array, "..."]
@@ -181,6 +228,11 @@ def tumbling(scene: Scene, theta: Float[ArrayLike, "..."]) -> Tumbling:
     - `theta`: inclination [rad] with D > 0; in group II that is every inclination.
 
     **Raises:** `ValueError` if the arena is not a plane, or if no tumbling top exists at the inclination.
+
+    **Example:** of the module's scene.
+
+    >>> print(f"{steady.tumbling(scene, 2.0).precession:.2f} rad/s")
+    33.55 rad/s
     """
     _on_a_plane(scene)
     theta = as_number(theta)
@@ -193,7 +245,13 @@ def tumbling(scene: Scene, theta: Float[ArrayLike, "..."]) -> Tumbling:
 
 
 def tumbling_is_stable(scene: Scene, theta: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
-    """Whether the tumbling top is stable: J^2 grows with theta there, that is 4 D^2 + G (I1 - I3) > 0."""
+    """Whether the tumbling top is stable: J^2 grows with theta there, that is 4 D^2 + G (I1 - I3) > 0.
+
+    **Example:** of the module's scene.
+
+    >>> bool(steady.tumbling_is_stable(scene, 1.0))
+    True
+    """
     lever, inertia = _lever_and_inertia(scene, theta)
     return 4.0 * lever**2 + inertia * (scene.body.I1 - scene.body.I3) > 0.0
 
@@ -204,6 +262,12 @@ def effective_energy(
     """Least energy [J] of a top with the given inclination and Jellett's constant: J^2 / (2 R^2 G) + m g (R - a cos).
 
     Its extrema over theta are the steady motions, its minima the stable ones.
+
+    **Example:** of the module's scene.
+
+    >>> motion = steady.tumbling(scene, 1.0)
+    >>> print(f"{1e3 * steady.effective_energy(scene, 1.0, motion.jellett):.3f} mJ")
+    4.886 mJ
     """
     body = scene.body
     _, inertia = _lever_and_inertia(scene, theta)
@@ -219,6 +283,12 @@ def tumbling_angles(scene: Scene, jellett: float, samples: int = 2001) -> list[f
     - `scene`: a `Scene` on the plane with concrete numbers.
     - `jellett`: Jellett's constant [kg m^3/s], of either sign.
     - `samples`: points of the grid on which brackets are sought; each is then halved down to the zero.
+
+    **Example:** of the module's scene.
+
+    >>> jellett = steady.tumbling(scene, 1.0).jellett
+    >>> print([round(theta, 3) for theta in steady.tumbling_angles(scene, float(jellett))])
+    [1.0]
     """
     _on_a_plane(scene)
     grid = jnp.linspace(0.0, jnp.pi, samples)
@@ -230,7 +300,14 @@ def tumbling_angles(scene: Scene, jellett: float, samples: int = 2001) -> list[f
 
 
 def tumbling_state(scene: Scene, motion: Tumbling) -> Float[Array, " 8"]:
-    """State of the vector form of a tumbling top whose axis leans towards t1."""
+    """State of the vector form of a tumbling top whose axis leans towards t1.
+
+    **Example:** of the module's scene.
+
+    >>> motion = steady.tumbling(scene, 1.0)
+    >>> print(f"{1e3 * scene.energy(steady.tumbling_state(scene, motion)):.3f} mJ")
+    4.886 mJ
+    """
     body, s, c = scene.body, jnp.sin(motion.theta), jnp.cos(motion.theta)
     zero = jnp.zeros_like(s)
     across, along = -body.I1 * motion.precession * s, body.I3 * motion.spin
@@ -238,7 +315,16 @@ def tumbling_state(scene: Scene, motion: Tumbling) -> Float[Array, " 8"]:
 
 
 def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
-    """Rate of a state of the plane when everything turns about the vertical at 1 rad/s."""
+    """Rate of a state of the plane when everything turns about the vertical at 1 rad/s.
+
+    **Example:** of the module's scene.
+
+    >>> motion = steady.tumbling(scene, 1.0)
+    >>> state = steady.tumbling_state(scene, motion)
+    >>> change = scene.field(state) - motion.precession * steady.quarter_turn(state)
+    >>> bool(abs(change).max() < 1e-12)
+    True
+    """
     (u1, u2), (e1, e2, _), (L1, L2, _), _ = parts(state)
     zero = jnp.zeros_like(u1)
     return joined((-u2, u1), (-e2, e1, zero), (-L2, L1, zero))
@@ -254,6 +340,12 @@ def tumbling_matrix(scene: Scene, motion: Tumbling) -> Float[Array, "5 5"]:
 
     - `scene`: a `Scene` on the plane, with friction.
     - `motion`: from `tumbling`.
+
+    **Example:** of the module's scene.
+
+    >>> motion = steady.tumbling(scene, 1.0)
+    >>> print(f"{steady.growth_rate(steady.tumbling_matrix(scene, motion)):.2f} 1/s")
+    -0.35 1/s
     """
     state = tumbling_state(scene, motion)
     scales = scene.scales(Launch(motion.theta, motion.spin))
@@ -271,7 +363,13 @@ def tumbling_matrix(scene: Scene, motion: Tumbling) -> Float[Array, "5 5"]:
 
 
 def growth_rate(matrix: Float[Array, "k k"]) -> Float[Array, ""]:
-    """Largest real part [1/s] of the eigenvalues of a stability matrix: positive if the motion is unstable."""
+    """Largest real part [1/s] of the eigenvalues of a stability matrix: positive if the motion is unstable.
+
+    **Example:** of the module's scene.
+
+    >>> print(f"{steady.growth_rate(steady.standing_matrix(scene, 50.0, inverted=True)):.2f} 1/s")
+    -0.80 1/s
+    """
     return jnp.max(jnp.linalg.eigvals(matrix).real)
 
 

@@ -160,7 +160,9 @@ class InversionJob(NamedTuple):
         found = runs.results(self.roots, columns, self.tolerance, count)
         if self.errors:
             coarse = runs._replace(slopes_by=[]).results(self.roots, columns, COARSER * self.tolerance, count)
-            agreed = (found["status"] == coarse["status"]) & (found["status"] != words.index("failed"))
+            # Two runs that ended before their answer agree on nothing.
+            silent = [words.index(word) for word in ("failed", "unresolved") if word in words]
+            agreed = (found["status"] == coarse["status"]) & ~np.isin(found["status"], silent)
             for name in runs.times:
                 alike = agreed & (np.isfinite(found[name]) == np.isfinite(coarse[name]))
                 found[f"{name}_error"] = time_error(found[name], coarse[name], alike)

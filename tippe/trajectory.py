@@ -11,14 +11,32 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import scale, sum_vectors
-from nonholonomic.integration import LOOSEST, Followed, PhasedPath, Settings, explicit_tableau, follow
+from nonholonomic.integration import (
+    LOOSEST,
+    Followed,
+    PhasedPath,
+    Settings,
+    explicit_tableau,
+    follow,
+    require_adaptive,
+    require_adjoint,
+)
 from nonholonomic.progress import Progress
-from nonholonomic.validation import Bound, all_bounds, as_number, is_traced, legal, nan_unless, require_all
+from nonholonomic.validation import (
+    Bound,
+    all_bounds,
+    as_number,
+    is_traced,
+    legal,
+    nan_unless,
+    require_all,
+    require_increasing,
+)
 from nonholonomic.xla_cpu import on_device
 
 from .inversion import check_run, run_bounds
 from .launch import Launch
-from .observables import AbstractTrajectory, check_increasing, of_each_run
+from .observables import AbstractTrajectory, of_each_run
 from .phases.airborne_trajectory import sampled_airborne, simulate_airborne
 from .phases.flight_trajectory import HybridTrajectory, sampled_hybrid, simulate_hybrid
 from .phases.stick_slip_runs import follow_stick_slip
@@ -124,9 +142,9 @@ def simulate(
     - `t1`: horizon [s].
     - `times`: times of the result [s], increasing, within [0, t1]; by default those of the accepted steps. Outside of
       transformations those after the end of the run are left out, and `Trajectory.at` gives others.
-    - `tolerance`: relative tolerance; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
-    - `solver`: any solver of Diffrax; by default `Dopri8()`, inside transformations and without `adjoint`
-      `nonholonomic.integration.Oscillatory8()`.
+    - `tolerance`: relative tolerance, in [1e-14, 1e-2]; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
+    - `solver`: any adaptive solver of Diffrax for ordinary differential equations; by default `Dopri8()`, inside
+      transformations and without `adjoint` `nonholonomic.integration.Oscillatory8()`.
     - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
       parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax integrates a traced run, which pays if a
       loss is differentiated by many parameters.
@@ -150,12 +168,12 @@ def simulate(
     ```
     """
     check_run(scene, launch, t1, tolerance)
-    if not isinstance(solver, diffrax.AbstractSolver | None):
-        raise ValueError(f"solver = {solver!r} must be a solver of Diffrax, such as Dopri8()")
+    require_adaptive(solver)
+    require_adjoint(adjoint)
     if times is not None:
         times = as_number(times)
         require_all(times_bounds(times, t1))
-        check_increasing(times)
+        require_increasing(times, "times")
     if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
         return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
     if scene.contact == "hybrid":

@@ -10,11 +10,10 @@ from jaxtyping import Float
 from nonholonomic.integration import Settings
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
-from nonholonomic.validation import as_number, require, require_all
+from nonholonomic.validation import as_number, require, require_all, require_increasing
 
 from .cells import COUNTED
 from .launches import described, launches
-from .observables import check_increasing
 from .quantities import COMPONENTS, QUANTITIES
 from .scene import Scene
 from .trajectory import times_bounds
@@ -89,7 +88,7 @@ def trajectory_table(
     """
     names = _names(quantities)
     require_all(times_bounds(as_number(times), None))
-    check_increasing(times)
+    require_increasing(times, "times")
     times = np.asarray(times, dtype=float)
     require(times[-1], "times[-1]", above=0.0, why="it is the horizon")
     given = {"theta": theta, "eta": eta, "mu": mu, "spin": spin}

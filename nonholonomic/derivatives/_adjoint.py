@@ -53,7 +53,7 @@ KEPT = 256
 Measured = Callable[[Any, Block], Lanes]
 
 
-class Record(NamedTuple):
+class Taken(NamedTuple):
     """The steps of a period: where each began, and its length, 0 for a lane that did not move."""
 
     time: Float[Array, "iterations lanes"]
@@ -195,7 +195,7 @@ def march_with_gradient(
     return run.outcome._replace(state=run.outcome.state[:components]), run.gradient[:components], by_number
 
 
-def _recorded(queue: Queue, progress: Progress) -> tuple[Progress, Record, Int[Array, ""]]:
+def _recorded(queue: Queue, progress: Progress) -> tuple[Progress, Taken, Int[Array, ""]]:
     """Advance the block by a period and record its steps; also returns the number of iterations."""
     here = queue.here(progress.block)
 
@@ -207,12 +207,12 @@ def _recorded(queue: Queue, progress: Progress) -> tuple[Progress, Record, Int[A
         block, record, idle, count = carry
         after = attempt(*here, block)
         length = jnp.where(after.time > block.time, length_to_try(here[1], block), 0.0)
-        made = Record(block.time, _without_probe(block).state, length)
+        made = Taken(block.time, _without_probe(block).state, length)
         record = jax.tree.map(functools.partial(written_in_place, at=count), record, made)
         return after, record, idle + queue.idle(block), count + 1
 
     def loop(start: Block) -> Any:
-        empty = Record(
+        empty = Taken(
             *(
                 jnp.zeros((PERIOD, *leaf.shape), leaf.dtype)
                 for leaf in (start.time, _without_probe(start).state, start.length)
@@ -234,7 +234,7 @@ def _taken_back(
     moving: Any,
     measured: Measured,
     block: Block,
-    record: Record,
+    record: Taken,
     count: Int[Array, ""],
     adjoint: Float[Array, "rows lanes"],
 ) -> Float[Array, "rows lanes"]:

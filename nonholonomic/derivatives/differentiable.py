@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..validation import is_traced
 from ._block import find
 from .slopes import directions_of
 from .variation import natural_size
@@ -78,13 +79,17 @@ def ask(question: AbstractQuestion, *leaves: Float[Array, "..."]) -> Answer:
         if not active:
             answer = found(*leaves)
             return answer, jax.tree.map(jnp.zeros_like, answer)
-        # Copied: under `jit` JAX refuses a function with a rule, called in a rule, the NumPy arrays that `vmap` hands on.
-        answer, slopes = _with_slopes(question, active)(*map(jnp.array, leaves))
+        answer, slopes = _with_slopes(question, active)(*leaves)
         moved = [tangents[i] for i in active]
         # Slopes have `None` where the answer has an array that is not differentiated.
         return answer, jax.tree.map(lambda value, *by: _change(question, value, by, moved), answer, *slopes)
 
-    return found(*leaves)
+    return found(*_canonical(leaves))
+
+
+def _canonical(leaves: tuple[Any, ...]) -> list[Any]:
+    """Leaves that a function with a rule of its own takes inside `jit`: JAX refuses the NumPy arrays that `vmap` hands on."""
+    return [jnp.array(leaf) if is_traced(leaf) else leaf for leaf in leaves]
 
 
 def _change(question: AbstractQuestion, value: Array, slopes: tuple[Any, ...], tangents: list[Array]) -> Any:

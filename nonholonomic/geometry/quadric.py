@@ -152,6 +152,15 @@ class Spheroid(AbstractQuadric, AbstractLevel):
         - `xi`: coordinate [1], positive.
 
         **Raises:** `ValueError` for numbers outside these ranges.
+
+        **Example:**
+
+        ```
+        >>> import stroller
+        >>> stroller.Spheroid.from_oblate(a=2.0, xi=0.8)
+        Spheroid(equatorial=2.67487 m, polar=1.77621 m)
+
+        ```
         """
         a, xi = as_number(a), as_number(xi)
         require(a, "a", above=0.0)

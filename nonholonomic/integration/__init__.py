@@ -45,6 +45,9 @@ from .settings import ABSOLUTE as ABSOLUTE
 from .settings import LOOSEST as LOOSEST
 from .settings import Settings as Settings
 from .settings import lanes_for as lanes_for
+from .settings import require_adaptive as require_adaptive
+from .settings import require_adjoint as require_adjoint
+from .settings import tolerance_bound as tolerance_bound
 from .single_run import Followed as Followed
 from .single_run import Sampled as Sampled
 from .single_run import follow as follow

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Float
 
-from .march import Outcome
 from .problem import AbstractProblem
+from .queue import Outcome
 from .settings import Settings
 from .single_run import saved
 from .status import CROSSED, FAILED, GUARD_LOST, REACHED_END

@@ -15,8 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from ..xla_cpu import compiled_alone
 from .problem import AbstractProblem, crossing_time
-from .queue import Outcome as Outcome
-from .queue import Queue
+from .queue import Outcome, Queue
 from .settings import Settings
 from .status import CROSSED
 

@@ -30,14 +30,14 @@ STRETCH = 1.08
 Samples = Float[Array, "cells times components"]
 
 
-class Record(NamedTuple):
+class Reached(NamedTuple):
     """What the iterations of a period reached: the state, and the number of the sample there, if it is one."""
 
     state: Float[Array, "iterations components lanes"]
     sample: Int[Array, "iterations lanes"]
 
 
-class Sampled(NamedTuple):
+class Sampling(NamedTuple):
     """A march with samples on its way: `sample` is the number of the next one in every lane."""
 
     progress: Progress
@@ -72,7 +72,7 @@ def march_with_samples(
     first = jnp.sum(of_cell <= 0.0, axis=1)
     own_times = times.ndim == 2
 
-    def period(run: Sampled) -> Sampled:
+    def period(run: Sampling) -> Sampling:
         cell = jnp.minimum(run.progress.block.cell, queue.capacity - 1)
         here = of_cell[cell].T if own_times else times
         progress, sample, record = _recorded(queue, here, run.progress, run.sample)
@@ -82,18 +82,18 @@ def march_with_samples(
         begin = first[jnp.minimum(onward.block.cell, queue.capacity - 1)]
         rows = jnp.moveaxis(record.state, 1, -1)
         samples = run.samples.at[cell[None], record.sample].set(rows, mode="drop", unique_indices=True)
-        return Sampled(onward, jnp.where(fresh, begin, sample), outcome, samples)
+        return Sampling(onward, jnp.where(fresh, begin, sample), outcome, samples)
 
     progress = queue.start()
     at_start = jnp.where(of_cell[..., None] <= 0.0, starts.T[:, None], jnp.nan)
-    run = Sampled(progress, first[jnp.minimum(progress.block.cell, queue.capacity - 1)], queue.empty(), at_start)
+    run = Sampling(progress, first[jnp.minimum(progress.block.cell, queue.capacity - 1)], queue.empty(), at_start)
     run = jax.lax.while_loop(lambda run: queue.unfinished(run.progress), period, run)
     return queue.store(run.outcome, run.progress.block), run.samples
 
 
 def _recorded(
     queue: Queue, times: Float[Array, "times ..."], progress: Progress, sample: Int[Array, " lanes"]
-) -> tuple[Progress, Int[Array, " lanes"], Record]:
+) -> tuple[Progress, Int[Array, " lanes"], Reached]:
     """Advance the block by a period and record its samples."""
     here, control, atol = queue.here(progress.block)
     count = times.shape[0]
@@ -114,13 +114,13 @@ def _recorded(
         is_sample = reached & (sample < count) & (after.time >= next_time)
         goes_on = reached & (after.time < horizon)
         after = after._replace(status=jnp.where(goes_on, RUNNING, after.status))
-        made = Record(after.state, jnp.where(is_sample, sample, count))
+        made = Reached(after.state, jnp.where(is_sample, sample, count))
         record = jax.tree.map(functools.partial(written_in_place, at=iteration), record, made)
         return after, sample + is_sample, record, idle, iteration + 1
 
     def loop(start: tuple[Block, Int[Array, " lanes"]]) -> Any:
         block, sample = start
-        empty = Record(
+        empty = Reached(
             jnp.zeros((PERIOD, *block.state.shape), block.state.dtype), jnp.full((PERIOD, *sample.shape), count)
         )
         return jax.lax.while_loop(going, step, (block, sample, empty, jnp.zeros((), int), jnp.zeros((), int)))

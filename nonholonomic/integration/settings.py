@@ -1,20 +1,20 @@
 """How runs are integrated."""
 
-from typing import Self
+from typing import Any, Self
 
 import diffrax
 import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
-from ..validation import as_number
+from ..validation import Bound, as_number
 from .oscillatory import Oscillatory8
 
 #: The absolute tolerance as a fraction of the relative one, in units of a problem's own magnitudes.
 ABSOLUTE = 0.1
 
-#: The greatest relative tolerance that is accepted.
-LOOSEST = 1e-2
+#: The least and the greatest relative tolerance: below, steps are decided by round-off; above, steps are hardly controlled.
+TIGHTEST, LOOSEST = 1e-14, 1e-2
 
 
 class Settings(eqx.Module):
@@ -60,6 +60,31 @@ class Settings(eqx.Module):
     def lanes_of(self, cells: int, parts: int = 1) -> int:
         """How many of the cells of a problem advance together, given the number of parts in its state."""
         return lanes_for(cells, parts) if self.lanes is None else self.lanes
+
+
+def tolerance_bound(tolerance: Any) -> Bound:
+    """The range of the relative tolerance."""
+    return Bound(tolerance, "tolerance", at_least=TIGHTEST, at_most=LOOSEST)
+
+
+def require_adaptive(solver: Any, others: str = "") -> None:
+    """Raise `ValueError` unless this is `None` or a solver of Diffrax that estimates its errors and takes one field.
+
+    Those with two take a stiff part or noise beside it. **Arguments:** `others`: what else the message should allow.
+    """
+    structure = getattr(solver, "term_structure", None)
+    adaptive = isinstance(solver, diffrax.AbstractAdaptiveSolver) and isinstance(structure, type)
+    if solver is not None and not adaptive:
+        raise ValueError(
+            f"solver = {solver!r} must be an adaptive solver of Diffrax for ordinary differential equations, such as "
+            f"Dopri8(){others}"
+        )
+
+
+def require_adjoint(adjoint: Any) -> None:
+    """Raise `ValueError` unless this is `None` or a way of Diffrax to differentiate."""
+    if not isinstance(adjoint, diffrax.AbstractAdjoint | None):
+        raise ValueError(f"adjoint = {adjoint!r} must be one of Diffrax, such as RecursiveCheckpointAdjoint(), or None")
 
 
 def lanes_for(cells: int, parts: int = 1) -> int:

@@ -30,12 +30,13 @@ def local_processes(n: int, threads: int = 1) -> Iterator[Executor]:
 
     **Raises:** `ValueError` for numbers below 1.
 
-    **Example:**
+    **Example:** a table takes it as `executor=processes`.
 
     ```
     >>> import nonholonomic
-    >>> with nonholonomic.local_processes(2) as processes:  # doctest: +SKIP
-    ...     table = tippe.inversion_table(scene, theta=theta, spin=spin, t1=8.0, executor=processes)
+    >>> with nonholonomic.local_processes(1) as processes:
+    ...     print(processes.submit(sum, [1.0, 2.0]).result())
+    3.0
 
     ```
     """

@@ -10,10 +10,10 @@ import pytest
 from close import assert_close
 from hop_reference import CASES, Case, contact, energy, gap, rate, watched
 from scipy.integrate import solve_ivp
+from stems import first_contact
 from test_hops import scene_of
 
 import tippe
-from tippe.phases import first_contact
 from tippe.phases.free_body import FreeBody, balls, freed, gap_rate, jellett
 from tippe.phases.free_body import energy as energy_of
 from tippe.phases.leaning import BOTH, at_rest
@@ -38,7 +38,7 @@ def states_of_the_reference(scene: tippe.Scene, states: np.ndarray) -> np.ndarra
 def leaning_states(body: tippe.Top, count: int, seed: int) -> np.ndarray:
     """States (8, count) of a top that leans in any direction, at any spin and precession."""
     random = np.random.default_rng(seed)
-    theta, azimuth = float(first_contact(body)), random.uniform(-np.pi, np.pi, count)
+    theta, azimuth = first_contact(body), random.uniform(-np.pi, np.pi, count)
     e = np.stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.full(count, np.cos(theta))])
     along, upright = random.normal(scale=[[7e-5], [3e-5]], size=(2, count))
     momentum = along * e + upright * np.array([[0.0], [0.0], [1.0]])
@@ -131,7 +131,7 @@ def test_coming_to_rest_along_the_normal():
     for ball in spheres:
         assert_close(gap_rate(scene.body, ball, after), 0.0, atol=1e-16)
         assert_close(jellett(ball, after), jellett(ball, before), atol=1e-20)
-    turned = tilt * math.sin(float(first_contact(scene.body)))
+    turned = tilt * math.sin(first_contact(scene.body))
     lost = turned**2 / (2.0 * 8e-7) + 6e-3 * np.asarray(before.velocity[2]) ** 2 / 2.0
     assert_close(energy_of(scene.body, 9.81, before) - energy_of(scene.body, 9.81, after), lost, rtol=1e-8, atol=1e-17)
 
@@ -149,7 +149,7 @@ def test_the_end_of_rocking():
         # The top turns about the sphere that stays.
         stays, strikes = spheres[1 - striking], spheres[striking]
         turned = -1e-6 / (strikes.offset - stays.offset)
-        across = np.stack([-states[3], states[2]]) / math.sin(float(first_contact(scene.body)))
+        across = np.stack([-states[3], states[2]]) / math.sin(first_contact(scene.body))
         sine2 = states[2] ** 2 + states[3] ** 2
         tilt = turned * 8e-7 / np.sqrt(sine2)
         momentum = (*(L - tilt * a for L, a in zip(free.momentum[:2], across, strict=True)), free.momentum[2])
@@ -205,7 +205,7 @@ def test_while_it_leans(ride):
     assert ride.status == "reached t1"
     (cosine,), (height,) = set(ride.states[4, on_both]), set(ride.distance[0, on_both])
     assert_close([cosine, height], [-10.0 / 13.0, 0.0], rtol=1e-15, atol=1e-17)
-    assert_close(ride.theta[on_both], float(first_contact(ride.scene.body)), atol=1e-9)
+    assert_close(ride.theta[on_both], first_contact(ride.scene.body), atol=1e-9)
     free = FreeBody(*(ride.at(ride.t[on_both])._free))
     for ball in balls(ride.scene.body):
         assert_close(gap_rate(ride.scene.body, ball, free), 0.0, atol=1e-11)

@@ -131,11 +131,17 @@ def test_axes_of_one_name_are_told_apart():
         (dict(axes={"scene.body.mass": [1.0, -1.0]}), r"mass = .* must be greater than 0\.0"),
         (dict(axes={"launch.place[1]": [0.0, 2.0]}), r"place\[1\] = .* must be at most 1\.57"),
         (dict(axes={}, tolerance=1.0), r"tolerance = 1\.0 must be at most"),
+        (dict(axes=None), r"axes = None must be a dictionary"),
+        (dict(axes={3: [1.0]}), r"axes = \{3: \[1\.0\]\} must be a dictionary, full name of a parameter -> values"),
+        (dict(axes={}, t1=[1.0, 2.0]), r"t1 must be one number, not of shape \(2,\); axes of sweep take lists"),
+        (dict(axes={}, launch=Launch((0.0, 0.1), 0.0, [1.0, 2.0])), r"launch\.speed must be one number, not of shape"),
+        (dict(axes={}, launch=1.0), r"launch = 1\.0 must be a Launch"),
     ],
 )
 def test_bad_sweeps_are_refused(change, message):
+    given = {"launch": LAUNCH, "t1": 1.0} | change
     with pytest.raises(ValueError, match=message):
-        stroller.sweep(BOWL, LAUNCH, 1.0, **change)
+        stroller.sweep(BOWL, **given)
 
 
 def test_main_job(tmp_path, capsys):

@@ -75,6 +75,7 @@ def test_arrays_of_numpy_in_a_batch_inside_jit(time):
 
     values, slopes = jax.jit(lambda mu: jax.jvp(times, (mu,), (jnp.ones(()),)))(0.3)
     assert np.all(np.isfinite(values))
+    assert_close(jax.jit(times)(0.3), values, rtol=1e-6)
     assert_close(slopes, jax.jvp(times, (0.3,), (1.0,))[1], rtol=1e-9)
 
 

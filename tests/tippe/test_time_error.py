@@ -9,9 +9,11 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.integration import Settings, compiled_march
-from nonholonomic.sweeps.digits import concise
+from nonholonomic.sweeps.digits import concise, concise_strings
 from tippe import steady
+from tippe.cells import CellRuns, driver_of
 from tippe.inversion import InversionProblem, is_inverted
+from tippe.table import InversionJob
 from tippe.time_error import COARSER, time_error
 
 SCENE = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
@@ -142,6 +144,24 @@ def test_a_cell_that_fails_is_in_doubt():
     table = tippe.inversion_table(SCENE, theta=0.1, spin=[1e200, 100.0], t1=0.1, errors=True)
     assert np.isinf(table.time_error[0])
     assert table.digits().tolist() == ["failed?", "not_inverted"]
+
+
+def test_agreement_on_no_answer_is_no_agreement(monkeypatch):
+    """Two runs that both failed, or both were given up, do not make it certain that there is no time."""
+    scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3), contact="hybrid")
+    words = driver_of(scene).words
+
+    def results(runs, *_):
+        times = {name: np.full(len(words), np.inf) for name in runs.times}
+        return times | {"status": np.arange(len(words), dtype=np.int8)}
+
+    monkeypatch.setattr(CellRuns, "results", results)
+    runs = CellRuns(driver_of(scene), 1.0, ANGLE, "both", None, "ensemble", [])
+    found = InversionJob(runs, {"scene": scene}, 1e-9, errors=True)({}, len(words))
+    for name in ("first_time", "last_time"):
+        doubtful = np.isinf(found[f"{name}_error"])
+        assert {word for word, doubt in zip(words, doubtful, strict=True) if doubt} == {"failed", "unresolved"}
+    assert concise_strings(found["last_time"], found["last_time_error"], np.array(words))[-1] == "unresolved?"
 
 
 def test_the_file_keeps_the_errors(tmp_path):

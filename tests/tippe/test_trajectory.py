@@ -154,9 +154,15 @@ def test_a_ceiling_start_has_no_contact(rutstam_scene):
     [
         ({"t1": -1.0}, "t1 = -1.0 must be greater than 0"),
         ({"times": [0.5, 2.0]}, "times = .* must be at most 1.0"),
-        ({"times": [0.5, 0.4]}, "times must increase"),
-        ({"times": []}, "times must be a non-empty list"),
-        ({"solver": "Dopri8"}, "solver = 'Dopri8' must be a solver of Diffrax"),
+        ({"times": [0.5, 0.4]}, r"times\[1\] = 0.4 must be greater than times\[0\] = 0.5: times must increase"),
+        ({"times": []}, r"times = \[\] must be a list of at least one number"),
+        ({"solver": "Dopri8"}, "solver = 'Dopri8' must be an adaptive solver of Diffrax"),
+        ({"solver": diffrax.Euler()}, r"solver = Euler\(\) must be an adaptive solver of Diffrax"),
+        (
+            {"solver": diffrax.KenCarp4()},
+            r"solver = KenCarp4\(.* must be an adaptive .* for ordinary differential equations",
+        ),
+        ({"adjoint": "backwards"}, "adjoint = 'backwards' must be one of Diffrax"),
         ({"launch": 3}, "launch = 3 must be a Launch"),
         ({"tolerance": math.nan}, "tolerance = nan must be finite"),
     ],

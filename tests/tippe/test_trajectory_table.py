@@ -191,9 +191,9 @@ def test_it_is_drawn_over_time(table):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"times": []}, "times must be a non-empty list"),
-        ({"times": 1.0}, "times must be a non-empty list"),
-        ({"times": [0.0, 1.0, 0.5]}, "times must increase"),
+        ({"times": []}, "times = [] must be a list of at least one number"),
+        ({"times": 1.0}, "times = 1.0 must be a list of at least one number"),
+        ({"times": [0.0, 1.0, 0.5]}, "times[2] = 0.5 must be greater than times[1] = 1.0: times must increase"),
         ({"times": [-0.1, 1.0]}, "times = -0.1 must be at least 0.0"),
         ({"times": [0.0, float("nan")]}, "times = nan must be finite"),
         ({"times": [0.0]}, "times[-1] = 0.0 must be greater than 0.0 (it is the horizon)"),
@@ -207,6 +207,7 @@ def test_it_is_drawn_over_time(table):
         ({"quantities": ()}, "quantities = () must be a list of names"),
         ({"quantities": ["theta", "mood"]}, "quantities: 'mood' must be one of theta, eta"),
         ({"quantities": ["theta", "theta"]}, "quantities: 'theta' must be there once only"),
+        ({"axes": {3: [1.0]}}, "axes = {3: [1.0]} must be a dictionary"),
         ({"axes": {"scene.body.colour": [1.0]}}, "unknown axis 'scene.body.colour'"),
         ({"axes": {"launch.theta": [0.1]}}, "'launch.theta' is an argument of its own"),
         ({"scene": "a top"}, "scene = 'a top' must be a Scene"),

@@ -6,7 +6,5 @@ their own names.
 """
 
 from .rolling import RollingDynamics as RollingDynamics
-from .stem import first_contact as first_contact
-from .stem import standing_spin as standing_spin
 from .stick_slip import Kind as Kind
 from .stick_slip import StickSlip as StickSlip

@@ -1,5 +1,7 @@
 """Runs through stick and slip: the cells of a table, and a single run with its path."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -130,6 +132,18 @@ def _first_phase(both: StickSlip, states: Float[Array, "components cells"]) -> I
     return jnp.where(both.slip_speed(states) <= AT_REST * both.speed, ROLLING, SLIPPING)
 
 
+def contact_phases(
+    run: TrajectoryProblem, tolerance: Any
+) -> tuple[tuple[AbstractPhase, ...], Int[Array, "1"], Float[Array, "components 1"]]:
+    """The phases of one run whose path is kept, the number of the first, and the state there.
+
+    **Arguments:** `run`: of a scene with `SetValuedCoulomb`; `tolerance`: relative, of the integration.
+    """
+    state, scales = run.start()
+    problem = InversionProblem(run.dynamics, jnp.asarray(NO_COSINE), run.state[:, None], scales[:, None])
+    return (*phases(None, problem, tolerance, False, run.axial, len(run.state)), state[:, None])
+
+
 def follow_stick_slip(run: TrajectoryProblem, t1: float, settings: Settings) -> PhasedPath:
     """One run, phase by phase, until `t1` or until contact is lost.
 
@@ -140,7 +154,5 @@ def follow_stick_slip(run: TrajectoryProblem, t1: float, settings: Settings) -> 
 
     **Returns:** a `PhasedPath`, whose counts tell how often slipping has turned into rolling.
     """
-    state, scales = run.start()
-    problem = InversionProblem(run.dynamics, jnp.asarray(NO_COSINE), run.state[:, None], scales[:, None])
-    both, first = phases(None, problem, settings.tolerance, False, run.axial, len(run.state))
-    return follow_phases(both, int(first[0]), state, t1, settings, kinds=1)
+    both, first, state = contact_phases(run, settings.tolerance)
+    return follow_phases(both, int(first[0]), state[:, 0], t1, settings, kinds=1)

@@ -23,7 +23,6 @@ from nonholonomic.integration import (
     march_by_diffrax,
 )
 from nonholonomic.integration.march import march
-from nonholonomic.integration.runge_kutta import inverse_root
 
 pytestmark = pytest.mark.newest
 
@@ -211,9 +210,3 @@ def test_an_interpolated_event_would_be_a_hundred_times_worse():
 def test_implicit_solvers_are_refused():
     with pytest.raises(ValueError, match="must be an explicit Runge-Kutta solver of Diffrax"):
         explicit_tableau(diffrax.Kvaerno5())
-
-
-@pytest.mark.parametrize("order", [2, 3, 4, 5, 8])
-def test_inverse_root(order):
-    values = jnp.array([1e-12, 0.3, 1.0, 1e9])
-    assert_close(inverse_root(values, order), np.asarray(values) ** (-1.0 / order), rtol=1e-14)

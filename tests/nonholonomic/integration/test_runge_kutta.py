@@ -5,9 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from close import assert_close
 
 from nonholonomic.integration import Oscillatory8
-from nonholonomic.integration.runge_kutta import explicit_step, explicit_tableau
+from nonholonomic.integration.runge_kutta import explicit_step, explicit_tableau, inverse_root
 
 
 def field(time, state):
@@ -68,3 +69,9 @@ def test_an_accelerator_gets_the_stages_written_out(monkeypatch):
     assert "while" not in compiled().lower(state).as_text()
     for name, value in compiled()(state)._asdict().items():
         np.testing.assert_allclose(getattr(here, name), value, rtol=1e-13, atol=1e-15, err_msg=name)
+
+
+@pytest.mark.parametrize("order", [2, 3, 4, 5, 8])
+def test_inverse_root(order):
+    values = jnp.array([1e-12, 0.3, 1.0, 1e9])
+    assert_close(inverse_root(values, order), np.asarray(values) ** (-1.0 / order), rtol=1e-14)
