@@ -121,7 +121,6 @@ def require_whole(value: Any, name: str, at_least: int) -> None:
         raise ValueError(f"{name} = {value!r} must be a whole number of at least {at_least}")
 
 
-<<<<<<< HEAD
 def require_increasing(values: Any, name: str) -> None:
     """Raise `ValueError` unless this is a list of one number or more, each greater than the one before it.
 
@@ -141,12 +140,12 @@ def require_increasing(values: Any, name: str) -> None:
             f"{name}[{k}] = {shown(known[k])} must be greater than {name}[{k - 1}] = {shown(known[k - 1])}: "
             f"{name} must increase"
         )
-=======
+
+
 def require_flag(value: Any, name: str) -> None:
     """Raise `ValueError` unless this is true or false; a word such as "no" would count as true."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} = {value!r} must be True or False")
->>>>>>> w_ident
 
 
 def require_folder(path: Path, name: str) -> None:

@@ -11,10 +11,7 @@ from nonholonomic import identification as generic
 from nonholonomic.identification import Free, Identification, of_data, predicted
 from nonholonomic.integration import tolerance_bound
 from nonholonomic.parameters import numbers, with_numbers
-<<<<<<< HEAD
-=======
-from nonholonomic.validation import as_number, require
->>>>>>> w_ident
+from nonholonomic.validation import as_number
 
 from .recording import Recording
 from .scene import Scene
