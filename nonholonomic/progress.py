@@ -4,93 +4,205 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
 from types import TracebackType
 from typing import Any
 
-#: How often the line is written [s]; a call that ends sooner shows nothing.
-INTERVAL = 0.5
+from .compilation_cache import OFF
+
+#: How often the line is written [s]; a call that ends sooner shows nothing. How often is looked whether it is time [s], and
+#: how long after the last call [s]: starting a thread for every call would cost short ones a millisecond.
+INTERVAL, TICK, LINGER = 0.5, 0.1, 5.0
+
+#: Functions of JAX, by their module and how their names begin, that are at work while a program is made.
+COMPILERS = (
+    ("jax._src.interpreters.partial_eval", "trace_to_jaxpr"),
+    ("jax._src.interpreters.mlir", "lower_jaxpr"),
+    ("jax._src.compiler", ""),
+)
 
 
 class Progress:
-    """A line that first says what is being prepared, then how many items are done, how fast, and how many are left.
+    """A line that says what is being done, and once items are counted, how many are done, how fast, and how many are left.
 
-    It is a context. A separate thread writes the line, because compiling blocks the caller's for many seconds. Nothing is
+    It is a context. Of several, one inside the other, the innermost that counts has the line, or else the outermost.
+    A separate thread writes the line, because compiling blocks the caller's for many seconds. Nothing is
     written where standard error is neither a terminal nor a notebook's, nor with `NONHOLONOMIC_PROGRESS=0`.
     """
 
-    def __init__(self, total: int, unit: str, preparing: str = "compiling", *, shown: bool = True):
+    def __init__(self, total: int | None, unit: str = "", doing: str = "compiling", *, shown: bool = True):
         """State what is to be done.
 
         **Arguments:**
 
-        - `total`: how many items are to be done, `unit`: what one is called.
-        - `preparing`: what is done before the first `advance` or `begin`.
-        - `shown`: whether to show anything at all.
+        - `total`: how many items are to be done, `None` if none are counted; `unit`: what one is called.
+        - `doing`: what is done before `begin`; while JAX makes a program for the caller, the line says "compiling".
+        - `shown`: whether to show anything at all, of calls within this one, too.
         """
-        self._total, self._unit, self._preparing = total, unit, preparing
-        self._shown = shown and os.environ.get("NONHOLONOMIC_PROGRESS") != "0" and is_watched()
+        self._total, self._unit, self._doing = total, unit, doing
+        self._heard = os.environ.get("NONHOLONOMIC_PROGRESS", "").strip().lower() not in OFF and is_watched()
+        self._shown = shown
         self._done, self._first, self._since, self._notes = 0, 0, None, {}
         self._bar: Any = None
-        self._lock, self._ended = threading.Lock(), threading.Event()
 
     def begin(self, done: int = 0) -> None:
         """The preparations are over; `done` items had been done before."""
-        with self._lock:
+        with _LINE.lock:
             self._done = self._first = done
             self._since = time.time()
-            self._close()
+            self._clear()
 
     def advance(self, count: int, **notes: Any) -> None:
         """`count` more items are done; `notes` are shown beside their number."""
-        with self._lock:
+        with _LINE.lock:
             self._done, self._notes = self._done + count, notes
             if self._bar is not None and self._since is not None:
                 self._bar.set_postfix(notes, refresh=False)
                 self._bar.update(count)
 
-    def __enter__(self) -> "Progress":
-        if self._shown:
-            # Imported here, and only if needed, because importing it changes the warning filters for a moment.
-            from tqdm.auto import tqdm
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Takes the line away while something else is written."""
+        with _LINE.lock:
+            self._clear()
+            yield
 
-            self._tqdm = tqdm
-            threading.Thread(target=self._write, daemon=True).start()
+    def __enter__(self) -> "Progress":
+        self._caller, self._start = threading.get_ident(), time.time()
+        if self._heard:
+            with _LINE.lock:
+                self._shown &= all(one._shown for one in _LINE.speakers if one._caller == self._caller)
+                if self._shown:
+                    self._tqdm = bar_class()
+                _LINE.add(self)
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._ended.set()
-        with self._lock:
-            self._close()
+        if self._heard:
+            with _LINE.lock:
+                _LINE.speakers.remove(self)
+                if self._bar is not None:
+                    self._bar.close()
+                self._bar = None
 
-    def _write(self) -> None:
-        while not self._ended.wait(INTERVAL):
-            with self._lock:
-                if self._ended.is_set():
-                    return
-                if self._bar is None:
-                    self._bar = self._line()
-                else:
-                    self._bar.refresh()
+    def _show(self) -> None:
+        """Writes the line, if it is time."""
+        if self._bar is not None and time.time() - self._written < INTERVAL:
+            return
+        self._written = time.time()
+        made = is_making_programs(self._caller)
+        if self._bar is None:
+            self._bar = self._line()
+        if self._since is None:
+            self._bar.set_description_str("compiling" if made else self._doing, refresh=False)
+        else:
+            self._bar.set_description("compiling" if made else None, refresh=False)
+        self._bar.refresh()
 
     def _line(self) -> Any:
-        """The line in its present state."""
-        # `disable=None` lets tqdm find out whether anybody is watching.
+        """The line in its present state, not yet written."""
+        # With a delay, or tqdm writes the line before all is known of it.
+        options = {"delay": 1e-9, "leave": self._since is not None}
         if self._since is None:
-            return self._tqdm(desc=self._preparing, bar_format="{desc} [{elapsed}]", leave=False, disable=None)
+            bar = self._tqdm(bar_format="{desc} [{elapsed}]", **options)
+            bar.start_t = self._start
+            return bar
         # The rate is that of the whole run, without the preparations: items are done in blocks, some cheap, some expensive.
-        bar = self._tqdm(total=self._total, initial=self._first, unit=self._unit, smoothing=0, disable=None)
+        bar = self._tqdm(total=self._total, initial=self._first, unit=self._unit, smoothing=0, **options)
         bar.start_t = self._since
+        bar.n = self._done
         bar.set_postfix(self._notes, refresh=False)
-        bar.update(self._done - self._first)
-        bar.refresh()
         return bar
 
-    def _close(self) -> None:
+    def _clear(self) -> None:
+        """Takes the line away, until it is written again."""
         if self._bar is not None:
+            self._bar.leave = False
             self._bar.close()
         self._bar = None
 
 
+class _Line:
+    """The line of the whole process, whose standard error is one, and the thread that writes it.
+
+    - `speakers`: who has something to say, the outermost call first.
+    """
+
+    def __init__(self):
+        self.lock, self.speakers = threading.RLock(), []
+        self._writer: threading.Thread | None = None
+
+    def add(self, speaker: Progress) -> None:
+        """One more has something to say."""
+        self.speakers.append(speaker)
+        if self._writer is None or not self._writer.is_alive():
+            self._writer = threading.Thread(target=self._write, daemon=True)
+            self._writer.start()
+
+    def _write(self) -> None:
+        last = time.time()
+        while True:
+            time.sleep(TICK)
+            with self.lock:
+                if self.speakers:
+                    last = time.time()
+                elif time.time() - last > LINGER:
+                    self._writer = None
+                    return
+                self._update()
+
+    def _update(self) -> None:
+        shown = [one for one in self.speakers if one._shown]
+        if not shown or time.time() - shown[0]._start < INTERVAL:
+            return
+        told = next((one for one in reversed(shown) if one._total is not None), shown[0])
+        for other in shown:
+            if other is not told:
+                other._clear()
+        told._show()
+
+
+_LINE = _Line()
+
+
+@contextmanager
+def telling(doing: str, shown: bool = True) -> Iterator[Progress]:
+    """Says what a call is doing that takes long when it is new to the compiler; decorates functions, too."""
+    with Progress(None, doing=doing, shown=shown) as line:
+        yield line
+
+
+def is_making_programs(thread: int) -> bool:
+    """Whether JAX is tracing or compiling in a thread."""
+    frame = sys._current_frames().get(thread)
+    while frame is not None:
+        module, name = frame.f_globals.get("__name__"), frame.f_code.co_name
+        if any(module == one and name.startswith(begin) for one, begin in COMPILERS):
+            return True
+        frame = frame.f_back
+    return False
+
+
 def is_watched() -> bool:
     """Whether somebody may be looking: standard error is a terminal, or this is a notebook."""
-    return getattr(sys.stderr, "isatty", bool)() or "ipykernel" in sys.modules
+    return getattr(sys.stderr, "isatty", bool)() or is_notebook()
+
+
+def is_notebook() -> bool:
+    """Whether this is the kernel of a notebook."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return "IPKernelApp" in getattr(shell, "config", {})
+
+
+def bar_class() -> type:
+    """The bar of tqdm for a terminal, or for a notebook that has the widgets for it.
+
+    `tqdm.auto` chooses too, but warns where there are no widgets, and sets the warning filters while it is imported.
+    """
+    if is_notebook() and find_spec("ipywidgets") is not None:
+        from tqdm.notebook import tqdm
+    else:
+        from tqdm import tqdm
+    return tqdm

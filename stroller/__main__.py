@@ -25,6 +25,7 @@ from nonholonomic.geometry import (
     Torus,
 )
 from nonholonomic.integration import ImplicitMidpoint
+from nonholonomic.progress import Progress, telling
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require, require_folder
 from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html
@@ -40,6 +41,9 @@ from .trajectory import Trajectory
 from .view import grouped
 
 RIDES = ("without friction", "with friction")
+
+#: Those of the rides that show how the energy's residual follows the tolerance.
+TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 
 
 class Ground(NamedTuple):
@@ -149,15 +153,16 @@ def audit(name: str, runs: dict[str, Trajectory]) -> list[str]:
     return lines
 
 
-def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
+def tolerance_curve(options: argparse.Namespace, helm: Helm, shown: Progress) -> list[str]:
     """The largest residual of energy against work over the tolerance of Dopri8, for the last ride."""
     (ground, ride), (scene, launch) = list(scenes(options).items())[-1]
     lines = [f"Dopri8 {ground}, {ride}: residual [J] of energy against work over the tolerance"]
-    for tolerance in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12):
+    for tolerance in TOLERANCES:
         # Few times of output, so that the tolerance alone chooses the steps.
         run = simulate(scene, launch, options.t1, helm, times=jnp.linspace(0.0, options.t1, 3), tolerance=tolerance)
         residual = float(jnp.max(jnp.abs(run.energy_residual)))
         lines.append(f"  {tolerance:7.0e}  {residual:8.1e}  in {int(run.stats.steps)} steps")
+        shown.advance(1)
     return lines
 
 
@@ -208,26 +213,35 @@ def main(arguments: list[str] | None = None) -> int:
         )
         rides, audits, helm, asked = {}, [], Helm(options.force, options.steer, options.period), scenes(options)
         print(heading)
-        for name, (scene, launch) in asked.items():
-            runs = {
-                "Dopri8": simulate(scene, launch, options.t1, helm, tolerance=options.tolerance),
-                "midpoint": simulate(scene, launch, options.t1, helm, solver=ImplicitMidpoint(options.step)),
-            }
-            rides[name] = runs["Dopri8"]
-            audits += audit(", ".join(name), runs)
-            print("\n".join(audits[-len(runs) :]), flush=True)
-        curve = tolerance_curve(options, helm)
-        print("\n" + "\n".join(curve))
-        written, drawing = [options.out / "rides.h5"], None
-        table(options, rides).save(written[0])
-        if find_spec("matplotlib") is None:
-            print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
-        else:
-            drawing = options.out / "rides.png"
-            grounds = {ground: scene.surface for (ground, _), (scene, _) in asked.items()}
-            draw_rides(grounds, rides).savefig(drawing, dpi=110)
-            written.append(drawing)
-        shown = write_page(options, rides, [heading, *audits, "", *curve], drawing)
+        with Progress(2 * len(asked) + len(TOLERANCES), "ride") as counted:
+            counted.begin()
+            for name, (scene, launch) in asked.items():
+                runs = {
+                    "Dopri8": simulate(scene, launch, options.t1, helm, tolerance=options.tolerance),
+                    "midpoint": simulate(scene, launch, options.t1, helm, solver=ImplicitMidpoint(options.step)),
+                }
+                rides[name] = runs["Dopri8"]
+                audits += audit(", ".join(name), runs)
+                with counted.aside():
+                    print("\n".join(audits[-len(runs) :]), flush=True)
+                counted.advance(2)
+            curve = tolerance_curve(options, helm, counted)
+            with counted.aside():
+                print("\n" + "\n".join(curve), flush=True)
+        with telling("drawing") as line:
+            written, drawing = [options.out / "rides.h5"], None
+            table(options, rides).save(written[0])
+            if find_spec("matplotlib") is None:
+                with line.aside():
+                    print(
+                        "No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr
+                    )
+            else:
+                drawing = options.out / "rides.png"
+                grounds = {ground: scene.surface for (ground, _), (scene, _) in asked.items()}
+                draw_rides(grounds, rides).savefig(drawing, dpi=110)
+                written.append(drawing)
+            shown = write_page(options, rides, [heading, *audits, "", *curve], drawing)
     except (ValueError, OSError) as error:
         print(f"python -m stroller: {error}", file=sys.stderr)
         return 2

@@ -11,6 +11,7 @@ from nonholonomic import identification as generic
 from nonholonomic.identification import Free, Identification, of_data, predicted
 from nonholonomic.integration import tolerance_bound
 from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.progress import telling
 from nonholonomic.validation import as_number
 
 from .recording import Recording
@@ -100,27 +101,28 @@ def identify(
     ```
     """
     generic.check_search(starts, spread, seed, max_steps, progress)
-    if not isinstance(scene, Scene):
-        raise ValueError(f"scene = {scene!r} must be a Scene")
-    data = tuple(data) if isinstance(data, list | tuple) else (data,)
-    if not data or not all(isinstance(one, Recording) for one in data):
-        raise ValueError(f"data = {data!r} must be a Recording, or a list of them")
-    tolerance_bound(tolerance).require()
-    for one in data:
-        scene.check(one.launch)
-    unknowns = _unknowns_of(scene, data, free)
-    measurements, labels, seen = generic.joined(data)
-    return generic.identify(
-        SceneModel(scene, data, seen, tolerance),
-        measurements,
-        unknowns,
-        starts=starts,
-        spread=spread,
-        seed=seed,
-        max_steps=max_steps,
-        labels=labels,
-        progress=progress,
-    )
+    with telling("fitting", progress):
+        if not isinstance(scene, Scene):
+            raise ValueError(f"scene = {scene!r} must be a Scene")
+        data = tuple(data) if isinstance(data, list | tuple) else (data,)
+        if not data or not all(isinstance(one, Recording) for one in data):
+            raise ValueError(f"data = {data!r} must be a Recording, or a list of them")
+        tolerance_bound(tolerance).require()
+        for one in data:
+            scene.check(one.launch)
+        unknowns = _unknowns_of(scene, data, free)
+        measurements, labels, seen = generic.joined(data)
+        return generic.identify(
+            SceneModel(scene, data, seen, tolerance),
+            measurements,
+            unknowns,
+            starts=starts,
+            spread=spread,
+            seed=seed,
+            max_steps=max_steps,
+            labels=labels,
+            progress=progress,
+        )
 
 
 def _unknowns_of(scene: Scene, data: tuple[Recording, ...], free: Any) -> dict[str, Free]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.integration import LOOSEST, ImplicitMidpoint, Settings
-from nonholonomic.progress import Progress
+from nonholonomic.progress import telling
 from nonholonomic.validation import as_known, is_traced, legal, nan_unless
 
 from .checks import check_options, check_run, check_times, run_bounds, times_bounds
@@ -26,6 +26,7 @@ from .trajectory import Trajectory, read_off
 DEFAULT_TIMES = 201
 
 
+@telling("simulating")
 def simulate(
     scene: Scene,
     launch: Launch,
@@ -88,8 +89,7 @@ def simulate(
     ride = Ride(scene, launch, as_module(input, scene, launch), jnp.add(end, 0.0), settings, grid)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((ride, times))):
         return _legal_or_nan(ride, times, adjoint)
-    with Progress(1, "ride", "simulating"):
-        return _concrete(ride, times)
+    return _concrete(ride, times)
 
 
 def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:

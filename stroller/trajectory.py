@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
 from nonholonomic.parameters import text_as_html
+from nonholonomic.progress import telling
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import is_traced
 from nonholonomic.views import Stage, Viewable, draw_portrait
@@ -149,6 +150,7 @@ class Trajectory(eqx.Module, Viewable):
             return "rank_lost"
         return "contact_lost" if np.isfinite(run.contact_lost_at) else "completed"
 
+    @telling("reading off")
     def to_table(self) -> Table:
         """All that can be read off the run, as a `Table` over its times.
 
@@ -193,6 +195,7 @@ class Trajectory(eqx.Module, Viewable):
     def _repr_html_(self) -> str:
         return text_as_html(str(self))
 
+    @telling("reading off")
     def __str__(self) -> str:
         # A batch, or a run inside a transformation, has no numbers to show.
         if is_traced(self.t) or self.t.ndim > 1:

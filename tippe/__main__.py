@@ -17,7 +17,7 @@ import numpy as np
 from nonholonomic import __version__
 from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
-from nonholonomic.progress import Progress
+from nonholonomic.progress import Progress, telling
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
@@ -320,14 +320,15 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         found = tables(options)
         print(report(options, found))
-        written, drawing = [options.out / f"{arena}.h5" for arena in found], None
-        if find_spec("matplotlib") is None:
-            print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
-        else:
-            drawing = options.out / "theta.png"
-            picture(options, found).savefig(drawing, dpi=130)
-            written.append(drawing)
-        shown = write_page(options, found, drawing)
+        with telling("drawing"):
+            written, drawing = [options.out / f"{arena}.h5" for arena in found], None
+            if find_spec("matplotlib") is None:
+                print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
+            else:
+                drawing = options.out / "theta.png"
+                picture(options, found).savefig(drawing, dpi=130)
+                written.append(drawing)
+            shown = write_page(options, found, drawing)
     except (ValueError, OSError) as error:
         print(f"python -m tippe: {error}", file=sys.stderr)
         return 2

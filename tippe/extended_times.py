@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from nonholonomic.derivatives import AbstractQuestion, VariationalProblem, ask, directions_by, in_groups
 from nonholonomic.integration import CROSSED, FAILED, Queue, Settings, crossing_time
+from nonholonomic.progress import telling
 from nonholonomic.validation import as_number, is_traced, nan_unless
 
 from .inversion import InversionProblem, check_event, check_run, check_smooth, permitted
@@ -24,6 +25,7 @@ MOST_STEPS = 100_000
 LEAST_ANGLE = 1e-6
 
 
+@telling("simulating")
 def extended_inversion_time(
     scene: Scene,
     launch: Launch,

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 from nonholonomic import identification as generic
 from nonholonomic.identification import Free, Identification, of_data
 from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.progress import telling
 from nonholonomic.validation import as_number
 
 from .cells import driver_of
@@ -97,23 +98,24 @@ def identify(
     ```
     """
     generic.check_search(starts, spread, seed, max_steps, progress)
-    data = checked_data(scene, data, tolerance, "identify with slopes = 'exact'" if slopes == "exact" else None)
-    unknowns = unknowns_of(scene, data, free)
-    measurements, labels, seen = generic.joined(data)
-    smooth = driver_of(scene).smooth
-    kind = SceneModel if smooth else PhasedModel
-    return generic.identify(
-        kind(scene, data, seen, tolerance),
-        measurements,
-        unknowns,
-        starts=starts,
-        spread=spread,
-        seed=seed,
-        max_steps=max_steps,
-        slopes=slopes or ("exact" if smooth else "differences"),
-        labels=labels,
-        progress=progress,
-    )
+    with telling("fitting", progress):
+        data = checked_data(scene, data, tolerance, "identify with slopes = 'exact'" if slopes == "exact" else None)
+        unknowns = unknowns_of(scene, data, free)
+        measurements, labels, seen = generic.joined(data)
+        smooth = driver_of(scene).smooth
+        kind = SceneModel if smooth else PhasedModel
+        return generic.identify(
+            kind(scene, data, seen, tolerance),
+            measurements,
+            unknowns,
+            starts=starts,
+            spread=spread,
+            seed=seed,
+            max_steps=max_steps,
+            slopes=slopes or ("exact" if smooth else "differences"),
+            labels=labels,
+            progress=progress,
+        )
 
 
 def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) -> tuple[Any, ...]:

@@ -29,6 +29,7 @@ from nonholonomic.integration import (
     traced_march,
     traced_travel,
 )
+from nonholonomic.progress import telling
 from nonholonomic.validation import as_number, is_traced, nan_unless
 
 from .cells import check_differentiable, driver_of
@@ -38,6 +39,7 @@ from .phases.airborne import on_the_ground
 from .scene import Scene
 
 
+@telling("simulating")
 def inversion_time(
     scene: Scene,
     launch: Launch,

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int, Shaped
 from nonholonomic.derivatives import exponent_of, growth
 from nonholonomic.geometry import cross
 from nonholonomic.integration import GUARD_LOST, REACHED_END, Settings, explicit_tableau, tolerance_bound
+from nonholonomic.progress import telling
 from nonholonomic.validation import require
 
 from .cells import driver_of
@@ -56,6 +57,7 @@ class LyapunovExponent(NamedTuple):
     running: Float[np.ndarray, "stretches ..."]
 
 
+@telling("simulating")
 def lyapunov_exponent(
     scene: Scene,
     launch: Launch,

@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 from nonholonomic.geometry import Component, Vector, dot, scale, sum_vectors
 from nonholonomic.integration import Followed, PhasedPath, padded
 from nonholonomic.parameters import text_as_html
+from nonholonomic.progress import telling
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import is_traced, require, require_increasing
 from nonholonomic.views import Stage, Viewable, draw_portrait
@@ -162,6 +163,7 @@ class AbstractTrajectory(eqx.Module, Viewable):
         require_increasing(times, "times")
         return self.resampled(times)
 
+    @telling("reading off")
     def to_table(self) -> Table:
         """All that can be read off the run, as a `Table` over its times.
 
@@ -246,6 +248,7 @@ class AbstractTrajectory(eqx.Module, Viewable):
         axes = self.scene.frame.axes(self._place, self._path)
         return jnp.stack([dot(vector, directions) for directions in zip(*axes, strict=True)], axis=-1)
 
+    @telling("reading off")
     def __str__(self) -> str:
         if is_traced(self.t) or self.t.ndim > 1:
             return f"Trajectory of {self.t.shape} times"

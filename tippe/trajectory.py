@@ -21,7 +21,7 @@ from nonholonomic.integration import (
     require_adaptive,
     require_adjoint,
 )
-from nonholonomic.progress import Progress
+from nonholonomic.progress import telling
 from nonholonomic.validation import (
     Bound,
     all_bounds,
@@ -121,6 +121,7 @@ class Trajectory(AbstractTrajectory):
         return eqx.tree_at(lambda one: (one.t, one.states, one.cyclic, one.spin_angle, one.work), self, found)
 
 
+@telling("simulating")
 def simulate(
     scene: Scene,
     launch: Launch,
@@ -177,14 +178,12 @@ def simulate(
     if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
         return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
     if scene.contact == "hybrid":
-        with Progress(1, "run", "simulating"):
-            follow_flights = simulate_hybrid if scene.flies_in_closed_form else simulate_airborne
-            return follow_flights(scene, launch, float(t1), times, tolerance, solver)
-    with Progress(1, "run", "simulating"):
-        run = TrajectoryProblem.of(scene, launch)
-        through = follow_stick_slip if scene.friction.set_valued else follow
-        path = through(run, float(t1), Settings(tolerance, solver))
-        trajectory = _as_trajectory(scene, run, path)
+        follow_flights = simulate_hybrid if scene.flies_in_closed_form else simulate_airborne
+        return follow_flights(scene, launch, float(t1), times, tolerance, solver)
+    run = TrajectoryProblem.of(scene, launch)
+    through = follow_stick_slip if scene.friction.set_valued else follow
+    path = through(run, float(t1), Settings(tolerance, solver))
+    trajectory = _as_trajectory(scene, run, path)
     if times is None:
         return trajectory
     return trajectory.at(np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)])

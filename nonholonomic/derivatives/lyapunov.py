@@ -105,7 +105,7 @@ def growth(
     logarithms, end_time, status = [], np.zeros(cells), np.full(cells, RUNNING)
     steps, state = np.zeros(cells, int), np.asarray(start)
     with Progress(stretches, "stretch") as shown:
-        for _ in range(stretches):
+        for number in range(stretches):
             unit = direction / jnp.linalg.norm(direction, axis=0)
             varied = VariedProblem(problem, jnp.concatenate([start, unit, jnp.zeros((1, cells))]), magnitudes)
             outcome, _ = compiled_march(varied, stretch, jnp.asarray(cells), settings)
@@ -116,7 +116,11 @@ def growth(
             status = np.where(alive, outcome.status, status)
             start, direction = outcome.state[:size], outcome.state[size:-1]
             state = np.where(alive, start, state)
-            shown.advance(1)
+            # The first one compiles.
+            if number == 0:
+                shown.begin(1)
+            else:
+                shown.advance(1)
     return Growth(np.stack(logarithms), status, end_time, state, steps)
 
 

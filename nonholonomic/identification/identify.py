@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..progress import telling
 from ..validation import require, require_flag, require_whole
 from .levenberg_marquardt import Ends, minimise
 from .likelihood import Measurements, estimated_errors, muted
@@ -83,21 +84,22 @@ def identify(
     if len(labels) != count:
         raise ValueError(f"labels must be {count}, one for each measurement, not {len(labels)}")
     problem = Problem(model, tuple(unknowns.items()), step)
-    begins = draw_starts(unknowns, starts, spread, seed)
-    ends, there = _fitted(problem, begins, measurements, max_steps, progress)
-    for _ in range(ROUNDS if np.any(np.asarray(measurements.estimated)) else 0):
-        best = int(np.argmin(there.deviance))
-        errors = estimated_errors(measurements, there.prediction[best], len(unknowns))
-        change = np.max(np.abs(np.log(errors / np.asarray(measurements.error))))
-        measurements = measurements.with_errors(errors)
-        if change > SETTLED:
-            ends = minimise(problem, ends.coordinates, measurements, max_steps=max_steps, progress=progress)
-        there = linearise(problem, ends.coordinates, measurements)
-        if change <= SETTLED:
-            break
-    if not np.any(np.isfinite(there.prediction)):
-        raise ValueError("model: no start led to finite predictions")
-    found = summarise(problem, measurements, labels, begins, ends.coordinates, ends.converged, there)
+    with telling("fitting", progress):
+        begins = draw_starts(unknowns, starts, spread, seed)
+        ends, there = _fitted(problem, begins, measurements, max_steps, progress)
+        for _ in range(ROUNDS if np.any(np.asarray(measurements.estimated)) else 0):
+            best = int(np.argmin(there.deviance))
+            errors = estimated_errors(measurements, there.prediction[best], len(unknowns))
+            change = np.max(np.abs(np.log(errors / np.asarray(measurements.error))))
+            measurements = measurements.with_errors(errors)
+            if change > SETTLED:
+                ends = minimise(problem, ends.coordinates, measurements, max_steps=max_steps, progress=progress)
+            there = linearise(problem, ends.coordinates, measurements)
+            if change <= SETTLED:
+                break
+        if not np.any(np.isfinite(there.prediction)):
+            raise ValueError("model: no start led to finite predictions")
+        found = summarise(problem, measurements, labels, begins, ends.coordinates, ends.converged, there)
     if not found.verdict.good:
         warnings.warn("; ".join(found.verdict.concerns), FitWarning, stacklevel=2)
     return found

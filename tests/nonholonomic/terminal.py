@@ -1,7 +1,10 @@
 """Standard error as a terminal."""
 
 import io
+import sys
 import time
+
+from nonholonomic import progress
 
 
 class Terminal(io.StringIO):
@@ -18,3 +21,28 @@ class Terminal(io.StringIO):
         if text.strip():
             self.lines.append((time.perf_counter() - self.start, text.strip()))
         return super().write(text)
+
+
+def watched(monkeypatch):
+    """Standard error as a terminal, on which everything happens ten times as fast."""
+    stream = Terminal()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr(progress, "INTERVAL", 0.05)
+    monkeypatch.setattr(progress, "TICK", 0.01)
+    return stream
+
+
+def words(stream):
+    """The first word of each line written."""
+    return [text.split()[0].rstrip(":") for _, text in stream.lines]
+
+
+def left(stream):
+    """What is still to be seen on the terminal when all is over."""
+    rows = []
+    for line in stream.getvalue().split("\n"):
+        row = []
+        for piece in line.split("\r"):
+            row[: len(piece)] = piece
+        rows.append("".join(row).strip())
+    return "".join(rows)

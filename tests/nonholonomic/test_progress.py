@@ -1,14 +1,24 @@
 """A long call says what it is doing, to whoever watches."""
 
+import importlib.util
 import subprocess
 import sys
+import threading
 import time
+import types
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from terminal import Terminal
+from terminal import Terminal, left, watched, words
 
+from nonholonomic import progress
+from nonholonomic.derivatives import growth
+from nonholonomic.integration import REACHED_END, Settings
+from nonholonomic.progress import Progress, telling
 from nonholonomic.sweeps import Variable, axis, sweep
 
 pytestmark = pytest.mark.newest
@@ -69,6 +79,119 @@ def test_nothing_is_written_where_nobody_watches_or_wants_it(way, monkeypatch):
         monkeypatch.setenv("NONHOLONOMIC_PROGRESS", "0")
     options = {"progress": False} if way == "argument" else {}
     assert slow_sweep(monkeypatch, Pipe() if way == "pipe" else Terminal(), cells=3, **options) == []
+
+
+def test_what_is_told_is_whether_a_program_is_being_made(monkeypatch):
+    terminal = watched(monkeypatch)
+
+    def waits(x):
+        time.sleep(0.3)
+        return x
+
+    with telling("simulating"):
+        jax.jit(waits)(1.0)
+        time.sleep(0.3)
+    told = words(terminal)
+    assert told[0] == "compiling"
+    assert told[-1] == "simulating"
+    assert left(terminal) == ""
+
+
+def test_a_line_within_a_line_does_not_garble_it(monkeypatch):
+    """One that counts takes the line while it lasts; one that does not, leaves it alone."""
+    terminal = watched(monkeypatch)
+    with telling("fitting"):
+        with telling("simulating"):
+            time.sleep(0.3)
+        with Progress(2, "fit") as counted:
+            counted.begin()
+            time.sleep(0.3)
+            counted.advance(2)
+        time.sleep(0.3)
+    told = words(terminal)
+    assert "simulating" not in told
+    assert told[0] == told[-1] == "fitting"
+    assert [text for _, text in terminal.lines if "fit/s" in text]
+    assert left(terminal).startswith("100%")
+    assert left(terminal).count("fit") == 1
+
+
+def test_what_is_to_be_quiet_quiets_what_it_calls(monkeypatch):
+    terminal = watched(monkeypatch)
+    with telling("fitting", shown=False), telling("simulating"), Progress(1, "fit"):
+        time.sleep(0.3)
+    assert terminal.lines == []
+
+
+def test_nothing_is_left_behind_after_an_error_and_nothing_is_in_the_way_of_what_is_printed(monkeypatch):
+    terminal = watched(monkeypatch)
+
+    @telling("simulating")
+    def fails():
+        time.sleep(0.3)
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fails()
+    assert words(terminal)
+    assert left(terminal) == ""
+    with Progress(3, "ride") as shown:
+        shown.begin()
+        time.sleep(0.3)
+        with shown.aside():
+            seen = left(terminal)
+            time.sleep(0.1)
+            assert left(terminal) == seen == ""
+
+
+def test_no_frame_is_written_twice(monkeypatch):
+    terminal = watched(monkeypatch)
+    with Progress(3, "ride") as shown:
+        shown.begin()
+        time.sleep(0.3)
+    first, second, *_ = (at for at, text in terminal.lines if "0/3" in text)
+    assert second - first > 0.03
+
+
+def test_short_calls_start_no_threads(monkeypatch):
+    terminal = watched(monkeypatch)
+    started, start = [], threading.Thread.start
+    monkeypatch.setattr(threading.Thread, "start", lambda self: (started.append(self), start(self)))
+    for _ in range(50):
+        with telling("simulating"):
+            pass
+    assert len(started) <= 1
+    time.sleep(0.3)
+    assert terminal.lines == []
+
+
+def test_an_exponent_says_how_many_stretches_are_done(monkeypatch):
+    terminal = watched(monkeypatch)
+
+    class Still:
+        def start(self):
+            return jnp.ones((2, 3)), jnp.ones((2, 3))
+
+    def march(problem, stretch, cells, settings):
+        time.sleep(0.06)
+        ends = {"state": jnp.ones((5, 3)), "end_time": jnp.ones(3), "steps": jnp.ones(3, int)}
+        return types.SimpleNamespace(**ends, status=jnp.full(3, REACHED_END)), None
+
+    monkeypatch.setattr(sys.modules["nonholonomic.derivatives.lyapunov"], "compiled_march", march)
+    growth(Still(), jnp.ones((2, 3)), 1.0, 8, Settings(1e-6))
+    assert words(terminal)[0] == "compiling"
+    assert any("3/8" in text and "stretch/s" in text for _, text in terminal.lines)
+    assert "8/8" in left(terminal)
+
+
+@pytest.mark.parametrize("widgets", [True, False])
+def test_a_notebook_without_widgets_has_a_line_of_text_and_no_warning(widgets, monkeypatch):
+    monkeypatch.setattr(progress, "is_notebook", lambda: True)
+    monkeypatch.setattr(progress, "find_spec", lambda name: importlib.util.find_spec(name) if widgets else None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = progress.bar_class()
+    assert found.__module__ == ("tqdm.notebook" if widgets else "tqdm.std")
 
 
 def test_what_few_processes_need_is_not_imported_with_the_package():

@@ -1,0 +1,108 @@
+"""Every call that takes long where its programs are new says so: none of them computes here, each only waits."""
+
+import importlib
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from terminal import left, watched, words
+from tops import rutstam_top
+
+import stroller
+import tippe
+from nonholonomic.identification import Identification, LogDensity, Measurements, identify
+from nonholonomic.views import Viewable
+
+pytestmark = pytest.mark.newest
+
+TOP = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
+LAUNCH = tippe.Launch(0.1, 155.0)
+TIMES = tippe.InversionTimes(tippe.Launch(0.1, [155.0]), [5.6], error=0.1, t1=8.0)
+STROLLER = stroller.Scene(stroller.Stroller(12.0, 0.7, 1.5, 0.05))
+RIDE = stroller.Launch((0.0, 0.0), 0.3, 2.0)
+RECORDING = stroller.Recording(RIDE, [0.0, 1.0], [2.0, 2.0], 0.1, "speed")
+DECAY = Measurements([2.0, 1.0], [0.1, 0.1])
+
+#: What is called, and the function in which it waits, by its module and name.
+CALLS = {
+    "inversion_time": (lambda: tippe.inversion_time(TOP, LAUNCH, 8.0), "tippe.inversion_time", "ask"),
+    "extended": (lambda: tippe.extended_inversion_time(TOP, LAUNCH, 8.0), "tippe.extended_times", "ask"),
+    "simulate": (lambda: tippe.simulate(TOP, LAUNCH, 1.0), "tippe.trajectory", "follow"),
+    "exponent": (lambda: tippe.lyapunov_exponent(TOP, LAUNCH, 1.0), "tippe.lyapunov", "_direction"),
+    "ride": (lambda: stroller.simulate(STROLLER, RIDE, 1.0), "stroller.simulate", "_concrete"),
+    "identify": (lambda: tippe.identify(TOP, TIMES, {"mu": 0.3}), "tippe.identify", "unknowns_of"),
+    "stroller identify": (
+        lambda: stroller.identify(STROLLER, RECORDING, {"mass": 12.0}),
+        "stroller.identify",
+        "_unknowns_of",
+    ),
+    "any fit": (lambda: identify(None, DECAY, {"x": 1.0}), "nonholonomic.identification.identify", "draw_starts"),
+    "its end": (lambda: fitted(), "nonholonomic.identification.identify", "summarise"),
+    "density": (lambda: LogDensity.__call__(stub("predict"), np.zeros(1)), None, None),
+    "gradient": (
+        lambda: LogDensity.value_and_gradient(SimpleNamespace(), [0.0]),
+        "nonholonomic.identification.posterior",
+        "_value_and_gradient",
+    ),
+    "profile": (lambda: Identification.profile(stub("_place"), "x"), None, None),
+    "page": (lambda: Viewable.view(stub("stages")), None, None),
+    "animation": (lambda: Viewable.animate(stub("stages"), "a.gif"), None, None),
+    "curves": (lambda: Viewable.plot(stub("stages")), None, None),
+    "table of a run": (lambda: tippe.Trajectory.to_table(SimpleNamespace(t=0.0)), "tippe.observables", "table_of"),
+    "table of a ride": (
+        lambda: stroller.Trajectory.to_table(SimpleNamespace()),
+        "stroller.trajectory",
+        "table_of_one",
+    ),
+    "words on a run": (lambda: tippe.Trajectory.__str__(SimpleNamespace(t=0.0)), "tippe.observables", "is_traced"),
+    "words on a ride": (
+        lambda: stroller.Trajectory.__str__(SimpleNamespace(t=0.0)),
+        "stroller.trajectory",
+        "is_traced",
+    ),
+}
+
+
+class Enough(Exception):
+    """It has waited."""
+
+
+def waits(*_, **__):
+    time.sleep(0.25)
+    raise Enough
+
+
+def stub(name):
+    return SimpleNamespace(**{name: waits}, of_prediction=None)
+
+
+def fitted():
+    return identify(lambda p: p["x"][:, None] * np.array([2.0, 1.0]), DECAY, {"x": 1.0}, progress=True)
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_a_long_call_says_what_it_does_and_leaves_nothing_behind(name, monkeypatch):
+    call, module, function = CALLS[name]
+    if module is not None:
+        monkeypatch.setattr(importlib.import_module(module), function, waits)
+    terminal = watched(monkeypatch)
+    with pytest.raises(Enough):
+        call()
+    assert words(terminal)[-1] in ("simulating", "fitting", "drawing", "reading")
+    seen = left(terminal)
+    assert seen == "" or seen.startswith("100%")
+
+
+def test_sampling_says_what_it_does_after_its_last_step(monkeypatch):
+    module = importlib.import_module("nonholonomic.identification.sampling")
+    walk = module.Walk(np.zeros((4, 1)), None)
+    monkeypatch.setattr(module.Surrogate, "around", lambda *_: None)
+    monkeypatch.setattr(module, "learn", lambda *_: (SimpleNamespace(to_power=lambda power: None), walk, 1))
+    monkeypatch.setattr(module, "_seen", lambda *_: (np.zeros((4, 1)), np.zeros(4)))
+    monkeypatch.setattr(module, "_walked", lambda *_: walk)
+    monkeypatch.setattr(module.Draws, "of", waits)
+    terminal = watched(monkeypatch)
+    with pytest.raises(Enough):
+        module.sample(None, None, None, warmup=1, draws=2)
+    assert words(terminal)[-1] == "diagnosing"
