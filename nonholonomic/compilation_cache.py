@@ -36,15 +36,15 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
     """Keep compiled programs on disk, where later processes find them.
 
     Call it before the first computation. A folder that was already chosen, by JAX's own `jax_compilation_cache_dir` or by an
-    earlier call, is kept unless another is given. With one of JAX's own its limits stay: unless
-    `jax_persistent_cache_min_compile_time_secs` is 0, programs that compile in less than a second are not kept.
+    earlier call, is kept unless another is given. One of JAX's own is left as it is: unless
+    `jax_persistent_cache_min_compile_time_secs` is 0, programs that compile in less than a second are not kept in it.
 
-    An entry that was written since the last call, in any process, is looked at once: if it does not decompress, because its
-    writer was killed or its copy is damaged, it is removed, and costs one compilation. What cannot be seen so stays, and costs
-    a compilation in every process: an entry that the disk damages later without a trace, one that decompresses to something
-    else, and a bad one compressed by zstandard, which JAX uses where that package is installed. Nothing else is ever removed:
-    delete the folder to be rid of such entries, and to reclaim its space. It holds code, so it should be where nobody else
-    can write.
+    In other folders an entry that was written since the last look, in any process, is looked at once: if it does not
+    decompress, because its writer was killed or its copy is damaged, it is removed, and costs one compilation. What cannot be
+    seen so stays, and costs a compilation in every process: an entry that the disk damages later without a trace, one that
+    decompresses to something else, and a bad one compressed by zstandard, which JAX uses where that package is installed.
+    Nothing else is ever removed: delete the folder to be rid of such entries, and to reclaim its space. It holds code, so it
+    should be where nobody else can write.
 
     **Arguments:** `folder`: where to keep them, by default `nonholonomic` in the user's cache folder (`XDG_CACHE_HOME`, or
     `~/.cache`). In it there is a folder for every version of jaxlib, kind of processor and set of XLA flags.

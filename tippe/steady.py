@@ -3,7 +3,8 @@
 A standing top spins with its axis along the normal: upright (stem out, theta = 0) or inverted (stem in, theta = pi). On
 the plane there are tumbling tops between: the axis precesses at a fixed inclination, the centre of mass at rest,
 without slip. The formulas hold for every friction law that vanishes with the slip only, not for `Contensou` and
-`Rolling`, under which every spin runs down; alpha = a / R and gamma = I1 / I3.
+`Rolling`, under which every spin runs down; alpha = a / R and gamma = I1 / I3. Of a top with a stem they describe the motions
+on its own sphere; only `inverted_critical_spin` is of the stem, on which such a top stands inverted.
 
 The stability matrices are Jacobians of the scene's own field, less the directions that are neutral by symmetry or by
 conservation, so that an eigenvalue with positive real part is an instability and nothing else.
@@ -113,18 +114,19 @@ def upright_critical_spin(scene: Scene) -> Float[Array, "..."]:
 
 
 def inverted_critical_spin(scene: Scene) -> Float[Array, "..."]:
-    """Spin [rad/s] above which the inverted top on the plane is stable; infinite if it never is.
+    """Spin [rad/s] above which the inverted top on the plane is stable, on its stem if it has one; infinite if it never is.
 
-    omega^2 = m g a (1 + alpha)^2 / (I3 (1 + alpha - gamma)).
+    omega^2 = m g a (1 + alpha)^2 / (I3 (1 + alpha - gamma)), for a stem with its offset and radius (`tippe.md`, sections 4, 6).
 
     **Example:** of the module's scene.
 
     >>> print(f"{steady.inverted_critical_spin(scene):.1f} rad/s")
     41.3 rad/s
     """
-    alpha, gamma = proportions(scene.body)
-    weight = scene.body.mass * scene.gravity * scene.body.offset
-    return _root_of_ratio(weight * (1.0 + alpha) ** 2 / scene.body.I3, 1.0 + alpha - gamma)
+    (_, gamma), body = proportions(scene.body), scene.body
+    sphere = body if body.stem is None else body.stem
+    alpha, weight = sphere.offset / sphere.radius, body.mass * scene.gravity * sphere.offset
+    return _root_of_ratio(weight * (1.0 + alpha) ** 2 / body.I3, 1.0 + alpha - gamma)
 
 
 def jellett_thresholds(scene: Scene) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
@@ -132,12 +134,18 @@ def jellett_thresholds(scene: Scene) -> tuple[Float[Array, "..."], Float[Array, 
 
     Below the first, the upright top is stable; above the second, the inverted one is (Rutstam's lambda_thres).
 
+    **Raises:** `ValueError` for a top with a stem: Jellett's constant of its sphere is not that of its stem.
+
     **Example:** of the module's scene.
 
     >>> print(" ".join(f"{jellett:.2e}" for jellett in steady.jellett_thresholds(scene)))
     1.24e-06 3.44e-06
     """
     (alpha, _), body = proportions(scene.body), scene.body
+    if body.stem is not None:
+        raise ValueError(
+            f"stem = {body.stem!r} must be None: a top with a stem does not keep Jellett's constant as it inverts"
+        )
     upright = (1.0 - alpha) * body.radius * body.I3 * upright_critical_spin(scene)
     inverted = (1.0 + alpha) * body.radius * body.I3 * inverted_critical_spin(scene)
     return upright, inverted

@@ -139,7 +139,8 @@ def test_those_who_start_together_all_have_the_folder(unset, tmp_path):
 
 
 @pytest.mark.parametrize("folder", [5, True, b"x", ""])
-def test_what_is_no_folder_is_refused(folder, unset):
+def test_what_is_no_folder_is_refused(folder, unset, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=f"folder = {folder!r} must be a path"):
         enable_compilation_cache(folder)
     assert jax.config.jax_compilation_cache_dir is None

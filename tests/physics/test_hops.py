@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from close import assert_close
 from hop_reference import CASES, Case, row
-from stems import first_contact, standing_spin
+from stems import first_contact
 from tops import rutstam_top
 
 import tippe
+from tippe import steady
 from tippe.phases.free_body import balls, jellett, standing_on
 
 REFERENCE = list(csv.DictReader(Path(__file__).with_name("hop_reference.csv").read_text().splitlines()))
@@ -138,7 +139,7 @@ def test_the_top_goes_over_to_its_stem(ride):
     assert len(ride.hops) > 10
     assert ride.theta[-1] > 3.0
     # It stands on its stem, faster than it must.
-    assert abs(ride.spin[-1]) > standing_spin(ride.scene.body)
+    assert abs(ride.spin[-1]) > steady.inverted_critical_spin(ride.scene)
     changes = np.flatnonzero((ride.contact[1:] == 1) & (ride.contact[:-1] == 0))
     assert_close(ride.theta[changes], first_contact(ride.scene.body), atol=2e-7)
 
@@ -208,8 +209,10 @@ def test_closed_forms_of_the_stem():
     """The literature's 2.448 rad, and 88.11 rad/s as the spin at which an eigenvalue changes sign."""
     top = leine_glocker_top()
     assert_close(first_contact(top), 2.44843, atol=5e-6)
-    assert_close(standing_spin(top), 88.11, atol=5e-3)
     scene = tippe.Scene(top, friction=tippe.Viscous(0.3), contact="hybrid")
+    assert_close(steady.inverted_critical_spin(scene), 88.11, atol=5e-3)
+    with pytest.raises(ValueError, match="must be None: a top with a stem"):
+        steady.jellett_thresholds(scene)
     dynamics = standing_on(scene.dynamics, balls(top)[1])
     jacobian = jax.jit(jax.jacfwd(dynamics.field))
 

@@ -100,7 +100,8 @@ def test_a_single_unknown_is_drawn_profiled_and_shown_like_several():
     def level(p):
         return jnp.repeat(p["height"][:, None], X.size, axis=1)
 
-    fit = identify(level, data, {"height": 0.5})
+    # As many starts as the profile has points, so that they share a program.
+    fit = identify(level, data, {"height": 0.5}, starts=13)
     density = LogDensity.of(level, data, {"height": 0.5})
     found = sample(density, fit.coordinates, fit.coordinate_covariance, chains=2, draws=100, warmup=5, progress=False)
     assert found.values["height"].shape == (2, 100)

@@ -84,7 +84,13 @@ def test_estimated_errors_are_those_of_the_scatter():
     assert_close(fit.standard_errors["a"], np.std(value[:40], ddof=1) / math.sqrt(40.0), rtol=0.01)
     assert_close(fit.standard_errors["b"], np.std(value[40:], ddof=1) / math.sqrt(40.0), rtol=0.01)
     assert math.isnan(fit.verdict.p_value)
-    assert "estimated from the scatter" in str(fit)
+    assert "the errors were estimated from it" in str(fit)
+
+
+def test_as_many_unknowns_as_measurements_leave_nothing_to_judge_by():
+    fit = identify(lambda p: p["x"][:, None], Measurements([2.0], 0.2), {"x": 0.5})
+    assert math.isnan(fit.verdict.p_value)
+    assert "no degree of freedom is left" in str(fit)
 
 
 def test_scores_of_student_errors_are_normal():
