@@ -190,7 +190,9 @@ def is_making_programs(thread: int) -> bool:
 
 def is_watched() -> bool:
     """Whether somebody may be looking: standard error is a terminal, or this is a notebook."""
-    return getattr(sys.stderr, "isatty", bool)() or is_notebook()
+    # A stream that is closed does not answer.
+    is_open = not getattr(sys.stderr, "closed", False)
+    return (is_open and getattr(sys.stderr, "isatty", bool)()) or is_notebook()
 
 
 def is_notebook() -> bool:

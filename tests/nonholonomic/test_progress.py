@@ -1,6 +1,7 @@
 """A long call says what it is doing, to whoever watches."""
 
 import importlib.util
+import io
 import subprocess
 import sys
 import threading
@@ -181,6 +182,14 @@ def test_an_exponent_says_how_many_stretches_are_done(monkeypatch):
     assert words(terminal)[0] == "compiling"
     assert any("3/8" in text and "stretch/s" in text for _, text in terminal.lines)
     assert "8/8" in left(terminal)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_nobody_watches_a_stream_that_is_closed(closed, monkeypatch):
+    stream = io.TextIOWrapper(io.BytesIO())
+    stream.close()
+    monkeypatch.setattr(sys, "stderr", stream if closed else None)
+    assert not progress.is_watched()
 
 
 @pytest.mark.parametrize("widgets", [True, False])
