@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from terminal import Terminal
 
 import stroller
 from nonholonomic.integration import Settings, sample
@@ -269,13 +268,6 @@ def test_a_function_that_is_defined_again_does_not_compile_again(reference, capl
     assert not [text for text in caplog.messages if "Finished XLA compilation" in text]
     np.testing.assert_array_equal(again.position, first.position)
     assert abs(float(other.speed[1] - first.speed[1])) > 0.1
-
-
-def test_a_ride_says_what_it_does(monkeypatch, reference):
-    monkeypatch.setattr("nonholonomic.progress.INTERVAL", 0.001)
-    monkeypatch.setattr("sys.stderr", stream := Terminal())
-    stroller.simulate(FULL, LAUNCH, 10.0, push, times=jnp.linspace(0.0, 10.0, 11), tolerance=1e-12)
-    assert stream.lines[0][1].startswith("simulating")
 
 
 def test_what_happened_in_a_traced_ride_is_found_by_riding_again():
