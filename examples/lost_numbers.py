@@ -32,7 +32,7 @@ def time(mass, radius, alpha, ratio, inertia, cylinder, azimuth, mu, theta, eta)
     body = tippe.Top(mass * paper.GRAM, radius, alpha * radius, ratio * I3, I3)
     scene = tippe.Scene(body, tippe.Cylinder(cylinder * radius), tippe.Viscous(mu))
     launch = tippe.Launch(theta, paper.BETA1 / I3, eta=eta, azimuth=azimuth)
-    return tippe.extended_inversion_time(scene, launch, HORIZON, 0.95 * np.pi, 1e-6)
+    return tippe.extended_inversion_time(scene, launch, HORIZON, 0.95 * np.pi, 1e-8)
 
 
 def model(numbers: dict) -> jnp.ndarray:
