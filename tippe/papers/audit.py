@@ -288,7 +288,7 @@ column after 25 (Coulomb 15) rounds in which the best sets were varied.
 
       python benchmarks/paper_tables_joint.py --law viscous
 
-  the least -2 log likelihood found is 29.5 at 11 degrees of freedom, in 190000 sets of numbers and a fit from the best:
+  the least -2 log likelihood found is 29.6 at 11 degrees of freedom, in 190000 sets of numbers and a fit from the best:
   m = 11.573 g, R = 27.474 mm, a / R = 0.086495, I1 / I3 = 1.0533, I3 / m R^2 = 0.4075, a cylinder of 84.428 R, azimuth
   1.7971, mu = 0.32573 s/m. It reverses from 0.1, 0.2, 0.3, 0.4 rad at 22.6, 19.3, 19.9, 22.4 s from the wall (printed 23,
   19, 20, 22), where it loses contact in the other rows, and at 26.3, 26.3, 28.2, 30.3 s from the lowest line (printed 25,
