@@ -43,8 +43,8 @@ def trajectory_table(
 ) -> Table:
     """Trajectories over a grid of launches and scenes, sampled at given times, in one batched call on all cores.
 
-    The samples have the accuracy of `simulate`: a step ends on each of the times. With a sample for each step of the integration
-    it costs twice as much as a table of inversion times to the same horizon.
+    The samples have the accuracy of `simulate`: a step ends on each of the times. With a sample for each step of the
+    integration it costs twice as much as a table of inversion times to the same horizon.
 
     **Arguments:**
 

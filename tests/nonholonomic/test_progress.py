@@ -30,11 +30,11 @@ class Pipe(Terminal):
         return False
 
 
-def slow_sweep(monkeypatch, stream, cells=6, block=3, **options):
+def slow_sweep(monkeypatch, stream, cells=6, block=3, waits=(1.3, 0.8), **options):
     """A sweep that compiles for 1.3 s and takes 0.8 s for each of its blocks, one at a time; what it writes, and when."""
 
     def compute(columns, count):
-        time.sleep(0.8 if count else 1.3)
+        time.sleep(waits[count > 0])
         return {"value": columns["x"]}
 
     monkeypatch.setattr(sys, "stderr", stream)
@@ -78,8 +78,10 @@ def test_the_rate_is_that_of_all_workers(monkeypatch):
 def test_nothing_is_written_where_nobody_watches_or_wants_it(way, monkeypatch):
     if way == "environment":
         monkeypatch.setenv("NONHOLONOMIC_PROGRESS", "0")
+    watched(monkeypatch)
     options = {"progress": False} if way == "argument" else {}
-    assert slow_sweep(monkeypatch, Pipe() if way == "pipe" else Terminal(), cells=3, **options) == []
+    stream = Pipe() if way == "pipe" else Terminal()
+    assert slow_sweep(monkeypatch, stream, cells=3, waits=(0.2, 0.2), **options) == []
 
 
 def test_what_is_told_is_whether_a_program_is_being_made(monkeypatch):
