@@ -132,8 +132,9 @@ def name_of(part):
     return type(part).__name__
 
 
-#: Every arena under the longest law and the one with two kinds of motion; every law on a frame of its own and on a carried one.
-SCENES = [*itertools.product(ARENAS, LAWS[4:]), *itertools.product((ARENAS[0], ARENAS[4]), LAWS[:4])]
+#: Every arena under the longest law; every law on a frame of its own and on a carried one; rolling on every frame.
+SCENES = [*itertools.product(ARENAS, LAWS[4:5]), *itertools.product((ARENAS[0], ARENAS[4]), (*LAWS[:4], LAWS[5]))]
+SCENES += [(arena, LAWS[5]) for arena in ARENAS[1:4]]
 
 
 @pytest.mark.parametrize(("arena", "law"), SCENES, ids=name_of)

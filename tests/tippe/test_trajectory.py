@@ -61,7 +61,11 @@ def test_illegal_numbers_in_a_batch_of_runs_give_nothing_that_looks_right(rutsta
         assert np.all(np.isnan(read[1:]))
 
 
-@pytest.mark.parametrize("options", [{"adjoint": diffrax.ForwardMode()}, {"solver": diffrax.Kvaerno3()}], ids=str)
+@pytest.mark.parametrize(
+    "options",
+    [{"adjoint": diffrax.ForwardMode()}, pytest.param({"solver": diffrax.Kvaerno3()}, marks=pytest.mark.slow)],
+    ids=str,
+)
 def test_a_run_without_contact_at_its_start_ends_there(options):
     """On the ceiling of a cylinder, whoever integrates; nothing looks right of a run by an illegal number, nor its slopes."""
 

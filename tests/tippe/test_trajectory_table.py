@@ -1,8 +1,6 @@
 """Tables of trajectories: single runs and batches, axes, ends, files, and what is refused."""
 
-import doctest
 import re
-import sys
 
 import h5py
 import jax
@@ -233,13 +231,3 @@ def test_scenes_whose_runs_have_phases_are_refused(change, told):
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), **{"friction": tippe.Viscous(0.3)} | change)
     with pytest.raises(ValueError, match=told):
         tippe.trajectory_table(scene, theta=0.1, spin=100.0, times=TIMES)
-
-
-def test_the_example_of_its_docstring():
-    results = doctest.DocTestRunner()
-    for example in doctest.DocTestFinder().find(
-        tippe.trajectory_table, "trajectory_table", sys.modules["tippe.trajectory_table"], {}
-    ):
-        results.run(example)
-    assert results.tries > 4
-    assert results.failures == 0
