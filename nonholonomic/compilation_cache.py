@@ -23,7 +23,7 @@ from jax.experimental.compilation_cache import compilation_cache
 #: The file that tells which entries were found sound, a line for each.
 LOOKED_AT = ".looked_at"
 
-#: What forbids the cache, as the value of `NONHOLONOMIC_CACHE`.
+#: What switches something off, as the value of an environment variable.
 OFF = ("0", "off", "false", "no")
 
 #: How writing fails where there is no room: the disk is full, or the user's share of it, or a file may not be so long.
@@ -67,7 +67,7 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
     """
     if folder is not None and (not isinstance(folder, str | os.PathLike) or folder == ""):
         raise ValueError(f"folder = {folder!r} must be a path")
-    if os.environ.get("NONHOLONOMIC_CACHE", "").strip().lower() in OFF:
+    if is_off("NONHOLONOMIC_CACHE"):
         return None
     settings: Any = jax.config
     chosen = settings.jax_compilation_cache_dir
@@ -121,6 +121,11 @@ def processor() -> str:
     lines_by_name = dict(line.split(":", 1) for line in reversed(lines) if ":" in line)
     lines_by_name = {name.strip(): value.strip() for name, value in lines_by_name.items()}
     return "\n".join(lines_by_name.get(name, "") for name in kinds)
+
+
+def is_off(variable: str) -> bool:
+    """Whether an environment variable switches off what it is named for."""
+    return os.environ.get(variable, "").strip().lower() in OFF
 
 
 def remove_damaged(folder: Path) -> None:

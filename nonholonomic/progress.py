@@ -1,6 +1,5 @@
 """What a long call is doing, in one line on a terminal or in a notebook."""
 
-import os
 import sys
 import threading
 import time
@@ -10,7 +9,7 @@ from importlib.util import find_spec
 from types import TracebackType
 from typing import Any
 
-from .compilation_cache import OFF
+from .compilation_cache import is_off
 
 #: How often the line is written [s]; a call that ends sooner shows nothing. How often is looked whether it is time [s], and
 #: how long after the last call [s]: starting a thread for every call would cost short ones a millisecond.
@@ -43,7 +42,7 @@ class Progress:
         - `shown`: whether to show anything at all, of calls within this one, too.
         """
         self._total, self._unit, self._doing = total, unit, doing
-        self._heard = os.environ.get("NONHOLONOMIC_PROGRESS", "").strip().lower() not in OFF and is_watched()
+        self._heard = not is_off("NONHOLONOMIC_PROGRESS") and is_watched()
         self._shown = shown
         self._done, self._first, self._since, self._notes = 0, 0, None, {}
         self._bar: Any = None

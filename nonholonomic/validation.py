@@ -115,6 +115,13 @@ def require(
             raise ValueError(message + remark)
 
 
+def require_scalars(values: dict[str, Any], otherwise: str) -> None:
+    """Raise `ValueError` unless each of these, by its name, is one number or left out; `otherwise`: what takes lists."""
+    for name, value in values.items():
+        if value is not None and np.ndim(value) != 0:
+            raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; {otherwise}")
+
+
 def require_whole(value: Any, name: str, at_least: int) -> None:
     """Raise `ValueError` unless this is a whole number of at least so much."""
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < at_least:

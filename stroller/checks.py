@@ -1,13 +1,10 @@
 """Checks of what is asked of a ride, before anything compiles."""
 
-from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
-
-from nonholonomic.integration import ImplicitMidpoint, require_adaptive, require_adjoint, tolerance_bound
+from nonholonomic.integration import ImplicitMidpoint, require_adaptive, require_adjoint, run_bounds, times_bounds
 from nonholonomic.parameters import numbers
-from nonholonomic.validation import Bound, require_all, require_increasing, require_whole
+from nonholonomic.validation import require_all, require_increasing, require_scalars, require_whole
 
 from .input import check_input
 from .launch import Launch
@@ -22,9 +19,7 @@ def check_run(scene: Any, launch: Any, t1: Any, input: Any, tolerance: Any) -> N
         raise ValueError(f"launch = {launch!r} must be a Launch")
     require_all(run_bounds(t1, tolerance))
     values = numbers("scene", scene, functions=False) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
-    for name, value in values.items():
-        if value is not None and np.ndim(value) != 0:
-            raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; axes of sweep take lists")
+    require_scalars(values, "axes of sweep take lists")
     scene.check(launch)
     check_input(input, scene, launch)
 
@@ -41,14 +36,3 @@ def check_options(solver: Any, max_steps: Any, adjoint: Any) -> None:
         require_adaptive(solver, ", or an ImplicitMidpoint")
     require_whole(max_steps, "max_steps", 1)
     require_adjoint(adjoint)
-
-
-def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:
-    """The ranges of the horizon [s] and of the tolerance."""
-    yield Bound(t1, "t1", above=0.0)
-    yield tolerance_bound(tolerance)
-
-
-def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
-    """The range of the times of output [s]."""
-    yield Bound(times, "times", at_least=0.0, at_most=t1)

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.integration import LOOSEST, ImplicitMidpoint, Settings
+from nonholonomic.integration import LOOSEST, ImplicitMidpoint, Settings, run_bounds, times_bounds
 from nonholonomic.progress import telling
 from nonholonomic.validation import as_known, is_traced, legal, nan_unless
 
-from .checks import check_options, check_run, check_times, run_bounds, times_bounds
+from .checks import check_options, check_run, check_times
 from .input import Input
 from .launch import Launch
 from .ride import Ride, RideRecipe, as_module, traced_ride

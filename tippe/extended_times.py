@@ -11,9 +11,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from nonholonomic.derivatives import AbstractQuestion, VariationalProblem, ask, directions_by, in_groups
 from nonholonomic.integration import CROSSED, FAILED, Queue, Settings, crossing_time
 from nonholonomic.progress import telling
-from nonholonomic.validation import as_number, is_traced, nan_unless
+from nonholonomic.validation import as_number, is_traced
 
-from .inversion import InversionProblem, check_event, check_run, check_smooth, permitted
+from .inversion import InversionProblem, check_event, check_run, check_smooth, nan_if_illegal, permitted
 from .launch import Launch
 from .scene import Scene
 from .state import inclination, parts
@@ -65,7 +65,7 @@ def extended_inversion_time(
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
     unchecked = any(is_traced(leaf) for leaf in leaves)
     found = ask(ExtendedQuestion(len(leaves) - 2, structure, unchecked), *leaves)
-    return nan_unless(permitted(structure, unchecked, leaves)[0], found)
+    return nan_if_illegal(found, structure, unchecked, leaves)
 
 
 class ExtendedQuestion(AbstractQuestion):

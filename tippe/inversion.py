@@ -17,10 +17,10 @@ from nonholonomic.integration import (
     AbstractProblem,
     Journey,
     Outcome,
-    tolerance_bound,
+    run_bounds,
 )
 from nonholonomic.parameters import numbers
-from nonholonomic.validation import Bound, all_bounds, legal, require_all
+from nonholonomic.validation import Bound, all_bounds, legal, nan_unless, require_all, require_scalars
 from nonholonomic.xla_cpu import compiled_setup
 
 from .dynamics import Dynamics
@@ -94,6 +94,11 @@ def permitted(
     return may, t1, jnp.min(tolerance)
 
 
+def nan_if_illegal(found: Float[Array, ""], structure: Any, unchecked: bool, leaves: list[Any]) -> Float[Array, ""]:
+    """What was found, or NaN, and so every derivative of it, where numbers are not legal. **Arguments:** as for `permitted`."""
+    return nan_unless(permitted(structure, unchecked, leaves)[0], found) if unchecked else found
+
+
 def is_inverted(outcome: Outcome | Journey, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:
     """Which cells count as inverted: those that reached the angle, or that end above it where the last crossing counts."""
     if not last:
@@ -110,16 +115,8 @@ def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any) -> None:
         raise ValueError(f"launch = {launch!r} must be a Launch")
     require_all(run_bounds(t1, tolerance))
     values = numbers("scene", scene) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
-    for name, value in values.items():
-        if value is not None and np.ndim(value) != 0:
-            raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; inversion_table takes lists")
+    require_scalars(values, "inversion_table takes lists")
     scene.check_start(launch)
-
-
-def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:
-    """The ranges of the horizon [s] and of the tolerance."""
-    yield Bound(t1, "t1", above=0.0)
-    yield tolerance_bound(tolerance)
 
 
 def event_bounds(angle: Any) -> Iterator[Bound]:

@@ -30,10 +30,10 @@ from nonholonomic.integration import (
     traced_travel,
 )
 from nonholonomic.progress import telling
-from nonholonomic.validation import as_number, is_traced, nan_unless
+from nonholonomic.validation import as_number, is_traced
 
 from .cells import check_differentiable, driver_of
-from .inversion import InversionProblem, check_event, check_run, is_inverted, permitted
+from .inversion import InversionProblem, check_event, check_run, is_inverted, nan_if_illegal, permitted
 from .launch import Launch
 from .phases.airborne import on_the_ground
 from .scene import Scene
@@ -97,7 +97,7 @@ def inversion_time(
     question = InversionQuestion if driver_of(scene).smooth else PhasedInversionQuestion
     # The last two leaves, horizon and tolerance, do not move the event.
     found = ask(question(len(leaves) - 2, structure, solver, crossing == "last", unchecked), *leaves)
-    return nan_unless(permitted(structure, unchecked, leaves)[0], found)
+    return nan_if_illegal(found, structure, unchecked, leaves)
 
 
 class InversionQuestion(AbstractQuestion):

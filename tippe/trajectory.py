@@ -1,6 +1,5 @@
 """One run of a tippe top, with its path."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import diffrax
@@ -20,10 +19,11 @@ from nonholonomic.integration import (
     follow,
     require_adaptive,
     require_adjoint,
+    run_bounds,
+    times_bounds,
 )
 from nonholonomic.progress import telling
 from nonholonomic.validation import (
-    Bound,
     all_bounds,
     as_number,
     is_traced,
@@ -34,7 +34,7 @@ from nonholonomic.validation import (
 )
 from nonholonomic.xla_cpu import on_device
 
-from .inversion import check_run, run_bounds
+from .inversion import check_run
 from .launch import Launch
 from .observables import AbstractTrajectory, of_each_run
 from .phases.airborne_trajectory import sampled_airborne, simulate_airborne
@@ -187,11 +187,6 @@ def simulate(
     if times is None:
         return trajectory
     return trajectory.at(np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)])
-
-
-def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
-    """The range of the times of output [s]."""
-    yield Bound(times, "times", at_least=0.0, at_most=t1)
 
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nonholonomic.integration import Settings
+from nonholonomic.integration import Settings, times_bounds
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
 from nonholonomic.validation import as_number, require, require_all, require_increasing
@@ -16,7 +16,6 @@ from .cells import COUNTED
 from .launches import described, launches
 from .quantities import COMPONENTS, QUANTITIES
 from .scene import Scene
-from .trajectory import times_bounds
 from .trajectory_cells import follow_cells
 
 #: The status of a run, in the order of `sampled.STATUS`; a word has no space in it, so that a file can list them.

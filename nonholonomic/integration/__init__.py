@@ -47,6 +47,8 @@ from .settings import Settings as Settings
 from .settings import lanes_for as lanes_for
 from .settings import require_adaptive as require_adaptive
 from .settings import require_adjoint as require_adjoint
+from .settings import run_bounds as run_bounds
+from .settings import times_bounds as times_bounds
 from .settings import tolerance_bound as tolerance_bound
 from .single_run import Followed as Followed
 from .single_run import Sampled as Sampled

@@ -1,5 +1,6 @@
 """How runs are integrated."""
 
+from collections.abc import Iterator
 from typing import Any, Self
 
 import diffrax
@@ -65,6 +66,17 @@ class Settings(eqx.Module):
 def tolerance_bound(tolerance: Any) -> Bound:
     """The range of the relative tolerance."""
     return Bound(tolerance, "tolerance", at_least=TIGHTEST, at_most=LOOSEST)
+
+
+def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:
+    """The ranges of the horizon [s] and of the tolerance."""
+    yield Bound(t1, "t1", above=0.0)
+    yield tolerance_bound(tolerance)
+
+
+def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
+    """The range of the times of output [s]."""
+    yield Bound(times, "times", at_least=0.0, at_most=t1)
 
 
 def require_adaptive(solver: Any, others: str = "") -> None:
