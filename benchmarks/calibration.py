@@ -33,7 +33,7 @@ from nonholonomic.identification.result import coordinate_covariance
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 from posterior import ANGLE, ERROR, I1, SPIN, THETA, scene
 
-from tippe.identify import SceneModel
+from tippe.fit.identify import SceneModel
 
 #: Mean and standard deviation of the priors, which are of the numbers themselves. Times fix one combination to 5e-5, and offset
 #: and friction only together: without a balance for the offset the posterior is a bent ridge, which no ellipse covers.

@@ -1,4 +1,6 @@
-"""The lean vector fields in scalar arithmetic, for the peers: the formulas of `tippe/dynamics.py` and `stroller/dynamics.py`.
+"""The lean vector fields in scalar arithmetic, for the peers.
+
+They are the formulas of `tippe/model/dynamics.py` and `stroller/model/dynamics.py`.
 
 One text serves NumPy, numba, JAX and heyoka: the components are numbers, arrays or symbolic expressions, the functions are
 the caller's. `scenes.misprint` compares each field with the scene's own.

@@ -21,7 +21,7 @@ import numpy as np
 
 import tippe
 from nonholonomic.integration import CROSSED, FAILED, GUARD_LOST, Settings, compiled_march
-from tippe.inversion import InversionProblem
+from tippe.modes.inversion_problem import InversionProblem
 from tippe.papers import paper
 
 ANGLE, BLOCK = 0.95 * np.pi, 4096

@@ -8,7 +8,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr
 from measure import timed
 
 from nonholonomic.integration import Queue, Settings, attempt
-from tippe.inversion import InversionProblem
+from tippe.modes.inversion_problem import InversionProblem
 
 #: What counts as one operation.
 ARITHMETIC = ("add", "add_any", "sub", "mul", "div", "sqrt", "max", "min")

@@ -31,7 +31,7 @@ from scenes import TOP
 import tippe
 from nonholonomic.integration import Settings, compiled_march, lanes_for
 from nonholonomic.sweeps import running
-from tippe.inversion import InversionProblem
+from tippe.modes.inversion_problem import InversionProblem
 
 ON_CPU = jax.default_backend() == "cpu"
 DOUBLE = jnp.result_type(float) == jnp.float64

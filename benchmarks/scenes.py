@@ -12,8 +12,8 @@ from peers import NUMPY, Task
 import stroller
 import tippe
 from nonholonomic.integration import AbstractProblem
-from stroller.table import RideProblem
-from tippe.inversion import InversionProblem
+from stroller.runs.table import RideProblem
+from tippe.modes.inversion_problem import InversionProblem
 
 ANGLE = 0.95 * math.pi
 

@@ -14,31 +14,22 @@ import jax.numpy as jnp
 
 from nonholonomic import __version__
 from nonholonomic.compilation_cache import enable_compilation_cache
-from nonholonomic.geometry import (
-    CLOSED,
-    AbstractSurface,
-    Cylinder,
-    Paraboloid,
-    Plane,
-    Sphere,
-    Spheroid,
-    Torus,
-)
+from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.progress import Progress, telling
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require, require_folder
 from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html
 
-from .friction import Damping, Frictionless
-from .launch import Launch
-from .plot import draw_rides
-from .quantities import table_of
-from .scene import FORKS, Scene
-from .simulate import simulate
-from .stroller import Stroller
-from .trajectory import Trajectory
-from .view import grouped
+from .model.friction import Damping, Frictionless
+from .model.launch import Launch
+from .model.scene import FORKS, Scene
+from .model.stroller import Stroller
+from .runs.plot import draw_rides
+from .runs.quantities import table_of
+from .runs.simulate import simulate
+from .runs.trajectory import Trajectory
+from .runs.view import grouped
 
 RIDES = ("without friction", "with friction")
 

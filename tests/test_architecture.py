@@ -19,10 +19,14 @@ HEIGHT = {
     "integration": 0,
     "formulations": 0,
     "derivatives": 1,
+    "hybrid": 2,
     "sweeps": 2,
     "identification": 3,
     "views": 4,
 }
+
+#: The same for the rooms of a vehicle.
+VEHICLE_HEIGHT = {"model": 0, "modes": 1, "runs": 2, "fit": 3}
 
 #: Rooms that check what the others compute; papers may use witnesses, and command lines, which show the papers' tables
 #: beside their own, may use papers.
@@ -97,8 +101,10 @@ def allowed(arrow: Arrow) -> bool:
     (package, _, here), (target, _, there) = start.partition("/"), end.partition("/")
     if target != package:
         return target == "nonholonomic"
-    if start == end or package != "nonholonomic" or arrow.file == f"{package}/__init__.py" or not there:
+    if start == end or arrow.file == f"{package}/__init__.py" or not there:
         return True
+    if package != "nonholonomic":
+        return VEHICLE_HEIGHT.get(there, -1) < VEHICLE_HEIGHT.get(here, len(VEHICLE_HEIGHT))
     if not here:
         return False
     # Something may show itself when it is asked to.

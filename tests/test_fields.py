@@ -14,16 +14,16 @@ from tops import rutstam_top
 
 import stroller
 import tippe
-from stroller.table import RideProblem
-from tippe.cells import driver_of
-from tippe.inversion import InversionProblem
-from tippe.phases.airborne_trajectory import arena_phases
-from tippe.phases.exact_impact import Skid
-from tippe.phases.flight_trajectory import level_phases
-from tippe.phases.free_body import FreeBody, balls
-from tippe.phases.impact import Impact, approach
-from tippe.phases.stick_slip_runs import contact_phases
-from tippe.trajectory import TrajectoryProblem
+from stroller.runs.table import RideProblem
+from tippe.modes.exact_impact import Skid
+from tippe.modes.free_body import FreeBody, balls
+from tippe.modes.impact import Impact, approach
+from tippe.modes.inversion_problem import InversionProblem
+from tippe.modes.stick_slip_runs import contact_phases
+from tippe.runs.airborne_trajectory import arena_phases
+from tippe.runs.cells import driver_of
+from tippe.runs.flight_trajectory import level_phases
+from tippe.runs.trajectory import TrajectoryProblem
 
 #: 16 to 44 ns for each number on a CPU, where a product takes one.
 SLOW = {"sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2", "expm1"}

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 import tippe
 from nonholonomic.validation import Bound, as_number
-from tippe.body import AbstractBody, AbstractOutline, Lever
-from tippe.friction import AbstractFriction, ContactLoad, Slip, length
+from tippe.model.body import AbstractBody, AbstractOutline, Lever
+from tippe.model.friction import AbstractFriction, ContactLoad, Slip, length
 
 ROOT = Path(__file__).parents[1]
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]

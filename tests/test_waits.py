@@ -26,15 +26,15 @@ DECAY = Measurements([2.0, 1.0], [0.1, 0.1])
 
 #: What is called, and the function in which it waits, by its module and name.
 CALLS = {
-    "inversion_time": (lambda: tippe.inversion_time(TOP, LAUNCH, 8.0), "tippe.inversion_time", "ask"),
-    "extended": (lambda: tippe.extended_inversion_time(TOP, LAUNCH, 8.0), "tippe.extended_times", "ask"),
-    "simulate": (lambda: tippe.simulate(TOP, LAUNCH, 1.0), "tippe.trajectory", "follow"),
-    "exponent": (lambda: tippe.lyapunov_exponent(TOP, LAUNCH, 1.0), "tippe.lyapunov", "_direction"),
-    "ride": (lambda: stroller.simulate(STROLLER, RIDE, 1.0), "stroller.simulate", "_concrete"),
-    "identify": (lambda: tippe.identify(TOP, TIMES, {"mu": 0.3}), "tippe.identify", "unknowns_of"),
+    "inversion_time": (lambda: tippe.inversion_time(TOP, LAUNCH, 8.0), "tippe.runs.inversion_time", "ask"),
+    "extended": (lambda: tippe.extended_inversion_time(TOP, LAUNCH, 8.0), "tippe.runs.extended_times", "ask"),
+    "simulate": (lambda: tippe.simulate(TOP, LAUNCH, 1.0), "tippe.runs.trajectory", "follow"),
+    "exponent": (lambda: tippe.lyapunov_exponent(TOP, LAUNCH, 1.0), "tippe.runs.lyapunov", "_direction"),
+    "ride": (lambda: stroller.simulate(STROLLER, RIDE, 1.0), "stroller.runs.simulate", "_concrete"),
+    "identify": (lambda: tippe.identify(TOP, TIMES, {"mu": 0.3}), "tippe.fit.identify", "unknowns_of"),
     "stroller identify": (
         lambda: stroller.identify(STROLLER, RECORDING, {"mass": 12.0}),
-        "stroller.identify",
+        "stroller.fit.identify",
         "_unknowns_of",
     ),
     "any fit": (lambda: identify(None, DECAY, {"x": 1.0}), "nonholonomic.identification.identify", "draw_starts"),
@@ -49,16 +49,16 @@ CALLS = {
     "page": (lambda: Viewable.view(stub("stages")), None, None),
     "animation": (lambda: Viewable.animate(stub("stages"), "a.gif"), None, None),
     "curves": (lambda: Viewable.plot(stub("stages")), None, None),
-    "table of a run": (lambda: tippe.Trajectory.to_table(SimpleNamespace(t=0.0)), "tippe.observables", "table_of"),
+    "table of a run": (lambda: tippe.Trajectory.to_table(SimpleNamespace(t=0.0)), "tippe.runs.observables", "table_of"),
     "table of a ride": (
         lambda: stroller.Trajectory.to_table(SimpleNamespace()),
-        "stroller.trajectory",
+        "stroller.runs.trajectory",
         "table_of_one",
     ),
-    "words on a run": (lambda: tippe.Trajectory.__str__(SimpleNamespace(t=0.0)), "tippe.observables", "is_traced"),
+    "words on a run": (lambda: tippe.Trajectory.__str__(SimpleNamespace(t=0.0)), "tippe.runs.observables", "is_traced"),
     "words on a ride": (
         lambda: stroller.Trajectory.__str__(SimpleNamespace(t=0.0)),
-        "stroller.trajectory",
+        "stroller.runs.trajectory",
         "is_traced",
     ),
 }

@@ -23,15 +23,15 @@ from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
 from nonholonomic.xla_cpu import compiled_quickly
 
-from .friction import AbstractFriction, Coulomb, Viscous
-from .launch import Launch
+from .model.friction import AbstractFriction, Coulomb, Viscous
+from .model.launch import Launch
+from .model.scene import Scene
+from .model.top import Top
 from .papers import paper
-from .plot import Panel, draw_launches
-from .scene import Scene
-from .table import inversion_table
-from .top import Top
-from .trajectory import simulate
-from .view import Motion, stages
+from .runs.plot import Panel, draw_launches
+from .runs.table import inversion_table
+from .runs.trajectory import simulate
+from .runs.view import Motion, stages
 
 #: The arenas that have names, and what their numbers are.
 SURFACES = {

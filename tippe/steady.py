@@ -38,10 +38,10 @@ from nonholonomic.geometry import Plane
 from nonholonomic.integration import sign_changes
 from nonholonomic.validation import as_number, require
 
-from .launch import Launch
-from .scene import Scene
-from .state import AXIS, joined, parts
-from .top import Top
+from .model.launch import Launch
+from .model.scene import Scene
+from .model.state import AXIS, joined, parts
+from .model.top import Top
 
 
 def proportions(body: Top) -> tuple[Float[Array, "..."], Float[Array, "..."]]:

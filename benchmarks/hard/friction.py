@@ -16,7 +16,7 @@ from hard.lagrange import theta_by_lagrange
 from hard.limits import rutstam_top
 from hard.row import Row, of_runs
 from nonholonomic.integration import Followed, Settings, follow
-from tippe.trajectory import TrajectoryProblem
+from tippe.runs.trajectory import TrajectoryProblem
 
 GRAVITY = 9.81
 

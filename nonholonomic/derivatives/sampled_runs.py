@@ -22,9 +22,9 @@ from ..integration import (
     march_with_samples,
     sample,
 )
-from ._sampling import AbstractSampling, Recipe, ask_for_samples
 from .differentiable import directions_by
 from .lyapunov import probed
+from .sampling import AbstractSampling, Recipe, ask_for_samples
 from .variation import VariationalProblem, in_groups
 
 #: From some modules (scene, launch, ...) and a number of cells, `None` for a single run, to the problem.

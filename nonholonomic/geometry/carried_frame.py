@@ -15,17 +15,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ..validation import Bound, as_number
 from ..xla_cpu import stored
 from .cylinder import Cylinder
-from .frames import (
-    AbstractFrame,
-    Carriage,
-    CylinderFrame,
-    Fixed,
-    Place,
-    PlaneFrame,
-    SphereFrame,
-    Tangent,
-    along,
-)
+from .frames import AbstractFrame, Carriage, CylinderFrame, Fixed, Place, PlaneFrame, SphereFrame, Tangent, along
 from .plane import Plane
 from .quadric import Sphere
 from .surface import AbstractSurface

@@ -1,10 +1,9 @@
 """Runs in time: from a start along a field to an event, to the end of the model's validity, or to a horizon.
 
 `compiled_march` runs many cells of a problem in lanes that keep step with one another; `follow` and `sample` are single runs
-with any solver of Diffrax. `travel` runs many cells through phases (`traced_travel` inside other transformed functions),
-`follow_phases` a single run with its path.
-`march_by_diffrax` is the independent second road. `Settings` says how, and the codes of a run's status are `RUNNING`,
-`REACHED_END`, `CROSSED`, `GUARD_LOST`, `FAILED` and `UNRESOLVED`.
+with any solver of Diffrax. `march_by_diffrax` is the independent second road. Runs of several modes are in
+`nonholonomic.hybrid`. `Settings` says how, and the codes of a run's status are `RUNNING`, `REACHED_END`, `CROSSED`,
+`GUARD_LOST`, `FAILED` and `UNRESOLVED`.
 """
 
 from .attempt import Block as Block
@@ -16,17 +15,6 @@ from .march import traced_march as traced_march
 from .march import with_crossing_times as with_crossing_times
 from .midpoint import ImplicitMidpoint as ImplicitMidpoint
 from .oscillatory import Oscillatory8 as Oscillatory8
-from .phased_run import BETWEEN as BETWEEN
-from .phased_run import PhasedPath as PhasedPath
-from .phased_run import Piece as Piece
-from .phased_run import follow_phases as follow_phases
-from .phases import AbstractPhase as AbstractPhase
-from .phases import Journey as Journey
-from .phases import Passage as Passage
-from .phases import Record as Record
-from .phases import marched as marched
-from .phases import passed_on as passed_on
-from .phases import travel as travel
 from .problem import AbstractProblem as AbstractProblem
 from .problem import LeadingProblem as LeadingProblem
 from .problem import crossing_time as crossing_time
@@ -61,8 +49,6 @@ from .status import GUARD_LOST as GUARD_LOST
 from .status import REACHED_END as REACHED_END
 from .status import RUNNING as RUNNING
 from .status import UNRESOLVED as UNRESOLVED
-from .traced_phases import in_rounds as in_rounds
-from .traced_phases import traced_travel as traced_travel
 from .zeros import few_trials as few_trials
 from .zeros import halved as halved
 from .zeros import sign_changes as sign_changes

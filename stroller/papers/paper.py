@@ -325,7 +325,7 @@ def render() -> str:
         "`stroller.papers.paper.render()` gives this page.",
         "",
         "The paper announces friction, a constrained Levi-Civita connection, Poincare's equations and graphs; none of",
-        "them is in its text. The program has them (`stroller/friction.py`, `nonholonomic/formulations/formulation.py`,",
+        "them is in its text. The program has them (`stroller/model/friction.py`, `nonholonomic/formulations/formulation.py`,",
         "`python -m stroller`).",
         "",
         'The paper constrains the horizontal projections of the wheels\' velocities: `heading="projected"`. On a slope',

@@ -12,10 +12,10 @@ from jaxtyping import Array, Float
 from nonholonomic.formulations import AbstractSystem, Coordinates
 from nonholonomic.geometry import AbstractQuadric, Plane, add, inverse, multiply, subtract
 
-from ..dynamics import State
-from ..friction import WheelMotion
-from ..input import Input, Motion
-from ..scene import FORKS, Scene
+from ..model.dynamics import State
+from ..model.friction import WheelMotion
+from ..model.input import Input, Motion
+from ..model.scene import FORKS, Scene
 
 
 class Chart(AbstractSystem):

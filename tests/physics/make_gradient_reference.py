@@ -20,7 +20,7 @@ import numpy as np
 import tippe
 from nonholonomic.integration import CROSSED, Settings, compiled_march
 from nonholonomic.parameters import with_numbers
-from tippe.inversion import InversionProblem
+from tippe.modes.inversion_problem import InversionProblem
 
 HERE = Path(__file__).parent
 ANGLE, TOLERANCE, STEP, RATIO, STEPS = 0.95 * math.pi, 1e-13, 1e-3, 1.6, 16

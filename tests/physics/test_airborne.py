@@ -10,9 +10,10 @@ from close import assert_close
 from tops import rutstam_top
 
 import tippe
-from nonholonomic.integration import Settings, follow_phases
-from tippe.phases.airborne import FLYING, SLIDING
-from tippe.phases.airborne_trajectory import arena_phases
+from nonholonomic.hybrid import follow_phases
+from nonholonomic.integration import Settings
+from tippe.modes.airborne import FLYING, SLIDING
+from tippe.runs.airborne_trajectory import arena_phases
 
 REFERENCE = recorded()
 

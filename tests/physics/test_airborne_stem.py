@@ -16,8 +16,8 @@ from hop_reference import CASES as ON_THE_PLANE
 from test_leaning import REFERENCE as FOUND_ON_THE_PLANE
 
 import tippe
-from tippe.phases.airborne import ON_STEM, STRIKING
-from tippe.phases.airborne_stem import FlyBoth
+from tippe.modes.airborne import ON_STEM, STRIKING
+from tippe.modes.airborne_stem import FlyBoth
 
 REFERENCE = recorded()
 STEM = tippe.Stem(radius=5e-3, offset=0.016)

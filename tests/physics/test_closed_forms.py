@@ -11,7 +11,7 @@ from tops import homogeneous_ball, rutstam_top
 
 import tippe
 from nonholonomic.integration import Settings, follow
-from tippe.trajectory import TrajectoryProblem
+from tippe.runs.trajectory import TrajectoryProblem
 
 GRAVITY = 9.81
 

@@ -99,7 +99,7 @@ def test_a_frictionless_run_goes_back_to_its_start():
     from dataclasses import replace
 
     from nonholonomic.integration import follow
-    from tippe.trajectory import TrajectoryProblem
+    from tippe.runs.trajectory import TrajectoryProblem
 
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Frictionless())
     run = TrajectoryProblem.of(scene, tippe.Launch(0.3, 60.0, eta=0.5))

@@ -17,12 +17,12 @@ from test_strong_friction import random_falls
 from tops import homogeneous_ball
 
 import tippe
-from tippe.phases.airborne import FLYING
-from tippe.phases.airborne_stick_slip import ROLLING, SLIPPING
-from tippe.phases.exact_impact import strike_exactly
-from tippe.phases.free_body import balls, energy, gap_rate
-from tippe.phases.impact import approach
-from tippe.state import angular_velocity
+from tippe.model.state import angular_velocity
+from tippe.modes.airborne import FLYING
+from tippe.modes.airborne_stick_slip import ROLLING, SLIPPING
+from tippe.modes.exact_impact import strike_exactly
+from tippe.modes.free_body import balls, energy, gap_rate
+from tippe.modes.impact import approach
 
 NUMBERS, MU, THETA, SPIN, T1 = (0.02, 0.02, 0.016, 1.6e-6, 1.9e-6), 0.5, 1.5, 350.0, 0.276
 

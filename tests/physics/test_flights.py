@@ -12,10 +12,10 @@ from test_hops import scene_of
 from tops import rutstam_top
 
 import tippe
-from tippe.phases.flight import Descent, angle_reached, cone, flown, landing
-from tippe.phases.free_body import FreeBody, balls, energy, gap_rate, jellett
-from tippe.phases.impact import strike
-from tippe.state import angular_velocity
+from tippe.model.state import angular_velocity
+from tippe.modes.flight import Descent, angle_reached, cone, flown, landing
+from tippe.modes.free_body import FreeBody, balls, energy, gap_rate, jellett
+from tippe.modes.impact import strike
 
 search = eqx.filter_jit(landing)
 

@@ -11,7 +11,7 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.integration import Oscillatory8
-from tippe.sensitivities import slopes_of_cells
+from tippe.runs.sensitivities import slopes_of_cells
 
 ROWS = list(csv.DictReader(Path(__file__).with_name("gradient_reference.csv").read_text().splitlines()))
 

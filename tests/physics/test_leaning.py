@@ -14,11 +14,11 @@ from stems import first_contact
 from test_hops import scene_of
 
 import tippe
-from tippe.phases.free_body import FreeBody, balls, freed, gap_rate, jellett
-from tippe.phases.free_body import energy as energy_of
-from tippe.phases.leaning import BOTH, at_rest
-from tippe.phases.sliding import leaning
-from tippe.state import angular_velocity
+from tippe.model.state import angular_velocity
+from tippe.modes.free_body import FreeBody, balls, freed, gap_rate, jellett
+from tippe.modes.free_body import energy as energy_of
+from tippe.modes.leaning import BOTH, at_rest
+from tippe.modes.sliding import leaning
 
 REFERENCE = list(csv.DictReader(Path(__file__).with_name("hop_reference.csv").read_text().splitlines()))
 

@@ -11,8 +11,8 @@ from tops import homogeneous_ball, random_states, rutstam_top
 
 import tippe
 from nonholonomic.formulations import Multipliers
-from tippe.friction import AbstractFriction, ContactLoad, Slip
-from tippe.phases import RollingDynamics
+from tippe.model.friction import AbstractFriction, ContactLoad, Slip
+from tippe.model.rolling import RollingDynamics
 from tippe.witnesses import euler_angles, poincare, quadrature
 
 ARENAS = [tippe.Plane(), tippe.Cylinder(0.1), tippe.Sphere(0.1)]

@@ -10,9 +10,11 @@ from scipy.integrate import solve_ivp
 from tops import homogeneous_ball, rutstam_top
 
 import tippe
-from nonholonomic.integration import PhasedPath, Settings
-from tippe.phases.stick_slip_runs import ROLLING, follow_stick_slip
-from tippe.trajectory import TrajectoryProblem
+from nonholonomic.hybrid import PhasedPath
+from nonholonomic.integration import Settings
+from tippe.modes.stick_slip_runs import ROLLING
+from tippe.runs.stick_slip_trajectory import follow_stick_slip
+from tippe.runs.trajectory import TrajectoryProblem
 
 
 def cohen_top() -> tippe.Top:

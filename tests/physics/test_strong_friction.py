@@ -12,10 +12,10 @@ from impact_reference import strike as reference_strike
 from scipy.integrate import solve_ivp
 
 import tippe
-from tippe.dynamics import JAMMED
-from tippe.phases.free_body import FreeBody, balls, energy, gap_rate, jellett
-from tippe.phases.impact import strike
-from tippe.state import angular_velocity
+from tippe.model.dynamics import JAMMED
+from tippe.model.state import angular_velocity
+from tippe.modes.free_body import FreeBody, balls, energy, gap_rate, jellett
+from tippe.modes.impact import strike
 
 # Impacts
 

@@ -13,8 +13,8 @@ from test_hops import scene_of
 from test_strong_friction import COUNT, Falls, random_falls, struck
 
 import tippe
-from tippe.phases.free_body import balls, energy, gap_rate
-from tippe.state import angular_velocity
+from tippe.model.state import angular_velocity
+from tippe.modes.free_body import balls, energy, gap_rate
 
 
 def with_torques(falls: Falls) -> Falls:

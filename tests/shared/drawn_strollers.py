@@ -4,16 +4,7 @@ import math
 
 import numpy as np
 
-from stroller import (
-    Damping,
-    Launch,
-    Plane,
-    RollingResistance,
-    Scene,
-    Sphere,
-    Spheroid,
-    Stroller,
-)
+from stroller import Damping, Launch, Plane, RollingResistance, Scene, Sphere, Spheroid, Stroller
 
 #: As many at a time, so that one compiled program runs them all.
 LANES = 16

@@ -25,8 +25,8 @@ from stroller import (
     Torus,
 )
 from stroller.__main__ import GROUNDS, main, parser, scenes
-from stroller.ride import RideProblem
-from stroller.table import named_axes
+from stroller.runs.ride import RideProblem
+from stroller.runs.table import named_axes
 
 BODY = Stroller(1.7, 0.3, 0.4, 0.05)
 

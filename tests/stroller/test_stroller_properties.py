@@ -16,17 +16,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from nonholonomic.integration import GUARD_LOST, REACHED_END, Settings, compiled_march
-from stroller import (
-    Damping,
-    Launch,
-    Plane,
-    RollingResistance,
-    Scene,
-    Sphere,
-    Spheroid,
-    Stroller,
-)
-from stroller.table import RideProblem
+from stroller import Damping, Launch, Plane, RollingResistance, Scene, Sphere, Spheroid, Stroller
+from stroller.runs.table import RideProblem
 
 HORIZON = 0.25
 

@@ -10,7 +10,7 @@ import xarray
 import stroller
 from stroller import Damping, Launch, Plane, Scene, Sphere, Spheroid, Steady, Stroller, Table
 from stroller.__main__ import main
-from stroller.table import named_axes
+from stroller.runs.table import named_axes
 
 BODY = Stroller(mass=1.7, wheelbase=0.7, inertia=0.4, steering_inertia=0.05)
 LAUNCH = Launch((0.3, -0.6), 0.5, 1.5, 0.2, 0.1)

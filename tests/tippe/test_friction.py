@@ -10,7 +10,7 @@ from hard.friction import hertz_disc
 from tops import random_states, rutstam_top
 
 import tippe
-from tippe.friction import ContactLoad, Slip
+from tippe.model.friction import ContactLoad, Slip
 from tippe.witnesses import reduced
 
 ARENAS = {"plane": tippe.Plane(), "cylinder": tippe.Cylinder(0.3), "sphere": tippe.Sphere(0.3)}

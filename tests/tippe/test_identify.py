@@ -17,7 +17,7 @@ from nonholonomic.identification import Free, Measurements
 from nonholonomic.identification.levenberg_marquardt import minimise
 from nonholonomic.identification.problem import Problem, linearise
 from nonholonomic.identification.result import coordinate_covariance
-from tippe.identify import SceneModel
+from tippe.fit.identify import SceneModel
 
 LAUNCH = tippe.Launch(theta=[0.2, 0.2, 0.3, 0.2], spin=[110.0, 140.0, 110.0, 60.0])
 LAUNCHES = list(zip(np.asarray(LAUNCH.theta).tolist(), np.asarray(LAUNCH.spin).tolist(), strict=True))

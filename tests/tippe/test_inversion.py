@@ -14,7 +14,7 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.integration import CROSSED, Settings, compiled_march
-from tippe.inversion import InversionProblem
+from tippe.modes.inversion_problem import InversionProblem
 
 
 def time_of(mu=0.3, theta=0.1, spin=155.0, offset=0.006, tolerance=1e-11, crossing="first", t1=20.0):

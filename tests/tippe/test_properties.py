@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import tippe
 from nonholonomic.integration import FAILED, GUARD_LOST, REACHED_END, Settings, compiled_march
-from tippe.inversion import InversionProblem
+from tippe.modes.inversion_problem import InversionProblem
 
 # Scenes are scaled beyond the size of any top.
 pytestmark = pytest.mark.filterwarnings("ignore:radius = .* is large for a top:UserWarning")

@@ -8,7 +8,7 @@ from tops import rutstam_top
 from viscous_top import Body, azimuth, follow, start, theta
 
 import tippe
-from tippe.identify import unknowns_of
+from tippe.fit.identify import unknowns_of
 
 LAUNCHES = {"theta": (0.4, 0.5), "spin": (100.0, 110.0), "azimuth": (0.7, 3.0), "t0": (0.013, 0.2), "samples": (30, 24)}
 LAUNCHES |= {"velocity[0]": (0.0, 0.08)}

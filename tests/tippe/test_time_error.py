@@ -11,10 +11,11 @@ import tippe
 from nonholonomic.integration import Settings, compiled_march
 from nonholonomic.sweeps.digits import concise, concise_strings
 from tippe import steady
-from tippe.cells import CellRuns, driver_of
-from tippe.inversion import InversionProblem, is_inverted
-from tippe.table import InversionJob
-from tippe.time_error import COARSER, time_error
+from tippe.modes.inversion_problem import InversionProblem
+from tippe.runs.cells import CellRuns, driver_of
+from tippe.runs.inversion import is_inverted
+from tippe.runs.table import InversionJob
+from tippe.runs.time_error import COARSER, time_error
 
 SCENE = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
 ANGLE = np.pi - 0.1

@@ -13,7 +13,7 @@ from tops import rutstam_top
 import tippe
 from nonholonomic.integration import Settings, follow
 from nonholonomic.integration.single_run import PIECE
-from tippe.trajectory import TrajectoryProblem
+from tippe.runs.trajectory import TrajectoryProblem
 
 LAUNCH = tippe.Launch(0.1, 155.0)
 

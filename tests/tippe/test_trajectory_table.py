@@ -213,7 +213,7 @@ def test_it_is_drawn_over_time(table):
     ids=str,
 )
 def test_what_is_refused_before_anything_compiles(scene, change, told, monkeypatch):
-    monkeypatch.setattr("tippe.trajectory_cells.launches_with", lambda *_: pytest.fail("it was run"))
+    monkeypatch.setattr("tippe.runs.trajectory_cells.launches_with", lambda *_: pytest.fail("it was run"))
     arguments = {"scene": scene, "theta": 0.1, "spin": 100.0, "times": TIMES} | change
     with pytest.raises(ValueError, match=re.escape(told)):
         tippe.trajectory_table(arguments.pop("scene"), **arguments)

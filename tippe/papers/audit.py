@@ -249,7 +249,7 @@ function computes the corrected form and which test shows it. Four things first.
 * Jellett's quantity is a constant on the plane only. **In the cylinder it is not**, so it cannot replace an equation
   of motion there, which is what the paper uses it for.
 * The momentum β₁ is not constant while there is friction. Either β₁ or Jellett's quantity can be held, never both.
-* The model of this package uses none of the paper's equations. It is the vector form (`tippe/dynamics.py`), to which
+* The model of this package uses none of the paper's equations. It is the vector form (`tippe/model/dynamics.py`), to which
   the corrected equations are compared at 1000 random tops, arenas and states each, to 10⁻¹⁰.
 
 This page is printed by `python -m tippe.papers.audit`.

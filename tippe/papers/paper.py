@@ -9,9 +9,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..launch import Launch
-from ..scene import Scene
-from ..top import Top
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..model.top import Top
 from ..witnesses.euler_angles import across
 
 #: The paper's units in SI.

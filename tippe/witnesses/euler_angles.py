@@ -17,9 +17,9 @@ from jaxtyping import Array, Float
 
 from nonholonomic.geometry import carried
 
-from ..friction import Slip
-from ..scene import Scene
-from ..state import AXIS, MOMENTUM, PLACE, VELOCITY
+from ..model.friction import Slip
+from ..model.scene import Scene
+from ..model.state import AXIS, MOMENTUM, PLACE, VELOCITY
 
 
 class Across(NamedTuple):
@@ -50,7 +50,7 @@ def from_vector_state(scene: Scene, state: Float[Array, " components"]) -> Float
     **Arguments:**
 
     - `scene`: a `Scene` on a `Plane` or a `Cylinder`.
-    - `state`: (8 or 10,) as in `tippe/state.py`.
+    - `state`: (8 or 10,) as in `tippe/model/state.py`.
 
     **Returns:** (eta or x, theta, phi, and the rates of eta or x, y, theta, phi, psi), an array (8,) in rad, m and s; x
     is 0.

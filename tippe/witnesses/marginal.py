@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Cylinder
 
-from ..scene import Scene
+from ..model.scene import Scene
 from ..steady import inverted_critical_spin, standing_matrix, upright_critical_spin
 
 #: Curvature ratio at which the curve starts: so close to the plane that the plane's critical spin is the first guess.

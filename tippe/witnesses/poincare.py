@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.formulations import AbstractSystem, structure_constants
 
-from ..scene import Scene
+from ..model.scene import Scene
 from .euler_angles import Accelerations, metric, per_normal_force, potential, slip_velocity, spread
 
 #: Place of the cyclic angle psi among (eta, y, theta, phi, psi, gap).

@@ -22,8 +22,8 @@ from jaxtyping import Array, Float
 
 from nonholonomic.integration import halved
 
-from ..scene import Scene
-from ..state import AXIS, MOMENTUM, VELOCITY
+from ..model.scene import Scene
+from ..model.state import AXIS, MOMENTUM, VELOCITY
 
 #: Gauss points for the divided difference along each direction, and cosines for the time as a function of chi.
 POINTS, COSINES = 24, 96

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..friction import Slip
-from ..scene import Scene
-from ..state import AXIS, VELOCITY
+from ..model.friction import Slip
+from ..model.scene import Scene
+from ..model.state import AXIS, VELOCITY
 from .euler_angles import from_vector_state
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from close import assert_close
 
-from nonholonomic.derivatives import directions_of, traced_travel_with_slopes, travel_with_slopes
-from nonholonomic.integration import CROSSED, REACHED_END, RUNNING, AbstractPhase, AbstractProblem, Passage, Settings
+from nonholonomic.derivatives import directions_of
+from nonholonomic.hybrid import AbstractPhase, Passage, traced_travel_with_slopes, travel_with_slopes
+from nonholonomic.integration import CROSSED, REACHED_END, RUNNING, AbstractProblem, Settings
 
 CELLS = 8
 

@@ -8,17 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nonholonomic.geometry import (
-    Cylinder,
-    Graph,
-    Implicit,
-    Paraboloid,
-    Plane,
-    Sphere,
-    Spheroid,
-    Torus,
-    tangents,
-)
+from nonholonomic.geometry import Cylinder, Graph, Implicit, Paraboloid, Plane, Sphere, Spheroid, Torus, tangents
 
 RNG = np.random.default_rng(5)
 LANES = 40

@@ -12,7 +12,7 @@ from tuning.trees import error_coefficients, trees
 import tippe
 from nonholonomic.integration import Oscillatory8, Settings, compiled_march
 from nonholonomic.integration.oscillatory import CAUTION
-from tippe.inversion import InversionProblem
+from tippe.modes.inversion_problem import InversionProblem
 
 OWN = unknowns_of(Oscillatory8().tableau, CAUTION)
 PAIR, PLAIN = pair_of(OWN), pair_of(unknowns_of(diffrax.Dopri8().tableau))

@@ -7,20 +7,8 @@ import numpy as np
 import pytest
 from close import assert_close
 
-from nonholonomic.integration import (
-    BETWEEN,
-    CROSSED,
-    REACHED_END,
-    RUNNING,
-    UNRESOLVED,
-    AbstractPhase,
-    AbstractProblem,
-    Passage,
-    Record,
-    Settings,
-    follow_phases,
-    travel,
-)
+from nonholonomic.hybrid import BETWEEN, AbstractPhase, Passage, Record, follow_phases, travel
+from nonholonomic.integration import CROSSED, REACHED_END, RUNNING, UNRESOLVED, AbstractProblem, Settings
 
 GRAVITY, CLOSING = 9.81, 1e-3
 

@@ -1,0 +1,228 @@
+"""Single runs of several phases, sampled at given times inside other transformations, with their derivatives."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..derivatives.differentiable import directions_by
+from ..derivatives.sampling import AbstractSampling, Recipe, ask_for_samples
+from ..derivatives.variation import in_groups
+from ..integration import GUARD_LOST, REACHED_END, RUNNING, Settings, march_with_samples
+from .phased_run import BETWEEN
+from .phases import AbstractPhase, Journey, Record, marched, passed_on
+from .traced_phases import in_rounds
+from .varied_phases import VariedPhase, varied_phases, varied_start
+
+#: From some modules (scene, launch, ...) and the tolerance to the phases of a single run, the number of the first, and the
+#: state there.
+Build = Callable[[Any, Array], tuple[tuple[AbstractPhase, ...], Array, Float[Array, "components 1"]]]
+
+
+class PhasedSamples(NamedTuple):
+    """A run through several phases at given times, all floats.
+
+    - `shown`: what the phases show, NaN after the end of the run; `number`: of the phase at each time, or `BETWEEN`.
+    - `end_time`, `end_state`: when and where the run ended; `status`: the code of how.
+    - `steps`, `rejected`; `counts`: what happened how often.
+    """
+
+    shown: Float[Array, "shown times"]
+    number: Float[Array, " times"]
+    end_time: Float[Array, ""]
+    end_state: Float[Array, " components"]
+    status: Float[Array, ""]
+    steps: Float[Array, ""]
+    rejected: Float[Array, ""]
+    counts: Float[Array, " kinds"]
+
+
+def phased_samples(
+    build: Build,
+    modules: Any,
+    times: Float[Array, " times"],
+    t1: Float[Array, ""],
+    settings: Settings,
+    kinds: int,
+) -> PhasedSamples:
+    """Run one cell through its phases inside a transformation and sample it, with derivatives that take part in step control.
+
+    **Arguments:**
+
+    - `build`: compared by identity, so it should not be made anew for each call.
+    - `modules`: the tree whose numbers can be differentiated by, once.
+    - `times`: of the samples [s], growing; `t1`: horizon [s]. Neither can be differentiated by.
+    - `settings`: with an explicit Runge-Kutta solver; the tolerance may be traced.
+    - `kinds`: rows of `Passage.counts`.
+
+    **Returns:** `PhasedSamples`; what is shown and the time of the end have derivatives, NaN behind a grazing event.
+
+    **Raises:** `ValueError` for derivatives by the times, and for second derivatives.
+    """
+    question = functools.partial(PhasedSampling, kinds=kinds)
+    return ask_for_samples(question, build, modules, _fixed(times), t1, settings)
+
+
+@eqx.filter_custom_jvp
+def _fixed(times: Float[Array, " times"]) -> Float[Array, " times"]:
+    """The times themselves, by which nothing is differentiated."""
+    return times
+
+
+@_fixed.def_jvp
+def _refused(primals: Any, tangents: Any) -> Any:
+    if tangents[0] is not None:
+        raise ValueError("times must not be differentiated by where runs have phases: contact = 'hybrid'")
+    return primals[0], jnp.zeros_like(primals[0])
+
+
+class PhasedSampling(AbstractSampling):
+    """Samples of a run through phases."""
+
+    in_blocks = False
+
+    movable: int
+    recipe: Recipe
+    places: Any = eqx.field(static=True)
+    kinds: int = eqx.field(static=True)
+
+    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> PhasedSamples:
+        numbers, (*given, tolerance), recipe = self._sorted(leaves)
+        settings = recipe.settings.with_tolerance(tolerance)
+        found, _ = _follow(recipe.made(numbers, tolerance), (), given, settings, self.kinds)
+        return jax.tree.map(lambda part: part[None], found)
+
+    def with_slopes(
+        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[PhasedSamples, list[PhasedSamples]]:
+        if again:
+            raise ValueError("second derivatives do not go through changes of phase: contact = 'hybrid'")
+        numbers, (*given, tolerance), recipe = self._sorted(leaves)
+        settings = recipe.settings.with_tolerance(tolerance)
+
+        def build(numbers: tuple[Array, ...], cells: None) -> Any:
+            return recipe.made(numbers, tolerance)
+
+        built, directions, gather = directions_by(build, active, numbers, None)
+
+        def run(some: tuple[Any, ...]) -> tuple[PhasedSamples, list[PhasedSamples]]:
+            return _follow(built, tuple((one[0], one[2]) for one in some), given, settings, self.kinds)
+
+        found, slopes = in_groups(run, directions)
+        return jax.tree.map(lambda part: part[None], (found, gather(slopes)))
+
+
+def _follow(
+    built: Any, directions: tuple[Any, ...], given: Sequence[Array], settings: Settings, kinds: int
+) -> tuple[PhasedSamples, list[PhasedSamples]]:
+    """The run, and its slope along each of the directions."""
+    (phases, first, state), (times, t1) = built, given
+    varied, start = varied_phases(phases, directions, settings.tolerance, False), varied_start(state, directions)
+    ended, filled = _followed(varied, first, start, times, t1, settings, kinds)
+    return _found(ended, filled, times, len(state), len(directions))
+
+
+class Filled(NamedTuple):
+    """The samples so far: what is shown, its variations, the phases' numbers, NaN where there are none yet; and the time [s]
+    of the first grazing event, infinite if there was none."""
+
+    shown: Float[Array, "shown times"]
+    variations: Float[Array, "directions shown times"]
+    number: Float[Array, " times"]
+    grazed: Float[Array, ""]
+
+    def with_samples(self, here: Bool[Array, " times"], seen: tuple[Array, Array], number: int) -> "Filled":
+        """With the samples of some times that have none yet."""
+        here = here & jnp.isnan(self.number)
+        shown, variations = (
+            jnp.where(here, new, old) for new, old in zip(seen, (self.shown, self.variations), strict=True)
+        )
+        return self._replace(shown=shown, variations=variations, number=jnp.where(here, number, self.number))
+
+
+def _followed(
+    phases: tuple[VariedPhase, ...],
+    first: Array,
+    state: Float[Array, "components 1"],
+    times: Float[Array, " times"],
+    t1: Float[Array, ""],
+    settings: Settings,
+    kinds: int,
+) -> tuple[Journey, Filled]:
+    """Round by round, as in `traced_travel`, with samples of every phase and of the way to the next."""
+    count, zero, none = len(phases[0].directions), jnp.zeros(1), jnp.zeros(1, int)
+    own = VariedPhase.parts(phases[0], state)[0][:-1]
+    rows = len(jax.eval_shape(phases[0].phase.shown, own))
+    start = Journey(none + RUNNING, zero + jnp.inf, zero, state, none, none, first, jnp.zeros((kinds + 1, 1), int))
+    missing = jnp.full((rows, len(times)), jnp.nan)
+    empty = Filled(missing, jnp.zeros((count, *missing.shape)), missing[0], jnp.full((), jnp.inf))
+
+    def stay(one: VariedPhase, number: int, found: Journey, filled: Filled) -> tuple[Journey, Filled]:
+        since, left = times - found.end_time, jnp.maximum(t1 - found.end_time, 0.0)
+        outcome, samples = march_with_samples(
+            one.problem(found.state), since, left, jnp.asarray(1), settings, parts=1 + count
+        )
+        after = marched(jnp, found, outcome, t1)
+        return after, filled.with_samples((since >= 0.0) & (times <= after.end_time), one.seen(samples[0].T), number)
+
+    def change(one: VariedPhase, found: Journey, filled: Filled) -> tuple[Journey, Filled]:
+        def seen(phase: AbstractPhase, record: Record | None, left: Float[Array, " 1"]) -> Any:
+            # A time that stays as it is comes sooner after an event that is later, as the horizon does.
+            return None if record is None else _on_the_way(phase, record, times - t1 + left)
+
+        left = jnp.maximum(t1 - found.end_time, 0.0)
+        passage, shown, variations = one.left_behind(found.state, left, seen)
+        after = passed_on(jnp, found, passage, t1)
+        if shown is not None:
+            inside = (times > found.end_time) & (times <= after.end_time)
+            filled = filled.with_samples(inside, (shown, variations), BETWEEN)
+        grazes = after.counts[-1, 0] > found.counts[-1, 0]
+        return after, filled._replace(
+            grazed=jnp.where(grazes, jnp.minimum(filled.grazed, found.end_time[0]), filled.grazed)
+        )
+
+    def one_round(carry: Any) -> Any:
+        found, filled, rounds = carry
+        at = found.phase[0]
+        for number, one in enumerate(phases):
+            under_way = (found.status[0] == RUNNING) & (at == number)
+
+            def here(one: VariedPhase = one, number: int = number, found: Any = found, filled: Any = filled) -> Any:
+                stayed = stay(one, number, found, filled)
+                return jax.lax.cond(stayed[0].status[0] == GUARD_LOST, lambda: change(one, *stayed), lambda: stayed)
+
+            found, filled = jax.lax.cond(under_way, here, lambda found=found, filled=filled: (found, filled))
+        return found, filled, rounds + 1
+
+    return in_rounds(one_round, start, empty)
+
+
+def _on_the_way(phase: AbstractPhase, record: Record, since: Float[Array, " times"]) -> Float[Array, "shown times"]:
+    """What a path shows some times [s] after it has left a phase; nothing that means anything after the last stretch."""
+    ends = record.ends[:, 0]
+    stretch = jnp.minimum(jnp.searchsorted(jax.lax.stop_gradient(ends), jax.lax.stop_gradient(since)), len(ends) - 1)
+    began = jnp.where(stretch > 0, ends[jnp.maximum(stretch - 1, 0)], 0.0)
+    motions = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[stretch][..., 0], 0, -1), record.motions)
+    return phase.between(motions, jnp.where(jnp.isfinite(began), since - began, 0.0))
+
+
+def _found(
+    ended: Journey, filled: Filled, times: Float[Array, " times"], size: int, count: int
+) -> tuple[PhasedSamples, list[PhasedSamples]]:
+    """What is found, and its slope along each of the directions."""
+    end_time, status, grazed = ended.end_time[0], ended.status[0], ended.counts[-1, 0] > 0
+    late = jnp.where(times > filled.grazed, jnp.nan, 0.0)
+    # The variation of a time stands behind that of the state; a horizon does not move.
+    later = [ended.state[k * (size + 1) + size, 0] for k in range(1, count + 1)]
+    later = [jnp.where(status == REACHED_END, 0.0, jnp.where(grazed, jnp.nan, one)) for one in later]
+    numbers = (status, ended.steps[0], ended.rejected[0], ended.counts[:-1, 0])
+    others = (part.astype(float) for part in numbers)
+    found = PhasedSamples(filled.shown, filled.number, end_time, ended.state[:size, 0], *others)
+    slopes = [
+        PhasedSamples(filled.variations[k] + late, None, later[k], None, None, None, None, None) for k in range(count)
+    ]
+    return found, slopes

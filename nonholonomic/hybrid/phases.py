@@ -1,0 +1,269 @@
+"""Motion in smooth phases with jumps between them, for many cells at once.
+
+A phase has its own equations and ends where they cease to hold: a contact opens or closes, slipping ends. What follows
+is a function, the phase's `leave`: an impact, a flight in closed form, other equations. All phases share one layout
+of the state. The cells advance in rounds: in each, the cells that are now in a phase are gathered and marched together
+(`march.py`) to the event, to the horizon or to the end of the phase, and those at its end are passed on.
+"""
+
+import abc
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..integration.march import compiled_march
+from ..integration.problem import AbstractProblem
+from ..integration.queue import Outcome
+from ..integration.settings import Settings
+from ..integration.status import FAILED, GUARD_LOST, REACHED_END, RUNNING, UNRESOLVED
+from ..xla_cpu import compiled_quickly
+
+#: Rounds, and so phases of a single run, after which what is still under way is given up.
+MOST_ROUNDS = 2000
+
+
+class Record(NamedTuple):
+    """The way of a single run from one phase to the next, as stretches of motion of known form that follow one another.
+
+    - `ends`: when each stretch ends [s], counted from the end of the phase; infinite where there are no more.
+    - `motions`: what `AbstractPhase.between` needs of each, with the stretches on the first axis of every leaf.
+    - `shown`: at how many times each is to be shown by default.
+    """
+
+    ends: Float[Array, " stretches 1"]
+    motions: Any
+    shown: Int[Array, " stretches 1"]
+
+
+class Passage(NamedTuple):
+    """What follows the end of a phase, one number per cell.
+
+    `status` is `RUNNING` where the motion goes on in the phase numbered `phase`, else how it ended; `state` is the state
+    then, `elapsed` [s] the time that passed on the way, `crossing_time` [s] when on the way the event was passed (for the
+    last time), infinite if it was not; `counts` how often each kind of thing happened, a row for each kind. `record` is for a
+    single run that keeps its path (`phased_run.py`); `None` where no time passes on the way, or where the path is not kept.
+    `log_rates` is the sum of the logarithms of the rates at which events on the way are met; `None` if there are none.
+    """
+
+    phase: Int[Array, " cells"]
+    state: Float[Array, "components cells"]
+    elapsed: Float[Array, " cells"]
+    status: Int[Array, " cells"]
+    crossing_time: Float[Array, " cells"]
+    counts: Int[Array, "kinds cells"]
+    record: Record | None = None
+    log_rates: Float[Array, " cells"] | None = None
+
+
+class AbstractPhase(eqx.Module):
+    """One phase of the motion. Its leaves are scalars, or hold one number per cell in their last axis."""
+
+    @abc.abstractmethod
+    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+        """The motion in this phase from the given states on; the problem's guard ends the phase."""
+
+    @abc.abstractmethod
+    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+        """What follows where the guard has ended the phase.
+
+        **Arguments:**
+
+        - `state`: the states there.
+        - `left`: time [s] to the horizon.
+
+        **Returns:** a `Passage`, which ends with `REACHED_END` where it would take longer than `left`.
+        """
+
+    def shown(self, state: Float[Array, "components times"]) -> Float[Array, "shown times"]:
+        """What a path shows of states in this phase: in all phases of a run as many components."""
+        return state
+
+    def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
+        """What a path shows of one of the stretches in `Passage.record`, some time [s] after it has begun."""
+        raise NotImplementedError(f"{type(self).__name__} records stretches but does not say what they show")
+
+
+class Journey(NamedTuple):
+    """How every cell ended, as in `march.Outcome`, in which phase, and how often each kind of thing happened on the way."""
+
+    status: Int[np.ndarray, " cells"]
+    crossing_time: Float[np.ndarray, " cells"]
+    end_time: Float[np.ndarray, " cells"]
+    state: Float[np.ndarray, "components cells"]
+    steps: Int[np.ndarray, " cells"]
+    rejected: Int[np.ndarray, " cells"]
+    phase: Int[np.ndarray, " cells"]
+    counts: Int[np.ndarray, "kinds cells"]
+
+
+@eqx.filter_jit
+def _problem(phase: AbstractPhase, state: Float[Array, "components cells"]) -> AbstractProblem:
+    return phase.problem(state)
+
+
+@compiled_quickly
+def _leave(phase: AbstractPhase, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+    return phase.leave(state, left)
+
+
+def travel(
+    phases: tuple[AbstractPhase, ...],
+    phase: Int[np.ndarray, " cells"],
+    state: Float[np.ndarray, "components cells"],
+    t1: float | Float[np.ndarray, " cells"],
+    cells: int,
+    settings: Settings,
+    *,
+    kinds: int,
+    passes: bool = False,
+    parts: int = 1,
+    most_rounds: int = MOST_ROUNDS,
+) -> Journey:
+    """Run every cell through its phases to its event, to `t1`, or to where the model ends.
+
+    It runs on the host, round by round, and is called with concrete numbers. All calls with the same number of cells, padding
+    included, share their compiled programs.
+
+    **Arguments:**
+
+    - `phases`: the phases, of which `phase` and `Passage.phase` are numbers.
+    - `phase`, `state`: where every cell starts.
+    - `t1`: horizon [s], one for all or one per cell.
+    - `cells`: how many cells to run; the rest is padding. With 0, the programs are compiled and nothing is run.
+    - `settings`: with an explicit Runge-Kutta solver of Diffrax.
+    - `kinds`: rows of `Passage.counts`.
+    - `passes`, `parts`: as for `march`.
+    - `most_rounds`: a cell that needs more ends as `UNRESOLVED`.
+
+    **Returns:** a `Journey`.
+    """
+    size, options = len(phase), {"passes": passes, "parts": parts}
+    t1 = np.broadcast_to(np.asarray(t1, float), size)
+    found = Journey(
+        status=np.full(size, RUNNING),
+        crossing_time=np.full(size, np.inf),
+        end_time=np.zeros(size),
+        state=np.array(state),
+        steps=np.zeros(size, int),
+        rejected=np.zeros(size, int),
+        phase=np.array(phase),
+        counts=np.zeros((kinds, size), int),
+    )
+    found.status[cells:] = REACHED_END
+    if cells == 0:
+        _compile(phases, found, t1, settings, options)
+    for _ in range(most_rounds):
+        # Selected before the round: a cell that changes its phase during it waits for the next round.
+        here = [np.flatnonzero((found.status == RUNNING) & (found.phase == number)) for number in range(len(phases))]
+        for one, some in zip(phases, here, strict=True):
+            if some.size:
+                _march(one, found, some, t1, settings, options)
+                lost = some[found.status[some] == GUARD_LOST]
+                if lost.size:
+                    _pass_on(one, found, lost, t1)
+        if not (found.status == RUNNING).any():
+            break
+    found.status[found.status == RUNNING] = UNRESOLVED
+    return found
+
+
+def _compile(
+    phases: tuple[AbstractPhase, ...],
+    found: Journey,
+    t1: Float[np.ndarray, " cells"],
+    settings: Settings,
+    options: dict[str, Any],
+) -> None:
+    """Compile all programs by running none of the cells: two at once, for the compiler uses little more than one core."""
+    none = np.arange(0)
+    with ThreadPoolExecutor(2) as threads:
+        marches = [threads.submit(_march, one, found, none, t1, settings, options) for one in phases]
+        leaving = [threads.submit(_pass_on, one, found, none, t1) for one in phases]
+        for program in (*marches, *leaving):
+            program.result()
+
+
+def _gather(
+    phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
+) -> tuple[Any, ...]:
+    """The phase, the states and the remaining times of some cells, padded to the size of the whole."""
+    size = len(found.status)
+    cell = np.concatenate([some, np.full(size - some.size, some[-1] if some.size else 0)])
+    numbers, rest = eqx.partition(phase, eqx.is_array)
+    numbers = jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., cell], numbers)
+    left = jnp.asarray(np.maximum(t1[cell] - found.end_time[cell], 0.0))
+    return eqx.combine(numbers, rest), jnp.asarray(found.state[:, cell]), left
+
+
+def _march(
+    phase: AbstractPhase,
+    found: Journey,
+    some: Int[np.ndarray, " some"],
+    t1: Float[np.ndarray, " cells"],
+    settings: Settings,
+    options: dict[str, Any],
+) -> None:
+    """March some cells to the end of their phase and note what was found."""
+    phase, state, left = _gather(phase, found, some, t1)
+    problem = _problem(phase, state)
+    count = jnp.asarray(some.size)
+    outcome, _ = compiled_march(problem, left, count, settings, **options)
+    outcome = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], outcome)
+    _store(found, some, marched(np, _some(found, some), outcome, t1[some]))
+
+
+def _pass_on(
+    phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
+) -> None:
+    """Pass some cells on to the phase that follows and note what happened on the way."""
+    passage = _leave(*_gather(phase, found, some, t1))
+    passage = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], passage)
+    _store(found, some, passed_on(np, _some(found, some), passage, t1[some]))
+
+
+def _some(found: Journey, some: Int[np.ndarray, " some"]) -> Journey:
+    return Journey(*(values[..., some] for values in found))
+
+
+def _store(found: Journey, some: Int[np.ndarray, " some"], new: Journey) -> None:
+    for values, of_some in zip(found, new, strict=True):
+        values[..., some] = of_some
+
+
+def marched(xp: Any, found: Journey, outcome: Outcome, t1: Float[Array, " cells"]) -> Journey:
+    """What is known of cells after a march that ended as `outcome` says. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
+    began = found.end_time
+    # A cell that enters a phase beyond the event passed it earlier, unless it started there.
+    passed = xp.isfinite(outcome.crossing_time) & ((outcome.crossing_time > 0.0) | xp.isinf(found.crossing_time))
+    return Journey(
+        status=outcome.status,
+        crossing_time=xp.where(passed, began + outcome.crossing_time, found.crossing_time),
+        end_time=xp.where(outcome.status == REACHED_END, t1, began + outcome.end_time),
+        state=outcome.state,
+        steps=found.steps + outcome.steps,
+        rejected=found.rejected + outcome.rejected,
+        phase=found.phase,
+        counts=found.counts,
+    )
+
+
+def passed_on(xp: Any, found: Journey, passage: Passage, t1: Float[Array, " cells"]) -> Journey:
+    """What is known of cells after the passage from one phase to the next. **Arguments:** as for `marched`."""
+    passed = xp.isfinite(passage.crossing_time)
+    # Non-finite states would be marched forever.
+    sound = xp.isfinite(passage.state).all(axis=0) & xp.isfinite(passage.elapsed)
+    return Journey(
+        status=xp.where(sound, passage.status, FAILED),
+        crossing_time=xp.where(passed, found.end_time + passage.crossing_time, found.crossing_time),
+        end_time=xp.where(passage.status == REACHED_END, t1, found.end_time + passage.elapsed),
+        state=passage.state,
+        steps=found.steps,
+        rejected=found.rejected,
+        phase=passage.phase,
+        counts=found.counts + passage.counts,
+    )

@@ -1,0 +1,319 @@
+"""First derivatives through runs of several phases: the variations of the state go through every change of phase.
+
+A variation of a run at an event is that of the state there, dx, and that of the time, dt. With the event g(x) = 0, x' = f(x)
+and the phase entered at t + dt,
+
+    dT = -dg / (Dg f),   dx <- dx + f dT,   dt <- dt + dT,
+
+by the implicit function theorem; then the phase's own `leave` is differentiated, an impact or a flight, which may take time
+itself. That is the saltation matrix (Leine and Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical Systems, 2004,
+ch. 7) in two halves: the next phase counts its time from its own beginning, so -f dt of it is never needed, and is added
+where a time is held fixed.
+
+The rates at which events are met stand in the denominator of a derivative. Where one of them may be zero, within the
+tolerance, the event is grazing and the derivative has no digits: such events are counted (`GRAZING`).
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float, Int
+
+from ..derivatives.slopes import directions_of
+from ..derivatives.variation import VariationalProblem, where_moved
+from ..integration import AbstractProblem, Settings
+from .phases import AbstractPhase, Journey, Passage, travel
+from .traced_phases import traced_travel
+
+#: An event is grazing if numbers that change by the tolerance, as a part of their own size, or an error of the state that the
+#: tolerance allows, change its rate by more than this part. The derivative then errs by about as much.
+GRAZING = 1e-2
+
+#: The magnitude by which errors of the clock are measured [s]: it has none, and no share in step control.
+UNMEASURED = 1e9
+
+
+class Clocked(AbstractProblem):
+    """A problem with the time since its phase began behind its state; the clock's variation is that of the beginning."""
+
+    problem: AbstractProblem
+    began: Float[Array, " cells"]
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        states, scales = self.problem.start()
+        return with_row(states, self.began), with_row(scales, jnp.full_like(self.began, UNMEASURED))
+
+    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return with_row(self.problem.field(time, state[:-1]), jnp.ones_like(state[-1]))
+
+    def crossing(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"] | None:
+        return self.problem.crossing(state[:-1])
+
+    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.problem.guard(time, state[:-1])
+
+
+def with_row(state: Float[Array, "components cells"], row: Float[Array, " cells"]) -> Float[Array, "more cells"]:
+    """A state with one more component."""
+    return jnp.concatenate([state, row[None]])
+
+
+class VariedPhase(AbstractPhase):
+    """A phase, and first variations of its runs behind the state: of the state and, last, of the time at which it began.
+
+    The phase's equations must not depend on time.
+
+    - `directions`: tangents of the phase, as for `VariationalProblem`.
+    - `ends_on_event`: as there; `tolerance`: relative, of the integration.
+    """
+
+    phase: AbstractPhase
+    directions: tuple[Any, ...]
+    tolerance: Float[Array, ""]
+    ends_on_event: bool = eqx.field(static=True)
+
+    def problem(self, state: Float[Array, "components cells"]) -> VariationalProblem:
+        at, *variations = self.parts(state)
+        numbers, build = self._moving()
+
+        def clocked(state: Float[Array, "components cells"], *numbers: Array) -> Clocked:
+            return Clocked(build(*numbers).problem(state[:-1]), state[-1])
+
+        point = (with_row(at[:-1], jnp.zeros_like(at[-1])), *numbers)
+        tangents = [(one, *rates) for one, rates in zip(variations, self._rates(), strict=True)]
+        return VariationalProblem(clocked(*point), directions_of(clocked, point, tangents), self.ends_on_event)
+
+    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+        """What follows the phase itself, with variations. Counted in the last row are grazing events."""
+        return self.left_behind(state, left, lambda phase, record, left: ())[0]
+
+    def left_behind(
+        self, state: Float[Array, "components cells"], left: Float[Array, " cells"], seen: Callable[..., Any]
+    ) -> tuple[Passage, Any, Any]:
+        """What follows the phase, as `leave` says it, and what is seen of the way to the next.
+
+        **Arguments:** `seen`: takes the phase, the `Record` of the way and `left`, and gives a tree of numbers.
+
+        **Returns:** the `Passage`; the numbers; and their variations, with the directions first.
+        """
+        at, *variations = self.parts(state)
+        at, lasted, count = at[:-1], at[-1], len(variations)
+        numbers, build = self._moving()
+        still = [jnp.zeros_like(number) for number in numbers]
+        rates = self.phase.problem(at).field(lasted, at)
+
+        def met(at: Float[Array, "components cells"], *numbers: Array) -> tuple[Array, Array]:
+            problem = build(*numbers).problem(at)
+            return jax.jvp(lambda at: problem.guard(lasted, at), (at,), (problem.field(lasted, at),))
+
+        # Behind the variations stand an error of the state, and the way on in time.
+        along = [(one[:-1], *moved) for one, moved in zip(variations, self._rates(), strict=True)]
+        along += [(self._error(at, lasted, rates), *still), (rates, *still)]
+        (_, rate), (guards, changes) = _along(met, (at, *numbers), along)
+        # A phase that ended as it began has not met its event.
+        happened = (lasted > 0.0) & (rate != 0.0)
+        safe = jnp.where(happened, rate, 1.0)
+        later = jnp.where(happened, -guards[:-1] / safe, 0.0)
+        log_rates = jnp.where(happened, (changes[:-1] + changes[-1] * later) / safe, 0.0)
+
+        def passed(at: Float[Array, "components cells"], left: Float[Array, " cells"], *numbers: Array) -> Any:
+            phase = build(*numbers)
+            onward = phase.leave(at, left)
+            inside = jnp.zeros_like(left) if onward.log_rates is None else onward.log_rates
+            path = seen(phase, onward.record, left)
+            return (onward.state, onward.elapsed, inside, path), onward._replace(record=None, log_rates=None)
+
+        begins = jnp.concatenate([*[one[None, -1] for one in variations], jnp.zeros_like(lasted)[None]]) + later
+        onwards = [
+            (moved[0] + shift * rates, -begin, *moved[1:])
+            for moved, shift, begin in zip(along[:-1], later, begins, strict=True)
+        ]
+        there, moved, onward = _along(passed, (at, left, *numbers), onwards, has_aux=True)
+        states, elapsed, inside, changes = moved
+        found = jnp.concatenate([states, (begins + elapsed)[:, None]], axis=1)[:count]
+        log_rates = jnp.max(jnp.abs(log_rates + inside), axis=0)
+        finite = jnp.isfinite(found).all(axis=(0, 1)) & jnp.isfinite(log_rates)
+        grazes = ~finite | (self.tolerance * log_rates > GRAZING)
+        # The run itself is sound: without digits its variations must not end it.
+        found = jnp.where(finite, found, 0.0)
+        whole = jnp.concatenate([onward.state, jnp.zeros_like(lasted)[None], *found])
+        onward = onward._replace(state=whole, counts=jnp.concatenate([onward.counts, grazes.astype(int)[None]]))
+        return onward, there[-1], jax.tree.map(lambda change: change[:count], changes)
+
+    def seen(
+        self, state: Float[Array, "components times"]
+    ) -> tuple[Float[Array, "shown times"], Float[Array, "directions shown times"]]:
+        """What is shown of states of a single run, and how it varies at times that stay as they are."""
+        at, *variations = self.parts(state)
+        at, lasted = at[:-1], at[-1]
+        numbers, build = self._moving()
+
+        def shown(at: Float[Array, "components times"], *numbers: Array) -> Float[Array, "shown times"]:
+            return build(*numbers).shown(at)
+
+        if not variations:
+            return shown(at), jnp.zeros((0, *shown(at).shape))
+        rates = self.phase.problem(at).field(lasted, at)
+        # A phase that begins later is less far at the same time.
+        along = [(one[:-1] - rates * one[-1], *moved) for one, moved in zip(variations, self._rates(), strict=True)]
+        return _along(shown, (at, *numbers), along)
+
+    def slopes(self, state: Float[Array, "components cells"]) -> Float[Array, "directions cells"]:
+        """The derivative of the time of the event at which runs have ended in this phase, or on the way to it."""
+        at, *variations = self.parts(state)
+        numbers, build = self._moving()
+
+        def time(at: Float[Array, "components cells"], began: Float[Array, " cells"], *numbers: Array) -> Any:
+            problem = build(*numbers).problem(at)
+            if problem.crossing(at) is None:
+                return began
+            return began + delay(problem.crossing, at, problem.field(began, at))
+
+        point = (at[:-1], jnp.zeros_like(at[-1]), *numbers)
+        tangents = [(one[:-1], one[-1], *rates) for one, rates in zip(variations, self._rates(), strict=True)]
+        return jnp.stack([jax.jvp(time, point, tangent)[1] for tangent in tangents])
+
+    def parts(self, state: Float[Array, "components cells"]) -> list[Float[Array, "components cells"]]:
+        """The state with its clock, and the variations of both."""
+        return jnp.split(state, 1 + len(self.directions))
+
+    def _error(
+        self,
+        at: Float[Array, "components cells"],
+        lasted: Float[Array, " cells"],
+        rates: Float[Array, "components cells"],
+    ) -> Float[Array, "components cells"]:
+        """What the state at the end of the phase may err by, over the tolerance: of what has changed, and of the magnitudes."""
+        sizes = jnp.minimum(self.phase.problem(at).start()[1], jnp.abs(rates) * lasted)
+        # Shares of both signs that are not likely to cancel.
+        shares = [(-1.0) ** k * (0.5 + math.modf(0.618 * k)[0]) for k in range(len(sizes))]
+        return jnp.asarray(shares)[:, None] * sizes
+
+    def _moving(self) -> tuple[list[Array], Any]:
+        """The phase's numbers that are moved, and the phase as a function of them."""
+        if not self.directions:
+            return [], lambda: self.phase
+        numbers, structure = jax.tree.flatten(where_moved(self.phase, self.directions[0]))
+        return numbers, lambda *numbers: eqx.combine(jax.tree.unflatten(structure, numbers), self.phase)
+
+    def _rates(self) -> list[list[Array]]:
+        """For each direction the rates at which these numbers move."""
+        return [jax.tree.leaves(direction) for direction in self.directions]
+
+
+def delay(function: Any, state: Float[Array, "components cells"], rates: Float[Array, "components cells"]) -> Any:
+    """Zero, with the variation of the time at which a function of the state vanishes (implicit function theorem)."""
+    value, rate = jax.jvp(function, (state,), (rates,))
+    return -(value - stop_gradient(value)) / stop_gradient(jnp.where(rate == 0.0, jnp.inf, rate))
+
+
+def _along(function: Any, point: tuple[Array, ...], tangents: list[tuple[Array, ...]], has_aux: bool = False) -> Any:
+    """A function's value, its variations along tangents with these on the first axis, and what it gives besides if any."""
+
+    def along(tangent: tuple[Array, ...]) -> Any:
+        return jax.jvp(function, point, tangent, has_aux=has_aux)
+
+    # The function itself is computed once, whatever the number of tangents.
+    stacked = jax.tree.map(lambda *moved: jnp.stack(moved), *tangents)
+    return jax.vmap(along, out_axes=(None, 0, None) if has_aux else (None, 0))(stacked)
+
+
+class Slopes(NamedTuple):
+    """Derivatives of the times of the events at which runs ended, (directions, cells); and where they have no digits, because
+    an event on the way was `grazing`."""
+
+    slopes: Float[Array, "directions cells"]
+    grazing: Bool[Array, " cells"]
+
+
+def travel_with_slopes(
+    phases: tuple[AbstractPhase, ...],
+    directions: tuple[tuple[tuple[Any, ...], Any], ...],
+    phase: Int[np.ndarray, " cells"],
+    state: Float[np.ndarray, "components cells"],
+    t1: Float[np.ndarray, "..."],
+    cells: int,
+    settings: Settings,
+    *,
+    kinds: int,
+    ends_on_event: bool = True,
+) -> tuple[Journey, Slopes]:
+    """Run every cell through its phases to its event, and differentiate the event's time in some directions.
+
+    **Arguments:** as for `travel`, and
+
+    - `directions`: for each, the tangents of the phases and that of the states, `None` for what does not move.
+    - `ends_on_event`: whether runs end on the event; else they end at `t1`, which is then the event's time.
+
+    **Returns:** the `Journey`, and the `Slopes`, 0 where there is no event, or it is there at the start.
+    """
+    varied = varied_phases(phases, directions, settings.tolerance, ends_on_event)
+    start, parts = np.asarray(varied_start(jnp.asarray(state), directions)), 1 + len(directions)
+    ended = travel(varied, phase, start, t1, cells, settings, kinds=kinds + 1, parts=parts)
+    slopes = [np.asarray(_slopes(one, jnp.asarray(ended.state))) for one in varied]
+    return _own(ended, len(state)), Slopes(_of_phase(np, ended.phase, slopes), ended.counts[-1] > 0)
+
+
+def traced_travel_with_slopes(
+    phases: tuple[AbstractPhase, ...],
+    directions: tuple[tuple[tuple[Any, ...], Any], ...],
+    phase: Int[Array, " cells"],
+    state: Float[Array, "components cells"],
+    t1: Float[Array, "..."],
+    settings: Settings,
+    *,
+    kinds: int,
+    ends_on_event: bool = True,
+) -> tuple[Journey, Slopes]:
+    """`travel_with_slopes` inside other transformed functions, for all cells; arguments and results are traced."""
+    varied = varied_phases(phases, directions, settings.tolerance, ends_on_event)
+    start, parts = varied_start(state, directions), 1 + len(directions)
+    ended = traced_travel(varied, phase, start, t1, settings, kinds=kinds + 1, parts=parts)
+    slopes = _of_phase(jnp, ended.phase, [one.slopes(ended.state) for one in varied])
+    return _own(ended, len(state)), Slopes(slopes, ended.counts[-1] > 0)
+
+
+def _own(ended: Journey, size: int) -> Journey:
+    """A journey without its variations."""
+    return ended._replace(state=ended.state[:size], counts=ended.counts[:-1])
+
+
+def _of_phase(xp: Any, phase: Int[Array, " cells"], slopes: list[Float[Array, "directions cells"]]) -> Any:
+    """Of the slopes in every phase those of the phase in which each cell is."""
+    found = xp.zeros_like(slopes[0])
+    for number, some in enumerate(slopes):
+        found = xp.where(phase == number, some, found)
+    return found
+
+
+@eqx.filter_jit
+def _slopes(varied: VariedPhase, state: Float[Array, "components cells"]) -> Float[Array, "directions cells"]:
+    return varied.slopes(state)
+
+
+def varied_phases(
+    phases: tuple[AbstractPhase, ...],
+    directions: tuple[tuple[tuple[Any, ...], Any], ...],
+    tolerance: Float[Array, ""],
+    ends_on_event: bool,
+) -> tuple[VariedPhase, ...]:
+    """The phases with their variations. **Arguments:** as for `travel_with_slopes`."""
+    return tuple(
+        VariedPhase(phase, tuple(direction[0][k] for direction in directions), tolerance, ends_on_event)
+        for k, phase in enumerate(phases)
+    )
+
+
+def varied_start(
+    state: Float[Array, "components cells"], directions: tuple[tuple[tuple[Any, ...], Any], ...]
+) -> Float[Array, "more cells"]:
+    """States at the start with their clocks, and the variations of both behind them."""
+    zero = jnp.zeros_like(state[0])
+    moved = [jnp.zeros_like(state) if direction[1] is None else direction[1] for direction in directions]
+    return jnp.concatenate([with_row(one, zero) for one in (state, *moved)])

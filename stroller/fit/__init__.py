@@ -1,0 +1,1 @@
+"""Recordings of a stroller, and the parameters identified from them."""

@@ -1,0 +1,137 @@
+"""Parameters of a stroller, its ground and its launch from recorded rides."""
+
+import itertools
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from nonholonomic import identification as generic
+from nonholonomic.identification import Free, Identification, of_data, predicted
+from nonholonomic.integration import tolerance_bound
+from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.progress import telling
+from nonholonomic.validation import as_number
+
+from ..model.scene import Scene
+from ..runs.simulate import simulate
+from .recording import Recording
+
+
+class SceneModel(eqx.Module):
+    """Predictions of all recordings of a scene, in the form that `nonholonomic.identification.identify` expects.
+
+    `seen` says which of the predictions were measured.
+    """
+
+    scene: Scene
+    data: tuple[Recording, ...]
+    seen: Int[Array, " n"]
+    tolerance: Float[Array, ""] = eqx.field(converter=as_number)
+
+    def __call__(self, parameters: dict[str, Float[Array, " rows"]]) -> Float[Array, "rows n"]:
+        rows = len(next(iter(parameters.values())))
+        values = [of_data(parameters, k) for k in range(len(self.data))]
+        parts: dict[int, Array] = {}
+        rides: dict[Any, list[int]] = {}
+        for k, one in enumerate(self.data):
+            rides.setdefault((id(one.input), tuple(numbers("launch", one.launch)), tuple(values[k])), []).append(k)
+        for alike in rides.values():
+            found = self._predict([(self.data[k], values[k]) for k in alike], rows)
+            parts |= dict(zip(alike, found, strict=True))
+        return jnp.concatenate([parts[k] for k in range(len(self.data))], axis=1)[:, self.seen]
+
+    def _predict(self, recordings: list[tuple[Recording, Any]], rows: int) -> list[Float[Array, "rows samples"]]:
+        """What is recorded of rides with one input."""
+        first = recordings[0][0]
+
+        def run(lane: dict[str, Array], times: Float[Array, " times"]) -> Any:
+            roots = with_numbers({"scene": self.scene, "launch": first.launch}, lane)
+            return simulate(roots["scene"], roots["launch"], times[-1], first.input, times, self.tolerance)
+
+        def column(run: Any, name: str) -> Float[Array, " times"]:
+            return run.position[:, "xyz".index(name)] if name in ("x", "y", "z") else getattr(run, name)
+
+        return predicted(recordings, rows, run, column)
+
+
+def identify(
+    scene: Scene,
+    data: Any,
+    free: dict[str, Any],
+    *,
+    starts: int = 1,
+    spread: float = 2.0,
+    seed: int = 0,
+    tolerance: float = 1e-8,
+    max_steps: int = 60,
+    progress: bool = True,
+) -> Identification:
+    """Parameters of a scene and its launch from recorded rides, with their errors and with what is not determined.
+
+    **Arguments:**
+
+    - `scene`: a `Scene`; what is not free is taken from it.
+    - `data`: a `Recording`, or a list of several to be fitted together.
+    - `free`: full name of a parameter -> a `Free` or only the value from which to start: `"scene.friction.rolling"`, or
+      `"rolling"` where nothing else ends so; `"launch.place[0]"` and `"launch.place[1]"` are parts of the place. A parameter
+      of the launch, or `"t0"`, the reading of a recording's clock at the launch, is the same in all recordings;
+      `"data[1].launch.heading"` is that of the second, and `"data[*].t0"` stands for one of each. Parameters that cannot be
+      negative are fitted in their logarithms.
+    - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
+    - `tolerance`: relative tolerance of the integration.
+
+    **Returns:** an `Identification`, with its `verdict`; of which it warns (`FitWarning`) if it is not good.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown name.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> data = stroller.Recording(launch, times=[0.5, 1.0], value=[1.765, 1.557], error=0.01, quantity="speed")
+    >>> found = stroller.identify(scene, data, {"rolling": 1.5}, progress=False)
+    >>> print(f"{found.estimates['scene.friction.rolling']:.2f} N s/m, {found.status}")
+    2.00 N s/m, converged
+
+    ```
+    """
+    generic.check_search(starts, spread, seed, max_steps, progress)
+    with telling("fitting", progress):
+        if not isinstance(scene, Scene):
+            raise ValueError(f"scene = {scene!r} must be a Scene")
+        data = tuple(data) if isinstance(data, list | tuple) else (data,)
+        if not data or not all(isinstance(one, Recording) for one in data):
+            raise ValueError(f"data = {data!r} must be a Recording, or a list of them")
+        tolerance_bound(tolerance).require()
+        for one in data:
+            scene.check(one.launch)
+        unknowns = _unknowns_of(scene, data, free)
+        measurements, labels, seen = generic.joined(data)
+        return generic.identify(
+            SceneModel(scene, data, seen, tolerance),
+            measurements,
+            unknowns,
+            starts=starts,
+            spread=spread,
+            seed=seed,
+            max_steps=max_steps,
+            labels=labels,
+            progress=progress,
+        )
+
+
+def _unknowns_of(scene: Scene, data: tuple[Recording, ...], free: Any) -> dict[str, Free]:
+    """The unknowns of a scene and its data by their full names, checked."""
+    roots = {"scene": scene, "launch": data[0].launch}
+    own = [[*numbers("launch", one.launch), "t0"] for one in data]
+
+    def check(values: dict[str, float]) -> None:
+        with_numbers(roots, {name: value for name, value in values.items() if name != "t0"})
+
+    known = [*numbers("scene", scene), *dict.fromkeys(itertools.chain(*own))]
+    return generic.free_numbers(free, known, own, check)

@@ -1,0 +1,99 @@
+"""Recorded rides of strollers, from arrays and from files."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from nonholonomic.identification import AbstractRecording, Quantities, as_quantity, read_columns
+from nonholonomic.validation import as_number, as_number_or_none
+
+from ..model.input import Input
+from ..model.launch import Launch
+
+#: What can be recorded of a ride: as the properties of a `Trajectory` call it.
+QUANTITIES = Quantities(
+    columns={"position": ("x", "y", "z")},
+    units=dict.fromkeys(("x", "y", "z"), "m")
+    | {"heading": "rad", "steering": "rad", "speed": "m/s", "yaw_rate": "rad/s", "steering_rate": "rad/s"},
+    angles=frozenset({"heading"}),
+)
+
+
+class Recording(AbstractRecording):
+    """A recorded ride: some quantities at the readings of a clock.
+
+    **Arguments:**
+
+    - `launch`: a `Launch`, every number a scalar.
+    - `times`: (times,) [s], increasing.
+    - `value`: (times,) for one column, (times, columns) for several; NaN where a sample is missing.
+    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: to be estimated for each column
+      from the scatter about the fit.
+    - `quantity`: "position" ("x", "y", "z") [m] of the rear axle in the fixed frame, "heading", "steering" [rad], "speed"
+      [m/s], "yaw_rate" or "steering_rate" [rad/s], all as in `Trajectory`; or a tuple of some of these words. A heading may
+      be given up to whole turns.
+    - `input`: what drove the stroller, as for `simulate`.
+    - `t0`: the clock's reading [s] at the launch. Until then the stroller is where it is launched.
+    - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None`: Gaussian.
+
+    **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
+
+    **Example:** two positions in the plane, seen from above.
+
+    >>> import stroller
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.0, speed=1.0)
+    >>> track = stroller.Recording(launch, [0.5, 1.0], [[0.5, 0.0], [1.0, 0.02]], 0.01, ("x", "y"))
+    >>> track.labels
+    ('x(0.5 s)', 'y(0.5 s)', 'x(1 s)', 'y(1 s)')
+    """
+
+    launch: Launch
+    quantity: str | tuple[str, ...] = eqx.field(static=True, default="position", converter=as_quantity)
+    input: Input | None = None
+    t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
+    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    quantities: ClassVar[Quantities] = QUANTITIES
+
+
+def read_recording(
+    path: Any,
+    columns: Any,
+    fps: float | None = None,
+    *,
+    launch: Launch,
+    error: Any = None,
+    input: Input | None = None,
+    t0: float = 0.0,
+    student: float | None = None,
+) -> Recording:
+    """A recording of a ride from a text file of columns with a line of headers (CSV).
+
+    **Arguments:**
+
+    - `path`: of the file. Columns are parted by commas, semicolons, tabs or blanks; empty cells and `nan` are missing samples;
+      lines that begin with # are left out.
+    - `columns`: what a column is -> (its header, its unit): `"time"`, or `"frame"`, and any of `"x"`, `"y"`, `"z"`,
+      `"heading"`, `"steering"`, `"speed"`, `"yaw_rate"`, `"steering_rate"`. Units are s, ms, min; rad, deg, rev; rad/s, deg/s,
+      rpm, rev/s; m, cm, mm; m/s, cm/s, mm/s, km/h; or a number, the SI units that one of the file is, such as the metres of a
+      pixel.
+    - `fps`: frames a second, where there is no `"time"`; without a `"frame"` every line is one.
+    - `launch`: a `Launch`, as far as it is known; `input`, `t0`, `student`: as for `Recording`.
+    - `error`: what a column is -> (its standard error, or the header of a column of them, unit); `None`: to be estimated.
+
+    **Returns:** a `Recording`.
+
+    **Raises:** `ValueError` that names the column and what is wrong with it.
+
+    **Example:** a speedometer, read every second.
+
+    >>> import pathlib, tempfile, stroller
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "ride.csv"
+    >>> _ = path.write_text("speed\\n5.4\\n5.0\\n4.7\\n")
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.0, speed=1.5)
+    >>> ride = stroller.read_recording(path, {"speed": ("speed", "km/h")}, fps=1, launch=launch)
+    >>> print(ride.times, ride.value.round(2))
+    [0. 1. 2.] [1.5  1.39 1.31]
+    """
+    read = read_columns(path, columns, fps, error, QUANTITIES)
+    return Recording(launch, *read, input, t0, student)

@@ -1,0 +1,97 @@
+"""When a quantity was zero during a run: found within a step by repeating that step with other lengths."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from nonholonomic.integration import few_trials
+
+from ..model.dynamics import State
+from .ride import RideRecipe
+from .steps import Lanes, States, Steps, in_blocks
+
+#: What can be watched: the normal force [N], the cosine of the steering angle, and the relative reduced mass.
+WATCHED = ("normal_force", "steering_cosine", "rank")
+
+#: Parts into which a step is divided, to look at the sign at their ends, if there may be a crossing.
+PARTS = 8
+
+#: How many times looks are added where the quantity is nearest to zero, so that two crossings close together are seen.
+CLOSER_LOOKS = 3
+
+#: Looks closer together than this [s] would show nothing new.
+CLOSEST = 1e-14
+
+
+class Between(NamedTuple):
+    """A watched quantity, less a level, at any time of a run."""
+
+    recipe: RideRecipe
+    steps: Steps
+    name: str
+    level: float
+
+    def at(self, times: Lanes) -> Lanes:
+        """The quantity at the given times; what is not a number counts as beyond the level."""
+        value = watched(self.recipe, self.steps.at(self.recipe, times), self.name) - self.level
+        return np.where(np.isfinite(value), value, -np.inf)
+
+
+def watched(recipe: RideRecipe, states: States, name: str) -> Lanes:
+    """A quantity of `WATCHED` at some states."""
+    return in_blocks(lambda at: _watched(recipe, at), states)[WATCHED.index(name)]
+
+
+@eqx.filter_jit
+def _watched(recipe: RideRecipe, states: State) -> Float[Array, "watched lanes"]:
+    dynamics = recipe.ride.scene.dynamics
+    found = (dynamics.contact(states), dynamics.geometry(states).cosine, dynamics.rank(states))
+    return jnp.stack(jnp.broadcast_arrays(*found))
+
+
+def crossings(recipe: RideRecipe, steps: Steps, name: str, level: float) -> Float[np.ndarray, " times"]:
+    """Times [s] at which a watched quantity passes a level, in either direction, in increasing order."""
+    time, value = steps.times, watched(recipe, steps.states, name) - level
+    which = np.flatnonzero(_may_cross(value))
+    if which.size == 0:
+        return np.zeros(0)
+    quantity = Between(recipe, steps, name, level)
+    parts = np.arange(1, PARTS) / PARTS
+    new = (time[which] + parts[:, None] * (time[which + 1] - time[which])).ravel()
+    for _ in range(1 + CLOSER_LOOKS):
+        time, value = np.concatenate([time, new]), np.concatenate([value, quantity.at(new)])
+        order = np.argsort(time, kind="stable")
+        time, value = time[order], value[order]
+        new = _nearest(time, value)
+        if new.size == 0:
+            break
+    found = np.flatnonzero((value[:-1] > 0.0) != (value[1:] > 0.0))
+    return few_trials(quantity.at, time[found], time[found + 1], value[found], value[found + 1])
+
+
+def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
+    """Steps in which a quantity may be zero: it changes sign, or it or a neighbour changes by more than its size."""
+    with np.errstate(invalid="ignore"):
+        change = np.abs(np.diff(value))
+        largest = np.max([change, np.append(change[1:], 0.0), np.insert(change[:-1], 0, 0.0)], axis=0)
+        small = np.minimum(np.abs(value[:-1]), np.abs(value[1:])) < largest
+    return small | ((value[:-1] > 0.0) != (value[1:] > 0.0))
+
+
+def _nearest(time: Float[np.ndarray, " looks"], value: Float[np.ndarray, " looks"]) -> Float[np.ndarray, " new"]:
+    """Where a quantity is nearest to zero between looks that show no change of sign: the vertices of parabolas."""
+    distance = np.abs(value)
+    least = (distance[1:-1] < distance[:-2]) & (distance[1:-1] <= distance[2:])
+    least &= (value[1:-1] > 0.0) == (value[:-2] > 0.0)
+    least &= (value[1:-1] > 0.0) == (value[2:] > 0.0)
+    middle = np.flatnonzero(least) + 1
+    before, after = time[middle] - time[middle - 1], time[middle + 1] - time[middle]
+    with np.errstate(all="ignore"):
+        fall = (distance[middle - 1] - distance[middle]) / before
+        rise = (distance[middle + 1] - distance[middle]) / after
+        vertex = time[middle] + 0.5 * (fall * after**2 - rise * before**2) / (fall * after + rise * before)
+    inside = (vertex > time[middle - 1]) & (vertex < time[middle + 1]) & (np.abs(vertex - time[middle]) > CLOSEST)
+    return vertex[inside]

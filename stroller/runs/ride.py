@@ -1,0 +1,147 @@
+"""Rides as problems, what made a run, and runs inside transformations."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from nonholonomic.derivatives import SampledRun, sampled_run, sampled_run_by_diffrax
+from nonholonomic.geometry import Plane
+from nonholonomic.integration import REACHED_END, AbstractProblem, Settings
+
+from ..model.dynamics import Dynamics, State
+from ..model.heading import Projected
+from ..model.input import Formula, Input
+from ..model.launch import Launch
+from ..model.scene import Scene
+
+#: Reduced mass, relative to its largest, below which the constraints count as having lost rank.
+RANK_LOST = 1e-8
+#: Pull on the ground, relative to the weight, that still counts as round-off.
+CONTACT_ROUND_OFF = 1e-12
+
+
+class RideProblem(AbstractProblem):
+    """One ride, or those of many cells.
+
+    Where `watched`, the event is that the ground would have to pull; where `guarded`, a ride ends where constraints lose rank.
+    """
+
+    dynamics: Dynamics
+    input: Input | None
+    states: Float[Array, "components *cells"]
+    scales: Float[Array, "components *cells"]
+    press: Float[Array, "..."]
+    watched: bool = eqx.field(static=True)
+    guarded: bool = eqx.field(static=True)
+
+    @classmethod
+    def single(cls, scene: Scene, launch: Launch, controls: Input | None) -> "RideProblem":
+        """The problem of one ride, which goes on where contact or rank is lost."""
+        driven = controls is not None
+        press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
+        start = (scene.state(launch, driven), scene.scales(launch, driven))
+        return cls(scene.dynamics, controls, *start, press, False, False)
+
+    @classmethod
+    def of(cls, scene: Scene, launch: Launch, controls: Input | None, cells: int, watched: bool) -> "RideProblem":
+        """The problem of the given number of cells; every number is a scalar or one per cell."""
+
+        def spread(states):
+            return jnp.broadcast_to(states.reshape(states.shape[0], -1), (states.shape[0], cells))
+
+        one = cls.single(scene, launch, controls)
+        guarded, watched = isinstance(one.dynamics.heading, Projected), watched and not isinstance(scene.surface, Plane)
+        columns = {"states": spread(one.states), "scales": spread(one.scales)}
+        return dataclasses.replace(one, **columns, watched=watched, guarded=guarded)
+
+    def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
+        return self.states, self.scales
+
+    def field(self, time: Float[Array, "..."], state: State) -> Any:
+        return self.dynamics.field(time, state, self.input)
+
+    def crossing(self, state: State) -> Any:
+        return self.dynamics.contact(state) / self.press + CONTACT_ROUND_OFF if self.watched else None
+
+    def crossing_along(self, state: State, rate: State) -> Any:
+        return self.dynamics.contact_along(state, rate) / self.press + CONTACT_ROUND_OFF if self.watched else None
+
+    def guard(self, time: Float[Array, "..."], state: State) -> Any:
+        return self.dynamics.rank(state) / RANK_LOST - 1.0 if self.guarded else None
+
+
+class Stats(NamedTuple):
+    """Numbers of accepted and rejected steps, and whether the integration reached its end."""
+
+    steps: Int[Array, ""]
+    rejected: Int[Array, ""]
+    finished: Bool[Array, ""]
+
+
+class Ride(NamedTuple):
+    """What is run and how: until `t1` [s]; `grid` are the ends of the steps [s] of a solver without an error estimate."""
+
+    scene: Scene
+    launch: Launch
+    input: Input | None
+    t1: Float[Array, ""]
+    settings: Settings
+    grid: Float[Array, " steps"] | None
+
+
+class RideRecipe(eqx.Module):
+    """A `Ride` as it can leave a transformation: its numbers are leaves and everything else is static."""
+
+    numbers: Any
+    rest: Any = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, ride: Ride) -> "RideRecipe":
+        """The recipe of a ride."""
+        return cls(*eqx.partition(ride, eqx.is_array_like))
+
+    @property
+    def ride(self) -> Ride:
+        """What is run and how."""
+        return eqx.combine(self.numbers, self.rest)
+
+
+def as_module(controls: Input | None, scene: Scene, launch: Launch) -> eqx.Module | None:
+    """An input as a module, whose numbers are leaves; a function is read once, as it is called with scalars."""
+    if controls is None or isinstance(controls, eqx.Module):
+        return controls
+
+    def motion(scene: Scene, launch: Launch) -> Any:
+        return scene.dynamics.geometry(scene.state(launch, True)).motion
+
+    return Formula.of(controls, jnp.zeros(()), eqx.filter_eval_shape(motion, scene, launch))
+
+
+def ride_problem(modules: tuple[Scene, Launch, Input | None], cells: int | None) -> RideProblem:
+    """The problem of scene, launch and input, whose numbers are scalars or one per cell."""
+    return RideProblem.single(*modules) if cells is None else RideProblem.of(*modules, cells, False)
+
+
+def traced_ride(
+    ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None
+) -> tuple[State, Stats]:
+    """The states of a ride at `times`, inside a transformation, and statistics."""
+    modules = (ride.scene, ride.launch, ride.input)
+    if adjoint is None:
+        found = sampled_run(ride_problem, modules, times, ride.t1, ride.settings, ride.grid)
+    else:
+        given = (times, ride.t1, ride.settings, adjoint, ride.grid)
+        found = sampled_run_by_diffrax(ride_problem(modules, None), *given)
+    return found.states.T, stats_of(found)
+
+
+def stats_of(found: SampledRun) -> Stats:
+    """The statistics of a run."""
+    counts = (jax.lax.stop_gradient(part) for part in (found.accepted, found.rejected, found.status))
+    accepted, rejected, status = counts
+    return Stats(accepted.astype(int), rejected.astype(int), status == REACHED_END)

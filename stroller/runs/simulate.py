@@ -1,0 +1,150 @@
+"""Run the stroller from a launch."""
+
+import dataclasses
+import functools
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from nonholonomic.integration import LOOSEST, ImplicitMidpoint, Settings, run_bounds, times_bounds
+from nonholonomic.progress import telling
+from nonholonomic.validation import as_known, is_traced, legal, nan_unless
+
+from ..model.input import Input
+from ..model.launch import Launch
+from ..model.scene import Scene
+from .checks import check_options, check_run, check_times
+from .ride import Ride, RideRecipe, as_module, traced_ride
+from .steps import followed
+from .trajectory import Trajectory, read_off
+
+#: How many times are saved if none are asked for.
+DEFAULT_TIMES = 201
+
+
+@telling("simulating")
+def simulate(
+    scene: Scene,
+    launch: Launch,
+    t1: Float[ArrayLike, ""],
+    input: Input | None = None,
+    times: Float[ArrayLike, " times"] | None = None,
+    tolerance: float = 1e-9,
+    solver: diffrax.AbstractSolver | None = None,
+    max_steps: int = 65536,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+) -> Trajectory:
+    """Run the stroller from a launch until `t1`.
+
+    **Arguments:**
+
+    - `scene`: a `Scene`.
+    - `launch`: a `Launch`.
+    - `t1`: end of the run [s], positive.
+    - `input`: a function `(t, motion) -> (drive force [N], steering torque [N m])` (see `input.py`), or `None`.
+    - `times`: times [s] to report, increasing, within [0, t1]; by default 201 equally spaced ones.
+    - `tolerance`: relative tolerance of an adaptive solver, in [1e-14, 1e-2]; a tenth of it is the absolute tolerance, in units
+      of the scene's magnitudes.
+    - `solver`: any adaptive solver of Diffrax for ordinary differential equations, or an `ImplicitMidpoint`; by default
+      `diffrax.Dopri8()`, inside transformations, without `adjoint` and where every number is a scalar,
+      `nonholonomic.integration.Oscillatory8()`, which is refused elsewhere for its poor dense output.
+    - `max_steps`: a run that needs more has failed; at least 1.
+    - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
+      parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax differentiates, which pays if a loss
+      is differentiated by many parameters, such as the weights of an input.
+
+    **Returns:** a `Trajectory`; its `status` says whether the run reached its end and what happened on the way.
+
+    **Raises:** `ValueError` for arguments out of range, a number that is a list, a launch that the scene cannot start from,
+    times that are not increasing, a solver without an error estimate, and an input that is no function, cannot be traced, or
+    is not finite at the start.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> run = stroller.simulate(scene, launch, 1.0, stroller.Steady(1.0, 0.1), times=[0.5, 1.0], tolerance=1e-6)
+    >>> print(f"{run.speed[-1]:.3f} m/s, {run.heading[-1]:.3f} rad, {run.status}")
+    1.472 m/s, 0.980 rad, completed
+
+    ```
+    """
+    check_run(scene, launch, t1, input, tolerance)
+    check_options(solver, max_steps, adjoint)
+    end, grid = as_known(t1), None
+    times = _evenly_spaced(end) if times is None else as_known(times)
+    check_times(times, t1)
+    if isinstance(solver, ImplicitMidpoint):
+        grid = even_steps(times, end, solver.step_length)
+        max_steps = grid.size
+    settings = Settings(tolerance, solver, max_steps=max_steps)
+    # Inside a transformation numbers become its own here, even if all are known.
+    ride = Ride(scene, launch, as_module(input, scene, launch), jnp.add(end, 0.0), settings, grid)
+    if any(is_traced(leaf) for leaf in jax.tree.leaves((ride, times))):
+        return _legal_or_nan(ride, times, adjoint)
+    return _concrete(ride, times)
+
+
+def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
+    """The run of concrete numbers."""
+    recipe = RideRecipe.of(ride)
+    if not isinstance(ride.settings.for_single_runs, diffrax.AbstractERK | ImplicitMidpoint):
+        return _read_off(recipe, times, *_sampled(ride, times))
+    steps, stats = followed(recipe)
+    return dataclasses.replace(_read_off(recipe, times, steps.at(recipe, np.asarray(times)), stats), steps=steps)
+
+
+_read_off = eqx.filter_jit(read_off)
+
+# Steps of other implicit solvers cannot be repeated cheaply, so they end on the times.
+_sampled = eqx.filter_jit(functools.partial(traced_ride, adjoint=None))
+
+
+# Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
+@eqx.filter_jit
+def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
+    """The run, or NaN and `finished` false where a traced number is out of range."""
+    bounds = [*run_bounds(ride.t1, ride.settings.tolerance), *times_bounds(times, ride.t1)]
+    may = ride.scene.may_start(ride.launch, ride.input) & jnp.all(legal(bounds)) & jnp.all(jnp.diff(times) > 0.0)
+    # A run of illegal numbers might never reach its end, so it is not begun, unless its steps have a given length.
+    begins = may | (ride.grid is not None)
+    run_times = jnp.where(begins, times, 0.0)
+    # Nor is its tolerance that of its block.
+    settings = ride.settings.with_tolerance(jnp.where(may, ride.settings.tolerance, LOOSEST))
+    begun = ride._replace(t1=jnp.where(begins, ride.t1, 0.0), settings=settings)
+    if adjoint is not None:
+        # Diffrax would differentiate the run that is not begun.
+        begun = begun._replace(**nan_unless(may, {"scene": ride.scene, "launch": ride.launch, "input": ride.input}))
+    run = read_off(RideRecipe.of(ride), run_times, *traced_ride(begun, run_times, adjoint))
+    stats = run.stats._replace(finished=run.stats.finished & may)
+    return eqx.tree_at(lambda one: (one.t, one.stats), nan_unless(may, run), (times, stats))
+
+
+def _evenly_spaced(t1: Float[Array, ""]) -> Float[Array, " times"]:
+    """The times of output if none are asked for; known inside a transformation if `t1` is."""
+    return jnp.linspace(0.0, t1, DEFAULT_TIMES) if is_traced(t1) else as_known(np.linspace(0.0, t1, DEFAULT_TIMES))
+
+
+def even_steps(
+    times: Float[Array, " times"], t1: Float[Array, ""], longest: Float[Array, ""]
+) -> Float[Array, " steps"]:
+    """Times from 0 to `t1` at most `longest` apart that fall on every one of `times`, evenly between them.
+
+    **Raises:** `ValueError` if one of the three is traced: how many steps there are is part of the program.
+    """
+    for name, number in {"t1": t1, "times": times, "step_length": longest}.items():
+        if is_traced(number):
+            raise ValueError(
+                f"{name} is traced and must be known for ImplicitMidpoint, whose steps have a given length"
+            )
+    knots = np.union1d(np.asarray(times), [0.0, float(t1)])
+    counts = np.ceil(np.diff(knots) / float(longest) * (1.0 - 1e-12)).astype(int)
+    pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots, knots[1:], counts, strict=False)]
+    return jnp.asarray(np.concatenate([*pieces, knots[-1:]]))

@@ -1,0 +1,113 @@
+"""The steps of a run, and the states between them, found by repeating a step with another length.
+
+So a state has the accuracy of the integration and not that of an interpolation. Only the field is compiled; the stages of
+the steps are summed in NumPy.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic.integration import explicit_tableau, follow, sample
+from nonholonomic.xla_cpu import compiled_quickly
+
+from ..model.dynamics import State
+from .ride import RideProblem, RideRecipe, Stats
+
+Lanes = Float[np.ndarray, " lanes"]
+States = Float[np.ndarray, "components lanes"]
+
+#: How many states a compiled function is given at once, so that it is compiled once.
+WIDTH = 256
+
+
+class Steps(NamedTuple):
+    """Where the steps of a run ended: times [s], the first of them 0, and states."""
+
+    times: Float[np.ndarray, " steps"]
+    states: Float[np.ndarray, "components steps"]
+
+    def at(self, recipe: RideRecipe, times: Lanes) -> States:
+        """The states at the given times [s]; not a number after the end of the run."""
+        which = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
+        ends = np.where(times == self.times[which], which, which + 1)
+        states = self.states[:, ends]
+        inside = (times > self.times[which]) & (times < self.times[which + 1])
+        if inside.any():
+            states[:, inside] = self._between(recipe, which[inside], times[inside] - self.times[which[inside]])
+        states[:, times > self.times[-1]] = np.nan
+        return states
+
+    def _between(self, recipe: RideRecipe, which: Any, length: Lanes) -> States:
+        """The states some time [s] after the starts of some steps."""
+
+        def field(times: Lanes, states: States) -> States:
+            return in_blocks(lambda *at: _field(recipe, *at), times, states)
+
+        time, start, solver = self.times[which], self.states[:, which], recipe.ride.settings.for_single_runs
+        rates = [field(time, start)]
+        if not isinstance(solver, diffrax.AbstractERK):
+            # The cubic through states and rates at both ends; an implicit step cannot be repeated so cheaply.
+            whole, end = self.times[which + 1] - time, self.states[:, which + 1]
+            part, change = length / whole, end - start
+            last = field(time + whole, end)
+            bend = (1.0 - part) * (whole * rates[0] - change) - part * (whole * last - change)
+            return start + part * (change + (1.0 - part) * bend)
+        tableau = explicit_tableau(solver)
+        for fraction, row in zip(tableau.c, tableau.a_lower, strict=True):
+            end = start + length * np.tensordot(row, np.stack(rates), 1)
+            rates.append(field(time + fraction * length, end))
+        return start + length * np.tensordot(tableau.b_sol, np.stack(rates), 1)
+
+
+@eqx.filter_jit
+def _field(recipe: RideRecipe, times: Float[Array, " lanes"], states: State) -> State:
+    ride = recipe.ride
+    return ride.scene.dynamics.field(times, states, ride.input)
+
+
+def in_blocks(function: Callable[..., Any], *columns: Any) -> Any:
+    """A compiled function of any number of columns, `WIDTH` at a time; the last block is padded with its last column."""
+    count = columns[0].shape[-1]
+    found = []
+    for first in range(0, count, WIDTH):
+        lanes = np.minimum(np.arange(first, first + WIDTH), count - 1)
+        found.append(np.asarray(function(*(column[..., lanes] for column in columns))))
+    return np.concatenate(found, axis=-1)[..., :count]
+
+
+def followed(recipe: RideRecipe) -> tuple[Steps, Stats]:
+    """Run a ride outside of transformations, and keep its steps."""
+    ride = recipe.ride
+    problem = _problem(recipe)
+    if ride.grid is None:
+        path = follow(problem, float(ride.t1), ride.settings)
+        return Steps(path.times, path.states), _counted(path.accepted, path.rejected, not path.failed)
+    found = _on_grid(problem, recipe)
+    ends = np.asarray(ride.grid)
+    good = ends <= float(found.end_time)
+    steps = Steps(ends[good], np.asarray(found.states)[:, good])
+    return steps, _counted(int(found.accepted), int(found.rejected), bool(good.all()))
+
+
+def _counted(accepted: int, rejected: int, finished: bool) -> Stats:
+    """Statistics as arrays: as plain numbers they would be constants of a program, and other numbers another program."""
+    return Stats(jnp.asarray(accepted), jnp.asarray(rejected), jnp.asarray(finished))
+
+
+@eqx.filter_jit
+def _problem(recipe: RideRecipe) -> RideProblem:
+    ride = recipe.ride
+    return RideProblem.single(ride.scene, ride.launch, ride.input)
+
+
+@compiled_quickly
+def _on_grid(problem: RideProblem, recipe: RideRecipe) -> Any:
+    """A ride with given steps, sampled at their ends."""
+    ride = recipe.ride
+    return sample(problem, None, ride.t1, ride.settings, grid=ride.grid)

@@ -1,0 +1,313 @@
+"""One run of the stroller, and what can be read off it."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
+from nonholonomic.parameters import text_as_html
+from nonholonomic.progress import telling
+from nonholonomic.sweeps import Table
+from nonholonomic.validation import is_traced
+from nonholonomic.views import Stage, Viewable, draw_portrait
+
+from ..model.dynamics import Power, State, padded
+from ..model.input import Input
+from ..model.scene import Scene
+from .crossings import crossings, watched
+from .quantities import table_of_one
+from .ride import CONTACT_ROUND_OFF, RANK_LOST, RideRecipe, Stats
+from .steps import Steps, followed
+from .view import as_stages
+
+
+class Trajectory(eqx.Module, Viewable):
+    """A run at the given times. Times are the first axis of every array.
+
+    - `t` [s]; `place`, as the surface names it (see `Launch`), (times, 2), or (times, 3) on an implicit surface; `position`
+      [m] in the fixed frame, z up, (times, 3);
+    - `heading` [rad], as in `Launch`; `direction`: the same as a unit vector in the fixed frame, (times, 3);
+    - `steering` [rad], `steering_rate` [rad/s], `yaw_rate` [rad/s], `speed` of the rear axle and `front_speed` at which
+      the front wheel rolls [m/s];
+    - `energy` [J], `work` [J] done so far by inputs and friction, `power` [W] through each port (a `Power`);
+    - `side_force` [N] of the ground on the rear axle and the front wheel, to the left of each, (times, 2);
+    - `normal_force` [N] of the ground, and `load` [N] on the rear and the front axle, (times, 2);
+    - `constraint` [m/s]: speed at which the rear axle and the front wheel slip sideways, (times, 2);
+    - `departure`: how far the position is off the ground [m]: an error of the integration;
+    - `stats` of the integration; `recipe`: what made the run; `steps`: where its steps ended, `None` if it was made inside a
+      transformation: what happened between the times is then found by running it once more, when it is asked for.
+
+    **Example:**
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> run = stroller.simulate(scene, launch, 1.0, stroller.Steady(1.0, 0.1), times=[0.5, 1.0], tolerance=1e-6)
+    >>> run.position.shape, run.side_force.shape
+    ((2, 3), (2, 2))
+    >>> print(f"{run.work[-1]:.2f} J of work")
+    -8.25 J of work
+
+    ```
+    """
+
+    t: Float[Array, " times"]
+    place: Float[Array, "times numbers"]
+    position: Float[Array, "times 3"]
+    heading: Float[Array, " times"]
+    direction: Float[Array, "times 3"]
+    steering: Float[Array, " times"]
+    speed: Float[Array, " times"]
+    front_speed: Float[Array, " times"]
+    steering_rate: Float[Array, " times"]
+    yaw_rate: Float[Array, " times"]
+    energy: Float[Array, " times"]
+    work: Float[Array, " times"]
+    power: Power
+    side_force: Float[Array, "times 2"]
+    normal_force: Float[Array, " times"]
+    load: Float[Array, "times 2"]
+    constraint: Float[Array, "times 2"]
+    departure: Float[Array, " times"]
+    state: Float[Array, "times components"]
+    stats: Stats
+    recipe: RideRecipe
+    steps: Steps | None
+
+    @property
+    def energy_residual(self) -> Float[Array, " times"]:
+        """Energy minus its start and the work done since [J]: zero for an exact solution."""
+        return self.energy - self.energy[0] - (self.work - self.work[0])
+
+    @property
+    def wheelbase_error(self) -> Float[Array, " times"]:
+        """Relative error |K| l^2 / 6 of taking the ground for its tangent plane as far as the wheelbase l reaches.
+
+        K is the Gaussian curvature (`stroller.md`, section 9). The model holds for a wheelbase short against the radii of
+        curvature.
+        """
+        scene = self.recipe.ride.scene
+        states = self.state.T
+        curvature = scene.surface.gaussian_curvature(scene.dynamics.unpack(states)[0])
+        return jnp.abs(spread(curvature, states[0])) * scene.body.wheelbase**2 / 6.0
+
+    def grip(self) -> Float[Array, "times 2"]:
+        """Coefficient of friction that each axle needs in order not to slip; infinite for a force without a load."""
+        force = jnp.abs(self.side_force)
+        return jnp.where(force == 0.0, 0.0, force / jnp.maximum(self.load, 0.0))
+
+    def grip_margin(self, coefficient: Float[Array, ""]) -> Float[Array, "times 2"]:
+        """Side force [N] that each axle has left before it slips, given a coefficient of friction [1]."""
+        return coefficient * jnp.maximum(self.load, 0.0) - jnp.abs(self.side_force)
+
+    def with_steps(self) -> "Trajectory":
+        """The same run with its steps."""
+        return self if self.steps is not None else dataclasses.replace(self, steps=followed(self.recipe)[0])
+
+    @property
+    def contact_lost_at(self) -> float:
+        """Time [s] at which the ground first has to pull to keep the stroller on it; infinite if it never does."""
+        run = self.with_steps()
+        force = watched(run.recipe, run.steps.states, "normal_force")
+        allowed = -CONTACT_ROUND_OFF * np.max(np.abs(force[np.isfinite(force)]), initial=0.0)
+        return run._first_below("normal_force", allowed)
+
+    @property
+    def rank_lost_at(self) -> float:
+        """Time [s] at which the constraints first lose rank, as only a projected heading can; otherwise infinite."""
+        return self.with_steps()._first_below("rank", RANK_LOST)
+
+    @property
+    def jackknifed_at(self) -> Float[np.ndarray, " times"]:
+        """Times [s] at which the steering angle passes a right angle, where the rear axle reverses."""
+        return crossings(self.recipe, self.with_steps().steps, "steering_cosine", 0.0)
+
+    def _first_below(self, name: str, level: float) -> float:
+        """Time [s] at which a watched quantity first is below a level; infinite if it never is."""
+        assert self.steps is not None
+        if watched(self.recipe, self.steps.states[:, :1], name)[0] < level:
+            return float(self.steps.times[0])
+        return float(min(crossings(self.recipe, self.steps, name, level), default=np.inf))
+
+    @property
+    def status(self) -> str:
+        """`failed`, `rank_lost`, `contact_lost` or `completed`: the first of these words that holds.
+
+        After `contact_lost` the run goes on as if the ground could pull.
+        """
+        if not (bool(self.stats.finished) and np.all(np.isfinite(self.state))):
+            return "failed"
+        run = self.with_steps()
+        if np.isfinite(run.rank_lost_at):
+            return "rank_lost"
+        return "contact_lost" if np.isfinite(run.contact_lost_at) else "completed"
+
+    @telling("reading off")
+    def to_table(self) -> Table:
+        """All that can be read off the run, as a `Table` over its times.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        return table_of_one(self)
+
+    def to_xarray(self) -> Any:
+        """The run as an `xarray.Dataset` over "time" (needs xarray), with units and names.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        return self.to_table().to_xarray()
+
+    def save(self, path: Any) -> None:
+        """Write the run to an HDF5 file that `stroller.Table.load` and xarray (`engine="h5netcdf"`) read.
+
+        **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for a batch of runs.
+        """
+        self.to_table().save(path)
+
+    def portrait(self, x: str = "steering", y: str = "yaw_rate", ax: Any = None) -> Any:
+        """Draw one quantity over another, a phase portrait (needs matplotlib).
+
+        **Arguments:**
+
+        - `x`, `y`: variables of `to_table()`, such as "steering", or one component, such as "position.x".
+        - `ax`: axes of matplotlib to draw in, instead of a new figure.
+
+        **Returns:** the matplotlib figure, or `ax`.
+
+        **Raises:** `ValueError` for an unknown variable.
+        """
+        return draw_portrait(self.to_table(), x, y, ax)
+
+    def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
+        return as_stages([self, *others], overlaid)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        return text_as_html(str(self))
+
+    @telling("reading off")
+    def __str__(self) -> str:
+        # A batch, or a run inside a transformation, has no numbers to show.
+        if is_traced(self.t) or self.t.ndim > 1:
+            return f"Trajectory of {self.t.shape} times"
+        self = self.with_steps()
+        jackknives = self.jackknifed_at
+        lines = [
+            f"Trajectory of {self.t.size} times, {float(self.t[0]):g} s to {float(self.t[-1]):g} s: {self.status}",
+            f"  steps           {int(self.stats.steps)}, of which {int(self.stats.rejected)} rejected",
+            f"  end             place {shown(self.place[-1])}, heading {float(self.heading[-1]):.6g} rad, "
+            f"speed {float(self.speed[-1]):.6g} m/s, steering {float(self.steering[-1]):.6g} rad",
+            f"  energy          {float(self.energy[0]):.6g} J to {float(self.energy[-1]):.6g} J, "
+            f"work {float(self.work[-1]):.6g} J, residual {float(jnp.max(jnp.abs(self.energy_residual))):.1e} J",
+            f"  normal force    {float(jnp.min(self.normal_force)):.6g} N to {float(jnp.max(self.normal_force)):.6g} N",
+            f"  side forces     up to {shown(jnp.max(jnp.abs(self.side_force), axis=0))} N, rear and front",
+            f"  no-slip         {float(jnp.max(jnp.abs(self.constraint))):.1e} m/s",
+        ]
+        error = float(jnp.max(self.wheelbase_error))
+        if error > 0.0:
+            lines.append(f"  wheelbase       off by up to {error:.1e} of its effect: the ground curves over its length")
+        if np.isfinite(self.contact_lost_at):
+            lines.append(f"  contact lost    at {self.contact_lost_at:.6g} s; from there the ground pulls")
+        if np.isfinite(self.rank_lost_at):
+            lines.append(f"  rank lost       at {self.rank_lost_at:.6g} s; from there the motion is undetermined")
+        if jackknives.size:
+            lines.append(f"  jackknifed      at {', '.join(f'{time:.6g}' for time in jackknives)} s")
+        return "\n".join(lines)
+
+
+def shown(numbers: Float[Array, " n"]) -> str:
+    """Numbers in brackets, to six digits."""
+    return f"({', '.join(f'{float(number):.6g}' for number in numbers)})"
+
+
+def side_slip(scene: Scene, rate: State, state: State) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Speeds [m/s] at which the rear axle and the front wheel slip sideways when the state changes at `rate`.
+
+    They come from the rates of the position r and of the heading, with the front wheel l ahead of the rear axle.
+    """
+    dynamics, body = scene.dynamics, scene.body
+
+    def heading_components(state):
+        return [component for component in dynamics.geometry(state).motion.heading if component is not None]
+
+    g = dynamics.geometry(state)
+    velocity = dynamics.unpack(rate)[0]
+    turning = padded(jax.jvp(heading_components, (state,), (rate,))[1])
+    if scene.heading == "projected":
+        along, left = g.motion.heading, (-g.motion.heading[1], g.motion.heading[0], None)
+    else:
+        along, left = g.direction, g.left
+    sideways = sum_vectors(scale(-g.sine, along), scale(g.cosine, left))
+    front = sum_vectors(velocity, scale(multiply(body.wheelbase, dot(turning, left)), left))
+    return dot(velocity, left), dot(front, sideways)
+
+
+def spread(component: Component, like: Float[Array, "..."]) -> Float[Array, "..."]:
+    """A component as an array, zeros where it vanishes identically."""
+    return jnp.zeros_like(like) if component is None else jnp.broadcast_to(component, like.shape)
+
+
+def side_force(
+    scene: Scene, t: Float[Array, " times"], states: Float[Array, "components times"], controls: Input | None
+) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
+    """Side forces [N] on the rear axle and the front wheel, to the left of each."""
+    if scene.heading == "intrinsic" or isinstance(scene.surface, Plane):
+        return scene.dynamics.side_force(t, states, controls)
+    return scene.dynamics.projected_side_force(t, states, controls)
+
+
+def read_off(
+    recipe: RideRecipe,
+    t: Float[Array, " times"],
+    states: Float[Array, "components times"],
+    stats: Stats,
+) -> Trajectory:
+    """The trajectory of the given states at the given times."""
+    scene, controls = recipe.ride.scene, recipe.ride.input
+    dynamics, surface = scene.dynamics, scene.surface
+    integrated, states = states, scene.dynamics.righted(states)
+    g = dynamics.geometry(states)
+    motion, like = g.motion, states[0]
+    place = surface.place_at(motion.position)
+    _, east, north = surface.chart(place)
+    power = dynamics.power(g, dynamics.forces(t, g, controls))
+    normal_force = spread(g.normal_force, like)
+    front_load = spread(g.front_load, like)
+
+    def columns(*components):
+        return jnp.stack([spread(component, like) for component in components], axis=-1)
+
+    return Trajectory(
+        t=t,
+        place=columns(*place),
+        position=columns(*surface.in_fixed_frame(motion.position)),
+        heading=dynamics.heading.angle(motion.heading, east, north),
+        direction=columns(*surface.in_fixed_frame(motion.heading)),
+        steering=motion.steering,
+        speed=motion.speed,
+        front_speed=motion.front_speed,
+        steering_rate=spread(motion.steering_rate, like),
+        yaw_rate=motion.yaw_rate,
+        energy=scene.energy(states),
+        work=scene.work(states),
+        power=Power(*(spread(part, like) for part in power)),
+        side_force=columns(*side_force(scene, t, states, controls)),
+        normal_force=normal_force,
+        load=columns(normal_force - front_load, front_load),
+        constraint=columns(*side_slip(scene, dynamics.field(t, states, controls), states)),
+        departure=spread(surface.offset(motion.position), like),
+        state=integrated.T,
+        stats=stats,
+        recipe=recipe,
+        steps=None,
+    )

@@ -1,0 +1,180 @@
+"""A ride as it is drawn: the vehicle with its wheels, the traces of its wheels, forces, and curves over time."""
+
+from typing import Any
+
+import numpy as np
+
+from nonholonomic.geometry import AbstractSurface
+from nonholonomic.parameters import told_apart
+from nonholonomic.views import (
+    COLOURS,
+    DARK,
+    PALE,
+    Arrow,
+    Body,
+    Curve,
+    Mesh,
+    Show,
+    Stage,
+    Trace,
+    arena,
+    bar,
+    box,
+    told_by_colour,
+    turned,
+    wheel,
+)
+
+from ..model.scene import DRIVES
+
+#: Lengths in units of the wheelbase, which is all that the model knows: radius and width of the wheels, and the track.
+RADIUS, WIDTH, TRACK = 0.2, 0.07, 0.8
+
+#: How large it counts to the camera, in units of the wheelbase.
+SIZE = 0.65
+
+#: Most radians by which a wheel rolls from one frame to the next.
+ROLL_PER_FRAME = 0.5
+
+#: Length of the arrow of a force as great as the weight, in units of the wheelbase.
+WEIGHT = 1.0
+
+GREEN, BLUE, VIOLET, GOLD = 0x1F8A4C, 0x1B6CA8, 0x7B4FA3, 0xE0A100
+
+
+def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
+    """Rides as they are drawn: a stage for each, or one for all if they are to be overlaid."""
+    rides = [run.recipe.ride for run in runs]
+    starts = [f"ride of {float(run.t[-1]):.3g} s" for run in runs]
+    names = told_apart(starts, [ride.scene for ride in rides], [ride.launch for ride in rides])
+    return grouped([list(enumerate(runs))] if overlaid else [[one] for one in enumerate(runs)], names)
+
+
+def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage]:
+    """A stage for each group of rides, which are numbered and have one ground; `names` are those of the rides."""
+    found = []
+    for group in groups:
+        scene = group[0][1].recipe.ride.scene
+        length = float(scene.body.wheelbase)
+        shows = told_by_colour(tuple(show(run, k, names[k]) for k, run in group))
+        points = np.concatenate([np.asarray(run.position) for _, run in group])
+        normal = normals(scene.surface, scene.side, np.asarray(group[0][1].position)[:1])[0]
+        ground = arena(scene.surface, points, normal, 3.0 * length, length)
+        found.append(Stage("; ".join(one.name for one in shows), ground, shows))
+    return found
+
+
+def normals(surface: AbstractSurface, side: str | None, position: np.ndarray) -> np.ndarray:
+    """Unit normals at positions (times, 3), towards the side on which the stroller is."""
+    found = surface.normal(surface.in_own_axes(tuple(position.T)))
+    like = np.zeros(len(position))
+    full = tuple(like if part is None else np.asarray(part) + like for part in found)
+    return surface.sign(side, DRIVES) * np.stack([np.asarray(part) for part in surface.in_fixed_frame(full)], axis=-1)
+
+
+def show(run: Any, number: int, name: str) -> Show:
+    """One ride as it is drawn, the `number`-th of all."""
+    if run.t.ndim > 1:
+        raise ValueError(f"a batch of rides, of shape {run.t.shape}, cannot be shown: take one of them")
+    scene = run.recipe.ride.scene
+    length, colour = float(scene.body.wheelbase), COLOURS[number % len(COLOURS)]
+    radius, half = RADIUS * length, TRACK * length / 2.0
+    given = np.asarray(run.t)
+    times, read = refined(run, radius)
+    position, direction = read(run.position), read(run.direction)
+    normal = read(normals(scene.surface, scene.side, np.asarray(run.position)))
+    x = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    y = np.cross(normal, x)
+    y /= np.linalg.norm(y, axis=-1, keepdims=True)
+    z = np.cross(x, y)
+    steering = read(run.steering)[:, None]
+    forward, left = np.cos(steering) * x + np.sin(steering) * y, np.cos(steering) * y - np.sin(steering) * x
+    axle, front = position + radius * z, position + length * x + radius * z
+    rolled = {
+        side: read(_integral(given, (np.asarray(run.speed) - sign * half * np.asarray(run.yaw_rate)) / radius))
+        for side, sign in (("left", 1.0), ("right", -1.0))
+    }
+    ahead = read(_integral(given, np.asarray(run.front_speed) / radius))
+    rear = wheel(radius, WIDTH * length, (DARK, PALE))
+    weight = float(scene.body.mass * scene.gravity)
+    forces = read(run.side_force) * WEIGHT * length / weight
+    contacts = (position + 0.02 * radius * z, position + length * x + 0.02 * radius * z)
+    push = read(run.normal_force)[:, None] * WEIGHT * length / weight * z
+    return Show(
+        name,
+        colour,
+        times,
+        SIZE * length,
+        (
+            Body("frame", axle, _turning(x, y, z), frame(length, colour)),
+            Body("left wheel", axle + half * y, _rolling(x, y, z, rolled["left"]), rear),
+            Body("right wheel", axle - half * y, _rolling(x, y, z, rolled["right"]), rear),
+            Body("front wheel", front, _rolling(forward, left, z, ahead), wheel(radius, WIDTH * length, (DARK, PALE))),
+        ),
+        (
+            Trace("path of the rear axle", contacts[0], GREEN, 0.05 * length),
+            Trace("path of the front wheel", contacts[1], BLUE, 0.025 * length),
+        ),
+        (
+            # Above the axle the basket would hide it.
+            Arrow(
+                f"normal force ({WEIGHT:g} wheelbase: the weight)", axle - 1.4 * half * y, push, VIOLET, 0.035 * length
+            ),
+            Arrow("side force, rear (as long)", contacts[0], forces[:, :1] * y, GOLD, 0.035 * length),
+            Arrow("side force, front", contacts[1], forces[:, 1:] * left, GOLD, 0.035 * length),
+        ),
+        (
+            Curve("speed [m/s]", read(run.speed)),
+            Curve("steering angle [rad]", read(run.steering)),
+            Curve("energy [J]", read(run.energy)),
+            Curve("normal force [N]", read(run.normal_force)),
+        ),
+    )
+
+
+def refined(run: Any, radius: float) -> tuple[np.ndarray, Any]:
+    """Times between which wheels roll little, those of the ride among them, and how its numbers are read there."""
+    times = np.asarray(run.t)
+    if len(times) < 4:
+        return times, np.asarray
+    from scipy.interpolate import CubicSpline
+
+    gaps = np.diff(times)
+    rolled = np.maximum(np.abs(run.speed), np.abs(run.front_speed)).max() * gaps / radius
+    parts = np.clip(np.ceil(rolled / ROLL_PER_FRAME), 1, 20).astype(int)
+    fine = np.concatenate([a + (b - a) * np.arange(n) / n for a, b, n in zip(times, times[1:], parts, strict=False)])
+    fine = np.append(fine, times[-1])
+    return fine, lambda values: CubicSpline(times, np.asarray(values))(fine)
+
+
+def frame(length: float, colour: int) -> tuple[Mesh, ...]:
+    """Axle, chassis, basket, handle and fork, as seen from the middle of the rear axle."""
+    half, thin = TRACK * length / 2.0, 0.025 * length
+    low, high = 0.12 * length, 0.62 * length
+    handle = [(-0.55 * length, sign * 0.3 * half, 0.95 * length) for sign in (1.0, -1.0)]
+    posts = [bar((0.0, 0.3 * half * sign, low), handle[k], thin, DARK) for k, sign in enumerate((1.0, -1.0))]
+    return (
+        bar((0.0, -half, 0.0), (0.0, half, 0.0), thin, DARK),
+        bar((0.0, 0.0, 0.0), (0.92 * length, 0.0, 0.30 * length), thin, DARK),
+        bar((length, 0.0, 0.22 * length), (length, 0.0, 0.34 * length), 1.4 * thin, DARK),
+        bar((0.92 * length, 0.0, 0.30 * length), (length, 0.0, 0.30 * length), thin, DARK),
+        box((0.62 * length, 1.1 * half, high - low), (0.22 * length, 0.0, (low + high) / 2.0 + 0.06 * length), colour),
+        box((0.5 * length, 0.9 * half, 0.02 * length), (0.22 * length, 0.0, high + 0.07 * length), PALE),
+        *posts,
+        bar(handle[0], handle[1], 1.3 * thin, DARK),
+    )
+
+
+def _turning(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    return turned(np.stack([x, y, z], axis=-1))
+
+
+def _rolling(x: np.ndarray, y: np.ndarray, z: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Turned about y by an angle, forwards."""
+    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    return _turning(cosine * x - sine * z, y, sine * x + cosine * z)
+
+
+def _integral(times: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """Integral over time, by the trapezoidal rule."""
+    return np.concatenate([[0.0], np.cumsum(np.diff(times) * (rate[1:] + rate[:-1]) / 2.0)])

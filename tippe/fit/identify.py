@@ -1,0 +1,144 @@
+"""Parameters of a top, its arena and its launches from inversion times and from recorded motion."""
+
+import itertools
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from nonholonomic import identification as generic
+from nonholonomic.identification import Free, Identification, of_data
+from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.progress import telling
+from nonholonomic.validation import as_number
+
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..runs.cells import driver_of
+from ..runs.inversion import check_run, check_smooth
+from .data import InversionTimes, Recording, Values, predict_recordings
+from .phased_fit import PhasedModel
+
+
+class SceneModel(eqx.Module):
+    """Predictions of all data of a scene, in the form that `nonholonomic.identification.identify` expects.
+
+    `seen` says which of the predictions were measured.
+    """
+
+    scene: Scene
+    data: tuple[Any, ...]
+    seen: Int[Array, " n"]
+    tolerance: Float[Array, ""] = eqx.field(converter=as_number)
+
+    def __call__(self, parameters: Values) -> Float[Array, "rows n"]:
+        rows = len(next(iter(parameters.values())))
+        values = [of_data(parameters, k) for k in range(len(self.data))]
+        parts: dict[int, Array] = {}
+        films: dict[Any, list[int]] = {}
+        for k, one in enumerate(self.data):
+            if isinstance(one, Recording):
+                kind = tuple(name for name, value in numbers("launch", one.launch).items() if value is not None)
+                films.setdefault((kind, tuple(values[k])), []).append(k)
+            else:
+                parts[k] = one.predict(self.scene, values[k], rows, self.tolerance)
+        for alike in films.values():
+            found = predict_recordings(self.scene, [(self.data[k], values[k]) for k in alike], rows, self.tolerance)
+            parts |= dict(zip(alike, found, strict=True))
+        return jnp.concatenate([parts[k] for k in range(len(self.data))], axis=1)[:, self.seen]
+
+
+def identify(
+    scene: Scene,
+    data: Any,
+    free: dict[str, Any],
+    *,
+    starts: int = 1,
+    spread: float = 2.0,
+    seed: int = 0,
+    tolerance: float = 1e-8,
+    max_steps: int = 60,
+    slopes: str | None = None,
+    progress: bool = True,
+) -> Identification:
+    """Parameters of a scene and its launches from measurements, with their errors and with what is not determined.
+
+    **Arguments:**
+
+    - `scene`: a `Scene`; what is not free is taken from it.
+    - `data`: an `InversionTimes` or a `Recording`, or a list of several to be fitted together.
+    - `free`: full name of a parameter -> a `Free` or only the value from which to start: `"scene.friction.mu"`, or
+      `"friction.mu"` where nothing else ends so. A parameter of the launch, or `"t0"`, the reading of a recording's clock at
+      the launch, is the same in all data; `"data[1].launch.azimuth"` is that of the second, and `"data[*].t0"` stands for one
+      of each recording. Parameters that cannot be negative are fitted in their logarithms.
+    - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
+    - `slopes`: "exact", those of the equations; or "differences", central ones of 1 % in every parameter, 2 k + 1 runs for k
+      parameters, recordings one by one, which smooth over the staircase of the times. By default exact ones where a run is one
+      smooth motion, and differences through flights, impacts, stick and slip.
+    - `tolerance`: relative tolerance of the integration.
+
+    **Returns:** an `Identification`, with its `verdict`; of which it warns (`FitWarning`) if it is not good.
+
+    **Raises:** `ValueError` for arguments out of range, an unknown name, and for exact slopes through phases: the time of a top
+    that hops has a slope, but with steps of every flight it may point the other way than the trend.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> launch = tippe.Launch(theta=[0.2, 0.2, 0.3, 0.2], spin=[155.0, 140.0, 110.0, 60.0])
+    >>> data = tippe.InversionTimes(launch, time=[5.60, 5.53, 5.52, float("inf")], error=0.05, t1=8.0)
+    >>> found = tippe.identify(scene, data, {"friction.mu": 0.25}, progress=False)
+    >>> print(f"{found.estimates['scene.friction.mu']:.3f} s/m, {found.status}")
+    0.300 s/m, converged
+
+    ```
+    """
+    generic.check_search(starts, spread, seed, max_steps, progress)
+    with telling("fitting", progress):
+        data = checked_data(scene, data, tolerance, "identify with slopes = 'exact'" if slopes == "exact" else None)
+        unknowns = unknowns_of(scene, data, free)
+        measurements, labels, seen = generic.joined(data)
+        smooth = driver_of(scene).smooth
+        kind = SceneModel if smooth else PhasedModel
+        return generic.identify(
+            kind(scene, data, seen, tolerance),
+            measurements,
+            unknowns,
+            starts=starts,
+            spread=spread,
+            seed=seed,
+            max_steps=max_steps,
+            slopes=slopes or ("exact" if smooth else "differences"),
+            labels=labels,
+            progress=progress,
+        )
+
+
+def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) -> tuple[Any, ...]:
+    """The sets of data as a tuple, once all is checked; `caller` is who needs derivatives, or `None`."""
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene = {scene!r} must be a Scene")
+    if caller is not None:
+        check_smooth(scene, caller)
+    data = tuple(data) if isinstance(data, list | tuple) else (data,)
+    if not data or not all(isinstance(one, InversionTimes | Recording) for one in data):
+        raise ValueError(f"data = {data!r} must be an InversionTimes or a Recording, or a list of them")
+    check_run(scene, Launch(0.0, 0.0), 1.0, tolerance)
+    return data
+
+
+def unknowns_of(scene: Scene, data: tuple[Any, ...], free: Any) -> dict[str, Free]:
+    """The unknowns of a scene and its data by their full names, checked."""
+    of_scene = list(numbers("scene", scene))
+    launches = [[name for name, value in numbers("launch", one.launch).items() if value is not None] for one in data]
+    own = [names + ["t0"] * isinstance(one, Recording) for names, one in zip(launches, data, strict=True)]
+    roots = {"scene": scene, "launch": data[0].launch}
+
+    def check(values: dict[str, float]) -> None:
+        with_numbers(roots, {name: value for name, value in values.items() if name != "t0"})
+
+    return generic.free_numbers(free, [*of_scene, *dict.fromkeys(itertools.chain(*own))], own, check)

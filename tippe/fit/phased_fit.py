@@ -1,0 +1,96 @@
+"""Predictions for fits of runs with phases, by whose differences they are fitted: outside of transformations."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nonholonomic.identification import of_data
+from nonholonomic.parameters import numbers, with_numbers
+
+from ..model.scene import Scene
+from ..runs.cells import CellRuns, driver_of
+from ..runs.extended_times import LEAST_ANGLE
+from ..runs.trajectory import simulate
+from .data import InversionTimes, Recording, column_of
+
+
+class PhasedModel(NamedTuple):
+    """Predictions of all data of a scene with flights, impacts, stick and slip, as `SceneModel` gives them for one without.
+
+    Times are found as in tables, all in one block; recordings are followed one by one. Parameters that the scene refuses have
+    no predictions.
+    """
+
+    scene: Scene
+    data: tuple[Any, ...]
+    seen: Float[np.ndarray, " n"]
+    tolerance: float
+
+    #: It runs phase by phase, and cannot be traced.
+    on_host = True
+
+    def __call__(self, parameters: dict[str, Any]) -> Float[np.ndarray, "rows n"]:
+        columns = {name: np.asarray(values) for name, values in parameters.items()}
+        rows = [{name: float(values[i]) for name, values in columns.items()} for i in range(_count(columns))]
+        parts = [self._of(k, [of_data(row, k) for row in rows]) for k in range(len(self.data))]
+        return np.concatenate(parts, axis=1)[:, np.asarray(self.seen)]
+
+    def _of(self, k: int, rows: list[dict[str, float]]) -> Float[np.ndarray, "rows size"]:
+        """The predictions of one set of data in every row."""
+        data, found = self.data[k], np.full((len(rows), self.data[k].size), np.nan)
+        allowed = [i for i, row in enumerate(rows) if self._allows(data, row)]
+        if allowed and isinstance(data, InversionTimes):
+            # Others are run in their place, so that every block has the same size and is compiled once.
+            every = [rows[i] if i in allowed else rows[allowed[0]] for i in range(len(rows))]
+            found[allowed] = self._times(data, every)[allowed]
+        elif allowed:
+            for i in allowed:
+                found[i] = self._samples(data, rows[i])
+        return found
+
+    def _allows(self, data: Any, row: dict[str, float]) -> bool:
+        try:
+            self._roots(data, row)
+        except ValueError:
+            return False
+        return True
+
+    def _roots(self, data: Any, row: dict[str, float]) -> dict[str, Any]:
+        own = {name: value for name, value in row.items() if name != "t0"}
+        return with_numbers({"scene": self.scene, "launch": data.launch}, own)
+
+    def _times(self, data: InversionTimes, rows: list[dict[str, float]]) -> Float[np.ndarray, "rows launches"]:
+        """Times as `extended_inversion_time` gives them."""
+        launches = data.size
+        of_launch = {name: value for name, value in numbers("launch", data.launch).items() if value is not None}
+        columns = {
+            name: np.tile(np.broadcast_to(np.asarray(value), (launches,)), len(rows))
+            for name, value in of_launch.items()
+        }
+        columns |= {name: np.repeat([row[name] for row in rows], launches) for name in rows[0] if name != "t0"}
+        t1, angle = float(data.t1), float(data.angle)
+        runs = CellRuns(driver_of(self.scene), t1, angle, "first", None, "ensemble", [])
+        count = launches * len(rows)
+        found = runs.results({"scene": self.scene, "launch": data.launch}, columns, self.tolerance, count)
+        missing = np.log(angle / np.clip(np.asarray(found["end_theta"]), LEAST_ANGLE, angle))
+        whole = np.maximum(np.log(angle / np.clip(columns["launch.theta"], LEAST_ANGLE, angle)), 1.0)
+        time = np.where(np.isfinite(found["time"]), found["time"], t1 * (1.0 + missing / whole))
+        failed = np.asarray(found["status"]) == runs.driver.words.index("failed")
+        return np.where(failed, np.nan, time).reshape(len(rows), launches)
+
+    def _samples(self, data: Recording, row: dict[str, float]) -> Float[np.ndarray, " size"]:
+        """The samples of one run, those before the launch as at the launch, NaN after its end."""
+        roots = self._roots(data, row)
+        since = np.maximum(np.asarray(data.times) - row.get("t0", float(data.t0)), 0.0)
+        at, where = np.unique(since, return_inverse=True)
+        run = simulate(roots["scene"], roots["launch"], float(at[-1]), tolerance=self.tolerance)
+        reached = at[at <= float(run.end_time)]
+        samples = np.full((len(at), len(data.columns)), np.nan)
+        shown = run.at(reached)
+        samples[: len(reached)] = np.stack([np.asarray(column_of(shown, name)) for name in data.columns], axis=-1)
+        return samples[where].reshape(-1)
+
+
+def _count(columns: dict[str, np.ndarray]) -> int:
+    return len(next(iter(columns.values())))

@@ -1,0 +1,269 @@
+"""The onset of a slip: one implicit step from a contact at rest to one that slips, as long as the tolerance lets it be.
+
+With G what friction lacks of the force that rolling takes, the slip velocity v changes as v' = M G, M the contact's inverse
+mass along the arena. Where rolling leaves the friction cone G = 0, and so the slip's acceleration; both grow in proportion to
+the time t since. Of all solutions that begin there one alone is smooth: v = c t^2 d + O(t^3), with d against the force
+of rolling and
+
+    c = -m' / (2 (d . P_t + mu P_n)),   m = mu N - |F_t| of rolling, P the blow that gives the contact the velocity d;
+
+a deviation of the slip's direction decays as exp(k / t), faster than any power, so no other is found by going forward,
+and no explicit method can begin there. A collocation method can: it asks nothing of the point t = 0 but the state, and the
+smooth solution's polynomial satisfies the equations wherever it is asked. This is one step of Radau IIA (Hairer and Wanner,
+Solving ODEs II, section IV.5), its equations solved by Newton's method in the slip velocity, which alone is stiff, and by
+iteration in the rest. A contact at rest whose rolling force is beyond the cone from the first begins with v = b t d +
+O(t^2), d the direction in which friction that opposes it lets it grow, near that against the force of rolling; the same step
+serves it.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.polynomial import Polynomial, legendre
+
+from .dynamics import Dynamics
+from .friction import Slip, length
+from .rolling import RollingDynamics
+
+#: Stages of the step. Its error falls as the power of this plus one of its length, its estimate as this power.
+STAGES = 6
+
+#: Length of the first trial over tolerance^(1 / STAGES), in units of the shorter of sqrt(R / g) and the time for a radian. No
+#: error depends on it: a step whose estimate is too great is tried again, shorter.
+FIRST = 5.0
+
+#: Estimates below this are round-off: where a slip of 1e-7 m/s begins, its direction has nine digits. The step's length
+#: follows the tolerance below this too; steps with an estimate of 1e-11 were found to err by 1e-13.
+ROUNDING = 1e-10
+
+#: Trials of the length, and iterations for each; where they are not enough, the run has failed (none of 256 tops that slip and
+#: stick for 4 s in a sphere).
+TRIALS, ITERATIONS = 10, 10
+
+
+def _radau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The nodes in (0, 1], what the integrals up to `x` are made of (coefficients of x, stage), and the row of the highest
+    Legendre coefficient."""
+    # The roots are real, but since NumPy 2.5 their type is complex.
+    nodes = (np.sort(legendre.legroots([0.0] * (STAGES - 1) + [-1.0, 1.0]).real) + 1.0) / 2.0
+    nodes[-1] = 1.0
+    integrals = []
+    for k in range(STAGES):
+        others = np.delete(nodes, k)
+        basis = Polynomial.fromroots(others) / np.prod(nodes[k] - others)
+        integrals.append(basis.integ().coef)
+    highest = np.linalg.inv(legendre.legvander(2.0 * nodes - 1.0, STAGES - 1))[-1]
+    return nodes, np.stack(integrals, axis=1), highest
+
+
+NODES, INTEGRALS, HIGHEST = _radau()
+WEIGHTS = np.vander(NODES, STAGES + 1, increasing=True) @ INTEGRALS
+
+
+class Onset(eqx.Module):
+    """The beginning of a slip.
+
+    - `start`: the state at its onset, (components, ...); `length`: how long it is [s].
+    - `rates`: of the state at the step's stages, (components, stages, ...).
+    - `found`: whether it was found to the tolerance.
+    """
+
+    start: Float[Array, "components ..."]
+    length: Float[Array, "..."]
+    rates: Float[Array, "components stages ..."]
+    found: Bool[Array, "..."]
+
+    def at(self, fraction: Float[Array, "..."]) -> Float[Array, "components ..."]:
+        """The state after a fraction of the step."""
+        powers = jnp.stack([fraction**k for k in range(STAGES + 1)])
+        return self.start + self.length * jnp.einsum("ps,p...,cs...->c...", INTEGRALS, powers, self.rates)
+
+    def falls_to(self, component: int, value: Float[Array, "..."], first: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The fraction of the step, after `first`, at which a component of the state has fallen to a value; 1 if nowhere."""
+        one = Onset(
+            self.start[component : component + 1], self.length, self.rates[component : component + 1], self.found
+        )
+
+        def halved(_, bracket):
+            low, high = bracket
+            middle = 0.5 * (low + high)
+            above = one.at(middle)[0] > value
+            return jnp.where(above, middle, low), jnp.where(above, high, middle)
+
+        found = jax.lax.stop_gradient(jax.lax.fori_loop(0, 52, halved, (first, jnp.ones_like(first)))[1])
+        # Halving has no derivative: that is by the implicit function theorem.
+        height, rise = jax.jvp(lambda at: one.at(at)[0], (found,), (jnp.ones_like(found),))
+        missing = height - value
+        inside = (found < 1.0) & (rise != 0.0)
+        shift = (missing - jax.lax.stop_gradient(missing)) / jax.lax.stop_gradient(jnp.where(inside, rise, 1.0))
+        return found - jnp.where(inside, shift, 0.0)
+
+    @property
+    def end(self) -> Float[Array, "components ..."]:
+        """The state at the end of the step, not a number where none was found."""
+        moved = self.start + self.length * jnp.einsum("s,cs...->c...", WEIGHTS[-1], self.rates)
+        return jnp.where(self.found, moved, jnp.nan)
+
+
+def begin(
+    slipping: Dynamics,
+    rolling: RollingDynamics,
+    mu: Float[Array, "..."],
+    field: Callable[[Float[Array, "components ..."]], Float[Array, "components ..."]],
+    state: Float[Array, "components ..."],
+    size: int,
+    scales: Float[Array, "components ..."],
+    most: Float[Array, "..."],
+    tolerance: Float[Array, ""],
+) -> Onset:
+    """The beginning of a slip from a contact at rest.
+
+    **Arguments:**
+
+    - `slipping`, `rolling`: the equations with slip and without; `mu`: coefficient of friction [1].
+    - `field`: rate of the slipping state, with what else is integrated.
+    - `state`: at rest, (components, ...), the first `size` of which the equations know; `scales`: their magnitudes.
+    - `most`: how long it may be at most [s]; `tolerance`: of its estimated error, relative to the magnitudes.
+
+    **Returns:** an `Onset`.
+    """
+    own = state[:size]
+    rolls = rolling.field(own)
+    contact = _Contact.of(rolling, mu, own, rolls)
+    rolls = jnp.concatenate([rolls, jnp.zeros_like(state[size:])])
+    scales = scales.reshape(scales.shape[:1] + (1,) * (state.ndim - scales.ndim) + scales.shape[1:])
+
+    def iterated(age, times):
+        """Slip velocities and rates at the stages: one loop, so that the equations are compiled once."""
+
+        def newton(_, carry):
+            v, moved, _, _ = carry
+            struck = rolling.with_slip(moved[:size], Slip(v[0], v[1]))
+            rates = field(jnp.concatenate([struck, moved[size:]]))
+            moved = state[:, None] + age * jnp.einsum("js,cs...->cj...", WEIGHTS, rates)
+            slip = slipping.motion(moved[:size]).slip
+            change = contact.correction(age, v, jnp.stack([slip.x, slip.y]) - v)
+            return v + change, moved, change, rates
+
+        # The force of rolling must have changed as it does, or Newton's first correction would stop the slip.
+        rolled = state[:, None] + times * rolls[:, None]
+        v = contact.first_guess(times)
+        return jax.lax.fori_loop(0, ITERATIONS, newton, (v, rolled, v, jnp.zeros_like(rolled)))
+
+    def again(carry):
+        trial, age, found, _ = carry
+        times = age * NODES.reshape((-1,) + (1,) * (state.ndim - 1))
+        _, moved, change, rates = iterated(age, times)
+        unsettled = jnp.max(length(*change), axis=0) / contact.speed
+        highest = age * jnp.abs(jnp.einsum("s,cs...->c...", HIGHEST, rates))
+        error = jnp.maximum(jnp.max((highest / scales)[:size], axis=0), unsettled)
+        # The contact must persist, or the slip would pass by its loss.
+        lost = jnp.min(slipping.contact_margin(moved[:size]), axis=0) <= 0.0
+        error = jnp.where(jnp.isfinite(error) & ~lost, error, jnp.inf)
+        found = error <= jnp.maximum(tolerance, ROUNDING)
+        shorter = jnp.clip(0.8 * (tolerance / error) ** (1.0 / STAGES), 0.4, 0.8)
+        return trial + 1, jnp.where(found, age, shorter * age), found, rates
+
+    def goes_on(carry):
+        trial, _, found, _ = carry
+        return (trial < TRIALS) & ~jnp.all(found)
+
+    age = jnp.minimum(FIRST * tolerance ** (1.0 / STAGES) * contact.unit, most)
+    rates = jnp.zeros((*state.shape[:1], STAGES, *state.shape[1:]))
+    _, age, found, rates = jax.lax.while_loop(goes_on, again, (0, age, jnp.zeros(age.shape, bool), rates))
+    return Onset(state, age, rates, found)
+
+
+class _Contact(eqx.Module):
+    """What decides how a contact at rest begins to slip.
+
+    - `direction`: against the force of rolling; `rise`: the slip's acceleration [m/s^2] and half its rate [m/s^3] at once.
+    - `inverse_mass`: M [1/kg] as (M11, M12, M22); `lifted`: n, the change of N by the force along the arena.
+    - `mu`; `unloaded`: N if there were no force along the arena [N]; `speed`: sqrt(g R) [m/s]; `unit`: of time [s].
+    """
+
+    direction: Float[Array, "2 ..."]
+    rise: tuple[Float[Array, "..."], Float[Array, "..."]]
+    inverse_mass: tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]
+    lifted: Float[Array, "2 ..."]
+    mu: Float[Array, "..."]
+    unloaded: Float[Array, "..."]
+    speed: Float[Array, "..."]
+    unit: Float[Array, "..."]
+
+    @classmethod
+    def of(
+        cls,
+        rolling: RollingDynamics,
+        mu: Float[Array, "..."],
+        state: Float[Array, "components ..."],
+        rate: Float[Array, "components ..."],
+    ) -> "_Contact":
+        weight = rolling.mass * rolling.gravity
+        grip, falls = jax.jvp(lambda at: rolling.grip(at, mu), (state,), (rate,))
+        F1, F2, N = rolling.reaction(state)
+        force = length(F1, F2)
+        force = jnp.where(force > 0.0, force, 1.0)
+        d = jnp.stack([-F1 / force, -F2 / force])
+
+        # The blows that give the contact unit velocities: P_t = M^-1 v and P_n = -n . P_t.
+        (a, b, f), (_, c, h) = rolling.blow(state, 0), rolling.blow(state, 1)
+        determinant = a * c - b * b
+        lifted = jnp.stack([b * h - c * f, b * f - a * h]) / determinant
+        yields = d[0] * (a * d[0] + b * d[1] + mu * f) + d[1] * (b * d[0] + c * d[1] + mu * h)
+        rise = (jnp.maximum(-grip, 0.0) * weight / yields, jnp.maximum(-falls, 0.0) * weight / (2.0 * yields))
+        speed = jnp.sqrt(rolling.gravity * rolling.radius)
+        spin = jnp.sqrt(sum(x * x for x in rolling.angular_velocity(state)))
+        unit = 1.0 / jnp.maximum(spin, speed / rolling.radius)
+        inverse_mass = (c / determinant, -b / determinant, a / determinant)
+        return cls(d, rise, inverse_mass, lifted, mu, N + lifted[0] * F1 + lifted[1] * F2, speed, unit)
+
+    def first_guess(self, times: Float[Array, "stages ..."]) -> Float[Array, "2 stages ..."]:
+        """The slip velocity that the limit of the equations says [m/s]."""
+        return self.direction[:, None] * (self.rise[0] + self.rise[1] * times) * times
+
+    def correction(
+        self, age: Float[Array, "..."], v: Float[Array, "2 stages ..."], missing: Float[Array, "2 stages ..."]
+    ) -> Float[Array, "2 stages ..."]:
+        """Newton's correction of the slip velocities: only the slip's direction makes the equations stiff.
+
+        With F = -mu N d along the arena and N = N0 - n . F, so that N = N0 / (1 - mu n . d), a turn of d by eta changes the
+        acceleration by -eta mu N M (1 - mu d n^T)^-1 d', d' across d. Beyond the cone that N is not the one of rolling.
+        """
+        size = length(v[0], v[1])
+        size = jnp.where(size > 0.0, size, 1.0)
+        along = v / size
+        across = jnp.stack([-along[1], along[0]])
+        n, (M11, M12, M22) = self.lifted, self.inverse_mass
+        stiffness = 1.0 - self.mu * (n[0] * along[0] + n[1] * along[1])
+        share = self.mu * (n[0] * across[0] + n[1] * across[1]) / stiffness
+        x, y = self.mu * self.unloaded / stiffness * (across + share * along)
+        pull = jnp.stack([M11 * x + M12 * y, M12 * x + M22 * y])
+        # Stage by stage: across_j . pull_k, times what the step gives stage j of stage k.
+        matrix = age * jnp.einsum("jk,ij...,ik...->jk...", WEIGHTS, across, pull)
+        matrix = matrix + jnp.eye(STAGES).reshape((STAGES, STAGES) + (1,) * (size.ndim - 1)) * size
+        turn = _solved(matrix, across[0] * missing[0] + across[1] * missing[1])
+        change = missing - age * jnp.einsum("js,is...->ij...", WEIGHTS, pull * turn)
+        # The force asks for a slip's direction alone, and where a slip begins v is far less than what a small turn of the force
+        # makes of it. So the direction turns by what the equations say, and not to where v points; v is not turned round.
+        turned = along + turn * across
+        longer = jnp.maximum(size + change[0] * along[0] + change[1] * along[1], 0.2 * size)
+        return longer / length(turned[0], turned[1]) * turned - v
+
+
+def _solved(matrix: Float[Array, "n n ..."], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    """Solution of a few linear equations, lane by lane, by elimination. The matrices here need no pivots."""
+    rows = jnp.arange(len(right)).reshape((-1,) + (1,) * (right.ndim - 1))
+
+    def eliminated(k, both):
+        matrix, right = both
+        row, of_row = matrix[k] / matrix[k, k], right[k] / matrix[k, k]
+        column = jnp.where(rows == k, 0.0, matrix[:, k])
+        matrix = jnp.where(rows[:, None] == k, row, matrix - column[:, None] * row)
+        return matrix, jnp.where(rows == k, of_row, right - column * of_row)
+
+    return jax.lax.fori_loop(0, len(right), eliminated, (matrix, right))[1]

@@ -1,0 +1,296 @@
+"""The scene: what moves, on what arena, with what friction, under what gravity."""
+
+import math
+from collections.abc import Iterator
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nonholonomic.geometry import (
+    AbstractFrame,
+    AbstractSurface,
+    CarriedFrame,
+    Component,
+    Plane,
+    PlaneFrame,
+    cross,
+    dot,
+    frame_of,
+    multiply,
+    none_if_zero,
+    place_named,
+    room_bounds,
+    scale,
+    sum_vectors,
+)
+from nonholonomic.validation import Bound, Bounded, as_number, require_all
+
+from .body import AbstractBody
+from .dynamics import TURNING, Dynamics
+from .friction import AbstractFriction, Frictionless
+from .launch import Launch
+from .state import inclination, joined, parts
+from .stick_slip import StickSlip
+from .top import Top
+
+#: Tilt [rad] of a launch below which errors across the normal are measured in proportion to it.
+NEARLY_UPRIGHT = 1e-2
+
+#: How fast the foot of a top on a general arena is drawn back to it, over sqrt(g / R); `docs/tippe.md` has the drift.
+PULL = 1.0
+
+
+class Scene(Bounded):
+    """A tippe top on an arena.
+
+    Every number in it is a leaf of a pytree: it can be swept, traced and differentiated.
+
+    **Arguments:**
+
+    - `body`: a `Top`; or a `SpheroidBody` or `ConvexBody`, on a plane, with `contact="stop"` and friction without phases.
+    - `surface`: the arena: `Plane(tilt)`, `Cylinder(radius)`, `Sphere(radius)`, `Spheroid(equatorial, polar)`, `Torus(ring,
+      tube)`, `Paraboloid(p)`, `Graph(height)` or `Implicit(function)`.
+    - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
+      or `Rolling(resistance, turning_speed, sliding)` with one of them, or, for a top without a stem,
+      `SetValuedCoulomb(mu)`.
+    - `gravity`: acceleration of free fall [m/s^2], positive.
+    - `contact`: "stop": a run ends where the contact is lost; "hybrid": it goes on through flights, impacts, and changes to
+      the stem and back (`phases/`). A top with a stem needs the latter. One that comes to rest on its sphere and its stem at
+      once leans on both on the level plane; on any other arena its run ends there as "unresolved".
+    - `restitution`: Newton's coefficient e_N of impacts [1], in [0, 1], for "hybrid" only; `None` is 0.
+    - `side`: "inside" or "outside" of a closed surface, "above" an open one; `None` is inside, or above.
+
+    **Raises:** `ValueError` if a part is of the wrong kind, if the top does not fit into the arena, if gravity is not
+    positive, or if the arena, the body or the friction does not allow the contact.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, surface=tippe.Cylinder(0.3), friction=tippe.Viscous(0.3))
+    >>> print(scene)
+    Scene
+      body      Top(mass=0.02 kg, radius=0.02 m, offset=0.006 m, I1=2.994e-06 kg m², I3=3.2e-06 kg m²)
+      surface   Cylinder(radius=0.3 m)
+      friction  Viscous(mu=0.3 s/m)
+      gravity   9.81 m/s²
+      contact   'stop'
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = {"gravity": "m s-2", "restitution": "1"}
+
+    body: AbstractBody
+    surface: AbstractSurface = Plane()
+    friction: AbstractFriction = Frictionless()
+    gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81)
+    contact: str = eqx.field(static=True, default="stop")
+    restitution: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)
+    side: str | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        if not isinstance(self.body, AbstractBody):
+            raise ValueError(f"body = {self.body!r} must be a Top, a SpheroidBody or a ConvexBody")
+        for name, part, kind in (
+            ("surface", self.surface, AbstractSurface),
+            ("friction", self.friction, AbstractFriction),
+        ):
+            if not isinstance(part, kind):
+                raise ValueError(f"{name} = {part!r} must be a {kind.__name__.removeprefix('Abstract')}")
+        # This raises if the surface has no such side.
+        self.surface.sign(self.side, "inside")
+        if self.contact not in ("stop", "hybrid"):
+            raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
+        if self.restitution is not None and self.contact == "stop":
+            raise ValueError(f"restitution = {self.restitution!r} must be left out where contact = 'stop'")
+        if not isinstance(self.body, Top):
+            self._check_convex(type(self.body).__name__)
+            return
+        if self.friction.set_valued and self.body.stem is not None:
+            raise ValueError(
+                f"friction = {self.friction!r} must be a law without phases for a top with a stem, such as Coulomb: which of "
+                "two contacts sticks and which slips has no single answer"
+            )
+        if self.contact == "stop" and self.body.stem is not None:
+            raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
+
+    def _check_convex(self, kind: str) -> None:
+        """Raise `ValueError` for what only a sphere can: its contact follows from the place of its centre."""
+        if not isinstance(self.surface, Plane):
+            raise ValueError(f"surface = {self.surface!r} must be a Plane for a {kind}; a Top runs on any arena")
+        if self.contact != "stop":
+            raise ValueError(f"contact = {self.contact!r} must be 'stop' for a {kind}; a Top flies on")
+        if self.friction.set_valued:
+            raise ValueError(f"friction = {self.friction!r} must be a law without phases for a {kind}, such as Coulomb")
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.gravity, "gravity", above=0.0)
+        yield from room_bounds(self.surface, self.surface.sign(self.side, "inside"), self.body.size)
+        if self.restitution is not None:
+            yield Bound(self.restitution, "restitution", at_least=0.0, at_most=1.0)
+
+    @property
+    def frame(self) -> AbstractFrame:
+        """The moving frame of the body on the arena."""
+        side, pull = self.surface.sign(self.side, "inside"), PULL * jnp.sqrt(self.gravity / self.body.size)
+        if self.contact == "hybrid" and not self.flies_in_closed_form:
+            # A flight takes the top anywhere: the frame that knows where it is.
+            return CarriedFrame.of(self.surface, self.body.size, pull, side)
+        return frame_of(self.surface, side, self.body.size, pull)
+
+    @property
+    def level(self) -> bool:
+        """Whether the arena is a level plane."""
+        return isinstance(self.surface, Plane) and self.surface.tilt is None
+
+    @property
+    def flies_in_closed_form(self) -> bool:
+        """Whether flights of a hybrid scene need no integration: over a level plane, under a law without phases of its own."""
+        return self.level and not self.friction.set_valued
+
+    @property
+    def dynamics(self) -> Dynamics | StickSlip:
+        """The equations of motion, with the combinations of the scene's numbers that they need."""
+        equations = StickSlip if self.friction.set_valued else Dynamics
+        return equations.of(self.body, self.frame, self.friction, self.gravity)
+
+    @property
+    def turning_dynamics(self) -> Dynamics | StickSlip:
+        """The equations of motion for questions about angles, times, energies or forces, whose answers are cheaper so.
+
+        On a level plane under an isotropic law the frame turns with the top, and how far it has turned is not known afterwards.
+        """
+        equations, body = self.dynamics, self.body
+        alike = isinstance(equations, Dynamics) and self.level and self.friction.isotropic
+        if not (alike and isinstance(body, Top)):
+            return equations
+        # The other tops, of group I (`steady.py`), soon stand upright with their axis beside L: turning would move both.
+        may_invert = 1.0 - body.offset / body.radius < body.I1 / body.I3
+        return equations.turning(jax.lax.stop_gradient(jnp.where(may_invert, TURNING, 0.0)))
+
+    def check_start(self, launch: Launch) -> None:
+        """Raise `ValueError` if a launch has no place on this arena."""
+        require_all(self.start_bounds(launch))
+
+    def start_bounds(self, launch: Launch) -> Iterator[Bound]:
+        """The ranges that the arena sets for a launch.
+
+        **Raises:** `ValueError` for a place with the wrong number of numbers.
+        """
+        surface = self.surface
+        names, kind = [name for name, _ in surface.coordinates], type(surface).__name__
+        if launch.place is None:
+            if len(names) == 3:
+                raise ValueError(f"place = None must be (x, y, z) on a {kind}, which names no place by eta")
+            if "eta" not in names and not isinstance(self.frame, PlaneFrame):
+                yield Bound(launch.eta, "eta", at_least=0.0, at_most=0.0, why=f"a place on a {kind} is given by place")
+            return
+        counts_from_below = len(launch.place) == 2 and names[0] == "mu"
+        for bound in surface.place_bounds(place_named(surface, launch.place), self.body.size):
+            if counts_from_below and bound.name == "place[1]":
+                yield Bound(launch.place[1], "place[1]", at_least=0.0, at_most=math.pi, why="from the lowest point")
+            else:
+                yield bound
+
+    def start(self, launch: Launch) -> tuple[tuple[Component, ...], tuple[Component, ...]]:
+        """Place and cyclic coordinates of the frame at the start of a run."""
+        if launch.place is None:
+            return self.frame.at_angle(launch.eta)
+        return self.frame.at_foot(self.surface.chart(place_named(self.surface, launch.place))[0])
+
+    def state(self, launch: Launch) -> Float[Array, "components ..."]:
+        """The state at the start of a run (see `state.py` for its components).
+
+        **Arguments:**
+
+        - `launch`: a `Launch` whose numbers, like the scene's, are scalars or one per lane.
+
+        **Returns:** an array (components, ...) in SI units.
+        """
+        body, sine, zero = self.body, jnp.sin(launch.theta), jnp.zeros_like(launch.theta)
+        e = (sine * jnp.cos(launch.azimuth), sine * jnp.sin(launch.azimuth), jnp.cos(launch.theta))
+        L, u = scale(body.I3 * launch.spin, e), launch.velocity or (zero, zero)
+        if launch.angular_velocity is not None:
+            turning = launch.angular_velocity
+            along = dot(turning, e)
+            L = sum_vectors(L, scale(body.I1, turning), scale((body.I3 - body.I1) * along, e))
+            u = sum_vectors(u, scale(multiply(-1.0, body.offset_of_path), cross(turning, e)[:2]))
+        return joined(u, e, L, self.start(launch)[0])
+
+    def scales(self, launch: Launch) -> Float[Array, "components ..."]:
+        """Magnitudes by which absolute errors of the state are measured, component by component.
+
+        Velocities count in units of sqrt(g R) with the body's size R, directions in units of 1, angular momenta in units of the
+        launch's own, or of I1 sqrt(g / R) where that is more. For a launch within `NEARLY_UPRIGHT` of the normal, what vanishes
+        with the tilt counts in proportion to it; otherwise errors would hide its growth, which decides when the top turns over.
+
+        **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
+        """
+        one = jnp.ones_like(launch.theta)
+        rate = jnp.sqrt(self.gravity / self.body.size)
+        velocity = rate * self.body.size
+        momentum = jnp.maximum(self.body.I3 * jnp.abs(launch.spin), self.body.I1 * rate)
+        if launch.angular_velocity is not None:
+            turning = launch.angular_velocity
+            momentum = jnp.maximum(momentum, self.body.I1 * jnp.sqrt(dot(turning, turning)))
+        place = scale(one, self.frame.place_scales)
+        tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
+        # A top that stands exactly upright has no growth to resolve.
+        tilt = jnp.where(tilt > 0.0, jnp.clip(tilt, 1e-280, 1.0), 1.0)
+        velocities, momenta = (velocity * tilt, velocity * tilt), (momentum * tilt, momentum * tilt, momentum)
+        return joined(velocities, (tilt, tilt, one), momenta, place)
+
+    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+        """Rate of change of the state: (m/s^2, 1/s, N m, 1/s) for (velocity, axis, angular momentum, place)."""
+        return self.dynamics.field(state)
+
+    def normal_force(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Force of the arena on the top along n [N]; at zero the contact is lost."""
+        return self.dynamics.motion(state).normal_force
+
+    def slip_velocity(self, state: Float[Array, "components ..."]) -> Float[Array, "2 ..."]:
+        """Velocity of the material contact point in the moving frame [m/s]."""
+        slip = self.dynamics.motion(state).slip
+        return jnp.stack([slip.x, slip.y])
+
+    def friction_power(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Power of friction N (f.v_s + tau.w) [W], at most 0 (`tippe.md`, section 2)."""
+        motion = self.dynamics.motion(state)
+        power = motion.friction_power
+        return jnp.zeros_like(motion.normal_force) if power is None else power
+
+    def energy(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Kinetic energy plus weight times the height of the centre of mass above the arena's lowest point [J]."""
+        body, dynamics = self.body, self.dynamics
+        (u1, u2), e, L, place = parts(state)
+        e3_dot = (L[0] * e[1] - L[1] * e[0]) / body.I1
+        speed2 = u1**2 + u2**2 + (body.outline.at(e[2]).offset * e3_dot) ** 2
+        axial = dot(L, e)
+        rotation = (dot(L, L) - axial**2) / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
+        height = dynamics.frame.height(place) + dot(body.mass_from_frame(e), dynamics.frame.vertical(place))
+        return 0.5 * body.mass * speed2 + rotation + body.mass * self.gravity * height
+
+    def jellett(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Jellett's quantity L.(R n - a e) [kg m^3/s]: for a sphere constant on the plane under every friction at the contact
+        point. Of other bodies -L.r, which is constant only nearly, and while they spin fast.
+
+        On a curved arena it changes at the rate R L.n', and a contact torque N tau changes it at the rate
+        N tau.(R n - a e) (`tippe.md`, section 2).
+        """
+        _, e, L, _ = parts(state)
+        lever = self.body.outline.at(e[2])
+        return lever.radius * L[2] - lever.offset * dot(e, L)
+
+    def theta(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Angle [rad] from the arena's normal to the axis, in [0, pi]."""
+        return inclination(parts(state).axis)
+
+    def spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Angular velocity about the axis, w.e [rad/s]."""
+        _, e, L, _ = parts(state)
+        return dot(e, L) / self.body.I3

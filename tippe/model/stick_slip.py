@@ -1,0 +1,237 @@
+"""Stick and slip under Coulomb's law as it stands: the two kinds of motion, when each ends, and what follows.
+
+Within the friction cone rolling is the only motion near zero slip, and a slip reaches zero in finite time. The direction of
+a slip has no limit there, and steps shrink with its speed; so the slip is stopped by a blow where the way that is left to
+slide, v^2 / (2 |v'|), is `LEFT` times the tolerance in units of R. Friction would have taken the same momentum in the time
+that was left, so the state errs by that way, in proportion to the tolerance. Rolling ends where mu N = |F_t|; from there the
+slip is begun by a step of its own (`onset.py`), whose estimated error is within the tolerance
+(`tests/physics/test_stick_slip.py` has the figures).
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from nonholonomic.geometry import AbstractFrame
+
+from .dynamics import FITS, Dynamics, Motion, least, stacked
+from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, Slip, length
+from .onset import Onset, begin
+from .rolling import RollingDynamics
+from .top import Top
+
+#: The way that is left to slide where a slip is stopped, over the tolerance and the radius. The state errs by a tenth of the
+#: tolerance at most, and falls with it; the time of the blow is early by the speed over the deceleration, 8e-8 s at 1e-11.
+LEFT = 0.1
+
+#: Slip speed, in units of sqrt(g R), below which a state counts as rolling: rounding leaves less. No run's course depends on
+#: it; where a slip begins the forces of the two kinds are the same in the limit.
+AT_REST = 1e-10
+
+#: The round-off that rolling is allowed in its grip: a top that stands upright needs none. It delays a slip by this over the
+#: rate of the grip, about 1e-14 s.
+ROUNDING = 1e-13
+
+
+class StickSlip(eqx.Module):
+    """The equations of motion of a scene with `SetValuedCoulomb`, in place of `Dynamics`.
+
+    A state whose contact is at rest rolls, any other slips.
+
+    - `slipping`: the equations of motion under the full force; `rolling`: those without slip.
+    - `mu`: coefficient of friction [1].
+    """
+
+    slipping: Dynamics
+    rolling: RollingDynamics
+    mu: Float[Array, "..."]
+
+    @classmethod
+    def of(
+        cls, body: Top, frame: AbstractFrame, friction: AbstractFriction, gravity: Float[Array, "..."]
+    ) -> "StickSlip":
+        """The equations for a body on an arena.
+
+        **Arguments:** as for `Dynamics.of`, with a `SetValuedCoulomb`.
+        """
+        assert isinstance(friction, SetValuedCoulomb)
+        slipping = Dynamics.of(body, frame, friction, gravity)
+        return cls(slipping, RollingDynamics.of(body, frame, gravity), friction.mu)
+
+    @property
+    def frame(self) -> AbstractFrame:
+        """The frame of the sphere on the arena."""
+        return self.slipping.frame
+
+    @property
+    def speed(self) -> Float[Array, "..."]:
+        """The speed sqrt(g R) [m/s]."""
+        return jnp.sqrt(self.slipping.gravity * self.rolling.radius)
+
+    @property
+    def per_transverse(self) -> Float[Array, "..."]:
+        """1 / I1 [1/(kg m^2)]."""
+        return self.slipping.per_transverse
+
+    def motion(self, state: Float[Array, "components ..."]) -> Motion:
+        """Evaluate the equations of the kind of motion that the state is in.
+
+        **Arguments:**
+
+        - `state`: (8 + the arena's place, ...) as `tippe/model/dynamics.py` states it.
+
+        **Returns:** a `Motion`.
+        """
+        slips = self.slip_speed(state) > AT_REST * self.speed
+        kinds = (self.slipping.motion(state), self.rolling.motion(state))
+        return jax.tree.map(lambda slipping, rolling: jnp.where(slips, slipping, rolling), *kinds)
+
+    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+        """Rate of change of the state, (components, ...)."""
+        return stacked(self.motion(state).rate, state)
+
+    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Normal force as a fraction of the weight, plus the round-off that a start with N = 0 exactly is allowed; or the
+        room that is left, if that is less."""
+        motion = self.motion(state)
+        margin = motion.normal_force / (self.slipping.mass * self.slipping.gravity) + 1e-12
+        return margin if motion.room is None else least(margin, motion.room - FITS)
+
+    def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+        """How a contact has ended whose margin is zero: a code in `LOSSES`. Only one that slips can jam."""
+        return self.slipping.loss(state)
+
+    def slip_speed(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Speed of the contact point along the arena [m/s]."""
+        slip = self.slipping.motion(state).slip
+        return length(slip.x, slip.y)
+
+    def stopped(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+        """The state after the blow that stops the slip."""
+        nothing = jnp.zeros_like(state[0])
+        return self.rolling.with_slip(state, Slip(nothing, nothing))
+
+    def lifts_off(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
+        """Where a contact at rest parts at once: without a force at the contact point, the arena need not push.
+
+        Unless the contact jams, the normal force of rolling's end, of the slip that follows and of no friction have one sign.
+        """
+        return dataclasses.replace(self.slipping, friction=Frictionless()).motion(state).normal_force <= 0.0
+
+    def grip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """What a rolling top has left before it slips, as a fraction of the weight."""
+        return self.rolling.grip(state, self.mu) + ROUNDING
+
+
+class Change(NamedTuple):
+    """What follows the end of a phase.
+
+    - `state`: from which the motion goes on, and whether it `rolls` then; `lost`: whether the contact is lost instead.
+    - `onset`: the beginning of the slip where it does not roll; it starts `wait` [s] after the phase has ended.
+    - `elapsed`: until the motion goes on [s].
+    """
+
+    state: Float[Array, "components ..."]
+    rolls: Bool[Array, "..."]
+    lost: Bool[Array, "..."]
+    onset: Onset
+    wait: Float[Array, "..."]
+    elapsed: Float[Array, "..."]
+
+
+class Kind(eqx.Module):
+    """One of the two kinds of motion of a `StickSlip`, in place of `Dynamics`: its contact margin is what ends it.
+
+    - `both`: the scene's equations; `tolerance`: relative, of the integration.
+    - `rolls`: which of the two.
+    """
+
+    both: StickSlip
+    tolerance: Float[Array, ""]
+    rolls: bool = eqx.field(static=True)
+
+    @property
+    def frame(self) -> AbstractFrame:
+        """The frame of the sphere on the arena."""
+        return self.both.frame
+
+    @property
+    def per_transverse(self) -> Float[Array, "..."]:
+        """1 / I1 [1/(kg m^2)]."""
+        return self.both.per_transverse
+
+    def motion(self, state: Float[Array, "components ..."]) -> Motion:
+        """The equations of motion of this kind."""
+        return (self.both.rolling if self.rolls else self.both.slipping).motion(state)
+
+    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+        """Rate of change of the state, (components, ...)."""
+        return stacked(self.motion(state).rate, state)
+
+    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Positive while this kind of motion lasts. Rolling leaves the friction cone before the normal force is zero."""
+        if self.rolls:
+            grip, room = self.both.grip_left(state), self.both.rolling.motion(state).room
+            return grip if room is None else least(grip, room - FITS)
+        return least(self.both.slipping.contact_margin(state), self.slip_left(state))
+
+    def slip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Slip speed above that at which a slip is over, in units of sqrt(g R). A slip that grows is never over."""
+        speed, change = self._slowing(state)
+        way = LEFT * self.tolerance * self.both.rolling.radius
+        return (speed - jnp.sqrt(2.0 * way * jnp.maximum(-change, 0.0))) / self.both.speed
+
+    def _slowing(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """The slip's speed [m/s] and its rate."""
+        return jax.jvp(self.both.slip_speed, (state,), (self.both.slipping.field(state),))
+
+    def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+        """How a contact has ended whose margin is zero: a code in `LOSSES`."""
+        return self.both.loss(state)
+
+    def ended(
+        self,
+        state: Float[Array, "components ..."],
+        size: int,
+        slipping: Callable[[Float[Array, "components ..."]], Float[Array, "components ..."]],
+        scales: Float[Array, "components ..."],
+        left: Float[Array, "..."],
+    ) -> Change:
+        """What follows where this kind of motion has ended.
+
+        **Arguments:**
+
+        - `state`: (components, ...), where the margin is 0; the equations know the first `size` components.
+        - `slipping`: rate of the whole state while it slips; `scales`: its magnitudes.
+        - `left`: time [s] to the horizon, which a slip's beginning does not pass.
+        """
+        both, own, rest = self.both, state[:size], state[size:]
+        still = both.stopped(own)
+        nothing = jnp.zeros_like(own[0])
+        if self.rolls:
+            holds = nothing > 0.0
+            # What ended is either the grip or the room; or there was no contact to begin with, as behind an impact.
+            room, lost = both.rolling.motion(own).room, both.lifts_off(still)
+            lost = lost if room is None else lost | (room - FITS <= both.grip_left(own))
+            wait = nothing
+        else:
+            holds = both.rolling.grip(still, both.mu) >= 0.0
+            lost = both.slipping.contact_margin(own) <= self.slip_left(own)
+            # A slip that only turns round goes on through zero, which it reaches in the time that is left of it.
+            speed, change = self._slowing(own)
+            slows = change < 0.0
+            wait = jnp.where(slows & ~holds & ~lost, -speed / jnp.where(slows, change, 1.0), 0.0)
+            wait = jnp.minimum(wait, left)
+            still = still + wait * both.rolling.field(still + 0.5 * wait * both.rolling.field(still))
+            rest = rest + wait * slipping(state)[size:]
+        whole = jnp.concatenate([still, rest])
+        slips = ~(holds | lost)
+        most = jnp.where(slips, left - wait, 0.0)
+        onset = begin(both.slipping, both.rolling, both.mu, slipping, whole, size, scales, most, self.tolerance)
+        after = jnp.where(slips, onset.end, jnp.where(lost, state, whole))
+        return Change(after, holds, lost, onset, wait, wait + jnp.where(slips, onset.length, 0.0))

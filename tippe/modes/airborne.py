@@ -1,0 +1,328 @@
+"""Contact lost and found on any arena: phases of sliding and of flight, for a top without a stem (`airborne_stem.py` has one).
+
+In contact the state is that of `tippe/model/state.py` with a `CarriedFrame`, 14 components. In flight it is, in the surface's
+axes, the place of the centre of mass [m], its velocity [m/s], the axis, the angular momentum about it, and two zeros. A flight
+ends where the distance of the centre of a sphere from the arena has come back to its radius; then that sphere strikes the
+tangent plane there (`impact.py`). theta counts from the normal below the top's own sphere, whichever touches.
+
+A single run whose path is kept carries five more: the vector c of `trajectory_problem.py`, in the frame in contact, in the
+surface's axes in flight; the angle by which the top has turned about its axis [rad]; and the work of friction and impacts [J].
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from nonholonomic.geometry import (
+    CarriedFrame,
+    Component,
+    Vector,
+    carried,
+    cross,
+    dot,
+    scale,
+    subtract,
+    sum_vectors,
+    tangents,
+)
+from nonholonomic.hybrid import Passage
+from nonholonomic.integration import FAILED, GUARD_LOST, RUNNING, AbstractProblem
+from nonholonomic.xla_cpu import compiled_setup
+
+from ..model.dynamics import COS_THETA, Dynamics, stacked
+from ..model.scene import Scene
+from ..model.state import joined, parts
+from .exact_impact import strike_exactly
+from .flying_phase import AbstractFlyingPhase
+from .free_body import Ball, FreeBody, axis_rate, balls, energy, gap_rate, standing_on, still_parting
+from .impact import strike
+from .inversion_problem import InversionProblem
+
+#: The numbers of the phases. The last two are those of a top with a stem: that slides; or a sphere is about to strike, and the
+#: state is that of a flight.
+SLIDING, FLYING, ON_STEM, STRIKING = range(4)
+
+#: Components of a state, behind which others may ride along.
+OWN = 14
+
+#: A rebound slower than this fraction of sqrt(g R) is none: the contact closes, as in `sliding.py`. Ten times the value moves
+#: places and axes after the last bounce by 5e-13, inversion times after 270 flights in a bowl by 3e-13 of themselves.
+CLOSING_SPEED = 1e-5
+
+
+class Aloft(NamedTuple):
+    """A state of flight, taken apart, in the surface's axes."""
+
+    place: Vector
+    velocity: Vector
+    axis: Vector
+    momentum: Vector
+
+
+def aloft(state: Float[Array, "components ..."]) -> Aloft:
+    """The parts of a state of flight."""
+    rows = tuple(state[k] for k in range(12))
+    return Aloft(rows[:3], rows[3:6], rows[6:9], rows[9:12])
+
+
+class Below(NamedTuple):
+    """The arena below a sphere of a flying top: the foot of its centre, the frame (t1, t2, n) there, and the gap [m]."""
+
+    foot: Vector
+    axes: tuple[Vector, Vector, Vector]
+    gap: Component
+
+
+def below(scene: Scene, flying: Aloft, ball: Ball | None = None) -> Below:
+    """What a flying top has below one of its spheres, by default its own."""
+    frame, ball = carried_frame(scene), balls(scene.body)[0] if ball is None else ball
+    centre = sum_vectors(flying.place, scale(ball.offset, flying.axis))
+    foot = tuple(0.0 * centre[0] if part is None else part for part in scene.surface.nearest(centre))
+    n = frame.normal(foot)
+    away = dot(tuple(subtract(a, b) for a, b in zip(centre, foot, strict=True)), n)
+    return Below(foot, (*tangents(n), n), away - ball.radius)
+
+
+def carried_frame(scene: Scene) -> CarriedFrame:
+    """The frame of a scene whose contact may be lost and found."""
+    assert isinstance(scene.frame, CarriedFrame)
+    return scene.frame
+
+
+def seen(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
+    """Components of a vector in a frame."""
+    return (dot(vector, axes[0]), dot(vector, axes[1]), dot(vector, axes[2]))
+
+
+def unseen(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
+    """The vector with given components in a frame."""
+    return tuple(sum_vectors(*(scale(part, axis) for part, axis in zip(vector, axes, strict=True))))
+
+
+def freed(scene: Scene, flying: Aloft, ground: Below, ball: Ball | None = None) -> FreeBody:
+    """A flying top as a free body above the tangent plane below one of its spheres, by default its own."""
+    velocity, axis, momentum = (seen(part, ground.axes) for part in flying[1:])
+    ball = balls(scene.body)[0] if ball is None else ball
+    height = ball.radius + ground.gap - ball.offset * axis[2]
+    return FreeBody(velocity, height, axis, momentum)
+
+
+def in_contact(ground: Below, free: FreeBody) -> Float[Array, "14 ..."]:
+    """The state of a top in contact at the foot below it; in flight what it would be but for the distance."""
+    return joined(free.velocity[:2], free.axis, free.momentum, ground.foot, ground.axes[0])
+
+
+def in_flight(place: Vector, axes: tuple[Vector, Vector, Vector], free: FreeBody) -> Float[Array, "14 ..."]:
+    """The state of flight of a body whose velocity, axis and momentum are given in a frame."""
+    zero = jnp.zeros_like(place[0])
+    return joined(place, *(unseen(part, axes) for part in (free.velocity, free.axis, free.momentum)), (zero, zero))
+
+
+def standing(scene: Scene, ball: Ball) -> Dynamics:
+    """The equations of motion of a top that stands on one of its spheres."""
+    frame = dataclasses.replace(carried_frame(scene), distance=ball.radius)
+    return dataclasses.replace(standing_on(scene.dynamics, ball), frame=frame)
+
+
+# A single run asks before every phase, outside of its programs, whether it is over as it begins.
+@compiled_setup
+def nearing(scene: Scene, flying: Aloft, ball: Ball, rounding: float = 0.0) -> Float[Array, "..."]:
+    """Distance of a sphere from the arena as a fraction of R, plus the round-off of a parting.
+
+    **Arguments:** `rounding`: what is allowed besides that.
+    """
+    body, ground = scene.body, below(scene, flying, ball)
+    rate = gap_rate(body, ball, freed(scene, flying, ground, ball))
+    far = sum(jnp.abs(part) for part in flying.place)
+    rounding = rounding + 4.0 * jnp.finfo(far.dtype).eps * far / body.radius
+    return ground.gap / body.radius + still_parting(rate, scene.gravity, body.radius, rounding)
+
+
+class Contact(AbstractProblem):
+    """Sliding until theta reaches an angle or the contact ends; `axial` [kg m^2] is `None` where nothing rides along."""
+
+    dynamics: Dynamics
+    cos_angle: Float[Array, "..."]
+    states: Float[Array, "components cells"]
+    scales: Float[Array, "components cells"]
+    axial: Float[Array, "..."] | None
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        return self.states, self.scales
+
+    def field(self, time, state):
+        motion = self.dynamics.motion(state[:OWN])
+        if self.axial is None:
+            return stacked(motion.rate, state)
+        _, e, L, _ = parts(state[:OWN])
+        across = tuple(state[OWN + k] for k in range(3))
+        falls = -dot(cross(L, e), across) * self.dynamics.per_transverse
+        riding = (*sum_vectors(scale(falls, e), carried(across, motion.turning)), motion.spin_momentum / self.axial)
+        return stacked((*motion.rate, *riding, motion.friction_power), state)
+
+    def crossing(self, state):
+        return state[COS_THETA] - self.cos_angle
+
+    def guard(self, time, state):
+        return self.dynamics.contact_margin(state[:OWN])
+
+
+class Flight(AbstractProblem):
+    """Flying until theta reaches an angle or a sphere is back at the arena; `falls` is the acceleration [m/s^2]."""
+
+    scene: Scene
+    cos_angle: Float[Array, "..."]
+    states: Float[Array, "components cells"]
+    scales: Float[Array, "components cells"]
+    falls: Vector
+    rides: bool = eqx.field(static=True)
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        return self.states, self.scales
+
+    def field(self, time, state):
+        flying, body = aloft(state), self.scene.body
+        turning = axis_rate(body, flying.axis, flying.momentum)
+        rates = (*flying.velocity, *self.falls, *turning, None, None, None, None, None)
+        if self.rides:
+            across = tuple(state[OWN + k] for k in range(3))
+            carry = scale(-1.0 * dot(turning, across), flying.axis)
+            rates = (*rates, *carry, dot(flying.momentum, flying.axis) / body.I3, None)
+        return stacked(rates, state)
+
+    def crossing(self, state):
+        flying = aloft(state)
+        return dot(flying.axis, below(self.scene, flying).axes[2]) - self.cos_angle
+
+    def guard(self, time, state):
+        flying = aloft(state)
+        margins = (nearing(self.scene, flying, ball) for ball in balls(self.scene.body))
+        return functools.reduce(jnp.minimum, margins)
+
+
+class Slide(AbstractFlyingPhase):
+    """Sliding on the arena."""
+
+    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+        return Contact(self.scene.dynamics, self.cos_angle, state, self.scales, self.axial)
+
+    def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
+        return jnp.concatenate([state, jnp.zeros_like(state[:2])])
+
+    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+        """Fly where the contact is lost, end where it jams or the ball does not fit. It counts the flights."""
+        ends, zero = self.scene.dynamics.loss(state[:OWN]) > 0, jnp.zeros_like(state[0])
+        return Passage(
+            phase=jnp.where(ends, SLIDING, FLYING),
+            state=jnp.where(ends, state, parted(self.scene, state, self.rides)),
+            elapsed=zero,
+            status=jnp.where(ends, GUARD_LOST, RUNNING),
+            crossing_time=jnp.full_like(zero, jnp.inf),
+            counts=(~ends).astype(int)[None],
+        )
+
+
+def parted(
+    scene: Scene, state: Float[Array, "components ..."], rides: bool, ball: Ball | None = None
+) -> Float[Array, "components ..."]:
+    """The state of flight of a top that has lost the contact in which its state is given, with what rides along if any.
+
+    **Arguments:** `ball`: the sphere that touched, by default the top's own.
+    """
+    body, frame, (u, e, L, place) = scene.body, carried_frame(scene), parts(state[:OWN])
+    ball = balls(body)[0] if ball is None else ball
+    # Errors of the steps take the foot off the arena: a flight that began below it would end where it begins.
+    place = (*scene.surface.nearest(place[:3]), *place[3:])
+    axes = frame.own_axes(place)
+    velocity = (*u, -ball.offset * axis_rate(body, e, L)[2])
+    centre = sum_vectors(place[:3], scale(ball.radius, axes[2]))
+    s = sum_vectors(centre, scale(-ball.offset, unseen(e, axes)))
+    flies = in_flight(s, axes, FreeBody(velocity, jnp.zeros_like(state[0]), e, L))
+    if not rides:
+        return flies
+    across = unseen(tuple(state[OWN + k] for k in range(3)), axes)
+    return jnp.concatenate([flies, jnp.stack(across), state[OWN + 3 :]])
+
+
+class Fly(AbstractFlyingPhase):
+    """Flying over the arena."""
+
+    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+        velocity, momentum = self.scales[0], self.scales[7]
+        one = jnp.ones_like(velocity)
+        rows = [one * self.scene.body.radius] * 3 + [velocity] * 3 + [one] * 3 + [momentum] * 3 + [one] * 2
+        scales = jnp.concatenate([jnp.stack(rows), self.scales[OWN:]])
+        falls = scale(-1.0 * self.scene.gravity, self.scene.surface.up)
+        return Flight(self.scene, self.cos_angle, state, scales, falls, self.rides)
+
+    def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
+        flying = aloft(state)
+        ground = below(self.scene, flying)
+        free = freed(self.scene, flying, ground)
+        across = seen(tuple(state[OWN + k] for k in range(3)), ground.axes)
+        rate = gap_rate(self.scene.body, balls(self.scene.body)[0], free)
+        rows = [jnp.stack(across), state[OWN + 3 :], jnp.stack([ground.gap, rate])]
+        return jnp.concatenate([in_contact(ground, free), *rows])
+
+    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+        """Strike the arena; rebound, or slide on where the rebound would be slow. It counts the flights that begin."""
+        scene, flying = self.scene, aloft(state)
+        ground = below(scene, flying)
+        ball, free, zero = balls(scene.body)[0], freed(scene, flying, ground), jnp.zeros_like(state[0])
+        speed = jnp.maximum(-gap_rate(scene.body, ball, free), 0.0)
+        bounce = zero if scene.restitution is None else scene.restitution + zero
+        rebounds = bounce * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
+        blow = strike_exactly if scene.friction.set_valued else strike
+        struck, fails = blow(scene.body, scene.friction, ball, free, jnp.where(rebounds, bounce, 0.0))
+        # Where the landing was located a little below the arena, the next flight would end where it begins.
+        lifted = tuple(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
+        after = jnp.where(rebounds, in_flight(lifted, ground.axes, struck), in_contact(ground, struck))
+        if self.rides:
+            across = tuple(state[OWN + k] for k in range(3))
+            across = jnp.where(rebounds, jnp.stack(across), jnp.stack(seen(across, ground.axes)))
+            gained = energy(scene.body, 0.0, struck) - energy(scene.body, 0.0, free)
+            after = jnp.concatenate([after, across, state[OWN + 3 :].at[1].add(gained)])
+        return Passage(
+            phase=jnp.where(rebounds, FLYING, SLIDING),
+            state=after,
+            elapsed=zero,
+            status=jnp.where(fails, FAILED, RUNNING),
+            crossing_time=jnp.full_like(zero, jnp.inf),
+            counts=rebounds.astype(int)[None],
+        )
+
+
+def phases(
+    scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
+) -> tuple[tuple[AbstractFlyingPhase, ...], Int[Array, " cells"]]:
+    """The phases of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`."""
+    given = (scene, problem.scales, problem.cos_angle, rides)
+    return (Slide(*given), Fly(*given)), jnp.zeros(problem.states.shape[1:], int)
+
+
+def on_the_ground(
+    scene: Scene, state: Float[Array, "components cells"], phase: Int[Array, " cells"]
+) -> Float[Array, "14 cells"]:
+    """States of runs in the layout of a contact of the top's own sphere; others as they are seen from the foot below that."""
+    flies, flown = phase == FLYING, state[:OWN]
+    if scene.body.stem is not None:
+        on_stem = phase == ON_STEM
+        flies, flown = phase != SLIDING, jnp.where(on_stem, parted(scene, flown, False, balls(scene.body)[1]), flown)
+    flying = aloft(flown)
+    ground = below(scene, flying)
+    return jnp.where(flies, in_contact(ground, freed(scene, flying, ground)), state[:OWN])
+
+
+def loss(scene: Scene, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+    """How a contact has ended that was not merely lost: a code in `tippe.dynamics.LOSSES`."""
+    own, state = scene.dynamics, state[:OWN]
+    if scene.body.stem is None:
+        return own.loss(state)
+    # It is the sphere that touched whose margin has vanished.
+    stem = standing(scene, balls(scene.body)[1])
+    on_stem = jnp.abs(stem.contact_margin(state)) < jnp.abs(own.contact_margin(state))
+    return jnp.where(on_stem, stem.loss(state), own.loss(state))

@@ -1,0 +1,246 @@
+"""Contact lost and found on any arena by a top with a stem: sliding on either sphere, flights, and the blows of both.
+
+States are those of `airborne.py`. A top that slides on its stem has a frame of its own, carried along by the stem's sphere: its
+place is the foot below that. On a curved arena the feet of both spheres are apart and so are the normals there: each sphere
+strikes the tangent plane at its own foot. A top that comes to rest on both ends there as `UNRESOLVED`, because the equations of
+leaning are those of the plane (`leaning.py`).
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from nonholonomic.geometry import dot, scale, sum_vectors
+from nonholonomic.hybrid import Passage
+from nonholonomic.integration import FAILED, GUARD_LOST, RUNNING, UNRESOLVED, AbstractProblem
+from nonholonomic.xla_cpu import compiled_setup
+
+from ..model.scene import Scene
+from ..model.state import COS_THETA
+from .airborne import (
+    CLOSING_SPEED,
+    FLYING,
+    ON_STEM,
+    OWN,
+    SLIDING,
+    STRIKING,
+    Aloft,
+    Below,
+    Contact,
+    Flight,
+    Fly,
+    aloft,
+    below,
+    freed,
+    in_contact,
+    in_flight,
+    nearing,
+    parted,
+    seen,
+    standing,
+    unseen,
+)
+from .flying_phase import AbstractFlyingPhase
+from .free_body import Ball, FreeBody, balls, energy, gap_rate
+from .impact import strike
+from .inversion_problem import InversionProblem
+
+#: Two spheres are at the arena together if neither is farther from it than this fraction of R, as in `sliding.py`.
+TOUCHING = 1e-9
+
+#: How far the other sphere may be in the arena while it parts, as a fraction of R: where its landing was located a little late.
+OVERLAP = 1e-11
+
+
+class OneOfTwo(AbstractProblem):
+    """Sliding on one of two spheres until theta reaches an angle, the contact ends, or the other sphere is at the arena.
+
+    `contact` is the sliding; `own` and `other` are the spheres; `on_stem` says whether the stem is the one that slides.
+    """
+
+    scene: Scene
+    contact: Contact
+    own: Ball
+    other: Ball
+    on_stem: Bool[Array, ""]
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        return self.contact.start()
+
+    def field(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
+        return self.contact.field(time, state)
+
+    def crossing(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+        # The angle from the normal below the top's own sphere; it is that of the state if that sphere slides.
+        flying = aloft(parted(self.scene, state[:OWN], False, self.own))
+        apart = dot(flying.axis, below(self.scene, flying, self.other).axes[2])
+        return jnp.where(self.on_stem, apart, state[COS_THETA]) - self.contact.cos_angle
+
+    def guard(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+        return jnp.minimum(self.contact.guard(time, state), clearance(self.scene, self.own, self.other, state))
+
+
+@compiled_setup
+def clearance(scene: Scene, own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    """Distance of the other sphere from the arena as a fraction of R, plus the round-off of a parting."""
+    return nearing(scene, aloft(parted(scene, state[:OWN], False, own)), other, OVERLAP)
+
+
+class SlideOnOne(AbstractFlyingPhase):
+    """Sliding on the sphere numbered `number`, in the order of `free_body.balls`.
+
+    The number is an array, so that one program serves both spheres.
+    """
+
+    number: Int[Array, ""]
+
+    @property
+    def spheres(self) -> tuple[Ball, Ball]:
+        """The sphere that slides, and the other one."""
+        return own_and_other(self.scene, self.number)
+
+    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+        own, other = self.spheres
+        contact = Contact(standing(self.scene, own), self.cos_angle, state, self.scales, self.axial)
+        return OneOfTwo(self.scene, contact, own, other, self.number == 1)
+
+    def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
+        flight = Fly(self.scene, self.scales, self.cos_angle, self.rides)
+        beside = flight.shown(parted(self.scene, state, True, self.spheres[0]))
+        return jnp.where(self.number == 1, beside, jnp.concatenate([state, jnp.zeros_like(state[:2])]))
+
+    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+        """Fly where the contact is lost, strike with the other sphere where that is at the arena, end where the contact jams or
+        the sphere does not fit. It counts the flights."""
+        own, other = self.spheres
+        dynamics, zero = standing(self.scene, own), jnp.zeros_like(state[0])
+        lands = clearance(self.scene, own, other, state) <= dynamics.contact_margin(state[:OWN])
+        ends = (dynamics.loss(state[:OWN]) > 0) & ~lands
+        return Passage(
+            phase=jnp.where(ends, jnp.where(self.number == 0, SLIDING, ON_STEM), jnp.where(lands, STRIKING, FLYING)),
+            state=jnp.where(ends, state, parted(self.scene, state, self.rides, own)),
+            elapsed=zero,
+            status=jnp.where(ends, GUARD_LOST, RUNNING),
+            crossing_time=jnp.full_like(zero, jnp.inf),
+            counts=(~ends & ~lands).astype(int)[None],
+        )
+
+
+class FlightToBlow(AbstractProblem):
+    """A flight that is over as it begins where a sphere is at the arena already (`strikes`)."""
+
+    flight: Flight
+    strikes: Bool[Array, ""]
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        return self.flight.start()
+
+    def field(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
+        return self.flight.field(time, state)
+
+    def crossing(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+        return self.flight.crossing(state)
+
+    def guard(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+        return jnp.where(self.strikes, -1.0, self.flight.guard(time, state))
+
+
+class FlyBoth(Fly):
+    """Flying over the arena, with two spheres that can land; or the instant before a blow, if it `strikes`.
+
+    That is an array, so that one program serves both.
+    """
+
+    strikes: Bool[Array, ""]
+
+    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+        return FlightToBlow(super().problem(state), self.strikes)
+
+    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+        """Strike the arena with the sphere that is there; rebound, or slide on it where the rebound would be slow.
+
+        If the blow throws the other sphere into the arena, that strikes next. It counts the flights that begin.
+        """
+        scene, flying, zero = self.scene, aloft(state), jnp.zeros_like(state[0])
+        main, stem = (nearing(scene, flying, ball) for ball in balls(scene.body))
+        number = (stem < main).astype(int)
+        own, other = own_and_other(scene, number)
+        ground = below(scene, flying, own)
+        # Where the landing was located a little below the arena, the next phase would end where it begins.
+        flying = flying._replace(place=tuple(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
+        ground = ground._replace(gap=zero)
+        blow = struck(scene, flying, ground, own, other)
+        flies = blow.rebounds | blow.throws
+        after = in_flight(flying.place, ground.axes, blow.free)
+        after = jnp.where(flies, after, in_contact(ground, blow.free))
+        if self.rides:
+            across = tuple(state[OWN + k] for k in range(3))
+            across = jnp.where(flies, jnp.stack(across), jnp.stack(seen(across, ground.axes)))
+            gained = energy(scene.body, 0.0, blow.free) - energy(scene.body, 0.0, freed(scene, flying, ground, own))
+            after = jnp.concatenate([after, across, state[OWN + 3 :].at[1].add(gained)])
+        slides = jnp.where(number == 0, SLIDING, ON_STEM)
+        return Passage(
+            phase=jnp.where(blow.throws, STRIKING, jnp.where(blow.rebounds, FLYING, slides)),
+            state=after,
+            elapsed=zero,
+            status=jnp.where(blow.fails, FAILED, jnp.where(blow.rests, UNRESOLVED, RUNNING)),
+            crossing_time=jnp.full_like(zero, jnp.inf),
+            counts=(blow.rebounds & ~blow.throws).astype(int)[None],
+        )
+
+
+class Blow(NamedTuple):
+    """What a blow does.
+
+    - `free`: the top after it, above the tangent plane.
+    - `rebounds`: whether it flies off; `throws`: whether the other sphere is thrown into the arena; `rests`: whether the top is
+      at rest on both; `fails`: whether the blow could not be computed.
+    """
+
+    free: FreeBody
+    rebounds: Bool[Array, " cells"]
+    throws: Bool[Array, " cells"]
+    rests: Bool[Array, " cells"]
+    fails: Bool[Array, " cells"]
+
+
+def struck(scene: Scene, flying: Aloft, ground: Below, own: Ball, other: Ball) -> Blow:
+    """The blow of one sphere, on the tangent plane at its foot; slow rebounds are none.
+
+    **Arguments:** `flying`: the top, its sphere `own` at the arena; `ground`: below that sphere; `other`: the other one.
+    """
+    body, closing = scene.body, CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
+    free = freed(scene, flying, ground, own)
+    speed = jnp.maximum(-gap_rate(body, own, free), 0.0)
+    bounce = jnp.zeros_like(speed) if scene.restitution is None else scene.restitution
+    rebounds = bounce * speed > closing
+    after, fails = strike(body, scene.friction, own, free, jnp.where(rebounds, bounce, 0.0))
+    thrown = flying._replace(velocity=unseen(after.velocity, ground.axes), momentum=unseen(after.momentum, ground.axes))
+    beside = below(scene, flying, other)
+    before, now = (gap_rate(body, other, freed(scene, one, beside, other)) for one in (flying, thrown))
+    touches = beside.gap < TOUCHING * body.radius
+    rests = touches & ~rebounds & (speed <= closing) & (jnp.abs(before) <= closing)
+    return Blow(after, rebounds, touches & ~rests & (now < -closing), rests, fails)
+
+
+def own_and_other(scene: Scene, number: Int[Array, "..."]) -> tuple[Ball, Ball]:
+    """The sphere of a top with a number, and the other one."""
+    main, stem = balls(scene.body)
+    own = Ball(*(jnp.where(number == 0, a, b) for a, b in zip(main, stem, strict=True)))
+    return own, Ball(*(jnp.where(number == 0, b, a) for a, b in zip(main, stem, strict=True)))
+
+
+def phases(
+    scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
+) -> tuple[tuple[AbstractFlyingPhase, ...], Int[Array, " cells"]]:
+    """The phases of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`.
+
+    A launch in which the stem would be in the arena starts on the stem: its place and its theta are those of the stem's foot.
+    """
+    given, (main, stem) = (scene, problem.scales, problem.cos_angle, rides), balls(scene.body)
+    started = aloft(parted(scene, problem.states[:OWN], False, main))
+    first = jnp.where(below(scene, started, stem).gap < 0.0, ON_STEM, SLIDING)
+    slides = [SlideOnOne(*given, jnp.asarray(number)) for number in (0, 1)]
+    flies, strikes = (FlyBoth(*given, jnp.asarray(strikes)) for strikes in (False, True))
+    return (slides[0], flies, slides[1], strikes), first

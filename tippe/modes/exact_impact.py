@@ -1,0 +1,155 @@
+"""Impact under Coulomb's law as it stands: the slip may stop, and the contact then sticks or slips on.
+
+As in `impact.py` the normal impulse p is the clock, and the contact's velocity changes by the constant matrix W. While it slips
+the tangential impulse grows by -mu v / |v|, whose direction has no limit where a slip stops. With the way of the slip as the
+clock, ds = dp / |v|, nothing is singular, v' = |v| W_n - mu W_t v, and a slip that stops does so exponentially in s.
+
+From a stop on the tangential impulse per p is, of all f with |f| <= mu, that with the least f.W_tt f / 2 + f.W_tn: v then
+grows along -f if |f| = mu, and stays zero if |f| < mu. W_tt being positive definite, there is one such f, (W_tt + k) f = -W_tn
+with k >= 0: the way on is unique, straight, and lasts to the end. The normal velocity grows on it.
+"""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from nonholonomic.geometry import Vector, dot, scale, sum_vectors
+from nonholonomic.integration import GUARD_LOST, AbstractProblem, Settings, traced_march
+
+from ..model.dynamics import least
+from ..model.friction import SetValuedCoulomb, length
+from ..model.top import Top
+from .free_body import Ball, FreeBody
+from .impact import LARGEST, MOST_STEPS, TOLERANCE, Blow, Impact, approach, struck
+
+Cells = Float[Array, " cells"]
+
+#: A slip has stopped where its speed is this part of that with which the sphere arrives. The impulse errs by as much at most.
+#: Errors of the integration, a tenth of its tolerance, must be less.
+STOPS = 1e-11
+
+#: Newton's iterations for the force after a stop. They converge from one side, in six or so.
+ITERATIONS = 30
+
+
+class Skid(AbstractProblem):
+    """The slipping part of impacts: tangential and normal impulse as the state, the way of the slip as the time.
+
+    - `impact`: the impacts, in whose units the impulses are; `pace`: the speed with which the sphere arrives [m/s].
+    """
+
+    impact: Impact
+    mu: Float[Array, "..."]
+    pace: Cells
+
+    def velocity(self, state: Float[Array, "3 cells"]) -> Vector:
+        """Velocity of the contact point [m/s]."""
+        meets, blow = self.impact.approach, self.impact.blow(state[2], state[:2])
+        changes = tuple(dot(column, blow.force) for column in meets.response)
+        return sum_vectors(meets.velocity, changes)
+
+    def start(self) -> tuple[Float[Array, "3 cells"], Float[Array, "3 cells"]]:
+        none = jnp.zeros((3, *self.pace.shape))
+        return none, jnp.ones_like(none)
+
+    def field(self, time: Cells, state: Float[Array, "3 cells"]) -> Float[Array, "3 cells"]:
+        v1, v2, _ = self.velocity(state)
+        return jnp.stack([-self.mu * v1, -self.mu * v2, length(v1, v2)]) / self.pace
+
+    def crossing(self, state: Float[Array, "3 cells"]) -> None:
+        return None
+
+    def guard(self, time: Cells, state: Float[Array, "3 cells"]) -> Cells:
+        return least(self.impact.guard(state[2], state[:2]), self.slip_left(state))
+
+    def slip_left(self, state: Float[Array, "3 cells"]) -> Cells:
+        """Slip speed above that at which a slip has stopped, as a part of the speed of arrival."""
+        return length(*self.velocity(state)[:2]) / self.pace - STOPS
+
+
+def strike_exactly(
+    body: Top, friction: SetValuedCoulomb, ball: Ball, free: FreeBody, restitution: Cells
+) -> tuple[FreeBody, Bool[Array, " cells"]]:
+    """The body after a sphere of it has struck the plane; where the contact sticks, its slip is zero but for round-off.
+
+    **Arguments, returns:** as for `strike`, of which it is the limit for a slip speed of 0.
+    """
+    meets = approach(body, ball, free)
+    impact = Impact(body, friction, meets, ball.radius, (1.0 + restitution) * jnp.maximum(-meets.velocity[2], 0.0))
+    pace = jnp.maximum(length(*meets.velocity[:2]), impact.speed)
+    skid = Skid(impact, friction.mu, pace)
+    settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=0.1, max_steps=MOST_STEPS)
+    outcome, _ = traced_march(skid, jnp.asarray(LARGEST), jnp.asarray(pace.shape[0]), settings)
+    stops = skid.slip_left(outcome.state) <= STOPS
+    rates = skid.field(outcome.end_time, outcome.state)
+    # An impact that ends while it slips is put right by one step of Newton's method, as in `Impact.ended`.
+    left, slope = jax.jvp(lambda at: impact.guard(at[2], at[:2]), (outcome.state,), (rates,))
+    step = -left / jnp.where(slope == 0.0, 1.0, slope)
+    step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
+    state = jnp.where(stops, outcome.state, outcome.state + step * rates)
+    blow = impact.blow(state[2], state[:2])
+    onward = _onward(impact, friction.mu, blow.force)
+    force = tuple(jnp.where(stops, a + b, a) for a, b in zip(blow.force, onward, strict=True))
+    return struck(body, meets, free, Blow(force, None)), outcome.status != GUARD_LOST
+
+
+def _onward(impact: Impact, mu: Float[Array, "..."], blow: Vector) -> Vector:
+    """The impulse [N s] from the stop of the slip to the end of the impact."""
+    meets = impact.approach
+    W = meets.response
+    a, b, c = W[0][0], W[0][1], W[1][1]
+    f1, f2 = sticking_force((a, b, c), (W[0][2], W[1][2]), mu)
+
+    def change(force: Vector) -> Vector:
+        return tuple(dot(column, force) for column in W)
+
+    # Where it sticks, a blow first takes the slip that was left.
+    v1, v2, _ = sum_vectors(meets.velocity, change(blow))
+    sticks, determinant = f1 * f1 + f2 * f2 < mu * mu, a * c - b * b
+    rest = (
+        jnp.where(sticks, (b * v2 - c * v1) / determinant, 0.0),
+        jnp.where(sticks, (b * v1 - a * v2) / determinant, 0.0),
+    )
+    blow = sum_vectors(blow, (*rest, None))
+    velocity, along = sum_vectors(meets.velocity, change(blow)), (f1, f2, jnp.ones_like(f1))
+    # It ends as `Impact.guard` says: the normal velocity grows in proportion, the energy as a parabola.
+    gains = change(along)
+    wanted = jnp.maximum((meets.velocity[2] + impact.gained - velocity[2]) / gains[2], 0.0)
+    compressed = jnp.maximum(-velocity[2], 0.0) / gains[2]
+    power, stiff = dot(along, velocity), dot(along, gains)
+    gain = jnp.minimum(dot(blow, meets.velocity) + 0.5 * dot(blow, change(blow)), 0.0)
+    restored = (-power + jnp.sqrt(power * power - 2.0 * gain * stiff)) / stiff
+    return sum_vectors(scale(jnp.minimum(wanted, jnp.maximum(compressed, restored)), along), (*rest, None))
+
+
+def sticking_force(
+    matrix: tuple[Cells, Cells, Cells], lifted: tuple[Cells, Cells], mu: Float[Array, "..."]
+) -> tuple[Cells, Cells]:
+    """The f of least f.A f / 2 + f.b with |f| <= mu, for A = (A11, A12, A22) positive definite.
+
+    (A + k) f = -b, and 1 / |f| grows with k and is concave, so that Newton's method finds |f| = mu from k = 0 on.
+    """
+    a, b, c = matrix
+
+    def solved(k: Cells, right: tuple[Cells, Cells]) -> tuple[Cells, Cells]:
+        determinant = (a + k) * (c + k) - b * b
+        x, y = right
+        return ((c + k) * x - b * y) / determinant, ((a + k) * y - b * x) / determinant
+
+    def force(k: Cells) -> tuple[Cells, Cells]:
+        return solved(k, (-lifted[0], -lifted[1]))
+
+    free = length(*force(jnp.zeros_like(a)))
+    beyond = (free > mu) & (mu > 0.0)
+    wanted = jnp.where(beyond, mu, 1.0)
+
+    def newton(_: int, k: Cells) -> Cells:
+        f1, f2 = force(k)
+        size = jnp.where(beyond, length(f1, f2), 1.0)
+        g1, g2 = solved(k, (f1, f2))
+        slope = jnp.where(beyond, (f1 * g1 + f2 * g2) / size**3, 1.0)
+        return k + jnp.where(beyond, (1.0 / wanted - 1.0 / size) / slope, 0.0)
+
+    f1, f2 = force(jax.lax.fori_loop(0, ITERATIONS, newton, jnp.zeros_like(a)))
+    return jnp.where(mu > 0.0, f1, 0.0), jnp.where(mu > 0.0, f2, 0.0)

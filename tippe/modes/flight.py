@@ -1,0 +1,267 @@
+"""Flight in closed form: the centre of mass on a parabola, the axis on a cone about the angular momentum.
+
+Between two contacts L is constant and e turns about it at the rate |L| / I1 (`tippe.md`, section 3). So the distance of a
+sphere from the plane is a parabola plus a cosine. Between inflections, which are known, its slope is monotone: there it has
+one minimum at most, and one root or none between points of different sign. That makes the search for the landing complete.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float, Int
+
+from nonholonomic.geometry import Vector, cross, dot, scale, subtract, sum_vectors
+from nonholonomic.integration import halved
+
+from ..model.top import Top
+from .free_body import Ball, FreeBody, gap, gap_rate
+
+Cells = Float[Array, " cells"]
+
+#: Stretches between inflections that are searched for a landing; the search leaves out those where the top is too high.
+MOST_STRETCHES = 20_000
+
+
+class Cone(NamedTuple):
+    """How the axis turns: e(t) = `along` + `across` cos(W t) + `ahead` sin(W t), W being `rate` [rad/s]."""
+
+    rate: Float[Array, "..."]
+    along: Vector
+    across: Vector
+    ahead: Vector
+
+
+class Descent(NamedTuple):
+    """The distance [m] of a sphere from the plane, g0 + v t - g t^2 / 2 - c (1 - cos W t) - s (W t - sin W t).
+
+    Written so that it is exact for a flight that has just begun: `start` is g0, `speed` its rate v [m/s] at the start.
+    """
+
+    start: Cells
+    speed: Cells
+    gravity: Cells
+    rate: Cells
+    cosine: Cells
+    sine: Cells
+
+    def value(self, time: Cells) -> Cells:
+        angle = self.rate * time
+        swing = 2.0 * self.cosine * jnp.sin(0.5 * angle) ** 2 + self.sine * angle_less_sine(angle)
+        return self.start + time * (self.speed - 0.5 * self.gravity * time) - swing
+
+    def slope(self, time: Cells) -> Cells:
+        angle = self.rate * time
+        swing = self.cosine * jnp.sin(angle) + self.sine * 2.0 * jnp.sin(0.5 * angle) ** 2
+        return self.speed - self.gravity * time - self.rate * swing
+
+
+class Flight(NamedTuple):
+    """How a flight ended: its length [s], whether a sphere landed and which.
+
+    `lost` says where the search for the landing gave up; `log_rate` is the logarithm of the speed of landing.
+    """
+
+    duration: Cells
+    landed: Bool[Array, " cells"]
+    ball: Int[Array, " cells"]
+    lost: Bool[Array, " cells"]
+    log_rate: Cells
+
+
+def angle_less_sine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
+    """x - sin x, without cancellation where x is small."""
+    square = angle * angle
+    series = 1.0
+    for k in (14, 12, 10, 8, 6, 4):
+        series = 1.0 - square / (k * (k + 1)) * series
+    return jnp.where(jnp.abs(angle) < 0.5, angle * square / 6.0 * series, angle - jnp.sin(angle))
+
+
+def cone(body: Top, free: FreeBody) -> Cone:
+    """How the axis of a free body turns."""
+    size = jnp.sqrt(dot(free.momentum, free.momentum))
+    still = size == 0.0
+    direction = scale(1.0 / jnp.where(still, 1.0, size), free.momentum)
+    along = scale(dot(direction, free.axis), direction)
+    across = tuple(subtract(e, p) for e, p in zip(free.axis, along, strict=True))
+    return Cone(size / body.I1, along, across, cross(direction, free.axis))
+
+
+def flown(body: Top, gravity: Float[Array, "..."], free: FreeBody, time: Float[Array, "..."]) -> FreeBody:
+    """A free body some time [s] later."""
+    turning = cone(body, free)
+    angle = turning.rate * time
+    turned = (turning.along, scale(jnp.cos(angle), turning.across), scale(jnp.sin(angle), turning.ahead))
+    u1, u2, u3 = free.velocity
+    height = free.height + time * (u3 - 0.5 * gravity * time)
+    return FreeBody((u1, u2, u3 - gravity * time), height, sum_vectors(*turned), free.momentum)
+
+
+def carried_aloft(body: Top, free: FreeBody, across: Vector, time: Float[Array, "..."]) -> Vector:
+    """A vector across the axis that turns with it and not about it, some time [s] later.
+
+    It turns at the rate L / I1 - (e.L / I1) e: about L, and less about e.
+    """
+    size = jnp.sqrt(dot(free.momentum, free.momentum))
+    direction = scale(1.0 / jnp.where(size == 0.0, 1.0, size), free.momentum)
+    about_axis = turned(across, free.axis, -dot(free.axis, free.momentum) / body.I1 * time)
+    return turned(about_axis, direction, size / body.I1 * time)
+
+
+def turned(vector: Vector, axis: Vector, angle: Float[Array, "..."]) -> Vector:
+    """A vector turned about a unit axis by an angle [rad]."""
+    along, ahead = scale(dot(axis, vector), axis), cross(axis, vector)
+    across = tuple(subtract(v, p) for v, p in zip(vector, along, strict=True))
+    return sum_vectors(along, scale(jnp.cos(angle), across), scale(jnp.sin(angle), ahead))
+
+
+def fly(
+    body: Top,
+    gravity: Float[Array, "..."],
+    spheres: tuple[Ball, ...],
+    free: FreeBody,
+    parted: Int[Array, " cells"],
+    rising: Bool[Array, " cells"],
+    most: Cells,
+) -> Flight:
+    """Fly until a sphere lands, for some time at most.
+
+    **Arguments:**
+
+    - `spheres`: those that can land.
+    - `free`: the body at the start.
+    - `parted`: the number of the sphere that has just left the plane.
+    - `rising`: where that sphere leaves with a speed, as after an impact; elsewhere it is at rest and its normal force has
+      vanished, so that its distance grows with the third power of time.
+    - `most`: the flight is cut off there [s].
+
+    **Returns:** a `Flight`.
+    """
+    times, speeds, lost = [], [], jnp.zeros(most.shape, bool)
+    for number, ball in enumerate(spheres):
+        descent = _descent(body, gravity, ball, free, (parted == number) & ~rising, parted == number)
+        # The search is by halving, which has no derivative.
+        time, given_up = landing(*stop_gradient((descent, most)))
+        times.append(landed_at(descent, time))
+        speeds.append(-descent.slope(jnp.where(jnp.isfinite(time), times[-1], 0.0)))
+        lost |= given_up
+    first = jnp.argmin(jnp.stack(times), axis=0)
+    time = jnp.min(jnp.stack(times), axis=0)
+    landed = time <= most
+    duration = jnp.where(landed, time, most)
+    speed = jnp.take_along_axis(jnp.stack(speeds), first[None], axis=0)[0]
+    log_rate = jnp.log(jnp.maximum(speed, jnp.finfo(speed.dtype).tiny))
+    return Flight(duration, landed, first, lost, log_rate)
+
+
+def _descent(
+    body: Top,
+    gravity: Float[Array, "..."],
+    ball: Ball,
+    free: FreeBody,
+    at_rest: Bool[Array, " cells"],
+    touching: Bool[Array, " cells"],
+) -> Descent:
+    """The distance of a sphere from the plane, as it flies."""
+    turning = cone(body, free)
+    start = jnp.where(touching, 0.0, jnp.maximum(gap(ball, free), 0.0))
+    speed = gap_rate(body, ball, free)
+    speed = jnp.where(at_rest, 0.0, jnp.where(touching, jnp.maximum(speed, 0.0), speed))
+    cosine, sine = ball.offset * turning.across[2], ball.offset * turning.ahead[2]
+    # Where the normal force vanishes the distance is not bent: of what is left there, round-off, it may rise only.
+    unbent = -gravity / jnp.maximum(turning.rate**2, jnp.finfo(cosine.dtype).tiny)
+    cosine = jnp.where(at_rest, jnp.minimum(cosine, unbent), cosine)
+    gravity = jnp.broadcast_to(gravity, start.shape)
+    return Descent(start, speed, gravity, turning.rate, cosine, sine)
+
+
+def landing(descent: Descent, most: Cells) -> tuple[Cells, Bool[Array, " cells"]]:
+    """When the distance first falls below zero, after a start at zero or above.
+
+    **Arguments:** `most`: time [s] that is looked at.
+
+    **Returns:** the time [s], infinite where it is more than `most`; and where the search gave up.
+    """
+    g, rate, amplitude = descent.gravity, descent.rate, jnp.hypot(descent.cosine, descent.sine)
+    # The distance lies between two parabolas, mean +- amplitude.
+    mean, drift = descent.start - descent.cosine, descent.speed - descent.sine * rate
+    end = jnp.minimum(most, _last_root(mean + amplitude, drift, g) * (1.0 + 1e-9))
+    high_from, high_to = _roots(mean - amplitude, drift, g)
+    # It is bent upwards where rate^2 amplitude cos(rate t - phase) < -g, for angles between bend and 2 pi - bend.
+    phase = jnp.arctan2(descent.sine, descent.cosine)
+    ratio = g / jnp.maximum(rate**2 * amplitude, jnp.finfo(g.dtype).tiny)
+    bend = jnp.arccos(-jnp.minimum(ratio, 1.0))
+    straight = ratio >= 1.0
+
+    def next_inflection(time: Cells) -> Cells:
+        ahead = [jnp.mod(phase + side * bend - rate * time, 2.0 * jnp.pi) for side in (1.0, -1.0)]
+        # The one that has been reached is left behind.
+        ahead = [jnp.where(angle < 1e-9, 2.0 * jnp.pi, angle) for angle in ahead]
+        return jnp.where(straight, jnp.inf, time + jnp.minimum(*ahead) / jnp.where(straight, 1.0, rate))
+
+    def search(carry):
+        low, high, found, over, count = carry
+        begin = jnp.where((low > high_from) & (low < high_to), high_to, low)
+        stop = jnp.minimum(next_inflection(begin), end)
+        falls = descent.value(stop) < 0.0
+        dips = (descent.slope(begin) < 0.0) & (descent.slope(stop) > 0.0)
+        bottom = halved(lambda t: descent.slope(t) < 0.0, begin, stop)[1]
+        dips &= descent.value(bottom) < 0.0
+        hit = falls | dips
+        here = ~found & ~over
+        low = jnp.where(here, jnp.where(hit, begin, stop), low)
+        high = jnp.where(here & hit, jnp.where(dips, bottom, stop), high)
+        return low, high, found | (here & hit), over | (here & ~hit & (stop >= end)), count + 1
+
+    def searching(carry):
+        _, _, found, over, count = carry
+        return jnp.any(~found & ~over) & (count < MOST_STRETCHES)
+
+    zero, no = jnp.zeros_like(end), jnp.zeros(end.shape, bool)
+    low, high, found, over, _ = jax.lax.while_loop(searching, search, (zero, zero, no, no, 0))
+    # At the very start the distance is zero: what counts is that it has been above since.
+    time = halved(lambda t: descent.value(t) >= 0.0, low, high)[1]
+    return jnp.where(found, time, jnp.inf), ~found & ~over
+
+
+def landed_at(descent: Descent, time: Cells) -> Cells:
+    """A time at which the distance is zero, with its derivatives (implicit function theorem)."""
+    value, slope = descent.value(time), stop_gradient(descent.slope(time))
+    known = jnp.isfinite(time) & (slope < 0.0)
+    return time - jnp.where(known, (value - stop_gradient(value)) / jnp.where(known, slope, 1.0), 0.0)
+
+
+def _roots(height: Cells, speed: Cells, gravity: Cells) -> tuple[Cells, Cells]:
+    """Between which times a body thrown from a height is above zero; infinite, and so never, if it is not."""
+    square = speed**2 + 2.0 * gravity * height
+    root = jnp.sqrt(jnp.maximum(square, 0.0))
+    never = square <= 0.0
+    return (
+        jnp.where(never, jnp.inf, (speed - root) / gravity),
+        jnp.where(never, jnp.inf, (speed + root) / gravity),
+    )
+
+
+def _last_root(height: Cells, speed: Cells, gravity: Cells) -> Cells:
+    """When a body thrown from a height, which is not negative but for round-off, is at zero again."""
+    return (speed + jnp.sqrt(jnp.maximum(speed**2 + 2.0 * gravity * height, 0.0))) / gravity
+
+
+def angle_reached(body: Top, free: FreeBody, cos_angle: Float[Array, "..."], until: Cells, last: bool) -> Cells:
+    """When in flight theta rises through an angle, for the first or for the last time; infinite if not by `until`.
+
+    Along the normal the axis is a constant plus a cosine, so the times are known in closed form.
+    """
+    turning = cone(body, free)
+    height = jnp.hypot(turning.across[2], turning.ahead[2])
+    part = (cos_angle - turning.along[2]) / jnp.maximum(height, jnp.finfo(until.dtype).tiny)
+    crosses = (jnp.abs(part) < 1.0) & (turning.rate > 0.0)
+    angle = jnp.arctan2(turning.ahead[2], turning.across[2]) + jnp.arccos(jnp.clip(part, -1.0, 1.0))
+    turn, rate = 2.0 * jnp.pi, jnp.where(turning.rate > 0.0, turning.rate, 1.0)
+    angle = jnp.mod(angle, turn)
+    if last:
+        angle = angle + turn * jnp.floor((rate * until - angle) / turn)
+    time = angle / rate
+    return jnp.where(crosses & (time >= 0.0) & (time <= until), time, jnp.inf)

@@ -1,0 +1,126 @@
+"""The top free of the plane, and the spheres with which it can touch it.
+
+In contact the velocity and the height of the centre of mass follow from the axis; a free body carries them on its own.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nonholonomic.geometry import Vector, cross, dot, scale
+
+from ..model.body import Round
+from ..model.dynamics import Dynamics
+from ..model.state import joined, parts
+from ..model.top import Top
+
+#: The round-off that a sphere that has just left the arena is allowed, as a fraction of R. As it is allowed to none that comes
+#: back, ten times the value and a tenth of it move no landing.
+ROUNDING = 1e-12
+
+#: A sphere comes back if it does so faster than this fraction of sqrt(g R). Until then it sinks by half the square, in R.
+COMES_BACK = 1e-8
+
+
+class Ball(NamedTuple):
+    """A sphere of the body: how far its centre is from the centre of mass along e [m], and its radius [m]."""
+
+    offset: Float[Array, "..."]
+    radius: Float[Array, "..."]
+
+
+class FreeBody(NamedTuple):
+    """A top that touches nothing: velocity [m/s] and height [m] of its centre of mass, axis, angular momentum about it.
+
+    Vectors are tuples of components along x, y and the plane's normal z.
+    """
+
+    velocity: Vector
+    height: Float[Array, "..."]
+    axis: Vector
+    momentum: Vector
+
+
+def balls(body: Top) -> tuple[Ball, ...]:
+    """The spheres of a top with which it can touch the plane: its own, and that of its stem if it has one."""
+    main = Ball(body.offset, body.radius)
+    return (main,) if body.stem is None else (main, Ball(body.stem.offset, body.stem.radius))
+
+
+def standing_on(dynamics: Dynamics, ball: Ball) -> Dynamics:
+    """The equations of motion of a top that stands on another of its spheres: of the same form with its numbers."""
+    coupling = dynamics.mass * ball.offset * dynamics.per_transverse
+    return dataclasses.replace(dynamics, outline=Round(ball.offset, ball.radius, coupling))
+
+
+def freed(body: Top, ball: Ball, state: Float[Array, "components ..."]) -> FreeBody:
+    """A top that stands on a sphere, as a free body: the sphere's centre is at rest along the normal.
+
+    **Arguments:** `state`: (8, ...), as `tippe/model/state.py` has it.
+    """
+    velocity, axis, momentum, _ = parts(state)
+    height = ball.radius - ball.offset * axis[2]
+    return FreeBody((*velocity, -ball.offset * axis_rate(body, axis, momentum)[2]), height, axis, momentum)
+
+
+def grounded(free: FreeBody) -> Float[Array, "components ..."]:
+    """The state (8, ...) of a top in contact; what is left out follows from the contact."""
+    return joined(free.velocity[:2], free.axis, free.momentum)
+
+
+def shown(body: Top, free: FreeBody, riding: Float[Array, "7 ..."]) -> Float[Array, "17 ..."]:
+    """What a path shows of a body that may fly.
+
+    **Arguments:** `riding`: place (x, y) of the centre of mass [m], the vector c of `trajectory_problem.py`, spin angle [rad],
+    work [J].
+
+    **Returns:** the state as in contact; place (x, y) of the sphere's centre, c, spin angle, work; and the distance of the
+    top's own sphere from the plane [m] with its rate [m/s].
+    """
+    main = balls(body)[0]
+    place = [x + main.offset * e for x, e in zip(riding[:2], free.axis[:2], strict=True)]
+    distance = (gap(main, free), gap_rate(body, main, free))
+    rows = (*free.velocity[:2], *free.axis, *free.momentum, *place, *riding[2:], *distance)
+    return jnp.stack(jnp.broadcast_arrays(*rows))
+
+
+def axis_rate(body: Top, axis: Vector, momentum: Vector) -> Vector:
+    """Rate of the axis e' = L x e / I1 [1/s]."""
+    return scale(1.0 / body.I1, cross(momentum, axis))
+
+
+def gap(ball: Ball, free: FreeBody) -> Float[Array, "..."]:
+    """Distance [m] of a sphere from the plane."""
+    return free.height + ball.offset * free.axis[2] - ball.radius
+
+
+def gap_rate(body: Top, ball: Ball, free: FreeBody) -> Float[Array, "..."]:
+    """Rate of that distance [m/s]."""
+    return free.velocity[2] + ball.offset * axis_rate(body, free.axis, free.momentum)[2]
+
+
+def still_parting(
+    rate: Float[Array, "..."], gravity: Float[Array, "..."], radius: Float[Array, "..."], rounding: Any = 0.0
+) -> Float[Array, "..."]:
+    """The round-off that the distance of a sphere is allowed, as a fraction of R.
+
+    It is all allowed while the sphere parts, and none when it comes back, for then it would put the landing too late.
+
+    **Arguments:** `rate`: of the distance [m/s]; `rounding`: what is allowed besides `ROUNDING`.
+    """
+    return (ROUNDING + rounding) * jnp.clip(1.0 + rate / (COMES_BACK * jnp.sqrt(gravity * radius)), 0.0, 1.0)
+
+
+def energy(body: Top, gravity: Float[Array, "..."], free: FreeBody) -> Float[Array, "..."]:
+    """Kinetic energy plus weight times height above the plane [J]."""
+    axial = dot(free.momentum, free.axis)
+    across = dot(free.momentum, free.momentum) - axial**2
+    rotation = across / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
+    return body.mass * (0.5 * dot(free.velocity, free.velocity) + gravity * free.height) + rotation
+
+
+def jellett(ball: Ball, free: FreeBody) -> Float[Array, "..."]:
+    """Jellett's quantity L.(R n - a e) [kg m^3/s] for one of the spheres: constant while no force acts at another."""
+    return ball.radius * free.momentum[2] - ball.offset * dot(free.axis, free.momentum)

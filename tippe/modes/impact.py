@@ -1,0 +1,202 @@
+"""Impact of a sphere of the top on the plane, with the scene's own friction, torque included (Routh's incremental method).
+
+During an impact the configuration stands still and the contact load acts as in contact, f and tau being the scene's
+friction force and torque per unit normal force: with the normal impulse p in place of time, d(tangential impulse)/dp =
+f and d(impulse of the torque)/dp = tau, slip and angular velocity changing with the impulses (Routh, Dynamics of a
+System of Rigid Bodies, 1905, art. 198; Stronge, Impact Mechanics, ch. 4). It is the limit of a stiff contact with the
+same law, and so needs no law of its own: a stop of the slip, a reversal, and friction that depends on the speed come
+out by themselves. Newton's restitution e_N says when it ends: once the velocity along the normal is e_N times the speed
+of approach. With friction Newton's rule may ask for more energy than there was (Stronge, section 3.3); the impact then
+ends earlier, where the kinetic energy is what it was before.
+
+There is always an end. Strong friction can pull the sphere into the plane faster than the impulse pushes it out (a jam), so
+the velocity along the normal is no clock. But friction only takes energy, the slip comes to an end, and a contact that does
+not slip is pushed out, because the response to an impulse is positive definite. So it is with a torque, which only takes
+energy too: velocity and angular velocity of the contact respond to force and torque by a positive definite matrix.
+"""
+
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
+from nonholonomic.integration import GUARD_LOST, AbstractProblem, Settings, traced_march
+
+from ..model.dynamics import least
+from ..model.friction import AbstractFriction, ContactLoad, Slip
+from ..model.state import angular_velocity
+from ..model.top import Top
+from .free_body import Ball, FreeBody
+
+Cells = Float[Array, " cells"]
+
+#: Relative tolerance of an impact's integration: impacts are rare, so they may cost. Ten times the value moves inversion times
+#: after hundreds of them by 1e-14.
+TOLERANCE = 1e-12
+
+#: An impact has failed if it takes this many times the normal impulse that would stop the sphere without friction.
+LARGEST = 1e9
+
+#: Steps after which an impact has failed.
+MOST_STEPS = 100_000
+
+
+class Approach(NamedTuple):
+    """A sphere about to strike: from the centre of mass to the contact point [m], velocity of that point [m/s].
+
+    `response` is the symmetric matrix W with (change of that velocity) = W (impulse) [1/kg], as three columns. `axis` is that
+    of the body; `turning` its angular velocity [rad/s].
+    """
+
+    arm: Vector
+    velocity: Vector
+    response: tuple[Vector, Vector, Vector]
+    axis: Vector
+    turning: Vector
+
+
+class Blow(NamedTuple):
+    """Impulses at the contact: of the force [N s], and of the torque [N m s], `None` under a law that has no torque."""
+
+    force: Vector
+    torque: Vector | None
+
+
+class Impact(AbstractProblem):
+    """Impacts, with the normal impulse as the time; the state is the tangential impulse and, where there is one, that of the
+    torque.
+
+    Both are in units of the impulse that would stop the sphere if there were no friction, and of that times the sphere's
+    radius. `gained` is the velocity along the normal [m/s] by which the impact is over.
+    """
+
+    body: Top
+    friction: AbstractFriction
+    approach: Approach
+    radius: Float[Array, "..."]
+    gained: Cells
+
+    @property
+    def speed(self) -> Cells:
+        """Speed along the normal before the impact [m/s]; positive, because a sphere at rest has none to be measured by."""
+        return jnp.maximum(jnp.abs(self.approach.velocity[2]), 1e-12)
+
+    def blow(self, normal: Cells, state: Float[Array, "rows cells"]) -> Blow:
+        """The impulses at a stage of the impact."""
+        unit = self.speed / self.approach.response[2][2]
+        force = (state[0] * unit, state[1] * unit, normal * unit)
+        return Blow(force, tuple(row * unit * self.radius for row in state[2:]) or None)
+
+    def changes(self, blow: Blow) -> tuple[Vector, Vector]:
+        """How the velocity of the contact point [m/s] and the angular velocity [rad/s] change by a blow."""
+        meets, torque = self.approach, cross(self.approach.arm, blow.force)
+        velocity = tuple(dot(column, blow.force) for column in meets.response)
+        if blow.torque is not None:
+            turned = angular_velocity(self.body, meets.axis, blow.torque)
+            velocity = sum_vectors(velocity, cross(turned, meets.arm))
+            torque = sum_vectors(torque, blow.torque)
+        return velocity, angular_velocity(self.body, meets.axis, torque)
+
+    def load(self, velocity: Vector, turning: Vector) -> ContactLoad:
+        """What friction does per unit normal impulse."""
+        drilling = turning[2] if self.friction.drills else None
+        return self.friction.per_normal_force(Slip(velocity[0], velocity[1], (turning[0], turning[1], drilling)))
+
+    def start(self) -> tuple[Float[Array, "rows cells"], Float[Array, "rows cells"]]:
+        turns = self.load(self.approach.velocity, self.approach.turning).torque != (None, None, None)
+        none = jnp.zeros((5 if turns else 2, *self.gained.shape))
+        return none, jnp.ones_like(none)
+
+    def field(self, time: Cells, state: Float[Array, "rows cells"]) -> Float[Array, "rows cells"]:
+        meets, (velocity, turning) = self.approach, self.changes(self.blow(time, state))
+        load = self.load(sum_vectors(meets.velocity, velocity), sum_vectors(meets.turning, turning))
+        torque = scale(1.0 / self.radius, load.torque) if len(state) > 2 else ()
+        rows = [jnp.zeros_like(time) if component is None else component for component in (*load.force, *torque)]
+        return jnp.stack(jnp.broadcast_arrays(*rows, time)[:-1])
+
+    def crossing(self, state: Float[Array, "rows cells"]) -> None:
+        return None
+
+    def guard(self, time: Cells, state: Float[Array, "rows cells"]) -> Cells:
+        blow, response = self.blow(time, state), self.approach.response
+        change, turned = self.changes(blow)
+        missing = (self.gained - change[2]) / self.speed
+        # In compression the sphere still approaches; in restitution the energy that was lost is not to come back in full.
+        approaches = -(self.approach.velocity[2] + change[2]) / self.speed
+        gain = dot(blow.force, self.approach.velocity) + 0.5 * dot(blow.force, change)
+        if blow.torque is not None:
+            gain = gain + dot(blow.torque, self.approach.turning) + 0.5 * dot(blow.torque, turned)
+        short = -gain * response[2][2] / self.speed**2
+        return least(missing, jnp.where(approaches > short, approaches, short))
+
+    def ended(self, time: Cells, state: Float[Array, "rows cells"]) -> Blow:
+        """The impulses of an impact whose end has been located: put right by one step of Newton's method.
+
+        The search leaves an error of 1e-10, its square is round-off.
+        """
+        left, slope = jax.jvp(self.guard, (time, state), (jnp.ones_like(time), self.field(time, state)))
+        step = -left / jnp.where(slope == 0.0, 1.0, slope)
+        step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
+        return self.blow(time + step, state + step * self.field(time, state))
+
+
+def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
+    """How a sphere of a free body meets the plane.
+
+    W = 1/m - [r]x J^-1 [r]x, r = a e - R n (`tippe.md`, section 3).
+    """
+    arm = (
+        ball.offset * free.axis[0],
+        ball.offset * free.axis[1],
+        ball.offset * free.axis[2] - ball.radius,
+    )
+    turning = angular_velocity(body, free.axis, free.momentum)
+    velocity = sum_vectors(free.velocity, cross(turning, arm))
+    zero, one = jnp.zeros_like(arm[0]), jnp.ones_like(arm[0])
+
+    def gained(impulse: Vector) -> Vector:
+        turned = angular_velocity(body, free.axis, cross(arm, impulse))
+        return sum_vectors(scale(1.0 / body.mass, impulse), cross(turned, arm))
+
+    response = (gained((one, zero, zero)), gained((zero, one, zero)), gained((zero, zero, one)))
+    return Approach(arm, velocity, response, free.axis, turning)
+
+
+def strike(
+    body: Top, friction: AbstractFriction, ball: Ball, free: FreeBody, restitution: Cells
+) -> tuple[FreeBody, Bool[Array, " cells"]]:
+    """The body after a sphere of it has struck the plane; unchanged where the sphere does not approach the plane.
+
+    An impulse at the contact point leaves Jellett's quantity of that sphere as it is; that of a torque changes it.
+
+    **Arguments:**
+
+    - `friction`: the scene's law.
+    - `free`: the body before the impact.
+    - `restitution`: Newton's coefficient e_N [1]; the rebound is slower where it would take energy from nowhere.
+
+    **Returns:** the body after it; and where the impact could not be computed (`MOST_STEPS`, `LARGEST`).
+    """
+    meets = approach(body, ball, free)
+    gained = (1.0 + restitution) * jnp.maximum(-meets.velocity[2], 0.0)
+    problem = Impact(body, friction, meets, ball.radius, gained)
+    cells = gained.shape[0]
+    outcome, _ = traced_march(
+        problem,
+        jnp.asarray(LARGEST),
+        jnp.asarray(cells),
+        Settings(TOLERANCE, diffrax.Dopri5(), absolute=1.0, max_steps=MOST_STEPS),
+    )
+    return struck(body, meets, free, problem.ended(outcome.end_time, outcome.state)), outcome.status != GUARD_LOST
+
+
+def struck(body: Top, meets: Approach, free: FreeBody, blow: Blow) -> FreeBody:
+    """A free body after a blow at its contact."""
+    velocity = sum_vectors(free.velocity, scale(1.0 / body.mass, blow.force))
+    momentum = sum_vectors(free.momentum, cross(meets.arm, blow.force))
+    if blow.torque is not None:
+        momentum = sum_vectors(momentum, blow.torque)
+    return FreeBody(velocity, free.height, free.axis, momentum)

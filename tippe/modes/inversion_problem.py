@@ -1,0 +1,53 @@
+"""Motion on one smooth contact until theta reaches an angle or the contact ends, for many cells."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from nonholonomic.integration import AbstractProblem
+from nonholonomic.xla_cpu import compiled_setup
+
+from ..model.dynamics import Dynamics
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..model.state import COS_THETA
+from ..model.stick_slip import Kind, StickSlip
+
+
+class InversionProblem(AbstractProblem):
+    """Launches that end when theta reaches an angle or the contact is lost or jams."""
+
+    dynamics: Dynamics | StickSlip | Kind
+    cos_angle: Float[Array, "..."]
+    states: Float[Array, "components cells"]
+    scales: Float[Array, "components cells"]
+
+    @classmethod
+    def of(cls, scene: Scene, launch: Launch, angle: Float[ArrayLike, "..."], cells: int) -> "InversionProblem":
+        """The problem of the given number of cells; the numbers of scene and launch are scalars or one per cell.
+
+        Its frame is that of `Scene.turning_dynamics`: nothing with a direction can be read off its final states.
+        """
+        return _problem(scene, launch, jnp.asarray(angle), cells)
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        return self.states, self.scales
+
+    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.dynamics.field(state)
+
+    def crossing(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
+        return state[COS_THETA] - self.cos_angle
+
+    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
+        return self.dynamics.contact_margin(state)
+
+
+@compiled_setup
+def _problem(scene: Scene, launch: Launch, angle: Float[Array, "..."], cells: int) -> InversionProblem:
+    states = scene.state(launch)
+    shape = (states.shape[0], cells)
+    states = jnp.broadcast_to(states.reshape(shape[0], -1), shape)
+    scales = jnp.broadcast_to(scene.scales(launch).reshape(shape[0], -1), shape)
+    return InversionProblem(scene.turning_dynamics, jnp.cos(angle), states, scales)

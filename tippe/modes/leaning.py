@@ -1,0 +1,196 @@
+"""The top that slides on its sphere and on its stem at once: it leans.
+
+Both spheres touch the plane at one angle theta only, so the axis turns about the normal at some rate W, e' = W n x e, and
+the centre of mass stays at its height h = R_j - a_j c, c = cos theta. With L = A e + I1 W n and the momenta p = L.n and
+b = L.e,
+
+    A = (b - c p) / (1 - c^2),   I1 W = p - c A,   w = s e + W n,   s = A / I1 + (1 / I3 - 1 / I1) b,
+
+and the slip of sphere j is v_j = u + (s R_j + W a_j) n x e. With the friction f_j per unit normal force, each from its own
+slip, nothing lifts the centre of mass and nothing raises the axis if
+
+    N_0 + N_1 = m g,   N_0 m_0 + N_1 m_1 = -A W (1 - c^2),   m_j = a_j (1 - c^2) + h f_j.e - tau_j.(n x e),
+
+with tau_j the torque per unit normal force of a law that has one. Then m u' = N_0 f_0 + N_1 f_1, and with t_j = f_j.(n x e)
+the momenta change by p' = sum N_j (a_j t_j + tau_j.n) and b' = sum N_j (R_j t_j + tau_j.e).
+
+The slips differ across the direction of leaning only. So m_1 - m_0 is (a_1 - a_0) (1 - c^2) without friction and with
+viscous friction; Coulomb's law can make it vanish if mu h is more than (a_1 - a_0) sin theta. The first of two normal
+forces vanishes before that.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from nonholonomic.geometry import Component, add, cross, dot, multiply, scale, subtract, sum_vectors
+
+from ..model.dynamics import least, stacked
+from ..model.friction import AbstractFriction, Slip
+from ..model.state import angular_velocity, parts
+from ..model.top import Top
+from .free_body import FreeBody, axis_rate, balls, gap_rate, grounded
+from .impact import approach
+
+#: The number of this kind of contact, next to those of the spheres, 0 and 1.
+BOTH = 2
+
+#: A contact ends where it would pull by this fraction of the weight. A top that comes to roll on its sphere presses its stem
+#: ever less, and never lifts it; the steps would go by the errors of a force that is next to zero. To let go so late changes
+#: velocities by the square of this: ten times the value and a tenth of it move an inversion time by 4e-16.
+HOLDS = 1e-8
+
+#: Where m_1 - m_0 is less than this fraction of what it is without friction, rigid bodies do not say what follows. It decides
+#: on a status alone.
+INDEFINITE = 1e-6
+
+
+class LeaningMotion(NamedTuple):
+    """What the equations of motion give for one state: the rate of the state of `tippe/model/dynamics.py`, and both normal
+    forces [N].
+
+    `friction_power` [W] is that of both contacts, `None` without friction; `definiteness` is m_1 - m_0 as a fraction of what
+    it is without friction.
+    """
+
+    rate: tuple[Component, ...]
+    normal_forces: tuple[Float[Array, "..."], Float[Array, "..."]]
+    friction_power: Component
+    spin_momentum: Float[Array, "..."]
+    definiteness: Float[Array, "..."]
+
+
+class LeaningDynamics(eqx.Module):
+    """The equations of motion of a top with a stem while both of its spheres touch the plane.
+
+    The state has the layout of `tippe/model/dynamics.py`. Its cos theta is constant to the bit, and the part of L along n x
+    e, which would change theta and is round-off, is carried along but not used.
+    """
+
+    body: Top
+    friction: AbstractFriction
+    gravity: Float[Array, "..."]
+
+    def motion(self, state: Float[Array, "components ..."]) -> LeaningMotion:
+        """Evaluate the equations of motion.
+
+        **Arguments:**
+
+        - `state`: (8, ...), with the axis at the angle at which both spheres touch.
+
+        **Returns:** a `LeaningMotion`; `rate` is (m/s^2, 1/s, N m).
+        """
+        spheres, m, I1, I3 = balls(self.body), self.body.mass, self.body.I1, self.body.I3
+        u, e, L, _ = parts(state)
+        c, p, b = e[2], L[2], dot(e, L)
+        across = (-e[1], e[0])
+        sine2 = dot(across, across)
+        along = (b - c * p) / sine2
+        precession = (p - c * along) / I1
+        rolling = along / I1 + (1.0 / I3 - 1.0 / I1) * b
+
+        turning = (rolling * e[0], rolling * e[1], rolling * c + precession if self.friction.drills else None)
+        slips = [Slip(*sum_vectors(u, scale(rolling * R + precession * a, across)), turning) for a, R in spheres]
+        loads = [self.friction.per_normal_force(slip) for slip in slips]
+        height = spheres[0].radius - spheres[0].offset * c
+        m_0, m_1 = (
+            subtract(add(ball.offset * sine2, multiply(height, dot(load.force, e[:2]))), dot(across, load.torque[:2]))
+            for ball, load in zip(spheres, loads, strict=True)
+        )
+        weight = m * self.gravity
+        N_1 = -(along * precession * sine2 + weight * m_0) / (m_1 - m_0)
+        normal = (weight - N_1, N_1)
+
+        u_dot = scale(1.0 / m, sum_vectors(*(scale(N, load.force) for N, load in zip(normal, loads, strict=True))))
+        pulls = [dot(across, load.force) for load in loads]
+        each = list(zip(spheres, pulls, loads, strict=True))
+        p_dot = dot(normal, tuple(add(multiply(ball.offset, t), load.torque[2]) for ball, t, load in each))
+        b_dot = dot(normal, tuple(add(multiply(ball.radius, t), dot(load.torque, e)) for ball, t, load in each))
+        # L turns with the axis, whatever part of it is across; so b changes by its rate and by no more.
+        growth = multiply(1.0 / sine2, subtract(b_dot, multiply(c, p_dot)))
+        L_dot = sum_vectors(scale(growth, e[:2]), (-precession * L[1], precession * L[0]))
+        rate = (*u_dot, *scale(precession, across), None, *L_dot, p_dot)
+        power = dot(normal, tuple(load.power(slip) for load, slip in zip(loads, slips, strict=True)))
+        stiff = (m_1 - m_0) / ((spheres[1].offset - spheres[0].offset) * sine2)
+        return LeaningMotion(rate, normal, power, b, stiff)
+
+    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+        """Rate of change of the state, (8, ...)."""
+        return stacked(self.motion(state).rate, state)
+
+    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """The lesser of both normal forces as a fraction of the weight, plus `HOLDS`."""
+        return least(*self.motion(state).normal_forces) / (self.body.mass * self.gravity) + HOLDS
+
+    def heavier(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+        """The number of the sphere with the greater normal force: the one that stays when the other's vanishes."""
+        N_0, N_1 = self.motion(state).normal_forces
+        return (N_1 > N_0).astype(int)
+
+    def stopped(self, free: FreeBody) -> tuple[FreeBody, Bool[Array, "..."]]:
+        """The end of rocking: what all blows to come do together to a top whose spheres are both at the plane.
+
+        The top rocks from sphere to sphere, ever less, and infinitely many blows take a finite time T. Sphere j gets the
+        impulse P_j (f_j, 1), and P_j tau_j where the law has a torque, more than while it leans for T, and the sum stops both
+        speeds along the normal, g + G P = 0. In T both slips change by as little as the speeds g, so that this errs by their
+        square.
+
+        **Returns:** the body after these impulses, but for `at_rest`; and whether their friction takes energy. One P_j is
+        negative, what that sphere carries less in T; if it gives energy now, it takes some if the blow of the other sphere is
+        waited for (det G > 0).
+        """
+        spheres, zero = balls(self.body), jnp.zeros_like(free.height)
+        w1, w2, w3 = angular_velocity(self.body, free.axis, free.momentum)
+        forces, turns, gains = [], [], []
+        for ball in spheres:
+            meets = approach(self.body, ball, free)
+            slip = Slip(*meets.velocity[:2], (w1, w2, w3 if self.friction.drills else None))
+            load = self.friction.per_normal_force(slip)
+            forces.append(tuple(zero if part is None else part for part in (*load.force, 1.0 + zero)))
+            turns.append(sum_vectors(cross(meets.arm, forces[-1]), load.torque))
+            gains.append(zero if (power := load.power(slip)) is None else power)
+        speeds = [gap_rate(self.body, ball, free) for ball in spheres]
+        rates = [axis_rate(self.body, free.axis, turn)[2] for turn in turns]
+        (G_00, G_01), (G_10, G_11) = ([1.0 / self.body.mass + ball.offset * one for one in rates] for ball in spheres)
+        determinant = G_00 * G_11 - G_01 * G_10
+        per = 1.0 / jnp.where(determinant == 0.0, 1.0, determinant)
+        impulses = (per * (G_01 * speeds[1] - G_11 * speeds[0]), per * (G_10 * speeds[0] - G_00 * speeds[1]))
+        total = sum_vectors(*(scale(P, force) for P, force in zip(impulses, forces, strict=True)))
+        velocity = sum_vectors(free.velocity, scale(1.0 / self.body.mass, total))
+        momentum = sum_vectors(free.momentum, *(scale(P, turn) for P, turn in zip(impulses, turns, strict=True)))
+        return FreeBody(velocity, free.height, free.axis, momentum), dot(impulses, tuple(gains)) <= 0.0
+
+    def settled(self, free: FreeBody) -> tuple[FreeBody, Int[Array, "..."], Bool[Array, "..."]]:
+        """What holds a top at rest along the normal whose spheres are both at the plane.
+
+        Of all ways to have both normal forces at least zero, and each zero where its sphere leaves the plane, there is one
+        if m_1 - m_0 is positive: on both spheres if that takes two positive forces, else on the one with the positive force.
+
+        **Returns:** the body, at rest along the normal to the bit (`at_rest`); `BOTH`, or the number of the sphere that it
+        stands on; and whether that is the only answer.
+        """
+        free = at_rest(self.body, free)
+        state = grounded(free)
+        number = jnp.where(self.contact_margin(state) > 0.0, BOTH, self.heavier(state))
+        return free, number, self.motion(state).definiteness > INDEFINITE
+
+
+def at_rest(body: Top, free: FreeBody) -> FreeBody:
+    """A body whose spheres are both at the plane, without the speeds along the normal that are left.
+
+    theta becomes the angle of both contacts, and L loses its component along n x e, the one that changes theta: as by an
+    impulse along the normal at each sphere that ends its motion. L.n, L.e, and so Jellett's quantity of either sphere, and
+    the slip keep their values; the energy falls by that of the motion which ends.
+    """
+    main, stem = balls(body)
+    e, L = free.axis, free.momentum
+    c = jnp.broadcast_to((stem.radius - main.radius) / (stem.offset - main.offset), e[2].shape)
+    square = e[0] ** 2 + e[1] ** 2
+    # The length of e stays what it was.
+    factor = jnp.sqrt((square + e[2] ** 2 - c**2) / square)
+    across = (-e[1], e[0])
+    L = (*sum_vectors(L[:2], scale(-dot(across, L[:2]) / square, across)), L[2])
+    velocity = (free.velocity[0], free.velocity[1], jnp.zeros_like(c))
+    return FreeBody(velocity, main.radius - main.offset * c, (*scale(factor, e[:2]), c), L)

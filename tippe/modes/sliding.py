@@ -1,0 +1,361 @@
+"""Sliding as a phase of the motion, on one sphere or on both, and what follows it: a flight, the other sphere, or the end.
+
+A single run whose path is kept carries seven more numbers behind its state, which ride along: the place (x, y) of the centre
+of mass [m], the vector c of `trajectory_problem.py`, the angle by which the top has turned about its axis [rad], and the work
+of friction and impacts [J].
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from nonholonomic.geometry import dot, multiply, scale
+from nonholonomic.hybrid import Passage, Record
+from nonholonomic.integration import CROSSED, FAILED, GUARD_LOST, REACHED_END, RUNNING, UNRESOLVED, AbstractProblem
+
+from ..model.dynamics import COS_THETA, Dynamics, least, stacked
+from ..model.scene import Scene
+from ..model.state import parts
+from ..model.top import Top
+from .flight import angle_reached, carried_aloft, cone, flown, fly
+from .flying_phase import AbstractFlyingPhase
+from .free_body import Ball, FreeBody, balls, energy, freed, gap, gap_rate, grounded, shown, standing_on, still_parting
+from .impact import strike
+from .inversion_problem import InversionProblem
+from .leaning import LeaningDynamics, at_rest
+
+Cells = Float[Array, " cells"]
+
+#: A rebound slower than this fraction of sqrt(g R) is none: the contact closes. In the time T that the bounces to come would
+#: take, the sliding top gets the impulse that they would give it, so the error is as small as its square: ten times the value
+#: moves inversion times by 3e-12 of themselves where a top bounces, and by 4e-11 where it rocks from sphere to sphere, ever
+#: less, until it leans on both (`LeaningDynamics.stopped`); the value itself errs by 3e-13. Contact begins too early by T.
+CLOSING_SPEED = 1e-5
+
+#: Two spheres are at the plane together if neither is farther from it than this fraction of R. Ten times the value and a
+#: tenth of it change no bit of a time.
+TOUCHING = 1e-9
+
+#: Bounces in a row after which a run is given up.
+MOST_BOUNCES = 10_000
+
+#: Components of a state, behind which others may ride along.
+OWN = 8
+
+#: Angle by which the axis turns between the times at which a flight is shown by default [rad].
+SHOWN = 0.4
+
+
+class Sliding(AbstractProblem):
+    """Sliding until theta reaches an angle, a contact is lost or jams, or a sphere that does not touch the plane does.
+
+    `own` is the sphere that slides and `other` the one that does not; `None` if there is none. `axial` is the moment of inertia
+    about the axis [kg m^2], `None` where nothing rides along.
+    """
+
+    dynamics: Dynamics | LeaningDynamics
+    own: Ball | None
+    other: Ball | None
+    cos_angle: Float[Array, "..."]
+    states: Float[Array, "components cells"]
+    scales: Float[Array, "components cells"]
+    axial: Float[Array, "..."] | None
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        return self.states, self.scales
+
+    def field(self, time: Cells, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
+        if self.axial is None:
+            return self.dynamics.field(state)
+        motion = self.dynamics.motion(state)
+        across, turning = tuple(state[OWN + 2 : OWN + 5]), motion.rate[2:5]
+        across_rate = scale(multiply(-1.0, dot(turning, across)), tuple(state[2:5]))
+        riding = (state[0], state[1], *across_rate, motion.spin_momentum / self.axial, motion.friction_power)
+        return stacked((*motion.rate, *riding), state)
+
+    def crossing(self, state: Float[Array, "components cells"]) -> Cells:
+        return state[COS_THETA] - self.cos_angle
+
+    def guard(self, time: Cells, state: Float[Array, "components cells"]) -> Cells:
+        margin = self.dynamics.contact_margin(state)
+        if self.own is None or self.other is None:
+            return margin
+        assert isinstance(self.dynamics, Dynamics)
+        return least(margin, clearance(self.dynamics, self.own, self.other, state))
+
+
+def clearance(dynamics: Dynamics, own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    """Distance of the other sphere from the plane as a fraction of the own radius, plus the round-off of a parting."""
+    _, e, L, _ = parts(state[:OWN])
+    rate = (other.offset - own.offset) * dynamics.per_transverse * (L[0] * e[1] - L[1] * e[0])
+    return height(own, other, state) / own.radius + still_parting(rate, dynamics.gravity, own.radius)
+
+
+def height(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    """Distance [m] of the other sphere from the plane, where a top stands on its own one."""
+    return own.radius - other.radius + (other.offset - own.offset) * state[COS_THETA]
+
+
+class Slide(AbstractFlyingPhase):
+    """Sliding on the sphere numbered `number`, in the order of `free_body.balls`, up to an angle of theta.
+
+    The number is an array, so that one program serves both spheres; `last` says whether the run goes on through the angle. A
+    single run whose path is kept records its flights.
+    """
+
+    number: Int[Array, ""]
+    last: bool = eqx.field(static=True)
+
+    def problem(self, state: Float[Array, "components cells"]) -> Sliding:
+        own, other = _own_and_other(balls(self.scene.body), self.number)
+        dynamics = standing_on(self.scene.dynamics, own)
+        return Sliding(dynamics, own, other, self.cos_angle, state, self.scales, self.axial)
+
+    def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
+        own, _ = _own_and_other(balls(self.scene.body), self.number)
+        return shown(self.scene.body, freed(self.scene.body, own, state), state[OWN:])
+
+    def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "17 times"]:
+        free, riding = motion
+        later = flown(self.scene.body, self.scene.gravity, free, passed)
+        return shown(self.scene.body, later, _carried(self.scene.body, free, riding, passed))
+
+    def leave(self, state: Float[Array, "components cells"], left: Cells) -> Passage:
+        """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land where it is that which touches.
+
+        It counts the flights.
+        """
+
+        def hop(carry: tuple[Air, Array, Record | None]) -> tuple[Air, Array, Record | None]:
+            air, count, record = carry
+            after, landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
+            if air.falls is not None:
+                after, landed = _where(air.falls, air, after), air.falls | landed
+            record = _with_flight(self.scene.body, record, air, after)
+            after = _where(landed, land(self.scene, after), after)
+            return _where(air.open, after, air), count + 1, record
+
+        def under_way(carry: tuple[Air, Array, Record | None]) -> Array:
+            return jnp.any(carry[0].open) & (carry[1] < MOST_BOUNCES)
+
+        start = lost_contact(self.scene, self.number, state)
+        if self.rides:
+            start = start._replace(riding=state[OWN:])
+        record = _no_flights(start) if self.rides else None
+        air, _, record = jax.lax.while_loop(under_way, hop, (start, jnp.zeros((), int), record))
+        status = jnp.where(air.open, UNRESOLVED, air.status)
+        state = grounded(air.free)
+        if air.riding is not None:
+            state = jnp.concatenate([state, air.riding])
+        found = (air.ball, state, air.elapsed, status, air.crossing_time, air.flights[None])
+        return Passage(*found, record, air.log_rates)
+
+
+class Lean(AbstractFlyingPhase):
+    """Sliding on both spheres; the phase after those of the spheres."""
+
+    def problem(self, state: Float[Array, "components cells"]) -> Sliding:
+        return Sliding(leaning(self.scene), None, None, self.cos_angle, state, self.scales, self.axial)
+
+    def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
+        return shown(self.scene.body, freed(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])
+
+    def leave(self, state: Float[Array, "components cells"], left: Cells) -> Passage:
+        """Slide on the sphere whose normal force has not vanished."""
+        number = leaning(self.scene).heavier(state)
+        own = grounded(at_rest(self.scene.body, freed(self.scene.body, balls(self.scene.body)[0], state)))
+        state = jnp.concatenate([own, state[OWN:]])
+        zero = jnp.zeros_like(state[0])
+        running, none = jnp.full(zero.shape, RUNNING), jnp.zeros((1, *zero.shape), int)
+        return Passage(number, state, zero, running, jnp.full_like(zero, jnp.inf), none)
+
+
+def phases(
+    scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
+) -> tuple[tuple[AbstractFlyingPhase, ...], Int[Array, " cells"]]:
+    """The phases of runs, sliding on each sphere and on both if there are two; and the number of that in which each starts.
+
+    **Arguments:**
+
+    - `scene`: with `contact="hybrid"`; `problem`: of its launches, which stand on their lower sphere.
+    - `tolerance`: no phase needs it; `last`: whether the last crossing counts; `rides`: as for `AbstractFlyingPhase`.
+    """
+    spheres, given = balls(scene.body), (scene, problem.scales, problem.cos_angle, rides)
+    found = tuple(Slide(*given, jnp.asarray(number), last) for number in range(len(spheres)))
+    if len(spheres) == 1:
+        return found, jnp.zeros(problem.states.shape[1:], int)
+    main, stem = spheres
+    return (*found, Lean(*given)), (height(main, stem, problem.states) < 0.0).astype(int)
+
+
+def leaning(scene: Scene) -> LeaningDynamics:
+    """The equations of motion of a scene's top on both of its spheres."""
+    return LeaningDynamics(scene.body, scene.friction, scene.gravity)
+
+
+class Air(NamedTuple):
+    """A top that may be in the air.
+
+    - `free`, `elapsed` [s]: the body and the time since the contact was lost.
+    - `ball`: the sphere that touched last; `rising`: whether it left with a speed; `falls`: whether, without a flight, it is
+      about to strike the plane, `None` for a top without stem. Once the contact is closed, the number of the phase.
+    - `status`: `RUNNING`, or how the run ended, `GUARD_LOST` if it has jammed; `crossing_time` [s] of the event, infinite if
+      there was none.
+    - `flights`: so far; `open`: whether there is no contact and the run goes on.
+    - `log_rates`: of the landings, as in `Passage`.
+    - `riding`: what rides along with a single run.
+    """
+
+    free: FreeBody
+    elapsed: Cells
+    ball: Int[Array, " cells"]
+    rising: Bool[Array, " cells"]
+    falls: Bool[Array, " cells"] | None
+    status: Int[Array, " cells"]
+    crossing_time: Cells
+    flights: Int[Array, " cells"]
+    open: Bool[Array, " cells"]
+    log_rates: Cells
+    riding: Float[Array, "7 cells"] | None = None
+
+
+def lost_contact(scene: Scene, number: Int[Array, ""], state: Float[Array, "components cells"]) -> Air:
+    """The top at the end of sliding on the sphere with a number: its contact is lost or jams, or the other is at the plane."""
+    own, other = _own_and_other(balls(scene.body), number)
+    zero = jnp.zeros_like(state[0])
+    dynamics = standing_on(scene.dynamics, own)
+    falls, ball, jams = None, jnp.broadcast_to(number, zero.shape), dynamics.loss(state) > 0
+    if other is not None:
+        falls = clearance(dynamics, own, other, state) <= dynamics.contact_margin(state)
+        ball, jams = jnp.where(falls, 1 - number, number), jams & ~falls
+    return Air(
+        free=freed(scene.body, own, state),
+        elapsed=zero,
+        ball=ball,
+        rising=jnp.zeros(zero.shape, bool),
+        falls=falls,
+        status=jnp.where(jams, GUARD_LOST, RUNNING),
+        crossing_time=jnp.full_like(zero, jnp.inf),
+        flights=jnp.zeros(zero.shape, int),
+        open=~jams,
+        log_rates=zero,
+    )
+
+
+def take_flight(
+    scene: Scene, air: Air, cos_angle: Float[Array, "..."], left: Cells, last: bool
+) -> tuple[Air, Bool[Array, " cells"]]:
+    """One flight, until a sphere reaches the plane, theta the angle (unless `last`), or the time from the loss `left` [s].
+
+    **Returns:** the top at its end; and where a sphere has reached the plane.
+    """
+    body, gravity = scene.body, scene.gravity
+    flight = fly(body, gravity, balls(body), air.free, air.ball, air.rising, jnp.maximum(left - air.elapsed, 0.0))
+    reached = angle_reached(body, air.free, cos_angle, flight.duration, last)
+    crosses = jnp.isfinite(reached) & (not last)
+    duration = jnp.where(crosses, reached, flight.duration)
+    landed = flight.landed & ~crosses & ~flight.lost
+    status = jnp.where(crosses, CROSSED, jnp.where(flight.landed, air.status, REACHED_END))
+    after = Air(
+        free=flown(body, gravity, air.free, duration),
+        elapsed=air.elapsed + duration,
+        ball=jnp.where(landed, flight.ball, air.ball),
+        rising=air.rising,
+        falls=air.falls,
+        status=jnp.where(flight.lost, FAILED, status),
+        crossing_time=jnp.where(jnp.isfinite(reached), air.elapsed + reached, air.crossing_time),
+        flights=air.flights + 1,
+        open=landed,
+        log_rates=air.log_rates + jnp.where(landed, flight.log_rate, 0.0),
+        riding=None if air.riding is None else _carried(body, air.free, air.riding, duration),
+    )
+    return after, landed
+
+
+def land(scene: Scene, air: Air) -> Air:
+    """The impact of the sphere that has reached the plane; slow rebounds are none, and the contact closes."""
+    body, spheres = scene.body, balls(scene.body)
+    own, other = _own_and_other(spheres, air.ball)
+    speed = jnp.maximum(-gap_rate(body, own, air.free), 0.0)
+    restitution = (
+        jnp.zeros_like(speed) if scene.restitution is None else jnp.broadcast_to(scene.restitution, speed.shape)
+    )
+    closing = CLOSING_SPEED * jnp.sqrt(scene.gravity * body.radius)
+    rebounds = restitution * speed > closing
+    free, fails = strike(body, scene.friction, own, air.free, jnp.where(rebounds, restitution, 0.0))
+    struck = air._replace(free=free, rising=rebounds, open=rebounds, status=jnp.where(fails, FAILED, air.status))
+    if other is not None:
+        struck = _with_other(scene, air, struck, other, (speed <= closing) & ~rebounds, closing)
+    if air.riding is not None:
+        gained = energy(body, scene.gravity, struck.free) - energy(body, scene.gravity, air.free)
+        struck = struck._replace(riding=air.riding.at[-1].add(gained))
+    return struck._replace(open=struck.open & ~fails)
+
+
+def _with_other(scene: Scene, air: Air, struck: Air, other: Ball, slow: Bool[Array, " cells"], closing: Cells) -> Air:
+    """What an impact means to the other sphere if that is at the plane: it strikes too, or the top comes to rest on both.
+
+    **Arguments:** `air`: before the impact; `struck`: after it; `slow`: where it is so slow that it may be the last.
+    """
+    touches = gap(other, air.free) < TOUCHING * scene.body.radius
+    falls = touches & (gap_rate(scene.body, other, struck.free) < -closing)
+    stopped, takes = leaning(scene).stopped(air.free)
+    rests = touches & slow & (jnp.abs(gap_rate(scene.body, other, air.free)) <= closing) & takes
+    free, number, definite = leaning(scene).settled(stopped)
+    falls &= ~rests
+    return struck._replace(
+        free=_where(rests, free, struck.free),
+        ball=jnp.where(rests, number, jnp.where(falls, 1 - air.ball, air.ball)),
+        falls=falls,
+        status=jnp.where(rests & ~definite & (struck.status == RUNNING), UNRESOLVED, struck.status),
+        open=struck.open | falls,
+    )
+
+
+def _carried(
+    body: Top, free: FreeBody, riding: Float[Array, "7 ..."], time: Float[Array, "..."]
+) -> Float[Array, "7 ..."]:
+    """What rides along after some time [s] in flight."""
+    x, y, *across, angle, work = riding
+    u1, u2, _ = free.velocity
+    spin_rate = dot(free.axis, free.momentum) / body.I3
+    across = carried_aloft(body, free, tuple(across), time)
+    return jnp.stack([x + u1 * time, y + u2 * time, *across, angle + spin_rate * time, work + 0.0 * time])
+
+
+def _no_flights(start: Air) -> Record:
+    """Room for the flights of a single run."""
+
+    def room(leaf: Array) -> Array:
+        return jnp.zeros((MOST_BOUNCES, *leaf.shape), leaf.dtype)
+
+    motions = jax.tree.map(room, (start.free, start.riding))
+    return Record(jnp.inf + room(start.elapsed), motions, room(start.flights))
+
+
+def _with_flight(body: Top, record: Record | None, before: Air, after: Air) -> Record | None:
+    """A record, if one is kept, with the flight that leads from one state of a single run to another, if it flew."""
+    if record is None:
+        return None
+    place, flew = before.flights[0], after.flights > before.flights
+    turned = cone(body, before.free).rate * (after.elapsed - before.elapsed)
+    new = Record(
+        jnp.where(flew, after.elapsed, jnp.inf), (before.free, before.riding), 1 + (turned / SHOWN).astype(int)
+    )
+    return jax.tree.map(lambda kept, leaf: kept.at[place].set(leaf), record, new)
+
+
+def _where(condition: Bool[Array, " cells"], this: Any, that: Any) -> Any:
+    """Each leaf of one tree where a condition holds, of the other elsewhere."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), this, that)
+
+
+def _own_and_other(spheres: tuple[Ball, ...], number: Int[Array, "..."]) -> tuple[Ball, Ball | None]:
+    """The sphere with a number, and the other if there is one."""
+    if len(spheres) == 1:
+        return spheres[0], None
+    main, stem = spheres
+    return _where(number == 0, main, stem), _where(number == 0, stem, main)

@@ -1,0 +1,159 @@
+"""One run through contacts, flights and impacts, with its path, where flights are integrated."""
+
+import dataclasses
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from nonholonomic.geometry import scale, sum_vectors
+from nonholonomic.hybrid import BETWEEN, Piece, follow_phases, phased_samples
+from nonholonomic.integration import Settings
+
+from ..model.dynamics import LOSSES, NO_COSINE, Motion
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..model.state import parts
+from ..modes import airborne, airborne_stem
+from ..modes.airborne import (
+    FLYING,
+    ON_STEM,
+    STRIKING,
+    aloft,
+    below,
+    carried_frame,
+    freed,
+    in_contact,
+    loss,
+    parted,
+    standing,
+)
+from ..modes.airborne_stick_slip import phases as stick_slip_phases
+from ..modes.free_body import Ball, balls
+from ..modes.inversion_problem import InversionProblem
+from ..modes.trajectory_problem import TrajectoryProblem
+from .flight_trajectory import STATUS, HybridTrajectory, flights_of, sampled_flights
+from .observables import of_each_run
+from .sampled import STATUS as CODES
+
+
+class ArenaTrajectory(HybridTrajectory):
+    """A `HybridTrajectory` over any arena: `theta` and `azimuth` refer to the frame at the foot, the point of the arena nearest
+    to the centre of the top's own sphere, and `distance` is that of this sphere from it. The frame of `slip` is that at the
+    foot of the sphere that touches."""
+
+    @of_each_run
+    def energy(self) -> Float[Array, " times"]:
+        """Kinetic energy plus weight times the height of the centre of mass [J]."""
+        scene, (_, e, L, place) = self.scene, parts(self.states)
+        (distance, rate), n_up = self.above, scene.frame.vertical(place)[2]
+        # In contact the velocity along n is that of the centre of mass about the sphere's centre.
+        about = -scene.body.offset * (L[0] * e[1] - L[1] * e[0]) / scene.body.I1
+        lifted = scene.gravity * distance * n_up + 0.5 * ((about + rate) ** 2 - about**2)
+        return scene.energy(self.states) + scene.body.mass * lifted
+
+    @of_each_run
+    def theta_rate(self) -> Float[Array, " times"]:
+        """Rate of change of theta [rad/s]."""
+        dynamics = self.scene.dynamics
+        # The frame is carried along by the centre of the top's sphere, wherever that is.
+        frame = dataclasses.replace(carried_frame(self.scene), distance=self.scene.body.radius + self.above[0])
+        rates = dataclasses.replace(dynamics, frame=frame).field(self.states)
+        return jax.jvp(self.scene.theta, (self.states,), (rates,))[1]
+
+    @of_each_run
+    def normal_force(self) -> Float[Array, " times"]:
+        """Normal force [N]; 0 in flight."""
+        force = self.scene.normal_force(self.states)
+        if self.scene.body.stem is not None:
+            force = jnp.where(self.contact == 1, self._on_stem.normal_force, force)
+        return jnp.where(self.contact < 0, 0.0, force)
+
+    @of_each_run
+    def slip(self) -> Float[Array, "times 2"]:
+        """Velocity along the tangent plane of the point of a sphere that is closest to the arena [m/s]: of the stem's sphere
+        while that touches, else of the top's own."""
+        slip = self.scene.slip_velocity(self.states)
+        if self.scene.body.stem is not None:
+            of_stem = self._on_stem.slip
+            slip = jnp.where(self.contact == 1, jnp.stack([of_stem.x, of_stem.y]), slip)
+        return slip.T
+
+    @property
+    def _on_stem(self) -> Motion:
+        """The motion on the stem, at times at which that touches; the first tangent is the projection of the one shown."""
+        scene, place = self.scene, parts(self.states).place
+        (distance, rate), own, stem = self.above, *balls(scene.body)
+        # Its place is that of a top whose own sphere is so much greater that it touches.
+        flying = aloft(parted(scene, self.states, False, Ball(own.offset, own.radius + distance)))
+        frame = carried_frame(scene)
+        flying = flying._replace(velocity=tuple(sum_vectors(flying.velocity, scale(rate, frame.normal(place[:3])))))
+        ground = below(scene, flying, stem)
+        ground = ground._replace(axes=frame.own_axes((*ground.foot, *place[3:])))
+        return standing(scene, stem).motion(in_contact(ground, freed(scene, flying, ground, stem)))
+
+    @staticmethod
+    def parts_of(shown: Float[np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
+        return shown[:14], shown[14:17], shown[17], shown[18], shown[19:]
+
+    @staticmethod
+    def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
+        # Also of traced numbers, -1 after the end of a run.
+        return (numbers == ON_STEM) - 1 * ((numbers == FLYING) | (numbers == STRIKING) | (numbers < 0))
+
+
+class StickSlipArenaTrajectory(ArenaTrajectory):
+    """An `ArenaTrajectory` under Coulomb's law as it stands; `stats` holds `sticks` too, how often a slip has turned into
+    rolling."""
+
+    @staticmethod
+    def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
+        # Between two phases a slip begins.
+        return -1 * (numbers == FLYING)
+
+    @staticmethod
+    def work_in(piece: Piece) -> float:
+        if piece.number == BETWEEN:
+            return float(np.diff(piece.at(np.array([piece.begin, piece.end]))[18])[0])
+        return ArenaTrajectory.work_in(piece)
+
+
+def arena_phases(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "19 1"]]:
+    """The phases of one launch of a hybrid scene on any arena, the number of the first, and the state there.
+
+    **Arguments:** `modules`: scene and launch; `tolerance`: relative, of the integration.
+    """
+    run = TrajectoryProblem.of(*modules)
+    state, scales = run.start()
+    problem = InversionProblem(modules[0].dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
+    phases = airborne.phases if modules[0].body.stem is None else airborne_stem.phases
+    if modules[0].friction.set_valued:
+        phases = stick_slip_phases
+    return (*phases(modules[0], problem, tolerance, last=False, rides=True), state[:, None])
+
+
+def simulate_airborne(
+    scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver | None
+) -> ArenaTrajectory:
+    """Run one launch of a hybrid scene whose flights are integrated. **Arguments:** as for `simulate`, checked."""
+    kinds, first, state = arena_phases((scene, launch), tolerance)
+    exact = scene.friction.set_valued
+    path = follow_phases(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1 + exact)
+    status = STATUS[path.status]
+    if status == "jammed":
+        status = LOSSES[int(loss(scene, jnp.asarray(path.state)))]
+    hops = np.array([(one.begin, one.end) for one in path.stays if one.number == FLYING]).reshape(-1, 2)
+    run = flights_of(StickSlipArenaTrajectory if exact else ArenaTrajectory, scene, path, status, hops, times)
+    if exact:
+        run.stats["sticks"] = int(path.counts[1])
+    return run
+
+
+def sampled_airborne(scene: Scene, launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:
+    """Run one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, checked."""
+    found = phased_samples(arena_phases, (scene, launch), times, t1, settings, kinds=1)
+    codes = jnp.asarray([CODES.index(word) for word in LOSSES])
+    return sampled_flights(ArenaTrajectory, scene, times, found, codes[loss(scene, found.end_state)])

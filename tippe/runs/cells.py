@@ -1,0 +1,237 @@
+"""How the cells of a table are run: the kinds of scene, and the variables of each."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from nonholonomic.hybrid import AbstractPhase, Journey, travel
+from nonholonomic.integration import (
+    CROSSED,
+    FAILED,
+    GUARD_LOST,
+    REACHED_END,
+    UNRESOLVED,
+    Outcome,
+    Settings,
+    compiled_march,
+    march_by_diffrax,
+)
+from nonholonomic.parameters import with_numbers
+from nonholonomic.sweeps import Variable
+
+from ..model.dynamics import LOSSES
+from ..model.scene import Scene
+from ..modes import airborne, airborne_stem, airborne_stick_slip
+from ..modes.inversion_problem import InversionProblem
+from ..modes.sliding import phases as hybrid_phases
+from ..modes.stick_slip_runs import phases as stick_slip_phases
+from .inversion import is_inverted
+from .sensitivities import phased_slopes_of_cells, slopes_of_cells
+
+
+class Driver(NamedTuple):
+    """How the runs of a kind of scene go: the words of their status, what is counted besides steps, and the phases.
+
+    `phases` takes (scene, problem, tolerance, last) and gives the phases and the number of each cell's first; `None` for runs
+    of one smooth motion. `aloft` is whether states may be those of flight, in a layout of their own.
+    """
+
+    words: tuple[str, ...]
+    counts: tuple[str, ...]
+    phases: Callable[..., tuple[tuple[AbstractPhase, ...], Int[Array, " cells"]]] | None
+    aloft: bool = False
+
+    @property
+    def smooth(self) -> bool:
+        """Whether a run is one smooth motion."""
+        return self.phases is None
+
+    @property
+    def variables(self) -> dict[str, Variable]:
+        """The table's variables besides the times."""
+        found = {"status": Variable("1", np.int8, self.words, long_name="how the run ended")}
+        found |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
+        found |= {"end_theta": Variable("rad", np.float64, long_name="θ at the end of the run")}
+        counts = ("steps", "rejected", *self.counts)
+        return found | {name: Variable("1", np.int64, long_name=COUNTED[name]) for name in counts}
+
+
+#: What is counted in a run, and the times that are found, in words.
+COUNTED = {"steps": "steps", "rejected": "rejected steps", "hops": "flights", "sticks": "changes from slip to rolling"}
+TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_time": "last inversion time"}
+
+# Compiled once for all blocks.
+_on_the_ground = eqx.filter_jit(airborne.on_the_ground)
+_loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
+_loss_aloft = eqx.filter_jit(airborne.loss)
+
+
+@eqx.filter_jit
+def _at_the_end(
+    scene: Scene, problem: InversionProblem, ended: Outcome | Journey, last: bool
+) -> tuple[Bool[Array, " cells"], Float[Array, " cells"]]:
+    """Which cells count as inverted, and theta [rad] at the end of each."""
+    return is_inverted(ended, problem, last), scene.theta(jnp.asarray(ended.state))
+
+
+WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit")
+SMOOTH = Driver(WORDS, (), None)
+STICK_SLIP = Driver((*WORDS, "unresolved"), ("sticks",), stick_slip_phases)
+HYBRID = Driver((*WORDS, "unresolved"), ("hops",), hybrid_phases)
+AIRBORNE = Driver((*WORDS, "unresolved"), ("hops",), airborne.phases, aloft=True)
+ON_STEM_TOO = Driver((*WORDS, "unresolved"), ("hops",), airborne_stem.phases, aloft=True)
+STICK_SLIP_FLY = Driver((*WORDS, "unresolved"), ("hops", "sticks"), airborne_stick_slip.phases, aloft=True)
+
+#: The word for a run's status if it has not inverted; `not_inverted` for all others.
+WORD_OF_STATUS = {GUARD_LOST: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
+
+
+def driver_of(scene: Scene) -> Driver:
+    """The driver for a scene."""
+    hybrid = scene.contact == "hybrid"
+    if scene.friction.set_valued:
+        return STICK_SLIP_FLY if hybrid else STICK_SLIP
+    if not hybrid:
+        return SMOOTH
+    if scene.flies_in_closed_form:
+        return HYBRID
+    return AIRBORNE if scene.body.stem is None else ON_STEM_TOO
+
+
+def check_differentiable(scene: Scene) -> None:
+    """Raise `ValueError` for a scene through whose phases no derivative goes."""
+    if driver_of(scene) is STICK_SLIP_FLY:
+        raise ValueError(
+            "friction = SetValuedCoulomb with contact = 'hybrid' has no derivatives: they do not go through impacts in which a "
+            "slip may stop"
+        )
+
+
+class CellRuns(NamedTuple):
+    """What is asked of every cell of a table; see `inversion_table`."""
+
+    driver: Driver
+    t1: float
+    angle: float
+    crossing: str
+    solver: diffrax.AbstractERK | None
+    method: str
+    slopes_by: list[str]
+
+    @property
+    def times(self) -> tuple[str, ...]:
+        """The table's variables that are times of crossings."""
+        return ("first_time", "last_time") if self.crossing == "both" else ("time",)
+
+    @property
+    def last(self) -> bool:
+        """Whether a run goes on through the angle: where it ends above it, the last crossing counts."""
+        return self.crossing != "first"
+
+    @property
+    def variables(self) -> dict[str, Variable]:
+        """The table's variables, but errors and derivatives."""
+        times = {name: Variable("s", np.float64, long_name=TIMES[name]) for name in self.times}
+        grazes = Variable("1", np.int8, long_name="whether an event on the way was grazing")
+        return times | self.driver.variables | ({"grazes": grazes} if self.slopes_by and not self.driver.smooth else {})
+
+    def results(self, roots: dict[str, Any], columns: dict[str, Any], tolerance: float, count: int) -> dict[str, Any]:
+        """The variables of some cells.
+
+        **Arguments:** `roots`: scene and launch; `columns`: full name of a parameter -> its value in every cell, of which the
+        first `count` are to be run; `tolerance`: relative tolerance.
+        """
+        cells = with_numbers(roots, columns)
+        scene, launch = cells["scene"], cells["launch"]
+        size = next((len(values) for values in columns.values()), 1)
+        problem = InversionProblem.of(scene, launch, self.angle, size)
+        options = {"count": count, "size": size, "solver": self.solver, "last": self.last}
+        numbers = (roots, columns, self.slopes_by, self.angle)
+        if self.driver.phases is not None:
+            options |= {"kinds": len(self.driver.counts)}
+            along = functools.partial(phased_slopes_of_cells, self.driver.phases, *numbers, **options)
+            return self._travelled(scene, problem, tolerance, count, along)
+        if not self.slopes_by:
+            return self._ended(scene, problem, self._outcome(problem, tolerance, count))
+        outcome, slopes = slopes_of_cells(*numbers, self.t1, tolerance, **options)
+        return self._ended(scene, problem, outcome) | slopes
+
+    def _travelled(
+        self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, along: Callable[..., Any]
+    ) -> dict[str, Any]:
+        """The variables of cells whose runs have phases; `along` takes (horizon, tolerance) and gives runs and slopes."""
+        if self.slopes_by and not self.last:
+            found, slopes, grazing = along(self.t1, tolerance)
+        else:
+            found = self._journey(scene, problem, tolerance, count, self.last)
+        if self.slopes_by and self.last:
+            # The slopes need the run up to the event alone, whose time is known by now.
+            there, slopes, grazing = along(
+                np.where(np.isfinite(found.crossing_time), found.crossing_time, 0.0), tolerance
+            )
+            grazing |= there.status != REACHED_END
+        loss = functools.partial(self._loss, scene, found.state)
+        if self.driver.aloft:
+            found = found._replace(state=np.asarray(_on_the_ground(scene, found.state, found.phase)))
+        named = self._named(scene, problem, found, loss) | dict(zip(self.driver.counts, found.counts, strict=True))
+        if self.crossing == "both":
+            # Through phases the first crossing takes a journey of its own, which ends there.
+            first = self._journey(scene, problem, tolerance, count, False)
+            named["first_time"] = np.where(first.status == CROSSED, first.crossing_time, np.inf)
+        if not self.slopes_by:
+            return named
+        # At the very start the event is there at once, whatever moves.
+        moves = (named["status"] == 0) & (named[self.times[-1]] > 0.0)
+        slopes = {name: np.where(moves, np.where(grazing, np.nan, slope), 0.0) for name, slope in slopes.items()}
+        return named | slopes | {"grazes": (moves & grazing).astype(np.int8)}
+
+    def _journey(self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, last: bool) -> Journey:
+        """The runs of cells through their phases."""
+        assert self.driver.phases is not None
+        phases, first = self.driver.phases(scene, problem, tolerance, last)
+        start, settings = (np.asarray(first), np.asarray(problem.states)), Settings(tolerance, self.solver)
+        return travel(phases, *start, self.t1, count, settings, kinds=len(self.driver.counts), passes=last)
+
+    def _outcome(self, problem: InversionProblem, tolerance: float, count: int) -> Outcome:
+        horizon, settings = jnp.asarray(self.t1), Settings(tolerance, self.solver)
+        if self.method == "diffrax":
+            return march_by_diffrax(problem, horizon, settings)
+        return compiled_march(problem, horizon, jnp.asarray(count), settings, passes=self.last)[0]
+
+    def _ended(self, scene: Scene, problem: InversionProblem, outcome: Outcome) -> dict[str, Any]:
+        """The variables of cells whose runs are one smooth motion."""
+        return self._named(scene, problem, outcome, functools.partial(self._loss, scene, outcome.state))
+
+    def _loss(self, scene: Scene, state: Any) -> Any:
+        """How the contacts ended with which runs ended: codes in `LOSSES`."""
+        if self.driver is HYBRID:
+            # It flies on where contact is lost, and fits everywhere.
+            return LOSSES.index("jammed")
+        state = jnp.asarray(state)
+        return np.asarray(_loss_aloft(scene, state) if self.driver.aloft else _loss(scene.dynamics, state))
+
+    def _named(
+        self, scene: Scene, problem: InversionProblem, ended: Outcome | Journey, loss: Callable[[], Any]
+    ) -> dict[str, Any]:
+        inverted, theta = _at_the_end(scene, problem, ended, self.last)
+        others = [np.asarray(ended.status) == status for status in WORD_OF_STATUS]
+        code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
+        lost = code == WORDS.index("contact_lost")
+        if lost.any():
+            code = np.where(lost, np.array([WORDS.index(word) for word in LOSSES])[loss()], code)
+        times = {self.times[-1]: np.where(inverted, ended.crossing_time, np.inf)}
+        if isinstance(ended, Outcome) and self.crossing == "both":
+            times["first_time"] = np.asarray(ended.first_crossing)
+        return times | {
+            "status": code.astype(np.int8),
+            "end_time": np.asarray(ended.end_time),
+            "end_theta": np.asarray(theta),
+            "steps": np.asarray(ended.steps),
+            "rejected": np.asarray(ended.rejected),
+        }

@@ -1,0 +1,142 @@
+"""Inversion times that a loss can follow beyond the horizon: finite, and with a slope, where the top does not invert."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from nonholonomic.derivatives import AbstractQuestion, VariationalProblem, ask, directions_by, in_groups
+from nonholonomic.integration import CROSSED, FAILED, Queue, Settings, crossing_time
+from nonholonomic.progress import telling
+from nonholonomic.validation import as_number, is_traced
+
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..model.state import inclination, parts
+from ..modes.inversion_problem import InversionProblem
+from .inversion import check_event, check_run, check_smooth, nan_if_illegal, permitted
+
+#: A cell that needs more steps than this has failed: parameters tried by a fit may be far off.
+MOST_STEPS = 100_000
+
+#: The least angle [rad] distinguished from 0 in the penalty for a top that does not invert.
+LEAST_ANGLE = 1e-6
+
+
+@telling("simulating")
+def extended_inversion_time(
+    scene: Scene,
+    launch: Launch,
+    t1: float,
+    angle: Float[ArrayLike, ""] = 0.95 * math.pi,
+    tolerance: float = 1e-8,
+) -> Float[Array, ""]:
+    """Inversion time, continued beyond the horizon so that a loss is finite everywhere and leads back.
+
+    A top that has not inverted by `t1`, or has lost contact, and is then at theta counts as inverting at
+    t1 (1 + log(angle / theta) / C), C = log(angle / theta at the launch), 1 at least. Where theta grows as exp(s t), as it
+    does from small angles, this is the tangent to the time C / s, taken at the rate s that arrives exactly at `t1`: continuous
+    with its slope where a time passes the horizon, and linear in the rate beyond. It is a penalty, not a prediction. It works
+    under `jit`, `vmap`, `grad`, `jvp` and their compositions; the derivative is that of the event's time (implicit function
+    theorem) and of the penalty, by every number but `t1` and `tolerance`.
+
+    **Arguments:**
+
+    - `scene`, `launch`, `t1`, `angle`: as for `inversion_time`, every number a scalar.
+    - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
+
+    **Returns:** the time [s]; NaN where the integration failed or numbers inside a transformation are out of range.
+
+    **Raises:** `ValueError` for arguments out of range, and for a scene with `contact="hybrid"` or `SetValuedCoulomb`.
+
+    **Example:** this top does not invert by 3 s, and counts as one that would later.
+
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=3.0e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> print(3.0 < tippe.extended_inversion_time(scene, tippe.Launch(0.2, 60.0), t1=3.0) < 10.0)
+    True
+    """
+    check_run(scene, launch, t1, tolerance)
+    check_event(angle, "first")
+    check_smooth(scene, "extended_inversion_time")
+    leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
+    unchecked = any(is_traced(leaf) for leaf in leaves)
+    found = ask(ExtendedQuestion(len(leaves) - 2, structure, unchecked), *leaves)
+    return nan_if_illegal(found, structure, unchecked, leaves)
+
+
+class ExtendedQuestion(AbstractQuestion):
+    """When cells invert, beyond the horizon too; the leaves are those of `InversionQuestion`."""
+
+    movable: int
+    # JAX's PyTreeDef, which type checkers take for a variable.
+    structure: Any = eqx.field(static=True)
+    # Whether some numbers were traced, so that the checks could not see them.
+    unchecked: bool = eqx.field(static=True)
+
+    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
+        # Every run has one. A select on NaN would make the derivative of a run that failed zero.
+        return jnp.zeros(jnp.shape(value), bool)
+
+    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
+        return self._found((), self._problem(leaves[: self.movable], cells), leaves, cells)[0]
+
+    def with_slopes(
+        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
+        problem, directions, gather = directions_by(self._problem, active, leaves[: self.movable], cells)
+
+        def run(some: tuple[Any, ...]) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
+            return self._found(some, problem, leaves, cells, again)
+
+        times, slopes = in_groups(run, directions)
+        return times, gather(slopes)
+
+    def _problem(self, leaves: tuple[Array, ...], cells: int | None) -> InversionProblem:
+        """The launches of some cells."""
+        assert cells is not None
+        scene, launch, angle, *_ = jax.tree.unflatten(self.structure, (*leaves, None, None))
+        return InversionProblem.of(scene, launch, angle, cells)
+
+    def _found(
+        self,
+        directions: tuple[Any, ...],
+        problem: InversionProblem,
+        leaves: tuple[Array, ...],
+        cells: int,
+        again: bool = False,
+    ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
+        """The extended times of every cell, and their derivatives along directions (as of `VariationalProblem`)."""
+        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
+        varied = VariationalProblem(problem, directions, True)
+        settings = Settings(tolerance, max_steps=MOST_STEPS)
+        queue = Queue.of(varied, t1, jnp.asarray(cells), settings, one_kernel=not again, parts=1 + len(directions))
+        outcome, _ = queue.outcome()
+        state, *variations = varied.parts(outcome.state)
+        crossed = outcome.status == CROSSED
+
+        def extended(problem: InversionProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+            # A cell that starts beyond the angle has reached it at once.
+            time = jnp.where(outcome.end_time > 0.0, crossing_time(problem, outcome.end_time, state), 0.0)
+            angle = jnp.arccos(problem.cos_angle)
+            missing = _e_folds(state, angle)
+            whole = jnp.maximum(_e_folds(problem.states, angle), 1.0)
+            return jnp.where(crossed, time, t1 * (1.0 + missing / whole))
+
+        good = may & (outcome.status != FAILED)
+        times = jnp.where(good, extended(problem, state), jnp.nan)
+        slopes = [
+            jnp.where(good, eqx.filter_jvp(extended, (problem, state), moved)[1], jnp.nan)
+            for moved in zip(directions, variations, strict=True)
+        ]
+        return times, slopes
+
+
+def _e_folds(state: Float[Array, "components cells"], angle: Float[Array, "..."]) -> Float[Array, " cells"]:
+    """How many times theta must still grow e-fold to reach an angle."""
+    theta = inclination(parts(state).axis)
+    return jnp.log(angle / jnp.clip(theta, LEAST_ANGLE, angle))

@@ -1,0 +1,204 @@
+"""One run through contacts, flights and impacts, with its path."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from nonholonomic.hybrid import BETWEEN, PhasedPath, PhasedSamples, Piece, follow_phases, phased_samples
+from nonholonomic.integration import FAILED, GUARD_LOST, REACHED_END, UNRESOLVED, Settings
+
+from ..model.dynamics import NO_COSINE
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..modes.free_body import Ball, FreeBody, balls, energy, freed, standing_on
+from ..modes.impact import approach
+from ..modes.inversion_problem import InversionProblem
+from ..modes.leaning import BOTH
+from ..modes.sliding import phases
+from ..modes.trajectory_problem import TrajectoryProblem
+from .observables import AbstractTrajectory, of_each_run
+from .sampled import STATUS as CODES
+
+STATUS = {REACHED_END: "reached t1", GUARD_LOST: "jammed", FAILED: "failed", UNRESOLVED: "unresolved"}
+
+
+class HybridTrajectory(AbstractTrajectory):
+    """A run through contacts, flights and impacts; vectors are arrays (times, 3) in the fixed frame (x, y, z).
+
+    `status` is "reached t1", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a row or
+    2000 contacts; sphere and stem on the plane together with so much friction that the forces are not determined; sphere and
+    stem at rest together on another arena); the run ends at `end_time`. `contact` says at each time which sphere touches: 0
+    the top's, 1 its stem's, 2 both, -1 none. At the time of an impact the values are those before it. `distance` is that of
+    the top's own sphere from the plane [m] with its rate [m/s]. `hops` has a row for each flight until `end_time`, its begin
+    and its end [s]; a table counts those before the inversion. Bounces that shrink by the restitution e are followed down to
+    1e-5 sqrt(g R); from there on the top counts as in contact, though all that are left would take e / (1 - e) of the last
+    one's time. `work` is that of friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest
+    drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J]. `rotation` and
+    `angular_velocity` are those of `Trajectory`.
+
+    Inside a transformation `status` is a code as for `Trajectory`, 6 for "unresolved"; `hops` is `None`, `stats["hops"]`
+    counts the flights. First derivatives by the scene and the launch go through flights and impacts; they are NaN behind an
+    event that is grazing, so that within the tolerance it may not happen at all.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3), contact="hybrid")
+    >>> run = tippe.simulate(scene, tippe.Launch(0.1, 155.0), t1=0.1, tolerance=1e-6)
+    >>> int(run.contact[0]), len(run.hops)
+    (0, 0)
+
+    ```
+    """
+
+    t: Float[np.ndarray, " times"]
+    scene: Scene
+    states: Float[np.ndarray, "8 times"]
+    cyclic: Float[np.ndarray, "5 times"]
+    spin_angle: Float[np.ndarray, " times"]
+    work: Float[np.ndarray, " times"]
+    status: str
+    end_time: float
+    stats: dict[str, Any]
+    dense: PhasedPath
+    distance: Float[np.ndarray, "2 times"]
+    contact: Int[np.ndarray, " times"]
+    hops: Float[np.ndarray, "hops 2"] | None
+
+    unused = (*AbstractTrajectory.unused, "hops")
+    by_time = (*AbstractTrajectory.by_time, "distance", "contact")
+
+    @property
+    def above(self) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, " times"]]:
+        """Distance of the top's own sphere from the plane [m] and its rate [m/s]."""
+        return self.distance[0], self.distance[1]
+
+    @property
+    def _free(self) -> FreeBody:
+        """The top as a free body, in contact too."""
+        body, states = self.scene.body, self.states
+        free = freed(body, balls(body)[0], jnp.asarray(states))
+        (distance, rate), (u1, u2, u3) = self.above, free.velocity
+        return FreeBody((u1, u2, u3 + rate), free.height + distance, free.axis, free.momentum)
+
+    @property
+    def _ball(self) -> Ball:
+        """The sphere that touches, the top's own in flight and where both do."""
+        spheres = balls(self.scene.body)
+        return Ball(
+            *(jnp.where(self.contact == 1, stem, own) for own, stem in zip(spheres[0], spheres[-1], strict=True))
+        )
+
+    @of_each_run
+    def energy(self) -> Float[Array, " times"]:
+        """Kinetic energy plus weight times the height of the centre of mass [J]."""
+        return energy(self.scene.body, self.scene.gravity, self._free)
+
+    @of_each_run
+    def normal_force(self) -> Float[Array, " times"]:
+        """Normal force [N]; 0 in flight. Where both spheres touch it is their sum, the weight."""
+        motion = standing_on(self.scene.dynamics, self._ball).motion(jnp.asarray(self.states))
+        both = jnp.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, motion.normal_force)
+        return jnp.where(self.contact < 0, 0.0, both)
+
+    @of_each_run
+    def slip(self) -> Float[Array, "times 2"]:
+        """Velocity along the plane of the lowest point of the sphere that touches [m/s]: of the top's own in flight too, and
+        where both touch."""
+        return jnp.stack(approach(self.scene.body, self._ball, self._free).velocity[:2], axis=-1)
+
+    def resampled(self, times: Float[np.ndarray, " times"]) -> "HybridTrajectory":
+        """The same run at other times, which are not checked."""
+        found = (times, *self.parts_of(self.dense.at(times)), self.touching(self.dense.numbers(times)))
+        return eqx.tree_at(
+            lambda one: (one.t, one.states, one.cyclic, one.spin_angle, one.work, one.distance, one.contact),
+            self,
+            found,
+        )
+
+    @staticmethod
+    def parts_of(shown: Float[np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
+        """State, cyclic coordinates, spin angle, work, and the distance with its rate, from what the phases show."""
+        return shown[:8], shown[8:13], shown[13], shown[14], shown[15:]
+
+    @staticmethod
+    def work_in(piece: Piece) -> float:
+        """The work [J] of friction in a piece of the path, that of impacts apart."""
+        return 0.0 if piece.number == BETWEEN else piece.motion.states[-1, -1] - piece.motion.states[-1, 0]
+
+    @staticmethod
+    def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
+        """Which sphere touches, for the numbers of the phases."""
+        return numbers
+
+    def __str__(self) -> str:
+        return f"{super().__str__()}\n  {len(self.hops)} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
+
+
+def level_phases(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "15 1"]]:
+    """The phases of one launch of a hybrid scene on a level plane, the number of the first, and the state there.
+
+    **Arguments:** `modules`: scene and launch; `tolerance`: no phase needs it.
+    """
+    scene = modules[0]
+    state, scales = TrajectoryProblem.of(*modules).start()
+    # The place is that of the centre of mass.
+    state = state.at[8:10].add(-scene.body.offset * state[2:4])
+    problem = InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
+    return (*phases(scene, problem, tolerance, last=False, rides=True), state[:, None])
+
+
+def simulate_hybrid(
+    scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver | None
+) -> HybridTrajectory:
+    """Run one launch of a hybrid scene until `t1`. **Arguments:** as for `simulate`, checked."""
+    kinds, first, state = level_phases((scene, launch), tolerance)
+    path = follow_phases(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1)
+    hops = np.array([(one.begin, one.end) for one in path.pieces if one.number == BETWEEN]).reshape(-1, 2)
+    return flights_of(HybridTrajectory, scene, path, STATUS[path.status], hops, times)
+
+
+def sampled_hybrid(scene: Scene, launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
+    """Run one launch of a hybrid scene inside a transformation. **Arguments:** as for `simulate`, checked."""
+    found = phased_samples(level_phases, (scene, launch), times, t1, settings, kinds=1)
+    return sampled_flights(HybridTrajectory, scene, times, found, jnp.asarray(CODES.index("jammed")))
+
+
+def sampled_flights(
+    kind: type[HybridTrajectory], scene: Scene, times: Any, found: PhasedSamples, lost: Int[Array, ""]
+) -> Any:
+    """A trajectory of some kind from samples; `lost` is the code of how a run has ended that its guard has ended."""
+    states, place, spin_angle, work, distance = kind.parts_of(found.shown)
+    # After the end no sphere touches.
+    number = jnp.where(jnp.isnan(found.number), BETWEEN, found.number).astype(int)
+    ended = {code: jnp.asarray(CODES.index(word)) for code, word in STATUS.items()} | {GUARD_LOST: lost}
+    status = sum(jnp.where(found.status == code, index, 0) for code, index in ended.items())
+    stats = {"accepted": found.steps - found.rejected, "rejected": found.rejected, "hops": found.counts[0]}
+    stats = {name: count.astype(int) for name, count in stats.items()}
+    ends = (status, found.end_time, stats, None, distance, kind.touching(number), None)
+    return kind(times, scene, states, place, spin_angle, work, *ends)
+
+
+def flights_of(
+    kind: type[HybridTrajectory],
+    scene: Scene,
+    path: PhasedPath,
+    status: str,
+    hops: Float[np.ndarray, "hops 2"],
+    times: Any,
+) -> Any:
+    """A trajectory of some kind along a path, at given times or at those of its steps."""
+    shown = path.times
+    states, place, spin_angle, work, distance = kind.parts_of(path.at(shown))
+    ends = (status, path.end_time, {}, path, distance, kind.touching(path.numbers(shown)), hops)
+    run = kind(shown, scene, states, place, spin_angle, work, *ends)
+    in_contact = sum(kind.work_in(one) for one in path.pieces)
+    # What is left of the work is that of the impacts.
+    run = run.with_stats(path, impact_loss=float(in_contact - path.state[-1]))
+    return run if times is None else run.resampled(np.asarray(times)[np.asarray(times) <= run.end_time])

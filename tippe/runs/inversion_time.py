@@ -1,0 +1,212 @@
+"""The time of inversion of one launch, as a function for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
+
+import math
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from nonholonomic.derivatives import AbstractQuestion, ask, directions_by, in_groups, traced_march_with_slopes
+from nonholonomic.hybrid import AbstractPhase, Journey, traced_travel, traced_travel_with_slopes
+from nonholonomic.integration import CROSSED, FAILED, REACHED_END, UNRESOLVED, Settings, explicit_tableau, traced_march
+from nonholonomic.progress import telling
+from nonholonomic.validation import as_number, is_traced
+
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..modes.airborne import on_the_ground
+from ..modes.inversion_problem import InversionProblem
+from .cells import check_differentiable, driver_of
+from .inversion import check_event, check_run, is_inverted, nan_if_illegal, permitted
+
+
+@telling("simulating")
+def inversion_time(
+    scene: Scene,
+    launch: Launch,
+    t1: float,
+    angle: Float[ArrayLike, ""] = 0.95 * math.pi,
+    tolerance: float = 1e-9,
+    crossing: str = "first",
+    solver: diffrax.AbstractERK | None = None,
+) -> Float[Array, ""]:
+    """Time at which theta reaches an angle; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
+
+    The derivative is that of the event's time by the implicit function theorem; it is 0 where the result is infinite.
+    Differentiating by one parameter costs about as much again as the time itself, by any number of them four to seven
+    times as much (`nonholonomic/derivatives/slopes.py`); second derivatives take forward-mode passes.
+
+    **Arguments:**
+
+    - `scene`, `launch`: as for `simulate`, every number a scalar.
+    - `t1`: horizon [s], positive.
+    - `angle`: angle [rad] to be reached, in (0, pi].
+    - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
+    - `crossing`: "first" for the first time theta reaches the angle, "last" for the up-crossing after which theta stays
+      above it until `t1`.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
+      `nonholonomic.integration.Oscillatory8()`.
+
+    **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before; NaN
+    if the integration failed, or if numbers inside a transformation are out of range.
+
+    With `contact="hybrid"` and `SetValuedCoulomb` first derivatives go through flights, impacts, stick and slip
+    (`nonholonomic/hybrid/varied_phases.py`). Where an event on the way is grazing, so that within the tolerance it may
+    not happen at all, the derivative is NaN; `inversion_table` says so in the variable `grazes`.
+
+    **Raises:** `ValueError` for arguments outside these ranges, for second derivatives through changes of phase, and for
+    derivatives with both, whose impacts may stop a slip.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> time = tippe.inversion_time(scene, tippe.Launch(0.1, 155.0), t1=8.0, tolerance=1e-6)
+    >>> print(f"{time:.2f} s")
+    5.97 s
+
+    ```
+    """
+    check_run(scene, launch, t1, tolerance)
+    check_event(angle, crossing)
+    solver = Settings(tolerance, solver).for_lanes
+    explicit_tableau(solver)
+    leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
+    unchecked = any(is_traced(leaf) for leaf in leaves)
+    question = InversionQuestion if driver_of(scene).smooth else PhasedInversionQuestion
+    # The last two leaves, horizon and tolerance, do not move the event.
+    found = ask(question(len(leaves) - 2, structure, solver, crossing == "last", unchecked), *leaves)
+    return nan_if_illegal(found, structure, unchecked, leaves)
+
+
+class InversionQuestion(AbstractQuestion):
+    """When cells invert; the leaves are those of scene and launch, the angle, the horizon, the tolerance."""
+
+    movable: int
+    # JAX's PyTreeDef, which type checkers take for a variable.
+    structure: Any = eqx.field(static=True)
+    solver: diffrax.AbstractERK
+    last: bool = eqx.field(static=True)
+    # Whether some numbers were traced, so that the checks could not see them.
+    unchecked: bool = eqx.field(static=True)
+
+    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
+        return jnp.isinf(value)
+
+    def problem(self, leaves: tuple[Array, ...], cells: int | None) -> InversionProblem:
+        """The launches of some cells."""
+        # The leaves that do not move the event are not needed here.
+        unused = (None,) * (self.structure.num_leaves - len(leaves))
+        scene, launch, angle, *_ = jax.tree.unflatten(self.structure, (*leaves, *unused))
+        assert cells is not None
+        return InversionProblem.of(scene, launch, angle, cells)
+
+    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
+        problem = self.problem(leaves[: self.movable], cells)
+        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
+        outcome, _ = traced_march(
+            problem,
+            t1,
+            jnp.asarray(cells),
+            Settings(tolerance, self.solver),
+            passes=self.last,
+            one_kernel=True,
+        )
+        time = jnp.where(is_inverted(outcome, problem, self.last), outcome.crossing_time, jnp.inf)
+        return jnp.where(may & (outcome.status != FAILED), time, jnp.nan)
+
+    def with_slopes(
+        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
+        # Cells do not influence one another, so varying a parameter in all of them at once gives each its own derivative.
+        problem, directions, gather = directions_by(self.problem, active, leaves[: self.movable], cells)
+        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
+        outcome, slopes = traced_march_with_slopes(
+            problem,
+            directions,
+            t1,
+            jnp.asarray(cells),
+            Settings(tolerance, self.solver),
+            passes=self.last,
+            one_kernel=not again,
+        )
+        inverted, good = is_inverted(outcome, problem, self.last), may & (outcome.status != FAILED)
+        time = jnp.where(good, jnp.where(inverted, outcome.crossing_time, jnp.inf), jnp.nan)
+        return time, [jnp.where(good, jnp.where(inverted, slope, 0.0), jnp.nan) for slope in gather(slopes)]
+
+
+class PhasedInversionQuestion(InversionQuestion):
+    """When cells invert whose runs have phases; the leaves are those of `InversionQuestion`."""
+
+    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
+        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
+        phases, first, problem, scene = self.phased((*leaves[: self.movable], tolerance), cells)
+        return self.named(may, self.journey(phases, first, problem, scene, t1, tolerance), problem, scene)
+
+    def with_slopes(
+        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
+        if again:
+            raise ValueError(
+                "second derivatives do not go through changes of phase: contact = 'hybrid', SetValuedCoulomb"
+            )
+        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
+        built = directions_by(self.phased, active, (*leaves[: self.movable], tolerance), cells)
+        (phases, first, problem, scene), directions, gather = built
+        check_differentiable(scene)
+        if self.last:
+            # The slopes need the run up to the event alone, whose time is known then.
+            whole = self.journey(phases, first, problem, scene, t1, tolerance)
+            t1 = jnp.where(jnp.isfinite(whole.crossing_time), whole.crossing_time, 0.0)
+        settings = Settings(tolerance, self.solver)
+
+        def run(some: tuple[Any, ...]) -> tuple[tuple[Journey, Array], list[Float[Array, " cells"]]]:
+            moved = tuple((one[0], one[2].states) for one in some)
+            given = (phases, moved, first, problem.states, t1, settings)
+            kinds = len(driver_of(scene).counts)
+            journey, found = traced_travel_with_slopes(*given, kinds=kinds, ends_on_event=not self.last)
+            return (journey, found.grazing), list(found.slopes)
+
+        (journey, grazing), slopes = in_groups(run, directions)
+        time = self.named(may, whole if self.last else journey, problem, scene)
+        ended = journey.status == (REACHED_END if self.last else CROSSED)
+        digits = ended & ~grazing
+        # At the very start the event is there at once, whatever moves.
+        happened = jnp.isfinite(time) & (time > 0.0)
+        return time, [jnp.where(happened, jnp.where(digits, slope, jnp.nan), 0.0 * time) for slope in gather(slopes)]
+
+    def phased(self, leaves: tuple[Array, ...], cells: int | None) -> Any:
+        """The phases of some cells, the number of each one's first, problem and scene; the last leaf is the tolerance."""
+        *own, tolerance = leaves
+        scene, *_ = jax.tree.unflatten(self.structure, (*own, *(None,) * (self.structure.num_leaves - len(own))))
+        problem, phases_of = self.problem(tuple(own), cells), driver_of(scene).phases
+        assert phases_of is not None
+        return (*phases_of(scene, problem, tolerance, self.last), problem, scene)
+
+    def journey(
+        self,
+        phases: tuple[AbstractPhase, ...],
+        first: Int[Array, " cells"],
+        problem: InversionProblem,
+        scene: Scene,
+        t1: Float[Array, "..."],
+        tolerance: Float[Array, ""],
+    ) -> Journey:
+        """The runs of cells through their phases."""
+        settings, kinds = Settings(tolerance, self.solver), len(driver_of(scene).counts)
+        return traced_travel(phases, first, problem.states, t1, settings, kinds=kinds, passes=self.last)
+
+    def named(
+        self, may: Bool[Array, "..."], ended: Journey, problem: InversionProblem, scene: Scene
+    ) -> Float[Array, " cells"]:
+        """The times of inversion."""
+        if driver_of(scene).aloft:
+            ended = ended._replace(state=on_the_ground(scene, ended.state, ended.phase))
+        time = jnp.where(is_inverted(ended, problem, self.last), ended.crossing_time, jnp.inf)
+        failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
+        return jnp.where(may & ~failed, time, jnp.nan)

@@ -1,0 +1,115 @@
+"""The grid of launches and scenes that a table is asked for, made of its arguments and checked."""
+
+from collections import Counter
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+
+from nonholonomic.parameters import description, numbers, with_numbers
+from nonholonomic.sweeps import Axis, axis, cells_to_check
+
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..model.top import Top
+from .inversion import check_run
+
+UNITS = Top.units | Scene.units | Launch.units
+
+#: What the axes are, in words.
+LONG_NAMES = {
+    "theta": "θ(0)",
+    "eta": "η(0)",
+    "azimuth": "φ(0)",
+    "spin": "spin ω₃(0)",
+    "mu": "friction μ",
+    "mass": "mass m",
+    "radius": "radius",
+    "offset": "offset a",
+    "equatorial": "equatorial half axis b",
+    "polar": "polar half axis p",
+    "I1": "moment of inertia I₁",
+    "I3": "moment of inertia I₃",
+    "gravity": "gravity g",
+    "slip_speed": "slip speed",
+    "restitution": "restitution e_N",
+}
+
+#: The parts of a launch that are several numbers: what an axis along each is called, and its unit.
+SEVERAL = {
+    "velocity": [(f"velocity_{axis}", "m s-1") for axis in ("t1", "t2")],
+    "angular_velocity": [(f"angular_velocity_{axis}", "rad s-1") for axis in ("t1", "t2", "n")],
+}
+
+
+def launches(
+    scene: Any, given: dict[str, Any], axes: Any, t1: Any, tolerance: Any, taken: Collection[str] = ()
+) -> tuple[dict[str, Any], list[Axis], dict[str, str]]:
+    """The scene and launch that all cells share, and the axes of the grid, its cells checked before anything compiles.
+
+    **Arguments:**
+
+    - `scene`: the scene, every number a scalar.
+    - `given`: number of the launch, or "mu" for the scene's friction, its own if `None` -> a number or a list.
+    - `axes`: path of a number -> values, or `None`; those of a launch's several numbers are `"launch.place[0]"` and so on, and
+      what is left out of them is 0.
+    - `t1`, `tolerance`: as for `inversion_table`.
+    - `taken`: names that no axis may have; it then goes by its path, as do axes that would share a name.
+
+    **Returns:** "scene" and "launch" with the numbers that are no axes, for `with_numbers`; the axes, the last varying
+    fastest; and the units of numbers by their short names.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown axis.
+    """
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene = {scene!r} must be a Scene")
+    if axes is not None and not (isinstance(axes, dict) and all(isinstance(number, str) for number in axes)):
+        raise ValueError(f"axes = {axes!r} must be a dictionary, path of a number -> values")
+    known = numbers("scene.friction", scene.friction)
+    of_mu = next((number for number in known if number.endswith(".mu")), "scene.friction.mu")
+    paths = {name: of_mu if name == "mu" else f"launch.{name}" for name in given}
+    values = {paths[name]: value for name, value in given.items() if name != "mu" or value is not None}
+    for number in values:
+        if number in (axes or {}):
+            raise ValueError(f"axes: {number!r} is an argument of its own")
+    values |= axes or {}
+    fixed = {number: value for number, value in values.items() if np.ndim(value) == 0}
+    launch, several = _with_room(scene, values)
+    units = UNITS | scene.body.units | scene.friction.units | dict(several.values())
+    names = {number: several.get(number, (number.rsplit(".", 1)[-1],))[0] for number in values}
+    # A place that is given takes the place of the argument eta.
+    counts = Counter(name for number, name in names.items() if number != "launch.eta" or launch.place is None)
+    grid = []
+    for number, name in names.items():
+        if number not in fixed:
+            alone = counts[name] == 1 and name not in taken
+            unit, long_name = units.get(name, "1"), LONG_NAMES.get(name, name)
+            grid.append(axis(name if alone else number, number, unit, values[number], long_name))
+    roots = with_numbers({"scene": scene, "launch": launch}, fixed)
+    check_run(roots["scene"], roots["launch"], t1, tolerance)
+    # The modules check their numbers, which may be impossible only together.
+    for cells in cells_to_check(grid):
+        looked_at = with_numbers(roots, cells)
+        looked_at["scene"].check_start(looked_at["launch"])
+    return roots, grid, units
+
+
+def _with_room(scene: Scene, values: Collection[str]) -> tuple[Launch, dict[str, tuple[str, str]]]:
+    """A launch with room for all numbers that are given, and the name and unit of each that is one of several."""
+    found: dict[str, tuple[str, str]] = {}
+    parts: dict[str, Any] = {}
+    coordinates = list(scene.surface.coordinates)
+    if "launch.place[2]" in values and len(coordinates) == 2:
+        coordinates = [("x", "m"), ("y", "m"), ("z", "m")]
+    for name, labels in {"place": coordinates, **SEVERAL}.items():
+        here = {f"launch.{name}[{k}]": label for k, label in enumerate(labels)}
+        if not here.keys().isdisjoint(values):
+            parts[name] = (0.0,) * len(labels)
+            found |= here
+    return Launch(theta=0.0, spin=0.0, **parts), found
+
+
+def described(roots: dict[str, Any], grid: list[Axis]) -> dict[str, Any]:
+    """What is asked of which scene and launch, as plain data; the values of axes stand elsewhere."""
+    found = {path: value for name, root in roots.items() for path, value in description(name, root).items()}
+    return found | {one.number: "an axis" for one in grid}

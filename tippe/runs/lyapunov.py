@@ -1,0 +1,146 @@
+"""The Lyapunov exponent of a launch: whether nearby launches diverge exponentially, and how fast."""
+
+import dataclasses
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Shaped
+
+from nonholonomic.derivatives import exponent_of, growth
+from nonholonomic.geometry import cross
+from nonholonomic.integration import GUARD_LOST, REACHED_END, Settings, explicit_tableau, tolerance_bound
+from nonholonomic.progress import telling
+from nonholonomic.validation import require
+
+from ..model.dynamics import LOSSES
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..model.state import joined, parts
+from ..modes.inversion_problem import InversionProblem
+from .cells import driver_of
+
+#: Stretches of time whose growth is recorded; half of them give the exponent and its scatter.
+STRETCHES = 32
+
+
+class LyapunovExponent(NamedTuple):
+    """The largest Lyapunov exponent of a run, or of each of several.
+
+    - `exponent`: mean rate [1/s] of exponential divergence in the second half of the run; NaN if the run ended early.
+    - `error`: of the exponent [1/s]; an exponent below twice its error is no sign of chaos.
+    - `status`: "reached_end", "contact_lost", "jammed", "does_not_fit" or "failed".
+    - `end_time`: when the run ended [s]; `steps`: accepted and rejected ones.
+    - `times`: [s], (32,), and `running`: the mean rate of divergence [1/s] from the start to each of them, (32, ...).
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> found = tippe.lyapunov_exponent(scene, tippe.Launch(1e-3, [155.0, 120.0]), t1=4.0, tolerance=1e-6)
+    >>> print(found.status, found.running.shape)
+    ['reached_end' 'reached_end'] (32, 2)
+
+    ```
+    """
+
+    exponent: Float[np.ndarray, "..."]
+    error: Float[np.ndarray, "..."]
+    status: Shaped[np.ndarray, "..."]
+    end_time: Float[np.ndarray, "..."]
+    steps: Int[np.ndarray, "..."]
+    times: Float[np.ndarray, " stretches"]
+    running: Float[np.ndarray, "stretches ..."]
+
+
+@telling("simulating")
+def lyapunov_exponent(
+    scene: Scene,
+    launch: Launch,
+    t1: float,
+    tolerance: float = 1e-9,
+    solver: diffrax.AbstractERK | None = None,
+) -> LyapunovExponent:
+    """The largest Lyapunov exponent of one launch or of many at once, by the variational equation.
+
+    Positive if nearby launches diverge exponentially. While a top rises, it is the rate of the rise; chaos is a rate that stays
+    positive as `t1` grows. Source: Benettin et al., Meccanica 15 (1980) 9; see `nonholonomic/derivatives/lyapunov.py`.
+
+    **Arguments:**
+
+    - `scene`, `launch`: every number a scalar or one per launch, of shape (n,).
+    - `t1`: time [s] to follow the motion, positive.
+    - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
+      `nonholonomic.integration.Oscillatory8()`.
+
+    **Returns:** a `LyapunovExponent`, its arrays of shape () or (n,).
+
+    **Raises:** `ValueError` for arguments outside these ranges, and for a scene with `contact="hybrid"` or `SetValuedCoulomb`.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> found = tippe.lyapunov_exponent(scene, tippe.Launch(1e-3, [155.0, 120.0]), t1=4.0, tolerance=1e-6)
+    >>> print(found.exponent.round(1))  # 1/s, while the top rises
+    [1.2 1.2]
+
+    ```
+    """
+    if not isinstance(scene, Scene):
+        raise ValueError(f"scene = {scene!r} must be a Scene")
+    if not isinstance(launch, Launch):
+        raise ValueError(f"launch = {launch!r} must be a Launch")
+    if not driver_of(scene).smooth:
+        raise ValueError(
+            "contact = 'hybrid' and SetValuedCoulomb have no exponents: variations end at a change of phase"
+        )
+    require(t1, "t1", above=0.0)
+    tolerance_bound(tolerance).require()
+    settings = Settings(tolerance, solver)
+    explicit_tableau(settings.for_lanes)
+    shapes = {np.shape(leaf) for leaf in jax.tree.leaves((scene, launch))} - {()}
+    if len(shapes) > 1 or any(len(shape) > 1 for shape in shapes):
+        raise ValueError(f"scene and launch must hold scalars or one number per launch, not arrays of shapes {shapes}")
+    shape = shapes.pop() if shapes else ()
+    cells = int(np.prod(shape, dtype=int))
+    # No angle has a cosine of 2, so only a contact that is lost or jams ends a run before the horizon.
+    problem = InversionProblem.of(scene, launch, jnp.pi, cells)
+    # A turning frame turns by another angle for each launch, and that difference would count as divergence.
+    problem = dataclasses.replace(problem, dynamics=scene.dynamics, cos_angle=jnp.asarray(-2.0))
+    found = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, settings)
+    exponent, error = exponent_of(found.logarithm, float(t1))
+    whole = found.status == REACHED_END
+    lost = np.asarray(LOSSES)[np.asarray(problem.dynamics.loss(jnp.asarray(found.state)))]
+    words = np.select([whole, found.status == GUARD_LOST], ["reached_end", lost], "failed")
+    times = t1 * np.arange(1, STRETCHES + 1) / STRETCHES
+    passed = np.minimum(times[:, None], found.end_time)
+    # A run that ends where it starts has not diverged from anything.
+    running = np.cumsum(found.logarithm, axis=0) / np.where(passed > 0.0, passed, 1.0)
+    return LyapunovExponent(
+        exponent=np.where(whole, exponent, np.nan).reshape(shape),
+        error=np.where(whole, error, np.nan).reshape(shape),
+        status=words.reshape(shape),
+        end_time=found.end_time.reshape(shape),
+        steps=found.steps.reshape(shape),
+        times=times,
+        running=running.reshape(STRETCHES, *shape),
+    )
+
+
+def _direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, "components cells"]:
+    """A direction with nothing special about it, tangent to the set of states: axis and vertical keep length 1."""
+    magnitudes = scene.scales(launch)
+    u1, u2, r1, r2, r3, *L = (magnitudes[i] * jnp.cos(1.0 + i) for i in range(8))
+    e = parts(scene.state(launch)).axis
+    frame, (place, _) = scene.frame, scene.start(launch)
+    place = frame.carriage(place, (scene.body.size, scene.body.size)).place_rate
+    direction = joined((u1, u2), cross((r1, r2, r3), e), tuple(L), place)
+    return jnp.broadcast_to(direction.reshape(len(direction), -1), (len(direction), cells))

@@ -1,0 +1,272 @@
+"""What is read off a run of a tippe top, with its contact kept or through flights: one state at each time."""
+
+import abc
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from nonholonomic.geometry import Component, Vector, dot, scale, sum_vectors
+from nonholonomic.hybrid import PhasedPath
+from nonholonomic.integration import Followed, padded
+from nonholonomic.parameters import text_as_html
+from nonholonomic.progress import telling
+from nonholonomic.sweeps import Table
+from nonholonomic.validation import is_traced, require, require_increasing
+from nonholonomic.views import Stage, Viewable, draw_portrait
+
+from ..model.scene import Scene
+from ..model.state import angular_velocity, parts
+from .quantities import table_of
+from .sampled import STATUS
+from .view import as_stages
+
+
+def of_each_run(function: Callable[[Any], Array]) -> property:
+    """A property of one run that is, for a batch of runs as `vmap` returns it, the property of each.
+
+    Outside of transformations it is compiled for powers of two only: every run has another number of steps.
+    """
+    compiled = eqx.filter_jit(function)
+
+    def get(self):
+        if self.t.ndim == 1 and not any(is_traced(leaf) for leaf in jax.tree.leaves((self.t, self.states, self.scene))):
+            return jax.device_put(np.asarray(compiled(self.padded()))[: len(self.t)])
+        mapped = function
+        for _ in range(self.t.ndim - 1):
+            mapped = eqx.filter_vmap(mapped)
+        return mapped(self)
+
+    return property(get, doc=function.__doc__)
+
+
+def unit(vectors: Float[Array, "times 3"]) -> Float[Array, "times 3"]:
+    """Vectors at unit length."""
+    return vectors / jnp.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+class AbstractTrajectory(eqx.Module, Viewable):
+    """A run at its times `t`: states as in `tippe/model/dynamics.py`, the path on the arena, spin angle [rad] and work [J].
+
+    Vectors are arrays (times, 3) in the fixed frame (x, y, z); `Trajectory` says more.
+    """
+
+    t: eqx.AbstractVar[Float[Any, " times"]]
+    scene: eqx.AbstractVar[Scene]
+    states: eqx.AbstractVar[Float[Any, "components times"]]
+    cyclic: eqx.AbstractVar[Float[Any, "paths times"]]
+    spin_angle: eqx.AbstractVar[Float[Any, " times"]]
+    work: eqx.AbstractVar[Float[Any, " times"]]
+    status: eqx.AbstractVar[Any]
+    end_time: eqx.AbstractVar[Any]
+    stats: eqx.AbstractVar[dict[str, Any]]
+    dense: eqx.AbstractVar[Any]
+
+    #: The fields that no observable needs.
+    unused: ClassVar[tuple[str, ...]] = ("status", "end_time", "stats", "dense")
+
+    #: The fields with a value for each time, along the last axis.
+    by_time: ClassVar[tuple[str, ...]] = ("t", "states", "cyclic", "spin_angle", "work")
+
+    def padded(self) -> Self:
+        """The run with the last of its times repeated, up to a power of two; without what observables do not need."""
+        longer = {name: padded(np.asarray(getattr(self, name)), len(self.t)) for name in self.by_time}
+        return dataclasses.replace(self, **longer, **dict.fromkeys(self.unused, None))
+
+    @property
+    @abc.abstractmethod
+    def above(self) -> tuple[Component, Component]:
+        """Distance of the top's sphere from the arena [m] and its rate [m/s]; `None` where it touches at all times."""
+
+    @property
+    @abc.abstractmethod
+    def energy(self) -> Float[Array, " times"]:
+        """Kinetic and potential energy [J]."""
+
+    @abc.abstractmethod
+    def resampled(self, times: Float[np.ndarray, " times"]) -> Self:
+        """The same run at other times, which are not checked."""
+
+    @of_each_run
+    def theta(self) -> Float[Array, " times"]:
+        """Angle from the normal to the axis [rad]."""
+        return self.scene.theta(self.states)
+
+    @of_each_run
+    def theta_rate(self) -> Float[Array, " times"]:
+        """Rate of change of theta [rad/s]."""
+        return jax.jvp(self.scene.theta, (self.states,), (self.scene.field(self.states),))[1]
+
+    @of_each_run
+    def eta(self) -> Float[Array, " times"]:
+        """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
+        return self.scene.frame.angle(self._place, self._path)
+
+    @of_each_run
+    def azimuth(self) -> Float[Array, " times"]:
+        """Direction in which the axis leans [rad], from t1 towards t2, in (-pi, pi]."""
+        return jnp.arctan2(self.states[3], self.states[2])
+
+    @of_each_run
+    def spin(self) -> Float[Array, " times"]:
+        """Angular velocity about the axis [rad/s]."""
+        return self.scene.spin(self.states)
+
+    @of_each_run
+    def axis(self) -> Float[Array, "times 3"]:
+        """The unit vector e along the axis."""
+        return self._fixed(tuple(self.states[2:5]))
+
+    @of_each_run
+    def angular_momentum(self) -> Float[Array, "times 3"]:
+        """Angular momentum about the centre of mass [kg m^2/s]."""
+        return self._fixed(tuple(self.states[5:8]))
+
+    @of_each_run
+    def velocity(self) -> Float[Array, "times 3"]:
+        """Velocity of the point whose path `position` is [m/s]."""
+        motion, axis = self.scene.dynamics.motion(self.states), parts(self.states).axis
+        beside = jax.jvp(self.scene.body.path_from_frame, (axis,), (motion.rate[2:5],))[1]
+        return self._fixed(sum_vectors((*motion.velocity, self.above[1]), beside))
+
+    @of_each_run
+    def position(self) -> Float[Array, "times 3"]:
+        """Position of the sphere's centre, of other bodies of the centre of mass [m]; the plane is z = 0, the cylinder's axis
+        x = z = 0, and a run on the plane starts above the origin."""
+        frame, where = self.scene.frame, (self._place, self._path)
+        centre = sum_vectors(frame.position(*where), scale(self.above[0], frame.axes(*where)[2]))
+        beside = self.scene.body.path_from_frame(parts(self.states).axis)
+        found = jnp.stack(centre, axis=-1)
+        return found if beside == (None, None, None) else found + self._fixed(beside)
+
+    @of_each_run
+    def jellett(self) -> Float[Array, " times"]:
+        """Jellett's quantity of the top's own sphere [kg m^3/s]; constant on the plane where friction acts at one of its
+        points, so not while a stem touches."""
+        return self.scene.jellett(self.states)
+
+    def at(self, times: Float[ArrayLike, " times"]) -> Self:
+        """The same run at other times, from the dense output.
+
+        **Arguments:** `times`: increasing, within [0, `end_time`] [s].
+
+        **Raises:** `ValueError` for times outside the run, or if the run was made inside a transformation.
+        """
+        if self.dense is None:
+            raise ValueError("a run made inside jit, vmap or grad has no dense output: hand `times` to simulate")
+        times = np.asarray(times, dtype=float)
+        require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
+        require_increasing(times, "times")
+        return self.resampled(times)
+
+    @telling("reading off")
+    def to_table(self) -> Table:
+        """All that can be read off the run, as a `Table` over its times.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        return table_of(self)
+
+    def to_xarray(self) -> Any:
+        """The run as an `xarray.Dataset` over "time" (needs xarray), with units and names.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        return self.to_table().to_xarray()
+
+    def save(self, path: Any) -> None:
+        """Write the run to an HDF5 file that `tippe.Table.load` and xarray (`engine="h5netcdf"`) read.
+
+        **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for a batch of runs.
+        """
+        self.to_table().save(path)
+
+    def portrait(self, x: str = "theta", y: str = "theta_rate", ax: Any = None) -> Any:
+        """Draw one quantity over another, a phase portrait (needs matplotlib).
+
+        **Arguments:**
+
+        - `x`, `y`: variables of `to_table()`, such as "theta", or one component, such as "position.x".
+        - `ax`: axes of matplotlib to draw in, instead of a new figure.
+
+        **Returns:** the matplotlib figure, or `ax`.
+
+        **Raises:** `ValueError` for an unknown variable.
+        """
+        return draw_portrait(self.to_table(), x, y, ax)
+
+    def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
+        return as_stages([self, *others], overlaid)
+
+    def with_stats(self, path: Followed | PhasedPath, **more: Any) -> Self:
+        """The same run with what it took, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and more."""
+        energy, work = np.asarray(self.energy), np.asarray(self.work)
+        stats = {
+            "accepted": path.accepted,
+            "rejected": path.rejected,
+            "axis_drift": float(np.max(np.abs(np.linalg.norm(np.asarray(self.states)[2:5], axis=0) - 1.0))),
+            "energy_residual": float(np.max(np.abs(energy - energy[0] - work))),
+        }
+        return eqx.tree_at(lambda one: one.stats, self, stats | more)
+
+    @of_each_run
+    def normal(self) -> Float[Array, "times 3"]:
+        """The arena's unit normal n where the top is, from the arena to the sphere's centre."""
+        return jnp.stack(self.scene.frame.axes(self._place, self._path)[2], axis=-1)
+
+    @of_each_run
+    def angular_velocity(self) -> Float[Array, "times 3"]:
+        """Angular velocity of the body [rad/s]."""
+        _, e, L, _ = parts(self.states)
+        return self._fixed(angular_velocity(self.scene.body, e, L))
+
+    @of_each_run
+    def rotation(self) -> Float[Array, "times 3 3"]:
+        """From the body to the fixed frame: its columns are the body's axes, the third of them e. At the start the first is
+        de/dtheta: it leans from e away from the arena's normal."""
+        # The errors of the steps take both vectors off unit length and off a right angle.
+        e, angle = unit(self.axis), self.spin_angle[:, None]
+        aside = unit(jnp.cross(e, self._fixed(tuple(self.cyclic[-3:]))))
+        across = jnp.cross(aside, e)
+        first = jnp.cos(angle) * across + jnp.sin(angle) * aside
+        return jnp.stack([first, jnp.cross(e, first), e], axis=-1)
+
+    @property
+    def _path(self) -> tuple[Array, ...]:
+        """The cyclic coordinates of the arena's frame; behind them stands the vector c of `trajectory_problem.py`."""
+        return tuple(self.cyclic[:-3])
+
+    @property
+    def _place(self) -> tuple[Array, ...]:
+        return tuple(self.states[8:])
+
+    def _fixed(self, vector: Vector) -> Float[Array, "times 3"]:
+        axes = self.scene.frame.axes(self._place, self._path)
+        return jnp.stack([dot(vector, directions) for directions in zip(*axes, strict=True)], axis=-1)
+
+    @telling("reading off")
+    def __str__(self) -> str:
+        if is_traced(self.t) or self.t.ndim > 1:
+            return f"Trajectory of {self.t.shape} times"
+        word = self.status if isinstance(self.status, str) else STATUS[int(self.status)]
+        ending = {"reached t1": "ran to", "contact_lost": "lost contact at"}.get(word, f"{word} at")
+        lines = [
+            f"Trajectory of {len(self.t)} times, {ending} {float(self.end_time):.6g} s",
+            f"  theta: {float(self.theta[0]):.6g} to {float(self.theta[-1]):.6g} rad",
+        ]
+        if "axis_drift" in self.stats:
+            lines.append(f"  steps: {self.stats['accepted']} accepted, {self.stats['rejected']} rejected")
+            lines.append(f"  drift of |e|: {self.stats['axis_drift']:.1e}")
+            lines.append(f"  energy residual: {self.stats['energy_residual']:.1e} J of {float(self.energy[0]):.4g} J")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        return text_as_html(str(self))

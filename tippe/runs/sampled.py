@@ -1,0 +1,63 @@
+"""Runs sampled at given times, as functions for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
+
+from typing import NamedTuple
+
+import diffrax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from nonholonomic.derivatives import sampled_run, sampled_run_by_diffrax
+from nonholonomic.integration import FAILED, GUARD_LOST, Settings
+
+from ..model.dynamics import LOSSES
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
+
+#: How a run can end; inside a transformation the index stands for the word.
+STATUS = ("reached t1", "contact_lost", "failed", "jammed", "illegal", "does_not_fit", "unresolved")
+
+
+def ended(
+    run: TrajectoryProblem,
+    state: Float[Array, "components ..."],
+    guard_lost: Bool[Array, "..."],
+    failed: Bool[Array, "..."],
+) -> Int[Array, "..."]:
+    """The code in `STATUS` of a run that ended in some state."""
+    codes = jnp.asarray([STATUS.index(word) for word in LOSSES])
+    lost = codes[run.dynamics.loss(state[: len(run.state)])]
+    return jnp.where(guard_lost, lost, jnp.where(failed, STATUS.index("failed"), STATUS.index("reached t1")))
+
+
+class Found(NamedTuple):
+    """What is found of a run: `states`, and as `riding` what else a `TrajectoryProblem` carries, are NaN after the end;
+    `status` is a code in `STATUS`, a float."""
+
+    states: Float[Array, "components times"]
+    riding: Float[Array, "riders times"]
+    end_time: Float[Array, ""]
+    status: Float[Array, ""]
+    accepted: Float[Array, ""]
+    rejected: Float[Array, ""]
+
+
+def sampled(
+    scene: Scene,
+    launch: Launch,
+    times: Float[Array, " times"],
+    t1: Float[Array, ""],
+    settings: Settings,
+    adjoint: diffrax.AbstractAdjoint | None,
+) -> Found:
+    """Run one launch inside a transformation and sample it.
+
+    **Arguments:** as for `simulate`.
+    """
+    run = TrajectoryProblem.of(scene, launch)
+    if adjoint is None:
+        found = sampled_run(trajectory_problem, (scene, launch), times, t1, settings)
+    else:
+        found = sampled_run_by_diffrax(run, times, t1, settings, adjoint)
+    status = ended(run, found.end_state, found.status == GUARD_LOST, found.status == FAILED)
+    return Found(found.states.T, found.riding.T, found.end_time, status, found.accepted, found.rejected)

@@ -1,0 +1,178 @@
+"""Derivatives of the inversion times of a table's cells with respect to parameters of the scene and the launch."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from nonholonomic.derivatives import compiled_march_with_slopes, directions_of, natural_size
+from nonholonomic.hybrid import Journey, travel_with_slopes
+from nonholonomic.integration import Outcome, Settings
+from nonholonomic.parameters import full_name, numbers, with_numbers
+from nonholonomic.sweeps import Variable
+
+from ..modes.inversion_problem import InversionProblem
+from .inversion import is_inverted
+
+
+def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
+    """The full names of the numbers to differentiate by.
+
+    **Arguments:** `roots`: the table's scene and launch; `names`: full names, or the ends of them that fit one only.
+
+    **Raises:** `ValueError` for something else than a list of such names.
+    """
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"sensitivities = {names!r} must be a list of names, such as ['scene.friction.mu']")
+    known = [name for root, tree in roots.items() for name, value in numbers(root, tree).items() if value is not None]
+    found = [full_name("sensitivities", name, known) for name in names]
+    if len(set(found)) < len(found):
+        raise ValueError(f"sensitivities = {names!r} must name every number once")
+    return found
+
+
+def slope_names(names: list[str]) -> list[str]:
+    """The table's variables: `time_by_mu` for `scene.friction.mu`, the full name where two numbers share a name."""
+    ends = [name.rsplit(".", 1)[-1] for name in names]
+    return [
+        "time_by_" + (end if ends.count(end) == 1 else name.replace(".", "_"))
+        for name, end in zip(names, ends, strict=True)
+    ]
+
+
+def slope_variables(names: list[str], units: dict[str, str]) -> dict[str, Variable]:
+    """The table's variables, with their units."""
+
+    def unit(name: str) -> str:
+        of_number = units.get(name.rsplit(".", 1)[-1], "1")
+        return "s" if of_number == "1" else f"s ({of_number})-1"
+
+    return {
+        slope: Variable(unit(name), np.float64, long_name=f"inversion time by {name}")
+        for slope, name in zip(slope_names(names), names, strict=True)
+    }
+
+
+def slopes_of_cells(
+    roots: dict[str, Any],
+    columns: dict[str, Any],
+    names: list[str],
+    angle: float,
+    t1: float,
+    tolerance: float,
+    *,
+    count: int,
+    size: int,
+    solver: diffrax.AbstractERK | None,
+    last: bool,
+) -> tuple[Outcome, dict[str, Any]]:
+    """How every cell ended, and the derivative of its inversion time by every number, 0 where the top did not invert.
+
+    **Arguments:** as for `inversion_table`, and
+
+    - `columns`: full name of a parameter -> its value in every cell; `count` of the `size` cells are to be run.
+    - `names`: full names of the numbers to differentiate by.
+
+    **Returns:** the `Outcome`, and name of the variable -> derivatives (size,). Source: implicit function theorem at the event.
+    """
+    problem, directions, sizes = _problem_and_directions(roots, columns, names, jnp.asarray(angle, float), size)
+    outcome, slopes = compiled_march_with_slopes(
+        problem,
+        directions,
+        jnp.asarray(t1, float),
+        jnp.asarray(count),
+        Settings(tolerance, solver),
+        passes=last,
+    )
+    inverted = is_inverted(outcome, problem, last)
+    found = [np.where(inverted, slope / moved, 0.0) for slope, moved in zip(slopes, sizes, strict=True)]
+    return outcome, dict(zip(slope_names(names), found, strict=True))
+
+
+@eqx.filter_jit
+def _problem_and_directions(
+    roots: dict[str, Any], columns: dict[str, Any], names: list[str], angle: Float[Array, ""], size: int
+) -> tuple[InversionProblem, tuple[Any, ...], list[Float[Array, "..."]]]:
+    """The problem of the cells, its tangents along the numbers to differentiate by, and by how much these move each."""
+
+    def build(*moving: Any) -> InversionProblem:
+        cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))
+        return InversionProblem.of(cells["scene"], cells["launch"], angle, size)
+
+    return _with_directions(build, roots, columns, names)
+
+
+def phased_slopes_of_cells(
+    phases_of: Callable[..., Any],
+    roots: dict[str, Any],
+    columns: dict[str, Any],
+    names: list[str],
+    angle: float,
+    t1: float | Float[np.ndarray, " cells"],
+    tolerance: float,
+    *,
+    count: int,
+    size: int,
+    solver: diffrax.AbstractERK | None,
+    last: bool,
+    kinds: int,
+) -> tuple[Journey, dict[str, Any], Bool[np.ndarray, " size"]]:
+    """What `slopes_of_cells` gives, for runs of several phases.
+
+    **Arguments:** as there, and
+
+    - `phases_of`: the phases, as `Driver` has them.
+    - `t1`: horizon [s]; where the `last` crossing counts, its time in every cell, at which the runs end.
+    - `kinds`: how many kinds of things are counted.
+
+    **Returns:** the `Journey`; name of the variable -> derivatives (size,); and where these have no digits, because an event
+    on the way was grazing. Source: saltation at every change of phase (`nonholonomic/hybrid/varied_phases.py`).
+    """
+    numbers = (jnp.asarray(angle, float), jnp.asarray(tolerance, float))
+    built = _phases_and_directions(phases_of, roots, columns, names, *numbers, size, last)
+    (phases, first, states), directions, sizes = built
+    directions = tuple((one[0], one[2]) for one in directions)
+    settings = Settings(tolerance, solver)
+    given = (directions, np.asarray(first), np.asarray(states), t1, count, settings)
+    journey, found = travel_with_slopes(phases, *given, kinds=kinds, ends_on_event=not last)
+    slopes = [slope / np.asarray(moved) for slope, moved in zip(found.slopes, sizes, strict=True)]
+    return journey, dict(zip(slope_names(names), slopes, strict=True)), found.grazing
+
+
+@eqx.filter_jit
+def _phases_and_directions(
+    phases_of: Callable[..., Any],
+    roots: dict[str, Any],
+    columns: dict[str, Any],
+    names: list[str],
+    angle: Float[Array, ""],
+    tolerance: Float[Array, ""],
+    size: int,
+    last: bool,
+) -> tuple[Any, tuple[Any, ...], list[Float[Array, "..."]]]:
+    """The phases of the cells, the number of each one's first and its state there; tangents and sizes as above."""
+
+    def build(*moving: Any) -> Any:
+        cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))
+        problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
+        return (*phases_of(cells["scene"], problem, tolerance, last), problem.states)
+
+    return _with_directions(build, roots, columns, names)
+
+
+def _with_directions(
+    build: Callable[..., Any], roots: dict[str, Any], columns: dict[str, Any], names: list[str]
+) -> tuple[Any, tuple[Any, ...], list[Float[Array, "..."]]]:
+    """What is built from the numbers to differentiate by, its tangents along them, and by how much these move each."""
+    cells = with_numbers(roots, columns)
+    values = {name: value for root, tree in cells.items() for name, value in numbers(root, tree).items()}
+    point = tuple(jnp.asarray(values[name], float) for name in names)
+    sizes = [natural_size(value) for value in point]
+    tangents = [
+        tuple(size if row == k else jnp.zeros_like(size) for k, size in enumerate(sizes)) for row in range(len(names))
+    ]
+    return build(*point), directions_of(build, point, tangents), sizes

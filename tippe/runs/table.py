@@ -1,0 +1,169 @@
+"""Tables of inversion times over the grid of launches and friction."""
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from typing import Any, NamedTuple
+
+import diffrax
+import numpy as np
+
+from nonholonomic.integration import Settings, explicit_tableau
+from nonholonomic.sweeps import Table, Variable, sweep
+from nonholonomic.validation import require_flag
+
+from ..model.scene import Scene
+from .cells import TIMES, CellRuns, check_differentiable, driver_of
+from .inversion import check_event
+from .launches import described, launches
+from .sensitivities import sensitivity_names, slope_variables
+from .time_error import COARSER, time_error
+
+
+def inversion_table(
+    scene: Scene,
+    *,
+    theta: Any,
+    spin: Any,
+    eta: Any = 0.0,
+    mu: Any = None,
+    t1: float,
+    angle: float = 0.95 * math.pi,
+    tolerance: float = 1e-9,
+    crossing: str = "first",
+    path: Any = None,
+    azimuth: Any = 0.0,
+    axes: dict[str, Any] | None = None,
+    solver: diffrax.AbstractERK | None = None,
+    method: str = "ensemble",
+    errors: bool = False,
+    sensitivities: Sequence[str] = (),
+    progress: bool = True,
+    executor: Executor | None = None,
+) -> Table:
+    """Inversion times over a grid of launches and scenes, in one batched call on all cores.
+
+    **Arguments:**
+
+    - `scene`: the scene, every number a scalar.
+    - `theta`, `spin`, `eta`, `azimuth`: of the launch, as for `Launch`; `mu`: of the scene's friction, or of the
+      law of sliding in it, its own by default. A list or array becomes an axis of the table, in the order (theta, eta, mu,
+      spin, azimuth); a number does not.
+    - `t1`: horizon [s].
+    - `angle`: angle [rad] that counts as inverted.
+    - `tolerance`: relative tolerance of the integration.
+    - `crossing`: "first" for the first time theta reaches the angle; "last" for the up-crossing after which theta stays
+      above it until `t1` (first crossings are ill-conditioned where theta oscillates about the angle); "both" for the two from
+      one run, in the variables `first_time` and `last_time` in place of `time`, the status being that of the last.
+    - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
+    - `axes`: further axes, full name of a parameter -> values, such as `{"scene.body.offset": [0.005, 0.006]}`.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
+      `nonholonomic.integration.Oscillatory8()`, or `Dopri8()` for method "diffrax".
+    - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which supports first
+      crossings only.
+    - `errors`: whether to run every cell again at ten times the tolerance, for an estimate of the error of its time.
+    - `sensitivities`: full names of parameters to differentiate the times by, such as `["scene.friction.mu", "launch.theta"]`;
+      the end of a name will do where only one parameter fits.
+    - `progress`: whether to show it, on a terminal or in a notebook; `NONHOLONOMIC_PROGRESS=0` hides it everywhere.
+    - `executor`: who computes: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a
+      Dask client, to which blocks are handed as its workers become free; by default a thread for each core. The numbers
+      are the same, to the bit on the same kind of processor.
+
+    **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
+    "contact_lost", "failed", "jammed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was
+    lost or jammed, when and at what angle), `steps` and `rejected`. With `errors` also `time_error` [s], infinite where
+    the two runs disagree on the status or failed, 0 where they agree that there is no time; `Table.digits("time")`
+    shows the digits it leaves. With `sensitivities` also the derivative of `time` by each number, `time_by_mu` for
+    `"scene.friction.mu"`, 0 where the top did not invert. It goes through flights, impacts, stick and slip; there
+    `grazes` is 1 where an event on the way, such as a landing, was grazing, so that within the tolerance it may not
+    happen at all: the derivative is then NaN (`SetValuedCoulomb` with `contact="hybrid"` has none). A scene with
+    `contact="hybrid"` flies on where contact is lost, and the angle counts in flight too; `hops` is the number of
+    flights until the run ended, and `status` may be "unresolved" (10 000 of them in a row, or sphere and stem on the
+    plane together with so much friction that the forces are not determined). With `SetValuedCoulomb`, `sticks` is how
+    often a slip has turned into rolling, impacts apart, and `status` may be "unresolved" (too many changes).
+
+    **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
+    `RuntimeError` for an executor that breaks down, or a worker with other versions.
+
+    **Example:**
+
+    ```
+    >>> import numpy as np
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> table = tippe.inversion_table(scene, theta=[0.1, 0.2], spin=[100.0, 155.0], t1=8.0, tolerance=1e-6)
+    >>> print(table.time.round(2))
+    [[6.36 5.97]
+     [5.86 5.59]]
+    >>> print(table.status)
+    [['inverted' 'inverted']
+     ['inverted' 'inverted']]
+
+    ```
+    """
+    check_event(angle, crossing, ("first", "last", "both"))
+    require_flag(errors, "errors")
+    if method not in ("ensemble", "diffrax"):
+        raise ValueError(f"method = {method!r} must be 'ensemble' or 'diffrax'")
+    if method == "diffrax" and sensitivities:
+        raise ValueError("method = 'diffrax' must be 'ensemble' for sensitivities")
+    if crossing == "both" and sensitivities:
+        raise ValueError("crossing = 'both' must be 'first' or 'last' for sensitivities, which are of one time")
+    if method == "diffrax" and crossing != "first":
+        raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
+    given = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
+    roots, grid, units = launches(scene, given, axes, t1, tolerance)
+    settings = Settings(tolerance, solver)
+    solver = settings.for_single_runs if method == "diffrax" else settings.for_lanes
+    explicit_tableau(solver)
+    paths = sensitivity_names(roots, sensitivities)
+    driver = driver_of(scene)
+    if paths:
+        check_differentiable(scene)
+    if not driver.smooth and method == "diffrax":
+        raise ValueError("method = 'diffrax' is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
+    runs = CellRuns(driver, float(t1), float(angle), crossing, solver, method, paths)
+    job = InversionJob(runs, roots, float(tolerance), errors)
+
+    request = {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
+    request = described(roots, grid) | request | {"solver": type(solver).__name__, "method": method}
+    variables = runs.variables
+    if errors:
+        request |= {"errors": True}
+        variables = variables | {
+            f"{name}_error": Variable("s", np.float64, long_name=f"error of the {TIMES[name]}") for name in runs.times
+        }
+    if paths:
+        request |= {"sensitivities": paths}
+        variables = variables | slope_variables(paths, units)
+    return sweep(job, grid, variables, request, path=path, progress=progress, executor=executor)
+
+
+class InversionJob(NamedTuple):
+    """What is asked of every cell, as data that can be sent to another process.
+
+    `errors`: whether to run every cell again at ten times the tolerance.
+    """
+
+    runs: CellRuns
+    roots: dict[str, Any]
+    tolerance: float
+    errors: bool
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which the first `count` are to be run."""
+        runs, words = self.runs, self.runs.driver.words
+        if runs.method == "diffrax" and count == 0:
+            # The reference runs whole blocks: a call that is only meant to compile would compute the first one twice.
+            return {}
+        found = runs.results(self.roots, columns, self.tolerance, count)
+        if self.errors:
+            coarse = runs._replace(slopes_by=[]).results(self.roots, columns, COARSER * self.tolerance, count)
+            # Two runs that ended before their answer agree on nothing.
+            silent = [words.index(word) for word in ("failed", "unresolved") if word in words]
+            agreed = (found["status"] == coarse["status"]) & ~np.isin(found["status"], silent)
+            for name in runs.times:
+                alike = agreed & (np.isfinite(found[name]) == np.isfinite(coarse[name]))
+                found[f"{name}_error"] = time_error(found[name], coarse[name], alike)
+        return found

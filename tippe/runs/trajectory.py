@@ -1,0 +1,262 @@
+"""One run of a tippe top, with its path."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic.geometry import scale, sum_vectors
+from nonholonomic.hybrid import PhasedPath
+from nonholonomic.integration import (
+    LOOSEST,
+    Followed,
+    Settings,
+    explicit_tableau,
+    follow,
+    require_adaptive,
+    require_adjoint,
+    run_bounds,
+    times_bounds,
+)
+from nonholonomic.progress import telling
+from nonholonomic.validation import all_bounds, as_number, is_traced, legal, nan_unless, require_all, require_increasing
+from nonholonomic.xla_cpu import on_device
+
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..modes.trajectory_problem import TrajectoryProblem
+from .airborne_trajectory import sampled_airborne, simulate_airborne
+from .flight_trajectory import HybridTrajectory, sampled_hybrid, simulate_hybrid
+from .inversion import check_run
+from .observables import AbstractTrajectory, of_each_run
+from .sampled import STATUS, ended, sampled
+from .stick_slip_trajectory import follow_stick_slip
+
+
+class Trajectory(AbstractTrajectory):
+    """A run of a tippe top, or a batch of runs, with the batch first.
+
+    Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame (t1,
+    t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre, of bodies that are no
+    sphere those of the centre of mass; `contact` is where the body touches the arena, `normal` the arena's normal there.
+    `rotation` (times, 3, 3) takes the body's axes to the fixed frame, and `angular_velocity` is the rate at which it turns.
+
+    `status` is "reached t1", "contact_lost", "failed", "jammed" or "does_not_fit"; inside a transformation it is a code 0, 1,
+    2, 3, 5, or 4, "illegal", for numbers out of range, for which everything is NaN. The run ends at `end_time`. The top does
+    not fit where a curvature of the arena reaches that of its sphere, which then touches elsewhere too. It is jammed where the
+    equation for the normal force ceases to have a solution, because friction pulls the top into the arena as hard as the
+    normal force pushes it out: strong friction, a large offset and a slip along the axis do that. `stats` holds accepted and
+    rejected steps, the greatest drift of |e| and the greatest energy residual |E - E(0) - work of friction| [J]; with
+    `SetValuedCoulomb` also `sticks`, how often a slip has turned into rolling.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> run = tippe.simulate(scene, tippe.Launch(0.1, 155.0), t1=1.0, tolerance=1e-6)
+    >>> later = run.at([0.25, 0.5])
+    >>> later.position.shape, later.axis.shape
+    ((2, 3), (2, 3))
+    >>> data = run.to_table()
+    >>> data.units["normal_force"], data.label("theta")
+    ('N', 'inclination θ [rad]')
+
+    ```
+    """
+
+    t: Float[Array, " times"]
+    scene: Scene
+    states: Float[Array, "components times"]
+    cyclic: Float[Array, "cyclic times"]
+    spin_angle: Float[Array, " times"]
+    work: Float[Array, " times"]
+    status: Any
+    end_time: Float[Array, ""]
+    stats: dict[str, Any]
+    dense: Any
+
+    @property
+    def above(self) -> tuple[None, None]:
+        """No distance from the arena: the contact persists."""
+        return None, None
+
+    @of_each_run
+    def energy(self) -> Float[Array, " times"]:
+        """Kinetic and potential energy [J]."""
+        return self.scene.energy(self.states)
+
+    @of_each_run
+    def normal_force(self) -> Float[Array, " times"]:
+        """Normal force [N]."""
+        return self.scene.normal_force(self.states)
+
+    @of_each_run
+    def contact(self) -> Float[Array, "times 3"]:
+        """The point at which the top touches the arena [m]."""
+        frame, where = self.scene.frame, (self._place, self._path)
+        foot = sum_vectors(frame.position(*where), scale(-self.scene.body.size, frame.axes(*where)[2]))
+        return jnp.stack(foot, axis=-1)
+
+    @of_each_run
+    def slip(self) -> Float[Array, "times 2"]:
+        """Velocity of the contact point along the arena, in the moving frame [m/s]."""
+        return self.scene.slip_velocity(self.states).T
+
+    def resampled(self, times: Float[np.ndarray, " times"]) -> "Trajectory":
+        """The same run at other times, which are not checked."""
+        found = on_device(times, *_parts(len(self.states), self.dense.at(times)))
+        return eqx.tree_at(lambda one: (one.t, one.states, one.cyclic, one.spin_angle, one.work), self, found)
+
+
+@telling("simulating")
+def simulate(
+    scene: Scene,
+    launch: Launch,
+    t1: float,
+    times: Any = None,
+    tolerance: float = 1e-9,
+    solver: diffrax.AbstractSolver | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+) -> Trajectory | HybridTrajectory:
+    """Run one launch until `t1`, or until contact is lost or jams; through flights and impacts if its contact is "hybrid".
+
+    Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run are then
+    NaN, and `status` and `end_time` say so. A batch, as `vmap` makes it, runs as the cells of one block, as tables do; where a
+    program under `jit` reads neither path nor rotation nor work, they are not integrated.
+
+    **Arguments:**
+
+    - `scene`, `launch`: every number a scalar.
+    - `t1`: horizon [s].
+    - `times`: times of the result [s], increasing, within [0, t1]; by default those of the accepted steps. Outside of
+      transformations those after the end of the run are left out, and `Trajectory.at` gives others.
+    - `tolerance`: relative tolerance, in [1e-14, 1e-2]; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
+    - `solver`: any adaptive solver of Diffrax for ordinary differential equations; by default `Dopri8()`, inside
+      transformations and without `adjoint` `nonholonomic.integration.Oscillatory8()`.
+    - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
+      parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax integrates a traced run, which pays if a
+      loss is differentiated by many parameters.
+
+    **Returns:** a `Trajectory`, for a hybrid scene a `HybridTrajectory`.
+
+    **Raises:** `ValueError` for arguments out of range; inside a transformation for a law with phases (`SetValuedCoulomb`),
+    and for a hybrid scene with `adjoint`, with a solver that is not an explicit Runge-Kutta one, and where derivatives by
+    `times` or second derivatives are asked for.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> run = tippe.simulate(scene, tippe.Launch(0.1, 155.0), t1=1.0, tolerance=1e-6)
+    >>> print(f"{run.theta[-1]:.3f} rad, {run.spin[-1]:.1f} rad/s, {run.status}")
+    0.025 rad, 154.0 rad/s, reached t1
+
+    ```
+    """
+    check_run(scene, launch, t1, tolerance)
+    require_adaptive(solver)
+    require_adjoint(adjoint)
+    if times is not None:
+        times = as_number(times)
+        require_all(times_bounds(times, t1))
+        require_increasing(times, "times")
+    if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
+        return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
+    if scene.contact == "hybrid":
+        follow_flights = simulate_hybrid if scene.flies_in_closed_form else simulate_airborne
+        return follow_flights(scene, launch, float(t1), times, tolerance, solver)
+    run = TrajectoryProblem.of(scene, launch)
+    through = follow_stick_slip if scene.friction.set_valued else follow
+    path = through(run, float(t1), Settings(tolerance, solver))
+    trajectory = _as_trajectory(scene, run, path)
+    if times is None:
+        return trajectory
+    return trajectory.at(np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)])
+
+
+# Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
+@eqx.filter_jit
+def _legal_or_nan(
+    scene: Scene,
+    launch: Launch,
+    times: Any,
+    t1: Any,
+    tolerance: Any,
+    solver: diffrax.AbstractSolver | None,
+    adjoint: diffrax.AbstractAdjoint | None,
+) -> Trajectory | HybridTrajectory:
+    """What `_traced` gives, or NaN and the status "illegal" where a traced number is out of range."""
+    if times is None:
+        # It raises the error that says so.
+        return _traced(scene, launch, times, t1, tolerance, solver, adjoint)
+    bounds = (
+        *all_bounds(scene),
+        *all_bounds(launch),
+        *scene.start_bounds(launch),
+        *run_bounds(t1, tolerance),
+        *times_bounds(times, t1),
+    )
+    may = jnp.all(legal(bounds)) & jnp.all(jnp.diff(times) > 0.0)
+    # A run of illegal numbers might never reach its end, so it is given the horizon 0, and its tolerance is not its block's.
+    t1, tolerance = jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
+    if adjoint is not None:
+        # Diffrax would differentiate the run of no length.
+        scene, launch = nan_unless(may, (scene, launch))
+    found = _traced(scene, launch, times, t1, tolerance, solver, adjoint)
+    status = jnp.where(may, found.status, STATUS.index("illegal"))
+    return eqx.tree_at(lambda one: (one.t, one.status), nan_unless(may, found), (times, status))
+
+
+def _traced(
+    scene: Scene,
+    launch: Launch,
+    times: Any,
+    t1: Any,
+    tolerance: float,
+    solver: diffrax.AbstractSolver | None,
+    adjoint: diffrax.AbstractAdjoint | None,
+) -> Trajectory | HybridTrajectory:
+    if scene.friction.set_valued:
+        raise ValueError(
+            f"friction = {type(scene.friction).__name__} must be a law without phases inside jit, vmap and grad"
+        )
+    if times is None:
+        raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
+    settings = Settings(tolerance, solver)
+    if scene.contact == "hybrid":
+        if adjoint is not None:
+            raise ValueError(f"adjoint = {adjoint!r} must be left out for contact = 'hybrid'")
+        explicit_tableau(settings.for_lanes)
+        return (sampled_hybrid if scene.flies_in_closed_form else sampled_airborne)(scene, launch, times, t1, settings)
+    found = sampled(scene, launch, times, t1, settings, adjoint)
+    status = found.status.astype(int)
+    stats = {"accepted": found.accepted.astype(int), "rejected": found.rejected.astype(int)}
+    riding = (found.riding[:-2], found.riding[-2], found.riding[-1])
+    return Trajectory(times, scene, found.states, *riding, status, found.end_time, stats, None)
+
+
+def _parts(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:
+    """State, with its number of components, cyclic coordinates, spin angle and work, of an array (components, times)."""
+    return states[:lean], states[lean:-2], states[-2], states[-1]
+
+
+_ended = eqx.filter_jit(ended)
+
+
+def _as_trajectory(scene: Scene, run: TrajectoryProblem, path: Followed | PhasedPath) -> Trajectory:
+    # NumPy cuts these: JAX would compile every cut anew for every number of steps.
+    states = np.asarray(path.states)
+    times, end, last = on_device(path.times, path.times[-1], states[:, -1])
+    status = STATUS[int(_ended(run, last, jnp.asarray(path.guard_lost), jnp.asarray(path.failed)))]
+    sticks = {"sticks": int(path.counts[0])} if isinstance(path, PhasedPath) else {}
+    return Trajectory(times, scene, *on_device(*_parts(len(run.state), states)), status, end, {}, path).with_stats(
+        path, **sticks
+    )

@@ -1,0 +1,98 @@
+"""How the cells of a table of trajectories are run and read: samples of many launches, and what is observed at them."""
+
+import dataclasses
+from typing import Any, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from nonholonomic.geometry import Plane
+from nonholonomic.integration import FAILED, GUARD_LOST, LeadingProblem, Outcome, Settings, march_with_samples
+from nonholonomic.xla_cpu import compiled_alone
+
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..modes.trajectory_problem import TrajectoryProblem
+from .quantities import QUANTITIES
+from .sampled import ended
+from .trajectory import Trajectory
+
+#: What can be read off the state alone; all else needs the path, except on the plane, where only the position does.
+OF_THE_STATE = {"theta", "azimuth", "spin", "energy", "jellett", "normal_force", "slip", "theta_rate"}
+
+#: What is the same in a frame that has turned about n, by no matter how much.
+WITHOUT_DIRECTION = {"theta", "theta_rate", "eta", "spin", "energy", "jellett", "normal_force"}
+
+
+def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> LeadingProblem:
+    """The runs of some cells with as much of a `TrajectoryProblem` as the named quantities need.
+
+    That is the path for some of them only, and neither rotation nor work: on the plane a run without them takes half the time.
+    If none of them has a direction, the frame turns on the level plane, and samples are some thirty times as accurate.
+    """
+    run = TrajectoryProblem.of(scene, launch, cells)
+    if scene.level and WITHOUT_DIRECTION.issuperset(names):
+        return LeadingProblem(dataclasses.replace(run, dynamics=scene.turning_dynamics), len(run.state))
+    needed = {"position"} if isinstance(scene.surface, Plane) else set(QUANTITIES) - OF_THE_STATE
+    return LeadingProblem(run, run.leading if needed.isdisjoint(names) else run.up_to_path)
+
+
+def _read(
+    run: TrajectoryProblem,
+    scene: Scene,
+    times: Float[Array, " times"],
+    samples: Float[Array, "cells times components"],
+    name: str,
+) -> Float[Array, "cells times ..."]:
+    """A quantity at every sample, not a number after the end of a run."""
+    riders = len(run.state) + len(run.cyclic) - samples.shape[-1]
+
+    def one(scene: Scene, states: Float[Array, "times components"]) -> Float[Array, "times ..."]:
+        nothing = jnp.zeros(len(times))
+        state, cyclic = jnp.split(jnp.pad(states.T, ((0, riders), (0, 0))), [len(run.state)])
+        values = getattr(Trajectory(times, scene, state, cyclic, nothing, nothing, None, times[-1], {}, None), name)
+        # What does not depend on the state would be a number after the end too.
+        there = jnp.isfinite(states[:, 0]).reshape(-1, *[1] * (values.ndim - 1))
+        return jnp.where(there, values, jnp.nan)
+
+    def cell_axis(leaf: Any) -> int | None:
+        return 0 if eqx.is_array(leaf) and leaf.ndim else None
+
+    return eqx.filter_vmap(one, in_axes=(cell_axis, 0))(scene, samples)
+
+
+# On its own, not inside other transformed functions: only so does it get the compiler's options.
+@compiled_alone
+def _followed(
+    problem: LeadingProblem,
+    scene: Scene,
+    times: Float[Array, " times"],
+    count: Int[Array, ""],
+    settings: Settings,
+    names: tuple[str, ...],
+) -> tuple[Outcome, Int[Array, " cells"], dict[str, Float[Array, "cells times ..."]]]:
+    """How the runs end, the codes of that in `sampled.STATUS`, and the named quantities on the way."""
+    outcome, samples = march_with_samples(problem, times, times[-1], count, settings, one_kernel=True)
+    run = cast(TrajectoryProblem, problem.whole)
+    status = ended(run, outcome.state, outcome.status == GUARD_LOST, outcome.status == FAILED)
+    return outcome, status, {name: _read(run, scene, times, samples, name) for name in names}
+
+
+def follow_cells(
+    scene: Scene, launch: Launch, cells: int, times: Any, tolerance: float, names: tuple[str, ...], count: int
+) -> dict[str, Array]:
+    """The variables of some cells.
+
+    **Arguments:** `scene`, `launch`: numbers that are scalars or one per cell; `cells`: how many there are, of which the first
+    `count` are to be run; `times`: of the samples [s], the last the horizon; `tolerance`: relative tolerance; `names`: the
+    quantities to be read.
+
+    **Returns:** name -> values, the cells first.
+    """
+    numbers = (jnp.asarray(times, float), jnp.asarray(count), Settings(tolerance))
+    problem = launches_with(scene, launch, cells, names)
+    outcome, status, values = _followed(problem, scene, *numbers, names)
+    ending = {"status": status, "end_time": outcome.end_time, "steps": outcome.steps, "rejected": outcome.rejected}
+    return jax.tree.map(jnp.asarray, values | ending)

@@ -1,0 +1,146 @@
+"""Tables of trajectories over the grid of launches and friction."""
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from nonholonomic.integration import Settings, times_bounds
+from nonholonomic.parameters import with_numbers
+from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
+from nonholonomic.validation import as_number, require, require_all, require_increasing
+
+from ..model.scene import Scene
+from .cells import COUNTED
+from .launches import described, launches
+from .quantities import COMPONENTS, QUANTITIES
+from .trajectory_cells import follow_cells
+
+#: The status of a run, in the order of `sampled.STATUS`; a word has no space in it, so that a file can list them.
+WORDS = ("reached_end", "contact_lost", "failed", "jammed")
+
+#: Numbers of the samples of a block, at most: 256 MB of them.
+MOST_SAMPLED = 1 << 25
+
+
+def trajectory_table(
+    scene: Scene,
+    *,
+    theta: Any,
+    spin: Any,
+    eta: Any = 0.0,
+    mu: Any = None,
+    times: Any,
+    axes: dict[str, Any] | None = None,
+    quantities: Sequence[str] = ("theta", "eta"),
+    tolerance: float = 1e-9,
+    path: Any = None,
+    progress: bool = True,
+    executor: Executor | None = None,
+) -> Table:
+    """Trajectories over a grid of launches and scenes, sampled at given times, in one batched call on all cores.
+
+    The samples have the accuracy of `simulate`: a step ends on each of the times. With a sample for each step of the
+    integration it costs twice as much as a table of inversion times to the same horizon.
+
+    **Arguments:**
+
+    - `scene`: the scene, every number a scalar.
+    - `theta`, `spin`, `eta`: of the launch, as for `Launch`; `mu`: of the scene's friction, or of the law of sliding in it, its
+      own by default. A list or array becomes an axis of the table, in the order (theta, eta, mu, spin); a number does not.
+      The axes of a launch's numbers are called "launch.theta", "launch.eta" and "launch.spin", for `theta` is what becomes
+      of it.
+    - `times`: of the samples [s], increasing, from 0 or later; the last is the horizon.
+    - `axes`: further axes, path of a number -> values, such as `{"launch.azimuth": [0.0, 1.0]}`.
+    - `quantities`: what to sample: any of "theta", "eta", "azimuth" [rad], "theta_rate", "spin" [rad/s], "energy" [J],
+      "jellett" [kg m^3/s], "normal_force" [N], and the vectors "axis" [1], "position" [m], "velocity" [m/s], "angular_momentum"
+      [kg m^2/s] and "slip" [m/s]; all as in `Trajectory`.
+    - `tolerance`: relative tolerance of the integration.
+    - `path`: HDF5 file to write, block by block. A call that was interrupted resumes from it.
+    - `progress`, `executor`: as for `inversion_table`.
+
+    **Returns:** a `Table` with a variable for each quantity, which has the axes' dimensions and a last dimension "time"; a
+    vector has one more behind it, "component" (x, y, z), for "slip" "tangent" (t1, t2). They are not a number after the end of
+    a run. Besides, over the axes: `status` ("reached_end" of the times, "contact_lost", "failed", "jammed"), `end_time` [s],
+    `steps` and `rejected`.
+
+    **Raises:** `ValueError` for arguments out of range, an unknown axis or quantity, and for a scene with
+    `contact="hybrid"` or `SetValuedCoulomb`, whose runs `simulate` samples one by one; `OSError` for a path that cannot be
+    used; `RuntimeError` for an executor that breaks down, or a worker with other versions.
+
+    **Example:**
+
+    ```
+    >>> import numpy as np
+    >>> import tippe
+    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> table = tippe.trajectory_table(scene, theta=[0.1, 0.2], spin=155.0, times=np.linspace(0.0, 1.0, 11))
+    >>> table.dims("theta"), table.theta.shape
+    (('launch.theta', 'time'), (2, 11))
+    >>> print(table.theta[:, -1].round(3), table.status)
+    [0.025 0.076] ['reached_end' 'reached_end']
+
+    ```
+    """
+    names = _names(quantities)
+    require_all(times_bounds(as_number(times), None))
+    require_increasing(times, "times")
+    times = np.asarray(times, dtype=float)
+    require(times[-1], "times[-1]", above=0.0, why="it is the horizon")
+    given = {"theta": theta, "eta": eta, "mu": mu, "spin": spin}
+    roots, grid, _ = launches(scene, given, axes, times[-1], tolerance, taken=QUANTITIES)
+    why = "for trajectory_table: runs with phases are sampled one by one, by simulate"
+    if scene.contact == "hybrid":
+        raise ValueError(f"contact = 'hybrid' must be 'stop' {why}")
+    if scene.friction.set_valued:
+        raise ValueError(f"friction = {type(scene.friction).__name__} must be a law without phases {why}")
+
+    inner = [axis("time", "time", "s", times, "time")]
+    variables = {}
+    for name in names:
+        unit, components, long_name = QUANTITIES[name]
+        dims = ("time",) if components is None else ("time", components)
+        variables[name] = Variable(unit, np.float64, inner=dims, long_name=long_name)
+    for dim in dict.fromkeys(QUANTITIES[name].components for name in names):
+        inner += [] if dim is None else [Axis(dim, dim, "1", np.array(COMPONENTS[dim]))]
+    variables |= {"status": Variable("1", np.int8, WORDS, long_name="how the run ended")}
+    variables |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
+    variables |= {name: Variable("1", np.int64, long_name=COUNTED[name]) for name in ("steps", "rejected")}
+    request = described(roots, grid) | {"quantities": list(names), "tolerance": float(tolerance)}
+    request |= {"solver": type(Settings(tolerance).for_lanes).__name__}
+    # A run has a dozen components or so.
+    most = max(16, 1 << (MOST_SAMPLED // (12 * len(times))).bit_length() - 1)
+    job = SamplingJob(roots, times, float(tolerance), names)
+    options = {"path": path, "most": most, "inner": inner, "progress": progress, "executor": executor}
+    return sweep(job, grid, variables, request, **options)
+
+
+class SamplingJob(NamedTuple):
+    """What is asked of every cell, as data that can be sent to another process."""
+
+    roots: dict[str, Any]
+    times: Float[np.ndarray, " times"]
+    tolerance: float
+    names: tuple[str, ...]
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which the first `count` are to be run."""
+        cells = with_numbers(self.roots, columns)
+        size = next((len(values) for values in columns.values()), 1)
+        found = follow_cells(cells["scene"], cells["launch"], size, self.times, self.tolerance, self.names, count)
+        return {name: np.asarray(values, np.int8 if name == "status" else None) for name, values in found.items()}
+
+
+def _names(quantities: Any) -> tuple[str, ...]:
+    """The quantities, checked."""
+    if isinstance(quantities, str) or not isinstance(quantities, Sequence) or not quantities:
+        raise ValueError(f"quantities = {quantities!r} must be a list of names")
+    for name in quantities:
+        if name not in QUANTITIES:
+            raise ValueError(f"quantities: {name!r} must be one of {', '.join(QUANTITIES)}")
+        if quantities.count(name) > 1:
+            raise ValueError(f"quantities: {name!r} must be there once only")
+    return tuple(quantities)

@@ -1,0 +1,190 @@
+"""A run of a top as it is drawn: its body, its contact's trace, the path of its axis, arrows, and curves over time."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic.parameters import told_apart
+from nonholonomic.views import (
+    COLOURS,
+    DARK,
+    PALE,
+    Arrow,
+    Body,
+    Curve,
+    Mesh,
+    Show,
+    Stage,
+    Trace,
+    arena,
+    ball,
+    rod,
+    striped,
+    told_by_colour,
+    turned,
+)
+
+from ..model.body import AbstractBody
+from ..model.scene import Scene
+from ..model.top import Top
+
+#: Radians by which the top turns from one frame to the next, about, and most frames.
+TURN_PER_FRAME = 0.4
+MOST_FRAMES = 12_000
+LEAST_FRAMES = 400
+
+#: Lengths in units of the radius: of the axis as it is drawn from the centre, and of the arrows for the weight and for the
+#: longest slip.
+AXIS, WEIGHT, SLIP = 1.6, 1.5, 3.0
+
+#: Slips above this quantile are not drawn longer: the first moments would hide the rest.
+COMMON_SLIP = 0.9
+
+GREEN, VIOLET, BLUE, GOLD = 0x1F8A4C, 0x7B4FA3, 0x1B6CA8, 0xE0A100
+
+
+class Motion(NamedTuple):
+    """What is drawn of a run: vectors in the fixed frame, (times, 3), and the rotation to it from the body."""
+
+    times: Float[Array, " times"]
+    position: Float[Array, "times 3"]
+    axis: Float[Array, "times 3"]
+    normal: Float[Array, "times 3"]
+    contact: Float[Array, "times 3"]
+    slip: Float[Array, "times 3"]
+    rotation: Float[Array, "times 3 3"]
+    theta: Float[Array, " times"]
+    energy: Float[Array, " times"]
+    jellett: Float[Array, " times"]
+    normal_force: Float[Array, " times"]
+
+    @classmethod
+    def of(cls, run: Any) -> "Motion":
+        """The motion of one run, inside or outside of transformations."""
+        body, slip = run.scene.body, run.slip
+        zero = jnp.zeros_like(run.t)
+        position, axis, normal = run.position, run.axis, run._fixed((zero, zero, zero + 1.0))
+        contact = run.contact if not isinstance(body, Top) else position - body.radius * normal
+        if isinstance(body, Top) and body.stem is not None:
+            stem = position + (body.stem.offset - body.offset) * axis - body.stem.radius * normal
+            contact = jnp.where((run.contact == 1)[:, None], stem, contact)
+        return cls(
+            run.t,
+            position,
+            axis,
+            normal,
+            contact,
+            run._fixed((slip[:, 0], slip[:, 1], zero)),
+            run.rotation,
+            run.theta,
+            run.energy,
+            run.jellett,
+            run.normal_force,
+        )
+
+
+_motion = eqx.filter_jit(Motion.of)
+_turning = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis=-1))
+
+
+def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
+    """Runs as they are drawn: a stage for each, or one for all if they are to be overlaid."""
+    starts = [f"θ(0) = {float(run.theta[0]):.3g} rad, {float(run.spin[0]):.4g} rad/s" for run in runs]
+    names = told_apart(starts, [run.scene for run in runs])
+    named = [(name, run.scene, motion(run)) for name, run in zip(names, runs, strict=True)]
+    return stages([named] if overlaid else [[one] for one in named])
+
+
+def motion(run: Any) -> Motion:
+    """The motion of one run at times so close together that its turning is seen, where it can be told between its own."""
+    if run.t.ndim > 1:
+        raise ValueError(f"a batch of runs, of shape {run.t.shape}, cannot be shown: take one of them")
+    if run.dense is not None:
+        times = np.asarray(run.t)
+        # Not the angle about the axis alone: half-way up a top turns across it, as fast.
+        turned_by = np.trapezoid(np.asarray(_turning(run.padded()))[: len(times)], times)
+        frames = int(np.clip(turned_by / TURN_PER_FRAME, LEAST_FRAMES, MOST_FRAMES))
+        run = run.at(np.linspace(0.0, float(run.end_time), frames))
+    count = len(run.t)
+    return Motion(*(np.asarray(part)[:count] for part in _motion(run.padded())))
+
+
+def show(scene: Scene, motion: Motion, number: int, name: str) -> Show:
+    """One run as it is drawn, the `number`-th of its stage."""
+    body, colour = scene.body, COLOURS[number % len(COLOURS)]
+    motion = Motion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
+    radius, weight = float(body.size), float(body.mass * scene.gravity)
+    tip = AXIS * radius
+    speed = np.linalg.norm(motion.slip, axis=-1)
+    longest = max(float(np.quantile(speed, COMMON_SLIP)), 1e-12)
+    slip = motion.slip * (SLIP * radius / np.maximum(speed, longest))[:, None]
+    turning = turned(motion.rotation)
+    force = (WEIGHT * radius / weight * motion.normal_force)[:, None] * motion.normal
+    lifted = motion.contact + 0.02 * radius * motion.normal
+    # Within the sphere it could not be seen.
+    beside = lifted + 1.35 * radius * aside(motion.normal)
+    return Show(
+        name,
+        colour,
+        motion.times,
+        radius,
+        (Body("top", motion.position, turning, meshes(body, colour)),),
+        (
+            Trace("contact", lifted, GREEN, 0.06 * radius),
+            Trace("path of the axis", tip * motion.axis, BLUE, 0.012 * radius, about=motion.position),
+        ),
+        (
+            Arrow(f"normal force ({WEIGHT:g} R: the weight)", beside, force, VIOLET, 0.05 * radius),
+            Arrow(f"slip ({SLIP:g} R: {longest:.2g} m/s or more)", lifted, slip, GOLD, 0.05 * radius),
+        ),
+        (
+            Curve("θ, normal to axis [rad]", motion.theta),
+            Curve("energy [J]", motion.energy),
+            Curve("Jellett's quantity [kg m²/s]", motion.jellett),
+            Curve("normal force [N]", motion.normal_force),
+        ),
+    )
+
+
+def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
+    """A stage for each group of runs, which have one arena, with their names; colours tell all runs apart."""
+    found, number = [], 0
+    for group in groups:
+        (_, scene, first), radius = group[0], float(group[0][1].body.size)
+        points = np.concatenate([motion.contact for _, _, motion in group])
+        ground = arena(scene.surface, points, first.normal[0], 4.0 * radius, 2.5 * radius)
+        shows = told_by_colour(
+            tuple(show(one, motion, number + k, name) for k, (name, one, motion) in enumerate(group))
+        )
+        found.append(Stage("; ".join(name for name, _, _ in group), ground, shows))
+        number += len(group)
+    return found
+
+
+def aside(normal: Float[np.ndarray, "times 3"]) -> Float[np.ndarray, "times 3"]:
+    """Unit vectors across the normal, towards x, or towards y where the normal is along x."""
+    towards = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    across = towards - np.sum(towards * normal, axis=-1, keepdims=True) * normal
+    return across / np.linalg.norm(across, axis=-1, keepdims=True)
+
+
+def meshes(body: AbstractBody, colour: int) -> tuple[Mesh, ...]:
+    """The body in two colours; of a top with the stem, as it is, or a short one that only shows where the axis points."""
+    if not isinstance(body, Top):
+        return striped(profile(body), (colour, PALE))
+    radius = float(body.radius)
+    sphere = ball(radius, (colour, PALE))
+    if body.stem is None:
+        return (*sphere, rod(0.10 * radius, 0.9 * radius, AXIS * radius - 0.16 * radius, 0.16 * radius, DARK))
+    knob, end = float(body.stem.radius), float(body.stem.offset - body.offset)
+    return (*sphere, rod(0.8 * knob, 0.0, end, knob, DARK))
+
+
+def profile(body: AbstractBody) -> Float[np.ndarray, "points 2"]:
+    """The meridian of a body about its centre of mass, from the top of its axis down: (distance from the axis, height) [m]."""
+    theta = jnp.linspace(jnp.pi, 0.0, 49)
+    lever = body.outline.at(jnp.cos(theta))
+    return np.stack([lever.radius * jnp.sin(theta), lever.offset - lever.radius * jnp.cos(theta)], axis=-1)
