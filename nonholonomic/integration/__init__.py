@@ -31,6 +31,7 @@ from .runge_kutta import over_stages as over_stages
 from .samples import march_with_samples as march_with_samples
 from .settings import ABSOLUTE as ABSOLUTE
 from .settings import LOOSEST as LOOSEST
+from .settings import TIGHTEST as TIGHTEST
 from .settings import Settings as Settings
 from .settings import lanes_for as lanes_for
 from .settings import require_adaptive as require_adaptive
