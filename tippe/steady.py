@@ -175,8 +175,8 @@ def standing_state(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = Fa
 def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = False) -> Float[Array, "k k"]:
     """Matrix [1/s] of the linear motion near a standing top, on any arena.
 
-    Components along n change at second order only and are left out, as are the frame's own direction and places that a symmetry
-    makes equivalent: on a plane, along a cylinder and around a torus. A scene with `contact="hybrid"` counts as one with "stop".
+    Components along n change at second order only and are left out, as are the frame's own direction and the places that a
+    symmetry makes equivalent (plane, cylinder, torus). A scene with `contact="hybrid"` counts as one with "stop".
 
     **Arguments:** as for `standing_state`.
 
