@@ -10,7 +10,7 @@ from tops import rutstam_top
 import tippe
 from nonholonomic.sweeps.digits import concise, concise_strings
 from tippe import steady
-from tippe.runs.cells import CellRuns, driver_of
+from tippe.runs.cells import InversionRuns, run_kind_of
 from tippe.runs.table import InversionJob
 from tippe.runs.time_error import FINER, SAFETY, SAFETY_OF_HISTORIES, error_bound, errors_of, second_tolerance
 
@@ -171,15 +171,15 @@ def test_a_cell_that_fails_is_in_doubt():
 def test_agreement_on_no_answer_is_no_agreement(monkeypatch):
     """Two runs that both failed, or both were given up, do not make it certain that there is no time."""
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3), contact="hybrid")
-    words = driver_of(scene).words
+    words = run_kind_of(scene).words
 
     def results(runs, *_):
         ends = {"end_time": np.ones(len(words)), "end_theta": np.ones(len(words)), "hops": np.zeros(len(words), int)}
         times = {name: np.full(len(words), np.inf) for name in runs.times}
         return times | ends | {"status": np.arange(len(words), dtype=np.int8)}
 
-    monkeypatch.setattr(CellRuns, "results", results)
-    runs = CellRuns(driver_of(scene), 1.0, ANGLE, "both", None, "ensemble", [])
+    monkeypatch.setattr(InversionRuns, "results", results)
+    runs = InversionRuns(run_kind_of(scene), 1.0, ANGLE, "both", None, "ensemble", [])
     found = InversionJob(runs, {"scene": scene}, 1e-9, errors=True)({}, len(words))
     for name in ("first_time", "last_time"):
         doubtful = np.isinf(found[f"{name}_error"])
@@ -202,7 +202,7 @@ def test_the_file_keeps_the_errors(tmp_path):
 def runs_of(kind, count, tolerances):
     """The variables of random scenes of a kind (`random_scenes.py`) at each tolerance, and how many things are counted."""
     scene, launch, columns = batch(kind, count)
-    runs = CellRuns(driver_of(scene), 8.0, 0.95 * np.pi, "first", None, "ensemble", [])
+    runs = InversionRuns(run_kind_of(scene), 8.0, 0.95 * np.pi, "first", None, "ensemble", [])
     roots = {"scene": scene, "launch": launch}
     return {tolerance: runs.results(roots, columns, tolerance, count) for tolerance in tolerances}, runs.driver.counts
 
