@@ -46,6 +46,8 @@ def permitted(
     return may, t1, jnp.min(tolerance)
 
 
+# One program where it is called on its own, not one for every comparison.
+@compiled_setup
 def nan_if_illegal(found: Float[Array, ""], structure: Any, unchecked: bool, leaves: list[Any]) -> Float[Array, ""]:
     """What was found, or NaN, and so every derivative of it, where numbers are not legal. **Arguments:** as for `permitted`."""
     return nan_unless(permitted(structure, unchecked, leaves)[0], found) if unchecked else found
