@@ -14,6 +14,7 @@ from nonholonomic.hybrid import Journey
 from nonholonomic.integration import CROSSED, LOOSEST, REACHED_END, Outcome, run_bounds
 from nonholonomic.parameters import numbers
 from nonholonomic.validation import Bound, all_bounds, legal, nan_unless, require_all, require_scalars
+from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.launch import Launch
 from ..model.scene import Scene
