@@ -171,7 +171,7 @@ _LINE = _Line()
 
 
 @contextmanager
-def telling(doing: str, shown: bool = True) -> Iterator[Progress]:
+def status_line(doing: str, shown: bool = True) -> Iterator[Progress]:
     """Says what a call is doing that takes long when it is new to the compiler; decorates functions, too.
 
     Before that, programs are forgotten if they take too much memory (`compiled_programs.py`).

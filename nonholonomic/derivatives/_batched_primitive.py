@@ -25,7 +25,7 @@ from ..xla_cpu import compiled_alone, compiled_quickly
 class Request:
     """What is asked of some cells.
 
-    - `question`: an `AbstractQuestion`.
+    - `question`: an `AbstractDifferentiableSolve`.
     - `active`: the numbers of the leaves to differentiate by, as for `with_slopes`; `None` for the answer alone.
     - `wanted`: the numbers of the parts of the tree that are to be found, all if `None`; parts that are `None` count.
     """
