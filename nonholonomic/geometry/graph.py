@@ -112,7 +112,7 @@ class Graph(AbstractOpen, AbstractDifferentiated):
     ```
     """
 
-    height: Any = eqx.field(converter=lambda given: as_function(given, "height", ("x", "y")))
+    height: Any = eqx.field(converter=lambda height: as_function(height, "height", ("x", "y")))
 
     def ground(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
         return self.height(x, y)

@@ -40,7 +40,7 @@ class Implicit(AbstractDifferentiated):
     sides: ClassVar[Mapping[str, float]] = DIVIDED
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("x", "m"), ("y", "m"), ("z", "m"))
 
-    function: Any = eqx.field(converter=lambda given: as_function(given, "function", ("x", "y", "z")))
+    function: Any = eqx.field(converter=lambda function: as_function(function, "function", ("x", "y", "z")))
 
     def gradient(self, position: Vector) -> Vector:
         slope = partials(self.function, position)
