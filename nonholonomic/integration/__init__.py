@@ -31,6 +31,7 @@ from .runge_kutta import over_stages as over_stages
 from .samples import march_with_samples as march_with_samples
 from .settings import ABSOLUTE as ABSOLUTE
 from .settings import LOOSEST as LOOSEST
+from .settings import MOST_STEPS as MOST_STEPS
 from .settings import Settings as Settings
 from .settings import lanes_for as lanes_for
 from .settings import require_adaptive as require_adaptive
@@ -45,10 +46,12 @@ from .single_run import padded as padded
 from .single_run import sample as sample
 from .status import CROSSED as CROSSED
 from .status import FAILED as FAILED
+from .status import FORMER_WORDS as FORMER_WORDS
 from .status import GUARD_LOST as GUARD_LOST
 from .status import REACHED_END as REACHED_END
 from .status import RUNNING as RUNNING
 from .status import UNRESOLVED as UNRESOLVED
+from .status import Status as Status
 from .zeros import few_trials as few_trials
 from .zeros import halved as halved
 from .zeros import sign_changes as sign_changes

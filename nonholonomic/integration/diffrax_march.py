@@ -11,12 +11,9 @@ from jaxtyping import Array, Float
 
 from .problem import AbstractProblem
 from .queue import Outcome
-from .settings import Settings
+from .settings import MOST_STEPS, Settings
 from .single_run import saved
 from .status import CROSSED, FAILED, GUARD_LOST, REACHED_END
-
-#: A run that needs more has failed.
-MOST_STEPS = 100_000
 
 
 @eqx.filter_jit

@@ -49,7 +49,7 @@ class Steps(NamedTuple):
         def field(times: Lanes, states: States) -> States:
             return in_blocks(lambda *at: _field(recipe, *at), times, states)
 
-        time, start, solver = self.times[which], self.states[:, which], recipe.ride.settings.for_single_runs
+        time, start, solver = self.times[which], self.states[:, which], recipe.ride.settings.for_steps_alone
         rates = [field(time, start)]
         if not isinstance(solver, diffrax.AbstractERK):
             # The cubic through states and rates at both ends; an implicit step cannot be repeated so cheaply.
@@ -86,7 +86,7 @@ def followed(recipe: RideRecipe) -> tuple[Steps, Stats]:
     ride = recipe.ride
     problem = _problem(recipe)
     if ride.grid is None:
-        path = follow(problem, float(ride.t1), ride.settings)
+        path = follow(problem, float(ride.t1), ride.settings, dense=False)
         return Steps(path.times, path.states), _counted(path.accepted, path.rejected, not path.failed)
     found = _on_grid(problem, recipe)
     ends = np.asarray(ride.grid)

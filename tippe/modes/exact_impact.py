@@ -15,13 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.geometry import Vector, dot, scale, sum_vectors
-from nonholonomic.integration import GUARD_LOST, AbstractProblem, Settings, traced_march
+from nonholonomic.integration import GUARD_LOST, MOST_STEPS, AbstractProblem, Settings, traced_march
 
 from ..model.dynamics import least
 from ..model.friction import SetValuedCoulomb, length
 from ..model.top import Top
 from .free_body import Ball, FreeBody
-from .impact import LARGEST, MOST_STEPS, TOLERANCE, Blow, Impact, approach, struck
+from .impact import LARGEST, TOLERANCE, Blow, Impact, approach, struck
 
 Cells = Float[Array, " cells"]
 

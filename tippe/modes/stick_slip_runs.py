@@ -11,7 +11,7 @@ from nonholonomic.hybrid import AbstractPhase, Passage, Record
 from nonholonomic.integration import CROSSED, GUARD_LOST, REACHED_END, RUNNING, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup
 
-from ..model.dynamics import COS_THETA, NO_COSINE, Dynamics
+from ..model.dynamics import NO_COSINE, Dynamics
 from ..model.onset import Onset
 from ..model.scene import Scene
 from ..model.stick_slip import AT_REST, Change, Kind, StickSlip

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from nonholonomic.derivatives import AbstractQuestion, VariationalProblem, ask, directions_by, in_groups
-from nonholonomic.integration import CROSSED, FAILED, Queue, Settings, crossing_time
+from nonholonomic.integration import CROSSED, FAILED, MOST_STEPS, Queue, Settings, crossing_time
 from nonholonomic.progress import telling
 from nonholonomic.validation import as_number, is_traced
 
@@ -18,9 +18,6 @@ from ..model.scene import Scene
 from ..model.state import inclination, parts
 from ..modes.inversion_problem import InversionProblem
 from .inversion import check_event, check_run, check_smooth, nan_if_illegal, permitted
-
-#: A cell that needs more steps than this has failed: parameters tried by a fit may be far off.
-MOST_STEPS = 100_000
 
 #: The least angle [rad] distinguished from 0 in the penalty for a top that does not invert.
 LEAST_ANGLE = 1e-6
@@ -113,6 +110,7 @@ class ExtendedQuestion(AbstractQuestion):
         """The extended times of every cell, and their derivatives along directions (as of `VariationalProblem`)."""
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         varied = VariationalProblem(problem, directions, True)
+        # Parameters tried by a fit may be far off.
         settings = Settings(tolerance, max_steps=MOST_STEPS)
         queue = Queue.of(varied, t1, jnp.asarray(cells), settings, one_kernel=not again, parts=1 + len(directions))
         outcome, _ = queue.outcome()

@@ -1,12 +1,14 @@
 """The time of inversion of one launch, as a function for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
 
 import math
+import warnings
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from nonholonomic.derivatives import AbstractQuestion, ask, directions_by, in_groups, traced_march_with_slopes
@@ -19,8 +21,8 @@ from ..model.launch import Launch
 from ..model.scene import Scene
 from ..modes.airborne import on_the_ground
 from ..modes.inversion_problem import InversionProblem
-from .cells import check_differentiable, driver_of
-from .inversion import check_event, check_run, is_inverted, nan_if_illegal, permitted
+from .cells import CellRuns, check_differentiable, driver_of, too_many_steps
+from .inversion import check_event, check_run, is_inverted, nan_if_illegal, permitted, warn_if_it_cannot_invert
 
 
 @telling("simulating")
@@ -57,8 +59,8 @@ def inversion_time(
     (`nonholonomic/hybrid/varied_phases.py`). Where an event on the way is grazing, so that within the tolerance it may
     not happen at all, the derivative is NaN; `inversion_table` says so in the variable `grazes`.
 
-    **Raises:** `ValueError` for arguments outside these ranges, for second derivatives through changes of phase, and for
-    derivatives with both, whose impacts may stop a slip.
+    **Raises:** `ValueError` for arguments outside these ranges, for a run that needs more than 2 000 000 steps, for second
+    derivatives through changes of phase, and for derivatives with both, whose impacts may stop a slip.
 
     **Example:**
 
@@ -74,6 +76,7 @@ def inversion_time(
     """
     check_run(scene, launch, t1, tolerance)
     check_event(angle, crossing)
+    warn_if_it_cannot_invert(scene, launch, launch.theta)
     solver = Settings(tolerance, solver).for_lanes
     explicit_tableau(solver)
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
@@ -81,7 +84,37 @@ def inversion_time(
     question = InversionQuestion if driver_of(scene).smooth else PhasedInversionQuestion
     # The last two leaves, horizon and tolerance, do not move the event.
     found = ask(question(len(leaves) - 2, structure, solver, crossing == "last", unchecked), *leaves)
+    if not is_traced(found) and not unchecked and np.isnan(found):
+        explain_failure(scene, launch, float(t1), float(angle), float(tolerance), crossing, solver)
     return nan_if_illegal(found, structure, unchecked, leaves)
+
+
+def explain_failure(
+    scene: Scene,
+    launch: Launch,
+    t1: float,
+    angle: float,
+    tolerance: float,
+    crossing: str,
+    solver: diffrax.AbstractERK,
+) -> None:
+    """Raise `ValueError` for a run that needed too many steps; warn of any other failure. The run is made once more.
+
+    **Arguments:** as for `inversion_time`.
+    """
+    runs = CellRuns(driver_of(scene), t1, angle, crossing, solver, "ensemble", [])
+    cell = {
+        name: values[0] for name, values in runs.results({"scene": scene, "launch": launch}, {}, tolerance, 1).items()
+    }
+    most = Settings(tolerance, solver).max_steps
+    word = runs.driver.words[cell["status"]]
+    if word == "failed" and cell["steps"] >= most:
+        raise ValueError(too_many_steps(t1, most, cell["end_time"]))
+    warnings.warn(
+        f"the inversion time is NaN: the run ended as {word!r} at {cell['end_time']:.6g} s, at {cell['end_theta']:.6g} rad",
+        UserWarning,
+        stacklevel=4,
+    )
 
 
 class InversionQuestion(AbstractQuestion):

@@ -1,6 +1,8 @@
 """Tables of inversion times over the grid of launches and friction."""
 
+import hashlib
 import math
+import warnings
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from typing import Any, NamedTuple
@@ -9,13 +11,13 @@ import diffrax
 import numpy as np
 
 from nonholonomic.integration import Settings, explicit_tableau
-from nonholonomic.sweeps import Table, Variable, sweep
-from nonholonomic.validation import require_flag
+from nonholonomic.sweeps import Axis, Table, Variable, sweep
+from nonholonomic.validation import require_flag, require_outside
 
 from ..model.scene import Scene
-from .cells import TIMES, CellRuns, check_differentiable, driver_of
-from .inversion import check_event
-from .launches import described, launches
+from .cells import TIMES, CellRuns, check_differentiable, driver_of, too_many_steps
+from .inversion import check_event, warn_if_it_cannot_invert
+from .launches import described, launches, rows
 from .sensitivities import sensitivity_names, slope_variables
 from .time_error import COARSER, time_error
 
@@ -36,6 +38,7 @@ def inversion_table(
     axes: dict[str, Any] | None = None,
     solver: diffrax.AbstractERK | None = None,
     method: str = "ensemble",
+    scattered: bool = False,
     errors: bool = False,
     sensitivities: Sequence[str] = (),
     progress: bool = True,
@@ -56,11 +59,14 @@ def inversion_table(
       above it until `t1` (first crossings are ill-conditioned where theta oscillates about the angle); "both" for the two from
       one run, in the variables `first_time` and `last_time` in place of `time`, the status being that of the last.
     - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
-    - `axes`: further axes, full name of a parameter -> values, such as `{"scene.body.offset": [0.005, 0.006]}`.
+    - `axes`: further axes, full name of a parameter, or the end of it that means one only -> values, such as
+      `{"offset": [0.005, 0.006]}` for `"scene.body.offset"`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`, or `Dopri8()` for method "diffrax".
     - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which supports first
       crossings only.
+    - `scattered`: whether the lists are no axes of a grid but columns of one length: the k-th cell has the k-th number of each.
+      The table then has the only axis "cell", and the columns are among its variables.
     - `errors`: whether to run every cell again at ten times the tolerance, for an estimate of the error of its time.
     - `sensitivities`: full names of parameters to differentiate the times by, such as `["scene.friction.mu", "launch.theta"]`;
       the end of a name will do where only one parameter fits.
@@ -102,8 +108,10 @@ def inversion_table(
 
     ```
     """
+    require_outside((scene, theta, spin, eta, mu, azimuth, axes, t1, angle), "inversion_table", "inversion_time")
     check_event(angle, crossing, ("first", "last", "both"))
     require_flag(errors, "errors")
+    require_flag(scattered, "scattered")
     if method not in ("ensemble", "diffrax"):
         raise ValueError(f"method = {method!r} must be 'ensemble' or 'diffrax'")
     if method == "diffrax" and sensitivities:
@@ -113,7 +121,9 @@ def inversion_table(
     if method == "diffrax" and crossing != "first":
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     given = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
-    roots, grid, units = launches(scene, given, axes, t1, tolerance)
+    roots, grid, units = launches(scene, given, axes, t1, tolerance, scattered=scattered)
+    looked_at = {one.number: one.values for one in grid}
+    warn_if_it_cannot_invert(scene, roots["launch"], looked_at.get("launch.theta", roots["launch"].theta))
     settings = Settings(tolerance, solver)
     solver = settings.for_single_runs if method == "diffrax" else settings.for_lanes
     explicit_tableau(solver)
@@ -137,7 +147,27 @@ def inversion_table(
     if paths:
         request |= {"sensitivities": paths}
         variables = variables | slope_variables(paths, units)
-    return sweep(job, grid, variables, request, path=path, progress=progress, executor=executor)
+    if scattered:
+        columns = rows(grid)
+        request |= {"cells": digest(columns)}
+        variables = {one.name: Variable(one.unit, np.float64, long_name=one.long_name) for one in grid} | variables
+        job = ScatteredJob(job, columns, {one.number: one.name for one in grid})
+        grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
+    table = sweep(job, grid, variables, request, path=path, progress=progress, executor=executor)
+    warn_of_long_runs(table, float(t1), settings.max_steps)
+    return table
+
+
+def warn_of_long_runs(table: Table, t1: float, most: int) -> None:
+    """Warn of runs that needed more steps than they may take; a table that stays in its file is not looked at."""
+    if not isinstance(table.variables, dict):
+        return
+    long = (table.variables["status"] == "failed") & (table.variables["steps"] >= most)
+    if long.any():
+        end = float(np.min(table.variables["end_time"][long]))
+        warnings.warn(
+            f"{long.sum()} of {long.size} runs have failed: {too_many_steps(t1, most, end)}", UserWarning, stacklevel=3
+        )
 
 
 class InversionJob(NamedTuple):
@@ -167,3 +197,27 @@ class InversionJob(NamedTuple):
                 alike = agreed & (np.isfinite(found[name]) == np.isfinite(coarse[name]))
                 found[f"{name}_error"] = time_error(found[name], coarse[name], alike)
         return found
+
+
+class ScatteredJob(NamedTuple):
+    """A job whose cells are the rows of some columns; these are among the results.
+
+    `columns`: full name of a number -> its value in every cell; `names`: full name -> name of the variable.
+    """
+
+    job: InversionJob
+    columns: dict[str, Any]
+    names: dict[str, str]
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which the first `count` are to be run."""
+        chosen = {number: values[columns["cell"]] for number, values in self.columns.items()}
+        return self.job(chosen, count) | {self.names[number]: values for number, values in chosen.items()}
+
+
+def digest(columns: dict[str, Any]) -> str:
+    """A checksum of columns of numbers and of their names."""
+    whole = hashlib.sha256()
+    for name, values in columns.items():
+        whole.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
+    return whole.hexdigest()[:16]
