@@ -270,7 +270,9 @@ SUSPECTED = {
 @pytest.fixture
 def nothing_runs(monkeypatch):
     """What would run says that it was asked to."""
-    monkeypatch.setattr(importlib.import_module("tippe.runs.inversion_time"), "ask", lambda *_: jnp.inf)
+    monkeypatch.setattr(
+        importlib.import_module("tippe.runs.inversion_time"), "differentiable_solve", lambda *_: jnp.inf
+    )
     monkeypatch.setattr(
         importlib.import_module("tippe.runs.table"), "sweep", lambda *_, **__: table_of_times([5.0], [9])
     )

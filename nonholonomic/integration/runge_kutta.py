@@ -42,7 +42,7 @@ def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
 def explicit_step(
     tableau: diffrax.ButcherTableau,
     field: Callable[[Lanes, States], States],
-    guard: Callable[[Lanes, States], Lanes | None],
+    domain_margin: Callable[[Lanes, States], Lanes | None],
     crossing: Callable[[States, States], Lanes | None],
     time: Lanes,
     state: States,
@@ -58,10 +58,10 @@ def explicit_step(
 
     - `tableau`: the method.
     - `field`: (time [s], state) -> rate of the state.
-    - `guard`, `crossing`: (time, state) and (state, rate) -> a number per lane that should stay positive, or `None`. They are
-      looked at in the end and at three stages between: the guard, which may need all of the state, in a branch of those
-      stages; the crossing, which may need few components, after the stages. If one is negative for less than two fifths
-      of a step, that may go unnoticed.
+    - `domain_margin`, `crossing`: (time, state) and (state, rate) -> a number per lane that should stay positive, or
+      `None`. They are looked at in the end and at three stages between: the guard, which may need all of the state, in a
+      branch of those stages; the crossing, which may need few components, after the stages. If one is negative for less
+      than two fifths of a step, that may go unnoticed.
     - `time`, `state`, `rate`: where the step starts, and the field there.
     - `length`: length of the step [s], one per lane.
 
@@ -79,7 +79,7 @@ def explicit_step(
         at = time + places[stage] * length
 
         def look(first_negative: Lanes) -> Lanes:
-            return jnp.minimum(first_negative, _where_negative(guard(at, there), places[stage], length))
+            return jnp.minimum(first_negative, _where_negative(domain_margin(at, there), places[stage], length))
 
         # A branch, for the other stages not to pay for it: a tenth of a step of a top in a cylinder.
         first_negative = jax.lax.cond(looked[stage], look, lambda first_negative: first_negative, first_negative)
@@ -96,16 +96,16 @@ def explicit_step(
     # Stored, for the step, its error and the event all depend on it.
     end = jax.lax.optimization_barrier(state + length * weighted_sum(tableau.b_sol[: 1 + inner], stages))
     last_rate = jax.lax.optimization_barrier(field(time + length, end))
-    watched = jax.lax.optimization_barrier(lesser(guard(time + length, end), crossing(end, last_rate), length))
+    watched = jax.lax.optimization_barrier(lesser(domain_margin(time + length, end), crossing(end, last_rate), length))
     stages += [last_rate] if tableau.fsal else []
     return Step(end, last_rate, length * weighted_sum(tableau.b_error, stages), watched, first_negative)
 
 
-def lesser(guard: Lanes | None, crossing: Lanes | None, like: Lanes) -> Lanes:
+def lesser(domain_margin: Lanes | None, crossing: Lanes | None, like: Lanes) -> Lanes:
     """The lesser of two numbers per lane, of which each may be `None`; 1 if both are."""
-    if guard is None:
+    if domain_margin is None:
         return jnp.ones_like(like) if crossing is None else crossing
-    return guard if crossing is None else jnp.minimum(crossing, guard)
+    return domain_margin if crossing is None else jnp.minimum(crossing, domain_margin)
 
 
 def _where_negative(watched: Lanes | None, place: Any, like: Lanes) -> Lanes:

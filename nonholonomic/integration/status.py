@@ -5,7 +5,7 @@ from typing import Self
 
 #: Still under way; at the horizon; on its event; where the model ceases to hold; given up by step control; given up
 #: because it changed its phase too often, or because the forces are not determined.
-RUNNING, REACHED_END, CROSSED, GUARD_LOST, FAILED, UNRESOLVED = range(6)
+RUNNING, REACHED_END, CROSSED, LEFT_DOMAIN, FAILED, UNRESOLVED = range(6)
 
 #: Words of earlier versions, which files and scripts hold.
 FORMER_WORDS = {"reached t1": "completed", "reached_end": "completed"}

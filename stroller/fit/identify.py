@@ -11,7 +11,7 @@ from nonholonomic import identification as generic
 from nonholonomic.identification import Free, Identification, of_data, predicted
 from nonholonomic.integration import tolerance_bound
 from nonholonomic.parameters import numbers, with_numbers
-from nonholonomic.progress import telling
+from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, require_kind
 
 from ..model.scene import Scene
@@ -101,7 +101,7 @@ def identify(
     ```
     """
     generic.check_search(starts, spread, seed, max_steps, progress)
-    with telling("fitting", progress):
+    with status_line("fitting", progress):
         require_kind(scene, "scene", Scene)
         data = tuple(data) if isinstance(data, list | tuple) else (data,)
         if not data or not all(isinstance(one, Recording) for one in data):

@@ -18,7 +18,7 @@ class Slip(NamedTuple):
 
     - `x`, `y`: velocity of the material contact point along the arena [m/s].
     - `turning`: angular velocity of the body [rad/s]; its component along n, the drilling, is `None` unless the law
-      `drills`.
+      `uses_spin`.
     """
 
     x: Float[Array, "..."]
@@ -80,7 +80,7 @@ class AbstractFriction(Bounded):
     set_valued: ClassVar[bool] = False
 
     @property
-    def drills(self) -> bool:
+    def uses_spin(self) -> bool:
         """Whether the law depends on the body's angular velocity about the normal."""
         return False
 
@@ -243,7 +243,7 @@ class Contensou(AbstractFriction):
         yield Bound(self.slip_speed, "slip_speed", above=0.0)
 
     @property
-    def drills(self) -> bool:
+    def uses_spin(self) -> bool:
         return True
 
     @property
@@ -303,8 +303,8 @@ class Rolling(AbstractFriction):
         return {"resistance": "m", "turning_speed": "rad s-1"} | self.sliding.units
 
     @property
-    def drills(self) -> bool:
-        return self.sliding.drills
+    def uses_spin(self) -> bool:
+        return self.sliding.uses_spin
 
     @property
     def isotropic(self) -> bool:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.parameters import told_apart
+from nonholonomic.parameters import distinguishing_labels
 from nonholonomic.validation import require_one_run
 from nonholonomic.views import (
     COLOURS,
@@ -22,9 +22,9 @@ from nonholonomic.views import (
     Trace,
     arena,
     ball,
+    distinguished_by_colour,
     rod,
     striped,
-    told_by_colour,
     turned,
 )
 
@@ -96,7 +96,7 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     for run in runs:
         require_one_run(run, "a picture", ", and hand the others over as others=")
     starts = [f"θ(0) = {float(run.theta[0]):.3g} rad, {float(run.spin[0]):.4g} rad/s" for run in runs]
-    names = told_apart(starts, [run.scene for run in runs])
+    names = distinguishing_labels(starts, [run.scene for run in runs])
     named = [(name, run.scene, motion(run)) for name, run in zip(names, runs, strict=True)]
     return stages([named] if overlaid else [[one] for one in named])
 
@@ -157,7 +157,7 @@ def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
         (_, scene, first), radius = group[0], float(group[0][1].body.size)
         points = np.concatenate([motion.contact for _, _, motion in group])
         ground = arena(scene.surface, points, first.normal[0], 4.0 * radius, 2.5 * radius)
-        shows = told_by_colour(
+        shows = distinguished_by_colour(
             tuple(show(one, motion, number + k, name) for k, (name, one, motion) in enumerate(group))
         )
         found.append(Stage("; ".join(name for name, _, _ in group), ground, shows))
@@ -187,5 +187,5 @@ def meshes(body: AbstractBody, colour: int) -> tuple[Mesh, ...]:
 def profile(body: AbstractBody) -> Float[np.ndarray, "points 2"]:
     """The meridian of a body about its centre of mass, from the top of its axis down: (distance from the axis, height) [m]."""
     theta = jnp.linspace(jnp.pi, 0.0, 49)
-    lever = body.outline.at(jnp.cos(theta))
+    lever = body.meridian.at(jnp.cos(theta))
     return np.stack([lever.radius * jnp.sin(theta), lever.offset - lever.radius * jnp.cos(theta)], axis=-1)
