@@ -24,6 +24,7 @@ from nonholonomic.validation import (
     require_kind,
     require_scalars,
 )
+from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.friction import Frictionless
 from ..model.launch import Launch
@@ -57,6 +58,8 @@ def permitted(
     return may, t1, jnp.min(tolerance)
 
 
+# One program where it is called on its own, not one for every comparison.
+@compiled_setup
 def nan_if_illegal(found: Float[Array, ""], structure: Any, unchecked: bool, leaves: list[Any]) -> Float[Array, ""]:
     """What was found, or NaN, and so every derivative of it, where numbers are not legal. **Arguments:** as for `permitted`."""
     return nan_unless(permitted(structure, unchecked, leaves)[0], found) if unchecked else found
