@@ -57,8 +57,9 @@ def inversion_time(
     """Time at which theta reaches an angle; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
     The derivative is that of the event's time by the implicit function theorem; it is 0 where the result is infinite.
-    Differentiating by one parameter costs about as much again as the time itself, by any number of them four to seven
-    times as much (`nonholonomic/derivatives/slopes.py`); second derivatives take forward-mode passes.
+    The time and its derivative by one parameter cost about three times the time alone, by two parameters five times, by
+    three or four seven to ten times, and by any number more eight to thirteen times (`nonholonomic/derivatives/slopes.py`);
+    second derivatives take forward-mode passes.
 
     **Arguments:**
 
@@ -126,7 +127,7 @@ def explain_failure(
         name: values[0] for name, values in runs.results({"scene": scene, "launch": launch}, {}, tolerance, 1).items()
     }
     most = Settings(tolerance, solver).max_steps
-    word = runs.driver.words[cell["status"]]
+    word = runs.run_kind.words[cell["status"]]
     if word == "failed" and cell["steps"] >= most:
         raise ValueError(too_many_steps(t1, most, cell["end_time"]))
     warnings.warn(
