@@ -61,7 +61,7 @@ def test_all_tables_use_words_of_the_list():
 
 
 def swept(words, path, fails_at=np.inf):
-    """A sweep of three blocks whose statuses are 0 to 3 and from the ninth cell on one that is new, if there is one."""
+    """A sweep of three chunks whose statuses are 0 to 3 and from the ninth cell on one that is new, if there is one."""
 
     def job(columns, count):
         place = columns["x"].astype(int)
@@ -71,7 +71,7 @@ def swept(words, path, fails_at=np.inf):
         return {"value": columns["x"], "status": status.astype(np.int8)}
 
     variables = {"value": Variable("m", np.float64), "status": Variable("1", np.int8, words)}
-    return sweep(job, [axis("x", "x", "m", CELLS)], variables, {"what": "a test"}, path=path, block=4, progress=False)
+    return sweep(job, [axis("x", "x", "m", CELLS)], variables, {"what": "a test"}, path=path, chunk=4, progress=False)
 
 
 def test_a_file_with_the_words_of_earlier_versions_is_read_with_those_of_today(tmp_path):
