@@ -126,7 +126,7 @@ def test_a_further_axis_by_its_path(rutstam_scene_module):
 
 def test_grids_larger_than_a_block_are_cut_and_joined(rutstam_scene_module, monkeypatch):
     """The order of cells survives blocks, threads and refilled lanes."""
-    monkeypatch.setattr(sweeping, "block_for", lambda cells: 16)
+    monkeypatch.setattr(sweeping, "chunk_for", lambda cells: 16)
     theta, spin = np.linspace(0.05, 0.6, 9), np.linspace(60.0, 200.0, 11)
     asked = {"theta": theta, "spin": spin, "t1": 4.0, "tolerance": 1e-5, "solver": diffrax.Bosh3()}
     cut = tippe.inversion_table(rutstam_scene_module, **asked)

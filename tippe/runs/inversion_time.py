@@ -96,9 +96,9 @@ def inversion_time(
     """
     check_run(scene, launch, t1, tolerance)
     check_event(angle, crossing)
-    warn_if_it_cannot_invert(scene, launch, launch.theta)
     solver = Settings(tolerance, solver).for_lanes
     explicit_tableau(solver)
+    warn_if_it_cannot_invert(scene, launch, launch.theta)
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
     unchecked = any(is_traced(leaf) for leaf in leaves)
     question = InversionSolve if run_kind_of(scene).smooth else HybridInversionSolve

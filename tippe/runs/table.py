@@ -126,8 +126,6 @@ def inversion_table(
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     given = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
     roots, grid, units = launches(scene, given, axes, t1, tolerance, scattered=scattered)
-    looked_at = {one.number: one.values for one in grid}
-    warn_if_it_cannot_invert(scene, roots["launch"], looked_at.get("launch.theta", roots["launch"].theta))
     settings = Settings(tolerance, solver)
     solver = settings.for_single_runs if method == "diffrax" else settings.for_lanes
     explicit_tableau(solver)
@@ -137,6 +135,8 @@ def inversion_table(
         check_differentiable(scene)
     if not run_kind.smooth and method == "diffrax":
         raise ValueError("method = 'diffrax' is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
+    looked_at = {one.number: one.values for one in grid}
+    warn_if_it_cannot_invert(scene, roots["launch"], looked_at.get("launch.theta", roots["launch"].theta))
     runs = InversionRuns(run_kind, float(t1), float(angle), crossing, solver, method, paths)
     job = InversionJob(runs, roots, float(tolerance), errors)
 
