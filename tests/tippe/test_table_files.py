@@ -67,7 +67,7 @@ def test_save_and_load_return_the_same(table, tmp_path):
 
 
 def test_an_interrupted_sweep_resumes_and_recomputes_no_finished_block(rutstam_scene_module, tmp_path, monkeypatch):
-    monkeypatch.setattr(sweeping, "block_for", lambda cells: 8)
+    monkeypatch.setattr(sweeping, "chunk_for", lambda cells: 8)
     monkeypatch.setattr(sweeping, "workers", lambda: 1)
     path, arguments = (
         tmp_path / "table.h5",
@@ -148,7 +148,7 @@ def test_a_table_killed_again_and_again_is_the_one_that_was_not(tmp_path, monkey
         assert enough <= len(after) < 200
         assert (cells[[block not in after for block in range(200)]] == "pending").all()
         finished = after
-    monkeypatch.setattr(sweeping, "block_for", lambda cells: 4)
+    monkeypatch.setattr(sweeping, "chunk_for", lambda cells: 4)
     top = tippe.Top(0.02, 0.02, 0.006, 131 / 350 * 0.02 * 0.02**2, 0.4 * 0.02 * 0.02**2)
     scene = tippe.Scene(top, tippe.Plane(), tippe.Viscous(0.3))
     arguments = {"theta": np.linspace(0.05, 0.3, 400), "spin": [80.0, 100.0], "t1": 5.0}

@@ -145,7 +145,7 @@ def test_the_file_opens_in_xarray_as_the_table_does(table):
 
 
 def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(sweeping, "block_for", lambda cells: 64)
+    monkeypatch.setattr(sweeping, "chunk_for", lambda cells: 64)
     monkeypatch.setattr(sweeping, "workers", lambda: 1)
     path = tmp_path / "table.h5"
     arguments = {"theta": np.linspace(0.1, 1.6, 20), "spin": [*SPIN, 90.0, 130.0], "mu": MU, "times": TIMES}
