@@ -117,7 +117,7 @@ class Table(eqx.Module):
             for name, words in self.words.items():
                 known = np.array([*words, UNREACHED])
                 dataset[name] = dataset[name].copy(
-                    data=dataset[name].data.map_chunks(known.__getitem__, dtype=known.dtype)
+                    data=dataset[name].data.map_blocks(known.__getitem__, dtype=known.dtype)
                 )
             return dataset
 

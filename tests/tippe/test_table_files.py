@@ -81,7 +81,7 @@ def test_an_interrupted_sweep_resumes_and_recomputes_no_finished_block(rutstam_s
     again = written_blocks.recorded(monkeypatch)
     whole = tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
     assert sorted(again + done) == [0, 1, 2]
-    monkeypatch.setattr(sweeping.Blocks, "write", written_blocks.WRITE)
+    monkeypatch.setattr(sweeping.ChunkStore, "write", written_blocks.WRITE)
     fresh = tippe.inversion_table(rutstam_scene_module, **arguments)
     np.testing.assert_array_equal(whole.status, fresh.status)
     assert_close(whole.end_theta, fresh.end_theta, atol=1e-12)
@@ -92,7 +92,7 @@ def test_an_interrupted_sweep_resumes_and_recomputes_no_finished_block(rutstam_s
 KILLED = """
 import sys, numpy as np, tippe
 from nonholonomic.sweeps import running as sweep
-sweep.block_for = lambda cells: 4
+sweep.chunk_for = lambda cells: 4
 sweep.workers = lambda: 1
 mass, radius = 0.02, 0.02
 top = tippe.Top(mass, radius, 0.006, 131 / 350 * mass * radius**2, 0.4 * mass * radius**2)
@@ -194,7 +194,7 @@ def test_unwritable_corrupt_and_foreign_files_are_named(rutstam_scene_module, tm
 def test_a_file_has_one_writer(rutstam_scene_module, tmp_path):
     """While one sweep computes a file, another is refused."""
     path, arguments = tmp_path / "table.h5", {"theta": THETA, "spin": SPIN, "t1": 0.1}
-    once = sweeping.Blocks.write
+    once = sweeping.ChunkStore.write
 
     def and_try_again(self, block, values):
         with pytest.raises(OSError, match="another process is writing it"):
@@ -202,7 +202,7 @@ def test_a_file_has_one_writer(rutstam_scene_module, tmp_path):
         once(self, block, values)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweeping.Blocks, "write", and_try_again)
+        patch.setattr(sweeping.ChunkStore, "write", and_try_again)
         table = tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
     assert (table.status == "not_inverted").all()
     assert list(tmp_path.iterdir()) == [path]

@@ -251,9 +251,9 @@ def pid():
 """
 
 
-def script(folder, domain_margin):
+def script(folder, guard):
     program = folder / "program.py"
-    program.write_text(SCRIPT.format(domain_margin=domain_margin))
+    program.write_text(SCRIPT.format(guard=guard))
     environment = os.environ | {"PYTHONPATH": str(HERE.parents[2])}
     return subprocess.Popen(
         [sys.executable, program], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
