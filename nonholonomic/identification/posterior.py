@@ -101,13 +101,6 @@ class LogDensity(eqx.Module):
         return jnp.array([*values, *(0.0 for _ in self.open_series)])
 
     def values(self, coordinates: Float[Array, "... unknowns"]) -> dict[str, Float[Array, "..."]]:
-<<<<<<< HEAD
-        """The unknowns at some coordinates: name -> (...,); of the errors, the factor on their first guess."""
-        numbers = len(self.problem.names)
-        unknowns = self.problem.values(coordinates[..., :numbers])
-        errors = jnp.exp(coordinates[..., numbers:])
-        return dict(zip(self.names, jnp.moveaxis(jnp.concatenate([unknowns, errors], axis=-1), -1, 0), strict=True))
-=======
         """The unknowns at some coordinates: name -> (...,).
 
         **Arguments:** `coordinates`: of all unknowns, or of a fit, which leaves out the errors: these are then the first guess.
@@ -123,10 +116,9 @@ class LogDensity(eqx.Module):
                 f"coordinates of shape {coordinates.shape} must have {len(self.names)} numbers along the last axis: "
                 f"{', '.join(self.names)}"
             )
-        found = self.problem.values(coordinates[..., :numbers])
+        unknowns = self.problem.values(coordinates[..., :numbers])
         errors = self._first_errors * jnp.exp(coordinates[..., numbers:])
-        return dict(zip(self.names, jnp.moveaxis(jnp.concatenate([found, errors], axis=-1), -1, 0), strict=True))
->>>>>>> main
+        return dict(zip(self.names, jnp.moveaxis(jnp.concatenate([unknowns, errors], axis=-1), -1, 0), strict=True))
 
     def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
         """What the model predicts for every measurement, at several coordinates."""

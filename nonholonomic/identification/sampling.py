@@ -70,13 +70,8 @@ class Draws(NamedTuple):
             np.asarray, (measure(coordinates) for measure in (potential_scale_reduction, effective_sample_size))
         )
         # Of a single unknown they are numbers, not lists of one.
-<<<<<<< HEAD
         named = (dict(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in draws)
-        return cls(values, coordinates, *named, accepted=accepted, runs=runs)
-=======
-        named = (dict(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in found)
         return cls(values, coordinates, *named, accepted=accepted, runs=runs, units=density.units)
->>>>>>> main
 
     def __str__(self) -> str:
         width = max(map(len, self.values))

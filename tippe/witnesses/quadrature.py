@@ -232,11 +232,11 @@ def swing(nutation: AbstractNutation, z: Float[Array, ""], z_dot: Float[Array, "
     angles = (jnp.arange(COSINES) + 0.5) * (math.pi / COSINES)
     waves = jnp.cos(jnp.arange(COSINES)[:, None] * angles)
     cosines = (2.0 / COSINES) * waves @ jax.lax.map(pace, angles)
-    made = Swing(middle, half, cosines.at[0].divide(2.0), jnp.zeros_like(z))
+    motion = Swing(middle, half, cosines.at[0].divide(2.0), jnp.zeros_like(z))
     # The rate fixes the phase near a turning point, where z does not.
     rough = jnp.arccos(jnp.clip((middle - z) / half, -1.0, 1.0))
-    phase = jnp.arctan2(z_dot * made.pace(rough), middle - z)
-    return eqx.tree_at(lambda s: s.phase, made, phase)
+    phase = jnp.arctan2(z_dot * motion.pace(rough), middle - z)
+    return eqx.tree_at(lambda s: s.phase, motion, phase)
 
 
 def turning_point(nutation: AbstractNutation, z: Float[Array, ""], direction: float) -> Float[Array, ""]:
