@@ -13,6 +13,7 @@ from nonholonomic.identification import FitWarning as FitWarning
 from nonholonomic.identification import Free as Free
 from nonholonomic.sweeps import Table as Table
 
+from . import presets as presets
 from . import steady as steady
 from .fit.csv import read_recording as read_recording
 from .fit.data import InversionTimes as InversionTimes

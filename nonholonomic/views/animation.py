@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .page import ANGLE, among, finite, view_from
+from .page import ANGLE, among, view_from
 from .plot import new_figure
-from .stage import Show, Stage, css, matrices, nearest
+from .stage import Show, Stage, css, finite, matrices, nearest
 
 #: Pictures a second, how many of them by default, and their dots per inch.
 RATE, FRAMES, DOTS = 25, 150, 80
@@ -156,7 +156,7 @@ class _Space:
                 points = np.where(np.linalg.norm(points - middle, axis=-1, keepdims=True) < 1.6 * reach, points, np.nan)
                 next(traces).set_data_3d(*points.T)
             for arrow in show.arrows:
-                ends = np.stack([arrow.start[now], arrow.start[now] + arrow.vector[now]])
+                ends = np.stack([arrow.start[now], arrow.start[now] + arrow.drawn[now]])
                 next(arrows).set_data_3d(*ends.T)
         self.solids.set_verts(np.concatenate(triangles))
         # Edges of the same colour close the seams between triangles.

@@ -21,7 +21,7 @@ class Viewable(abc.ABC):
 
     @status_line("drawing")
     def view(self, path: Any = None, others: Sequence[Any] = (), overlaid: bool = False) -> Page:
-        """A page in which the run moves: body, arena, traces, arrows, and curves over time (needs k3d).
+        """A page in which the run moves: body, arena, traces, arrows, and curves over time (needs jupyter-threejs-sage).
 
         It is one file that needs no network; a notebook shows what is returned.
 
@@ -33,7 +33,8 @@ class Viewable(abc.ABC):
 
         **Returns:** a `Page`, with its `html`.
 
-        **Raises:** `ModuleNotFoundError` if k3d is not installed; `OSError` if the file cannot be written; `ValueError` for
+        **Raises:** `ModuleNotFoundError` if jupyter-threejs-sage is not installed; `OSError` if the file cannot be
+        written; `ValueError` for
         a batch of runs.
 
         **Example:** `examples/a_page.py`.

@@ -21,6 +21,10 @@ from ..model.scene import Scene
 
 #: Reduced mass, relative to its largest, below which the constraints count as having lost rank.
 RANK_LOST = 1e-8
+
+#: Coefficient of friction that no tyre exceeds by much: rubber on dry asphalt.
+MOST_GRIP = 1.0
+
 #: Pull on the ground, relative to the weight, that still counts as round-off.
 CONTACT_ROUND_OFF = 1e-12
 

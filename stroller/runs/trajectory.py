@@ -22,7 +22,7 @@ from ..model.input import Input
 from ..model.scene import Scene
 from .crossings import crossings, watched
 from .quantities import table_of_one
-from .ride import CONTACT_ROUND_OFF, RANK_LOST, RideSpec, Stats
+from .ride import CONTACT_ROUND_OFF, MOST_GRIP, RANK_LOST, RideSpec, Stats
 from .steps import Steps, followed
 from .view import as_stages
 
@@ -107,6 +107,16 @@ class Trajectory(eqx.Module, Viewable):
     def grip_margin(self, coefficient: Float[Array, ""]) -> Float[Array, "times 2"]:
         """Side force [N] that each axle has left before it slips, given a coefficient of friction [1]."""
         return coefficient * jnp.maximum(self.load, 0.0) - jnp.abs(self.side_force)
+
+    @property
+    def needed_grip(self) -> Float[Array, " times"]:
+        """Least coefficient of friction [1] with which no axle slips, however the load is shared between them.
+
+        It is (|F_rear| + |F_front|) / N: each side force is at most the coefficient times the axle's load, and the loads add up
+        to N. Rubber on dry asphalt gives about 1; `grip` has the coefficient that each axle needs under its own load.
+        """
+        force = jnp.sum(jnp.abs(self.side_force), axis=-1)
+        return jnp.where(force == 0.0, 0.0, force / jnp.maximum(self.normal_force, 0.0))
 
     def with_steps(self) -> "Trajectory":
         """The same run with its steps."""
@@ -211,6 +221,7 @@ class Trajectory(eqx.Module, Viewable):
             f"work {float(self.work[-1]):.6g} J, residual {float(jnp.max(jnp.abs(self.energy_residual))):.1e} J",
             f"  normal force    {float(jnp.min(self.normal_force)):.6g} N to {float(jnp.max(self.normal_force)):.6g} N",
             f"  side forces     up to {shown(jnp.max(jnp.abs(self.side_force), axis=0))} N, rear and front",
+            f"  grip            {grip_in_words(self)}",
             f"  no-slip         {float(jnp.max(jnp.abs(self.constraint))):.1e} m/s",
         ]
         error = float(jnp.max(self.wheelbase_error))
@@ -223,6 +234,15 @@ class Trajectory(eqx.Module, Viewable):
         if jackknives.size:
             lines.append(f"  jackknifed      at {', '.join(f'{time:.6g}' for time in jackknives)} s")
         return "\n".join(lines)
+
+
+def grip_in_words(run: Trajectory) -> str:
+    """The coefficient of friction that a run needs, with a warning if no tyre gives it."""
+    needed = float(jnp.max(run.needed_grip))
+    warning = (
+        f", more than any tyre gives (about {MOST_GRIP:g}): a real stroller would slip" if needed > MOST_GRIP else ""
+    )
+    return f"needs a coefficient of friction of at least {needed:.3g}{warning}"
 
 
 def shown(numbers: Float[Array, " n"]) -> str:

@@ -26,6 +26,7 @@ from nonholonomic.views import (
 )
 
 from ..model.scene import DRIVES
+from .ride import MOST_GRIP
 
 #: Lengths in units of the wheelbase, which is all that the model knows: radius and width of the wheels, and the track.
 RADIUS, WIDTH, TRACK = 0.2, 0.07, 0.8
@@ -97,13 +98,14 @@ def show(run: Any, number: int, name: str) -> Show:
     ahead = read(_integral(given, np.asarray(run.front_speed) / radius))
     rear = wheel(radius, WIDTH * length, (DARK, PALE))
     weight = float(scene.body.mass * scene.gravity)
-    forces = read(run.side_force) * WEIGHT * length / weight
+    forces, scale = read(run.side_force), WEIGHT * length / weight
     contacts = (position + 0.02 * radius * z, position + length * x + 0.02 * radius * z)
-    push = read(run.normal_force)[:, None] * WEIGHT * length / weight * z
+    push = read(run.normal_force)[:, None] * z
     return Show(
         name,
         colour,
         times,
+        normal,
         SIZE * length,
         (
             Body("frame", axle, _turning(x, y, z), frame(length, colour)),
@@ -117,11 +119,11 @@ def show(run: Any, number: int, name: str) -> Show:
         ),
         (
             # Above the axle the basket would hide it.
+            Arrow("normal force", axle - 1.4 * half * y, push, "N", scale, VIOLET, 0.035 * length),
+            Arrow("side force, rear", contacts[0], forces[:, :1] * y, "N", scale, GOLD, 0.035 * length, 2.0 * length),
             Arrow(
-                f"normal force ({WEIGHT:g} wheelbase: the weight)", axle - 1.4 * half * y, push, VIOLET, 0.035 * length
+                "side force, front", contacts[1], forces[:, 1:] * left, "N", scale, GOLD, 0.035 * length, 2.0 * length
             ),
-            Arrow("side force, rear (as long)", contacts[0], forces[:, :1] * y, GOLD, 0.035 * length),
-            Arrow("side force, front", contacts[1], forces[:, 1:] * left, GOLD, 0.035 * length),
         ),
         (
             Curve("speed [m/s]", read(run.speed)),
@@ -129,7 +131,14 @@ def show(run: Any, number: int, name: str) -> Show:
             Curve("energy [J]", read(run.energy)),
             Curve("normal force [N]", read(run.normal_force)),
         ),
+        grip_warning(run),
     )
+
+
+def grip_warning(run: Any) -> str:
+    """What to say of a ride that needs more grip than tyres give; nothing of others."""
+    needed = float(np.max(run.needed_grip))
+    return f"needs grip {needed:.2g}: a real stroller would slip" if needed > MOST_GRIP else ""
 
 
 def refined(run: Any, radius: float) -> tuple[np.ndarray, Any]:
