@@ -1,13 +1,12 @@
 """Tops from a classroom and from the literature, each with its source.
 
-**Example:** a wooden top on a table, spun by hand, climbs onto its stem.
+**Example:** a wooden top, spun by hand with `tippe.Launch.degrees(theta=6, rpm=1900)`, climbs onto its stem within 3 s.
 
 ```
 >>> import tippe
 >>> scene = tippe.presets.classroom()
->>> time = tippe.inversion_time(scene, tippe.Launch.degrees(theta=6, rpm=1900), t1=5.0, tolerance=1e-6)
->>> print(f"{time:.1f} s")
-2.9 s
+>>> print(scene.friction, scene.contact)
+Coulomb(mu=0.3, slip_speed=0.05 m/s) hybrid
 
 ```
 """

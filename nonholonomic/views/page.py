@@ -200,9 +200,6 @@ def _stage(stage: Stage, numbers: _Numbers) -> dict[str, Any]:
     keys = [(stage.arena.spacing, "")]
     if len(stage.shows) > 1:
         keys += [(show.name, css(show.colour)) for show in stage.shows]
-    else:
-        # Traces of several runs have the runs' colours.
-        keys += [(trace.name, css(trace.colour)) for trace in stage.shows[0].traces]
     arena = _mesh(stage.arena.mesh, numbers) | {"lines": [numbers.add(line) for line in stage.arena.lines]}
     return {
         "title": stage.title,
@@ -241,6 +238,8 @@ def _show(show: Show, numbers: _Numbers) -> dict[str, Any]:
         ],
         "traces": [
             {
+                "name": trace.name,
+                "shown": trace.shown,
                 "colour": css(trace.colour),
                 "width": trace.width,
                 "points": numbers.add(finite(trace.points)),

@@ -90,15 +90,17 @@ window.views = window.views || {};
         if (colour) element("i", key).style.background = colour;
         key.append(words);
       }
-      stage.chips = fact.runs[0].arrows.map((arrow, k) => {
-        const chip = element("button", caption, { className: "chip", type: "button", title: "show or hide" });
-        element("i", chip).style.background = arrow.colour;
-        chip.append(arrow.name, " ");
-        const value = element("span", chip);
-        chip.onclick = () => { stage.showArrow(k, !stage.runs[0].arrows[k].shown); toggle(chip, stage.runs[0].arrows[k].shown); this.seek(this.now); };
-        toggle(chip, arrow.shown);
-        return value;
-      });
+      const chip = (kind, { name, colour, shown }, k) => {
+        const one = element("button", caption, { className: "chip", type: "button", title: "show or hide" });
+        element("i", one).style.background = colour;
+        one.append(name);
+        one.onclick = () => { const on = !stage.runs[0][kind][k].shown; stage.show(kind, k, on); toggle(one, on); this.seek(this.now); };
+        toggle(one, shown);
+        return element("span", one);
+      };
+      // Traces of several runs have the runs' colours, which are told beside their names.
+      fact.runs[0].traces.forEach((trace, k) => chip("traces", fact.runs.length > 1 ? { ...trace, colour: "#6b7280" } : trace, k));
+      stage.values = fact.runs[0].arrows.map((arrow, k) => chip("arrows", arrow, k));
       return stage;
     }
 
@@ -162,9 +164,9 @@ window.views = window.views || {};
       for (const stage of this.stages) {
         stage.look(stage.fact.runs.map((_, r) => this.show(stage, r, this.now)), stage.follows);
         stage.render();
-        stage.chips.forEach((value, k) => {
+        stage.values.forEach((value, k) => {
           const { size, unit } = stage.runs[0].arrows[k];
-          value.textContent = `${views.digits(size, 3)} ${unit}`;
+          value.textContent = ` ${views.digits(size, 3)} ${unit}`;
         });
       }
       this.strips.draw(this.now);

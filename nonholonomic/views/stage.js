@@ -70,8 +70,8 @@ window.views = window.views || {};
 
     light() {
       const { THREE, scene, size } = this;
-      scene.add(new THREE.HemisphereLight(0xffffff, 0xc9cdd3, 0.68));
-      this.sun = new THREE.DirectionalLight(0xffffff, 0.46);
+      scene.add(new THREE.HemisphereLight(0xffffff, 0xc9cdd3, 0.6));
+      this.sun = new THREE.DirectionalLight(0xffffff, 0.4);
       this.sun.castShadow = true;
       this.sun.shadow.mapSize.set(2048, 2048);
       this.sun.shadow.radius = 3;
@@ -125,13 +125,13 @@ window.views = window.views || {};
       scene.add(group);
       return group;
     }
-    trace({ colour, width, points }) {
+    trace({ colour, width, points, shown }) {
       const { THREE, scene, size } = this;
       const material = new THREE.LineMaterial({ color: new THREE.Color(colour).getHex(), linewidth: max(1.2, min(3, (45 * width) / size)) });
       const line = new THREE.Line2(new THREE.LineGeometry(), material);
       line.frustumCulled = false;
       scene.add(line);
-      const drawn = { line };
+      const drawn = { line, shown };
       this.setPoints(drawn, points);
       return drawn;
     }
@@ -166,9 +166,9 @@ window.views = window.views || {};
       group.quaternion.set(...quaternion);
     }
     setTrace(run, trace, count, about) {
-      const { line } = this.runs[run].traces[trace];
+      const { line, shown } = this.runs[run].traces[trace];
       line.geometry.instanceCount = max(0, count);
-      line.visible = count > 0;
+      line.visible = shown && count > 0;
       if (about) line.position.set(...about);
     }
     setArrow(run, number, start, vector) {
@@ -185,7 +185,8 @@ window.views = window.views || {};
       arrow.length = length;
     }
     setNormal(run, normal) { this.runs[run].normal = normal; }
-    showArrow(number, shown) { for (const run of this.runs) run.arrows[number].shown = shown; }
+    // Of all runs: `kind` is "arrows" or "traces".
+    show(kind, number, shown) { for (const run of this.runs) run[kind][number].shown = shown; }
 
     // Where the bodies are, and how far apart; a camera that follows keeps its place relative to them.
     look(points, follow) {

@@ -29,13 +29,17 @@ class Body(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """A line that grows as time goes on; `about`, if any, is a moving point to which its points are relative."""
+    """A line that grows as time goes on; `about`, if any, is a moving point to which its points are relative.
+
+    `shown`: whether a page shows it before somebody switches it on.
+    """
 
     name: str
     points: Points
     colour: int
     width: float
     about: Points | None = None
+    shown: bool = True
 
 
 class Arrow(NamedTuple):

@@ -34,8 +34,7 @@ class Viewable(abc.ABC):
         **Returns:** a `Page`, with its `html`.
 
         **Raises:** `ModuleNotFoundError` if jupyter-threejs-sage is not installed; `OSError` if the file cannot be
-        written; `ValueError` for
-        a batch of runs.
+        written; `ValueError` for a batch of runs.
 
         **Example:** `examples/a_page.py`.
         """

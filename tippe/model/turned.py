@@ -90,7 +90,10 @@ class Shape(NamedTuple):
         **Raises:** `ValueError` for numbers that no such top has.
         """
         for name, length in lengths.items():
-            require(length, name, **({"at_least": 0.0} if name.startswith("hole") else {"above": 0.0}))
+            if name.startswith("hole"):
+                require(length, name, at_least=0.0)
+            else:
+                require(length, name, above=0.0)
         shape = cls(**{name: as_number(length) for name, length in lengths.items()})
         radius, cut, stem = shape.radius, shape.cut, shape.stem_radius
         require(cut, "cut", below=radius, why="the radius of the sphere")

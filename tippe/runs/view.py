@@ -134,7 +134,7 @@ def show(scene: Scene, motion: Motion, number: int, name: str) -> Show:
         (Body("top", motion.position, turned(motion.rotation), meshes(body, colour)),),
         (
             Trace("contact", lifted, GREEN, 0.06 * radius),
-            Trace("path of the axis", AXIS * radius * motion.axis, BLUE, 0.012 * radius, about=motion.position),
+            Trace("path of the axis", AXIS * radius * motion.axis, BLUE, 0.012 * radius, motion.position, False),
         ),
         arrows(motion, float(body.offset) if isinstance(body, Top) else 0.0, radius, weight),
         (

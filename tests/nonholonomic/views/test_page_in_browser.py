@@ -185,7 +185,7 @@ def test_the_camera_never_goes_under_the_floor(browser):
 
 def test_arrows_are_labelled_in_their_units_and_switched_off(browser, top):
     browser.execute_script("player.seek(0.3)")
-    chip = browser.find_elements("css selector", "figure:first-child .chip")[0]
+    chip = browser.find_elements("css selector", "figure:first-child .chip")[2]
     assert chip.text == f"normal force {float(top.at([0.3]).normal_force[0]):.3g} N"
     label = (
         "return [...document.querySelectorAll('figure:first-child .force')]"
