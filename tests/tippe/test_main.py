@@ -45,7 +45,9 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rut
     arguments = ["--theta", "6", "18", "--mu", "0.2", "0.3", "--rpm", "1480", "--t1", "8", "--out", str(tmp_path)]
     assert main(arguments) == 0
     printed = capsys.readouterr().out
-    assert printed.startswith("A wooden top: 17.8 g, 40 mm across, a stem 10 mm thick, its centre of mass 1.77 mm below")
+    assert printed.startswith(
+        "A wooden top: 17.8 g, 40 mm across, a stem 10 mm thick, its centre of mass 1.77 mm below"
+    )
     assert "I1 / I3 = 0.952 lies between 1 - a / R = 0.911 and 1 + a / R = 1.089, so it can turn over." in printed
     assert printed.rstrip().endswith(f"To see the top climb onto its stem, open {tmp_path / 'index.html'}")
     rows = [line.split() for line in printed.splitlines() if line.strip().startswith("18 deg")]
