@@ -11,17 +11,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
-from nonholonomic.parameters import text_as_html
+from nonholonomic.parameters import likely, text_as_html
 from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Table
-from nonholonomic.validation import is_traced
+from nonholonomic.validation import is_traced, require_package
 from nonholonomic.views import Stage, Viewable, draw_portrait
 
 from ..model.dynamics import Power, State, padded
 from ..model.input import Input
 from ..model.scene import Scene
 from .crossings import crossings, watched
-from .quantities import table_of_one
+from .quantities import QUANTITIES, table_of_one
 from .ride import CONTACT_ROUND_OFF, MOST_GRIP, RANK_LOST, RideSpec, Stats
 from .steps import Steps, followed
 from .view import as_stages
@@ -82,6 +82,12 @@ class Trajectory(eqx.Module, Viewable):
     spec: RideSpec
     steps: Steps | None
 
+    def __getattr__(self, name: str) -> Any:
+        # Reached for unknown names, and where reading a known one has raised this kind of error: it raises it again.
+        if name.startswith("_") or hasattr(type(self), name):
+            return object.__getattribute__(self, name)
+        raise AttributeError(f"the run has no {name!r}{likely(name, QUANTITIES)} It has {', '.join(QUANTITIES)}")
+
     @property
     def energy_residual(self) -> Float[Array, " times"]:
         """Energy minus its start and the work done since [J]: zero for an exact solution."""
@@ -104,19 +110,23 @@ class Trajectory(eqx.Module, Viewable):
         force = jnp.abs(self.side_force)
         return jnp.where(force == 0.0, 0.0, force / jnp.maximum(self.load, 0.0))
 
+    @property
+    def loaded_axles(self) -> tuple[str, ...]:
+        """The axles that carry a load: the rear one alone where the centre of mass is on it (`centre` 0)."""
+        return ("rear",) if self.spec.ride.scene.body.centre is None else ("rear", "front")
+
     def grip_margin(self, coefficient: Float[Array, ""]) -> Float[Array, "times 2"]:
         """Side force [N] that each axle has left before it slips, given a coefficient of friction [1]."""
         return coefficient * jnp.maximum(self.load, 0.0) - jnp.abs(self.side_force)
 
     @property
-    def needed_grip(self) -> Float[Array, " times"]:
-        """Least coefficient of friction [1] with which no axle slips, however the load is shared between them.
-
-        It is (|F_rear| + |F_front|) / N: each side force is at most the coefficient times the axle's load, and the loads add up
-        to N. Rubber on dry asphalt gives about 1; `grip` has the coefficient that each axle needs under its own load.
-        """
-        force = jnp.sum(jnp.abs(self.side_force), axis=-1)
-        return jnp.where(force == 0.0, 0.0, force / jnp.maximum(self.normal_force, 0.0))
+    def _grip_line(self) -> str:
+        """The greatest friction that each axle needs, and what slips if that is more than any tyre gives."""
+        needs = dict(zip(self.loaded_axles, np.max(np.asarray(self.grip()), axis=0), strict=False))
+        text = ", ".join(f"{name} axle {most:.3g}" for name, most in needs.items())
+        slips = " and ".join(name for name, most in needs.items() if most > MOST_GRIP)
+        remark = f": the {slips} wheels would slip, for a tyre gives at most {MOST_GRIP:g}" if slips else ""
+        return f"needed friction up to {text}{remark}"
 
     def with_steps(self) -> "Trajectory":
         """The same run with its steps."""
@@ -173,6 +183,7 @@ class Trajectory(eqx.Module, Viewable):
 
         **Raises:** `ValueError` for a batch of runs.
         """
+        require_package("xarray", "xarray", "to_xarray")
         return self.to_table().to_xarray()
 
     def save(self, path: Any) -> None:
@@ -194,6 +205,7 @@ class Trajectory(eqx.Module, Viewable):
 
         **Raises:** `ValueError` for an unknown variable.
         """
+        require_package("matplotlib", "plot", "portrait")
         return draw_portrait(self.to_table(), x, y, ax)
 
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
@@ -221,7 +233,7 @@ class Trajectory(eqx.Module, Viewable):
             f"work {float(self.work[-1]):.6g} J, residual {float(jnp.max(jnp.abs(self.energy_residual))):.1e} J",
             f"  normal force    {float(jnp.min(self.normal_force)):.6g} N to {float(jnp.max(self.normal_force)):.6g} N",
             f"  side forces     up to {shown(jnp.max(jnp.abs(self.side_force), axis=0))} N, rear and front",
-            f"  grip            {grip_in_words(self)}",
+            f"  grip            {self._grip_line}",
             f"  no-slip         {float(jnp.max(jnp.abs(self.constraint))):.1e} m/s",
         ]
         error = float(jnp.max(self.wheelbase_error))
@@ -234,15 +246,6 @@ class Trajectory(eqx.Module, Viewable):
         if jackknives.size:
             lines.append(f"  jackknifed      at {', '.join(f'{time:.6g}' for time in jackknives)} s")
         return "\n".join(lines)
-
-
-def grip_in_words(run: Trajectory) -> str:
-    """The coefficient of friction that a run needs, with a warning if no tyre gives it."""
-    needed = float(jnp.max(run.needed_grip))
-    warning = (
-        f", more than any tyre gives (about {MOST_GRIP:g}): a real stroller would slip" if needed > MOST_GRIP else ""
-    )
-    return f"needs a coefficient of friction of at least {needed:.3g}{warning}"
 
 
 def shown(numbers: Float[Array, " n"]) -> str:
