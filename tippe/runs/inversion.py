@@ -63,7 +63,13 @@ def is_inverted(outcome: Outcome | HybridOutcome, problem: InversionProblem, las
 
 
 def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any) -> None:
-    """Raise `ValueError` unless these are a scene, a launch, a positive horizon and a tolerance in range."""
+    """Raise `ValueError` unless these are a scene, a launch with a place on it, a positive horizon and a tolerance in range."""
+    check_numbers(scene, launch, t1, tolerance)
+    scene.check_start(launch)
+
+
+def check_numbers(scene: Any, launch: Any, t1: Any, tolerance: Any) -> None:
+    """Raise `ValueError` unless these are a scene, a launch, a positive horizon and a tolerance in range, each by itself."""
     if not isinstance(scene, Scene):
         raise ValueError(f"scene = {scene!r} must be a Scene")
     if not isinstance(launch, Launch):
@@ -71,7 +77,6 @@ def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any) -> None:
     require_all(run_bounds(t1, tolerance))
     values = numbers("scene", scene) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
     require_scalars(values, "inversion_table takes lists")
-    scene.check_start(launch)
 
 
 def event_bounds(angle: Any) -> Iterator[Bound]:
