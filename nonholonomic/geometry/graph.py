@@ -97,8 +97,8 @@ class Paraboloid(AbstractOpen):
         return (position[2] - self.ground(position[0], position[1])) * self.normal(position)[2]
 
     def nearest(self, position: Vector) -> Vector:
-        # At a distance s from the axis, s^3 / (2 p^2) + (1 - z / p) s = r: the greatest root is nearest of all. Above it the cubic
-        # is convex, so that Newton's method falls to it.
+        # At a distance s from the axis, s^3 / (2 p^2) + (1 - z / p) s = r: the greatest root is nearest of all. Above it the
+        # cubic is convex, so that Newton's method falls to it.
         x, y, z = position
         square = x * x + y * y
         r = jnp.sqrt(jnp.maximum(square, TINY * TINY))

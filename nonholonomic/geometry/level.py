@@ -1,13 +1,13 @@
 """Surfaces on which a function is zero, known by the function and its derivatives alone.
 
-The points that such a surface is asked for are found by minimisation. The nearest point to a position minimises the distance over
-the surface, which may have many local minima for positions farther than the surface's least radius of curvature. So the places
-where the nearest point can be are divided into sectors, and a descent starts at the best of some points in each. The gap below a
-ball needs no nearest point: the ball touches where the function is least over the ball, so that the search never leaves the ball,
-however far the surface is. A gap is negative only where a point of the ball is in the arena.
+Both searches here are minimisations. The nearest point minimises the distance over the surface, which may have many local
+minima for positions farther than the surface's least radius of curvature. The places where the nearest point can be are
+therefore divided into sectors, and a descent starts at the best of some points in each. The gap below a ball needs no nearest
+point: the ball touches where the function is least over the ball, so the search never leaves the ball, however far the surface
+is. The gap is negative only where a point of the ball is in the arena.
 
-Both searches are Newton's method with the curvature kept positive and steps cut to a trust region (Nocedal and Wright, Numerical
-Optimization, chapter 4). Derivatives are those of a last Newton step from what is found (implicit function theorem).
+Each descent is Newton's method with the curvature kept positive and steps cut to a trust region (Nocedal and Wright, Numerical
+Optimization, chapter 4). A last Newton step carries the derivatives (implicit function theorem).
 """
 
 import abc
@@ -51,7 +51,7 @@ class Quadratic(NamedTuple):
         return 0.5 * (self.a + self.c) - jnp.sqrt((0.5 * (self.a - self.c)) ** 2 + self.b**2)
 
     def solved(self) -> tuple[Component, Component]:
-        """Solution of matrix times s = vector, with the matrix's eigenvalues raised to `LEAST_CURVATURE` where they are less."""
+        """Solution s of matrix times s = vector, with the eigenvalues raised to `LEAST_CURVATURE` where they are less."""
         raised = jnp.maximum(LEAST_CURVATURE - jax.lax.stop_gradient(self.least_eigenvalue), 0.0)
         a, c = self.a + raised, self.c + raised
         per_determinant = 1.0 / (a * c - self.b * self.b)
@@ -118,7 +118,7 @@ def descended(
 class AbstractLevel(AbstractSurface):
     """A surface on which a function is zero, and positive in the room where bodies are."""
 
-    #: Points about a position from which the search for the nearest point may start, in units of a distance within which that is.
+    #: Points about a position from which the search for the nearest point may start; its distance is less than 1 in their unit.
     starts: ClassVar[Float[np.ndarray, "sectors starts 3"]]
 
     @abc.abstractmethod
@@ -208,8 +208,8 @@ class AbstractLevel(AbstractSurface):
         return BallGap(_lowered(lowest, gap, normal), normal, gap)
 
     def _about(self, position: Vector, foot: Vector) -> tuple[Vector, Vector, Quadratic]:
-        """Two tangents at a foot, and what the square of the distance to a position is along them: half its second derivatives,
-        and minus half its first ones."""
+        """Two tangents at a foot, and the square of the distance to a position along them: half its second derivatives, and
+        minus half its first ones."""
         n = self.normal(foot)
         away = vector_of(subtract(a, b) for a, b in zip(position, foot, strict=True))
         d, (t1, t2) = dot(away, n), tangents(n)
@@ -217,8 +217,8 @@ class AbstractLevel(AbstractSurface):
         return t1, t2, Quadratic(1.0 + d * aa, d * ab, 1.0 + d * bb, dot(away, t1), dot(away, t2))
 
     def _under(self, centre: Vector, radius: Component, normal: Vector) -> tuple[Vector, Vector, Quadratic]:
-        """Two tangents of a ball at the point against a normal, and what the function is along them, per unit gradient and radius:
-        its second derivatives by the normal, and minus its first ones."""
+        """Two tangents of a ball at its point against a normal, and the function along them, per unit gradient and radius: its
+        second derivatives by the normal, and minus its first ones."""
         lowest, (t1, t2) = _lowered(centre, radius, normal), tangents(normal)
         m = self.normal(lowest)
         aa, ab, bb = self.bending(lowest, t1, t2)

@@ -182,9 +182,9 @@ class Spheroid(AbstractQuadric):
         return 0.5 * (dot(position, gradient) - 1.0) / jnp.sqrt(dot(gradient, gradient))
 
     def nearest(self, position: Vector) -> Vector:
-        # q = (1 + t N)^-1 r, with the greatest t for which q is on the surface: the one for which the distance is least of all.
-        # As the inverse length of N^1/2 q is almost linear in t, Newton's method needs few steps (Moré and Sorensen, SIAM Journal
-        # on Scientific and Statistical Computing 4 (1983) 553).
+        # q = (1 + t N)^-1 r, with the greatest t for which q is on the surface: of all solutions the nearest point. The inverse
+        # length of N^1/2 q is almost linear in t, so Newton's method needs few steps (Moré and Sorensen, SIAM Journal on
+        # Scientific and Statistical Computing 4 (1983) 553).
         equatorial, polar = self.semi_axes
         x, y, z = position
         # Where all directions are as near, the one of growing coordinates is taken.

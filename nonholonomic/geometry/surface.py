@@ -38,7 +38,7 @@ class BallGap(NamedTuple):
     """The gap between a ball and a surface.
 
     - `foot`: the point [m] that the ball is about to touch; `normal`: from it towards the ball.
-    - `gap`: distance [m] between them, to first order in it where the surface is given by a function alone; negative where the ball
+    - `gap`: distance [m] between them, to first order where the surface is given by a function alone; negative where the ball
       is in the arena, and only there.
     """
 
@@ -109,14 +109,16 @@ class AbstractSurface(Bounded):
     def ball_gap(self, centre: Vector, radius: Component, side: float) -> BallGap:
         """Where a ball is about to touch the surface.
 
-        **Arguments:** `centre`: of the ball [m]; `radius`: of the ball [m], less than the radii of curvature of the surface that is
-        hollow there; `side`: 1.0 if the ball is on the side to which n points, else -1.0.
+        **Arguments:** `centre`: of the ball [m]; `radius`: of the ball [m], less than the radii of curvature where the surface
+        is hollow; `side`: 1.0 if the ball is on the side to which n points, else -1.0.
         """
         foot = self.nearest(centre)
         foot = tuple(0.0 * centre[0] if part is None else part for part in foot)
         normal = scale(side, self.normal(foot))
         away = tuple(subtract(a, b) for a, b in zip(centre, foot, strict=True))
-        return BallGap((foot[0], foot[1], foot[2]), (normal[0], normal[1], normal[2]), subtract(dot(away, normal), radius))
+        return BallGap(
+            (foot[0], foot[1], foot[2]), (normal[0], normal[1], normal[2]), subtract(dot(away, normal), radius)
+        )
 
     def offset(self, position: Vector) -> Component:
         """`distance` [m], to first order where that is cheaper: for positions next to the surface."""

@@ -1,8 +1,8 @@
 """Flights higher than the arena's least radius of curvature, where it has several nearest points: when and where they land.
 
-The reference is a flight in closed form, the centre of mass on a parabola and the axis on a cone about L (`tippe.md`, section 3),
-and the distance of the sphere's centre from the arena by brute force: the least over a dense grid of places, refined. Nothing
-of it is shared with the simulator.
+The reference is a flight in closed form, the centre of mass on a parabola and the axis on a cone about L (`tippe.md`, section
+3), and the distance of the sphere's centre from the arena by brute force: the least over a dense grid of places, refined. It
+shares nothing with the simulator.
 """
 
 import jax.numpy as jnp
@@ -152,3 +152,17 @@ def test_a_flight_out_of_a_bowl_lands_on_its_wall():
     assert run.status == "reached t1"
     assert float(np.max(np.asarray(run.position)[:, 2])) > 0.2
     check(run, from_bowl(0.1), 0)
+
+
+class Mistaken(tippe.Paraboloid):
+    """A bowl that states half of its heights."""
+
+    def elevation(self, position):
+        return 0.5 * position[2]
+
+
+def test_a_run_whose_energy_does_not_balance_is_unresolved():
+    """The same run in a bowl that states its heights is whole."""
+    launch = tippe.Launch(0.4, 100.0, place=(0.1, 0.0), velocity=(0.0, 0.2))
+    ends = [thrown(kind(0.3), launch, 0.05, 1e-9).status for kind in (tippe.Paraboloid, Mistaken)]
+    assert ends == ["reached t1", "unresolved"]

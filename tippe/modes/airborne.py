@@ -53,8 +53,8 @@ OWN = 14
 #: places and axes after the last bounce by 5e-13, inversion times after 270 flights in a bowl by 3e-13 of themselves.
 CLOSING_SPEED = 1e-5
 
-#: How far a sphere may be from the arena where its flight ends, as a fraction of its radius, and by how much the normal there may
-#: differ from that of the contact. Located landings are within 1e-9.
+#: How far a sphere may be from the arena where its flight ends, as a fraction of its radius, and by how much the normal there
+#: may differ from that of the contact. Located landings are within 1e-9.
 LANDED = 1e-6
 
 
@@ -92,8 +92,7 @@ def below(scene: Scene, flying: FlightState, ball: Ball | None = None) -> Below:
 
 
 def landing_site(scene: Scene, flying: FlightState, ball: Ball) -> Below:
-    """Where a sphere is about to touch the arena. As it lands, that is the nearest point; in flight, only the sign of the gap is
-    known to be that of the distance."""
+    """Where a sphere is about to touch the arena: the nearest point as it lands. Before that only the gap's sign is known."""
     centre = centre_of(flying, ball)
     site, zero = scene.surface.ball_gap(centre, ball.radius, carried_frame(scene).side), jnp.zeros_like(flying.place[0])
     n = tuple(zero if part is None else part + zero for part in site.normal)

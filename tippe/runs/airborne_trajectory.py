@@ -146,7 +146,9 @@ def simulate_airborne(
     if status == "jammed":
         status = LOSSES[int(loss(scene, jnp.asarray(path.state)))]
     hops = np.array([(one.begin, one.end) for one in path.mode_segments if one.number == FLYING]).reshape(-1, 2)
-    run = flights_of(StickSlipArenaTrajectory if exact else ArenaTrajectory, scene, path, status, hops, times)
+    run = flights_of(
+        StickSlipArenaTrajectory if exact else ArenaTrajectory, scene, path, status, hops, times, tolerance
+    )
     if exact:
         run.stats["sticks"] = int(path.counts[1])
     return run

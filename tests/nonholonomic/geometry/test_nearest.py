@@ -26,8 +26,11 @@ def feet(surface, at) -> np.ndarray:
 
 
 def check_least(surface, at, profile, seen) -> None:
-    """No point of a profile is closer than the nearest one, and that is on the surface; the profile is a curve (2, n), whose points
-    are as far apart as makes its distance right to 1e-6, `seen` are the positions beside it."""
+    """No point of a profile is closer than the nearest one, and that one is on the surface.
+
+    The profile is a curve (2, n) of points so close that the distance from it is right to 2e-5 m; `seen` are the positions
+    beside it.
+    """
     foot = feet(surface, at)
     assert_close(np.linalg.norm(at - foot, axis=1), cKDTree(profile.T).query(seen.T)[0], atol=2e-5)
     assert_close(jax.jit(lambda place: surface.offset(place))(tuple(jnp.asarray(foot.T))), 0.0, atol=1e-14)
