@@ -100,7 +100,10 @@ def _change(question: AbstractDifferentiableSolve, value: Array, slopes: tuple[A
     def share(slope: Array, tangent: Array) -> Array:
         # Selected before and after, so that an infinite tangent or cotangent of an absent answer is dropped, not multiplied.
         kept = jnp.where(jnp.all(none), 0.0, tangent)
-        return jnp.where(none, 0.0, jnp.tensordot(slope, kept, axes=jnp.ndim(tangent)))
+        product = slope * kept
+        # Where the answer does not move, a cotangent that is not a number, such as that of theta at the pole, says nothing.
+        product = jnp.where(slope == 0.0, 0.0, product).sum(axis=tuple(range(jnp.ndim(value), jnp.ndim(product))))
+        return jnp.where(none, 0.0, product)
 
     return sum(share(slope, tangent) for slope, tangent in zip(slopes, tangents, strict=True))
 

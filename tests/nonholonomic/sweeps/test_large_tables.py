@@ -30,7 +30,7 @@ def job(columns, count):
 
 def large_sweep(path, **options):
     inner = [axis("two", "two", "1", [1.0, 2.0])]
-    return sweep(job, [Y, X], VARIABLES, {"what": "a test"}, path=path, inner=inner, block=4096, **options)
+    return sweep(job, [Y, X], VARIABLES, {"what": "a test"}, path=path, inner=inner, chunk=4096, **options)
 
 
 @pytest.fixture
