@@ -70,7 +70,7 @@ def test_nearest_point_of_a_function_is_that_of_the_same_spheroid():
     moved = (place, (jnp.zeros(len(at)), jnp.zeros(len(at)), jnp.ones(len(at))))
     slopes = []
     for surface in (egg, same):
-        rates = jax.jit(lambda *both, surface=surface: jax.jvp(lambda place: surface.nearest(place), *both)[1])
+        rates = jax.jit(lambda *both, surface=surface: jax.jvp(lambda *place: surface.nearest(place), *both)[1])
         slopes.append(np.stack(rates(*moved)))
     assert_close(*slopes, rtol=1e-6, atol=1e-9)
 
