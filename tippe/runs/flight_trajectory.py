@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import BETWEEN, HybridPath, HybridSamples, Segment, hybrid_samples, solve_hybrid_dense
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Settings
+from nonholonomic.integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Settings, Status
 
 from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch
@@ -22,19 +22,24 @@ from ..modes.leaning import BOTH
 from ..modes.sliding import modes
 from ..modes.trajectory_problem import TrajectoryProblem
 from .observables import AbstractTrajectory, of_each_run
-from .sampled import STATUS as CODES
 
 #: The greatest energy residual of a run, relative to its energy and over its tolerance. Flights over ripples and in a spheroid
 #: stay below 1e-4 of this; a landing where no arena was had left a residual of 8e4 times it.
 BALANCED = 1e4
 
-STATUS = {REACHED_END: "reached t1", LEFT_DOMAIN: "jammed", FAILED: "failed", UNRESOLVED: "unresolved"}
+#: What users are told, by the code of the integration.
+STATUS = {
+    REACHED_END: Status.COMPLETED,
+    LEFT_DOMAIN: Status.JAMMED,
+    FAILED: Status.FAILED,
+    UNRESOLVED: Status.UNRESOLVED,
+}
 
 
 class HybridTrajectory(AbstractTrajectory):
     """A run through contacts, flights and impacts; vectors are arrays (times, 3) in the fixed frame (x, y, z).
 
-    `status` is "reached t1", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a row or
+    `status` is "completed", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a row or
     2000 contacts; sphere and stem on the plane together with so much friction that the forces are not determined; sphere and
     stem at rest together on another arena, where the equations of both contacts at once are not implemented; a flight that
     does not end at the arena; an energy residual beyond 1e4 times the tolerance, relative to the energy); the run ends at
@@ -47,7 +52,7 @@ class HybridTrajectory(AbstractTrajectory):
     drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J]. `rotation` and
     `angular_velocity` are those of `Trajectory`.
 
-    Inside a transformation `status` is a code as for `Trajectory`, 6 for "unresolved"; `hops` is `None`, `stats["hops"]`
+    Inside a transformation `status` is the integer of the `Status`; `hops` is `None`, `stats["hops"]`
     counts the flights. First derivatives by the scene and the launch go through flights and impacts; they are NaN behind an
     event that is grazing, so that within the tolerance it may not happen at all.
 
@@ -168,13 +173,13 @@ def simulate_hybrid(
     kinds, first, state = level_modes((scene, launch), tolerance)
     path = solve_hybrid_dense(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1)
     hops = np.array([(one.begin, one.end) for one in path.segments if one.number == BETWEEN]).reshape(-1, 2)
-    return flights_of(HybridTrajectory, scene, path, STATUS[path.status], hops, times, tolerance)
+    return flights_of(HybridTrajectory, scene, path, STATUS[path.status].word, hops, times, tolerance)
 
 
 def sampled_hybrid(scene: Scene, launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
     """Run one launch of a hybrid scene inside a transformation. **Arguments:** as for `simulate`, checked."""
     found = hybrid_samples(level_modes, (scene, launch), times, t1, settings, kinds=1)
-    return sampled_flights(HybridTrajectory, scene, times, found, jnp.asarray(CODES.index("jammed")))
+    return sampled_flights(HybridTrajectory, scene, times, found, jnp.asarray(int(Status.JAMMED)))
 
 
 def sampled_flights(
@@ -184,7 +189,7 @@ def sampled_flights(
     states, place, spin_angle, work, distance = kind.parts_of(found.shown)
     # After the end no sphere touches.
     number = jnp.where(jnp.isnan(found.number), BETWEEN, found.number).astype(int)
-    ended = {code: jnp.asarray(CODES.index(word)) for code, word in STATUS.items()} | {LEFT_DOMAIN: lost}
+    ended = {code: jnp.asarray(int(status)) for code, status in STATUS.items()} | {LEFT_DOMAIN: lost}
     status = sum(jnp.where(found.status == code, index, 0) for code, index in ended.items())
     stats = {"accepted": found.steps - found.rejected, "rejected": found.rejected, "hops": found.counts[0]}
     stats = {name: count.astype(int) for name, count in stats.items()}
@@ -213,6 +218,6 @@ def flights_of(
     # What is left of the work is that of the impacts.
     run = run.with_stats(path, impact_loss=float(in_contact - path.state[-1]))
     size = float(np.max(np.abs(run.energy))) + float(scene.body.mass * scene.gravity * scene.body.radius)
-    if status != "failed" and not run.stats["energy_residual"] <= BALANCED * tolerance * size:
-        run = dataclasses.replace(run, status="unresolved")
+    if status != Status.FAILED.word and not run.stats["energy_residual"] <= BALANCED * tolerance * size:
+        run = dataclasses.replace(run, status=Status.UNRESOLVED.word)
     return run if times is None else run.resampled(np.asarray(times)[np.asarray(times) <= run.end_time])
