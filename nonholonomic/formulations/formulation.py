@@ -36,8 +36,8 @@ class AbstractSystem(eqx.Module):
     """A mechanical system with n coordinates and k linear constraints on its velocity, by its data.
 
     Subclass it, declare the numbers of your model as fields, set `dimension` to the number of coordinates, and write functions
-    of one set of coordinates: the `metric`, and as needed `potential`, `constraints`, `force` and `frame`. The equations of motion
-    follow; `nonholonomic.simulate`, `event_time`, `sweep` and `identify` run them.
+    of one set of coordinates: the `metric`, and as needed `potential`, `constraints`, `force` and `frame`. The equations of
+    motion follow; `nonholonomic.simulate`, `event_time`, `sweep` and `identify` run them.
 
     **Example:** a bead on a parabolic wire z = x^2 / 2, which oscillates in about 2 pi / sqrt(g).
 
