@@ -15,6 +15,7 @@ from nonholonomic.identification import Free as Free
 from nonholonomic.integration import ImplicitMidpoint as ImplicitMidpoint
 from nonholonomic.integration import Status as Status
 
+from . import presets as presets
 from .fit.identify import identify as identify
 from .fit.recording import Recording as Recording
 from .fit.recording import read_recording as read_recording

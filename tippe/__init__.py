@@ -16,6 +16,7 @@ from nonholonomic.identification import Free as Free
 from nonholonomic.integration import Status as Status
 from nonholonomic.sweeps import Table as Table
 
+from . import presets as presets
 from . import steady as steady
 from .fit.csv import read_recording as read_recording
 from .fit.data import InversionTimes as InversionTimes
