@@ -92,7 +92,8 @@ def explore(
     """
     check_run(scene, launch, t1, input, TOLERANCE)
     roots: dict[str, Any] = {"scene": scene, "launch": launch}
-    roots |= {"input": input} if isinstance(input, eqx.Module) else {}
+    if isinstance(input, eqx.Module):
+        roots["input"] = input
     knobs = sliders_of(default_ranges(scene, launch) if sliders is None else sliders, roots, LONG_NAMES, UNITS)
     shapes = [roots, *(with_numbers(roots, {path: end}) for path, end in ends_of(knobs))]
     page = live_page(live_run(roots, knobs, float(t1), input), stage(shapes, float(t1), input))
@@ -101,7 +102,7 @@ def explore(
     return page
 
 
-def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input: Input | None) -> LiveRun:
+def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input: Any) -> LiveRun:
     """What the page shows of a scene, a launch and an input, `roots`, some of whose numbers are those of sliders."""
     settings = Settings(TOLERANCE, max_steps=MOST_STEPS)
     controls = as_module(input, roots["scene"], roots["launch"])
@@ -130,7 +131,7 @@ def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input:
 def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
     """The sliders if a user names none: speed, steering angle, heading, and what friction has."""
     speed, steering, heading = float(launch.speed), abs(float(launch.steering)), float(launch.heading)
-    found = {
+    ranges = {
         "launch.speed": (min(0.0, 2.0 * speed), max(3.0, 2.0 * speed)),
         "launch.steering": (-max(0.9, steering), max(0.9, steering)),
         "launch.heading": (heading - math.pi, heading + math.pi),
@@ -138,7 +139,7 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
     friction = {
         path: float(value) for path, value in numbers("scene.friction", scene.friction).items() if value is not None
     }
-    return found | {
+    return ranges | {
         path: (0.0, 3.0 * value) for path, value in friction.items() if value > 0.0 and path.endswith("ing")
     }
 
@@ -182,7 +183,7 @@ def outcome(problem: RideProblem, lane: LaneState) -> tuple[Int[Array, ""], Floa
     return status, jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(apart))[0], jnp.inf)
 
 
-def stage(runs: list[dict[str, Any]], t1: float, controls: Input | None) -> Stage:
+def stage(runs: list[dict[str, Any]], t1: float, controls: Any) -> Stage:
     """The first of some scenes and launches as it is drawn, on a piece of the ground on which all of them are."""
     rides = [simulate(run["scene"], run["launch"], t1, run.get("input", controls), tolerance=DRAWN) for run in runs]
     (first,), length = rides[0].stages(), float(runs[0]["scene"].body.wheelbase)
@@ -234,6 +235,6 @@ def rolling(x: Array, y: Array, z: Array, angle: Float[Array, ""]) -> Float[Arra
 def fixed_normal(scene: Scene, position: Float[Array, "3"]) -> Float[Array, "3"]:
     """The ground's outward normal at a point, in the fixed frame."""
     surface = scene.surface
-    own = surface.normal(surface.in_own_axes(tuple(position)))
-    full = tuple(jnp.zeros(()) if part is None else jnp.asarray(part) + 0.0 for part in own)
-    return jnp.stack([jnp.asarray(part) for part in surface.in_fixed_frame(full)])
+    own = surface.normal(surface.in_own_axes((position[0], position[1], position[2])))
+    x, y, z = (jnp.zeros(()) if part is None else jnp.asarray(part) + 0.0 for part in own)
+    return jnp.stack([jnp.asarray(part) for part in surface.in_fixed_frame((x, y, z))])

@@ -154,19 +154,19 @@ def check_smooth(scene: Scene) -> None:
 def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
     """The sliders if a user names none: theta, spin, the coefficient of friction and the offset, about their own values."""
     theta, spin = float(launch.theta), float(launch.spin)
-    found = {"theta": (min(0.02, theta), max(0.6, theta)), "spin": tuple(sorted((0.4 * spin, 1.4 * spin)))}
+    ranges = {"theta": (min(0.02, theta), max(0.6, theta)), "spin": tuple(sorted((0.4 * spin, 1.4 * spin)))}
     if spin == 0.0:
-        found["spin"] = (0.0, 200.0)
+        ranges["spin"] = (0.0, 200.0)
     known = numbers("scene", scene)
     for name, (least, most) in {"mu": (0.1, 3.0), "offset": (0.5, 1.5)}.items():
         path = next((path for path in known if path.endswith(f".{name}")), None)
         if path is not None and known[path] > 0.0:
             value = float(known[path])
-            found[path] = (
+            ranges[path] = (
                 least * value,
                 min(most * value, 0.9 * float(scene.body.size)) if name == "offset" else most * value,
             )
-    return found
+    return ranges
 
 
 def outcome(problem: InversionProblem, lane: LaneState) -> tuple[Int[Array, ""], Float[Array, ""]]:
@@ -193,7 +193,7 @@ def frame(scene: Scene, problem: TrajectoryProblem, lane: LaneState) -> Frame:
     """What is drawn of a top at one time, as `view.show` orders it."""
     lean, rows = len(problem.state), lane.state
     parts = (rows[:lean], rows[lean:-2], rows[-2], rows[-1])
-    run = Trajectory(lane.time, scene, *parts, status=None, end_time=None, stats={}, dense=None)
+    run = Trajectory(lane.time, scene, *parts, status=0, end_time=lane.time[0], stats={}, dense=None)
     motion = Motion(*(part[0] for part in Motion.of(run)))
     radius = scene.body.size
     lifted = motion.contact + 0.02 * radius * motion.normal

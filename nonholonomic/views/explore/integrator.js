@@ -4,8 +4,8 @@
 
 function integrator(model) {
   const n = model.components, at = model.lane, stages = model.stages.length;
-  const [given, lane] = [new Float64Array(model.given), new Float64Array(at.size)];
-  const start = new Float64Array(model.given + at.size);
+  const [constants, lane] = [new Float64Array(model.constants), new Float64Array(at.size)];
+  const start = new Float64Array(model.constants + at.size);
   const rates = Array.from({ length: stages + 2 }, () => new Float64Array(n));
   const [there, time, length, number] = [new Float64Array(n), new Float64Array(1), new Float64Array(1), [1]];
   // As a `Step` of Python: state, rate, error, the lesser of domain margin and event function at the end, and where one was negative before.
@@ -29,18 +29,18 @@ function integrator(model) {
     for (let stage = 0; stage < stages; stage++) {
       move(there, state, length, model.stages[stage]);
       time[0] = from + model.places[stage] * length;
-      model.field(given, time, there, rates[stage + 1]);
+      model.field(constants, time, there, rates[stage + 1]);
       if (!watches || !model.looks.includes(stage)) continue;
-      if (value(model.domain, given, time, there) < 0 || side * value(model.crossing, given, there, rates[stage + 1]) < 0)
+      if (value(model.domain, constants, time, there) < 0 || side * value(model.crossing, constants, there, rates[stage + 1]) < 0)
         negative = Math.min(negative, model.places[stage]);
     }
     move(end, state, length, model.step);
     if (!watches) return;
     time[0] = from + length;
-    model.field(given, time, end, last);
+    model.field(constants, time, end, last);
     rates[stages + 1].set(last);
     move(error, none, length, model.error);
-    const margin = Math.min(value(model.domain, given, time, end), side * value(model.crossing, given, end, last));
+    const margin = Math.min(value(model.domain, constants, time, end), side * value(model.crossing, constants, end, last));
     tried[3 * n] = margin === Infinity ? 1 : margin;
     tried[3 * n + 1] = negative;
   }
@@ -48,14 +48,14 @@ function integrator(model) {
   // Runs from the start that the sliders' numbers say; `record` is called with the start and the length of each step that is taken.
   function run(values, record) {
     model.begin(values, start);
-    given.set(start.subarray(0, model.given));
-    lane.set(start.subarray(model.given));
+    constants.set(start.subarray(0, model.constants));
+    lane.set(start.subarray(model.constants));
     const [state, rate] = [lane.subarray(at.state, at.state + n), lane.subarray(at.rate, at.rate + n)];
     while (lane[at.status] === model.running) {
-      model.length(given, lane, length);
+      model.length(constants, lane, length);
       const from = lane[at.time], before = record && { time: from, state: state.slice(), rate: rate.slice() };
       step(from, state, rate, lane[at.side], length[0]);
-      model.after(given, lane, length, tried, lane);
+      model.after(constants, lane, length, tried, lane);
       if (record && lane[at.time] > from) record({ ...before, length: lane[at.time] - from });
     }
     return lane;
@@ -76,12 +76,12 @@ function integrator(model) {
           copy.set(end, at.state);
           copy[at.time] = wanted;
         }
-        found.push(Float64Array.from(model[reading](values, given, copy, [])));
+        found.push(Float64Array.from(model[reading](values, constants, copy, [])));
       }
       return found;
     }
     return { end: ended, steps: steps.length, read };
   }
 
-  return { run, trajectory, read: (name, values) => model[name](values, given, lane, []) };
+  return { run, trajectory, read: (name, values) => model[name](values, constants, lane, []) };
 }

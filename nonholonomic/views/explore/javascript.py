@@ -19,6 +19,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 #: A number: of Python where it is known, else the name or text that stands for it in JavaScript. A value is an array of them.
 Number = str | float
 Value = np.ndarray
+Values = list[Value]
 
 #: JavaScript for what is done element by element.
 _MATH = "abs sqrt cbrt sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp expm1 log log1p sign floor ceil"
@@ -108,7 +109,11 @@ def javascript(name: str, function: Callable[..., Any], *arguments: Any) -> str:
         shapes = [np.zeros(leaf.shape) for leaf in jax.tree.leaves(argument)]
         values += [_map(lambda _, names=names: block.name(next(names)), shape) for shape in shapes]
     results = _flat(block.call(closed, values))
-    lines = [*block.lines(results), *(f"out[{k}] = {_text(one)};" for k, one in enumerate(results)), "return out;"]
+    lines = [
+        *block.lines(results),
+        *(f"out[{k}] = {_text(number)};" for k, number in enumerate(results)),
+        "return out;",
+    ]
     heads = [*(f"a{number}" for number in range(len(arguments))), "out"]
     return f"function {name}({', '.join(heads)}) {{\n" + "\n".join(f"  {line}" for line in lines) + "\n}\n"
 
@@ -138,7 +143,7 @@ class _Block:
 
     def __init__(self, names: Any, known: dict[str, str]):
         self.names, self.known = names, known
-        self.statements: list[tuple[list[str], set[str], list[str]]] = []
+        self.statements: list[tuple[list[Number], set[str], list[str]]] = []
 
     def name(self, text: str, *reads: Number) -> str:
         """The name of what an expression gives, which is written once only."""
@@ -160,7 +165,7 @@ class _Block:
         """The names that are read on the way to some numbers."""
         return set(_strings(needed)).union(*(reads for _, reads, _ in self._needed(needed)))
 
-    def _needed(self, needed: Sequence[Number]) -> list[tuple[list[str], set[str], list[str]]]:
+    def _needed(self, needed: Sequence[Number]) -> list[tuple[list[Number], set[str], list[str]]]:
         wanted, kept = set(_strings(needed)), []
         for statement in reversed(self.statements):
             if not wanted.isdisjoint(statement[0]):
@@ -168,7 +173,7 @@ class _Block:
                 kept.append(statement)
         return kept[::-1]
 
-    def call(self, closed: Any, arguments: Sequence[Value]) -> list[Value]:
+    def call(self, closed: Any, arguments: Sequence[Value]) -> Values:
         """The values that a jaxpr gives."""
         jaxpr, constants = (closed.jaxpr, closed.consts) if isinstance(closed, ClosedJaxpr) else (closed, ())
         values = dict(zip(jaxpr.constvars, map(_value, constants), strict=True))
@@ -182,7 +187,7 @@ class _Block:
             values |= dict(zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
-    def apply(self, equation: Any, inputs: list[Value]) -> list[Value]:
+    def apply(self, equation: Any, inputs: Values) -> Values:
         """What one equation gives."""
         name, parameters = equation.primitive.name, equation.params
         if name in SAME:
@@ -193,8 +198,8 @@ class _Block:
             if key in parameters:
                 return self.call(parameters[key], inputs)
         if name in MOVES:
-            found = MOVES[name](*inputs, **{key: parameters[key] for key in parameters if key != "sharding"})
-            return found if isinstance(found, list) else [np.asarray(found, object)]
+            moved = MOVES[name](*inputs, **{key: parameters[key] for key in parameters if key != "sharding"})
+            return moved if isinstance(moved, list) else [np.asarray(moved, object)]
         if name in INDEXED:
             return self.indexed(equation, inputs, range(len(inputs))[INDEXED[name]])
         if name in REDUCTIONS:
@@ -209,7 +214,11 @@ class _Block:
 
     def kind(self, equation: Any) -> str:
         """What is done element by element: the name of a primitive, or JavaScript."""
-        name, parameters, types = equation.primitive.name, equation.params, [one.aval.dtype for one in equation.invars]
+        name, parameters, types = (
+            equation.primitive.name,
+            equation.params,
+            [atom.aval.dtype for atom in equation.invars],
+        )
         if name == "integer_pow":
             power = " * ".join(["{0}"] * abs(parameters["y"])) or "1"
             return power if parameters["y"] >= 0 else f"1 / ({power})"
@@ -252,14 +261,13 @@ class _Block:
 
     def product(self, a: Value, b: Value, contracted: Any, together: Any) -> Value:
         """The product of two arrays, summed over some axes of both, with other axes of both side by side."""
-        shapes, found = [], []
+        shapes, factors = [], []
         for value, summed, beside in zip((a, b), contracted, together, strict=True):
             free = [k for k in range(value.ndim) if k not in (*summed, *beside)]
-            shapes.append([[value.shape[k] for k in axes] for axes in (beside, free, summed)])
-            found.append(
-                np.transpose(value, [*beside, *free, *summed]).reshape([math.prod(part) for part in shapes[-1]])
-            )
-        whole = self.reduced("add", self.each("mul", found[0][:, :, None], found[1][:, None]), [3])
+            shape = [[value.shape[k] for k in axes] for axes in (beside, free, summed)]
+            factors.append(np.transpose(value, [*beside, *free, *summed]).reshape([math.prod(part) for part in shape]))
+            shapes.append(shape)
+        whole = self.reduced("add", self.each("mul", factors[0][:, :, None], factors[1][:, None]), [3])
         return whole.reshape([*shapes[0][0], *shapes[0][1], *shapes[1][1]])
 
     def extreme(self, kind: str, value: Value, axis: int) -> Value:
@@ -272,36 +280,37 @@ class _Block:
             best = self.each(CHOICE, better, best, row)
         return place
 
-    def indexed(self, equation: Any, inputs: list[Value], indices: Sequence[int]) -> list[Value]:
+    def indexed(self, equation: Any, inputs: Values, indices: Sequence[int]) -> Values:
         """Numbers taken from places that may be known only in JavaScript: there all possible ones are told apart."""
         pool = _flat([value for k, value in enumerate(inputs) if k not in indices])
         places = [(k, index) for k in indices for index in np.ndindex(inputs[k].shape)]
         unknown = [(k, index) for k, index in places if isinstance(inputs[k][index], str)]
-        found: list[Value] = []
+        values: Values = []
+
+        def numbered(value: Value, labels: Any) -> Value:
+            return np.fromiter(labels, int, value.size).reshape(value.shape)
+
+        def picked(places: Value) -> Value:
+            # A gather beyond the end fills with a number that is none of the labels.
+            return _map(lambda k: pool[k] if 0 <= k < len(pool) else math.nan, places)
+
         # One more than there are: an index beyond the end has a meaning of its own.
-        for option in itertools.product(range(max(inputs[0].shape, default=0) + 1), repeat=len(unknown)):
-            labels, operands, same = iter(range(len(pool))), [], []
-            for k, value in enumerate(inputs):
-                operands.append(
-                    value.copy() if k in indices else np.fromiter(labels, int, value.size).reshape(value.shape)
-                )
+        options = range(max(inputs[0].shape, default=0) + 1)
+        for option in itertools.product(options, repeat=len(unknown)):
+            labels, same = iter(range(len(pool))), []
+            operands = [value.copy() if k in indices else numbered(value, labels) for k, value in enumerate(inputs)]
             for (k, index), choice in zip(unknown, option, strict=True):
                 operands[k][index] = choice
-                same.append(self.element("eq", inputs[k][index], choice))
-            taken = equation.primitive.bind(*(one.astype(int) for one in operands), **equation.params)
-            taken = [np.asarray(one) for one in (taken if equation.primitive.multiple_results else [taken])]
-            # A gather beyond the end fills with a number that is none of the labels.
-            choose = np.vectorize(lambda k: pool[k] if 0 <= k < len(pool) else math.nan, otypes=[object])
-            values = [choose(one) for one in taken]
-            if found:
-                is_it = _value(functools.reduce(functools.partial(self.element, "and"), same))
-                values = [self.each(CHOICE, is_it, old, new) for old, new in zip(found, values, strict=True)]
-            found = values
-        return found
+                same.append(self.each("eq", np.asarray(inputs[k][index], object), _value(choice)))
+            moved = equation.primitive.bind(*(operand.astype(int) for operand in operands), **equation.params)
+            results = [picked(np.asarray(part)) for part in (moved if equation.primitive.multiple_results else [moved])]
+            if values:
+                chosen = functools.reduce(functools.partial(self.each, "and"), same)
+                results = [self.each(CHOICE, chosen, *pair) for pair in zip(values, results, strict=True)]
+            values = results
+        return values
 
-    def loop(
-        self, head: str, carry: Sequence[Value], step: Callable[["_Block", list[Value]], list[Value]]
-    ) -> list[Value]:
+    def loop(self, head: str, carry: Values, step: Callable[["_Block", Values], Values]) -> Values:
         """What is carried through a loop, each step of which gives what is carried on."""
         variables = self.variables(carry)
         names, starts, block = _flat(variables), _flat(carry), self.inner()
@@ -317,37 +326,33 @@ class _Block:
         self.statements.append((names, block.reads(needed).union(_strings(starts)), lines))
         return variables
 
-    def variables(self, values: Sequence[Value]) -> list[Value]:
+    def variables(self, values: Sequence[Value]) -> Values:
         """New names, as many as there are numbers in some values."""
         return [_map(lambda _: f"v{next(self.names)}", value) for value in values]
 
-    def while_(
-        self, inputs: list[Value], cond_jaxpr: Any, body_jaxpr: Any, cond_nconsts: int, body_nconsts: int
-    ) -> list[Value]:
+    def while_(self, inputs: Values, cond_jaxpr: Any, body_jaxpr: Any, cond_nconsts: int, body_nconsts: int) -> Values:
         of_cond, of_body = inputs[:cond_nconsts], inputs[cond_nconsts : cond_nconsts + body_nconsts]
 
-        def step(block: "_Block", carry: list[Value]) -> list[Value]:
+        def step(block: "_Block", carry: Values) -> Values:
             goes_on = block.call(cond_jaxpr, [*of_cond, *carry])[0].item()
             block.statements.append(([LEAVES], set(_strings([goes_on])), [f"if (!{_text(goes_on)}) break;"]))
             return block.call(body_jaxpr, [*of_body, *carry])
 
         return self.loop("while (true)", inputs[cond_nconsts + body_nconsts :], step)
 
-    def scan_(
-        self, inputs: list[Value], jaxpr: Any, length: int, num_consts: int, num_carry: int, reverse: bool, **_: Any
-    ) -> list[Value]:
+    def scan_(self, inputs: Values, jaxpr: Any, length: int, num_consts: int, num_carry: int, **others: Any) -> Values:
         constants, carry = inputs[:num_consts], inputs[num_consts : num_consts + num_carry]
         rows, results = inputs[num_consts + num_carry :], len(jaxpr.out_avals) - num_carry
         if not rows and not results and length > WRITTEN_OUT:
             head = f"for (let k = 0; k < {length}; k++)"
             return self.loop(head, carry, lambda block, carry: block.call(jaxpr, [*constants, *carry]))
         stacked: list[Any] = [None] * length
-        for k in reversed(range(length)) if reverse else range(length):
-            found = self.call(jaxpr, [*constants, *carry, *(np.asarray(row[k], object) for row in rows)])
-            carry, stacked[k] = found[:num_carry], found[num_carry:]
+        for k in reversed(range(length)) if others["reverse"] else range(length):
+            after = self.call(jaxpr, [*constants, *carry, *(np.asarray(row[k], object) for row in rows)])
+            carry, stacked[k] = after[:num_carry], after[num_carry:]
         return [*carry, *(np.stack(parts) for parts in zip(*stacked, strict=True))]
 
-    def cond_(self, inputs: list[Value], branches: Sequence[Any], **_: Any) -> list[Value]:
+    def cond_(self, inputs: Values, branches: Sequence[Any], **_: Any) -> Values:
         number, operands = inputs[0].item(), inputs[1:]
         if not isinstance(number, str):
             return self.call(branches[int(number)], operands)
@@ -355,18 +360,18 @@ class _Block:
         ends = [block.call(branch, operands) for block, branch in zip(blocks, branches, strict=True)]
         variables, flat = self.variables(ends[0]), [_flat(end) for end in ends]
         names, lines, reads = _flat(variables), [], {number}
-        lines += [f"let {', '.join(names)};"] if names else []
+        lines += [f"let {', '.join(_strings(names))};"] if names else []
         for k, (block, end) in enumerate(zip(blocks, flat, strict=True)):
             last = k == len(blocks) - 1
             lines += [("} else " if k else "") + ("{" if last else f"if ({number} == {k}) {{")]
             lines += [f"  {line}" for line in block.lines(end)]
-            lines += [f"  {name} = {_text(one)};" for name, one in zip(names, end, strict=True)]
+            lines += [f"  {name} = {_text(value)};" for name, value in zip(names, end, strict=True)]
             reads |= block.reads(end)
         self.statements.append((names, reads, [*lines, "}"]))
         return variables
 
 
-def _rows(value: Value, axis: int) -> list[Value]:
+def _rows(value: Value, axis: int) -> Values:
     return [np.asarray(row, object) for row in np.moveaxis(value, axis, 0)]
 
 

@@ -98,4 +98,4 @@ def _layout(motion: Simulator, values: Numbers) -> dict[str, Any]:
 
 
 def _file(name: str) -> str:
-    return files(__package__).joinpath(name).read_text(encoding="utf-8")
+    return files("nonholonomic.views.explore").joinpath(name).read_text(encoding="utf-8")

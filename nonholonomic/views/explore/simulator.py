@@ -69,32 +69,38 @@ def written(simulator: Simulator, values: Numbers) -> str:
         return (scheduler.problem, scheduler.control, scheduler.atols), scheduler.fresh
 
     shapes = eqx.filter_eval_shape(begin, values)
-    (given, lane), static = eqx.partition(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
+    (constants, lane), static = eqx.partition(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
     run = functools.partial(eqx.combine, static[0])
-    one, state = lane.time, lane.state
-    tried = Step(state, state, state, one, one)
+    time, state = lane.time, lane.state
+    tried = Step(state, state, state, time, time)
 
-    def after(given: Any, lane: LaneState, length: Any, tried: Step) -> LaneState:
-        problem, control, atols = run(given)
+    def after(constants: Any, lane: LaneState, length: Any, tried: Step) -> LaneState:
+        problem, control, atols = run(constants)
         return after_step(problem, control, atols, lane, length, tried)
 
     functions: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
         "begin": (lambda values: eqx.filter(begin(values), eqx.is_array), (values,)),
-        "length": (lambda given, lane: length_to_try(run(given)[1], lane), (given, lane)),
-        "field": (lambda given, time, state: run(given)[0].field(time, state), (given, one, state)),
-        "domain": (lambda given, time, state: run(given)[0].domain_margin(time, state), (given, one, state)),
-        "crossing": (lambda given, state, rate: run(given)[0].crossing_along(state, rate), (given, state, state)),
-        "after": (after, (given, lane, one, tried)),
+        "length": (lambda constants, lane: length_to_try(run(constants)[1], lane), (constants, lane)),
+        "field": (lambda constants, time, state: run(constants)[0].field(time, state), (constants, time, state)),
+        "domain": (
+            lambda constants, time, state: run(constants)[0].domain_margin(time, state),
+            (constants, time, state),
+        ),
+        "crossing": (
+            lambda constants, state, rate: run(constants)[0].crossing_along(state, rate),
+            (constants, state, state),
+        ),
+        "after": (after, (constants, lane, time, tried)),
     }
     for name, read in simulator.readings.items():
         functions[name] = (
-            lambda values, given, lane, read=read: read(values, run(given)[0], lane),
-            (values, given, lane),
+            lambda values, constants, lane, read=read: read(values, run(constants)[0], lane),
+            (values, constants, lane),
         )
     tableau = explicit_tableau(simulator.settings.for_lanes)
     inner = len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
     facts = {
-        "given": _size(given),
+        "constants": _size(constants),
         "components": state.shape[0],
         "lane": _offsets(lane),
         "running": RUNNING,

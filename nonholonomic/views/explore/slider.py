@@ -41,7 +41,7 @@ def sliders_of(ranges: Any, roots: dict[str, Any], labels: dict[str, str], units
         )
     known = {path: value for root, tree in roots.items() for path, value in numbers(root, tree).items()}
     scalars = [path for path, value in known.items() if value is not None and np.ndim(value) == 0]
-    found = []
+    sliders = []
     for name, ends in ranges.items():
         path = full_name("sliders", name, scalars)
         low, high = _ends(name, ends)
@@ -59,8 +59,8 @@ def sliders_of(ranges: Any, roots: dict[str, Any], labels: dict[str, str], units
             # The modules check the number.
             with_numbers(roots, {path: end})
         unit = readable_unit(units.get(short, "1"))
-        found.append(Slider(name, path, labels.get(short, short.replace("_", " ")), unit, low, high, value))
-    return tuple(found)
+        sliders.append(Slider(name, path, labels.get(short, short.replace("_", " ")), unit, low, high, value))
+    return tuple(sliders)
 
 
 def ends_of(sliders: tuple[Slider, ...]) -> list[tuple[str, float]]:
