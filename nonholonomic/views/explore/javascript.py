@@ -340,14 +340,22 @@ class _Block:
 
         return self.loop("while (true)", inputs[cond_nconsts + body_nconsts :], step)
 
-    def scan_(self, inputs: Values, jaxpr: Any, length: int, num_consts: int, num_carry: int, **others: Any) -> Values:
+    def scan_(self, inputs: Values, jaxpr: Any, length: int, reverse: bool, **counts: Any) -> Values:
+        if "ft_in" in counts:
+            # jax 0.11 and later.
+            num_consts, num_carry, _ = map(len, counts["ft_in"].unpack())
+        else:
+            num_consts, num_carry = counts["num_consts"], counts["num_carry"]
         constants, carry = inputs[:num_consts], inputs[num_consts : num_consts + num_carry]
-        rows, results = inputs[num_consts + num_carry :], len(jaxpr.out_avals) - num_carry
+        rows, results = (
+            inputs[num_consts + num_carry :],
+            len((jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr).outvars) - num_carry,
+        )
         if not rows and not results and length > WRITTEN_OUT:
             head = f"for (let k = 0; k < {length}; k++)"
             return self.loop(head, carry, lambda block, carry: block.call(jaxpr, [*constants, *carry]))
         stacked: list[Any] = [None] * length
-        for k in reversed(range(length)) if others["reverse"] else range(length):
+        for k in reversed(range(length)) if reverse else range(length):
             after = self.call(jaxpr, [*constants, *carry, *(np.asarray(row[k], object) for row in rows)])
             carry, stacked[k] = after[:num_carry], after[num_carry:]
         return [*carry, *(np.stack(parts) for parts in zip(*stacked, strict=True))]
