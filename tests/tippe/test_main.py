@@ -51,8 +51,10 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rut
     assert "I1 / I3 = 0.952 lies between 1 - a / R = 0.911 and 1 + a / R = 1.089, so it can turn over." in printed
     assert printed.rstrip().endswith(f"To see the top climb onto its stem, open {tmp_path / 'index.html'}")
     rows = [line.split() for line in printed.splitlines() if line.strip().startswith("18 deg")]
-    time = tippe.inversion_time(rutstam_scene, tippe.Launch.degrees(18, 1480), 8.0, tolerance=1e-6)
-    assert [float(row[-1]) for row in rows] == pytest.approx([float(time)] * 2, abs=0.006)
+    run = tippe.simulate(rutstam_scene, tippe.Launch.degrees(18, 1480), 8.0)
+    first = run.t[np.argmax(np.asarray(run.theta) > 0.95 * np.pi)]
+    # A step of the run is up to 0.05 s long.
+    assert [float(row[-1]) for row in rows] == pytest.approx([float(first)] * 2, abs=0.06)
     with xarray.open_dataset(tmp_path / "plane.h5", engine="h5netcdf") as data:
         assert data["time"].dims == ("theta", "mu")
     page = (tmp_path / "index.html").read_text()
