@@ -28,6 +28,7 @@ from .model.input import Steady as Steady
 from .model.launch import Launch as Launch
 from .model.scene import Scene as Scene
 from .model.stroller import Stroller as Stroller
+from .runs.explore import explore as explore
 from .runs.simulate import simulate as simulate
 from .runs.table import Table as Table
 from .runs.table import sweep as sweep

@@ -36,6 +36,7 @@ from .model.launch import Launch as Launch
 from .model.scene import Scene as Scene
 from .model.top import Stem as Stem
 from .model.top import Top as Top
+from .runs.explore import explore as explore
 from .runs.extended_times import extended_inversion_time as extended_inversion_time
 from .runs.flight_trajectory import HybridTrajectory as HybridTrajectory
 from .runs.inversion_time import inversion_time as inversion_time

@@ -70,7 +70,7 @@ def explicit_step(
     """
     # The last stage of a method whose steps end with a stage is the end of the step, below.
     inner = len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
-    looks = _places_to_look(tableau.c)
+    looks = places_to_look(tableau.c)
     places, looked = jnp.asarray(tableau.c[:inner]), jnp.asarray(np.isin(np.arange(inner), list(looks)))
 
     def do(stage: Int[Array, ""], carry: tuple[Stages, Lanes]) -> tuple[Stages, Lanes]:
@@ -120,7 +120,7 @@ def over_stages(stages: int, do: Callable[[Int[Array, ""], Any], Any], start: An
     return jax.lax.fori_loop(0, stages, do, start, unroll=jax.default_backend() != "cpu")
 
 
-def _places_to_look(fractions: Float[np.ndarray, " stages"]) -> set[int]:
+def places_to_look(fractions: Float[np.ndarray, " stages"]) -> set[int]:
     """The stages nearest to 1/4, 1/2 and 3/4 of the step: the places at which its inside is checked."""
     between = [stage for stage, fraction in enumerate(fractions) if 0.0 < fraction < 1.0]
     return {min(between, key=lambda stage: abs(fractions[stage] - part)) for part in (0.25, 0.5, 0.75) if between}

@@ -41,6 +41,9 @@ LEAST_FRAMES = 400
 #: longest slip, and for the angular velocity and momentum at the start.
 AXIS, WEIGHT, SLIP, SPIN = 1.6, 1.5, 2.0, 2.5
 
+#: How far beside the contact the normal force is drawn, in units of the radius.
+BESIDE = 1.35
+
 #: Slips above this quantile are not drawn longer: the first moments would hide the rest.
 COMMON_SLIP = 0.9
 
@@ -151,7 +154,7 @@ def arrows(motion: Motion, offset: float, radius: float, weight: float) -> tuple
     """Forces and slip at the contact, weight, angular velocity and momentum at the centre of mass."""
     lifted = motion.contact + 0.02 * radius * motion.normal
     # Within the sphere it could not be seen.
-    beside = lifted + 1.35 * radius * aside(motion.normal)
+    beside = lifted + BESIDE * radius * np.asarray(aside(motion.normal))
     centre = motion.position - offset * motion.axis
     speed = np.linalg.norm(motion.slip, axis=-1)
     common = max(float(np.quantile(speed, COMMON_SLIP)), 1e-12)
@@ -188,11 +191,12 @@ def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
     return found
 
 
-def aside(normal: Float[np.ndarray, "times 3"]) -> Float[np.ndarray, "times 3"]:
+def aside(normal: Float[Array, "times 3"]) -> Float[Array, "times 3"]:
     """Unit vectors across the normal, towards x, or towards y where the normal is along x."""
-    towards = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    across = towards - np.sum(towards * normal, axis=-1, keepdims=True) * normal
-    return across / np.linalg.norm(across, axis=-1, keepdims=True)
+    x, y = jnp.array([[1.0, 0.0, 0.0]]), jnp.array([[0.0, 1.0, 0.0]])
+    towards = jnp.where(jnp.abs(normal[:, :1]) < 0.9, x, y)
+    across = towards - jnp.sum(towards * normal, axis=-1, keepdims=True) * normal
+    return across / jnp.linalg.norm(across, axis=-1, keepdims=True)
 
 
 def meshes(body: AbstractBody, colour: int) -> tuple[Mesh, ...]:
