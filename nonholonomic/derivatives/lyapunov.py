@@ -50,6 +50,9 @@ class VariedProblem(AbstractProblem):
     def guard(self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]) -> Float[Array, " lanes"] | None:
         return self.problem.guard(time, state[: len(self.magnitudes)])
 
+    def margins(self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]) -> tuple[Float[Array, " lanes"], ...]:
+        return self.problem.margins(time, state[: len(self.magnitudes)])
+
 
 def probed(problem: AbstractProblem) -> VariedProblem:
     """A run and a direction with nothing special about it, for a derivative that does not take part in step control itself.

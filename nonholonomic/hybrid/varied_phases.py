@@ -58,6 +58,9 @@ class Clocked(AbstractProblem):
     def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
         return self.problem.guard(time, state[:-1])
 
+    def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.problem.margins(time, state[:-1])
+
 
 def with_row(state: Float[Array, "components cells"], row: Float[Array, " cells"]) -> Float[Array, "more cells"]:
     """A state with one more component."""

@@ -12,9 +12,10 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from ..xla_cpu import stored
-from .event import Search, dip, narrow
+from .double_roots import missed_double_root, missed_loss
+from .event import Search, narrow
 from .problem import AbstractProblem, crossing_time, side_of
-from .runge_kutta import Lanes, States, Step, explicit_step, inverse_root, scaled_error
+from .runge_kutta import Lanes, States, Step, explicit_step, inverse_root, scaled_error, watched_places
 from .status import CROSSED, FAILED, GUARD_LOST, REACHED_END, RUNNING
 
 #: Step control as in Diffrax's I controller with its defaults.
@@ -44,7 +45,8 @@ class Block(NamedTuple):
     - `cell`: which cell of the problem a lane runs; `status`: a code of `status.py`.
     - `time` [s], `state`, `rate`: where the lane is, and the field there.
     - `length`: of the step to be tried [s], if the horizon is not nearer.
-    - `side`: 1 before the event, -1 beyond it; `margin`: the least of `side` times the crossing function and the guard.
+    - `side`: 1 before the event, -1 beyond it; `margin`: the least of `side` times the crossing function and the margins.
+    - `margins`: those of the problem, `None` if there are none.
     - `first_crossing`, `crossing_time`: of the first and the last event that were passed [s], infinite if there was none.
     - `searching`: whether the lane looks for an event, `search`: where.
     - `steps`: tried so far, `rejected`: by step control.
@@ -58,6 +60,7 @@ class Block(NamedTuple):
     length: Lanes
     side: Lanes
     margin: Lanes
+    margins: Float[Array, "margins lanes"] | None
     first_crossing: Lanes
     crossing_time: Lanes
     searching: Bool[Array, " lanes"]
@@ -88,7 +91,7 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     tried_length = length_to_try(control, block)
     crossing = side_of(problem, block.side)
     start = (block.time, block.state, block.rate, tried_length)
-    tried = explicit_step(control.tableau, problem.field, problem.guard, crossing, *start)
+    tried = explicit_step(control.tableau, problem.field, problem.margins, crossing, *start, block.margins)
     running = block.status == RUNNING
     free = running & ~block.searching
     error = scaled_error(*stop_gradient((tried.error, block.state, tried.state)), control.rtol, atol, control.parts)
@@ -99,8 +102,9 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
     good = error <= 1.0
     # Negative in between: end the step there and look again, so that the first event of several is found.
-    dips = dip(problem.crossing, block.side, (block.state, block.rate), tried, tried_length)
-    negative = jnp.minimum(tried.first_negative, stop_gradient(dips))
+    event = missed_double_root(problem.crossing, block.side, (block.state, block.rate), tried, tried_length)
+    loss = missed_loss(watched_places(control.tableau), stop_gradient(tried.margins), free & good)
+    negative = jnp.minimum(tried.first_negative, stop_gradient(jnp.minimum(event, loss)))
     between = good & (negative < 1.0)
     beyond = good & ~between & (margin <= 0.0)
     forward = free & good & ~between & ~beyond
@@ -133,6 +137,7 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
         side=side,
         # Just past a crossing the margin is round-off of either sign.
         margin=jnp.where(hit, jnp.abs(margin), jnp.where(forward, margin, block.margin)),
+        margins=None if tried.margins is None else jnp.where(moved, stop_gradient(tried.margins[-1]), block.margins),
         first_crossing=first,
         crossing_time=latest,
         searching=searching,
@@ -152,9 +157,10 @@ def _fate(
     problem: AbstractProblem, control: Control, block: Block, tried: Step, time: Lanes, hit: Bool[Array, " lanes"]
 ) -> tuple[Int[Array, " lanes"], Lanes, Lanes, Lanes]:
     """Status, side, first and latest crossing time of the lanes, where `hit` says that an event was located."""
-    crossing, guard = problem.crossing(tried.state), problem.guard(time, tried.state)
+    crossing, margins = problem.crossing(tried.state), tried.margins
     # The lesser of the two is what was located; by its sign it may be round-off.
-    by_guard = hit if crossing is None else hit & (False if guard is None else guard <= block.side * crossing)
+    lost = False if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0) <= block.side * crossing
+    by_guard = hit if crossing is None else hit & lost
     crossed = hit & ~by_guard
     if not control.passes:
         status = jnp.where(hit, jnp.where(by_guard, GUARD_LOST, CROSSED), block.status)

@@ -43,6 +43,11 @@ class AbstractProblem(eqx.Module):
     def guard(self, time: Lanes, state: States) -> Lanes | None:
         """A function of order 1 that is positive while the model holds; `None` if it always does."""
 
+    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
+        """The smooth functions of which the guard is the least, for a search between the places at which it is evaluated."""
+        guard = self.guard(time, state)
+        return () if guard is None else (guard,)
+
 
 class LeadingProblem(AbstractProblem):
     """A problem with the first components of its state alone, on which the others do not act."""
@@ -63,6 +68,9 @@ class LeadingProblem(AbstractProblem):
 
     def guard(self, time: Lanes, state: States) -> Lanes | None:
         return self.whole.guard(time, self._longer(state))
+
+    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
+        return self.whole.margins(time, self._longer(state))
 
     def _longer(self, state: States) -> States:
         missing = len(self.whole.start()[0]) - self.size

@@ -222,6 +222,7 @@ def _fresh_block(
         length=lengths,
         side=side,
         margin=stop_gradient(least_margin(problem, side, zero, states, rates)),
+        margins=stop_gradient(jnp.stack(margins)) if (margins := problem.margins(zero, states)) else None,
         first_crossing=jnp.where(beyond, zero, jnp.inf),
         crossing_time=jnp.where(beyond, zero, jnp.inf),
         searching=no,

@@ -170,6 +170,9 @@ class Contact(AbstractProblem):
     def guard(self, time, state):
         return self.dynamics.contact_margin(state[:OWN])
 
+    def margins(self, time, state):
+        return self.dynamics.margins(state[:OWN])
+
 
 class Flight(AbstractProblem):
     """Flying until theta reaches an angle or a sphere is back at the arena; `falls` is the acceleration [m/s^2]."""
@@ -199,9 +202,11 @@ class Flight(AbstractProblem):
         return dot(flying.axis, below(self.scene, flying).axes[2]) - self.cos_angle
 
     def guard(self, time, state):
+        return functools.reduce(jnp.minimum, self.margins(time, state))
+
+    def margins(self, time, state):
         flying = aloft(state)
-        margins = (nearing(self.scene, flying, ball) for ball in balls(self.scene.body))
-        return functools.reduce(jnp.minimum, margins)
+        return tuple(nearing(self.scene, flying, ball) for ball in balls(self.scene.body))
 
 
 class Slide(AbstractFlyingPhase):

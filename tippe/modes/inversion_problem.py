@@ -43,6 +43,9 @@ class InversionProblem(AbstractProblem):
     def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
         return self.dynamics.contact_margin(state)
 
+    def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> tuple[Any, ...]:
+        return self.dynamics.margins(state)
+
 
 @compiled_setup
 def _problem(scene: Scene, launch: Launch, angle: Float[Array, "..."], cells: int) -> InversionProblem:
