@@ -159,8 +159,10 @@ def _fate(
     """Status, side, first and latest crossing time of the lanes, where `hit` says that an event was located."""
     crossing, margins = problem.crossing(tried.state), tried.margins
     # The lesser of the two is what was located; by its sign it may be round-off.
-    lost = False if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0) <= block.side * crossing
-    by_guard = hit if crossing is None else hit & lost
+    by_guard = hit
+    if crossing is not None:
+        lost = False if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0) <= block.side * crossing
+        by_guard = hit & lost
     crossed = hit & ~by_guard
     if not control.passes:
         status = jnp.where(hit, jnp.where(by_guard, GUARD_LOST, CROSSED), block.status)

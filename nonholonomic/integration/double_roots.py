@@ -18,9 +18,10 @@ from .runge_kutta import Lanes, States, Step
 #: times as much none is found that was not, for a quarter more steps.
 DIP = 0.2
 
-#: Only a margin that is below this fraction of its range in the step can have a minimum below zero between the places at which
-#: it is known: for a parabola whose minimum lies midway between two of them the fraction is 0.1.
-SUSPECT = 0.25
+#: Only a margin whose least known value is below this fraction of its range in the step can have a minimum below zero between
+#: the places at which it is known: inside the step, and where the least value is that of an end. For a parabola whose minimum
+#: lies midway between two places the fractions are 0.1 and 0.014.
+SUSPECT_INSIDE, SUSPECT_AT_END = 0.15, 0.05
 
 #: The error of the polynomial through the known values of a margin, midway in the step, as a fraction of the margin's range.
 SCATTER = 0.05
@@ -29,7 +30,7 @@ SCATTER = 0.05
 FLAT = 1e-10
 
 #: Cells into which a step is divided in the search for minima of that polynomial.
-CELLS = 8
+CELLS = 4
 
 
 def missed_double_root(
@@ -69,9 +70,10 @@ def missed_loss(
     """
     if margins is None:
         return jnp.full(free.shape, 2.0)
-    lowest = jnp.min(margins, axis=0)
+    inside, at_end = jnp.min(margins[1:-1], axis=0), jnp.minimum(margins[0], margins[-1])
+    lowest = jnp.minimum(inside, at_end)
     spread = jnp.max(margins, axis=0) - lowest
-    suspect = (lowest < SUSPECT * spread) & (spread > FLAT) & free
+    suspect = (lowest < jnp.where(inside < at_end, SUSPECT_INSIDE, SUSPECT_AT_END) * spread) & (spread > FLAT) & free
 
     def search() -> Lanes:
         edges = np.linspace(0.0, 1.0, CELLS + 1)
