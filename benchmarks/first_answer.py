@@ -29,7 +29,7 @@ PROGRAMS = ("inversion_table", "heyoka, batches", "Diffrax")
 MOST = {"inversion_table": 10**7, "heyoka, batches": 10**6, "Diffrax": 10**4}
 
 TOLERANCE = 1e-9
-PHASES = ("import", "trace", "compile", "run")
+MODES = ("import", "trace", "compile", "run")
 
 
 def phases_of_jax(begin: float, imported: float, spent: dict[str, float]) -> dict[str, float]:
@@ -86,8 +86,8 @@ def heyoka(launches: int, folder: Path) -> dict[str, float]:
     compiled = time.perf_counter()
     ends = run(TOLERANCE)
     done = time.perf_counter()
-    phases = {"import": imported - begin, "trace": written - imported, "compile": compiled - written}
-    return phases | {"run": done - compiled, "answer": float(ends.time[-1])}
+    modes = {"import": imported - begin, "trace": written - imported, "compile": compiled - written}
+    return modes | {"run": done - compiled, "answer": float(ends.time[-1])}
 
 
 def diffrax(launches: int, folder: Path) -> dict[str, float]:
@@ -163,7 +163,7 @@ def measured(program: str, launches: int, state: str, folder: Path) -> dict[str,
     answer = json.loads(done.stdout.splitlines()[-1])
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     row = {"launches": str(launches), "program": program, "state": state, "whole [s]": f"{whole:.2f}"}
-    row |= {"CPU [s]": f"{cpu:.2f}"} | {f"{name} [s]": f"{answer[name]:.2f}" for name in PHASES}
+    row |= {"CPU [s]": f"{cpu:.2f}"} | {f"{name} [s]": f"{answer[name]:.2f}" for name in MODES}
     return row | {"last time [s]": f"{answer['answer']:.7f}"}
 
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import tippe
-from nonholonomic.integration import CROSSED, FAILED, GUARD_LOST, Settings, compiled_march
+from nonholonomic.integration import CROSSED, FAILED, LEFT_DOMAIN, Settings, solve_ensemble
 from tippe.modes.inversion_problem import InversionProblem
 from tippe.papers import paper
 
@@ -91,7 +91,7 @@ def rows(
         here = np.minimum(np.arange(begin, begin + BLOCK), total - 1)
         scene, launch = scene_and_launch(cells[:, here], table, angles[here], options.law)
         count = min(BLOCK, total - begin)
-        outcome, _ = compiled_march(
+        outcome, _ = solve_ensemble(
             InversionProblem.of(scene, launch, ANGLE, BLOCK),
             jnp.asarray(options.horizon),
             jnp.asarray(count),
@@ -116,7 +116,7 @@ def run(numbers: np.ndarray, table: paper.Table, options: argparse.Namespace) ->
     failed, alive = np.zeros(len(numbers), bool), np.arange(len(numbers))
     for group in (*np.flatnonzero(reversing)[:, None], np.flatnonzero(~reversing)):
         time_, status = rows(numbers[alive], table, theta[group], options)
-        found[np.ix_(alive, group)], lost[np.ix_(alive, group)] = time_, status == GUARD_LOST
+        found[np.ix_(alive, group)], lost[np.ix_(alive, group)] = time_, status == LEFT_DOMAIN
         failed[alive] = np.any(status == FAILED, axis=1)
         right = np.all(np.isfinite(time_) == reversing[group], axis=1)
         alive = alive[right & ~failed[alive]]

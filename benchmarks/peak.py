@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr
 from measure import timed
 
-from nonholonomic.integration import Queue, Settings, attempt
+from nonholonomic.integration import LaneScheduler, Settings, try_step
 from tippe.modes.inversion_problem import InversionProblem
 
 #: What counts as one operation.
@@ -20,10 +20,10 @@ CHAINS, LINKS = 8, 64
 def operations_per_step(problem: InversionProblem, tolerance: float) -> float:
     """Arithmetic operations of one attempted step of one lane: stages, error, step control and event."""
     cells = problem.states.shape[1]
-    queue = Queue.of(problem, jnp.asarray(30.0), jnp.asarray(cells), Settings(tolerance))
+    queue = LaneScheduler.of(problem, jnp.asarray(30.0), jnp.asarray(cells), Settings(tolerance))
     block = queue.start().block
     here = queue.here(block)
-    return _counted(jax.make_jaxpr(lambda block: attempt(*here, block))(block).jaxpr) / queue.lanes
+    return _counted(jax.make_jaxpr(lambda block: try_step(*here, block))(block).jaxpr) / queue.lanes
 
 
 def _counted(jaxpr: Jaxpr) -> float:

@@ -29,7 +29,7 @@ from peak import operations_per_step, peak
 from scenes import TOP
 
 import tippe
-from nonholonomic.integration import Settings, compiled_march, lanes_for
+from nonholonomic.integration import Settings, lanes_for, solve_ensemble
 from nonholonomic.sweeps import running
 from tippe.modes.inversion_problem import InversionProblem
 
@@ -87,7 +87,7 @@ def useful_share(scene: tippe.Scene) -> float:
     """The part of all lane-steps on a 64 x 64 grid of theta x spin that advanced a lane that was still running."""
     theta, spin = np.meshgrid(np.linspace(0.05, 1.5, 64), np.linspace(20.0, 200.0, 64), indexing="ij")
     problem = InversionProblem.of(scene, tippe.Launch(theta.ravel(), spin.ravel()), 0.95 * np.pi, 4096)
-    outcome, iterations = compiled_march(
+    outcome, iterations = solve_ensemble(
         problem,
         jnp.asarray(30.0),
         jnp.asarray(4096),
@@ -104,7 +104,7 @@ def lanes_table(scene: tippe.Scene) -> list[dict[str, str]]:
     for lanes in (8, 16, 32, 64, 128, 256) if ON_CPU else (256, 1024, 4096, 16384, 65536):
 
         def run(lanes: int = lanes) -> Any:
-            return compiled_march(
+            return solve_ensemble(
                 problem,
                 jnp.asarray(30.0),
                 jnp.asarray(cells),

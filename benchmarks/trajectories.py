@@ -98,7 +98,7 @@ def main() -> None:
         found, back = jax.vjp(lambda mu: simulated(*given, mu), mu)
         return found, back(ones)
 
-    narrow, wide, obvious = jax.jit(simulated), compiled_alone(simulated), jax.jit(by_diffrax)
+    refine, wide, obvious = jax.jit(simulated), compiled_alone(simulated), jax.jit(by_diffrax)
     along, back_through = jax.jit(forward), jax.jit(reverse)
     ways: dict[str, tuple[Callable[[], Any], int]] = {
         "inversion_table": (
@@ -107,7 +107,7 @@ def main() -> None:
         ),
         "trajectory_table": (lambda: tabled(thetas, times).theta, 5),
         "trajectory_table, position": (lambda: tabled(thetas, times, quantities=("position",)).position, 3),
-        "jit(vmap(simulate))": (lambda: narrow(*given), 3),
+        "jit(vmap(simulate))": (lambda: refine(*given), 3),
         "vmap(simulate), wide vectors": (lambda: wide(*given), 3),
     }
     if not options.quick:

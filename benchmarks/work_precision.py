@@ -22,7 +22,7 @@ from measure import machine, one_core, table, timed, write_csv
 from peers import PEERS, Ends, Task, available, heyoka_scalar, scipy_with
 from scenes import Case, misprint, scenes
 
-from nonholonomic.integration import CROSSED, Oscillatory8, Settings, compiled_march
+from nonholonomic.integration import CROSSED, Oscillatory8, Settings, solve_ensemble
 
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 
@@ -39,7 +39,7 @@ def ours(case: Case, solver: Any) -> Any:
     def run(tolerance: float) -> Ends:
         # Relative and absolute tolerance as `inversion_table` and `stroller.sweep` have them.
         settings = Settings(tolerance, solver)
-        outcome, _ = compiled_march(case.problem, jnp.asarray(task.t1), jnp.asarray(cells), settings)
+        outcome, _ = solve_ensemble(case.problem, jnp.asarray(task.t1), jnp.asarray(cells), settings)
         ends = jax.tree.map(np.asarray, outcome)
         time = np.where(ends.status == CROSSED, ends.crossing_time, ends.end_time)
         return Ends(time, ends.state[task.compared].T)

@@ -17,7 +17,7 @@ def launch(turning: float) -> tippe.Launch:
     """Steady precession about the vertical, one end raised a little: (I3 w3 - I1 W c) W = -m g A."""
     theta = math.pi / 2.0 + RAISED
     c, egg = math.cos(theta), tippe.SpheroidBody(MASS, EQUATORIAL, POLAR, I1, I3)
-    axial = I1 * turning * c - MASS * 9.81 * float(egg.outline.at(c).offset) / turning
+    axial = I1 * turning * c - MASS * 9.81 * float(egg.meridian.at(c).offset) / turning
     return tippe.Launch(theta, axial / I3 - turning * c, angular_velocity=(0.0, 0.0, turning))
 
 

@@ -164,7 +164,7 @@ def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
     return "\n".join([title, *(f"  {name:{width}}  {text}" for name, text in rows)])
 
 
-def told_apart(starts: list[str], *groups: list[Any]) -> list[str]:
+def distinguishing_labels(starts: list[str], *groups: list[Any]) -> list[str]:
     """A name for each of some things: what it starts with, and where its modules differ from those of the others.
 
     **Arguments:** `starts`: the beginnings; `groups`: modules of one role, such as the scenes, one for each thing.

@@ -170,7 +170,7 @@ _LINE = _Line()
 
 
 @contextmanager
-def telling(doing: str, shown: bool = True) -> Iterator[Progress]:
+def status_line(doing: str, shown: bool = True) -> Iterator[Progress]:
     """Says what a call is doing that takes long when it is new to the compiler; decorates functions, too."""
     with Progress(None, doing=doing, shown=shown) as line:
         yield line

@@ -16,7 +16,7 @@ from nonholonomic import __version__
 from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.integration import ImplicitMidpoint
-from nonholonomic.progress import Progress, telling
+from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require, require_folder
 from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html
@@ -219,7 +219,7 @@ def main(arguments: list[str] | None = None) -> int:
             curve = tolerance_curve(options, helm, counted)
             with counted.aside():
                 print("\n" + "\n".join(curve), flush=True)
-        with telling("drawing") as line:
+        with status_line("drawing") as line:
             written, drawing = [options.out / "rides.h5"], None
             table(options, rides).save(written[0])
             if find_spec("matplotlib") is None:

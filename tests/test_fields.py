@@ -15,14 +15,14 @@ from tops import rutstam_top
 import stroller
 import tippe
 from stroller.runs.table import RideProblem
-from tippe.modes.exact_impact import Skid
+from tippe.modes.coulomb_impact import Skid
 from tippe.modes.free_body import FreeBody, balls
 from tippe.modes.impact import Impact, approach
 from tippe.modes.inversion_problem import InversionProblem
-from tippe.modes.stick_slip_runs import contact_phases
-from tippe.runs.airborne_trajectory import arena_phases
-from tippe.runs.cells import driver_of
-from tippe.runs.flight_trajectory import level_phases
+from tippe.modes.sticking import contact_modes
+from tippe.runs.airborne_trajectory import arena_modes
+from tippe.runs.cells import run_kind_of
+from tippe.runs.flight_trajectory import level_modes
 from tippe.runs.trajectory import TrajectoryProblem
 
 #: 16 to 44 ns for each number on a CPU, where a product takes one.
@@ -63,32 +63,32 @@ def slow_in_problem(problem):
     time = jnp.zeros(start.shape[1:])
     parts = (
         lambda problem, state: problem.field(time, state),
-        lambda problem, state: problem.guard(time, state),
-        lambda problem, state: problem.crossing(state),
+        lambda problem, state: problem.domain_margin(time, state),
+        lambda problem, state: problem.event_function(state),
     )
     return set().union(*(slow_in(part, problem, start) for part in parts))
 
 
 def table_problems(scene, launch):
     """The problems that a table of the scene integrates: one, or that of every phase."""
-    problem, driver = InversionProblem.of(scene, launch, 3.0, 1), driver_of(scene)
+    problem, driver = InversionProblem.of(scene, launch, 3.0, 1), run_kind_of(scene)
     if driver.smooth:
         return (problem,)
-    phases, _ = driver.phases(scene, problem, 1e-9, True)
-    return tuple(phase.problem(problem.states) for phase in phases)
+    modes, _ = driver.modes(scene, problem, 1e-9, True)
+    return tuple(mode.problem(problem.states) for mode in modes)
 
 
 def trajectory_problems(scene, launch):
     """The problems that `simulate` integrates, with all that rides along: one, or that of every phase."""
     if scene.contact == "hybrid":
-        phases_of = level_phases if scene.flies_in_closed_form else arena_phases
-        phases, _, state = phases_of((scene, launch), 1e-9)
+        modes_of = level_modes if scene.flies_in_closed_form else arena_modes
+        modes, _, state = modes_of((scene, launch), 1e-9)
     else:
         run = TrajectoryProblem.of(scene, launch)
         if not scene.friction.set_valued:
             return (run,)
-        phases, _, state = contact_phases(run, 1e-9)
-    return tuple(phase.problem(state) for phase in phases)
+        modes, _, state = contact_modes(run, 1e-9)
+    return tuple(mode.problem(state) for mode in modes)
 
 
 def slow_in_scene(scene, launch):
@@ -211,7 +211,7 @@ def test_fields_of_the_stroller(ground, friction, spring, heading):
     assert slow_in(problem.field, jnp.zeros(1), states) == allowed
     rates = problem.field(jnp.zeros(1), states)
     along = functools.partial(problem.crossing_along, rate=rates)
-    for watch in (lambda state: problem.guard(jnp.zeros(1), state), problem.crossing, along):
+    for watch in (lambda state: problem.domain_margin(jnp.zeros(1), state), problem.event_function, along):
         assert watch(states) is None or slow_in(watch, states) == set()
     if problem.watched:
-        np.testing.assert_allclose(along(states), problem.crossing(states), rtol=1e-14)
+        np.testing.assert_allclose(along(states), problem.event_function(states), rtol=1e-14)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 import tippe
 from nonholonomic.validation import Bound, as_number
-from tippe.model.body import AbstractBody, AbstractOutline, Lever
+from tippe.model.body import AbstractBody, AbstractMeridian, ContactGeometry
 from tippe.model.friction import AbstractFriction, ContactLoad, Slip, length
 
 ROOT = Path(__file__).parents[1]
@@ -34,7 +34,7 @@ def test_packages_are_typed(package):
 def contributed() -> dict[str, Any]:
     """What the classes in CONTRIBUTING.md define."""
     names = {"AbstractFriction": AbstractFriction, "ContactLoad": ContactLoad, "Slip": Slip, "length": length}
-    names |= {"AbstractBody": AbstractBody, "AbstractOutline": AbstractOutline, "Lever": Lever}
+    names |= {"AbstractBody": AbstractBody, "AbstractMeridian": AbstractMeridian, "ContactGeometry": ContactGeometry}
     names |= {"Bound": Bound, "as_number": as_number, "eqx": eqx, "jnp": jnp}
     names |= {"ClassVar": ClassVar, "Iterator": Iterator, "Float": Float, "Array": Array}
     for code in re.findall(r"```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.DOTALL):

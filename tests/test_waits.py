@@ -26,8 +26,16 @@ DECAY = Measurements([2.0, 1.0], [0.1, 0.1])
 
 #: What is called, and the function in which it waits, by its module and name.
 CALLS = {
-    "inversion_time": (lambda: tippe.inversion_time(TOP, LAUNCH, 8.0), "tippe.runs.inversion_time", "ask"),
-    "extended": (lambda: tippe.extended_inversion_time(TOP, LAUNCH, 8.0), "tippe.runs.extended_times", "ask"),
+    "inversion_time": (
+        lambda: tippe.inversion_time(TOP, LAUNCH, 8.0),
+        "tippe.runs.inversion_time",
+        "differentiable_solve",
+    ),
+    "extended": (
+        lambda: tippe.extended_inversion_time(TOP, LAUNCH, 8.0),
+        "tippe.runs.extended_times",
+        "differentiable_solve",
+    ),
     "simulate": (lambda: tippe.simulate(TOP, LAUNCH, 1.0), "tippe.runs.trajectory", "follow"),
     "exponent": (lambda: tippe.lyapunov_exponent(TOP, LAUNCH, 1.0), "tippe.runs.lyapunov", "_direction"),
     "ride": (lambda: stroller.simulate(STROLLER, RIDE, 1.0), "stroller.runs.simulate", "_concrete"),

@@ -17,7 +17,7 @@ import numpy as np
 from nonholonomic import __version__
 from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
-from nonholonomic.progress import Progress, telling
+from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
@@ -320,7 +320,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         found = tables(options)
         print(report(options, found))
-        with telling("drawing"):
+        with status_line("drawing"):
             written, drawing = [options.out / f"{arena}.h5" for arena in found], None
             if find_spec("matplotlib") is None:
                 print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)

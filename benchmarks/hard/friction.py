@@ -15,7 +15,7 @@ import tippe
 from hard.lagrange import theta_by_lagrange
 from hard.limits import rutstam_top
 from hard.row import Row, of_runs
-from nonholonomic.integration import Followed, Settings, follow
+from nonholonomic.integration import DenseSolution, Settings, follow
 from tippe.runs.trajectory import TrajectoryProblem
 
 GRAVITY = 9.81
@@ -74,7 +74,7 @@ def disc_by_quadrature() -> Row:
     )
 
 
-def set_going(scene: tippe.Scene, launch: tippe.Launch, velocity: float, momentum: float, end: float) -> Followed:
+def set_going(scene: tippe.Scene, launch: tippe.Launch, velocity: float, momentum: float, end: float) -> DenseSolution:
     """A run whose centre starts at a velocity along t1 and that has angular momentum about t2 [kg m^2/s]."""
     run = TrajectoryProblem.of(scene, launch)
     state = run.state.at[0].set(velocity).at[6].add(momentum)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from scenes import ANGLE, TOP, Case, of_top, scenes
 
 import tippe
-from nonholonomic.integration import AbstractProblem, Settings, compiled_march
+from nonholonomic.integration import AbstractProblem, Settings, solve_ensemble
 
 from .family import STAGES, Unknowns, pair_of, unknowns_of
 
@@ -50,7 +50,7 @@ def steps_of(case: Case, seed: int) -> list[Steps]:
     """Steps from random times of a motion, one set for each of `STRETCHES`."""
     problem, launches = case.problem, case.task.launches
     when = np.random.default_rng(seed).uniform(0.02, 1.0, launches) * min(case.task.t1, 6.0)
-    starts = compiled_march(problem, jnp.asarray(when), jnp.asarray(launches), Settings(1e-11))[0].state
+    starts = solve_ensemble(problem, jnp.asarray(when), jnp.asarray(launches), Settings(1e-11))[0].state
     scales = problem.start()[1]
     absolute = 0.1 * TOLERANCE * jnp.broadcast_to(scales.reshape(len(scales), -1), starts.shape)
     lengths = jnp.full(launches, 1e-4)

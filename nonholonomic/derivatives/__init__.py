@@ -5,9 +5,9 @@ once. Step lengths are held fixed in both. `sampled_run` gives a run at given ti
 modes are in `nonholonomic.hybrid`.
 """
 
-from .differentiable import AbstractQuestion as AbstractQuestion
-from .differentiable import ask as ask
-from .differentiable import directions_by as directions_by
+from .differentiable import AbstractDifferentiableSolve as AbstractDifferentiableSolve
+from .differentiable import differentiable_solve as differentiable_solve
+from .differentiable import tangents_by as tangents_by
 from .lyapunov import exponent_of as exponent_of
 from .lyapunov import growth as growth
 from .lyapunov import probed as probed
@@ -15,12 +15,12 @@ from .sampled_runs import SampledRun as SampledRun
 from .sampled_runs import sampled_run as sampled_run
 from .sampled_runs import sampled_run_by_diffrax as sampled_run_by_diffrax
 from .sampling import AbstractSampling as AbstractSampling
-from .sampling import Recipe as Recipe
-from .sampling import ask_for_samples as ask_for_samples
-from .slopes import compiled_march_with_slopes as compiled_march_with_slopes
-from .slopes import directions_of as directions_of
-from .slopes import traced_march_with_slopes as traced_march_with_slopes
+from .sampling import ProblemSpec as ProblemSpec
+from .sampling import solve_for_samples as solve_for_samples
+from .slopes import solve_ensemble_with_tangents as solve_ensemble_with_tangents
+from .slopes import tangents_of as tangents_of
+from .slopes import traced_solve_ensemble_with_tangents as traced_solve_ensemble_with_tangents
 from .variation import VariationalProblem as VariationalProblem
 from .variation import in_groups as in_groups
-from .variation import natural_size as natural_size
-from .variation import where_moved as where_moved
+from .variation import tangent_scale as tangent_scale
+from .variation import where_active as where_active

@@ -21,18 +21,18 @@ from jaxtyping import Array, Bool, Float, Int
 from ..integration import (
     RUNNING,
     AbstractProblem,
-    Block,
     Lanes,
+    LaneScheduler,
+    LaneState,
     Outcome,
     Progress,
-    Queue,
     Settings,
     Stages,
     States,
-    attempt,
     length_to_try,
     moved_state,
     over_stages,
+    try_step,
 )
 from ..xla_cpu import uncounted, written_by_component, written_in_place
 from ._shared_values import sharing_values
@@ -50,10 +50,10 @@ KEPT = 256
 
 #: What is measured at the end of a run: (problem, block) -> a number per lane, with its derivative by the problem's parameters
 #: and the block's state.
-Measured = Callable[[Any, Block], Lanes]
+Measured = Callable[[Any, LaneState], Lanes]
 
 
-class Taken(NamedTuple):
+class StepRecord(NamedTuple):
     """The steps of a period: where each began, and its length, 0 for a lane that did not move."""
 
     time: Float[Array, "iterations lanes"]
@@ -61,7 +61,7 @@ class Taken(NamedTuple):
     length: Float[Array, "iterations lanes"]
 
 
-class Kept(NamedTuple):
+class Checkpoints(NamedTuple):
     """The starts of periods that are kept, the earliest first.
 
     There are `depth` of them; `index` says which period each one starts, `slot` where in `progress` it is stored.
@@ -73,7 +73,7 @@ class Kept(NamedTuple):
     progress: Progress
 
     @classmethod
-    def of(cls, progress: Progress) -> "Kept":
+    def of(cls, progress: Progress) -> "Checkpoints":
         """The start of the first period."""
         room = jax.tree.map(lambda leaf: jnp.zeros((KEPT, *leaf.shape), leaf.dtype).at[0].set(leaf), progress)
         return cls(jnp.ones((), int), jnp.zeros(KEPT, int), jnp.arange(KEPT), room)
@@ -83,11 +83,11 @@ class Kept(NamedTuple):
         last = self.depth - 1
         return self.index[last], jax.tree.map(functools.partial(_read, at=self.slot[last]), self.progress)
 
-    def dropped(self, drop: Bool[Array, ""]) -> "Kept":
+    def dropped(self, drop: Bool[Array, ""]) -> "Checkpoints":
         """These without the latest one, if it is to be dropped."""
         return self._replace(depth=self.depth - drop)
 
-    def added(self, index: Int[Array, ""], progress: Progress, add: Bool[Array, ""]) -> "Kept":
+    def added(self, index: Int[Array, ""], progress: Progress, add: Bool[Array, ""]) -> "Checkpoints":
         """These and another one, if it is to be added; if there is no room, the one whose neighbours are closest is dropped."""
         position = jnp.arange(KEPT)
         full = self.depth == KEPT
@@ -101,7 +101,7 @@ class Kept(NamedTuple):
         slots = jnp.where(moves, jnp.roll(self.slot, -1), self.slot).at[to].set(free)
         # Written in any case: if none is added, the place stays free.
         room = jax.tree.map(functools.partial(written_in_place, at=free), self.progress, progress)
-        return Kept(jnp.minimum(self.depth + add, KEPT), indices, slots, room)
+        return Checkpoints(jnp.minimum(self.depth + add, KEPT), indices, slots, room)
 
 
 class Backward(NamedTuple):
@@ -111,14 +111,14 @@ class Backward(NamedTuple):
     the parameters; `gradient` holds those of every cell by its start.
     """
 
-    kept: Kept
+    kept: Checkpoints
     needed: Int[Array, ""]
     outcome: Outcome
     adjoint: Float[Array, "rows lanes"]
     gradient: Float[Array, "rows cells"]
 
 
-def march_with_gradient(
+def solve_with_adjoint(
     problem: VariationalProblem,
     moving: Any,
     probe: Any,
@@ -131,7 +131,7 @@ def march_with_gradient(
 ) -> tuple[Outcome, Float[Array, "components cells"], Any]:
     """Run every cell to its end, and differentiate what is measured there by the parameters of the problem.
 
-    **Arguments:** as for `march`, except `passes`, and
+    **Arguments:** as for `ensemble_solve`, except `passes`, and
 
     - `problem`: without directions.
     - `moving`: a tree of booleans like the problem: which of its leaves, scalars or (cells,), to differentiate by.
@@ -159,22 +159,24 @@ def march_with_gradient(
         problem.problem,
         is_leaf=lambda rate: rate is None,
     )
-    probed = dataclasses.replace(problem, directions=(probe,))
+    probed = dataclasses.replace(problem, tangents=(probe,))
     # As many lanes as for the run alone: on the way back, which costs most, the probe is not there.
     settings = dataclasses.replace(settings, lanes=settings.lanes_of(size))
-    queue = Queue.of(probed, t1, cells, settings, one_kernel=one_kernel, parts=2)
+    scheduler = LaneScheduler.of(probed, t1, cells, settings, one_kernel=one_kernel, parts=2)
     rows = components + len(jax.tree.leaves(numbers))
 
     def period(run: Backward) -> Backward:
         index, before = run.kept.latest()
-        after, record, count = _recorded(queue, before)
-        outcome = queue.store(run.outcome, after.block)
-        onward = queue.refill(after)
-        back = ~queue.unfinished(onward) | (index + 1 == run.needed)
-        adjoint = _taken_back(queue, moving, measured, after.block, record, jnp.where(back, count, 0), run.adjoint)
+        after, record, count = _recorded(scheduler, before)
+        outcome = scheduler.store(run.outcome, after.lane_state)
+        onward = scheduler.refill(after)
+        back = ~scheduler.unfinished(onward) | (index + 1 == run.needed)
+        adjoint = _taken_back(
+            scheduler, moving, measured, after.lane_state, record, jnp.where(back, count, 0), run.adjoint
+        )
         # A cell that had made no step was at its start.
-        began = back & (before.block.steps == 0) & (before.block.cell < cells)
-        to = jnp.where(began, before.block.cell, size)
+        began = back & (before.lane_state.steps == 0) & (before.lane_state.cell < cells)
+        to = jnp.where(began, before.lane_state.cell, size)
         return Backward(
             kept=run.kept.dropped(back).added(index + 1, onward, ~back),
             needed=jnp.where(back, index, run.needed),
@@ -184,10 +186,10 @@ def march_with_gradient(
         )
 
     run = Backward(
-        kept=Kept.of(queue.start()),
+        kept=Checkpoints.of(scheduler.start()),
         needed=jnp.asarray(jnp.iinfo(jnp.arange(0).dtype).max),
-        outcome=queue.empty(),
-        adjoint=jnp.zeros((rows, queue.lanes), states.dtype),
+        outcome=scheduler.empty(),
+        adjoint=jnp.zeros((rows, scheduler.lanes), states.dtype),
         gradient=jnp.zeros((rows, size), states.dtype),
     )
     run = jax.lax.while_loop(lambda run: uncounted(run.needed > 0, run.outcome.steps[0]), period, run)
@@ -195,24 +197,24 @@ def march_with_gradient(
     return run.outcome._replace(state=run.outcome.state[:components]), run.gradient[:components], by_number
 
 
-def _recorded(queue: Queue, progress: Progress) -> tuple[Progress, Taken, Int[Array, ""]]:
+def _recorded(scheduler: LaneScheduler, progress: Progress) -> tuple[Progress, StepRecord, Int[Array, ""]]:
     """Advance the block by a period and record its steps; also returns the number of iterations."""
-    here = queue.here(progress.block)
+    here = scheduler.here(progress.lane_state)
 
     def going(carry: Any) -> Bool[Array, ""]:
-        block, _, idle, count = carry
-        return queue.goes_on(block, idle, progress.queued, REFILL) & (count < PERIOD)
+        lane_state, _, idle, count = carry
+        return scheduler.goes_on(lane_state, idle, progress.scheduler, REFILL) & (count < PERIOD)
 
     def step(carry: Any) -> Any:
-        block, record, idle, count = carry
-        after = attempt(*here, block)
-        length = jnp.where(after.time > block.time, length_to_try(here[1], block), 0.0)
-        made = Taken(block.time, _without_probe(block).state, length)
+        lane_state, record, idle, count = carry
+        after = try_step(*here, lane_state)
+        length = jnp.where(after.time > lane_state.time, length_to_try(here[1], lane_state), 0.0)
+        made = StepRecord(lane_state.time, _without_probe(lane_state).state, length)
         record = jax.tree.map(functools.partial(written_in_place, at=count), record, made)
-        return after, record, idle + queue.idle(block), count + 1
+        return after, record, idle + scheduler.idle(lane_state), count + 1
 
-    def loop(start: Block) -> Any:
-        empty = Taken(
+    def loop(start: LaneState) -> Any:
+        empty = StepRecord(
             *(
                 jnp.zeros((PERIOD, *leaf.shape), leaf.dtype)
                 for leaf in (start.time, _without_probe(start).state, start.length)
@@ -220,54 +222,56 @@ def _recorded(queue: Queue, progress: Progress) -> tuple[Progress, Taken, Int[Ar
         )
         return jax.lax.while_loop(going, step, (start, empty, jnp.zeros((), int), jnp.zeros((), int)))
 
-    block, record, _, count = queue.in_kernel(loop)(progress.block)
-    return Progress(block, progress.queued, progress.iterations + count), record, count
+    lane_state, record, _, count = scheduler.in_kernel(loop)(progress.lane_state)
+    return Progress(lane_state, progress.scheduler, progress.iterations + count), record, count
 
 
-def _without_probe(block: Block) -> Block:
+def _without_probe(lane_state: LaneState) -> LaneState:
     """The block with the states alone, without the variations."""
-    return block._replace(state=block.state[: block.state.shape[0] // 2])
+    return lane_state._replace(state=lane_state.state[: lane_state.state.shape[0] // 2])
 
 
 def _taken_back(
-    queue: Queue,
+    scheduler: LaneScheduler,
     moving: Any,
     measured: Measured,
-    block: Block,
-    record: Taken,
+    lane_state: LaneState,
+    record: StepRecord,
     count: Int[Array, ""],
     adjoint: Float[Array, "rows lanes"],
 ) -> Float[Array, "rows lanes"]:
     """Carry the derivatives from the end of a period to its start; for lanes that have ended they begin there."""
-    weights = Weights.of(queue.control.tableau)
+    weights = Weights.of(scheduler.control.tableau)
     # Selected here: XLA 0.10.2 aborts on a kernel that gets all the cells' starts if these are constants.
-    problem = dataclasses.replace(queue.here(block)[0], directions=())
-    block = _without_probe(block)
+    problem = dataclasses.replace(scheduler.here(lane_state)[0], tangents=())
+    lane_state = _without_probe(lane_state)
 
     def loop(carry: Any) -> Any:
-        block, record, count, adjoint = carry
-        ended = block.status != RUNNING
-        adjoint = jnp.where(ended, _at_the_end(problem, moving, measured, block), adjoint)
+        lane_state, record, count, adjoint = carry
+        ended = lane_state.status != RUNNING
+        adjoint = jnp.where(ended, _at_the_end(problem, moving, measured, lane_state), adjoint)
 
         def step(carry: Any) -> Any:
             index, *along = carry
             made = jax.tree.map(functools.partial(_read, at=index - 1), record)
             return index - 1, *step_taken_back(weights, problem, moving, *made, *along)
 
-        room = jnp.zeros((1 + len(weights.fractions), *block.state.shape), adjoint.dtype)
+        room = jnp.zeros((1 + len(weights.fractions), *lane_state.state.shape), adjoint.dtype)
         return jax.lax.while_loop(lambda carry: carry[0] > 0, step, (count, adjoint, room))[1]
 
-    return queue.in_kernel(loop)((block, record, count, adjoint))
+    return scheduler.in_kernel(loop)((lane_state, record, count, adjoint))
 
 
-def _at_the_end(problem: AbstractProblem, moving: Any, measured: Measured, block: Block) -> Float[Array, "rows lanes"]:
+def _at_the_end(
+    problem: AbstractProblem, moving: Any, measured: Measured, lane_state: LaneState
+) -> Float[Array, "rows lanes"]:
     """The derivatives of what is measured, by the state at the end and by the parameters."""
     numbers, rest = eqx.partition(problem, moving)
 
     def value(numbers: Any, state: States) -> Lanes:
-        return measured(eqx.combine(numbers, rest), block._replace(state=state))
+        return measured(eqx.combine(numbers, rest), lane_state._replace(state=state))
 
-    by_number, by_state = jax.vjp(value, numbers, block.state)[1](jnp.ones_like(block.time))
+    by_number, by_state = jax.vjp(value, numbers, lane_state.state)[1](jnp.ones_like(lane_state.time))
     return jnp.concatenate([by_state, *(one[None] for one in jax.tree.leaves(by_number))])
 
 

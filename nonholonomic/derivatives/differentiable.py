@@ -17,15 +17,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..validation import is_traced
-from ._block import find
-from .slopes import directions_of
-from .variation import natural_size
+from ._batched_primitive import find
+from .slopes import tangents_of
+from .variation import tangent_scale
 
 #: An answer: arrays of floats, the cells along the first axis.
 Answer = Any
 
 
-class AbstractQuestion(eqx.Module):
+class AbstractDifferentiableSolve(eqx.Module):
     """What is asked of a run, as a function of `leaves`, of which the first `movable` can be differentiated by."""
 
     #: Whether a batch is run as the cells of one block; otherwise each run is separate, with a single cell.
@@ -60,7 +60,7 @@ class AbstractQuestion(eqx.Module):
         return self
 
 
-def ask(question: AbstractQuestion, *leaves: Float[Array, "..."]) -> Answer:
+def differentiable_solve(question: AbstractDifferentiableSolve, *leaves: Float[Array, "..."]) -> Answer:
     """The answer for one run. Where it is absent its derivative is 0, whatever is done with it afterwards.
 
     **Arguments:** `leaves`: the numbers, as the question takes them for a single cell.
@@ -92,7 +92,7 @@ def _canonical(leaves: tuple[Any, ...]) -> list[Any]:
     return [jnp.array(leaf) if is_traced(leaf) else leaf for leaf in leaves]
 
 
-def _change(question: AbstractQuestion, value: Array, slopes: tuple[Any, ...], tangents: list[Array]) -> Any:
+def _change(question: AbstractDifferentiableSolve, value: Array, slopes: tuple[Any, ...], tangents: list[Array]) -> Any:
     if slopes[0] is None:
         return jax.custom_derivatives.zero_from_primal(value, symbolic_zeros=True)
     none = question.absent(value)
@@ -105,7 +105,9 @@ def _change(question: AbstractQuestion, value: Array, slopes: tuple[Any, ...], t
     return sum(share(slope, tangent) for slope, tangent in zip(slopes, tangents, strict=True))
 
 
-def _with_slopes(question: AbstractQuestion, active: tuple[int, ...]) -> Callable[..., tuple[Answer, list[Answer]]]:
+def _with_slopes(
+    question: AbstractDifferentiableSolve, active: tuple[int, ...]
+) -> Callable[..., tuple[Answer, list[Answer]]]:
     """Answer and slopes of one run, which can be differentiated once more."""
 
     @jax.custom_jvp
@@ -121,7 +123,7 @@ def _with_slopes(question: AbstractQuestion, active: tuple[int, ...]) -> Callabl
     return found
 
 
-def _of_one(question: AbstractQuestion, way: Callable[..., Any], *leaves: Float[Array, "..."]) -> Any:
+def _of_one(question: AbstractDifferentiableSolve, way: Callable[..., Any], *leaves: Float[Array, "..."]) -> Any:
     """What is found of one run, in one of the ways of `_block.Request`."""
     return find(question, way, *leaves) if question.in_blocks else _only(way(question, 1, *leaves))
 
@@ -130,7 +132,7 @@ def _only(results: Any) -> Any:
     return jax.tree.map(lambda result: result[0], results)
 
 
-def directions_by(
+def tangents_by(
     build: Callable[[tuple[Array, ...], int | None], Any],
     active: tuple[int, ...],
     leaves: tuple[Array, ...],
@@ -155,7 +157,7 @@ def directions_by(
         return build(tuple(every), cells)
 
     point = tuple(leaves[i] for i in active)
-    sizes = [natural_size(leaf) for leaf in point]
+    sizes = [tangent_scale(leaf) for leaf in point]
     zeros = tuple(jnp.zeros_like(size) for size in sizes)
 
     def along(k: int, tangent: Array) -> tuple[Array, ...]:
@@ -182,7 +184,7 @@ def directions_by(
                 for size, some in zip(sizes, by_leaf, strict=True)
             ]
 
-    return moved(*point), directions_of(moved, point, tangents), gather
+    return moved(*point), tangents_of(moved, point, tangents), gather
 
 
 def _by_entries(size: Array, *parts: Array) -> Array:

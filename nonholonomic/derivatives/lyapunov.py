@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..integration import REACHED_END, RUNNING, AbstractProblem, Settings, compiled_march
+from ..integration import REACHED_END, RUNNING, AbstractProblem, Settings, solve_ensemble
 from ..progress import Progress
 
 
@@ -44,13 +44,17 @@ class VariedProblem(AbstractProblem):
         growth = jnp.sum(w * carried, axis=0) / jnp.sum(w * w, axis=0)
         return jnp.concatenate([rate, carried - growth * w, growth[None]])
 
-    def crossing(self, state: Float[Array, "all lanes"]) -> None:
+    def event_function(self, state: Float[Array, "all lanes"]) -> None:
         return None
 
-    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]) -> Float[Array, " lanes"] | None:
-        return self.problem.guard(time, state[: len(self.magnitudes)])
+    def domain_margin(
+        self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]
+    ) -> Float[Array, " lanes"] | None:
+        return self.problem.domain_margin(time, state[: len(self.magnitudes)])
 
-    def margins(self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]) -> tuple[Float[Array, " lanes"], ...]:
+    def margins(
+        self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]
+    ) -> tuple[Float[Array, " lanes"], ...]:
         return self.problem.margins(time, state[: len(self.magnitudes)])
 
 
@@ -85,7 +89,7 @@ class Growth(NamedTuple):
 
 def growth(
     problem: AbstractProblem,
-    directions: Float[Array, "components cells"],
+    tangents: Float[Array, "components cells"],
     t1: float,
     stretches: int,
     settings: Settings,
@@ -94,7 +98,7 @@ def growth(
 
     **Arguments:**
 
-    - `problem`: as for `march`.
+    - `problem`: as for `ensemble_solve`.
     - `directions`: to follow, in the problem's own units.
     - `t1`: horizon [s].
     - `stretches`: of time, in each of which the growth is counted by itself.
@@ -104,14 +108,14 @@ def growth(
     """
     start, magnitudes = problem.start()
     size, cells = start.shape
-    stretch, direction = jnp.asarray(t1 / stretches), directions / magnitudes
+    stretch, direction = jnp.asarray(t1 / stretches), tangents / magnitudes
     logarithms, end_time, status = [], np.zeros(cells), np.full(cells, RUNNING)
     steps, state = np.zeros(cells, int), np.asarray(start)
     with Progress(stretches, "stretch") as shown:
         for number in range(stretches):
             unit = direction / jnp.linalg.norm(direction, axis=0)
             varied = VariedProblem(problem, jnp.concatenate([start, unit, jnp.zeros((1, cells))]), magnitudes)
-            outcome, _ = compiled_march(varied, stretch, jnp.asarray(cells), settings)
+            outcome, _ = solve_ensemble(varied, stretch, jnp.asarray(cells), settings)
             alive = (status == RUNNING) | (status == REACHED_END)
             logarithms.append(np.where(alive, outcome.state[-1], 0.0))
             end_time += np.where(alive, outcome.end_time, 0.0)

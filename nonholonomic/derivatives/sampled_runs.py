@@ -12,19 +12,19 @@ from jaxtyping import Array, Float, Int
 
 from ..integration import (
     FAILED,
-    GUARD_LOST,
+    LEFT_DOMAIN,
     REACHED_END,
     AbstractProblem,
-    LeadingProblem,
-    Sampled,
+    CoreProblem,
+    SampledSolution,
     Settings,
     event_time,
-    march_with_samples,
     sample,
+    solve_with_samples,
 )
-from .differentiable import directions_by
+from .differentiable import tangents_by
 from .lyapunov import probed
-from .sampling import AbstractSampling, Recipe, ask_for_samples
+from .sampling import AbstractSampling, ProblemSpec, solve_for_samples
 from .variation import VariationalProblem, in_groups
 
 #: From some modules (scene, launch, ...) and a number of cells, `None` for a single run, to the problem.
@@ -33,7 +33,7 @@ Build = Callable[[Any, int | None], AbstractProblem]
 
 class SampledRun(NamedTuple):
     """A run at given times, all floats: its states, NaN after its end; when and where it ended, the code of how
-    (`REACHED_END`, `GUARD_LOST` or `FAILED`), and how many steps were accepted and rejected.
+    (`REACHED_END`, `LEFT_DOMAIN` or `FAILED`), and how many steps were accepted and rejected.
 
     `states` and `end_state` are those components on which the problem's `leading` ones depend, `riding` the others, `None` if
     there are none. If a program reads `riding` nowhere, its blocks run without.
@@ -73,7 +73,7 @@ def sampled_run(
     """
     scalars = all(leaf.ndim == 0 for leaf in jax.tree.leaves(modules) if eqx.is_inexact_array(leaf))
     kind = BlockSampling if scalars and isinstance(settings.for_lanes, diffrax.AbstractERK) else SingleSampling
-    found = ask_for_samples(kind, build, modules, jax.lax.stop_gradient(times), t1, settings, grid)
+    found = solve_for_samples(kind, build, modules, jax.lax.stop_gradient(times), t1, settings, grid)
     # One by one: what a custom derivative is given counts as read.
     states = _at_times(found.states, None, times, modules, build)
     riding = None if found.riding is None else _at_times(found.riding, found.states, times, modules, build)
@@ -100,15 +100,15 @@ def _later(primals: Any, tangents: Any) -> Any:
     if later is None:
         return samples, moved
     problem, size = build(modules, None), samples.shape[-1]
-    whole = leading_problem(problem) if leading is None else problem
+    whole = core_problem(problem) if leading is None else problem
     states = samples if leading is None else jnp.concatenate([leading, samples], axis=-1)
     rates = jax.vmap(whole.field)(times, states)[:, -size:]
     return samples, moved + jnp.where(jnp.isfinite(rates), rates * later[:, None], 0.0)
 
 
-def leading_problem(problem: AbstractProblem) -> AbstractProblem:
+def core_problem(problem: AbstractProblem) -> AbstractProblem:
     """A problem without what rides along."""
-    return problem if problem.leading is None else LeadingProblem(problem, problem.leading)
+    return problem if problem.leading is None else CoreProblem(problem, problem.leading)
 
 
 #: Samples of the leading components and of those that ride along, `None` without these.
@@ -145,16 +145,16 @@ def sampled_run_by_diffrax(
     return SampledRun(*states, path.end_time, path.end_state[:leading], status, *counts)
 
 
-def _status(path: Sampled, t1: Float[Array, ""]) -> Int[Array, ""]:
+def _status(path: SampledSolution, t1: Float[Array, ""]) -> Int[Array, ""]:
     """The code of how a single run ended."""
-    return jnp.where(path.lost, GUARD_LOST, jnp.where(path.end_time < t1, FAILED, REACHED_END))
+    return jnp.where(path.lost, LEFT_DOMAIN, jnp.where(path.end_time < t1, FAILED, REACHED_END))
 
 
 class BlockSampling(AbstractSampling):
     """Samples by the block of lanes, with what rides along or `alone`."""
 
     movable: int
-    recipe: Recipe
+    spec: ProblemSpec
     places: Any = eqx.field(static=True)
     alone: bool = eqx.field(static=True, default=False)
 
@@ -166,12 +166,12 @@ class BlockSampling(AbstractSampling):
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[SampledRun, list[SampledRun]]:
         build, numbers, given, settings = self._builder(leaves)
-        problem, directions, gather = directions_by(build, active, numbers, cells)
+        problem, tangents, gather = tangents_by(build, active, numbers, cells)
 
         def run(some: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
             return _march(VariationalProblem(problem, some, False), given, settings, not again)
 
-        found, slopes = in_groups(run, directions)
+        found, slopes = in_groups(run, tangents)
         return found, gather(slopes)
 
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
@@ -181,13 +181,13 @@ class BlockSampling(AbstractSampling):
 
     def _builder(self, leaves: tuple[Array, ...]) -> tuple[Callable[..., AbstractProblem], Any, Any, Settings]:
         """(the modules' numbers, cells) -> the problem; these numbers; times, horizon and tolerance; and the settings."""
-        numbers, given, recipe = self._sorted(leaves)
+        numbers, given, spec = self._sorted(leaves)
 
         def build(numbers: tuple[Array, ...], cells: int | None) -> AbstractProblem:
-            problem = recipe.made(numbers, cells)
-            return leading_problem(problem) if self.alone else problem
+            problem = spec.made(numbers, cells)
+            return core_problem(problem) if self.alone else problem
 
-        return build, numbers, given, recipe.settings
+        return build, numbers, given, spec.settings
 
 
 @eqx.filter_jit
@@ -196,14 +196,14 @@ def _march(
 ) -> tuple[SampledRun, list[SampledRun]]:
     """What is found of the cells, and its slope along each of the directions."""
     times, t1, tolerance = given
-    outcome, samples = march_with_samples(
+    outcome, samples = solve_with_samples(
         varied,
         times if times.ndim == 1 else times.T,
         t1,
         jnp.asarray(varied.problem.start()[0].shape[1]),
         # One tolerance serves a block: the smallest of a batch.
         settings.with_tolerance(jnp.min(tolerance)),
-        parts=1 + len(varied.directions),
+        parts=1 + len(varied.tangents),
         one_kernel=one_kernel,
     )
     counts = (outcome.steps - outcome.rejected, outcome.rejected)
@@ -217,23 +217,23 @@ def _found(
     counts: tuple[Int[Array, "*cells"], Int[Array, "*cells"]],
 ) -> tuple[SampledRun, list[SampledRun]]:
     """What is found, and its slope along each of the directions, given when, where and how the runs ended."""
-    states, *variations = jnp.split(samples, 1 + len(varied.directions), axis=-1)
+    states, *variations = jnp.split(samples, 1 + len(varied.tangents), axis=-1)
     time, end, status = ends
     end, *end_variations = varied.parts(end)
 
     def end_time(problem: AbstractProblem, state: Float[Array, "components *cells"]) -> Float[Array, "*cells"]:
-        return event_time(problem, lambda at: problem.guard(time, at), time, state)
+        return event_time(problem, lambda at: problem.domain_margin(time, at), time, state)
 
     def slope(direction: Any, variation: Array, at_end: Array) -> SampledRun:
-        if varied.problem.guard(time, end) is None:
+        if varied.problem.domain_margin(time, end) is None:
             later = jnp.zeros_like(time)
         else:
             later = eqx.filter_jvp(end_time, (varied.problem, end), (direction, at_end))[1]
-            later = jnp.where((status == GUARD_LOST) & (time > 0.0), later, 0.0)
+            later = jnp.where((status == LEFT_DOMAIN) & (time > 0.0), later, 0.0)
         changes = parted(varied.problem, jnp.where(jnp.isnan(states), 0.0, variation))
         return SampledRun(*changes, later, None, None, None, None)
 
-    slopes = [slope(*one) for one in zip(varied.directions, variations, end_variations, strict=True)]
+    slopes = [slope(*one) for one in zip(varied.tangents, variations, end_variations, strict=True)]
     numbers = (part.astype(float) for part in (status, *counts))
     end, _ = parted(varied.problem, jnp.moveaxis(end, 0, -1))
     return SampledRun(*parted(varied.problem, states), time, end, *numbers), slopes
@@ -245,32 +245,32 @@ class SingleSampling(AbstractSampling):
     in_blocks = False
 
     movable: int
-    recipe: Recipe
+    spec: ProblemSpec
     places: Any = eqx.field(static=True)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
-        numbers, given, recipe = self._sorted(leaves)
-        found, _ = _follow(VariationalProblem(recipe.made(numbers, None), (), False), given, recipe)
+        numbers, given, spec = self._sorted(leaves)
+        found, _ = _follow(VariationalProblem(spec.made(numbers, None), (), False), given, spec)
         return jax.tree.map(lambda part: part[None], found)
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[SampledRun, list[SampledRun]]:
-        numbers, given, recipe = self._sorted(leaves)
-        problem, directions, gather = directions_by(recipe.made, active, numbers, None)
+        numbers, given, spec = self._sorted(leaves)
+        problem, tangents, gather = tangents_by(spec.made, active, numbers, None)
 
         def run(some: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
-            return _follow(VariationalProblem(problem, some, False), given, recipe)
+            return _follow(VariationalProblem(problem, some, False), given, spec)
 
-        found, slopes = in_groups(run, directions)
+        found, slopes = in_groups(run, tangents)
         return jax.tree.map(lambda part: part[None], (found, gather(slopes)))
 
 
 def _follow(
-    varied: VariationalProblem, given: tuple[Array, Array, Array], recipe: Recipe
+    varied: VariationalProblem, given: tuple[Array, Array, Array], spec: ProblemSpec
 ) -> tuple[SampledRun, list[SampledRun]]:
     """What is found of a run, and its slope along each of the directions."""
     times, t1, tolerance = given
-    path = sample(varied, times, t1, recipe.settings.with_tolerance(tolerance), grid=recipe.grid)
+    path = sample(varied, times, t1, spec.settings.with_tolerance(tolerance), grid=spec.grid)
     ends = (path.end_time, path.end_state, _status(path, t1))
     return _found(varied, path.states.T, ends, (path.accepted, path.rejected))

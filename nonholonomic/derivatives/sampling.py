@@ -10,10 +10,10 @@ from jaxtyping import Array, Bool, Float
 
 from ..integration import Settings
 from ..validation import as_number
-from .differentiable import AbstractQuestion, ask
+from .differentiable import AbstractDifferentiableSolve, differentiable_solve
 
 
-class Recipe(eqx.Module):
+class ProblemSpec(eqx.Module):
     """How what is run is made of numbers, and how it is integrated, all but the tolerance."""
 
     build: Callable[[Any, Any], Any] = eqx.field(static=True)
@@ -28,26 +28,26 @@ class Recipe(eqx.Module):
         return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), self.rest), given)
 
 
-class AbstractSampling(AbstractQuestion):
+class AbstractSampling(AbstractDifferentiableSolve):
     """Samples of a run; the leaves are the modules' numbers, the times, the horizon, the tolerance and the recipe's arrays.
 
-    `recipe` is without its arrays, and `places` says where they belong in it.
+    `spec` is without its arrays, and `places` says where they belong in it.
     """
 
-    recipe: eqx.AbstractVar[Recipe]
+    spec: eqx.AbstractVar[ProblemSpec]
     places: eqx.AbstractVar[Any]
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isnan(value)
 
-    def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array, Array], Recipe]:
+    def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array, Array], ProblemSpec]:
         """The modules' numbers; times, horizon and tolerance; and the whole recipe."""
         numbers, (times, t1, tolerance, *held) = leaves[: self.movable], leaves[self.movable :]
-        return numbers, (times, t1, tolerance), eqx.combine(self.recipe, jax.tree.unflatten(self.places, held))
+        return numbers, (times, t1, tolerance), eqx.combine(self.spec, jax.tree.unflatten(self.places, held))
 
 
-def ask_for_samples(
-    question: Callable[[int, Recipe, Any], AbstractSampling],
+def solve_for_samples(
+    question: Callable[[int, ProblemSpec, Any], AbstractSampling],
     build: Callable[[Any, Any], Any],
     modules: Any,
     times: Float[Array, " times"],
@@ -63,6 +63,8 @@ def ask_for_samples(
     numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(numbers)
     # Arrays, such as those of the solver, may be traced, so they go among the leaves.
-    arrays, recipe = eqx.partition(Recipe(build, structure, rest, settings.with_tolerance(None), grid), eqx.is_array)
+    arrays, spec = eqx.partition(ProblemSpec(build, structure, rest, settings.with_tolerance(None), grid), eqx.is_array)
     held, places = jax.tree.flatten(arrays)
-    return ask(question(len(leaves), recipe, places), *leaves, times, as_number(t1), settings.tolerance, *held)
+    return differentiable_solve(
+        question(len(leaves), spec, places), *leaves, times, as_number(t1), settings.tolerance, *held
+    )

@@ -14,15 +14,24 @@ from jax.extend.core import Literal
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
-from ..integration import CROSSED, REACHED_END, AbstractProblem, Block, Outcome, Queue, Settings, with_crossing_times
+from ..integration import (
+    CROSSED,
+    REACHED_END,
+    AbstractProblem,
+    LaneScheduler,
+    LaneState,
+    Outcome,
+    Settings,
+    with_crossing_times,
+)
 from ..xla_cpu import compiled_alone
-from ._adjoint import march_with_gradient
+from ._adjoint import solve_with_adjoint
 from .variation import VariationalProblem, in_groups, slopes_by_variations
 
 
-def march_with_slopes(
+def ensemble_solve_with_tangents(
     problem: AbstractProblem,
-    directions: tuple[Any, ...],
+    tangents: tuple[Any, ...],
     t1: Float[Array, "..."],
     cells: Int[Array, ""],
     settings: Settings,
@@ -32,19 +41,19 @@ def march_with_slopes(
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """Run every cell, and differentiate the time of its event in some directions.
 
-    **Arguments:** as for `march`, and
+    **Arguments:** as for `ensemble_solve`, and
 
     - `directions`: tangents of the problem, as for `VariationalProblem`. Their variations, or a mixture of them, take part in
       step control.
-    - `one_kernel`: as for `march`. Without it, so that the result can be differentiated again, runs are not taken back:
-      variations run along, whatever the number of directions.
+    - `one_kernel`: as for `ensemble_solve`. Without it, so that the result can be differentiated again, runs are not taken
+      back: variations run along, whatever the number of directions.
 
     **Returns:** the `Outcome`, and for each direction the derivative of `crossing_time`, 0 where that is infinite. Source:
     implicit function theorem at the event; step lengths are held fixed.
     """
     horizon = t1
     if passes:
-        whole = Queue.of(problem, t1, cells, settings, passes=True, one_kernel=one_kernel)
+        whole = LaneScheduler.of(problem, t1, cells, settings, passes=True, one_kernel=one_kernel)
         outcome = whole.outcome()[0]
         # The slopes need the run up to the event alone, whose time is known by now.
         horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
@@ -53,10 +62,10 @@ def march_with_slopes(
     def along(some: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
         return slopes_by_variations(problem, some, *given, one_kernel=one_kernel)
 
-    if one_kernel and len(directions) > 1:
-        there, slopes = _slopes_by_adjoint(problem, directions, *given)
+    if one_kernel and len(tangents) > 1:
+        there, slopes = _slopes_by_adjoint(problem, tangents, *given)
     else:
-        there, slopes = in_groups(along, directions)
+        there, slopes = in_groups(along, tangents)
     if not passes:
         outcome = with_crossing_times(problem, there)
     # At the very start the event is there at once, whatever moves.
@@ -67,15 +76,15 @@ def march_with_slopes(
 
 
 def _slopes_by_adjoint(
-    problem: AbstractProblem, directions: tuple[Any, ...], ends_on_event: bool, *given: Any
+    problem: AbstractProblem, tangents: tuple[Any, ...], ends_on_event: bool, *given: Any
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """What `slopes_by_variations` gives, at a cost that does not depend on the number of directions."""
-    moving = _moving(problem, directions[0])
+    moving = _moving(problem, tangents[0])
     # Without directions it is the problem itself, which can be told not to end on its event.
-    there, by_start, by_number = march_with_gradient(
+    there, by_start, by_number = solve_with_adjoint(
         VariationalProblem(problem, (), ends_on_event),
         VariationalProblem(moving, (), ends_on_event),
-        _mixed(directions),
+        _mixed(tangents),
         *given,
         measured=_event_time,
         one_kernel=True,
@@ -89,23 +98,23 @@ def _slopes_by_adjoint(
         ]
         return sum(shares, jnp.zeros(by_start.shape[1]) if start is None else jnp.sum(by_start * start, axis=0))
 
-    return there, [slope(direction) for direction in directions]
+    return there, [slope(direction) for direction in tangents]
 
 
-def _mixed(directions: tuple[Any, ...]) -> Any:
+def _mixed(tangents: tuple[Any, ...]) -> Any:
     """A direction in which all of some directions have a share, by shares that are not likely to cancel."""
-    shares = [0.5 + math.modf(0.618 * k)[0] for k in range(len(directions))]
-    return jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *directions)
+    shares = [0.5 + math.modf(0.618 * k)[0] for k in range(len(tangents))]
+    return jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
 
 
-def _event_time(varied: VariationalProblem, block: Block) -> Float[Array, " lanes"]:
+def _event_time(varied: VariationalProblem, lane_state: LaneState) -> Float[Array, " lanes"]:
     """When the crossing function vanishes, for a block that has ended there (implicit function theorem).
 
     To first order, unlike `crossing_time`: the event is located to 1e-10 of a step, and its time is not differentiated again.
     """
-    crossing, rate = varied.problem.crossing, varied.problem.field(block.time, block.state)
-    fall = stop_gradient(jax.jvp(crossing, (stop_gradient(block.state),), (rate,))[1])
-    return block.time - crossing(block.state) / jnp.where(fall == 0.0, 1.0, fall)
+    crossing, rate = varied.problem.event_function, varied.problem.field(lane_state.time, lane_state.state)
+    fall = stop_gradient(jax.jvp(crossing, (stop_gradient(lane_state.state),), (rate,))[1])
+    return lane_state.time - crossing(lane_state.state) / jnp.where(fall == 0.0, 1.0, fall)
 
 
 def _moving(problem: AbstractProblem, direction: Any) -> Any:
@@ -115,7 +124,7 @@ def _moving(problem: AbstractProblem, direction: Any) -> Any:
 
     def seen(*leaves: Any) -> Any:
         one = jax.tree.unflatten(structure, leaves)
-        return one.field(jnp.zeros_like(states[0]), states), one.crossing(states)
+        return one.field(jnp.zeros_like(states[0]), states), one.event_function(states)
 
     closed = jax.make_jaxpr(seen)(*leaves)
     needed = set(closed.jaxpr.outvars)
@@ -126,14 +135,14 @@ def _moving(problem: AbstractProblem, direction: Any) -> Any:
     return jax.tree.map(lambda rate, one: one and rate is not None, direction, used, is_leaf=lambda rate: rate is None)
 
 
-#: `march_with_slopes`, compiled on its own, for use outside of other transformed functions.
-compiled_march_with_slopes = compiled_alone(eqx.Partial(march_with_slopes, one_kernel=True))
+#: `ensemble_solve_with_tangents`, compiled on its own, for use outside of other transformed functions.
+solve_ensemble_with_tangents = compiled_alone(eqx.Partial(ensemble_solve_with_tangents, one_kernel=True))
 
-#: `march_with_slopes`, for use inside other transformed functions.
-traced_march_with_slopes = eqx.filter_jit(march_with_slopes)
+#: `ensemble_solve_with_tangents`, for use inside other transformed functions.
+traced_solve_ensemble_with_tangents = eqx.filter_jit(ensemble_solve_with_tangents)
 
 
-def directions_of(
+def tangents_of(
     build: Callable[..., AbstractProblem], numbers: tuple[Any, ...], tangents: list[tuple[Any, ...]]
 ) -> tuple[Any, ...]:
     """The tangents of a problem that is built from numbers.

@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..integration import AbstractProblem, Outcome, Queue, crossing_time
+from ..integration import AbstractProblem, LaneScheduler, Outcome, crossing_time
 
 #: Directions that run along together: two take 0.6 to 1.0 times as long as one after the other, and compile for an eighth
 #: longer; four take 1.1 times as long as two twice.
 TOGETHER = 2
 
 
-def natural_size(number: Float[Array, "..."]) -> Float[Array, "..."]:
+def tangent_scale(number: Float[Array, "..."]) -> Float[Array, "..."]:
     """By how much to move a number: by its own size, or by 1 where it is zero."""
     return jax.lax.stop_gradient(jnp.where(number == 0.0, 1.0, jnp.abs(number)))
 
@@ -30,11 +30,11 @@ class VariationalProblem(AbstractProblem):
 
     A direction is a tangent of the problem: the same tree, with the rate at which each number moves, `None` where none of
     the directions moves it. A variation's absolute tolerance is that of the state, so a direction should move a number by
-    about its own size (`natural_size`).
+    about its own size (`tangent_scale`).
     """
 
     problem: AbstractProblem
-    directions: tuple[Any, ...]
+    tangents: tuple[Any, ...]
     ends_on_event: bool = eqx.field(static=True)
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
@@ -44,38 +44,38 @@ class VariationalProblem(AbstractProblem):
             moved = eqx.filter_jvp(lambda problem: problem.start()[0], (self.problem,), (direction,))[1]
             return jnp.zeros_like(states) if moved is None else moved
 
-        variations = [variation(direction) for direction in self.directions]
+        variations = [variation(direction) for direction in self.tangents]
         return jnp.concatenate([states, *variations]), jnp.concatenate([scales] * (1 + len(variations)))
 
     def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
         at, *variations = self.parts(state)
         if not variations:
             return self.problem.field(time, at)
-        moving = where_moved(self.problem, self.directions[0])
+        moving = where_active(self.problem, self.tangents[0])
 
         def rate(moving: Any, at: Float[Array, "components lanes"]) -> Float[Array, "components lanes"]:
             return eqx.combine(moving, self.problem).field(time, at)
 
         # Linearised once: the rate is computed once, and the directions share what their changes have in common.
         here, change = jax.linearize(rate, moving, at)
-        return jnp.concatenate([here, *(change(*moved) for moved in zip(self.directions, variations, strict=True))])
+        return jnp.concatenate([here, *(change(*moved) for moved in zip(self.tangents, variations, strict=True))])
 
-    def crossing(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"] | None:
-        return self.problem.crossing(self.parts(state)[0]) if self.ends_on_event else None
+    def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"] | None:
+        return self.problem.event_function(self.parts(state)[0]) if self.ends_on_event else None
 
-    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.problem.guard(time, self.parts(state)[0])
+    def domain_margin(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.problem.domain_margin(time, self.parts(state)[0])
 
     def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
         return self.problem.margins(time, self.parts(state)[0])
 
     def parts(self, state: Float[Array, "components ..."]) -> list[Float[Array, "components ..."]]:
         """The state and its variations."""
-        return jnp.split(state, 1 + len(self.directions)) if self.directions else [state]
+        return jnp.split(state, 1 + len(self.tangents)) if self.tangents else [state]
 
 
 def slopes_by_variations(
-    problem: AbstractProblem, directions: tuple[Any, ...], ends_on_event: bool, *given: Any, one_kernel: bool
+    problem: AbstractProblem, tangents: tuple[Any, ...], ends_on_event: bool, *given: Any, one_kernel: bool
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """Run every cell with its variations, and let them move the event at its end.
 
@@ -87,22 +87,22 @@ def slopes_by_variations(
 
     **Returns:** the `Outcome`, with crossing times left out, and for each direction the derivative of the event's time.
     """
-    varied = VariationalProblem(problem, directions, ends_on_event)
+    varied = VariationalProblem(problem, tangents, ends_on_event)
     # The variations take part in step control: the state alone may be at rest where its tangent is not, and steps would
     # outgrow what the tangent can bear.
-    there, _ = Queue.of(varied, *given, parts=1 + len(directions), one_kernel=one_kernel).outcome()
+    there, _ = LaneScheduler.of(varied, *given, parts=1 + len(tangents), one_kernel=one_kernel).outcome()
     state, *variations = varied.parts(there.state)
 
     def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         return crossing_time(problem, there.end_time, state)
 
     slopes = [
-        eqx.filter_jvp(event_time, (problem, state), moved)[1] for moved in zip(directions, variations, strict=True)
+        eqx.filter_jvp(event_time, (problem, state), moved)[1] for moved in zip(tangents, variations, strict=True)
     ]
     return there._replace(state=state), slopes
 
 
-def in_groups(run: Callable[..., tuple[Any, list[Any]]], directions: tuple[Any, ...]) -> tuple[Any, list[Any]]:
+def in_groups(run: Callable[..., tuple[Any, list[Any]]], tangents: tuple[Any, ...]) -> tuple[Any, list[Any]]:
     """What `run` finds along many directions, `TOGETHER` of them at a time by one program.
 
     **Arguments:**
@@ -113,19 +113,19 @@ def in_groups(run: Callable[..., tuple[Any, list[Any]]], directions: tuple[Any, 
 
     **Returns:** the result, and the slopes.
     """
-    if len(directions) <= TOGETHER:
-        return run(directions)
+    if len(tangents) <= TOGETHER:
+        return run(tangents)
     # The last group is filled with directions that lead nowhere.
-    empty = -len(directions) % TOGETHER
-    padded = [*directions, *[jax.tree.map(jnp.zeros_like, directions[0])] * empty]
+    empty = -len(tangents) % TOGETHER
+    padded = [*tangents, *[jax.tree.map(jnp.zeros_like, tangents[0])] * empty]
     stacked = [jax.tree.map(lambda *rates: jnp.stack(rates), *padded[k::TOGETHER]) for k in range(TOGETHER)]
     results, slopes = jax.lax.map(lambda group: run(tuple(group)), stacked)
     groups = range(len(padded) // TOGETHER)
     each = [jax.tree.map(operator.itemgetter(group), slope) for group in groups for slope in slopes]
-    return jax.tree.map(lambda leaf: leaf[0], results), each[: len(directions)]
+    return jax.tree.map(lambda leaf: leaf[0], results), each[: len(tangents)]
 
 
-def where_moved(problem: Any, direction: Any) -> Any:
+def where_active(problem: Any, direction: Any) -> Any:
     """The numbers of a problem that a direction moves, `None` for the others."""
 
     def moved(rate: Any, number: Any) -> Any:

@@ -11,8 +11,8 @@ from .carried_frame import place_named as place_named
 from .carried_frame import room_bounds as room_bounds
 from .cylinder import Cylinder as Cylinder
 from .frames import AbstractFrame as AbstractFrame
-from .frames import Carriage as Carriage
 from .frames import CylinderFrame as CylinderFrame
+from .frames import FrameMotion as FrameMotion
 from .frames import PlaneFrame as PlaneFrame
 from .frames import SphereFrame as SphereFrame
 from .frames import Tangent as Tangent

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ..validation import Bound, as_number
 from ..xla_cpu import stored
 from .cylinder import Cylinder
-from .frames import AbstractFrame, Carriage, CylinderFrame, Fixed, Place, PlaneFrame, SphereFrame, Tangent, along
+from .frames import AbstractFrame, CylinderFrame, Fixed, FrameMotion, Place, PlaneFrame, SphereFrame, Tangent, along
 from .plane import Plane
 from .quadric import Sphere
 from .surface import AbstractSurface
@@ -104,7 +104,7 @@ class CarriedFrame(AbstractFrame):
     def place_scales(self) -> tuple[Component, ...]:
         return (self.distance,) * 3 + (1.0,) * 3
 
-    def carriage(self, place: Place, velocity: Tangent) -> Carriage:
+    def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
         foot, R = place[:3], self.distance
         # Stored: what follows, and its derivatives above all, would each compute these anew.
         n = stored(*self.normal(foot))
@@ -121,7 +121,7 @@ class CarriedFrame(AbstractFrame):
         moved = sum_vectors(scale(q1, t1), scale(q2, t2), scale(back, n))
         # Both are positive where both of 1 - R k are; the first of them to vanish takes the determinant with it.
         room = jnp.minimum(determinant, 0.5 * (A11 + A22))
-        return Carriage((o1, o2), tuple(up), (*moved, *scale(o1, n)), room)
+        return FrameMotion((o1, o2), tuple(up), (*moved, *scale(o1, n)), room)
 
     def _shape(self, foot: Fixed, t1: Fixed, t2: Fixed) -> tuple[Component, Component, Component]:
         """The shape operator of the arena, n' = -S_a q', as (S11, S12, S22)."""

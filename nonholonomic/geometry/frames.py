@@ -32,7 +32,7 @@ def carried(vector: tuple[Component, ...], turning: Tangent) -> tuple[Component,
     return (multiply(turning[0], vector[2]), multiply(turning[1], vector[2]), subtract(None, along_normal))
 
 
-class Carriage(NamedTuple):
+class FrameMotion(NamedTuple):
     """What a frame does while the ball moves.
 
     - `turning`: (o1, o2) = S V [rad/s]; `vertical`: the upward vertical in the frame.
@@ -66,7 +66,7 @@ class AbstractFrame(eqx.Module):
         """Magnitudes of the place's components."""
 
     @abc.abstractmethod
-    def carriage(self, place: Place, velocity: Tangent) -> Carriage:
+    def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
         """What the frame does while the centre moves with the velocity (V1, V2) [m/s]."""
 
     @abc.abstractmethod
@@ -117,8 +117,8 @@ class PlaneFrame(AbstractFrame):
     def place_scales(self) -> tuple[Component, ...]:
         return () if self.slope is None else (self.distance,)
 
-    def carriage(self, place: Place, velocity: Tangent) -> Carriage:
-        return Carriage((None, None), self.vertical(place), () if self.slope is None else velocity[:1])
+    def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
+        return FrameMotion((None, None), self.vertical(place), () if self.slope is None else velocity[:1])
 
     def vertical(self, place: Place) -> Vector:
         return (None, None, 1.0) if self.slope is None else (self.slope[0], None, self.slope[1])
@@ -177,10 +177,10 @@ class CylinderFrame(AbstractFrame):
     def place_scales(self) -> tuple[Component, ...]:
         return (1.0, 1.0)
 
-    def carriage(self, place: Place, velocity: Tangent) -> Carriage:
+    def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
         sine, cosine = place
         rate = velocity[0] / self.radius
-        return Carriage((rate, None), self.vertical(place), (multiply(rate, cosine), -multiply(rate, sine)))
+        return FrameMotion((rate, None), self.vertical(place), (multiply(rate, cosine), -multiply(rate, sine)))
 
     def vertical(self, place: Place) -> Vector:
         sine, cosine = place
@@ -236,9 +236,9 @@ class SphereFrame(AbstractFrame):
     def place_scales(self) -> tuple[Component, ...]:
         return (1.0, 1.0, 1.0)
 
-    def carriage(self, place: Place, velocity: Tangent) -> Carriage:
+    def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
         turning = (velocity[0] / self.radius, velocity[1] / self.radius)
-        return Carriage(turning, self.vertical(place), carried(place, turning))
+        return FrameMotion(turning, self.vertical(place), carried(place, turning))
 
     def vertical(self, place: Place) -> Vector:
         return (place[0], place[1], place[2])

@@ -1,25 +1,25 @@
 """Hybrid systems: smooth motion in modes with resets between them, for ensembles and single runs, with their derivatives.
 
-`travel` takes an ensemble of runs through the modes of an `AbstractPhase` each (`traced_travel` inside other transformed
-functions); `follow_phases` is a single run with its path. `travel_with_slopes` carries tangents through every reset by the
-saltation matrix, and `phased_samples` gives states at times, with their derivatives.
+`solve_hybrid` takes an ensemble of runs through the modes of an `AbstractBatchedMode` each (`traced_solve_hybrid` inside
+other transformed functions); `solve_hybrid_dense` is a single run with its path. `solve_hybrid_with_tangents` carries
+tangents through every reset by the saltation matrix, and `hybrid_samples` gives states at times, with their derivatives.
 """
 
-from .phased_run import BETWEEN as BETWEEN
-from .phased_run import PhasedPath as PhasedPath
-from .phased_run import Piece as Piece
-from .phased_run import follow_phases as follow_phases
-from .phased_samples import PhasedSamples as PhasedSamples
-from .phased_samples import phased_samples as phased_samples
-from .phases import AbstractPhase as AbstractPhase
-from .phases import Journey as Journey
-from .phases import Passage as Passage
-from .phases import Record as Record
-from .phases import marched as marched
-from .phases import passed_on as passed_on
-from .phases import travel as travel
-from .traced_phases import in_rounds as in_rounds
-from .traced_phases import traced_travel as traced_travel
-from .varied_phases import Slopes as Slopes
-from .varied_phases import traced_travel_with_slopes as traced_travel_with_slopes
-from .varied_phases import travel_with_slopes as travel_with_slopes
+from .ensemble import AbstractBatchedMode as AbstractBatchedMode
+from .ensemble import HybridOutcome as HybridOutcome
+from .ensemble import Transition as Transition
+from .ensemble import TransitionPath as TransitionPath
+from .ensemble import after_reset as after_reset
+from .ensemble import after_solve as after_solve
+from .ensemble import solve_hybrid as solve_hybrid
+from .path import BETWEEN as BETWEEN
+from .path import HybridPath as HybridPath
+from .path import Segment as Segment
+from .path import solve_hybrid_dense as solve_hybrid_dense
+from .saltation import Slopes as Slopes
+from .saltation import solve_hybrid_with_tangents as solve_hybrid_with_tangents
+from .saltation import traced_solve_hybrid_with_tangents as traced_solve_hybrid_with_tangents
+from .samples import HybridSamples as HybridSamples
+from .samples import hybrid_samples as hybrid_samples
+from .traced_ensemble import in_rounds as in_rounds
+from .traced_ensemble import traced_solve_hybrid as traced_solve_hybrid

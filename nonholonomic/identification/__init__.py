@@ -5,6 +5,7 @@ likelihoods, the combinations that the data do not determine, and a `Verdict`. `
 both models are checked, read from files and turned into them here.
 """
 
+from .csv import read_columns as read_columns
 from .data import free_numbers as free_numbers
 from .data import joined as joined
 from .data import of_data as of_data
@@ -12,7 +13,6 @@ from .identify import check_search as check_search
 from .identify import identify as identify
 from .likelihood import Measurements as Measurements
 from .posterior import LogDensity as LogDensity
-from .reading import read_columns as read_columns
 from .recording import AbstractRecording as AbstractRecording
 from .recording import Quantities as Quantities
 from .recording import as_quantity as as_quantity

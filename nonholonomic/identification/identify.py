@@ -8,10 +8,10 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..progress import telling
+from ..progress import status_line
 from ..validation import require, require_flag, require_whole
 from .levenberg_marquardt import Ends, minimise
-from .likelihood import Measurements, estimated_errors, muted
+from .likelihood import Measurements, down_weighted, estimated_errors
 from .problem import Linearised, Problem, linearise
 from .result import Identification, summarise
 from .unknown import as_free, draw_starts
@@ -84,7 +84,7 @@ def identify(
     if len(labels) != count:
         raise ValueError(f"labels must be {count}, one for each measurement, not {len(labels)}")
     problem = Problem(model, tuple(unknowns.items()), step)
-    with telling("fitting", progress):
+    with status_line("fitting", progress):
         begins = draw_starts(unknowns, starts, spread, seed)
         ends, there = _fitted(problem, begins, measurements, max_steps, progress)
         for _ in range(ROUNDS if np.any(np.asarray(measurements.estimated)) else 0):
@@ -119,7 +119,7 @@ def _fitted(
         return ends, there
     at = begins
     for part in PARTS:
-        some = muted(measurements, part * longest)
+        some = down_weighted(measurements, part * longest)
         at = minimise(problem, at, some, max_steps=max_steps, progress=progress).coordinates
     others = minimise(problem, at, measurements, max_steps=max_steps, progress=progress)
     by_parts = linearise(problem, others.coordinates, measurements)

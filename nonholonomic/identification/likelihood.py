@@ -16,7 +16,7 @@ from ..validation import require
 MISSING = 1e4
 
 #: The factor on the error of a measurement that is not to count yet.
-MUTED = 1e6
+DOWN_WEIGHTED = 1e6
 
 
 class Measurements(eqx.Module):
@@ -221,7 +221,7 @@ def estimated_errors(measurements: Measurements, prediction: Any, unknowns: int)
     return errors
 
 
-def muted(measurements: Measurements, horizon: float) -> Measurements:
+def down_weighted(measurements: Measurements, horizon: float) -> Measurements:
     """The same, but what was measured after a time counts for next to nothing."""
     late = measurements.time > horizon
-    return measurements.with_errors(jnp.where(late, measurements.error * MUTED, measurements.error))
+    return measurements.with_errors(jnp.where(late, measurements.error * DOWN_WEIGHTED, measurements.error))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..progress import telling
+from ..progress import status_line
 from ..validation import require
 from .likelihood import Measurements
 from .problem import Problem
@@ -89,7 +89,7 @@ class LogDensity(eqx.Module):
         """What the model predicts for every measurement, at several coordinates."""
         return self.problem.predict(coordinates[:, : len(self.problem.names)])
 
-    @telling("simulating")
+    @status_line("simulating")
     def replicate(self, coordinates: Float[Array, "rows unknowns"], seed: int = 0) -> Float[np.ndarray, "rows n"]:
         """New measurements as the posterior predicts them, an error drawn for each; those of limits are without limits."""
         random, predicted = np.random.default_rng(seed), np.asarray(_predicted(self, jnp.asarray(coordinates)))
@@ -101,7 +101,7 @@ class LogDensity(eqx.Module):
         errors = jax.vmap(lambda one: self._with_errors(one).error)(jnp.asarray(coordinates))
         return predicted + np.asarray(errors) * drawn
 
-    @telling("simulating")
+    @status_line("simulating")
     def __call__(self, coordinates: Float[Array, " unknowns"]) -> Float[Array, ""]:
         return self.of_prediction(coordinates, self.predict(coordinates[None])[0])
 
@@ -109,7 +109,7 @@ class LogDensity(eqx.Module):
         """The log density at some coordinates, given what the model predicts there."""
         return self._with_errors(coordinates).log_likelihood(prediction) + self._log_prior(coordinates)
 
-    @telling("simulating")
+    @status_line("simulating")
     def value_and_gradient(
         self, coordinates: Float[Array, "*batch unknowns"]
     ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch unknowns"]]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..parameters import text_as_html
-from ..progress import telling
+from ..progress import status_line
 from .levenberg_marquardt import minimise
 from .likelihood import Measurements
 from .problem import Linearised, Problem, linearise
@@ -149,7 +149,7 @@ class Identification:
         with np.errstate(over="ignore"):
             return tuple(float(free.value(np.asarray(self.coordinates[k] + side * reach))) for side in (-1.0, 1.0))
 
-    @telling("fitting again")
+    @status_line("fitting again")
     def profile(self, name: str, values: Any = None) -> Profile:
         """The profile likelihood of a parameter: all others are fitted again, for all its values at once.
 
@@ -188,7 +188,7 @@ class Identification:
             shares = self.coordinate_covariance / np.outer(errors, errors)
         return np.where(np.eye(len(errors), dtype=bool), 1.0, np.where(np.isfinite(shares), shares, 0.0))
 
-    @telling("drawing")
+    @status_line("drawing")
     def plot(self) -> Any:
         """Data and model, residuals, the profile likelihood of every parameter, and the correlations (needs matplotlib).
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..progress import Progress, telling
+from ..progress import Progress, status_line
 from ..validation import require_flag, require_whole
 from .posterior import LogDensity
 from .surrogate import Surrogate
@@ -128,7 +128,7 @@ def sample(
                 accepted += float(np.mean(taken)) / draws
                 kept.append(at)
             shown.advance(1)
-    with telling("diagnosing the draws", progress):
+    with status_line("diagnosing the draws", progress):
         return Draws.of(density, np.stack(kept, axis=1), accepted, runs + chains * (warmup + draws + 1))
 
 

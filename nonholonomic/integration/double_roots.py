@@ -57,7 +57,9 @@ def missed_double_root(
 
 
 def missed_loss(
-    places: Float[np.ndarray, " places"], margins: Float[Array, "places margins lanes"] | None, free: Bool[Array, " lanes"]
+    places: Float[np.ndarray, " places"],
+    margins: Float[Array, "places margins lanes"] | None,
+    free: Bool[Array, " lanes"],
 ) -> Lanes:
     """Where in a step one of its margins may first fall below zero and come back, as a fraction of the step; 2 if nowhere.
 
@@ -75,7 +77,7 @@ def missed_loss(
     spread = jnp.max(margins, axis=0) - lowest
     suspect = (lowest < jnp.where(inside < at_end, SUSPECT_INSIDE, SUSPECT_AT_END) * spread) & (spread > FLAT) & free
 
-    def search() -> Lanes:
+    def bracket() -> Lanes:
         edges = np.linspace(0.0, 1.0, CELLS + 1)
         value, slope = _interpolated(places, edges, margins)
         width = 1.0 / CELLS
@@ -85,7 +87,7 @@ def missed_loss(
         return jnp.min(jnp.where(suspect & (at < 1.0) & (least < error), place, 2.0), axis=(0, 1))
 
     # A branch, for few steps come near to a zero.
-    return jax.lax.cond(jnp.any(suspect), search, lambda: jnp.full(free.shape, 2.0))
+    return jax.lax.cond(jnp.any(suspect), bracket, lambda: jnp.full(free.shape, 2.0))
 
 
 def _minimum(
@@ -112,8 +114,6 @@ def _interpolated(
     slopes = powers * edges[:, None] ** np.maximum(powers - 1, 0)
 
     def weighted(weights: Float[np.ndarray, "edges places"]) -> Float[Array, "edges ..."]:
-        return sum(
-            weights[:, k].reshape(-1, *(1,) * (values.ndim - 1)) * values[k] for k in range(len(places))
-        )
+        return sum(weights[:, k].reshape(-1, *(1,) * (values.ndim - 1)) * values[k] for k in range(len(places)))
 
     return weighted(edges[:, None] ** powers @ per_power), weighted(slopes @ per_power)

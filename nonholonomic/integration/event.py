@@ -20,7 +20,7 @@ LOCATED = 1e-10
 MOST_TRIALS = 64
 
 
-class Search(NamedTuple):
+class Bracket(NamedTuple):
     """Where a lane looks for its event: between the step lengths `low` and `high` [s], with the margins found there.
 
     `stride` is the length of the step in which the search began, `trials` counts the steps tried since.
@@ -34,9 +34,9 @@ class Search(NamedTuple):
     trials: Int[Array, " lanes"]
 
 
-def narrow(
-    searching: Bool[Array, " lanes"], was: Search, before: Lanes, margin: Lanes, length: Lanes
-) -> tuple[Search, Lanes, Bool[Array, " lanes"]]:
+def refine(
+    bracketing: Bool[Array, " lanes"], was: Bracket, before: Lanes, margin: Lanes, length: Lanes
+) -> tuple[Bracket, Lanes, Bool[Array, " lanes"]]:
     """Narrow the bracket by what an attempt found (Anderson and Bjorck, BIT 13 (1973) 253).
 
     **Arguments:**
@@ -48,14 +48,14 @@ def narrow(
 
     **Returns:** the bracket, the length to try next, and whether the attempt ended on the event.
     """
-    opens = ~searching
+    opens = ~bracketing
     replaces_high = margin <= 0.0
     # Just past a crossing the margin is round-off, or 0, and would send the search back to that crossing.
     start = jnp.maximum(before, -1e-3 * margin)
     # The end that stays is given less weight, so that it moves too in the next trial.
     weighted_low = was.margin_low * _fade(margin, was.margin_high)
     weighted_high = was.margin_high * _fade(margin, was.margin_low)
-    search = Search(
+    bracket = Bracket(
         low=jnp.where(opens, 0.0, jnp.where(replaces_high, was.low, length)),
         high=jnp.where(opens | replaces_high, length, was.high),
         margin_low=jnp.where(opens, start, jnp.where(replaces_high, weighted_low, margin)),
@@ -63,16 +63,16 @@ def narrow(
         stride=jnp.where(opens, length, was.stride),
         trials=jnp.where(opens, 0, was.trials + 1),
     )
-    rise = search.margin_high - search.margin_low
-    guess = search.low - search.margin_low * (search.high - search.low) / jnp.where(rise == 0.0, 1.0, rise)
-    guess = jnp.where(jnp.isfinite(guess), jnp.clip(guess, search.low, search.high), search.high)
-    located = max(LOCATED, 8.0 * float(jnp.finfo(margin.dtype).eps)) * search.stride
-    tired = search.trials >= MOST_TRIALS
-    close = searching & ((jnp.abs(guess - length) <= 2.0 * located) | tired)
+    rise = bracket.margin_high - bracket.margin_low
+    guess = bracket.low - bracket.margin_low * (bracket.high - bracket.low) / jnp.where(rise == 0.0, 1.0, rise)
+    guess = jnp.where(jnp.isfinite(guess), jnp.clip(guess, bracket.low, bracket.high), bracket.high)
+    located = max(LOCATED, 8.0 * float(jnp.finfo(margin.dtype).eps)) * bracket.stride
+    tired = bracket.trials >= MOST_TRIALS
+    close = bracketing & ((jnp.abs(guess - length) <= 2.0 * located) | tired)
     # A run that goes on must start beyond the event, or it would find the same one again.
     found = close & replaces_high
-    beyond = jnp.where(tired, search.high, jnp.minimum(length + located, search.high))
-    return search, jnp.where(close & ~found, beyond, guess), found
+    beyond = jnp.where(tired, bracket.high, jnp.minimum(length + located, bracket.high))
+    return bracket, jnp.where(close & ~found, beyond, guess), found
 
 
 def _fade(margin: Lanes, replaced: Lanes) -> Lanes:

@@ -32,24 +32,24 @@ class AbstractProblem(eqx.Module):
         """Rate of change of the state, lane by lane; the state may come as a tuple of its components."""
 
     @abc.abstractmethod
-    def crossing(self, state: States) -> Lanes | None:
+    def event_function(self, state: States) -> Lanes | None:
         """A smooth function of order 1, positive before the event, negative after it; `None` if there is no event."""
 
     def crossing_along(self, state: States, rate: States) -> Lanes | None:
         """The crossing function where the field is known too: what `crossing` is, for problems to which that saves work."""
-        return self.crossing(state)
+        return self.event_function(state)
 
     @abc.abstractmethod
-    def guard(self, time: Lanes, state: States) -> Lanes | None:
+    def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
         """A function of order 1 that is positive while the model holds; `None` if it always does."""
 
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         """The smooth functions of which the guard is the least, for a search between the places at which it is evaluated."""
-        guard = self.guard(time, state)
-        return () if guard is None else (guard,)
+        domain_margin = self.domain_margin(time, state)
+        return () if domain_margin is None else (domain_margin,)
 
 
-class LeadingProblem(AbstractProblem):
+class CoreProblem(AbstractProblem):
     """A problem with the first components of its state alone, on which the others do not act."""
 
     whole: AbstractProblem
@@ -63,11 +63,11 @@ class LeadingProblem(AbstractProblem):
         # What the rates do not depend on, and those that are left out, the compiler drops.
         return self.whole.field(time, self._longer(state))[: self.size]
 
-    def crossing(self, state: States) -> Lanes | None:
-        return self.whole.crossing(self._longer(state))
+    def event_function(self, state: States) -> Lanes | None:
+        return self.whole.event_function(self._longer(state))
 
-    def guard(self, time: Lanes, state: States) -> Lanes | None:
-        return self.whole.guard(time, self._longer(state))
+    def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
+        return self.whole.domain_margin(time, self._longer(state))
 
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
         return self.whole.margins(time, self._longer(state))
@@ -80,7 +80,7 @@ class LeadingProblem(AbstractProblem):
 def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: States, rate: States) -> Lanes:
     """The least of the problem's crossing function, counted positive on the lane's side of the event, and its guard, where the
     field is known."""
-    return lesser(problem.guard(time, state), side_of(problem, side)(state, rate), side)
+    return lesser(problem.domain_margin(time, state), side_of(problem, side)(state, rate), side)
 
 
 def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States], Lanes | None]:
@@ -95,7 +95,7 @@ def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States],
 
 def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes:
     """When the crossing function vanishes, for a state close to that (`event_time`)."""
-    return event_time(problem, problem.crossing, time, state)
+    return event_time(problem, problem.event_function, time, state)
 
 
 def event_time(problem: AbstractProblem, function: Callable[[States], Lanes], time: Lanes, state: States) -> Lanes:

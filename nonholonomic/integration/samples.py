@@ -13,12 +13,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ..xla_cpu import written_in_place
-from .attempt import Block, attempt
 from .problem import AbstractProblem
-from .queue import Outcome, Progress, Queue
 from .runge_kutta import Lanes
+from .scheduler import LaneScheduler, Outcome, Progress
 from .settings import Settings
 from .status import REACHED_END, RUNNING
+from .step import LaneState, try_step
 
 #: Iterations of a period: as many as fit the caches with their record.
 PERIOD = 64
@@ -46,7 +46,7 @@ class Sampling(NamedTuple):
     samples: Samples
 
 
-def march_with_samples(
+def solve_with_samples(
     problem: AbstractProblem,
     times: Float[Array, "times *cells"],
     t1: Float[Array, "..."],
@@ -66,51 +66,53 @@ def march_with_samples(
     **Returns:** the `Outcome`, without crossing times; and the states at the times, (cells, times, components), NaN after the
     end of a run.
     """
-    queue = Queue.of(problem, t1, cells, settings, parts=parts, one_kernel=one_kernel)
-    count, starts = times.shape[0], queue.fresh.state
-    of_cell = jnp.broadcast_to(times.reshape(count, -1), (count, queue.capacity)).T
+    scheduler = LaneScheduler.of(problem, t1, cells, settings, parts=parts, one_kernel=one_kernel)
+    count, starts = times.shape[0], scheduler.fresh.state
+    of_cell = jnp.broadcast_to(times.reshape(count, -1), (count, scheduler.capacity)).T
     first = jnp.sum(of_cell <= 0.0, axis=1)
     own_times = times.ndim == 2
 
     def period(run: Sampling) -> Sampling:
-        cell = jnp.minimum(run.progress.block.cell, queue.capacity - 1)
+        cell = jnp.minimum(run.progress.lane_state.cell, scheduler.capacity - 1)
         here = of_cell[cell].T if own_times else times
-        progress, sample, record = _recorded(queue, here, run.progress, run.sample)
-        outcome = queue.store(run.outcome, progress.block)
-        onward = queue.refill(progress)
-        fresh = onward.block.cell != progress.block.cell
-        begin = first[jnp.minimum(onward.block.cell, queue.capacity - 1)]
+        progress, sample, record = _recorded(scheduler, here, run.progress, run.sample)
+        outcome = scheduler.store(run.outcome, progress.lane_state)
+        onward = scheduler.refill(progress)
+        fresh = onward.lane_state.cell != progress.lane_state.cell
+        begin = first[jnp.minimum(onward.lane_state.cell, scheduler.capacity - 1)]
         rows = jnp.moveaxis(record.state, 1, -1)
         samples = run.samples.at[cell[None], record.sample].set(rows, mode="drop", unique_indices=True)
         return Sampling(onward, jnp.where(fresh, begin, sample), outcome, samples)
 
-    progress = queue.start()
+    progress = scheduler.start()
     at_start = jnp.where(of_cell[..., None] <= 0.0, starts.T[:, None], jnp.nan)
-    run = Sampling(progress, first[jnp.minimum(progress.block.cell, queue.capacity - 1)], queue.empty(), at_start)
-    run = jax.lax.while_loop(lambda run: queue.unfinished(run.progress), period, run)
-    return queue.store(run.outcome, run.progress.block), run.samples
+    run = Sampling(
+        progress, first[jnp.minimum(progress.lane_state.cell, scheduler.capacity - 1)], scheduler.empty(), at_start
+    )
+    run = jax.lax.while_loop(lambda run: scheduler.unfinished(run.progress), period, run)
+    return scheduler.store(run.outcome, run.progress.lane_state), run.samples
 
 
 def _recorded(
-    queue: Queue, times: Float[Array, "times ..."], progress: Progress, sample: Int[Array, " lanes"]
+    scheduler: LaneScheduler, times: Float[Array, "times ..."], progress: Progress, sample: Int[Array, " lanes"]
 ) -> tuple[Progress, Int[Array, " lanes"], Reached]:
     """Advance the block by a period and record its samples."""
-    here, control, atol = queue.here(progress.block)
+    here, control, atol = scheduler.here(progress.lane_state)
     count = times.shape[0]
-    horizon = jnp.broadcast_to(control.t1, progress.block.time.shape)
+    horizon = jnp.broadcast_to(control.t1, progress.lane_state.time.shape)
 
     def going(carry: Any) -> Any:
-        block, _, _, idle, iteration = carry
-        return queue.goes_on(block, idle, progress.queued) & (iteration < PERIOD)
+        lane_state, _, _, idle, iteration = carry
+        return scheduler.goes_on(lane_state, idle, progress.scheduler) & (iteration < PERIOD)
 
     def step(carry: Any) -> Any:
-        block, sample, record, idle, iteration = carry
-        idle = idle + queue.idle(block)
+        lane_state, sample, record, idle, iteration = carry
+        idle = idle + scheduler.idle(lane_state)
         next_time = _next_time(times, sample)
         stop = jnp.where(sample < count, jnp.minimum(next_time, horizon), horizon)
-        block = block._replace(length=_even(block.length, stop - block.time, block.searching))
-        after = attempt(here, control._replace(t1=stop), atol, block)
-        reached = (block.status == RUNNING) & (after.status == REACHED_END)
+        lane_state = lane_state._replace(length=_even(lane_state.length, stop - lane_state.time, lane_state.bracketing))
+        after = try_step(here, control._replace(t1=stop), atol, lane_state)
+        reached = (lane_state.status == RUNNING) & (after.status == REACHED_END)
         is_sample = reached & (sample < count) & (after.time >= next_time)
         goes_on = reached & (after.time < horizon)
         after = after._replace(status=jnp.where(goes_on, RUNNING, after.status))
@@ -118,15 +120,16 @@ def _recorded(
         record = jax.tree.map(functools.partial(written_in_place, at=iteration), record, made)
         return after, sample + is_sample, record, idle, iteration + 1
 
-    def loop(start: tuple[Block, Int[Array, " lanes"]]) -> Any:
-        block, sample = start
+    def loop(start: tuple[LaneState, Int[Array, " lanes"]]) -> Any:
+        lane_state, sample = start
         empty = Reached(
-            jnp.zeros((PERIOD, *block.state.shape), block.state.dtype), jnp.full((PERIOD, *sample.shape), count)
+            jnp.zeros((PERIOD, *lane_state.state.shape), lane_state.state.dtype),
+            jnp.full((PERIOD, *sample.shape), count),
         )
-        return jax.lax.while_loop(going, step, (block, sample, empty, jnp.zeros((), int), jnp.zeros((), int)))
+        return jax.lax.while_loop(going, step, (lane_state, sample, empty, jnp.zeros((), int), jnp.zeros((), int)))
 
-    block, sample, record, _, iterations = queue.in_kernel(loop)((progress.block, sample))
-    return Progress(block, progress.queued, progress.iterations + iterations), sample, record
+    lane_state, sample, record, _, iterations = scheduler.in_kernel(loop)((progress.lane_state, sample))
+    return Progress(lane_state, progress.scheduler, progress.iterations + iterations), sample, record
 
 
 def _next_time(times: Float[Array, "times ..."], sample: Int[Array, " lanes"]) -> Lanes:
@@ -135,8 +138,8 @@ def _next_time(times: Float[Array, "times ..."], sample: Int[Array, " lanes"]) -
     return times[inside] if times.ndim == 1 else jnp.take_along_axis(times, inside[None], axis=0)[0]
 
 
-def _even(length: Lanes, left: Lanes, searching: Array) -> Lanes:
+def _even(length: Lanes, left: Lanes, bracketing: Array) -> Lanes:
     """The length of a step, changed a little if one or two steps then end on the next sample."""
     reach = STRETCH * length
     fitting = jnp.where(reach >= left, left, jnp.where(2.0 * reach >= left, 0.5 * left, length))
-    return jnp.where(searching, length, fitting)
+    return jnp.where(bracketing, length, fitting)

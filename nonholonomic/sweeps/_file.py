@@ -72,7 +72,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def write_file(
-    path: Path, layout: Layout, blocks: Iterable[tuple[int, dict[str, Values]]], beside: Path | None = None
+    path: Path, layout: Layout, chunks: Iterable[tuple[int, dict[str, Values]]], beside: Path | None = None
 ) -> None:
     """Write a table, all at once or not at all; a file that exists is replaced.
 
@@ -89,13 +89,13 @@ def write_file(
         with h5py.File(stream, "w", libver=("v110", "v110"), track_order=True) as file:
             _describe(file, layout)
             group = file.create_group(CHECKSUMS)
-            group.attrs["block"] = layout.block
-            sums = {name: np.zeros(layout.blocks, np.uint32) for name in layout.kinds}
-            for block, values in blocks:
+            group.attrs["block"] = layout.chunk
+            sums = {name: np.zeros(layout.chunks, np.uint32) for name in layout.kinds}
+            for chunk, values in chunks:
                 for name, kind in layout.kinds.items():
                     some = np.ascontiguousarray(values[name], kind)
-                    sums[name][block] = zlib.crc32(some)
-                    _put(file[name], some, layout.shape, *layout.ends(block))
+                    sums[name][chunk] = zlib.crc32(some)
+                    _put(file[name], some, layout.shape, *layout.ends(chunk))
                 stream.check()
             for name in layout.coords:
                 sums[name] = np.array([zlib.crc32(file[name][()])], np.uint32)
@@ -222,26 +222,26 @@ class Stored:
             values, sums = np.asarray(file[name][()]), self._sums[name]
         values = values.reshape(-1, *self.layout.inner_shape(name))
         damaged = 0
-        for block in range(self.layout.blocks):
-            first, end = self.layout.ends(block)
-            damaged += zlib.crc32(np.ascontiguousarray(values[first:end])) != sums[block]
+        for chunk in range(self.layout.chunks):
+            first, end = self.layout.ends(chunk)
+            damaged += zlib.crc32(np.ascontiguousarray(values[first:end])) != sums[chunk]
         if damaged:
             raise OSError(
-                f"cannot read {self.path}: it is damaged: {damaged} of its {self.layout.blocks} blocks do not match their "
+                f"cannot read {self.path}: it is damaged: {damaged} of its {self.layout.chunks} blocks do not match their "
                 "checksums"
             )
         return values
 
-    def block(self, block: int) -> dict[str, Values] | None:
+    def chunk(self, chunk: int) -> dict[str, Values] | None:
         """The variables of one block; `None` if its numbers are not those that were written."""
-        first, end = self.layout.ends(block)
+        first, end = self.layout.ends(chunk)
         found = {}
         with self._opened() as file:
             for name in self.layout.kinds:
                 parts = [np.asarray(file[name][box]) for box in boxes(self.layout.shape, first, end)]
                 shape = self.layout.inner_shape(name)
                 found[name] = np.concatenate([part.reshape(-1, *shape) for part in parts])
-                if zlib.crc32(found[name]) != self._sums[name][block]:
+                if zlib.crc32(found[name]) != self._sums[name][chunk]:
                     return None
         return found
 
@@ -286,7 +286,7 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
     coords = {name: np.array(words.pop(name))[values] if name in words else values for name, values in coords.items()}
     layout = Layout(coords, kinds, units, attributes, words, inner, int(file[CHECKSUMS].attrs["block"]))
     for name, shape in shapes.items():
-        if shape != layout.shape + layout.inner_shape(name) or len(sums[name]) != layout.blocks:
+        if shape != layout.shape + layout.inner_shape(name) or len(sums[name]) != layout.chunks:
             raise ValueError(f"{name} has the wrong shape")
     return layout, sums
 

@@ -25,7 +25,7 @@ class Layout(NamedTuple):
     attributes: dict[str, Any]
     words: dict[str, tuple[str, ...]]
     inner: dict[str, tuple[str, ...]]
-    block: int
+    chunk: int
 
     @property
     def axes(self) -> list[str]:
@@ -43,17 +43,17 @@ class Layout(NamedTuple):
         return math.prod(self.shape)
 
     @property
-    def blocks(self) -> int:
+    def chunks(self) -> int:
         """How many blocks it is cut into."""
-        return -(-self.cells // self.block)
+        return -(-self.cells // self.chunk)
 
-    def ends(self, block: int) -> tuple[int, int]:
+    def ends(self, chunk: int) -> tuple[int, int]:
         """The first cell of a block, and the one after its last."""
-        return block * self.block, min((block + 1) * self.block, self.cells)
+        return chunk * self.chunk, min((chunk + 1) * self.chunk, self.cells)
 
-    def size(self, block: int) -> int:
+    def size(self, chunk: int) -> int:
         """How many cells a block has."""
-        first, end = self.ends(block)
+        first, end = self.ends(chunk)
         return end - first
 
     def inner_shape(self, name: str) -> tuple[int, ...]:

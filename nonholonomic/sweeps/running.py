@@ -16,19 +16,19 @@ import numpy as np
 
 from ..progress import Progress
 from ..validation import require_flag
-from ._blocks import Blocks
+from ._chunks import ChunkStore
 from ._file import LONG_NAMES, Stored
+from .dispatch import MAX_CRASHES, ExecutorBroken, handed_out
 from .grid import Axis, Variable, columns, size_of
-from .handing import DEATHS, Lost, handed_out
 from .layout import Layout, Values
 from .table import Table
-from .tasks import Job, Work, packed, remote_results, stamp, versions
+from .tasks import ChunkTask, Job, packed, remote_results, stamp, versions
 
 #: The most blocks that are handed out at once: their results are held in memory until they are stored.
 HANDED_OUT = 512
 
 #: About how many blocks a large grid is cut into, and what the results of one may take [bytes].
-BLOCKS, MOST_BYTES = 1024, 1 << 21
+CHUNKS, MOST_BYTES = 1024, 1 << 21
 
 
 def sweep(
@@ -38,7 +38,7 @@ def sweep(
     request: dict[str, Any],
     *,
     path: Any = None,
-    block: int | None = None,
+    chunk: int | None = None,
     most: int | None = None,
     inner: Sequence[Axis] = (),
     progress: bool = True,
@@ -71,16 +71,16 @@ def sweep(
     if executor is not None and not isinstance(executor, Executor):
         raise ValueError(f"executor = {executor!r} must be a concurrent.futures.Executor, or None")
     cells = size_of(axes)
-    given = block_for(cells) if block is None else block
+    given = chunk_for(cells) if chunk is None else chunk
     given = given if most is None else min(given, most)
     layout = layout_of(axes, inner, variables, request, given)
-    layout = layout._replace(block=given * blocks_together(layout, given))
-    work = Work(job, axes, given)
-    store = Held(layout) if path is None else Blocks(path, layout)
+    layout = layout._replace(chunk=given * chunks_together(layout, given))
+    work = ChunkTask(job, axes, given)
+    store = Held(layout) if path is None else ChunkStore(path, layout)
     try:
         found = store.filled(computed(work, layout, store.finished, executor, progress))
         return Table.of(found) if isinstance(found, Stored) else Table.laid_out(layout, found)
-    except Lost as error:
+    except ExecutorBroken as error:
         kept = (
             "nothing is kept without path=" if path is None else f"{path} has what is done; the same call does the rest"
         )
@@ -90,10 +90,10 @@ def sweep(
 
 
 def computed(
-    work: Work, layout: Layout, finished: set[int], executor: Executor | None, progress: bool
+    work: ChunkTask, layout: Layout, finished: set[int], executor: Executor | None, progress: bool
 ) -> Iterator[tuple[int, dict[str, Values]]]:
     """The blocks that are not finished, each as it is computed; see `sweep`."""
-    todo = [block for block in range(layout.blocks) if block not in finished]
+    todo = [chunk for chunk in range(layout.chunks) if chunk not in finished]
     done = layout.cells - sum(map(layout.size, todo))
     with Progress(layout.cells, "cell", shown=progress) as shown, workforce(work, executor) as submit:
         begun = executor is None
@@ -102,21 +102,21 @@ def computed(
                 work.compile()
             shown.begin(done)
         try:
-            for block, values in handed_out(lambda block: submit(block * layout.block, layout.block), todo, HANDED_OUT):
-                yield block, given_up(work.axes, layout, block) if values is None else values
-                done += layout.size(block)
+            for chunk, values in handed_out(lambda chunk: submit(chunk * layout.chunk, layout.chunk), todo, HANDED_OUT):
+                yield chunk, failed_chunk(work.axes, layout, chunk) if values is None else values
+                done += layout.size(chunk)
                 # Where others compute, nobody tells when the first of them has compiled.
                 if begun:
-                    shown.advance(layout.size(block))
+                    shown.advance(layout.size(chunk))
                 else:
                     shown.begin(done)
                 begun = True
-        except Lost as error:
-            raise Lost(f"{error}; {done} of {layout.cells} cells are done") from error.__cause__
+        except ExecutorBroken as error:
+            raise ExecutorBroken(f"{error}; {done} of {layout.cells} cells are done") from error.__cause__
 
 
 def layout_of(
-    axes: list[Axis], inner: Sequence[Axis], variables: dict[str, Variable], request: dict[str, Any], block: int
+    axes: list[Axis], inner: Sequence[Axis], variables: dict[str, Variable], request: dict[str, Any], chunk: int
 ) -> Layout:
     """What a sweep's table is made of; see `sweep`."""
     coords = {one.name: one.values for one in (*axes, *inner)}
@@ -135,7 +135,7 @@ def layout_of(
     kinds = {name: np.dtype(one.kind) for name, one in variables.items()}
     words = {name: one.words for name, one in variables.items() if one.words is not None}
     dims = {name: one.inner for name, one in variables.items() if one.inner}
-    return Layout(coords, kinds, units, attributes, words, dims, block)
+    return Layout(coords, kinds, units, attributes, words, dims, chunk)
 
 
 class Held:
@@ -157,8 +157,8 @@ class Held:
 
     def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> dict[str, Values]:
         """Keep the blocks that are computed; the variables, with all cells along the first axis."""
-        for block, values in computed:
-            first, end = self._layout.ends(block)
+        for chunk, values in computed:
+            first, end = self._layout.ends(chunk)
             for name, some in values.items():
                 self._found[name][first:end] = some
         return self._found
@@ -168,7 +168,7 @@ class Held:
 
 
 @contextlib.contextmanager
-def workforce(work: Work, executor: Executor | None) -> Iterator[Callable[[int, int], Future]]:
+def workforce(work: ChunkTask, executor: Executor | None) -> Iterator[Callable[[int, int], Future]]:
     """Who computes: a function that has `count` cells from `first` on computed.
 
     Threads share this process, and what it has compiled. Any other executor is sent all that it takes.
@@ -186,13 +186,13 @@ def workforce(work: Work, executor: Executor | None) -> Iterator[Callable[[int, 
         yield lambda first, count: executor.submit(remote_results, sent, needed, first, count, uuid.uuid4().hex)
 
 
-def given_up(axes: list[Axis], layout: Layout, block: int) -> dict[str, Values]:
+def failed_chunk(axes: list[Axis], layout: Layout, chunk: int) -> dict[str, Values]:
     """The results of a block that is given up: `failed`, and no numbers; a warning names its cells."""
-    first, end = layout.ends(block)
+    first, end = layout.ends(chunk)
     ends = [columns(axes, cell, 1) for cell in (first, end - 1)]
     named = ", ".join(f"{name} {ends[0][name].item():.6g} to {ends[1][name].item():.6g}" for name in ends[0])
     warnings.warn(
-        f"cells {first} to {end - 1} ({named}) are given up as failed: {DEATHS} workers or more died of them",
+        f"cells {first} to {end - 1} ({named}) are given up as failed: {MAX_CRASHES} workers or more died of them",
         RuntimeWarning,
         stacklevel=4,
     )
@@ -200,7 +200,7 @@ def given_up(axes: list[Axis], layout: Layout, block: int) -> dict[str, Values]:
     return layout.empty(end - first, words.index("failed"))
 
 
-def block_for(cells: int) -> int:
+def chunk_for(cells: int) -> int:
     """Cells in a block: few different sizes, so that few programs are compiled, but many blocks, to be shared among cores.
 
     It does not depend on the number of cores, so that a file can be resumed on another machine.
@@ -211,9 +211,9 @@ def block_for(cells: int) -> int:
     return 64 if cells <= 64 else 128 if cells <= 4096 else 512
 
 
-def blocks_together(layout: Layout, block: int) -> int:
+def chunks_together(layout: Layout, chunk: int) -> int:
     """How many blocks are handed out and stored as one, a power of two: more than one where the grid is large."""
-    wanted = min(layout.cells // (BLOCKS * block), MOST_BYTES // layout.bytes_of_cells(block))
+    wanted = min(layout.cells // (CHUNKS * chunk), MOST_BYTES // layout.bytes_of_cells(chunk))
     return 1 << max(wanted, 1).bit_length() - 1
 
 

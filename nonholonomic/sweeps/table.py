@@ -10,7 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from ..parameters import as_html, readable_unit
-from ._blocks import unfinished
+from ._chunks import unfinished
 from ._file import HELD, LONG_NAMES, Stored, StoredVariables, coded, replacing, write_file
 from .digits import concise_strings
 from .layout import UNREACHED, Layout, Values, axes_of
@@ -111,7 +111,7 @@ class Table(eqx.Module):
             for name, words in self.words.items():
                 known = np.array([*words, UNREACHED])
                 dataset[name] = dataset[name].copy(
-                    data=dataset[name].data.map_blocks(known.__getitem__, dtype=known.dtype)
+                    data=dataset[name].data.map_chunks(known.__getitem__, dtype=known.dtype)
                 )
             return dataset
 
@@ -142,8 +142,8 @@ class Table(eqx.Module):
         kinds = {name: values.dtype for name, values in stored.items()}
         layout = Layout(self.coords, kinds, self.units, self.attributes, words, self.inner, BLOCK)
         flat = {name: values.reshape(-1, *layout.inner_shape(name)) for name, values in stored.items()}
-        ends = enumerate(map(layout.ends, range(layout.blocks)))
-        cut = ((block, {name: some[first:end] for name, some in flat.items()}) for block, (first, end) in ends)
+        ends = enumerate(map(layout.ends, range(layout.chunks)))
+        cut = ((chunk, {name: some[first:end] for name, some in flat.items()}) for chunk, (first, end) in ends)
         write_file(Path(path), layout, cut)
 
     @classmethod

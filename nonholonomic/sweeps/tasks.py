@@ -22,29 +22,29 @@ Job = Callable[[dict[str, Values], int], dict[str, Values]]
 MUST_AGREE = ("nonholonomic", "jax", "jaxlib", "diffrax", "float")
 
 
-class Work(NamedTuple):
+class ChunkTask(NamedTuple):
     """A job and the grid it is for; `block`: how many cells the job is given at once, so that one compiled program serves."""
 
     job: Job
     axes: list[Axis]
-    block: int
+    chunk: int
 
     def compile(self) -> None:
         """Call the job with no cell that counts."""
-        self.job(columns(self.axes, 0, self.block), 0)
+        self.job(columns(self.axes, 0, self.chunk), 0)
 
     def results(self, first: int, count: int) -> dict[str, Values]:
         """The results of `count` cells from `first` on."""
         end = min(first + count, size_of(self.axes))
         parts = []
-        for start in range(first, end, self.block):
-            counted = min(self.block, end - start)
-            found = self.job(columns(self.axes, start, self.block), counted)
+        for start in range(first, end, self.chunk):
+            counted = min(self.chunk, end - start)
+            found = self.job(columns(self.axes, start, self.chunk), counted)
             parts.append({name: np.asarray(values)[:counted] for name, values in found.items()})
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def packed(work: Work) -> bytes:
+def packed(work: ChunkTask) -> bytes:
     """The work as another process can be sent it.
 
     **Raises:** `ValueError` that says what cannot be sent.
@@ -83,7 +83,7 @@ _unpacking = threading.Lock()
 
 
 @functools.lru_cache(maxsize=4)
-def _unpacked(sent: bytes) -> Work:
+def _unpacked(sent: bytes) -> ChunkTask:
     """The work, compiled: once in a process, however many parts of it come this way."""
     work = pickle.loads(sent)
     work.compile()

@@ -93,7 +93,7 @@ PALE = 0xF4E9D2
 DARK = 0x3A3A3E
 
 
-def told_by_colour(shows: tuple[Show, ...]) -> tuple[Show, ...]:
+def distinguished_by_colour(shows: tuple[Show, ...]) -> tuple[Show, ...]:
     """The shows of one stage: where there are several, the traces of each have its colour."""
     if len(shows) == 1:
         return shows

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..progress import telling
+from ..progress import status_line
 from .animation import draw_curves, write_animation
 from .page import Page, page
 from .stage import Stage
@@ -19,7 +19,7 @@ class Viewable(abc.ABC):
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
         """This run and others as they are drawn: each in its own place, or all in that of the first."""
 
-    @telling("drawing")
+    @status_line("drawing")
     def view(self, path: Any = None, others: Sequence[Any] = (), overlaid: bool = False) -> Page:
         """A page in which the run moves: body, arena, traces, arrows, and curves over time (needs k3d).
 
@@ -44,7 +44,7 @@ class Viewable(abc.ABC):
             found.save(path)
         return found
 
-    @telling("drawing")
+    @status_line("drawing")
     def animate(self, path: Any, times: Any = None, others: Sequence[Any] = (), overlaid: bool = False) -> None:
         """Write an animation for slides, 25 pictures a second (needs matplotlib).
 
@@ -60,7 +60,7 @@ class Viewable(abc.ABC):
         """
         write_animation(self.stages(others, overlaid), path, None if times is None else np.asarray(times, dtype=float))
 
-    @telling("drawing")
+    @status_line("drawing")
     def plot(self, others: Sequence[Any] = ()) -> Any:
         """Draw the curves of the page over time (needs matplotlib).
 

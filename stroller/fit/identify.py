@@ -11,7 +11,7 @@ from nonholonomic import identification as generic
 from nonholonomic.identification import Free, Identification, of_data, predicted
 from nonholonomic.integration import tolerance_bound
 from nonholonomic.parameters import numbers, with_numbers
-from nonholonomic.progress import telling
+from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number
 
 from ..model.scene import Scene
@@ -101,7 +101,7 @@ def identify(
     ```
     """
     generic.check_search(starts, spread, seed, max_steps, progress)
-    with telling("fitting", progress):
+    with status_line("fitting", progress):
         if not isinstance(scene, Scene):
             raise ValueError(f"scene = {scene!r} must be a Scene")
         data = tuple(data) if isinstance(data, list | tuple) else (data,)

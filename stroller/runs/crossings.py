@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from nonholonomic.integration import few_trials
 
 from ..model.dynamics import State
-from .ride import RideRecipe
+from .ride import RideSpec
 from .steps import Lanes, States, Steps, in_blocks
 
 #: What can be watched: the normal force [N], the cosine of the steering angle, and the relative reduced mass.
@@ -29,36 +29,36 @@ CLOSEST = 1e-14
 class Between(NamedTuple):
     """A watched quantity, less a level, at any time of a run."""
 
-    recipe: RideRecipe
+    spec: RideSpec
     steps: Steps
     name: str
     level: float
 
     def at(self, times: Lanes) -> Lanes:
         """The quantity at the given times; what is not a number counts as beyond the level."""
-        value = watched(self.recipe, self.steps.at(self.recipe, times), self.name) - self.level
+        value = watched(self.spec, self.steps.at(self.spec, times), self.name) - self.level
         return np.where(np.isfinite(value), value, -np.inf)
 
 
-def watched(recipe: RideRecipe, states: States, name: str) -> Lanes:
+def watched(spec: RideSpec, states: States, name: str) -> Lanes:
     """A quantity of `WATCHED` at some states."""
-    return in_blocks(lambda at: _watched(recipe, at), states)[WATCHED.index(name)]
+    return in_blocks(lambda at: _watched(spec, at), states)[WATCHED.index(name)]
 
 
 @eqx.filter_jit
-def _watched(recipe: RideRecipe, states: State) -> Float[Array, "watched lanes"]:
-    dynamics = recipe.ride.scene.dynamics
+def _watched(spec: RideSpec, states: State) -> Float[Array, "watched lanes"]:
+    dynamics = spec.ride.scene.dynamics
     found = (dynamics.contact(states), dynamics.geometry(states).cosine, dynamics.rank(states))
     return jnp.stack(jnp.broadcast_arrays(*found))
 
 
-def crossings(recipe: RideRecipe, steps: Steps, name: str, level: float) -> Float[np.ndarray, " times"]:
+def crossings(spec: RideSpec, steps: Steps, name: str, level: float) -> Float[np.ndarray, " times"]:
     """Times [s] at which a watched quantity passes a level, in either direction, in increasing order."""
-    time, value = steps.times, watched(recipe, steps.states, name) - level
+    time, value = steps.times, watched(spec, steps.states, name) - level
     which = np.flatnonzero(_may_cross(value))
     if which.size == 0:
         return np.zeros(0)
-    quantity = Between(recipe, steps, name, level)
+    quantity = Between(spec, steps, name, level)
     parts = np.arange(1, PARTS) / PARTS
     new = (time[which] + parts[:, None] * (time[which + 1] - time[which])).ravel()
     for _ in range(1 + CLOSER_LOOKS):

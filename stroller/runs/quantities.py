@@ -50,7 +50,7 @@ def table_of(runs: list[Any], names: list[str], request: dict[str, Any]) -> Tabl
     - `names`: of the runs, without spaces, which become an axis "ride"; none for the only run.
     - `request`: plain data that says what was computed.
     """
-    flat = {isinstance(run.recipe.ride.scene.surface, Plane) for run in runs}
+    flat = {isinstance(run.spec.ride.scene.surface, Plane) for run in runs}
     # On grounds of both kinds a place has no common unit.
     places, unit = {True: (("x", "y"), "m"), False: (("mu", "eta"), "rad")}[flat.pop()]
     places, unit = (("first", "second"), "m or rad") if flat else (places, unit)
@@ -83,5 +83,5 @@ def table_of_one(run: Any) -> Table:
     """
     if np.ndim(run.t) != 1:
         raise ValueError("a batch of runs is no table of one: stroller.sweep makes a table of many")
-    request = description("scene", run.recipe.ride.scene) | {"status": run.status}
+    request = description("scene", run.spec.ride.scene) | {"status": run.status}
     return table_of([run], [], request)

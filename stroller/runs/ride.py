@@ -65,13 +65,13 @@ class RideProblem(AbstractProblem):
     def field(self, time: Float[Array, "..."], state: State) -> Any:
         return self.dynamics.field(time, state, self.input)
 
-    def crossing(self, state: State) -> Any:
+    def event_function(self, state: State) -> Any:
         return self.dynamics.contact(state) / self.press + CONTACT_ROUND_OFF if self.watched else None
 
     def crossing_along(self, state: State, rate: State) -> Any:
         return self.dynamics.contact_along(state, rate) / self.press + CONTACT_ROUND_OFF if self.watched else None
 
-    def guard(self, time: Float[Array, "..."], state: State) -> Any:
+    def domain_margin(self, time: Float[Array, "..."], state: State) -> Any:
         return self.dynamics.rank(state) / RANK_LOST - 1.0 if self.guarded else None
 
 
@@ -94,14 +94,14 @@ class Ride(NamedTuple):
     grid: Float[Array, " steps"] | None
 
 
-class RideRecipe(eqx.Module):
+class RideSpec(eqx.Module):
     """A `Ride` as it can leave a transformation: its numbers are leaves and everything else is static."""
 
     numbers: Any
     rest: Any = eqx.field(static=True)
 
     @classmethod
-    def of(cls, ride: Ride) -> "RideRecipe":
+    def of(cls, ride: Ride) -> "RideSpec":
         """The recipe of a ride."""
         return cls(*eqx.partition(ride, eqx.is_array_like))
 

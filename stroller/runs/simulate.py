@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.integration import LOOSEST, ImplicitMidpoint, Settings, run_bounds, times_bounds
-from nonholonomic.progress import telling
+from nonholonomic.progress import status_line
 from nonholonomic.validation import as_known, is_traced, legal, nan_unless
 
 from ..model.input import Input
 from ..model.launch import Launch
 from ..model.scene import Scene
 from .checks import check_options, check_run, check_times
-from .ride import Ride, RideRecipe, as_module, traced_ride
+from .ride import Ride, RideSpec, as_module, traced_ride
 from .steps import followed
 from .trajectory import Trajectory, read_off
 
@@ -26,7 +26,7 @@ from .trajectory import Trajectory, read_off
 DEFAULT_TIMES = 201
 
 
-@telling("simulating")
+@status_line("simulating")
 def simulate(
     scene: Scene,
     launch: Launch,
@@ -94,11 +94,11 @@ def simulate(
 
 def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
     """The run of concrete numbers."""
-    recipe = RideRecipe.of(ride)
+    spec = RideSpec.of(ride)
     if not isinstance(ride.settings.for_single_runs, diffrax.AbstractERK | ImplicitMidpoint):
-        return _read_off(recipe, times, *_sampled(ride, times))
-    steps, stats = followed(recipe)
-    return dataclasses.replace(_read_off(recipe, times, steps.at(recipe, np.asarray(times)), stats), steps=steps)
+        return _read_off(spec, times, *_sampled(ride, times))
+    steps, stats = followed(spec)
+    return dataclasses.replace(_read_off(spec, times, steps.at(spec, np.asarray(times)), stats), steps=steps)
 
 
 _read_off = eqx.filter_jit(read_off)
@@ -122,7 +122,7 @@ def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.Ab
     if adjoint is not None:
         # Diffrax would differentiate the run that is not begun.
         begun = begun._replace(**nan_unless(may, {"scene": ride.scene, "launch": ride.launch, "input": ride.input}))
-    run = read_off(RideRecipe.of(ride), run_times, *traced_ride(begun, run_times, adjoint))
+    run = read_off(RideSpec.of(ride), run_times, *traced_ride(begun, run_times, adjoint))
     stats = run.stats._replace(finished=run.stats.finished & may)
     return eqx.tree_at(lambda one: (one.t, one.stats), nan_unless(may, run), (times, stats))
 

@@ -17,7 +17,7 @@ from nonholonomic.integration import explicit_tableau, follow, sample
 from nonholonomic.xla_cpu import compiled_quickly
 
 from ..model.dynamics import State
-from .ride import RideProblem, RideRecipe, Stats
+from .ride import RideProblem, RideSpec, Stats
 
 Lanes = Float[np.ndarray, " lanes"]
 States = Float[np.ndarray, "components lanes"]
@@ -32,24 +32,24 @@ class Steps(NamedTuple):
     times: Float[np.ndarray, " steps"]
     states: Float[np.ndarray, "components steps"]
 
-    def at(self, recipe: RideRecipe, times: Lanes) -> States:
+    def at(self, spec: RideSpec, times: Lanes) -> States:
         """The states at the given times [s]; not a number after the end of the run."""
         which = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         ends = np.where(times == self.times[which], which, which + 1)
         states = self.states[:, ends]
         inside = (times > self.times[which]) & (times < self.times[which + 1])
         if inside.any():
-            states[:, inside] = self._between(recipe, which[inside], times[inside] - self.times[which[inside]])
+            states[:, inside] = self._between(spec, which[inside], times[inside] - self.times[which[inside]])
         states[:, times > self.times[-1]] = np.nan
         return states
 
-    def _between(self, recipe: RideRecipe, which: Any, length: Lanes) -> States:
+    def _between(self, spec: RideSpec, which: Any, length: Lanes) -> States:
         """The states some time [s] after the starts of some steps."""
 
         def field(times: Lanes, states: States) -> States:
-            return in_blocks(lambda *at: _field(recipe, *at), times, states)
+            return in_blocks(lambda *at: _field(spec, *at), times, states)
 
-        time, start, solver = self.times[which], self.states[:, which], recipe.ride.settings.for_single_runs
+        time, start, solver = self.times[which], self.states[:, which], spec.ride.settings.for_single_runs
         rates = [field(time, start)]
         if not isinstance(solver, diffrax.AbstractERK):
             # The cubic through states and rates at both ends; an implicit step cannot be repeated so cheaply.
@@ -66,8 +66,8 @@ class Steps(NamedTuple):
 
 
 @eqx.filter_jit
-def _field(recipe: RideRecipe, times: Float[Array, " lanes"], states: State) -> State:
-    ride = recipe.ride
+def _field(spec: RideSpec, times: Float[Array, " lanes"], states: State) -> State:
+    ride = spec.ride
     return ride.scene.dynamics.field(times, states, ride.input)
 
 
@@ -81,14 +81,14 @@ def in_blocks(function: Callable[..., Any], *columns: Any) -> Any:
     return np.concatenate(found, axis=-1)[..., :count]
 
 
-def followed(recipe: RideRecipe) -> tuple[Steps, Stats]:
+def followed(spec: RideSpec) -> tuple[Steps, Stats]:
     """Run a ride outside of transformations, and keep its steps."""
-    ride = recipe.ride
-    problem = _problem(recipe)
+    ride = spec.ride
+    problem = _problem(spec)
     if ride.grid is None:
         path = follow(problem, float(ride.t1), ride.settings)
         return Steps(path.times, path.states), _counted(path.accepted, path.rejected, not path.failed)
-    found = _on_grid(problem, recipe)
+    found = _on_grid(problem, spec)
     ends = np.asarray(ride.grid)
     good = ends <= float(found.end_time)
     steps = Steps(ends[good], np.asarray(found.states)[:, good])
@@ -101,13 +101,13 @@ def _counted(accepted: int, rejected: int, finished: bool) -> Stats:
 
 
 @eqx.filter_jit
-def _problem(recipe: RideRecipe) -> RideProblem:
-    ride = recipe.ride
+def _problem(spec: RideSpec) -> RideProblem:
+    ride = spec.ride
     return RideProblem.single(ride.scene, ride.launch, ride.input)
 
 
 @compiled_quickly
-def _on_grid(problem: RideProblem, recipe: RideRecipe) -> Any:
+def _on_grid(problem: RideProblem, spec: RideSpec) -> Any:
     """A ride with given steps, sampled at their ends."""
-    ride = recipe.ride
+    ride = spec.ride
     return sample(problem, None, ride.t1, ride.settings, grid=ride.grid)

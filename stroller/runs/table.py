@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import AbstractSurface
-from nonholonomic.integration import FAILED, GUARD_LOST, Settings, compiled_march, explicit_tableau
+from nonholonomic.integration import FAILED, LEFT_DOMAIN, Settings, explicit_tableau, solve_ensemble
 from nonholonomic.parameters import description, with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, cells_to_check
 from nonholonomic.sweeps import sweep as computed
@@ -173,10 +173,10 @@ class RideJob(NamedTuple):
         problem = RideProblem.of(cells["scene"], cells["launch"], controls, size, watched=True)
         horizon, settings = as_number(self.t1), Settings(self.tolerance, self.solver)
         # A ride goes on where contact is lost, as if the ground could pull.
-        outcome, _ = compiled_march(problem, horizon, jnp.asarray(count), settings, passes=problem.watched)
+        outcome, _ = solve_ensemble(problem, horizon, jnp.asarray(count), settings, passes=problem.watched)
         contact_time = np.asarray(outcome.first_crossing)
         lost = np.isfinite(contact_time)
-        words = np.select([outcome.status == FAILED, outcome.status == GUARD_LOST, lost], [3, 2, 1], 0)
+        words = np.select([outcome.status == FAILED, outcome.status == LEFT_DOMAIN, lost], [3, 2, 1], 0)
         ends = read_ends(cells["scene"], outcome.state, problem.states)
         return {name: np.asarray(values) for name, values in ends.items()} | {
             "contact_time": contact_time,

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
 from nonholonomic.parameters import text_as_html
-from nonholonomic.progress import telling
+from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import is_traced
 from nonholonomic.views import Stage, Viewable, draw_portrait
@@ -22,7 +22,7 @@ from ..model.input import Input
 from ..model.scene import Scene
 from .crossings import crossings, watched
 from .quantities import table_of_one
-from .ride import CONTACT_ROUND_OFF, RANK_LOST, RideRecipe, Stats
+from .ride import CONTACT_ROUND_OFF, RANK_LOST, RideSpec, Stats
 from .steps import Steps, followed
 from .view import as_stages
 
@@ -40,7 +40,7 @@ class Trajectory(eqx.Module, Viewable):
     - `normal_force` [N] of the ground, and `load` [N] on the rear and the front axle, (times, 2);
     - `constraint` [m/s]: speed at which the rear axle and the front wheel slip sideways, (times, 2);
     - `departure`: how far the position is off the ground [m]: an error of the integration;
-    - `stats` of the integration; `recipe`: what made the run; `steps`: where its steps ended, `None` if it was made inside a
+    - `stats` of the integration; `spec`: what made the run; `steps`: where its steps ended, `None` if it was made inside a
       transformation: what happened between the times is then found by running it once more, when it is asked for.
 
     **Example:**
@@ -79,7 +79,7 @@ class Trajectory(eqx.Module, Viewable):
     departure: Float[Array, " times"]
     state: Float[Array, "times components"]
     stats: Stats
-    recipe: RideRecipe
+    spec: RideSpec
     steps: Steps | None
 
     @property
@@ -94,7 +94,7 @@ class Trajectory(eqx.Module, Viewable):
         K is the Gaussian curvature (`stroller.md`, section 9). The model holds for a wheelbase short against the radii of
         curvature.
         """
-        scene = self.recipe.ride.scene
+        scene = self.spec.ride.scene
         states = self.state.T
         curvature = scene.surface.gaussian_curvature(scene.dynamics.unpack(states)[0])
         return jnp.abs(spread(curvature, states[0])) * scene.body.wheelbase**2 / 6.0
@@ -110,13 +110,13 @@ class Trajectory(eqx.Module, Viewable):
 
     def with_steps(self) -> "Trajectory":
         """The same run with its steps."""
-        return self if self.steps is not None else dataclasses.replace(self, steps=followed(self.recipe)[0])
+        return self if self.steps is not None else dataclasses.replace(self, steps=followed(self.spec)[0])
 
     @property
     def contact_lost_at(self) -> float:
         """Time [s] at which the ground first has to pull to keep the stroller on it; infinite if it never does."""
         run = self.with_steps()
-        force = watched(run.recipe, run.steps.states, "normal_force")
+        force = watched(run.spec, run.steps.states, "normal_force")
         allowed = -CONTACT_ROUND_OFF * np.max(np.abs(force[np.isfinite(force)]), initial=0.0)
         return run._first_below("normal_force", allowed)
 
@@ -128,14 +128,14 @@ class Trajectory(eqx.Module, Viewable):
     @property
     def jackknifed_at(self) -> Float[np.ndarray, " times"]:
         """Times [s] at which the steering angle passes a right angle, where the rear axle reverses."""
-        return crossings(self.recipe, self.with_steps().steps, "steering_cosine", 0.0)
+        return crossings(self.spec, self.with_steps().steps, "steering_cosine", 0.0)
 
     def _first_below(self, name: str, level: float) -> float:
         """Time [s] at which a watched quantity first is below a level; infinite if it never is."""
         assert self.steps is not None
-        if watched(self.recipe, self.steps.states[:, :1], name)[0] < level:
+        if watched(self.spec, self.steps.states[:, :1], name)[0] < level:
             return float(self.steps.times[0])
-        return float(min(crossings(self.recipe, self.steps, name, level), default=np.inf))
+        return float(min(crossings(self.spec, self.steps, name, level), default=np.inf))
 
     @property
     def status(self) -> str:
@@ -150,7 +150,7 @@ class Trajectory(eqx.Module, Viewable):
             return "rank_lost"
         return "contact_lost" if np.isfinite(run.contact_lost_at) else "completed"
 
-    @telling("reading off")
+    @status_line("reading off")
     def to_table(self) -> Table:
         """All that can be read off the run, as a `Table` over its times.
 
@@ -195,7 +195,7 @@ class Trajectory(eqx.Module, Viewable):
     def _repr_html_(self) -> str:
         return text_as_html(str(self))
 
-    @telling("reading off")
+    @status_line("reading off")
     def __str__(self) -> str:
         # A batch, or a run inside a transformation, has no numbers to show.
         if is_traced(self.t) or self.t.ndim > 1:
@@ -267,13 +267,13 @@ def side_force(
 
 
 def read_off(
-    recipe: RideRecipe,
+    spec: RideSpec,
     t: Float[Array, " times"],
     states: Float[Array, "components times"],
     stats: Stats,
 ) -> Trajectory:
     """The trajectory of the given states at the given times."""
-    scene, controls = recipe.ride.scene, recipe.ride.input
+    scene, controls = spec.ride.scene, spec.ride.input
     dynamics, surface = scene.dynamics, scene.surface
     integrated, states = states, scene.dynamics.righted(states)
     g = dynamics.geometry(states)
@@ -308,6 +308,6 @@ def read_off(
         departure=spread(surface.offset(motion.position), like),
         state=integrated.T,
         stats=stats,
-        recipe=recipe,
+        spec=spec,
         steps=None,
     )

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from nonholonomic.geometry import AbstractSurface
-from nonholonomic.parameters import told_apart
+from nonholonomic.parameters import distinguishing_labels
 from nonholonomic.views import (
     COLOURS,
     DARK,
@@ -20,7 +20,7 @@ from nonholonomic.views import (
     arena,
     bar,
     box,
-    told_by_colour,
+    distinguished_by_colour,
     turned,
     wheel,
 )
@@ -44,9 +44,9 @@ GREEN, BLUE, VIOLET, GOLD = 0x1F8A4C, 0x1B6CA8, 0x7B4FA3, 0xE0A100
 
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     """Rides as they are drawn: a stage for each, or one for all if they are to be overlaid."""
-    rides = [run.recipe.ride for run in runs]
+    rides = [run.spec.ride for run in runs]
     starts = [f"ride of {float(run.t[-1]):.3g} s" for run in runs]
-    names = told_apart(starts, [ride.scene for ride in rides], [ride.launch for ride in rides])
+    names = distinguishing_labels(starts, [ride.scene for ride in rides], [ride.launch for ride in rides])
     return grouped([list(enumerate(runs))] if overlaid else [[one] for one in enumerate(runs)], names)
 
 
@@ -54,9 +54,9 @@ def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage
     """A stage for each group of rides, which are numbered and have one ground; `names` are those of the rides."""
     found = []
     for group in groups:
-        scene = group[0][1].recipe.ride.scene
+        scene = group[0][1].spec.ride.scene
         length = float(scene.body.wheelbase)
-        shows = told_by_colour(tuple(show(run, k, names[k]) for k, run in group))
+        shows = distinguished_by_colour(tuple(show(run, k, names[k]) for k, run in group))
         points = np.concatenate([np.asarray(run.position) for _, run in group])
         normal = normals(scene.surface, scene.side, np.asarray(group[0][1].position)[:1])[0]
         ground = arena(scene.surface, points, normal, 3.0 * length, length)
@@ -76,7 +76,7 @@ def show(run: Any, number: int, name: str) -> Show:
     """One ride as it is drawn, the `number`-th of all."""
     if run.t.ndim > 1:
         raise ValueError(f"a batch of rides, of shape {run.t.shape}, cannot be shown: take one of them")
-    scene = run.recipe.ride.scene
+    scene = run.spec.ride.scene
     length, colour = float(scene.body.wheelbase), COLOURS[number % len(COLOURS)]
     radius, half = RADIUS * length, TRACK * length / 2.0
     given = np.asarray(run.t)

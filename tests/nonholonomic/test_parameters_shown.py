@@ -7,7 +7,7 @@ import pytest
 
 import stroller
 import tippe
-from nonholonomic.parameters import as_html, as_text, in_lines, readable_unit, text_as_html, told_apart
+from nonholonomic.parameters import as_html, as_text, distinguishing_labels, in_lines, readable_unit, text_as_html
 
 
 @pytest.mark.parametrize(
@@ -58,10 +58,10 @@ def test_runs_are_told_apart_by_what_differs():
         tippe.Scene(body, tippe.Plane(), tippe.Viscous(0.3)),
         tippe.Scene(body, tippe.Plane(), tippe.Viscous(0.2)),
     ]
-    assert told_apart(["a", "a"], scenes) == ["a, mu 0.3 s/m", "a, mu 0.2 s/m"]
+    assert distinguishing_labels(["a", "a"], scenes) == ["a, mu 0.3 s/m", "a, mu 0.2 s/m"]
     scenes[1] = tippe.Scene(body, tippe.Cylinder(0.3), tippe.Viscous(0.3))
-    assert told_apart(["a", "b"], scenes) == ["a, Plane", "b, Cylinder"]
-    assert told_apart(["a", "b", "a"], [scenes[0]] * 3) == ["a (1)", "b", "a (2)"]
+    assert distinguishing_labels(["a", "b"], scenes) == ["a, Plane", "b, Cylinder"]
+    assert distinguishing_labels(["a", "b", "a"], [scenes[0]] * 3) == ["a (1)", "b", "a (2)"]
 
 
 def test_no_public_object_shows_the_shapes_of_its_arrays():

@@ -19,7 +19,7 @@ from terminal import Terminal, left, watched, words
 from nonholonomic import progress
 from nonholonomic.derivatives import growth
 from nonholonomic.integration import REACHED_END, Settings
-from nonholonomic.progress import Progress, telling
+from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Variable, axis, sweep
 
 pytestmark = pytest.mark.newest
@@ -91,7 +91,7 @@ def test_what_is_told_is_whether_a_program_is_being_made(monkeypatch):
         time.sleep(0.3)
         return x
 
-    with telling("simulating"):
+    with status_line("simulating"):
         jax.jit(waits)(1.0)
         time.sleep(0.3)
     told = words(terminal)
@@ -103,8 +103,8 @@ def test_what_is_told_is_whether_a_program_is_being_made(monkeypatch):
 def test_a_line_within_a_line_does_not_garble_it(monkeypatch):
     """One that counts takes the line while it lasts; one that does not, leaves it alone."""
     terminal = watched(monkeypatch)
-    with telling("fitting"):
-        with telling("simulating"):
+    with status_line("fitting"):
+        with status_line("simulating"):
             time.sleep(0.3)
         with Progress(2, "fit") as counted:
             counted.begin()
@@ -120,7 +120,7 @@ def test_a_line_within_a_line_does_not_garble_it(monkeypatch):
 
 def test_what_is_to_be_quiet_quiets_what_it_calls(monkeypatch):
     terminal = watched(monkeypatch)
-    with telling("fitting", shown=False), telling("simulating"), Progress(1, "fit"):
+    with status_line("fitting", shown=False), status_line("simulating"), Progress(1, "fit"):
         time.sleep(0.3)
     assert terminal.lines == []
 
@@ -128,7 +128,7 @@ def test_what_is_to_be_quiet_quiets_what_it_calls(monkeypatch):
 def test_nothing_is_left_behind_after_an_error_and_nothing_is_in_the_way_of_what_is_printed(monkeypatch):
     terminal = watched(monkeypatch)
 
-    @telling("simulating")
+    @status_line("simulating")
     def fails():
         time.sleep(0.3)
         raise ZeroDivisionError
@@ -160,7 +160,7 @@ def test_short_calls_start_no_threads(monkeypatch):
     started, start = [], threading.Thread.start
     monkeypatch.setattr(threading.Thread, "start", lambda self: (started.append(self), start(self)))
     for _ in range(50):
-        with telling("simulating"):
+        with status_line("simulating"):
             pass
     assert len(started) <= 1
     time.sleep(0.3)
@@ -174,12 +174,12 @@ def test_an_exponent_says_how_many_stretches_are_done(monkeypatch):
         def start(self):
             return jnp.ones((2, 3)), jnp.ones((2, 3))
 
-    def march(problem, stretch, cells, settings):
+    def ensemble_solve(problem, stretch, cells, settings):
         time.sleep(0.06)
         ends = {"state": jnp.ones((5, 3)), "end_time": jnp.ones(3), "steps": jnp.ones(3, int)}
         return types.SimpleNamespace(**ends, status=jnp.full(3, REACHED_END)), None
 
-    monkeypatch.setattr(sys.modules["nonholonomic.derivatives.lyapunov"], "compiled_march", march)
+    monkeypatch.setattr(sys.modules["nonholonomic.derivatives.lyapunov"], "solve_ensemble", ensemble_solve)
     growth(Still(), jnp.ones((2, 3)), 1.0, 8, Settings(1e-6))
     assert words(terminal)[0] == "compiling"
     assert any("3/8" in text and "stretch/s" in text for _, text in terminal.lines)

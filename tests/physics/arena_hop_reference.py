@@ -49,7 +49,7 @@ class Hopper(Top):
     def inverse(self, e):
         return np.eye(3) / self.case.I1 + (1 / self.case.I3 - 1 / self.case.I1) * np.outer(e, e)
 
-    def aloft(self, y):
+    def flight_state(self, y):
         """Rates in flight."""
         c = self.case
         _, u, e, w = y.reshape(4, 3)
@@ -62,7 +62,7 @@ class Hopper(Top):
         centre, u, e, w = y.reshape(4, 3)
         return self.below(centre)[1] @ (u + self.case.offset * np.cross(w, e))
 
-    def strike(self, y):
+    def resolve_impact(self, y):
         """The state after an impact, and whether it bounces."""
         c = self.case
         centre, u, e, w = y.reshape(4, 3)
@@ -94,7 +94,7 @@ def follow(case):
         flying = True
     while True:
         if flying:
-            event, field = watched(lambda y: top.below(y[:3])[0]), top.aloft
+            event, field = watched(lambda y: top.below(y[:3])[0]), top.flight_state
             first = min(0.2 * max(top.speed(y), 1e-7) / case.gravity, 1e-3)
         else:
             event, field, first = watched(lambda y: top.motion(y)[1]), lambda y: top.motion(y)[0], 1e-6
@@ -116,7 +116,7 @@ def follow(case):
         if not run.t_events[0].size:
             return samples, hops, place
         if flying:
-            y, flying = top.strike(y)
+            y, flying = top.resolve_impact(y)
         else:
             flying = True
 

@@ -75,7 +75,7 @@ class TwoSpheres:
         """Rates of the state; in flight `touching` is `None`."""
         number = touching or 0
         sphere, own = self.spheres[number], self.of(number, y)
-        slope = sphere.aloft(own) if touching is None else sphere.motion(own)[0]
+        slope = sphere.flight_state(own) if touching is None else sphere.motion(own)[0]
         # Of a sphere's centre.
         slope[:3] = y[3:6]
         return slope
@@ -91,7 +91,7 @@ class TwoSpheres:
 
     def struck(self, number, y):
         """The state after the blow of a sphere, and whether it bounces."""
-        after, bounces = self.spheres[number].strike(self.of(number, y))
+        after, bounces = self.spheres[number].resolve_impact(self.of(number, y))
         return np.concatenate([y[:3], after[3:]]), bounces
 
     def landed(self, number, y):

@@ -33,7 +33,7 @@ class Body(NamedTuple):
     curved: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-class Phase(NamedTuple):
+class Mode(NamedTuple):
     """A stretch of the run: "slipping" or "rolling", its steps' times [s] and states (12, times)."""
 
     kind: str
@@ -143,7 +143,7 @@ def follow(
     onset: float = 1e-10,
     rtol: float = 1e-11,
     stiff: float = 2e-3,
-) -> list[Phase]:
+) -> list[Mode]:
     """Run to `t1` [s], phase by phase; a slip ends where its speed has fallen to `floor` and begins with `onset` [m/s]. For
     the time `stiff` [s] after that the method is implicit."""
     atol = 0.1 * rtol * np.repeat([1.0, np.sqrt(body.gravity * body.radius), 100.0, body.radius], 3)
@@ -156,18 +156,18 @@ def follow(
 
     stops.terminal = leaves.terminal = True
     stops.direction = leaves.direction = -1.0
-    slips, t, phases, begins = stops(0.0, state) > 0.0, 0.0, [], -stiff
+    slips, t, modes, begins = stops(0.0, state) > 0.0, 0.0, [], -stiff
     while t < t1:
         kind, event = ("slipping", stops) if slips else ("rolling", leaves)
         early = slips and t < begins + stiff
         method, end = ("Radau", min(begins + stiff, t1)) if early else ("DOP853", t1)
         out = solve_ivp(rate_of(body, kind), (t, end), state, method, rtol=rtol, atol=atol, events=event)
         assert out.success, out.message
-        if slips and not early and begins >= 0.0 and phases and phases[-1].kind == "slipping":
-            was = phases.pop()
-            phases.append(Phase(kind, np.append(was.times, out.t[1:]), np.hstack([was.states, out.y[:, 1:]])))
+        if slips and not early and begins >= 0.0 and modes and modes[-1].kind == "slipping":
+            was = modes.pop()
+            modes.append(Mode(kind, np.append(was.times, out.t[1:]), np.hstack([was.states, out.y[:, 1:]])))
         else:
-            phases.append(Phase(kind, out.t, out.y))
+            modes.append(Mode(kind, out.t, out.y))
         t, state = out.t[-1], out.y[:, -1]
         if out.status == 0:
             continue
@@ -176,7 +176,7 @@ def follow(
         slips = leaves(t, state) <= 0.0 if slips else True
         if slips:
             state, begins = begun(body, state, onset), t
-    return phases
+    return modes
 
 
 def theta(states: np.ndarray) -> np.ndarray:

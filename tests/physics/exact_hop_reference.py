@@ -49,7 +49,7 @@ def struck(body: Body, state: np.ndarray, restitution: float) -> tuple[np.ndarra
     plain = impact_reference.Body(body.mass, body.radius, body.offset, body.I1, body.I3)
     motion = (frame @ state[:3], frame @ state[3:6], frame @ state[6:9])
     law = impact_reference.Law(body.mu, 1e-10 * np.linalg.norm(contact.v))
-    after = impact_reference.strike(plain, *motion, law, restitution if bounces else 0.0)
+    after = impact_reference.resolve_impact(plain, *motion, law, restitution if bounces else 0.0)
     new = np.concatenate([state[:3], frame.T @ after.velocity, frame.T @ after.turning, state[9:]])
     if bounces:
         return new, "flying"

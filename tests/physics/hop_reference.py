@@ -149,7 +149,7 @@ def energy(case, state):
     return (case.mass * (u @ u) + rotation) / 2 + case.mass * case.gravity * s[2]
 
 
-def strike(case, state, ball, closing=CLOSING):
+def resolve_impact(case, state, ball, closing=CLOSING):
     """The state after the impact of a ball, and whether it bounces."""
     s, u, e, w = split(state)
     r = arm(ball, e)
@@ -266,7 +266,7 @@ def follow(case, rtol=1e-12, flight_step=2e-4, contact_step=2.5e-4, slowest=CLOS
         ball = case.balls[number]
         # The ball is on the plane exactly; what the event left is round-off.
         state[2] = ball[1] - ball[0] * state[8]
-        state, flying = strike(case, state, ball, slowest)
+        state, flying = resolve_impact(case, state, ball, slowest)
         contacts.append((time, number))
         touching = [] if flying else [number]
         if not flying:

@@ -36,7 +36,7 @@ class Impact(NamedTuple):
     velocity: np.ndarray
     turning: np.ndarray
     normal_impulse: float
-    least_stiffness: float
+    least_painleve_factor: float
 
 
 def skew(r):
@@ -61,7 +61,7 @@ class Law(NamedTuple):
         return (sliding, self.mu, self.slip_speed / speed), (rolling, self.resistance, self.turning_speed / speed)
 
 
-def strike(body, axis, velocity, turning, law, restitution):
+def resolve_impact(body, axis, velocity, turning, law, restitution):
     """The motion after an impact of the sphere on the plane z = 0, from the motion before.
 
     `axis`, `velocity` (of the centre of mass [m/s]) and `turning` (angular velocity [rad/s]) are vectors (3,).

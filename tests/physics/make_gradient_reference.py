@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import tippe
-from nonholonomic.integration import CROSSED, Settings, compiled_march
+from nonholonomic.integration import CROSSED, Settings, solve_ensemble
 from nonholonomic.parameters import with_numbers
 from tippe.modes.inversion_problem import InversionProblem
 
@@ -51,7 +51,7 @@ def times_of(row: dict[str, str], columns: dict[str, np.ndarray], t1: float) -> 
     size = len(columns["launch.theta"])
     roots = with_numbers(roots_of(row), columns)
     problem = InversionProblem.of(roots["scene"], roots["launch"], ANGLE, size)
-    outcome, _ = compiled_march(problem, jnp.asarray(t1), jnp.asarray(size), Settings(TOLERANCE, lanes=32))
+    outcome, _ = solve_ensemble(problem, jnp.asarray(t1), jnp.asarray(size), Settings(TOLERANCE, lanes=32))
     return np.where(outcome.status == CROSSED, outcome.crossing_time, np.inf)
 
 

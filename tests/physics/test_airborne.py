@@ -10,10 +10,10 @@ from close import assert_close
 from tops import rutstam_top
 
 import tippe
-from nonholonomic.hybrid import follow_phases
+from nonholonomic.hybrid import solve_hybrid_dense
 from nonholonomic.integration import Settings
 from tippe.modes.airborne import FLYING, SLIDING
-from tippe.runs.airborne_trajectory import arena_phases
+from tippe.runs.airborne_trajectory import arena_modes
 
 REFERENCE = recorded()
 
@@ -72,12 +72,12 @@ def test_bounces_in_a_bowl():
 def test_a_ball_comes_to_rest():
     """Dropped at the lowest point of a bowl: all bounces together take sqrt(2 h / g) (1 + e) / (1 - e), to 1e-11 s."""
     scene, h, e = hop_scene(CASES[0], tippe.Paraboloid(CASES[0].p1)), 0.01, RESTITUTION
-    kinds, *_ = arena_phases((scene, tippe.Launch(0.0, 0.0)), 1e-12)
+    kinds, *_ = arena_modes((scene, tippe.Launch(0.0, 0.0)), 1e-12)
     upright = (0.0, 0.0, 1.0)
     centre = (0.0, 0.0, h + CASES[0].radius - CASES[0].offset)
     dropped = jnp.array([*centre, *np.zeros(3), *upright, *np.zeros(5), 1.0, *np.zeros(4)])
-    path = follow_phases(kinds, FLYING, dropped, 0.16, Settings(1e-12, diffrax.Dopri8()), kinds=1)
-    *_, last, rests = path.stays
+    path = solve_hybrid_dense(kinds, FLYING, dropped, 0.16, Settings(1e-12, diffrax.Dopri8()), kinds=1)
+    *_, last, rests = path.mode_segments
     assert (last.number, rests.number) == (FLYING, SLIDING)
     rest = last.end + (last.end - last.begin) * e / (1.0 - e)
     assert_close(rest, np.sqrt(2.0 * h / 9.81) * (1.0 + e) / (1.0 - e), atol=1e-11)
@@ -107,8 +107,8 @@ def test_a_top_jumps_over_a_hill():
     assert run.status == "reached t1"
     assert greatest_error(1, run) < 1e-8
     check_flights(1, run)
-    aloft = run.contact < 0
-    assert aloft.any()
+    flight_state = run.contact < 0
+    assert flight_state.any()
     assert run.stats["energy_residual"] < 1e-9 * float(run.energy[0])
-    assert_close(run.distance[0][~aloft], 0.0, atol=1e-12)
-    assert_close(run.normal_force[aloft], 0.0)
+    assert_close(run.distance[0][~flight_state], 0.0, atol=1e-12)
+    assert_close(run.normal_force[flight_state], 0.0)

@@ -166,7 +166,7 @@ def test_one_blow_may_throw_the_other_sphere_into_the_arena(monkeypatch):
     rest = np.zeros((2, cells))
     states = np.concatenate([np.tile(place[:, None], cells), u, np.tile(e[:, None], cells), L, rest])
     flies = FlyBoth(scene, jnp.ones((14, cells)), jnp.asarray(-2.0), False, jnp.asarray(True))
-    passage = eqx.filter_jit(flies.leave)(jnp.asarray(states), jnp.ones(cells))
+    transition = eqx.filter_jit(flies.reset_map)(jnp.asarray(states), jnp.ones(cells))
     top, seen = TwoSpheres(case), []
     for sphere in top.spheres:
         sphere.near = np.array((0.0, 0.0, -case.p1))
@@ -176,8 +176,8 @@ def test_one_blow_may_throw_the_other_sphere_into_the_arena(monkeypatch):
             continue
         after, _ = top.struck(1, y)
         throws = top.speed(0, after) < -1e-4
-        assert int(passage.phase[k]) == (STRIKING if throws else ON_STEM)
+        assert int(transition.mode[k]) == (STRIKING if throws else ON_STEM)
         seen.append(throws)
         if throws:
-            assert_close(passage.state[3:6, k], after[3:6], atol=1e-10)
+            assert_close(transition.state[3:6, k], after[3:6], atol=1e-10)
     assert {True, False} == set(seen)

@@ -167,8 +167,8 @@ def test_what_changes_and_what_stays(name):
     s, bend, own = (np.asarray(part) for part in (found.place, rate.velocity, rate.momentum[2]))
     size = 0.02 * np.max(np.abs(s)) * (9.81 + np.max(np.abs(bend)))
     orbital = 0.02 * (s[0] * bend[1] - s[1] * bend[0])
-    stays = np.max(np.abs(orbital + own)[~rubs]) < 1e-12 * size
-    assert stays == (name not in NOT_OF_REVOLUTION)
+    mode_segments = np.max(np.abs(orbital + own)[~rubs]) < 1e-12 * size
+    assert mode_segments == (name not in NOT_OF_REVOLUTION)
     assert_close(own[balls], 0.0, atol=1e-12 * size)
 
 

@@ -83,7 +83,7 @@ def test_rates_of_energy_and_jellett_at_random_states(law, tilt):
     assert_close(power / size, scene.friction_power(states) / size, atol=1e-13)
     assert np.all(np.asarray(scene.friction_power(states)) * np.sign(scene.normal_force(states)) <= 0.0)
     motion, e, L = scene.dynamics.motion(states), states[2:5], states[5:8]
-    lever = scene.body.outline.at(e[2])
+    lever = scene.body.meridian.at(e[2])
     torque = jnp.stack([jnp.zeros(200) if part is None else part for part in motion.friction.torque])
     r = jnp.stack(lever.contact(tuple(e)))
     expected = -lever.growth * rates[4] * (motion.spin_momentum - e[2] * L[2])
@@ -158,7 +158,7 @@ def test_what_is_drawn_of_a_run_stands_on_the_plane(run):
 def balanced(body: tippe.SpheroidBody, turning: float, raised: float) -> tippe.Launch:
     """Steady precession, raised a little from lying flat: (I3 w3 - I1 W c) W = -m g A, the centre of mass at rest."""
     theta = math.pi / 2.0 + raised
-    c, A = math.cos(theta), float(body.outline.at(math.cos(theta)).offset)
+    c, A = math.cos(theta), float(body.meridian.at(math.cos(theta)).offset)
     axial = float(body.I1) * turning * c - float(body.mass) * 9.81 * A / turning
     return tippe.Launch(theta, axial / float(body.I3) - turning * c, angular_velocity=(0.0, 0.0, turning))
 

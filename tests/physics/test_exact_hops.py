@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from impact_reference import Body as Solid
 from impact_reference import Law
-from impact_reference import strike as reference_strike
+from impact_reference import resolve_impact as reference_impact
 from test_strong_friction import random_falls
 from tops import homogeneous_ball
 
@@ -20,14 +20,14 @@ import tippe
 from tippe.model.state import angular_velocity
 from tippe.modes.airborne import FLYING
 from tippe.modes.airborne_stick_slip import ROLLING, SLIPPING
-from tippe.modes.exact_impact import strike_exactly
+from tippe.modes.coulomb_impact import resolve_coulomb_impact
 from tippe.modes.free_body import balls, energy, gap_rate
 from tippe.modes.impact import approach
 
 NUMBERS, MU, THETA, SPIN, T1 = (0.02, 0.02, 0.016, 1.6e-6, 1.9e-6), 0.5, 1.5, 350.0, 0.276
 
 struck = eqx.filter_jit(
-    lambda falls: strike_exactly(
+    lambda falls: resolve_coulomb_impact(
         falls.body, tippe.SetValuedCoulomb(falls.friction.mu), balls(falls.body)[0], falls.free, falls.restitution
     )
 )
@@ -55,7 +55,7 @@ def test_impacts_that_stick_or_slip_on():
         body = Solid(*(float(getattr(falls.body, name)[i]) for name in Solid._fields))
         motion = falls.axis[:, i], falls.velocity[:, i], falls.turning[:, i]
         speed = np.linalg.norm(motion[1]) + body.radius * np.linalg.norm(motion[2])
-        expected = reference_strike(body, *motion, Law(float(falls.friction.mu[i]), 1e-9 * speed), falls.restitution[i])
+        expected = reference_impact(body, *motion, Law(float(falls.friction.mu[i]), 1e-9 * speed), falls.restitution[i])
         # In proportion to the slip speed of the reference; the greatest difference seen is 5e-10.
         assert_close(velocity[:, i], expected.velocity, atol=3e-9 * speed)
         assert_close(turning[:, i], expected.turning, atol=3e-9 * speed / body.radius)
@@ -76,10 +76,10 @@ def check_against_reference(run: tippe.HybridTrajectory, arena: float | None) ->
     kinds = {"slipping": SLIPPING, "rolling": ROLLING, "flying": FLYING}
     # The reference follows the beginning of a slip by another method, and has no bounces that are too short to see.
     events = [one for k, one in enumerate(expected[1:]) if one.kind != expected[k].kind]
-    stays = run.dense.stays
-    numbers = [piece.number for piece in stays]
+    mode_segments = run.dense.mode_segments
+    numbers = [piece.number for piece in mode_segments]
     assert numbers == [kinds[one.kind] for one in (expected[0], *events)]
-    begins = {piece.begin if piece.number != SLIPPING else None for piece in stays[1:]} - {None}
+    begins = {piece.begin if piece.number != SLIPPING else None for piece in mode_segments[1:]} - {None}
     for before, one in zip(expected, expected[1:], strict=False):
         if one.kind not in ("slipping", before.kind):
             # A slip is stopped where the way that is left is within the tolerance, earlier by its speed over its deceleration.
@@ -104,10 +104,10 @@ def test_a_top_that_slips_flies_sticks_and_rolls(arena):
     assert np.max(np.diff(run.energy)) < 1e-10 * run.energy[0]
     assert run.stats["energy_residual"] < 1e-9 * run.energy[0]
     assert 0.05 < run.stats["impact_loss"] / run.energy[0] < 0.2
-    aloft = run.contact < 0
-    assert_close(run.normal_force[aloft], 0.0)
-    assert_close(run.distance[0][~aloft], 0.0, atol=1e-12)
-    rolls = (run.t > run.dense.stays[-2].begin) & (run.t < run.dense.stays[-2].end)
+    flight_state = run.contact < 0
+    assert_close(run.normal_force[flight_state], 0.0)
+    assert_close(run.distance[0][~flight_state], 0.0, atol=1e-12)
+    rolls = (run.t > run.dense.mode_segments[-2].begin) & (run.t < run.dense.mode_segments[-2].end)
     if arena:
         assert rolls.any()
         assert_close(run.slip[rolls], 0.0, atol=1e-12)

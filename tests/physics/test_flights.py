@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from close import assert_close
 from hop_reference import Case
-from hop_reference import strike as reference_strike
+from hop_reference import resolve_impact as reference_impact
 from test_hops import scene_of
 from tops import rutstam_top
 
@@ -15,7 +15,7 @@ import tippe
 from tippe.model.state import angular_velocity
 from tippe.modes.flight import Descent, angle_reached, cone, flown, landing
 from tippe.modes.free_body import FreeBody, balls, energy, gap_rate, jellett
-from tippe.modes.impact import strike
+from tippe.modes.impact import resolve_impact
 
 search = eqx.filter_jit(landing)
 
@@ -24,10 +24,10 @@ def random_descents(count: int, seed: int) -> Descent:
     """Distances of every kind: high and low, fast and slow, with many waves and with less than one."""
     random = np.random.default_rng(seed)
     rate = 10.0 ** random.uniform(0.0, 3.0, count)
-    amplitude, phase = 10.0 ** random.uniform(-4.0, -2.0, count), random.uniform(0.0, 2.0 * np.pi, count)
+    amplitude, mode = 10.0 ** random.uniform(-4.0, -2.0, count), random.uniform(0.0, 2.0 * np.pi, count)
     start = np.where(random.random(count) < 0.5, 0.0, 10.0 ** random.uniform(-6.0, -2.0, count))
     speed = 1e-3 + random.uniform(0.0, 1.0, count) ** 3 - np.where(start > 0.0, 0.3, 0.0)
-    cosine, sine = amplitude * np.cos(phase), amplitude * np.sin(phase)
+    cosine, sine = amplitude * np.cos(mode), amplitude * np.sin(mode)
     return Descent(*map(jnp.asarray, (start, speed, np.full(count, 9.81), rate, cosine, sine)))
 
 
@@ -108,7 +108,7 @@ def test_impacts(slip_speed):
     body, friction = rutstam_top(), scene_of(case).friction
     ball, free = balls(body)[0], free_bodies(60, 3)
     restitution = jnp.asarray(np.repeat([0.0, 0.5, 1.0], 20))
-    after, jams = eqx.filter_jit(strike)(body, friction, ball, free, restitution)
+    after, jams = eqx.filter_jit(resolve_impact)(body, friction, ball, free, restitution)
     assert not np.asarray(jams).any()
     assert_close(jellett(ball, after), jellett(ball, free), atol=1e-20)
     lost = energy(body, 9.81, free) - energy(body, 9.81, after)
@@ -122,7 +122,7 @@ def test_impacts(slip_speed):
     before, found = state_of(body, free), state_of(body, after)
     for i in np.flatnonzero(full)[::6]:
         one = Case(**{**case.__dict__, "restitution": float(restitution[i])})
-        expected, _ = reference_strike(one, before[:, i], (0.006, 0.02))
+        expected, _ = reference_impact(one, before[:, i], (0.006, 0.02))
         assert_close(found[:, i], expected, rtol=1e-9, atol=1e-9)
 
 

@@ -11,7 +11,7 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.integration import Oscillatory8
-from tippe.runs.sensitivities import slopes_of_cells
+from tippe.runs.sensitivities import sensitivities_of_cells
 
 ROWS = list(csv.DictReader(Path(__file__).with_name("gradient_reference.csv").read_text().splitlines()))
 
@@ -21,7 +21,7 @@ def relative_errors(family: str, tolerance: float) -> np.ndarray:
     rows = [row for row in ROWS if row["family"] == family]
     names = list(MOVED.values())
     options = {"count": len(rows), "size": len(rows), "solver": Oscillatory8(), "last": False}
-    _, found = slopes_of_cells(roots_of(rows[0]), columns_of(rows), names, ANGLE, 8.0, tolerance, **options)
+    _, found = sensitivities_of_cells(roots_of(rows[0]), columns_of(rows), names, ANGLE, 8.0, tolerance, **options)
     expected = np.array([[float(row[f"by_{name}"]) for row in rows] for name in MOVED])
     return np.abs(np.stack(list(found.values())) / expected - 1.0)
 

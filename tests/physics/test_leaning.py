@@ -15,7 +15,7 @@ from test_hops import scene_of
 
 import tippe
 from tippe.model.state import angular_velocity
-from tippe.modes.free_body import FreeBody, balls, freed, gap_rate, jellett
+from tippe.modes.free_body import FreeBody, as_free_body, balls, gap_rate, jellett
 from tippe.modes.free_body import energy as energy_of
 from tippe.modes.leaning import BOTH, at_rest
 from tippe.modes.sliding import leaning
@@ -29,7 +29,7 @@ FALLS_BACK, SHORT, RISES = 9, 10, 11
 
 def states_of_the_reference(scene: tippe.Scene, states: np.ndarray) -> np.ndarray:
     """s, u, e, w of states (8, times), as the reference has them, above the origin."""
-    free = freed(scene.body, balls(scene.body)[0], jnp.asarray(states))
+    free = as_free_body(scene.body, balls(scene.body)[0], jnp.asarray(states))
     turning = angular_velocity(scene.body, free.axis, free.momentum)
     zero = np.zeros(states.shape[1])
     return np.stack([zero, zero, free.height, *free.velocity, *free.axis, *turning])
@@ -77,7 +77,7 @@ def test_the_contacts_that_hold():
     case = CASES[FALLS_BACK]
     scene = scene_of(case)
     states = leaning_states(scene.body, 200, 2)
-    _, number, definite = leaning(scene).settled(freed(scene.body, balls(scene.body)[0], jnp.asarray(states)))
+    _, number, definite = leaning(scene).settled(as_free_body(scene.body, balls(scene.body)[0], jnp.asarray(states)))
     assert np.asarray(definite).all()
     seen = []
     for state, chosen in zip(states_of_the_reference(scene, states).T, np.asarray(number), strict=True):
@@ -102,7 +102,7 @@ def test_friction_without_an_answer():
     case = Case(**{**CASES[FALLS_BACK].__dict__, "mu": 2.0, "slip_speed": 1e-3})
     scene = scene_of(case)
     states = leaning_states(scene.body, 200, 3)
-    _, _, definite = leaning(scene).settled(freed(scene.body, balls(scene.body)[0], jnp.asarray(states)))
+    _, _, definite = leaning(scene).settled(as_free_body(scene.body, balls(scene.body)[0], jnp.asarray(states)))
     for state, fine in zip(states_of_the_reference(scene, states).T, np.asarray(definite), strict=True):
         assert fine == (determinant(case, state) > 0.0)
     assert not np.asarray(definite).all()
@@ -126,7 +126,7 @@ def test_coming_to_rest_along_the_normal():
     random = np.random.default_rng(5)
     tilt = random.normal(scale=1e-6, size=20)
     states[5:7] += tilt * np.stack([-states[3], states[2]])
-    before = freed(scene.body, spheres[1], jnp.asarray(states))
+    before = as_free_body(scene.body, spheres[1], jnp.asarray(states))
     after: FreeBody = at_rest(scene.body, before)
     for ball in spheres:
         assert_close(gap_rate(scene.body, ball, after), 0.0, atol=1e-16)
@@ -144,18 +144,18 @@ def test_the_end_of_rocking():
     """
     scene = scene_of(CASES[SHORT])
     spheres, states = balls(scene.body), leaning_states(scene.body, 50, 6)
-    free, taken = freed(scene.body, spheres[0], jnp.asarray(states)), []
+    free, taken = as_free_body(scene.body, spheres[0], jnp.asarray(states)), []
     for striking in (0, 1):
         # The top turns about the sphere that stays.
-        stays, strikes = spheres[1 - striking], spheres[striking]
-        turned = -1e-6 / (strikes.offset - stays.offset)
+        mode_segments, strikes = spheres[1 - striking], spheres[striking]
+        turned = -1e-6 / (strikes.offset - mode_segments.offset)
         across = np.stack([-states[3], states[2]]) / math.sin(first_contact(scene.body))
         sine2 = states[2] ** 2 + states[3] ** 2
         tilt = turned * 8e-7 / np.sqrt(sine2)
         momentum = (*(L - tilt * a for L, a in zip(free.momentum[:2], across, strict=True)), free.momentum[2])
-        before = FreeBody((*free.velocity[:2], -stays.offset * turned), free.height, free.axis, momentum)
+        before = FreeBody((*free.velocity[:2], -mode_segments.offset * turned), free.height, free.axis, momentum)
         assert_close(gap_rate(scene.body, strikes, before), -1e-6, rtol=1e-9)
-        assert_close(gap_rate(scene.body, stays, before), 0.0, atol=1e-15)
+        assert_close(gap_rate(scene.body, mode_segments, before), 0.0, atol=1e-15)
         after, takes = leaning(scene).stopped(before)
         assert_close([gap_rate(scene.body, ball, after) for ball in spheres], 0.0, atol=1e-15)
         gained = energy_of(scene.body, 9.81, after) - energy_of(scene.body, 9.81, before)
@@ -174,7 +174,7 @@ def ride() -> tippe.HybridTrajectory:
 
 def test_a_top_leans_and_falls_back(ride):
     """From the first moment of leaning on, the reference: when it ends, and state and work 0.5 s later."""
-    case, piece = CASES[SHORT], next(piece for piece in ride.dense.pieces if piece.number == BOTH)
+    case, piece = CASES[SHORT], next(piece for piece in ride.dense.segments if piece.number == BOTH)
     # The blows that are not followed take 6e-5 s; what they do is done at once.
     assert_close(piece.begin, float(REFERENCE[SHORT]["leans"]), atol=1e-4)
     assert_close(piece.end, float(REFERENCE[SHORT]["parted"]), atol=5e-8)

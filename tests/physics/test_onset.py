@@ -8,7 +8,7 @@ from close import assert_close
 from tops import rutstam_top
 
 import tippe
-from tippe.model.onset import begin
+from tippe.model.slip_onset import begin
 
 #: A top that rolls in a sphere, its grip just gone: velocity, axis, angular momentum, the vertical in its frame.
 ROLLING = np.array(

@@ -10,10 +10,10 @@ from scipy.integrate import solve_ivp
 from tops import homogeneous_ball, rutstam_top
 
 import tippe
-from nonholonomic.hybrid import PhasedPath
+from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import Settings
-from tippe.modes.stick_slip_runs import ROLLING
-from tippe.runs.stick_slip_trajectory import follow_stick_slip
+from tippe.modes.sticking import ROLLING
+from tippe.runs.stick_slip_trajectory import solve_stick_slip_dense
 from tippe.runs.trajectory import TrajectoryProblem
 
 
@@ -27,12 +27,12 @@ def scene_of(body: tippe.Top, mu: float) -> tippe.Scene:
     return tippe.Scene(body, tippe.Plane(), tippe.SetValuedCoulomb(mu))
 
 
-def kinds(path: PhasedPath) -> list[bool]:
+def kinds(path: HybridPath) -> list[bool]:
     """Whether each phase of a run rolls."""
-    return [piece.number == ROLLING for piece in path.stays]
+    return [piece.number == ROLLING for piece in path.mode_segments]
 
 
-def reference(body: tippe.Top, mu: float, theta: float, spin: float, t1: float) -> list[coulomb_top.Phase]:
+def reference(body: tippe.Top, mu: float, theta: float, spin: float, t1: float) -> list[coulomb_top.Mode]:
     """The phases of the same run in plain NumPy and SciPy."""
     numbers = [float(x) for x in (body.mass, body.radius, body.offset, body.I1, body.I3)]
     plain = coulomb_top.Body(*numbers, mu)
@@ -46,8 +46,8 @@ def test_cohens_top_stops_slipping_and_rolls():
     run = tippe.simulate(scene_of(cohen_top(), 0.3), tippe.Launch(0.1, 100.0), 20.0, tolerance=1e-11)
     expected = reference(cohen_top(), 0.3, 0.1, 100.0, 0.05)
     assert run.stats["sticks"] == 1
-    assert [phase.kind for phase in expected] == ["slipping", "rolling"]
-    slip, rolling = run.dense.stays
+    assert [mode.kind for mode in expected] == ["slipping", "rolling"]
+    slip, rolling = run.dense.mode_segments
     # The blow comes earlier by the time left: the speed, 1e-6 m/s at this tolerance, over the deceleration.
     assert_close(slip.end, expected[0].times[-1], atol=2e-7)
     assert_close(slip.end, 0.02879, atol=5e-6)
@@ -70,7 +70,7 @@ def test_a_top_that_sticks_and_slips_again():
     """Rutstam's top at mu = 0.2 slips, rolls, slips, rolls and slips within 0.9 s; against SciPy, event by event."""
     run = tippe.simulate(scene_of(rutstam_top(), 0.2), tippe.Launch(1.5, 30.0), 0.9, tolerance=1e-10)
     expected = reference(rutstam_top(), 0.2, 1.5, 30.0, 0.9)
-    assert kinds(run.dense) == [phase.kind == "rolling" for phase in expected] == [False, True, False, True, False]
+    assert kinds(run.dense) == [mode.kind == "rolling" for mode in expected] == [False, True, False, True, False]
     assert run.stats["sticks"] == 2
     assert_close(run.axis[-1], expected[-1].states[:3, -1], atol=1e-7)
     assert_close(run.jellett, run.jellett[0], rtol=1e-9)
@@ -84,9 +84,9 @@ def test_a_bowling_ball_slides_and_then_rolls():
     scene, end = scene_of(homogeneous_ball(), 0.3), 2.0 / (7.0 * 0.3 * 9.81)
     run = TrajectoryProblem.of(scene, tippe.Launch(theta=0.7, spin=0.0))
     run = TrajectoryProblem(run.dynamics, run.axial, run.state.at[0].set(1.0), run.cyclic, run.scales)
-    path = follow_stick_slip(run, 3.0 * end, Settings(1e-11))
+    path = solve_stick_slip_dense(run, 3.0 * end, Settings(1e-11))
     assert kinds(path) == [False, True]
-    assert_close(path.stays[0].end, end, atol=1e-7)
+    assert_close(path.mode_segments[0].end, end, atol=1e-7)
     times = np.array([0.3, 0.9, 0.999, 1.5, 3.0]) * end
     expected = np.where(times < end, 1.0 - 0.3 * 9.81 * times, 5.0 / 7.0)
     assert_close(path.at(times)[0], expected, rtol=1e-10)

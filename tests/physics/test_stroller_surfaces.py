@@ -23,13 +23,13 @@ class Hills(eqx.Module):
     waves: np.ndarray
 
     def __call__(self, x, y):
-        share, kx, ky, phase = self.waves
-        return self.height * sum(share[k] * jnp.sin(kx[k] * x + ky[k] * y + phase[k]) for k in range(4))
+        share, kx, ky, mode = self.waves
+        return self.height * sum(share[k] * jnp.sin(kx[k] * x + ky[k] * y + mode[k]) for k in range(4))
 
     def slopes(self, x, y):
         """Gradient and Hessian, for the reference."""
-        share, kx, ky, phase = np.asarray(self.waves)
-        at, number = kx * x + ky * y + phase, np.stack([kx, ky])
+        share, kx, ky, mode = np.asarray(self.waves)
+        at, number = kx * x + ky * y + mode, np.stack([kx, ky])
         height = float(self.height)
         return height * number @ (share * np.cos(at)), -height * (number * share * np.sin(at)) @ number.T
 

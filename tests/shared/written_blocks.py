@@ -2,7 +2,7 @@
 
 from nonholonomic.sweeps import running
 
-WRITE = running.Blocks.write
+WRITE = running.ChunkStore.write
 
 
 def recorded(monkeypatch, most=None):
@@ -15,5 +15,5 @@ def recorded(monkeypatch, most=None):
         done.append(block)
         WRITE(self, block, values)
 
-    monkeypatch.setattr(running.Blocks, "write", write)
+    monkeypatch.setattr(running.ChunkStore, "write", write)
     return done

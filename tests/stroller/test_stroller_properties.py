@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from drawn_strollers import KINDS, LANES, MORE_KINDS, batch_of
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Mode, given, settings
 from hypothesis import strategies as st
 
-from nonholonomic.integration import GUARD_LOST, REACHED_END, Settings, compiled_march
+from nonholonomic.integration import LEFT_DOMAIN, REACHED_END, Settings, solve_ensemble
 from stroller import Damping, Launch, Plane, RollingResistance, Scene, Sphere, Spheroid, Stroller
 from stroller.runs.table import RideProblem
 
@@ -49,7 +49,7 @@ def ride(scene: Scene, launch: Launch, tolerance: float = 1e-9, states=None, sca
     if scales is not None:
         problem = eqx.tree_at(lambda problem: problem.scales, problem, jnp.asarray(np.tile(scales, copies)))
     settings = Settings(tolerance, lanes=LANES, max_steps=200_000)
-    outcome = compiled_march(problem, jnp.asarray(horizon), jnp.asarray(count), settings)[0]
+    outcome = solve_ensemble(problem, jnp.asarray(horizon), jnp.asarray(count), settings)[0]
     return jax.tree.map(lambda leaf: np.asarray(leaf)[..., :count], outcome)
 
 
@@ -148,7 +148,7 @@ def check_a_batch(scene: Scene, launch: Launch, knots, kink):
     tolerance = 1e-9
     outcome = ride(scene, launch, tolerance)
     assert np.isfinite(outcome.state).all()
-    assert np.isin(outcome.status, [REACHED_END, GUARD_LOST] if scene.heading == "projected" else [REACHED_END]).all()
+    assert np.isin(outcome.status, [REACHED_END, LEFT_DOMAIN] if scene.heading == "projected" else [REACHED_END]).all()
     most = 0.0
     for knot in knots:
         slopes = np.asarray(integrals_and_slopes(scene, jnp.asarray(knot))[1]) * weights_of(scene, launch, knot)
@@ -306,7 +306,7 @@ def batches(kind):
 ANGLES = st.floats(-math.pi, math.pi)
 EXPONENTS = st.tuples(st.integers(-8, 8), st.integers(-6, 6), st.integers(-5, 5))
 # A batch comes from a seed, so there is no simpler one to shrink to.
-COMMON = settings(deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+COMMON = settings(deadline=None, database=None, modes=[Mode.generate], suppress_health_check=list(HealthCheck))
 FEW = settings(COMMON, max_examples=3, derandomize=True)
 MANY = settings(COMMON, max_examples=45, print_blob=True)
 

@@ -187,14 +187,14 @@ def test_how_to_search_is_checked_before_the_data_are(rutstam_scene):
 
 
 @pytest.mark.parametrize(
-    ("phases", "message"),
+    ("modes", "message"),
     [
         ({"contact": "hybrid"}, "contact = 'hybrid' must be 'stop' for"),
         ({"friction": tippe.SetValuedCoulomb(0.3)}, "friction = SetValuedCoulomb must be a law without phases for"),
     ],
 )
-def test_scenes_with_phases_are_refused_where_slopes_are_needed(rutstam_scene, phases, message):
-    scene = dataclasses.replace(rutstam_scene, **phases)
+def test_scenes_with_phases_are_refused_where_slopes_are_needed(rutstam_scene, modes, message):
+    scene = dataclasses.replace(rutstam_scene, **modes)
     data = tippe.InversionTimes(LAUNCH, [1.0, 2.0, 3.0, 4.0], 0.1, t1=5.0)
     with pytest.raises(ValueError, match=message + " identify"):
         tippe.identify(scene, data, {"mu": 0.2}, slopes="exact")

@@ -13,7 +13,7 @@ from close import assert_close
 from tops import rutstam_top
 
 import tippe
-from nonholonomic.integration import CROSSED, Settings, compiled_march
+from nonholonomic.integration import CROSSED, Settings, solve_ensemble
 from tippe.modes.inversion_problem import InversionProblem
 
 
@@ -266,7 +266,7 @@ def test_a_frame_that_turns_with_the_top_saves_digits_and_changes_none(rutstam_s
         return tables, dataclasses.replace(tables, dynamics=scene.dynamics)
 
     def ends(problem, tolerance):
-        outcome, _ = compiled_march(problem, jnp.asarray(2.0), jnp.asarray(4), Settings(tolerance))
+        outcome, _ = solve_ensemble(problem, jnp.asarray(2.0), jnp.asarray(4), Settings(tolerance))
         assert (outcome.status != CROSSED).all()
         state = np.asarray(outcome.state)
         u, e, L = np.vstack([state[:2], 0.0 * state[:1]]), state[2:5], state[5:]

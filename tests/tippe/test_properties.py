@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Mode, given, settings
 from hypothesis import strategies as st
 
 import tippe
-from nonholonomic.integration import FAILED, GUARD_LOST, REACHED_END, Settings, compiled_march
+from nonholonomic.integration import FAILED, LEFT_DOMAIN, REACHED_END, Settings, solve_ensemble
 from tippe.modes.inversion_problem import InversionProblem
 
 # Scenes are scaled beyond the size of any top.
@@ -77,7 +77,7 @@ def ends(scene: tippe.Scene, launch: tippe.Launch, tolerance: float = 1e-9, stat
     # No angle has a cosine of 2: nothing but the loss of contact ends a run before the horizon.
     states = problem.states if states is None else jnp.asarray(states)
     problem = InversionProblem(problem.dynamics, jnp.asarray(-2.0), states, problem.scales)
-    outcome, _ = compiled_march(
+    outcome, _ = solve_ensemble(
         problem,
         jnp.asarray(horizon),
         jnp.asarray(LANES),
@@ -92,7 +92,7 @@ def check_a_batch(scene: tippe.Scene, launch: tippe.Launch):
     outcome = ends(scene, launch)
     assert np.isfinite(outcome.state).all()
     assert np.all(np.asarray(outcome.status) != FAILED)
-    jammed = (np.asarray(outcome.status) == GUARD_LOST) & (np.asarray(scene.dynamics.loss(outcome.state)) == 1)
+    jammed = (np.asarray(outcome.status) == LEFT_DOMAIN) & (np.asarray(scene.dynamics.loss(outcome.state)) == 1)
     assert np.all(may_jam(scene) | ~jammed)
     start, end = scene.state(launch), outcome.state
     turns = 1.0 + np.abs(np.asarray(launch.spin)) * HORIZON
@@ -240,7 +240,7 @@ def check_everything(arena, batch, angle, exponents):
 ANGLES = st.floats(-math.pi, math.pi)
 EXPONENTS = st.tuples(st.integers(-8, 8), st.integers(-6, 6), st.integers(-10, 10))
 # A batch comes from a seed, so there is no simpler one to shrink to.
-COMMON = settings(deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+COMMON = settings(deadline=None, database=None, modes=[Mode.generate], suppress_health_check=list(HealthCheck))
 FEW = settings(COMMON, max_examples=3, derandomize=True)
 MANY = settings(COMMON, max_examples=180, print_blob=True)
 

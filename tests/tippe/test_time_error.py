@@ -8,11 +8,11 @@ from lagrange_top import inversion
 from tops import rutstam_top
 
 import tippe
-from nonholonomic.integration import Settings, compiled_march
+from nonholonomic.integration import Settings, solve_ensemble
 from nonholonomic.sweeps.digits import concise, concise_strings
 from tippe import steady
 from tippe.modes.inversion_problem import InversionProblem
-from tippe.runs.cells import CellRuns, driver_of
+from tippe.runs.cells import InversionRuns, run_kind_of
 from tippe.runs.inversion import is_inverted
 from tippe.runs.table import InversionJob
 from tippe.runs.time_error import COARSER, time_error
@@ -150,14 +150,14 @@ def test_a_cell_that_fails_is_in_doubt():
 def test_agreement_on_no_answer_is_no_agreement(monkeypatch):
     """Two runs that both failed, or both were given up, do not make it certain that there is no time."""
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3), contact="hybrid")
-    words = driver_of(scene).words
+    words = run_kind_of(scene).words
 
     def results(runs, *_):
         times = {name: np.full(len(words), np.inf) for name in runs.times}
         return times | {"status": np.arange(len(words), dtype=np.int8)}
 
-    monkeypatch.setattr(CellRuns, "results", results)
-    runs = CellRuns(driver_of(scene), 1.0, ANGLE, "both", None, "ensemble", [])
+    monkeypatch.setattr(InversionRuns, "results", results)
+    runs = InversionRuns(run_kind_of(scene), 1.0, ANGLE, "both", None, "ensemble", [])
     found = InversionJob(runs, {"scene": scene}, 1e-9, errors=True)({}, len(words))
     for name in ("first_time", "last_time"):
         doubtful = np.isinf(found[f"{name}_error"])
@@ -202,7 +202,7 @@ def times(scene, launch, tolerance, crossing, t1=12.0):
     cells = launch.theta.size
     problem = InversionProblem.of(scene, launch, 0.95 * np.pi, cells)
     given = (problem, jnp.asarray(t1), jnp.asarray(cells), Settings(tolerance))
-    outcome, _ = compiled_march(*given, passes=crossing == "last")
+    outcome, _ = solve_ensemble(*given, passes=crossing == "last")
     inverted = np.asarray(is_inverted(outcome, problem, crossing == "last"))
     return np.where(inverted, outcome.crossing_time, np.inf), np.where(inverted, -1, outcome.status)
 

@@ -12,7 +12,7 @@ from tops import rutstam_top
 
 import tippe
 from nonholonomic.integration import Settings, follow
-from nonholonomic.integration.single_run import PIECE
+from nonholonomic.integration.dense import PIECE
 from tippe.runs.trajectory import TrajectoryProblem
 
 LAUNCH = tippe.Launch(0.1, 155.0)
@@ -96,7 +96,7 @@ def test_a_run_of_too_many_steps_fails(rutstam_scene):
     """It says so and ends where it is, rather than go on for ever."""
     path = follow(TrajectoryProblem.of(rutstam_scene, LAUNCH), 1e6, Settings(3e-14, max_steps=3000))
     assert path.failed
-    assert not path.guard_lost
+    assert not path.left_domain
     assert 3000 <= path.accepted + path.rejected < 3000 + PIECE
     assert np.isfinite(path.states).all()
     assert 0.0 < path.times[-1] < 100.0

@@ -10,15 +10,15 @@ from jaxtyping import Array, Float, Int
 from nonholonomic import identification as generic
 from nonholonomic.identification import Free, Identification, of_data
 from nonholonomic.parameters import numbers, with_numbers
-from nonholonomic.progress import telling
+from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number
 
 from ..model.launch import Launch
 from ..model.scene import Scene
-from ..runs.cells import driver_of
+from ..runs.cells import run_kind_of
 from ..runs.inversion import check_run, check_smooth
 from .data import InversionTimes, Recording, Values, predict_recordings
-from .phased_fit import PhasedModel
+from .hybrid_fit import HybridModel
 
 
 class SceneModel(eqx.Module):
@@ -98,12 +98,12 @@ def identify(
     ```
     """
     generic.check_search(starts, spread, seed, max_steps, progress)
-    with telling("fitting", progress):
+    with status_line("fitting", progress):
         data = checked_data(scene, data, tolerance, "identify with slopes = 'exact'" if slopes == "exact" else None)
         unknowns = unknowns_of(scene, data, free)
         measurements, labels, seen = generic.joined(data)
-        smooth = driver_of(scene).smooth
-        kind = SceneModel if smooth else PhasedModel
+        smooth = run_kind_of(scene).smooth
+        kind = SceneModel if smooth else HybridModel
         return generic.identify(
             kind(scene, data, seen, tolerance),
             measurements,

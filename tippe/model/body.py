@@ -19,7 +19,7 @@ from nonholonomic.geometry import Component, Vector
 from nonholonomic.validation import Bound, Bounded
 
 
-class Lever(NamedTuple):
+class ContactGeometry(NamedTuple):
     """Where a body touches: the contact is at r = offset e - radius n from the centre of mass.
 
     - `offset`, `radius`: A and B [m].
@@ -38,23 +38,23 @@ class Lever(NamedTuple):
         return (a * axis[0], a * axis[1], a * axis[2] - self.radius)
 
 
-class AbstractOutline(eqx.Module):
+class AbstractMeridian(eqx.Module):
     """The meridian of a body, as the equations of motion ask for it."""
 
     @abc.abstractmethod
-    def at(self, cosine: Float[Array, "..."]) -> Lever:
+    def at(self, cosine: Float[Array, "..."]) -> ContactGeometry:
         """The lever at cos(theta)."""
 
 
-class Round(AbstractOutline):
-    """A sphere, which touches on the same lever however it leans; the fields are those of `Lever`."""
+class Round(AbstractMeridian):
+    """A sphere, which touches on the same lever however it leans; the fields are those of `ContactGeometry`."""
 
     offset: Float[Array, "..."]
     radius: Float[Array, "..."]
     coupling: Float[Array, "..."]
 
-    def at(self, cosine: Float[Array, "..."]) -> Lever:
-        return Lever(self.offset, self.radius, self.coupling)
+    def at(self, cosine: Float[Array, "..."]) -> ContactGeometry:
+        return ContactGeometry(self.offset, self.radius, self.coupling)
 
 
 class AbstractBody(Bounded):
@@ -72,7 +72,7 @@ class AbstractBody(Bounded):
 
     @property
     @abc.abstractmethod
-    def outline(self) -> AbstractOutline:
+    def meridian(self) -> AbstractMeridian:
         """Where it touches."""
 
     @property
@@ -87,7 +87,7 @@ class AbstractBody(Bounded):
 
     def mass_from_frame(self, axis: Vector) -> Vector:
         """From the point that the frame carries to the centre of mass [m], in (t1, t2, n)."""
-        r1, r2, r3 = self.outline.at(axis[2]).contact(axis)
+        r1, r2, r3 = self.meridian.at(axis[2]).contact(axis)
         return (-r1, -r2, -r3 - self.size)
 
     def path_from_frame(self, axis: Vector) -> Vector:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from nonholonomic.geometry import as_function
 from nonholonomic.validation import Bound, as_number
 
-from .body import AbstractBody, AbstractOutline, Lever
+from .body import AbstractBody, AbstractMeridian, ContactGeometry
 
 #: Inclinations at which a support function is looked at for whether it is that of a convex body.
 SAMPLES = 65
@@ -71,17 +71,17 @@ class SpheroidBody(AbstractBody):
         yield from self.inertia_bounds()
 
     @property
-    def outline(self) -> "SpheroidOutline":
+    def meridian(self) -> "SpheroidMeridian":
         square = self.equatorial * self.equatorial
         excess = self.polar * self.polar - square
-        return SpheroidOutline(square, excess, self.offset, self.mass / self.I1)
+        return SpheroidMeridian(square, excess, self.offset, self.mass / self.I1)
 
     @property
     def size(self) -> Float[Array, "..."]:
         return jnp.maximum(self.equatorial, self.polar)
 
 
-class SpheroidOutline(AbstractOutline):
+class SpheroidMeridian(AbstractMeridian):
     """H = q - a c with q^2 = b^2 + (p^2 - b^2) c^2, b and p the half axes.
 
     `square`: b^2; `excess`: p^2 - b^2 [m^2]; `offset`: a [m]; `per_inertia`: m / I1 [1/m^2].
@@ -92,13 +92,13 @@ class SpheroidOutline(AbstractOutline):
     offset: Float[Array, "..."]
     per_inertia: Float[Array, "..."]
 
-    def at(self, cosine: Float[Array, "..."]) -> Lever:
+    def at(self, cosine: Float[Array, "..."]) -> ContactGeometry:
         squared = self.square + self.excess * cosine * cosine
         per_height = 1.0 / jnp.sqrt(squared)
         offset = self.offset - self.excess * cosine * per_height
         radius = self.square * per_height
         growth = -self.excess * radius / squared
-        return Lever(offset, radius, self.per_inertia * offset, growth)
+        return ContactGeometry(offset, radius, self.per_inertia * offset, growth)
 
 
 class ConvexBody(AbstractBody):
@@ -150,27 +150,27 @@ class ConvexBody(AbstractBody):
         """Height and the two radii of curvature over the inclinations [m]."""
 
         def one(cosine: Float[Array, ""]) -> tuple[Float[Array, "..."], ...]:
-            lever = self.outline.at(cosine)
+            lever = self.meridian.at(cosine)
             return self.support(cosine), lever.radius, lever.radius - (1.0 - cosine * cosine) * lever.growth
 
         return jax.vmap(one)(jnp.cos(jnp.linspace(0.0, jnp.pi, SAMPLES)))
 
     @property
-    def outline(self) -> "SupportOutline":
-        return SupportOutline(self.support, self.mass / self.I1)
+    def meridian(self) -> "SupportMeridian":
+        return SupportMeridian(self.support, self.mass / self.I1)
 
     @property
     def size(self) -> Float[Array, "..."]:
         return jnp.max(self._samples()[0], axis=0)
 
 
-class SupportOutline(AbstractOutline):
+class SupportMeridian(AbstractMeridian):
     """The lever by differentiation of the support function; `per_inertia`: m / I1 [1/m^2]."""
 
     support: Any
     per_inertia: Float[Array, "..."]
 
-    def at(self, cosine: Float[Array, "..."]) -> Lever:
+    def at(self, cosine: Float[Array, "..."]) -> ContactGeometry:
         cosine = as_number(cosine)
         one = jnp.ones_like(cosine)
 
@@ -179,4 +179,4 @@ class SupportOutline(AbstractOutline):
             return along, height
 
         rise, bend, height = jax.jvp(slope, (cosine,), (one,), has_aux=True)
-        return Lever(-rise, height - cosine * rise, -self.per_inertia * rise, -bend)
+        return ContactGeometry(-rise, height - cosine * rise, -self.per_inertia * rise, -bend)

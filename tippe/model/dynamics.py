@@ -29,7 +29,7 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.xla_cpu import stored
 
-from .body import AbstractBody, AbstractOutline
+from .body import AbstractBody, AbstractMeridian
 from .friction import AbstractFriction, ContactLoad, Slip
 from .state import parts
 
@@ -59,9 +59,9 @@ LOSSES = ("contact_lost", "jammed", "does_not_fit")
 class Motion(NamedTuple):
     """What the equations of motion give for one state, every vector in the moving frame.
 
-    `stiffness` is the factor of N in its equation, 1 + m a A in `tippe.md`, section 2: 1 without an offset, and zero if the
-    friction due to each newton of N pulls the top down as hard as that newton pushes it up. `velocity` is that of the point
-    that the frame carries along. `room` is positive where the ball fits, `None` where it does everywhere.
+    `painleve_factor` is the factor of N in its equation, 1 + m a A in `tippe.md`, section 2: 1 without an offset, and zero
+    if the friction due to each newton of N pulls the top down as hard as that newton pushes it up. `velocity` is that of
+    the point that the frame carries along. `room` is positive where the ball fits, `None` where it does everywhere.
     """
 
     rate: tuple[Component, ...]
@@ -71,7 +71,7 @@ class Motion(NamedTuple):
     velocity: Tangent
     turning: Tangent
     spin_momentum: Float[Array, "..."]
-    stiffness: Float[Array, "..."]
+    painleve_factor: Float[Array, "..."]
     room: Component
 
     @property
@@ -88,7 +88,7 @@ class Dynamics(eqx.Module):
 
     frame: AbstractFrame
     friction: AbstractFriction
-    outline: AbstractOutline
+    meridian: AbstractMeridian
     mass: Float[Array, "..."]
     gravity: Float[Array, "..."]
     per_mass: Float[Array, "..."]
@@ -107,7 +107,7 @@ class Dynamics(eqx.Module):
         return cls(
             frame=frame,
             friction=friction,
-            outline=body.outline,
+            meridian=body.meridian,
             mass=body.mass,
             gravity=gravity,
             per_mass=1.0 / body.mass,
@@ -134,7 +134,7 @@ class Dynamics(eqx.Module):
         `body.py` in place of a and R, on the plane, the height's second rate H' c'' + H'' c'^2 in N.
         """
         (u1, u2), e, L, place = parts(state)
-        a, R, coupling, growth = self.outline.at(e[2])
+        a, R, coupling, growth = self.meridian.at(e[2])
 
         # The axis turns with the body; V is the velocity of the centre of the sphere that touches as the body does, o the rate
         # at which the frame turns. The frame carries that centre, or what is below it if the sphere is another at each moment.
@@ -142,13 +142,13 @@ class Dynamics(eqx.Module):
         V = (u1 + a * e_dot[0], u2 + a * e_dot[1])
         changing = multiply(growth, e_dot[2])
         path = (add(V[0], multiply(changing, e[0])), add(V[1], multiply(changing, e[1])))
-        o, up, place_rate, room = self.frame.carriage(place, path)
+        o, up, place_rate, room = self.frame.frame_motion(place, path)
 
         spin_momentum = dot(L, e)
         along_axis = self.axial_excess * spin_momentum
         w1 = self.per_transverse * L[0] + along_axis * e[0]
         w2 = self.per_transverse * L[1] + along_axis * e[1]
-        w3 = self.per_transverse * L[2] + along_axis * e[2] if self.friction.drills else None
+        w3 = self.per_transverse * L[2] + along_axis * e[2] if self.friction.uses_spin else None
         slip = Slip(*stored(V[0] - R * w2, V[1] + R * w1), (w1, w2, w3))
         friction = self.friction.per_normal_force(slip)
         f1, f2 = friction.force
@@ -167,8 +167,8 @@ class Dynamics(eqx.Module):
         pull = add(multiply(self.gravity, up[2]), centripetal)
         load = self.mass * pull - coupling * (L[0] * e_dot[1] - L[1] * e_dot[0])
         load = subtract(load, multiply(self.mass, changing, e_dot[2]))
-        stiffness = 1.0 + coupling * (M1 * e[1] - M2 * e[0])
-        N = load / stiffness
+        painleve_factor = 1.0 + coupling * (M1 * e[1] - M2 * e[0])
+        N = load / painleve_factor
 
         thrust = N * self.per_mass
         u3 = multiply(-a, e_dot[2]) if o != (None, None) else None
@@ -181,7 +181,7 @@ class Dynamics(eqx.Module):
             u1_dot, u2_dot = add(u1_dot, turn * u2), subtract(u2_dot, turn * u1)
             e_dot, L_dot = sum_vectors(e_dot, turned(e, turn)), sum_vectors(L_dot, turned(L, turn))
         rate = (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate)
-        return Motion(rate, N, friction, slip, path, o, spin_momentum, stiffness, room)
+        return Motion(rate, N, friction, slip, path, o, spin_momentum, painleve_factor, room)
 
     def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """Rate of change of the state, (components, ...)."""
@@ -201,7 +201,7 @@ class Dynamics(eqx.Module):
         """For each of `LOSSES` what is left: the normal force as a fraction of the weight, plus a round-off allowance for a
         start with N = 0; the excess of the stiffness over `JAMMED`; that of the room over `FITS`, if the room may end."""
         motion = self.motion(state)
-        lost, jammed = motion.normal_force / (self.mass * self.gravity) + 1e-12, motion.stiffness - JAMMED
+        lost, jammed = motion.normal_force / (self.mass * self.gravity) + 1e-12, motion.painleve_factor - JAMMED
         return (lost, jammed) if motion.room is None else (lost, jammed, motion.room - FITS)
 
 

@@ -18,7 +18,7 @@ class Slip(NamedTuple):
 
     - `x`, `y`: velocity of the material contact point along the arena [m/s].
     - `turning`: angular velocity of the body [rad/s]; its component along n, the drilling, is `None` unless the law
-      `drills`.
+      `uses_spin`.
     """
 
     x: Float[Array, "..."]
@@ -76,7 +76,7 @@ class AbstractFriction(Bounded):
     set_valued: ClassVar[bool] = False
 
     @property
-    def drills(self) -> bool:
+    def uses_spin(self) -> bool:
         """Whether the law depends on the body's angular velocity about the normal."""
         return False
 
@@ -239,7 +239,7 @@ class Contensou(AbstractFriction):
         yield Bound(self.slip_speed, "slip_speed", above=0.0)
 
     @property
-    def drills(self) -> bool:
+    def uses_spin(self) -> bool:
         return True
 
     @property
@@ -300,8 +300,8 @@ class Rolling(AbstractFriction):
         return {"resistance": "m", "turning_speed": "rad s-1"} | self.sliding.units
 
     @property
-    def drills(self) -> bool:
-        return self.sliding.drills
+    def uses_spin(self) -> bool:
+        return self.sliding.uses_spin
 
     @property
     def isotropic(self) -> bool:

@@ -102,7 +102,7 @@ class RollingDynamics(eqx.Module):
         w = angular_velocity(self, e, L)
         e_dot = cross(w, e)
         V: Tangent = (R * w[1], -R * w[0])
-        o, up, place_rate, room = self.frame.carriage(place, V)
+        o, up, place_rate, room = self.frame.frame_motion(place, V)
         r = self._contact(e)
         # n' = -(o1 t1 + o2 t2), and r' as a vector, not as the rate of its components.
         r_dot = sum_vectors(scale(a, e_dot), scale(R, (*o, None)))

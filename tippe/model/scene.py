@@ -269,7 +269,7 @@ class Scene(Bounded):
         body, dynamics = self.body, self.dynamics
         (u1, u2), e, L, place = parts(state)
         e3_dot = (L[0] * e[1] - L[1] * e[0]) / body.I1
-        speed2 = u1**2 + u2**2 + (body.outline.at(e[2]).offset * e3_dot) ** 2
+        speed2 = u1**2 + u2**2 + (body.meridian.at(e[2]).offset * e3_dot) ** 2
         axial = dot(L, e)
         rotation = (dot(L, L) - axial**2) / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
         height = dynamics.frame.height(place) + dot(body.mass_from_frame(e), dynamics.frame.vertical(place))
@@ -283,7 +283,7 @@ class Scene(Bounded):
         N tau.(R n - a e) (`tippe.md`, section 2).
         """
         _, e, L, _ = parts(state)
-        lever = self.body.outline.at(e[2])
+        lever = self.body.meridian.at(e[2])
         return lever.radius * L[2] - lever.offset * dot(e, L)
 
     def theta(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:

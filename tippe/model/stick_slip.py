@@ -21,8 +21,8 @@ from nonholonomic.geometry import AbstractFrame
 
 from .dynamics import FITS, Dynamics, Motion, least, stacked
 from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, Slip, length
-from .onset import Onset, begin
 from .rolling import RollingDynamics
+from .slip_onset import Onset, begin
 from .top import Top
 
 #: The way that is left to slide where a slip is stopped, over the tolerance and the radius. The state errs by a tenth of the
@@ -148,7 +148,7 @@ class Change(NamedTuple):
     elapsed: Float[Array, "..."]
 
 
-class Kind(eqx.Module):
+class ContactMode(eqx.Module):
     """One of the two kinds of motion of a `StickSlip`, in place of `Dynamics`: its contact margin is what ends it.
 
     - `both`: the scene's equations; `tolerance`: relative, of the integration.

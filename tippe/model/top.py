@@ -107,7 +107,7 @@ class Top(AbstractBody):
             yield Bound(self.stem.offset, "stem offset", above=reach, why="neither sphere lies within the other")
 
     @property
-    def outline(self) -> Round:
+    def meridian(self) -> Round:
         return Round(self.offset, self.radius, self.mass * self.offset / self.I1)
 
     @property

@@ -29,17 +29,17 @@ from nonholonomic.geometry import (
     sum_vectors,
     tangents,
 )
-from nonholonomic.hybrid import Passage
-from nonholonomic.integration import FAILED, GUARD_LOST, RUNNING, AbstractProblem
+from nonholonomic.hybrid import Transition
+from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import COS_THETA, Dynamics, stacked
 from ..model.scene import Scene
 from ..model.state import joined, parts
-from .exact_impact import strike_exactly
-from .flying_phase import AbstractFlyingPhase
+from .coulomb_impact import resolve_coulomb_impact
+from .flying_mode import AbstractFlyingMode
 from .free_body import Ball, FreeBody, axis_rate, balls, energy, gap_rate, standing_on, still_parting
-from .impact import strike
+from .impact import resolve_impact
 from .inversion_problem import InversionProblem
 
 #: The numbers of the phases. The last two are those of a top with a stem: that slides; or a sphere is about to strike, and the
@@ -54,7 +54,7 @@ OWN = 14
 CLOSING_SPEED = 1e-5
 
 
-class Aloft(NamedTuple):
+class FlightState(NamedTuple):
     """A state of flight, taken apart, in the surface's axes."""
 
     place: Vector
@@ -63,10 +63,10 @@ class Aloft(NamedTuple):
     momentum: Vector
 
 
-def aloft(state: Float[Array, "components ..."]) -> Aloft:
+def flight_state(state: Float[Array, "components ..."]) -> FlightState:
     """The parts of a state of flight."""
     rows = tuple(state[k] for k in range(12))
-    return Aloft(rows[:3], rows[3:6], rows[6:9], rows[9:12])
+    return FlightState(rows[:3], rows[3:6], rows[6:9], rows[9:12])
 
 
 class Below(NamedTuple):
@@ -77,7 +77,7 @@ class Below(NamedTuple):
     gap: Component
 
 
-def below(scene: Scene, flying: Aloft, ball: Ball | None = None) -> Below:
+def below(scene: Scene, flying: FlightState, ball: Ball | None = None) -> Below:
     """What a flying top has below one of its spheres, by default its own."""
     frame, ball = carried_frame(scene), balls(scene.body)[0] if ball is None else ball
     centre = sum_vectors(flying.place, scale(ball.offset, flying.axis))
@@ -93,19 +93,19 @@ def carried_frame(scene: Scene) -> CarriedFrame:
     return scene.frame
 
 
-def seen(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
+def to_frame(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
     """Components of a vector in a frame."""
     return (dot(vector, axes[0]), dot(vector, axes[1]), dot(vector, axes[2]))
 
 
-def unseen(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
+def from_frame(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
     """The vector with given components in a frame."""
     return tuple(sum_vectors(*(scale(part, axis) for part, axis in zip(vector, axes, strict=True))))
 
 
-def freed(scene: Scene, flying: Aloft, ground: Below, ball: Ball | None = None) -> FreeBody:
+def as_free_body(scene: Scene, flying: FlightState, ground: Below, ball: Ball | None = None) -> FreeBody:
     """A flying top as a free body above the tangent plane below one of its spheres, by default its own."""
-    velocity, axis, momentum = (seen(part, ground.axes) for part in flying[1:])
+    velocity, axis, momentum = (to_frame(part, ground.axes) for part in flying[1:])
     ball = balls(scene.body)[0] if ball is None else ball
     height = ball.radius + ground.gap - ball.offset * axis[2]
     return FreeBody(velocity, height, axis, momentum)
@@ -119,7 +119,7 @@ def in_contact(ground: Below, free: FreeBody) -> Float[Array, "14 ..."]:
 def in_flight(place: Vector, axes: tuple[Vector, Vector, Vector], free: FreeBody) -> Float[Array, "14 ..."]:
     """The state of flight of a body whose velocity, axis and momentum are given in a frame."""
     zero = jnp.zeros_like(place[0])
-    return joined(place, *(unseen(part, axes) for part in (free.velocity, free.axis, free.momentum)), (zero, zero))
+    return joined(place, *(from_frame(part, axes) for part in (free.velocity, free.axis, free.momentum)), (zero, zero))
 
 
 def standing(scene: Scene, ball: Ball) -> Dynamics:
@@ -130,13 +130,13 @@ def standing(scene: Scene, ball: Ball) -> Dynamics:
 
 # A single run asks before every phase, outside of its programs, whether it is over as it begins.
 @compiled_setup
-def nearing(scene: Scene, flying: Aloft, ball: Ball, rounding: float = 0.0) -> Float[Array, "..."]:
+def gap_margin(scene: Scene, flying: FlightState, ball: Ball, rounding: float = 0.0) -> Float[Array, "..."]:
     """Distance of a sphere from the arena as a fraction of R, plus the round-off of a parting.
 
     **Arguments:** `rounding`: what is allowed besides that.
     """
     body, ground = scene.body, below(scene, flying, ball)
-    rate = gap_rate(body, ball, freed(scene, flying, ground, ball))
+    rate = gap_rate(body, ball, as_free_body(scene, flying, ground, ball))
     far = sum(jnp.abs(part) for part in flying.place)
     rounding = rounding + 4.0 * jnp.finfo(far.dtype).eps * far / body.radius
     return ground.gap / body.radius + still_parting(rate, scene.gravity, body.radius, rounding)
@@ -164,10 +164,10 @@ class Contact(AbstractProblem):
         riding = (*sum_vectors(scale(falls, e), carried(across, motion.turning)), motion.spin_momentum / self.axial)
         return stacked((*motion.rate, *riding, motion.friction_power), state)
 
-    def crossing(self, state):
+    def event_function(self, state):
         return state[COS_THETA] - self.cos_angle
 
-    def guard(self, time, state):
+    def domain_margin(self, time, state):
         return self.dynamics.contact_margin(state[:OWN])
 
     def margins(self, time, state):
@@ -188,7 +188,7 @@ class Flight(AbstractProblem):
         return self.states, self.scales
 
     def field(self, time, state):
-        flying, body = aloft(state), self.scene.body
+        flying, body = flight_state(state), self.scene.body
         turning = axis_rate(body, flying.axis, flying.momentum)
         rates = (*flying.velocity, *self.falls, *turning, None, None, None, None, None)
         if self.rides:
@@ -197,19 +197,19 @@ class Flight(AbstractProblem):
             rates = (*rates, *carry, dot(flying.momentum, flying.axis) / body.I3, None)
         return stacked(rates, state)
 
-    def crossing(self, state):
-        flying = aloft(state)
+    def event_function(self, state):
+        flying = flight_state(state)
         return dot(flying.axis, below(self.scene, flying).axes[2]) - self.cos_angle
 
-    def guard(self, time, state):
+    def domain_margin(self, time, state):
         return functools.reduce(jnp.minimum, self.margins(time, state))
 
     def margins(self, time, state):
-        flying = aloft(state)
-        return tuple(nearing(self.scene, flying, ball) for ball in balls(self.scene.body))
+        flying = flight_state(state)
+        return tuple(gap_margin(self.scene, flying, ball) for ball in balls(self.scene.body))
 
 
-class Slide(AbstractFlyingPhase):
+class Slide(AbstractFlyingMode):
     """Sliding on the arena."""
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
@@ -218,20 +218,20 @@ class Slide(AbstractFlyingPhase):
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         return jnp.concatenate([state, jnp.zeros_like(state[:2])])
 
-    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Fly where the contact is lost, end where it jams or the ball does not fit. It counts the flights."""
         ends, zero = self.scene.dynamics.loss(state[:OWN]) > 0, jnp.zeros_like(state[0])
-        return Passage(
-            phase=jnp.where(ends, SLIDING, FLYING),
-            state=jnp.where(ends, state, parted(self.scene, state, self.rides)),
+        return Transition(
+            mode=jnp.where(ends, SLIDING, FLYING),
+            state=jnp.where(ends, state, lift_off(self.scene, state, self.rides)),
             elapsed=zero,
-            status=jnp.where(ends, GUARD_LOST, RUNNING),
+            status=jnp.where(ends, LEFT_DOMAIN, RUNNING),
             crossing_time=jnp.full_like(zero, jnp.inf),
             counts=(~ends).astype(int)[None],
         )
 
 
-def parted(
+def lift_off(
     scene: Scene, state: Float[Array, "components ..."], rides: bool, ball: Ball | None = None
 ) -> Float[Array, "components ..."]:
     """The state of flight of a top that has lost the contact in which its state is given, with what rides along if any.
@@ -245,15 +245,15 @@ def parted(
     axes = frame.own_axes(place)
     velocity = (*u, -ball.offset * axis_rate(body, e, L)[2])
     centre = sum_vectors(place[:3], scale(ball.radius, axes[2]))
-    s = sum_vectors(centre, scale(-ball.offset, unseen(e, axes)))
+    s = sum_vectors(centre, scale(-ball.offset, from_frame(e, axes)))
     flies = in_flight(s, axes, FreeBody(velocity, jnp.zeros_like(state[0]), e, L))
     if not rides:
         return flies
-    across = unseen(tuple(state[OWN + k] for k in range(3)), axes)
+    across = from_frame(tuple(state[OWN + k] for k in range(3)), axes)
     return jnp.concatenate([flies, jnp.stack(across), state[OWN + 3 :]])
 
 
-class Fly(AbstractFlyingPhase):
+class Fly(AbstractFlyingMode):
     """Flying over the arena."""
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
@@ -265,34 +265,34 @@ class Fly(AbstractFlyingPhase):
         return Flight(self.scene, self.cos_angle, state, scales, falls, self.rides)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
-        flying = aloft(state)
+        flying = flight_state(state)
         ground = below(self.scene, flying)
-        free = freed(self.scene, flying, ground)
-        across = seen(tuple(state[OWN + k] for k in range(3)), ground.axes)
+        free = as_free_body(self.scene, flying, ground)
+        across = to_frame(tuple(state[OWN + k] for k in range(3)), ground.axes)
         rate = gap_rate(self.scene.body, balls(self.scene.body)[0], free)
         rows = [jnp.stack(across), state[OWN + 3 :], jnp.stack([ground.gap, rate])]
         return jnp.concatenate([in_contact(ground, free), *rows])
 
-    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Strike the arena; rebound, or slide on where the rebound would be slow. It counts the flights that begin."""
-        scene, flying = self.scene, aloft(state)
+        scene, flying = self.scene, flight_state(state)
         ground = below(scene, flying)
-        ball, free, zero = balls(scene.body)[0], freed(scene, flying, ground), jnp.zeros_like(state[0])
+        ball, free, zero = balls(scene.body)[0], as_free_body(scene, flying, ground), jnp.zeros_like(state[0])
         speed = jnp.maximum(-gap_rate(scene.body, ball, free), 0.0)
         bounce = zero if scene.restitution is None else scene.restitution + zero
         rebounds = bounce * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
-        blow = strike_exactly if scene.friction.set_valued else strike
+        blow = resolve_coulomb_impact if scene.friction.set_valued else resolve_impact
         struck, fails = blow(scene.body, scene.friction, ball, free, jnp.where(rebounds, bounce, 0.0))
         # Where the landing was located a little below the arena, the next flight would end where it begins.
         lifted = tuple(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
         after = jnp.where(rebounds, in_flight(lifted, ground.axes, struck), in_contact(ground, struck))
         if self.rides:
             across = tuple(state[OWN + k] for k in range(3))
-            across = jnp.where(rebounds, jnp.stack(across), jnp.stack(seen(across, ground.axes)))
+            across = jnp.where(rebounds, jnp.stack(across), jnp.stack(to_frame(across, ground.axes)))
             gained = energy(scene.body, 0.0, struck) - energy(scene.body, 0.0, free)
             after = jnp.concatenate([after, across, state[OWN + 3 :].at[1].add(gained)])
-        return Passage(
-            phase=jnp.where(rebounds, FLYING, SLIDING),
+        return Transition(
+            mode=jnp.where(rebounds, FLYING, SLIDING),
             state=after,
             elapsed=zero,
             status=jnp.where(fails, FAILED, RUNNING),
@@ -301,25 +301,25 @@ class Fly(AbstractFlyingPhase):
         )
 
 
-def phases(
+def modes(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
-) -> tuple[tuple[AbstractFlyingPhase, ...], Int[Array, " cells"]]:
+) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The phases of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`."""
     given = (scene, problem.scales, problem.cos_angle, rides)
     return (Slide(*given), Fly(*given)), jnp.zeros(problem.states.shape[1:], int)
 
 
 def on_the_ground(
-    scene: Scene, state: Float[Array, "components cells"], phase: Int[Array, " cells"]
+    scene: Scene, state: Float[Array, "components cells"], mode: Int[Array, " cells"]
 ) -> Float[Array, "14 cells"]:
     """States of runs in the layout of a contact of the top's own sphere; others as they are seen from the foot below that."""
-    flies, flown = phase == FLYING, state[:OWN]
+    flies, flown = mode == FLYING, state[:OWN]
     if scene.body.stem is not None:
-        on_stem = phase == ON_STEM
-        flies, flown = phase != SLIDING, jnp.where(on_stem, parted(scene, flown, False, balls(scene.body)[1]), flown)
-    flying = aloft(flown)
+        on_stem = mode == ON_STEM
+        flies, flown = mode != SLIDING, jnp.where(on_stem, lift_off(scene, flown, False, balls(scene.body)[1]), flown)
+    flying = flight_state(flown)
     ground = below(scene, flying)
-    return jnp.where(flies, in_contact(ground, freed(scene, flying, ground)), state[:OWN])
+    return jnp.where(flies, in_contact(ground, as_free_body(scene, flying, ground)), state[:OWN])
 
 
 def loss(scene: Scene, state: Float[Array, "components ..."]) -> Int[Array, "..."]:

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import dot, scale, sum_vectors
-from nonholonomic.hybrid import Passage
-from nonholonomic.integration import FAILED, GUARD_LOST, RUNNING, UNRESOLVED, AbstractProblem
+from nonholonomic.hybrid import Transition
+from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.scene import Scene
@@ -26,25 +26,25 @@ from .airborne import (
     OWN,
     SLIDING,
     STRIKING,
-    Aloft,
     Below,
     Contact,
     Flight,
+    FlightState,
     Fly,
-    aloft,
+    as_free_body,
     below,
-    freed,
+    flight_state,
+    from_frame,
+    gap_margin,
     in_contact,
     in_flight,
-    nearing,
-    parted,
-    seen,
+    lift_off,
     standing,
-    unseen,
+    to_frame,
 )
-from .flying_phase import AbstractFlyingPhase
+from .flying_mode import AbstractFlyingMode
 from .free_body import Ball, FreeBody, balls, energy, gap_rate
-from .impact import strike
+from .impact import resolve_impact
 from .inversion_problem import InversionProblem
 
 #: Two spheres are at the arena together if neither is farther from it than this fraction of R, as in `sliding.py`.
@@ -72,13 +72,13 @@ class OneOfTwo(AbstractProblem):
     def field(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
         return self.contact.field(time, state)
 
-    def crossing(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+    def event_function(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         # The angle from the normal below the top's own sphere; it is that of the state if that sphere slides.
-        flying = aloft(parted(self.scene, state[:OWN], False, self.own))
+        flying = flight_state(lift_off(self.scene, state[:OWN], False, self.own))
         apart = dot(flying.axis, below(self.scene, flying, self.other).axes[2])
         return jnp.where(self.on_stem, apart, state[COS_THETA]) - self.contact.cos_angle
 
-    def guard(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+    def domain_margin(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         return functools.reduce(jnp.minimum, self.margins(time, state))
 
     def margins(self, time: Any, state: Float[Array, "components cells"]) -> tuple[Float[Array, " cells"], ...]:
@@ -88,10 +88,10 @@ class OneOfTwo(AbstractProblem):
 @compiled_setup
 def clearance(scene: Scene, own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
     """Distance of the other sphere from the arena as a fraction of R, plus the round-off of a parting."""
-    return nearing(scene, aloft(parted(scene, state[:OWN], False, own)), other, OVERLAP)
+    return gap_margin(scene, flight_state(lift_off(scene, state[:OWN], False, own)), other, OVERLAP)
 
 
-class SlideOnOne(AbstractFlyingPhase):
+class SlideOnOne(AbstractFlyingMode):
     """Sliding on the sphere numbered `number`, in the order of `free_body.balls`.
 
     The number is an array, so that one program serves both spheres.
@@ -111,21 +111,21 @@ class SlideOnOne(AbstractFlyingPhase):
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         flight = Fly(self.scene, self.scales, self.cos_angle, self.rides)
-        beside = flight.shown(parted(self.scene, state, True, self.spheres[0]))
+        beside = flight.shown(lift_off(self.scene, state, True, self.spheres[0]))
         return jnp.where(self.number == 1, beside, jnp.concatenate([state, jnp.zeros_like(state[:2])]))
 
-    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Fly where the contact is lost, strike with the other sphere where that is at the arena, end where the contact jams or
         the sphere does not fit. It counts the flights."""
         own, other = self.spheres
         dynamics, zero = standing(self.scene, own), jnp.zeros_like(state[0])
         lands = clearance(self.scene, own, other, state) <= dynamics.contact_margin(state[:OWN])
         ends = (dynamics.loss(state[:OWN]) > 0) & ~lands
-        return Passage(
-            phase=jnp.where(ends, jnp.where(self.number == 0, SLIDING, ON_STEM), jnp.where(lands, STRIKING, FLYING)),
-            state=jnp.where(ends, state, parted(self.scene, state, self.rides, own)),
+        return Transition(
+            mode=jnp.where(ends, jnp.where(self.number == 0, SLIDING, ON_STEM), jnp.where(lands, STRIKING, FLYING)),
+            state=jnp.where(ends, state, lift_off(self.scene, state, self.rides, own)),
             elapsed=zero,
-            status=jnp.where(ends, GUARD_LOST, RUNNING),
+            status=jnp.where(ends, LEFT_DOMAIN, RUNNING),
             crossing_time=jnp.full_like(zero, jnp.inf),
             counts=(~ends & ~lands).astype(int)[None],
         )
@@ -143,11 +143,11 @@ class FlightToBlow(AbstractProblem):
     def field(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
         return self.flight.field(time, state)
 
-    def crossing(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
-        return self.flight.crossing(state)
+    def event_function(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+        return self.flight.event_function(state)
 
-    def guard(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
-        return jnp.where(self.strikes, -1.0, self.flight.guard(time, state))
+    def domain_margin(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
+        return jnp.where(self.strikes, -1.0, self.flight.domain_margin(time, state))
 
     def margins(self, time: Any, state: Float[Array, "components cells"]) -> tuple[Float[Array, " cells"], ...]:
         return tuple(jnp.where(self.strikes, -1.0, margin) for margin in self.flight.margins(time, state))
@@ -164,31 +164,33 @@ class FlyBoth(Fly):
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         return FlightToBlow(super().problem(state), self.strikes)
 
-    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Strike the arena with the sphere that is there; rebound, or slide on it where the rebound would be slow.
 
         If the blow throws the other sphere into the arena, that strikes next. It counts the flights that begin.
         """
-        scene, flying, zero = self.scene, aloft(state), jnp.zeros_like(state[0])
-        main, stem = (nearing(scene, flying, ball) for ball in balls(scene.body))
+        scene, flying, zero = self.scene, flight_state(state), jnp.zeros_like(state[0])
+        main, stem = (gap_margin(scene, flying, ball) for ball in balls(scene.body))
         number = (stem < main).astype(int)
         own, other = own_and_other(scene, number)
         ground = below(scene, flying, own)
         # Where the landing was located a little below the arena, the next phase would end where it begins.
         flying = flying._replace(place=tuple(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
         ground = ground._replace(gap=zero)
-        blow = struck(scene, flying, ground, own, other)
+        blow = apply_impulse(scene, flying, ground, own, other)
         flies = blow.rebounds | blow.throws
         after = in_flight(flying.place, ground.axes, blow.free)
         after = jnp.where(flies, after, in_contact(ground, blow.free))
         if self.rides:
             across = tuple(state[OWN + k] for k in range(3))
-            across = jnp.where(flies, jnp.stack(across), jnp.stack(seen(across, ground.axes)))
-            gained = energy(scene.body, 0.0, blow.free) - energy(scene.body, 0.0, freed(scene, flying, ground, own))
+            across = jnp.where(flies, jnp.stack(across), jnp.stack(to_frame(across, ground.axes)))
+            gained = energy(scene.body, 0.0, blow.free) - energy(
+                scene.body, 0.0, as_free_body(scene, flying, ground, own)
+            )
             after = jnp.concatenate([after, across, state[OWN + 3 :].at[1].add(gained)])
         slides = jnp.where(number == 0, SLIDING, ON_STEM)
-        return Passage(
-            phase=jnp.where(blow.throws, STRIKING, jnp.where(blow.rebounds, FLYING, slides)),
+        return Transition(
+            mode=jnp.where(blow.throws, STRIKING, jnp.where(blow.rebounds, FLYING, slides)),
             state=after,
             elapsed=zero,
             status=jnp.where(blow.fails, FAILED, jnp.where(blow.rests, UNRESOLVED, RUNNING)),
@@ -197,7 +199,7 @@ class FlyBoth(Fly):
         )
 
 
-class Blow(NamedTuple):
+class ContactImpulse(NamedTuple):
     """What a blow does.
 
     - `free`: the top after it, above the tangent plane.
@@ -212,23 +214,25 @@ class Blow(NamedTuple):
     fails: Bool[Array, " cells"]
 
 
-def struck(scene: Scene, flying: Aloft, ground: Below, own: Ball, other: Ball) -> Blow:
+def apply_impulse(scene: Scene, flying: FlightState, ground: Below, own: Ball, other: Ball) -> ContactImpulse:
     """The blow of one sphere, on the tangent plane at its foot; slow rebounds are none.
 
     **Arguments:** `flying`: the top, its sphere `own` at the arena; `ground`: below that sphere; `other`: the other one.
     """
     body, closing = scene.body, CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
-    free = freed(scene, flying, ground, own)
+    free = as_free_body(scene, flying, ground, own)
     speed = jnp.maximum(-gap_rate(body, own, free), 0.0)
     bounce = jnp.zeros_like(speed) if scene.restitution is None else scene.restitution
     rebounds = bounce * speed > closing
-    after, fails = strike(body, scene.friction, own, free, jnp.where(rebounds, bounce, 0.0))
-    thrown = flying._replace(velocity=unseen(after.velocity, ground.axes), momentum=unseen(after.momentum, ground.axes))
+    after, fails = resolve_impact(body, scene.friction, own, free, jnp.where(rebounds, bounce, 0.0))
+    thrown = flying._replace(
+        velocity=from_frame(after.velocity, ground.axes), momentum=from_frame(after.momentum, ground.axes)
+    )
     beside = below(scene, flying, other)
-    before, now = (gap_rate(body, other, freed(scene, one, beside, other)) for one in (flying, thrown))
+    before, now = (gap_rate(body, other, as_free_body(scene, one, beside, other)) for one in (flying, thrown))
     touches = beside.gap < TOUCHING * body.radius
     rests = touches & ~rebounds & (speed <= closing) & (jnp.abs(before) <= closing)
-    return Blow(after, rebounds, touches & ~rests & (now < -closing), rests, fails)
+    return ContactImpulse(after, rebounds, touches & ~rests & (now < -closing), rests, fails)
 
 
 def own_and_other(scene: Scene, number: Int[Array, "..."]) -> tuple[Ball, Ball]:
@@ -238,15 +242,15 @@ def own_and_other(scene: Scene, number: Int[Array, "..."]) -> tuple[Ball, Ball]:
     return own, Ball(*(jnp.where(number == 0, b, a) for a, b in zip(main, stem, strict=True)))
 
 
-def phases(
+def modes(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
-) -> tuple[tuple[AbstractFlyingPhase, ...], Int[Array, " cells"]]:
+) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The phases of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`.
 
     A launch in which the stem would be in the arena starts on the stem: its place and its theta are those of the stem's foot.
     """
     given, (main, stem) = (scene, problem.scales, problem.cos_angle, rides), balls(scene.body)
-    started = aloft(parted(scene, problem.states[:OWN], False, main))
+    started = flight_state(lift_off(scene, problem.states[:OWN], False, main))
     first = jnp.where(below(scene, started, stem).gap < 0.0, ON_STEM, SLIDING)
     slides = [SlideOnOne(*given, jnp.asarray(number)) for number in (0, 1)]
     flies, strikes = (FlyBoth(*given, jnp.asarray(strikes)) for strikes in (False, True))

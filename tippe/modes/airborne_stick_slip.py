@@ -8,52 +8,52 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from nonholonomic.hybrid import Passage
-from nonholonomic.integration import GUARD_LOST, RUNNING, AbstractProblem
+from nonholonomic.hybrid import Transition
+from nonholonomic.integration import LEFT_DOMAIN, RUNNING, AbstractProblem
 
 from ..model.scene import Scene
-from ..model.stick_slip import AT_REST, Kind, StickSlip
-from . import stick_slip_runs
-from .airborne import FLYING, OWN, SLIDING, Fly, parted
-from .flying_phase import AbstractFlyingPhase
+from ..model.stick_slip import AT_REST, ContactMode, StickSlip
+from . import sticking
+from .airborne import FLYING, OWN, SLIDING, Fly, lift_off
+from .flying_mode import AbstractFlyingMode
 from .inversion_problem import InversionProblem
 
 #: The numbers of the phases; flying has that of `airborne.py`.
 SLIPPING, ROLLING = SLIDING, 2
 
 
-class Touch(AbstractFlyingPhase):
+class Touch(AbstractFlyingMode):
     """Slipping or rolling on the arena; `last` is whether the last crossing of the angle counts."""
 
-    kind: Kind
+    kind: ContactMode
     last: bool = eqx.field(static=True)
 
     @property
-    def grounded(self) -> stick_slip_runs.StickSlipPhase:
+    def contact_state(self) -> sticking.StickSlipMode:
         """The phase of runs that end where the contact is lost."""
         size = OWN if self.rides else None
-        return stick_slip_runs.StickSlipPhase(self.kind, self.cos_angle, self.scales, self.last, self.axial, size)
+        return sticking.StickSlipMode(self.kind, self.cos_angle, self.scales, self.last, self.axial, size)
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        return self.grounded.problem(state)
+        return self.contact_state.problem(state)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
-        return _at_no_distance(self.grounded.shown(state))
+        return _at_no_distance(self.contact_state.shown(state))
 
     def between(self, motion: tuple[Array, ...], passed: Float[Array, " times"]) -> Float[Array, "21 times"]:
-        return _at_no_distance(self.grounded.between(motion, passed))
+        return _at_no_distance(self.contact_state.between(motion, passed))
 
-    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Stick, slip, or fly where the contact is lost. It counts flights, and changes from slip to rolling."""
-        there = self.grounded.leave(state, left)
+        there = self.contact_state.reset_map(state, left)
         whole = there.state
         if self.kind.rolls:
             whole = jnp.concatenate([self.kind.both.rolling.carried_along(whole[:OWN]), whole[OWN:]])
-        flies = (there.status == GUARD_LOST) & (self.kind.loss(whole[:OWN]) == 0)
-        phase = jnp.where(there.phase == stick_slip_runs.ROLLING, ROLLING, SLIPPING)
+        flies = (there.status == LEFT_DOMAIN) & (self.kind.loss(whole[:OWN]) == 0)
+        mode = jnp.where(there.mode == sticking.ROLLING, ROLLING, SLIPPING)
         return there._replace(
-            phase=jnp.where(flies, FLYING, phase),
-            state=jnp.where(flies, parted(self.scene, whole, self.rides), there.state),
+            mode=jnp.where(flies, FLYING, mode),
+            state=jnp.where(flies, lift_off(self.scene, whole, self.rides), there.state),
             status=jnp.where(flies, RUNNING, there.status),
             counts=jnp.concatenate([flies.astype(int)[None], there.counts]),
         )
@@ -62,23 +62,23 @@ class Touch(AbstractFlyingPhase):
 class Land(Fly):
     """Flying over the arena, to a contact that slips or rolls."""
 
-    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Strike the arena; rebound, or slip or roll on."""
-        there, both = super().leave(state, left), self.scene.dynamics
+        there, both = super().reset_map(state, left), self.scene.dynamics
         assert isinstance(both, StickSlip)
         rests = both.slip_speed(there.state[:OWN]) <= AT_REST * both.speed
-        phase = jnp.where(rests, ROLLING, SLIPPING)
+        mode = jnp.where(rests, ROLLING, SLIPPING)
         counts = jnp.concatenate([there.counts, jnp.zeros_like(there.counts)])
-        return there._replace(phase=jnp.where(there.phase == FLYING, FLYING, phase), counts=counts)
+        return there._replace(mode=jnp.where(there.mode == FLYING, FLYING, mode), counts=counts)
 
 
-def phases(
+def modes(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
-) -> tuple[tuple[AbstractFlyingPhase, ...], Int[Array, " cells"]]:
+) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The phases of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`."""
     both, given = problem.dynamics, (scene, problem.scales, problem.cos_angle, rides)
     assert isinstance(both, StickSlip)
-    slips, rolls = (Touch(*given, Kind(both, jnp.asarray(tolerance, float), one), last) for one in (False, True))
+    slips, rolls = (Touch(*given, ContactMode(both, jnp.asarray(tolerance, float), one), last) for one in (False, True))
     rests = both.slip_speed(problem.states[:OWN]) <= AT_REST * both.speed
     return (slips, Land(*given), rolls), jnp.where(rests, ROLLING, SLIPPING)
 

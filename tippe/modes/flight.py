@@ -99,7 +99,7 @@ def flown(body: Top, gravity: Float[Array, "..."], free: FreeBody, time: Float[A
     return FreeBody((u1, u2, u3 - gravity * time), height, sum_vectors(*turned), free.momentum)
 
 
-def carried_aloft(body: Top, free: FreeBody, across: Vector, time: Float[Array, "..."]) -> Vector:
+def c_in_flight(body: Top, free: FreeBody, across: Vector, time: Float[Array, "..."]) -> Vector:
     """A vector across the axis that turns with it and not about it, some time [s] later.
 
     It turns at the rate L / I1 - (e.L / I1) e: about L, and less about e.
@@ -190,13 +190,13 @@ def landing(descent: Descent, most: Cells) -> tuple[Cells, Bool[Array, " cells"]
     end = jnp.minimum(most, _last_root(mean + amplitude, drift, g) * (1.0 + 1e-9))
     high_from, high_to = _roots(mean - amplitude, drift, g)
     # It is bent upwards where rate^2 amplitude cos(rate t - phase) < -g, for angles between bend and 2 pi - bend.
-    phase = jnp.arctan2(descent.sine, descent.cosine)
+    mode = jnp.arctan2(descent.sine, descent.cosine)
     ratio = g / jnp.maximum(rate**2 * amplitude, jnp.finfo(g.dtype).tiny)
     bend = jnp.arccos(-jnp.minimum(ratio, 1.0))
     straight = ratio >= 1.0
 
     def next_inflection(time: Cells) -> Cells:
-        ahead = [jnp.mod(phase + side * bend - rate * time, 2.0 * jnp.pi) for side in (1.0, -1.0)]
+        ahead = [jnp.mod(mode + side * bend - rate * time, 2.0 * jnp.pi) for side in (1.0, -1.0)]
         # The one that has been reached is left behind.
         ahead = [jnp.where(angle < 1e-9, 2.0 * jnp.pi, angle) for angle in ahead]
         return jnp.where(straight, jnp.inf, time + jnp.minimum(*ahead) / jnp.where(straight, 1.0, rate))

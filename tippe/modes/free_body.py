@@ -52,10 +52,10 @@ def balls(body: Top) -> tuple[Ball, ...]:
 def standing_on(dynamics: Dynamics, ball: Ball) -> Dynamics:
     """The equations of motion of a top that stands on another of its spheres: of the same form with its numbers."""
     coupling = dynamics.mass * ball.offset * dynamics.per_transverse
-    return dataclasses.replace(dynamics, outline=Round(ball.offset, ball.radius, coupling))
+    return dataclasses.replace(dynamics, meridian=Round(ball.offset, ball.radius, coupling))
 
 
-def freed(body: Top, ball: Ball, state: Float[Array, "components ..."]) -> FreeBody:
+def as_free_body(body: Top, ball: Ball, state: Float[Array, "components ..."]) -> FreeBody:
     """A top that stands on a sphere, as a free body: the sphere's centre is at rest along the normal.
 
     **Arguments:** `state`: (8, ...), as `tippe/model/state.py` has it.
@@ -65,7 +65,7 @@ def freed(body: Top, ball: Ball, state: Float[Array, "components ..."]) -> FreeB
     return FreeBody((*velocity, -ball.offset * axis_rate(body, axis, momentum)[2]), height, axis, momentum)
 
 
-def grounded(free: FreeBody) -> Float[Array, "components ..."]:
+def contact_state(free: FreeBody) -> Float[Array, "components ..."]:
     """The state (8, ...) of a top in contact; what is left out follows from the contact."""
     return joined(free.velocity[:2], free.axis, free.momentum)
 

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
-from nonholonomic.integration import GUARD_LOST, AbstractProblem, Settings, traced_march
+from nonholonomic.integration import LEFT_DOMAIN, AbstractProblem, Settings, traced_solve_ensemble
 
 from ..model.dynamics import least
 from ..model.friction import AbstractFriction, ContactLoad, Slip
@@ -58,7 +58,7 @@ class Approach(NamedTuple):
     turning: Vector
 
 
-class Blow(NamedTuple):
+class ContactImpulse(NamedTuple):
     """Impulses at the contact: of the force [N s], and of the torque [N m s], `None` under a law that has no torque."""
 
     force: Vector
@@ -84,13 +84,13 @@ class Impact(AbstractProblem):
         """Speed along the normal before the impact [m/s]; positive, because a sphere at rest has none to be measured by."""
         return jnp.maximum(jnp.abs(self.approach.velocity[2]), 1e-12)
 
-    def blow(self, normal: Cells, state: Float[Array, "rows cells"]) -> Blow:
+    def blow(self, normal: Cells, state: Float[Array, "rows cells"]) -> ContactImpulse:
         """The impulses at a stage of the impact."""
         unit = self.speed / self.approach.response[2][2]
         force = (state[0] * unit, state[1] * unit, normal * unit)
-        return Blow(force, tuple(row * unit * self.radius for row in state[2:]) or None)
+        return ContactImpulse(force, tuple(row * unit * self.radius for row in state[2:]) or None)
 
-    def changes(self, blow: Blow) -> tuple[Vector, Vector]:
+    def changes(self, blow: ContactImpulse) -> tuple[Vector, Vector]:
         """How the velocity of the contact point [m/s] and the angular velocity [rad/s] change by a blow."""
         meets, torque = self.approach, cross(self.approach.arm, blow.force)
         velocity = tuple(dot(column, blow.force) for column in meets.response)
@@ -102,7 +102,7 @@ class Impact(AbstractProblem):
 
     def load(self, velocity: Vector, turning: Vector) -> ContactLoad:
         """What friction does per unit normal impulse."""
-        drilling = turning[2] if self.friction.drills else None
+        drilling = turning[2] if self.friction.uses_spin else None
         return self.friction.per_normal_force(Slip(velocity[0], velocity[1], (turning[0], turning[1], drilling)))
 
     def start(self) -> tuple[Float[Array, "rows cells"], Float[Array, "rows cells"]]:
@@ -117,10 +117,10 @@ class Impact(AbstractProblem):
         rows = [jnp.zeros_like(time) if component is None else component for component in (*load.force, *torque)]
         return jnp.stack(jnp.broadcast_arrays(*rows, time)[:-1])
 
-    def crossing(self, state: Float[Array, "rows cells"]) -> None:
+    def event_function(self, state: Float[Array, "rows cells"]) -> None:
         return None
 
-    def guard(self, time: Cells, state: Float[Array, "rows cells"]) -> Cells:
+    def domain_margin(self, time: Cells, state: Float[Array, "rows cells"]) -> Cells:
         blow, response = self.blow(time, state), self.approach.response
         change, turned = self.changes(blow)
         missing = (self.gained - change[2]) / self.speed
@@ -132,12 +132,12 @@ class Impact(AbstractProblem):
         short = -gain * response[2][2] / self.speed**2
         return least(missing, jnp.where(approaches > short, approaches, short))
 
-    def ended(self, time: Cells, state: Float[Array, "rows cells"]) -> Blow:
+    def ended(self, time: Cells, state: Float[Array, "rows cells"]) -> ContactImpulse:
         """The impulses of an impact whose end has been located: put right by one step of Newton's method.
 
         The search leaves an error of 1e-10, its square is round-off.
         """
-        left, slope = jax.jvp(self.guard, (time, state), (jnp.ones_like(time), self.field(time, state)))
+        left, slope = jax.jvp(self.domain_margin, (time, state), (jnp.ones_like(time), self.field(time, state)))
         step = -left / jnp.where(slope == 0.0, 1.0, slope)
         step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
         return self.blow(time + step, state + step * self.field(time, state))
@@ -165,7 +165,7 @@ def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
     return Approach(arm, velocity, response, free.axis, turning)
 
 
-def strike(
+def resolve_impact(
     body: Top, friction: AbstractFriction, ball: Ball, free: FreeBody, restitution: Cells
 ) -> tuple[FreeBody, Bool[Array, " cells"]]:
     """The body after a sphere of it has struck the plane; unchanged where the sphere does not approach the plane.
@@ -184,16 +184,18 @@ def strike(
     gained = (1.0 + restitution) * jnp.maximum(-meets.velocity[2], 0.0)
     problem = Impact(body, friction, meets, ball.radius, gained)
     cells = gained.shape[0]
-    outcome, _ = traced_march(
+    outcome, _ = traced_solve_ensemble(
         problem,
         jnp.asarray(LARGEST),
         jnp.asarray(cells),
         Settings(TOLERANCE, diffrax.Dopri5(), absolute=1.0, max_steps=MOST_STEPS),
     )
-    return struck(body, meets, free, problem.ended(outcome.end_time, outcome.state)), outcome.status != GUARD_LOST
+    return apply_impulse(
+        body, meets, free, problem.ended(outcome.end_time, outcome.state)
+    ), outcome.status != LEFT_DOMAIN
 
 
-def struck(body: Top, meets: Approach, free: FreeBody, blow: Blow) -> FreeBody:
+def apply_impulse(body: Top, meets: Approach, free: FreeBody, blow: ContactImpulse) -> FreeBody:
     """A free body after a blow at its contact."""
     velocity = sum_vectors(free.velocity, scale(1.0 / body.mass, blow.force))
     momentum = sum_vectors(free.momentum, cross(meets.arm, blow.force))

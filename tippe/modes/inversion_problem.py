@@ -12,13 +12,13 @@ from ..model.dynamics import Dynamics
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import COS_THETA
-from ..model.stick_slip import Kind, StickSlip
+from ..model.stick_slip import ContactMode, StickSlip
 
 
 class InversionProblem(AbstractProblem):
     """Launches that end when theta reaches an angle or the contact is lost or jams."""
 
-    dynamics: Dynamics | StickSlip | Kind
+    dynamics: Dynamics | StickSlip | ContactMode
     cos_angle: Float[Array, "..."]
     states: Float[Array, "components cells"]
     scales: Float[Array, "components cells"]
@@ -37,10 +37,12 @@ class InversionProblem(AbstractProblem):
     def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
         return self.dynamics.field(state)
 
-    def crossing(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
+    def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
         return state[COS_THETA] - self.cos_angle
 
-    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
+    def domain_margin(
+        self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]
+    ) -> Float[Array, " lanes"]:
         return self.dynamics.contact_margin(state)
 
     def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> tuple[Any, ...]:

@@ -31,7 +31,7 @@ from ..model.dynamics import least, stacked
 from ..model.friction import AbstractFriction, Slip
 from ..model.state import angular_velocity, parts
 from ..model.top import Top
-from .free_body import FreeBody, axis_rate, balls, gap_rate, grounded
+from .free_body import FreeBody, axis_rate, balls, contact_state, gap_rate
 from .impact import approach
 
 #: The number of this kind of contact, next to those of the spheres, 0 and 1.
@@ -91,7 +91,7 @@ class LeaningDynamics(eqx.Module):
         precession = (p - c * along) / I1
         rolling = along / I1 + (1.0 / I3 - 1.0 / I1) * b
 
-        turning = (rolling * e[0], rolling * e[1], rolling * c + precession if self.friction.drills else None)
+        turning = (rolling * e[0], rolling * e[1], rolling * c + precession if self.friction.uses_spin else None)
         slips = [Slip(*sum_vectors(u, scale(rolling * R + precession * a, across)), turning) for a, R in spheres]
         loads = [self.friction.per_normal_force(slip) for slip in slips]
         height = spheres[0].radius - spheres[0].offset * c
@@ -151,7 +151,7 @@ class LeaningDynamics(eqx.Module):
         forces, turns, gains = [], [], []
         for ball in spheres:
             meets = approach(self.body, ball, free)
-            slip = Slip(*meets.velocity[:2], (w1, w2, w3 if self.friction.drills else None))
+            slip = Slip(*meets.velocity[:2], (w1, w2, w3 if self.friction.uses_spin else None))
             load = self.friction.per_normal_force(slip)
             forces.append(tuple(zero if part is None else part for part in (*load.force, 1.0 + zero)))
             turns.append(sum_vectors(cross(meets.arm, forces[-1]), load.torque))
@@ -177,7 +177,7 @@ class LeaningDynamics(eqx.Module):
         stands on; and whether that is the only answer.
         """
         free = at_rest(self.body, free)
-        state = grounded(free)
+        state = contact_state(free)
         number = jnp.where(self.contact_margin(state) > 0.0, BOTH, self.heavier(state))
         return free, number, self.motion(state).definiteness > INDEFINITE
 

@@ -13,17 +13,29 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import dot, multiply, scale
-from nonholonomic.hybrid import Passage, Record
-from nonholonomic.integration import CROSSED, FAILED, GUARD_LOST, REACHED_END, RUNNING, UNRESOLVED, AbstractProblem
+from nonholonomic.hybrid import Transition, TransitionPath
+from nonholonomic.integration import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED, AbstractProblem
 
 from ..model.dynamics import COS_THETA, Dynamics, least, stacked
 from ..model.scene import Scene
 from ..model.state import parts
 from ..model.top import Top
-from .flight import angle_reached, carried_aloft, cone, flown, fly
-from .flying_phase import AbstractFlyingPhase
-from .free_body import Ball, FreeBody, balls, energy, freed, gap, gap_rate, grounded, shown, standing_on, still_parting
-from .impact import strike
+from .flight import angle_reached, c_in_flight, cone, flown, fly
+from .flying_mode import AbstractFlyingMode
+from .free_body import (
+    Ball,
+    FreeBody,
+    as_free_body,
+    balls,
+    contact_state,
+    energy,
+    gap,
+    gap_rate,
+    shown,
+    standing_on,
+    still_parting,
+)
+from .impact import resolve_impact
 from .inversion_problem import InversionProblem
 from .leaning import LeaningDynamics, at_rest
 
@@ -76,10 +88,10 @@ class Sliding(AbstractProblem):
         riding = (state[0], state[1], *across_rate, motion.spin_momentum / self.axial, motion.friction_power)
         return stacked((*motion.rate, *riding), state)
 
-    def crossing(self, state: Float[Array, "components cells"]) -> Cells:
+    def event_function(self, state: Float[Array, "components cells"]) -> Cells:
         return state[COS_THETA] - self.cos_angle
 
-    def guard(self, time: Cells, state: Float[Array, "components cells"]) -> Cells:
+    def domain_margin(self, time: Cells, state: Float[Array, "components cells"]) -> Cells:
         return least(*self.margins(time, state))
 
     def margins(self, time: Cells, state: Float[Array, "components cells"]) -> tuple[Cells, ...]:
@@ -102,7 +114,7 @@ def height(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Flo
     return own.radius - other.radius + (other.offset - own.offset) * state[COS_THETA]
 
 
-class Slide(AbstractFlyingPhase):
+class Slide(AbstractFlyingMode):
     """Sliding on the sphere numbered `number`, in the order of `free_body.balls`, up to an angle of theta.
 
     The number is an array, so that one program serves both spheres; `last` says whether the run goes on through the angle. A
@@ -119,20 +131,20 @@ class Slide(AbstractFlyingPhase):
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         own, _ = _own_and_other(balls(self.scene.body), self.number)
-        return shown(self.scene.body, freed(self.scene.body, own, state), state[OWN:])
+        return shown(self.scene.body, as_free_body(self.scene.body, own, state), state[OWN:])
 
     def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "17 times"]:
         free, riding = motion
         later = flown(self.scene.body, self.scene.gravity, free, passed)
         return shown(self.scene.body, later, _carried(self.scene.body, free, riding, passed))
 
-    def leave(self, state: Float[Array, "components cells"], left: Cells) -> Passage:
+    def reset_map(self, state: Float[Array, "components cells"], left: Cells) -> Transition:
         """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land where it is that which touches.
 
         It counts the flights.
         """
 
-        def hop(carry: tuple[Air, Array, Record | None]) -> tuple[Air, Array, Record | None]:
+        def hop(carry: tuple[Air, Array, TransitionPath | None]) -> tuple[Air, Array, TransitionPath | None]:
             air, count, record = carry
             after, landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
             if air.falls is not None:
@@ -141,7 +153,7 @@ class Slide(AbstractFlyingPhase):
             after = _where(landed, land(self.scene, after), after)
             return _where(air.open, after, air), count + 1, record
 
-        def under_way(carry: tuple[Air, Array, Record | None]) -> Array:
+        def under_way(carry: tuple[Air, Array, TransitionPath | None]) -> Array:
             return jnp.any(carry[0].open) & (carry[1] < MOST_BOUNCES)
 
         start = lost_contact(self.scene, self.number, state)
@@ -150,41 +162,41 @@ class Slide(AbstractFlyingPhase):
         record = _no_flights(start) if self.rides else None
         air, _, record = jax.lax.while_loop(under_way, hop, (start, jnp.zeros((), int), record))
         status = jnp.where(air.open, UNRESOLVED, air.status)
-        state = grounded(air.free)
+        state = contact_state(air.free)
         if air.riding is not None:
             state = jnp.concatenate([state, air.riding])
         found = (air.ball, state, air.elapsed, status, air.crossing_time, air.flights[None])
-        return Passage(*found, record, air.log_rates)
+        return Transition(*found, record, air.log_rates)
 
 
-class Lean(AbstractFlyingPhase):
+class Lean(AbstractFlyingMode):
     """Sliding on both spheres; the phase after those of the spheres."""
 
     def problem(self, state: Float[Array, "components cells"]) -> Sliding:
         return Sliding(leaning(self.scene), None, None, self.cos_angle, state, self.scales, self.axial)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
-        return shown(self.scene.body, freed(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])
+        return shown(self.scene.body, as_free_body(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])
 
-    def leave(self, state: Float[Array, "components cells"], left: Cells) -> Passage:
+    def reset_map(self, state: Float[Array, "components cells"], left: Cells) -> Transition:
         """Slide on the sphere whose normal force has not vanished."""
         number = leaning(self.scene).heavier(state)
-        own = grounded(at_rest(self.scene.body, freed(self.scene.body, balls(self.scene.body)[0], state)))
+        own = contact_state(at_rest(self.scene.body, as_free_body(self.scene.body, balls(self.scene.body)[0], state)))
         state = jnp.concatenate([own, state[OWN:]])
         zero = jnp.zeros_like(state[0])
         running, none = jnp.full(zero.shape, RUNNING), jnp.zeros((1, *zero.shape), int)
-        return Passage(number, state, zero, running, jnp.full_like(zero, jnp.inf), none)
+        return Transition(number, state, zero, running, jnp.full_like(zero, jnp.inf), none)
 
 
-def phases(
+def modes(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
-) -> tuple[tuple[AbstractFlyingPhase, ...], Int[Array, " cells"]]:
+) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The phases of runs, sliding on each sphere and on both if there are two; and the number of that in which each starts.
 
     **Arguments:**
 
     - `scene`: with `contact="hybrid"`; `problem`: of its launches, which stand on their lower sphere.
-    - `tolerance`: no phase needs it; `last`: whether the last crossing counts; `rides`: as for `AbstractFlyingPhase`.
+    - `tolerance`: no phase needs it; `last`: whether the last crossing counts; `rides`: as for `AbstractFlyingMode`.
     """
     spheres, given = balls(scene.body), (scene, problem.scales, problem.cos_angle, rides)
     found = tuple(Slide(*given, jnp.asarray(number), last) for number in range(len(spheres)))
@@ -205,10 +217,10 @@ class Air(NamedTuple):
     - `free`, `elapsed` [s]: the body and the time since the contact was lost.
     - `ball`: the sphere that touched last; `rising`: whether it left with a speed; `falls`: whether, without a flight, it is
       about to strike the plane, `None` for a top without stem. Once the contact is closed, the number of the phase.
-    - `status`: `RUNNING`, or how the run ended, `GUARD_LOST` if it has jammed; `crossing_time` [s] of the event, infinite if
+    - `status`: `RUNNING`, or how the run ended, `LEFT_DOMAIN` if it has jammed; `crossing_time` [s] of the event, infinite if
       there was none.
     - `flights`: so far; `open`: whether there is no contact and the run goes on.
-    - `log_rates`: of the landings, as in `Passage`.
+    - `log_rates`: of the landings, as in `Transition`.
     - `riding`: what rides along with a single run.
     """
 
@@ -235,12 +247,12 @@ def lost_contact(scene: Scene, number: Int[Array, ""], state: Float[Array, "comp
         falls = clearance(dynamics, own, other, state) <= dynamics.contact_margin(state)
         ball, jams = jnp.where(falls, 1 - number, number), jams & ~falls
     return Air(
-        free=freed(scene.body, own, state),
+        free=as_free_body(scene.body, own, state),
         elapsed=zero,
         ball=ball,
         rising=jnp.zeros(zero.shape, bool),
         falls=falls,
-        status=jnp.where(jams, GUARD_LOST, RUNNING),
+        status=jnp.where(jams, LEFT_DOMAIN, RUNNING),
         crossing_time=jnp.full_like(zero, jnp.inf),
         flights=jnp.zeros(zero.shape, int),
         open=~jams,
@@ -288,7 +300,7 @@ def land(scene: Scene, air: Air) -> Air:
     )
     closing = CLOSING_SPEED * jnp.sqrt(scene.gravity * body.radius)
     rebounds = restitution * speed > closing
-    free, fails = strike(body, scene.friction, own, air.free, jnp.where(rebounds, restitution, 0.0))
+    free, fails = resolve_impact(body, scene.friction, own, air.free, jnp.where(rebounds, restitution, 0.0))
     struck = air._replace(free=free, rising=rebounds, open=rebounds, status=jnp.where(fails, FAILED, air.status))
     if other is not None:
         struck = _with_other(scene, air, struck, other, (speed <= closing) & ~rebounds, closing)
@@ -325,27 +337,27 @@ def _carried(
     x, y, *across, angle, work = riding
     u1, u2, _ = free.velocity
     spin_rate = dot(free.axis, free.momentum) / body.I3
-    across = carried_aloft(body, free, tuple(across), time)
+    across = c_in_flight(body, free, tuple(across), time)
     return jnp.stack([x + u1 * time, y + u2 * time, *across, angle + spin_rate * time, work + 0.0 * time])
 
 
-def _no_flights(start: Air) -> Record:
+def _no_flights(start: Air) -> TransitionPath:
     """Room for the flights of a single run."""
 
     def room(leaf: Array) -> Array:
         return jnp.zeros((MOST_BOUNCES, *leaf.shape), leaf.dtype)
 
     motions = jax.tree.map(room, (start.free, start.riding))
-    return Record(jnp.inf + room(start.elapsed), motions, room(start.flights))
+    return TransitionPath(jnp.inf + room(start.elapsed), motions, room(start.flights))
 
 
-def _with_flight(body: Top, record: Record | None, before: Air, after: Air) -> Record | None:
+def _with_flight(body: Top, record: TransitionPath | None, before: Air, after: Air) -> TransitionPath | None:
     """A record, if one is kept, with the flight that leads from one state of a single run to another, if it flew."""
     if record is None:
         return None
     place, flew = before.flights[0], after.flights > before.flights
     turned = cone(body, before.free).rate * (after.elapsed - before.elapsed)
-    new = Record(
+    new = TransitionPath(
         jnp.where(flew, after.elapsed, jnp.inf), (before.free, before.riding), 1 + (turned / SHOWN).astype(int)
     )
     return jax.tree.map(lambda kept, leaf: kept.at[place].set(leaf), record, new)

@@ -13,7 +13,7 @@ from ..model.dynamics import Dynamics, stacked
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import parts
-from ..model.stick_slip import Kind, StickSlip
+from ..model.stick_slip import ContactMode, StickSlip
 
 
 class TrajectoryProblem(AbstractProblem):
@@ -26,7 +26,7 @@ class TrajectoryProblem(AbstractProblem):
     `rest` are spin angle and work at the start, `None` where both are 0.
     """
 
-    dynamics: Dynamics | StickSlip | Kind
+    dynamics: Dynamics | StickSlip | ContactMode
     axial: Float[Array, "..."]
     state: Float[Array, "components ..."]
     cyclic: Float[Array, "components ..."]
@@ -62,10 +62,10 @@ class TrajectoryProblem(AbstractProblem):
         riding = (*path_rate, *across_rate, motion.spin_momentum / self.axial, motion.friction_power)
         return stacked((*motion.rate, *riding), state)
 
-    def crossing(self, state: Float[Array, "components ..."]) -> None:
+    def event_function(self, state: Float[Array, "components ..."]) -> None:
         return None
 
-    def guard(self, time: Float[Array, "..."], state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+    def domain_margin(self, time: Float[Array, "..."], state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         return self.dynamics.contact_margin(state[: len(self.state)])
 
     def margins(self, time: Float[Array, "..."], state: Float[Array, "components ..."]) -> tuple[Any, ...]:

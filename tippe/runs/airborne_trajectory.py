@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import scale, sum_vectors
-from nonholonomic.hybrid import BETWEEN, Piece, follow_phases, phased_samples
+from nonholonomic.hybrid import BETWEEN, Segment, hybrid_samples, solve_hybrid_dense
 from nonholonomic.integration import Settings
 
 from ..model.dynamics import LOSSES, NO_COSINE, Motion
@@ -22,16 +22,16 @@ from ..modes.airborne import (
     FLYING,
     ON_STEM,
     STRIKING,
-    aloft,
+    as_free_body,
     below,
     carried_frame,
-    freed,
+    flight_state,
     in_contact,
+    lift_off,
     loss,
-    parted,
     standing,
 )
-from ..modes.airborne_stick_slip import phases as stick_slip_phases
+from ..modes.airborne_stick_slip import modes as stick_slip_modes
 from ..modes.free_body import Ball, balls
 from ..modes.inversion_problem import InversionProblem
 from ..modes.trajectory_problem import TrajectoryProblem
@@ -88,12 +88,12 @@ class ArenaTrajectory(HybridTrajectory):
         scene, place = self.scene, parts(self.states).place
         (distance, rate), own, stem = self.above, *balls(scene.body)
         # Its place is that of a top whose own sphere is so much greater that it touches.
-        flying = aloft(parted(scene, self.states, False, Ball(own.offset, own.radius + distance)))
+        flying = flight_state(lift_off(scene, self.states, False, Ball(own.offset, own.radius + distance)))
         frame = carried_frame(scene)
         flying = flying._replace(velocity=tuple(sum_vectors(flying.velocity, scale(rate, frame.normal(place[:3])))))
         ground = below(scene, flying, stem)
         ground = ground._replace(axes=frame.own_axes((*ground.foot, *place[3:])))
-        return standing(scene, stem).motion(in_contact(ground, freed(scene, flying, ground, stem)))
+        return standing(scene, stem).motion(in_contact(ground, as_free_body(scene, flying, ground, stem)))
 
     @staticmethod
     def parts_of(shown: Float[np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
@@ -115,13 +115,13 @@ class StickSlipArenaTrajectory(ArenaTrajectory):
         return -1 * (numbers == FLYING)
 
     @staticmethod
-    def work_in(piece: Piece) -> float:
+    def work_in(piece: Segment) -> float:
         if piece.number == BETWEEN:
             return float(np.diff(piece.at(np.array([piece.begin, piece.end]))[18])[0])
         return ArenaTrajectory.work_in(piece)
 
 
-def arena_phases(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "19 1"]]:
+def arena_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "19 1"]]:
     """The phases of one launch of a hybrid scene on any arena, the number of the first, and the state there.
 
     **Arguments:** `modules`: scene and launch; `tolerance`: relative, of the integration.
@@ -129,23 +129,23 @@ def arena_phases(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, In
     run = TrajectoryProblem.of(*modules)
     state, scales = run.start()
     problem = InversionProblem(modules[0].dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
-    phases = airborne.phases if modules[0].body.stem is None else airborne_stem.phases
+    modes = airborne.modes if modules[0].body.stem is None else airborne_stem.modes
     if modules[0].friction.set_valued:
-        phases = stick_slip_phases
-    return (*phases(modules[0], problem, tolerance, last=False, rides=True), state[:, None])
+        modes = stick_slip_modes
+    return (*modes(modules[0], problem, tolerance, last=False, rides=True), state[:, None])
 
 
 def simulate_airborne(
     scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver | None
 ) -> ArenaTrajectory:
     """Run one launch of a hybrid scene whose flights are integrated. **Arguments:** as for `simulate`, checked."""
-    kinds, first, state = arena_phases((scene, launch), tolerance)
+    kinds, first, state = arena_modes((scene, launch), tolerance)
     exact = scene.friction.set_valued
-    path = follow_phases(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1 + exact)
+    path = solve_hybrid_dense(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1 + exact)
     status = STATUS[path.status]
     if status == "jammed":
         status = LOSSES[int(loss(scene, jnp.asarray(path.state)))]
-    hops = np.array([(one.begin, one.end) for one in path.stays if one.number == FLYING]).reshape(-1, 2)
+    hops = np.array([(one.begin, one.end) for one in path.mode_segments if one.number == FLYING]).reshape(-1, 2)
     run = flights_of(StickSlipArenaTrajectory if exact else ArenaTrajectory, scene, path, status, hops, times)
     if exact:
         run.stats["sticks"] = int(path.counts[1])
@@ -154,6 +154,6 @@ def simulate_airborne(
 
 def sampled_airborne(scene: Scene, launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:
     """Run one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, checked."""
-    found = phased_samples(arena_phases, (scene, launch), times, t1, settings, kinds=1)
+    found = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, kinds=1)
     codes = jnp.asarray([CODES.index(word) for word in LOSSES])
     return sampled_flights(ArenaTrajectory, scene, times, found, codes[loss(scene, found.end_state)])

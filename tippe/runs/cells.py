@@ -10,17 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.hybrid import AbstractPhase, Journey, travel
+from nonholonomic.hybrid import AbstractBatchedMode, HybridOutcome, solve_hybrid
 from nonholonomic.integration import (
     CROSSED,
     FAILED,
-    GUARD_LOST,
+    LEFT_DOMAIN,
     REACHED_END,
     UNRESOLVED,
     Outcome,
     Settings,
-    compiled_march,
-    march_by_diffrax,
+    solve_by_diffrax,
+    solve_ensemble,
 )
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Variable
@@ -29,28 +29,28 @@ from ..model.dynamics import LOSSES
 from ..model.scene import Scene
 from ..modes import airborne, airborne_stem, airborne_stick_slip
 from ..modes.inversion_problem import InversionProblem
-from ..modes.sliding import phases as hybrid_phases
-from ..modes.stick_slip_runs import phases as stick_slip_phases
+from ..modes.sliding import modes as hybrid_modes
+from ..modes.sticking import modes as stick_slip_modes
 from .inversion import is_inverted
-from .sensitivities import phased_slopes_of_cells, slopes_of_cells
+from .sensitivities import hybrid_sensitivities_of_cells, sensitivities_of_cells
 
 
-class Driver(NamedTuple):
+class RunKind(NamedTuple):
     """How the runs of a kind of scene go: the words of their status, what is counted besides steps, and the phases.
 
-    `phases` takes (scene, problem, tolerance, last) and gives the phases and the number of each cell's first; `None` for runs
-    of one smooth motion. `aloft` is whether states may be those of flight, in a layout of their own.
+    `modes` takes (scene, problem, tolerance, last) and gives the phases and the number of each cell's first; `None` for runs
+    of one smooth motion. `flight_state` is whether states may be those of flight, in a layout of their own.
     """
 
     words: tuple[str, ...]
     counts: tuple[str, ...]
-    phases: Callable[..., tuple[tuple[AbstractPhase, ...], Int[Array, " cells"]]] | None
-    aloft: bool = False
+    modes: Callable[..., tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]] | None
+    flight_state: bool = False
 
     @property
     def smooth(self) -> bool:
         """Whether a run is one smooth motion."""
-        return self.phases is None
+        return self.modes is None
 
     @property
     def variables(self) -> dict[str, Variable]:
@@ -69,30 +69,30 @@ TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_t
 # Compiled once for all blocks.
 _on_the_ground = eqx.filter_jit(airborne.on_the_ground)
 _loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
-_loss_aloft = eqx.filter_jit(airborne.loss)
+_flight_loss = eqx.filter_jit(airborne.loss)
 
 
 @eqx.filter_jit
 def _at_the_end(
-    scene: Scene, problem: InversionProblem, ended: Outcome | Journey, last: bool
+    scene: Scene, problem: InversionProblem, ended: Outcome | HybridOutcome, last: bool
 ) -> tuple[Bool[Array, " cells"], Float[Array, " cells"]]:
     """Which cells count as inverted, and theta [rad] at the end of each."""
     return is_inverted(ended, problem, last), scene.theta(jnp.asarray(ended.state))
 
 
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit")
-SMOOTH = Driver(WORDS, (), None)
-STICK_SLIP = Driver((*WORDS, "unresolved"), ("sticks",), stick_slip_phases)
-HYBRID = Driver((*WORDS, "unresolved"), ("hops",), hybrid_phases)
-AIRBORNE = Driver((*WORDS, "unresolved"), ("hops",), airborne.phases, aloft=True)
-ON_STEM_TOO = Driver((*WORDS, "unresolved"), ("hops",), airborne_stem.phases, aloft=True)
-STICK_SLIP_FLY = Driver((*WORDS, "unresolved"), ("hops", "sticks"), airborne_stick_slip.phases, aloft=True)
+SMOOTH = RunKind(WORDS, (), None)
+STICK_SLIP = RunKind((*WORDS, "unresolved"), ("sticks",), stick_slip_modes)
+HYBRID = RunKind((*WORDS, "unresolved"), ("hops",), hybrid_modes)
+AIRBORNE = RunKind((*WORDS, "unresolved"), ("hops",), airborne.modes, flight_state=True)
+ON_STEM_TOO = RunKind((*WORDS, "unresolved"), ("hops",), airborne_stem.modes, flight_state=True)
+STICK_SLIP_FLY = RunKind((*WORDS, "unresolved"), ("hops", "sticks"), airborne_stick_slip.modes, flight_state=True)
 
 #: The word for a run's status if it has not inverted; `not_inverted` for all others.
-WORD_OF_STATUS = {GUARD_LOST: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
+WORD_OF_STATUS = {LEFT_DOMAIN: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
 
 
-def driver_of(scene: Scene) -> Driver:
+def run_kind_of(scene: Scene) -> RunKind:
     """The driver for a scene."""
     hybrid = scene.contact == "hybrid"
     if scene.friction.set_valued:
@@ -106,17 +106,17 @@ def driver_of(scene: Scene) -> Driver:
 
 def check_differentiable(scene: Scene) -> None:
     """Raise `ValueError` for a scene through whose phases no derivative goes."""
-    if driver_of(scene) is STICK_SLIP_FLY:
+    if run_kind_of(scene) is STICK_SLIP_FLY:
         raise ValueError(
             "friction = SetValuedCoulomb with contact = 'hybrid' has no derivatives: they do not go through impacts in which a "
             "slip may stop"
         )
 
 
-class CellRuns(NamedTuple):
+class InversionRuns(NamedTuple):
     """What is asked of every cell of a table; see `inversion_table`."""
 
-    driver: Driver
+    run_kind: RunKind
     t1: float
     angle: float
     crossing: str
@@ -139,7 +139,11 @@ class CellRuns(NamedTuple):
         """The table's variables, but errors and derivatives."""
         times = {name: Variable("s", np.float64, long_name=TIMES[name]) for name in self.times}
         grazes = Variable("1", np.int8, long_name="whether an event on the way was grazing")
-        return times | self.driver.variables | ({"grazes": grazes} if self.slopes_by and not self.driver.smooth else {})
+        return (
+            times
+            | self.run_kind.variables
+            | ({"grazes": grazes} if self.slopes_by and not self.run_kind.smooth else {})
+        )
 
     def results(self, roots: dict[str, Any], columns: dict[str, Any], tolerance: float, count: int) -> dict[str, Any]:
         """The variables of some cells.
@@ -153,23 +157,23 @@ class CellRuns(NamedTuple):
         problem = InversionProblem.of(scene, launch, self.angle, size)
         options = {"count": count, "size": size, "solver": self.solver, "last": self.last}
         numbers = (roots, columns, self.slopes_by, self.angle)
-        if self.driver.phases is not None:
-            options |= {"kinds": len(self.driver.counts)}
-            along = functools.partial(phased_slopes_of_cells, self.driver.phases, *numbers, **options)
-            return self._travelled(scene, problem, tolerance, count, along)
+        if self.run_kind.modes is not None:
+            options |= {"kinds": len(self.run_kind.counts)}
+            along = functools.partial(hybrid_sensitivities_of_cells, self.run_kind.modes, *numbers, **options)
+            return self._hybrid_runs(scene, problem, tolerance, count, along)
         if not self.slopes_by:
             return self._ended(scene, problem, self._outcome(problem, tolerance, count))
-        outcome, slopes = slopes_of_cells(*numbers, self.t1, tolerance, **options)
+        outcome, slopes = sensitivities_of_cells(*numbers, self.t1, tolerance, **options)
         return self._ended(scene, problem, outcome) | slopes
 
-    def _travelled(
+    def _hybrid_runs(
         self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, along: Callable[..., Any]
     ) -> dict[str, Any]:
         """The variables of cells whose runs have phases; `along` takes (horizon, tolerance) and gives runs and slopes."""
         if self.slopes_by and not self.last:
             found, slopes, grazing = along(self.t1, tolerance)
         else:
-            found = self._journey(scene, problem, tolerance, count, self.last)
+            found = self._hybrid_outcome(scene, problem, tolerance, count, self.last)
         if self.slopes_by and self.last:
             # The slopes need the run up to the event alone, whose time is known by now.
             there, slopes, grazing = along(
@@ -177,12 +181,12 @@ class CellRuns(NamedTuple):
             )
             grazing |= there.status != REACHED_END
         loss = functools.partial(self._loss, scene, found.state)
-        if self.driver.aloft:
-            found = found._replace(state=np.asarray(_on_the_ground(scene, found.state, found.phase)))
-        named = self._named(scene, problem, found, loss) | dict(zip(self.driver.counts, found.counts, strict=True))
+        if self.run_kind.flight_state:
+            found = found._replace(state=np.asarray(_on_the_ground(scene, found.state, found.mode)))
+        named = self._named(scene, problem, found, loss) | dict(zip(self.run_kind.counts, found.counts, strict=True))
         if self.crossing == "both":
             # Through phases the first crossing takes a journey of its own, which ends there.
-            first = self._journey(scene, problem, tolerance, count, False)
+            first = self._hybrid_outcome(scene, problem, tolerance, count, False)
             named["first_time"] = np.where(first.status == CROSSED, first.crossing_time, np.inf)
         if not self.slopes_by:
             return named
@@ -191,18 +195,20 @@ class CellRuns(NamedTuple):
         slopes = {name: np.where(moves, np.where(grazing, np.nan, slope), 0.0) for name, slope in slopes.items()}
         return named | slopes | {"grazes": (moves & grazing).astype(np.int8)}
 
-    def _journey(self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, last: bool) -> Journey:
+    def _hybrid_outcome(
+        self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, last: bool
+    ) -> HybridOutcome:
         """The runs of cells through their phases."""
-        assert self.driver.phases is not None
-        phases, first = self.driver.phases(scene, problem, tolerance, last)
+        assert self.run_kind.modes is not None
+        modes, first = self.run_kind.modes(scene, problem, tolerance, last)
         start, settings = (np.asarray(first), np.asarray(problem.states)), Settings(tolerance, self.solver)
-        return travel(phases, *start, self.t1, count, settings, kinds=len(self.driver.counts), passes=last)
+        return solve_hybrid(modes, *start, self.t1, count, settings, kinds=len(self.run_kind.counts), passes=last)
 
     def _outcome(self, problem: InversionProblem, tolerance: float, count: int) -> Outcome:
         horizon, settings = jnp.asarray(self.t1), Settings(tolerance, self.solver)
         if self.method == "diffrax":
-            return march_by_diffrax(problem, horizon, settings)
-        return compiled_march(problem, horizon, jnp.asarray(count), settings, passes=self.last)[0]
+            return solve_by_diffrax(problem, horizon, settings)
+        return solve_ensemble(problem, horizon, jnp.asarray(count), settings, passes=self.last)[0]
 
     def _ended(self, scene: Scene, problem: InversionProblem, outcome: Outcome) -> dict[str, Any]:
         """The variables of cells whose runs are one smooth motion."""
@@ -210,14 +216,14 @@ class CellRuns(NamedTuple):
 
     def _loss(self, scene: Scene, state: Any) -> Any:
         """How the contacts ended with which runs ended: codes in `LOSSES`."""
-        if self.driver is HYBRID:
+        if self.run_kind is HYBRID:
             # It flies on where contact is lost, and fits everywhere.
             return LOSSES.index("jammed")
         state = jnp.asarray(state)
-        return np.asarray(_loss_aloft(scene, state) if self.driver.aloft else _loss(scene.dynamics, state))
+        return np.asarray(_flight_loss(scene, state) if self.run_kind.flight_state else _loss(scene.dynamics, state))
 
     def _named(
-        self, scene: Scene, problem: InversionProblem, ended: Outcome | Journey, loss: Callable[[], Any]
+        self, scene: Scene, problem: InversionProblem, ended: Outcome | HybridOutcome, loss: Callable[[], Any]
     ) -> dict[str, Any]:
         inverted, theta = _at_the_end(scene, problem, ended, self.last)
         others = [np.asarray(ended.status) == status for status in WORD_OF_STATUS]

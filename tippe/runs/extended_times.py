@@ -8,9 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from nonholonomic.derivatives import AbstractQuestion, VariationalProblem, ask, directions_by, in_groups
-from nonholonomic.integration import CROSSED, FAILED, Queue, Settings, crossing_time
-from nonholonomic.progress import telling
+from nonholonomic.derivatives import (
+    AbstractDifferentiableSolve,
+    VariationalProblem,
+    differentiable_solve,
+    in_groups,
+    tangents_by,
+)
+from nonholonomic.integration import CROSSED, FAILED, LaneScheduler, Settings, crossing_time
+from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, is_traced
 
 from ..model.launch import Launch
@@ -26,7 +32,7 @@ MOST_STEPS = 100_000
 LEAST_ANGLE = 1e-6
 
 
-@telling("simulating")
+@status_line("simulating")
 def extended_inversion_time(
     scene: Scene,
     launch: Launch,
@@ -65,12 +71,12 @@ def extended_inversion_time(
     check_smooth(scene, "extended_inversion_time")
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
     unchecked = any(is_traced(leaf) for leaf in leaves)
-    found = ask(ExtendedQuestion(len(leaves) - 2, structure, unchecked), *leaves)
+    found = differentiable_solve(ExtendedSolve(len(leaves) - 2, structure, unchecked), *leaves)
     return nan_if_illegal(found, structure, unchecked, leaves)
 
 
-class ExtendedQuestion(AbstractQuestion):
-    """When cells invert, beyond the horizon too; the leaves are those of `InversionQuestion`."""
+class ExtendedSolve(AbstractDifferentiableSolve):
+    """When cells invert, beyond the horizon too; the leaves are those of `InversionSolve`."""
 
     movable: int
     # JAX's PyTreeDef, which type checkers take for a variable.
@@ -88,12 +94,12 @@ class ExtendedQuestion(AbstractQuestion):
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-        problem, directions, gather = directions_by(self._problem, active, leaves[: self.movable], cells)
+        problem, tangents, gather = tangents_by(self._problem, active, leaves[: self.movable], cells)
 
         def run(some: tuple[Any, ...]) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
             return self._found(some, problem, leaves, cells, again)
 
-        times, slopes = in_groups(run, directions)
+        times, slopes = in_groups(run, tangents)
         return times, gather(slopes)
 
     def _problem(self, leaves: tuple[Array, ...], cells: int | None) -> InversionProblem:
@@ -104,7 +110,7 @@ class ExtendedQuestion(AbstractQuestion):
 
     def _found(
         self,
-        directions: tuple[Any, ...],
+        tangents: tuple[Any, ...],
         problem: InversionProblem,
         leaves: tuple[Array, ...],
         cells: int,
@@ -112,9 +118,11 @@ class ExtendedQuestion(AbstractQuestion):
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         """The extended times of every cell, and their derivatives along directions (as of `VariationalProblem`)."""
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
-        varied = VariationalProblem(problem, directions, True)
+        varied = VariationalProblem(problem, tangents, True)
         settings = Settings(tolerance, max_steps=MOST_STEPS)
-        queue = Queue.of(varied, t1, jnp.asarray(cells), settings, one_kernel=not again, parts=1 + len(directions))
+        queue = LaneScheduler.of(
+            varied, t1, jnp.asarray(cells), settings, one_kernel=not again, parts=1 + len(tangents)
+        )
         outcome, _ = queue.outcome()
         state, *variations = varied.parts(outcome.state)
         crossed = outcome.status == CROSSED
@@ -131,7 +139,7 @@ class ExtendedQuestion(AbstractQuestion):
         times = jnp.where(good, extended(problem, state), jnp.nan)
         slopes = [
             jnp.where(good, eqx.filter_jvp(extended, (problem, state), moved)[1], jnp.nan)
-            for moved in zip(directions, variations, strict=True)
+            for moved in zip(tangents, variations, strict=True)
         ]
         return times, slopes
 

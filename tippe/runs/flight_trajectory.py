@@ -8,22 +8,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from nonholonomic.hybrid import BETWEEN, PhasedPath, PhasedSamples, Piece, follow_phases, phased_samples
-from nonholonomic.integration import FAILED, GUARD_LOST, REACHED_END, UNRESOLVED, Settings
+from nonholonomic.hybrid import BETWEEN, HybridPath, HybridSamples, Segment, hybrid_samples, solve_hybrid_dense
+from nonholonomic.integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Settings
 
 from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch
 from ..model.scene import Scene
-from ..modes.free_body import Ball, FreeBody, balls, energy, freed, standing_on
+from ..modes.free_body import Ball, FreeBody, as_free_body, balls, energy, standing_on
 from ..modes.impact import approach
 from ..modes.inversion_problem import InversionProblem
 from ..modes.leaning import BOTH
-from ..modes.sliding import phases
+from ..modes.sliding import modes
 from ..modes.trajectory_problem import TrajectoryProblem
 from .observables import AbstractTrajectory, of_each_run
 from .sampled import STATUS as CODES
 
-STATUS = {REACHED_END: "reached t1", GUARD_LOST: "jammed", FAILED: "failed", UNRESOLVED: "unresolved"}
+STATUS = {REACHED_END: "reached t1", LEFT_DOMAIN: "jammed", FAILED: "failed", UNRESOLVED: "unresolved"}
 
 
 class HybridTrajectory(AbstractTrajectory):
@@ -66,7 +66,7 @@ class HybridTrajectory(AbstractTrajectory):
     status: str
     end_time: float
     stats: dict[str, Any]
-    dense: PhasedPath
+    dense: HybridPath
     distance: Float[np.ndarray, "2 times"]
     contact: Int[np.ndarray, " times"]
     hops: Float[np.ndarray, "hops 2"] | None
@@ -83,7 +83,7 @@ class HybridTrajectory(AbstractTrajectory):
     def _free(self) -> FreeBody:
         """The top as a free body, in contact too."""
         body, states = self.scene.body, self.states
-        free = freed(body, balls(body)[0], jnp.asarray(states))
+        free = as_free_body(body, balls(body)[0], jnp.asarray(states))
         (distance, rate), (u1, u2, u3) = self.above, free.velocity
         return FreeBody((u1, u2, u3 + rate), free.height + distance, free.axis, free.momentum)
 
@@ -128,7 +128,7 @@ class HybridTrajectory(AbstractTrajectory):
         return shown[:8], shown[8:13], shown[13], shown[14], shown[15:]
 
     @staticmethod
-    def work_in(piece: Piece) -> float:
+    def work_in(piece: Segment) -> float:
         """The work [J] of friction in a piece of the path, that of impacts apart."""
         return 0.0 if piece.number == BETWEEN else piece.motion.states[-1, -1] - piece.motion.states[-1, 0]
 
@@ -141,7 +141,7 @@ class HybridTrajectory(AbstractTrajectory):
         return f"{super().__str__()}\n  {len(self.hops)} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
 
 
-def level_phases(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "15 1"]]:
+def level_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "15 1"]]:
     """The phases of one launch of a hybrid scene on a level plane, the number of the first, and the state there.
 
     **Arguments:** `modules`: scene and launch; `tolerance`: no phase needs it.
@@ -151,33 +151,33 @@ def level_phases(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, In
     # The place is that of the centre of mass.
     state = state.at[8:10].add(-scene.body.offset * state[2:4])
     problem = InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
-    return (*phases(scene, problem, tolerance, last=False, rides=True), state[:, None])
+    return (*modes(scene, problem, tolerance, last=False, rides=True), state[:, None])
 
 
 def simulate_hybrid(
     scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver | None
 ) -> HybridTrajectory:
     """Run one launch of a hybrid scene until `t1`. **Arguments:** as for `simulate`, checked."""
-    kinds, first, state = level_phases((scene, launch), tolerance)
-    path = follow_phases(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1)
-    hops = np.array([(one.begin, one.end) for one in path.pieces if one.number == BETWEEN]).reshape(-1, 2)
+    kinds, first, state = level_modes((scene, launch), tolerance)
+    path = solve_hybrid_dense(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1)
+    hops = np.array([(one.begin, one.end) for one in path.segments if one.number == BETWEEN]).reshape(-1, 2)
     return flights_of(HybridTrajectory, scene, path, STATUS[path.status], hops, times)
 
 
 def sampled_hybrid(scene: Scene, launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
     """Run one launch of a hybrid scene inside a transformation. **Arguments:** as for `simulate`, checked."""
-    found = phased_samples(level_phases, (scene, launch), times, t1, settings, kinds=1)
+    found = hybrid_samples(level_modes, (scene, launch), times, t1, settings, kinds=1)
     return sampled_flights(HybridTrajectory, scene, times, found, jnp.asarray(CODES.index("jammed")))
 
 
 def sampled_flights(
-    kind: type[HybridTrajectory], scene: Scene, times: Any, found: PhasedSamples, lost: Int[Array, ""]
+    kind: type[HybridTrajectory], scene: Scene, times: Any, found: HybridSamples, lost: Int[Array, ""]
 ) -> Any:
     """A trajectory of some kind from samples; `lost` is the code of how a run has ended that its guard has ended."""
     states, place, spin_angle, work, distance = kind.parts_of(found.shown)
     # After the end no sphere touches.
     number = jnp.where(jnp.isnan(found.number), BETWEEN, found.number).astype(int)
-    ended = {code: jnp.asarray(CODES.index(word)) for code, word in STATUS.items()} | {GUARD_LOST: lost}
+    ended = {code: jnp.asarray(CODES.index(word)) for code, word in STATUS.items()} | {LEFT_DOMAIN: lost}
     status = sum(jnp.where(found.status == code, index, 0) for code, index in ended.items())
     stats = {"accepted": found.steps - found.rejected, "rejected": found.rejected, "hops": found.counts[0]}
     stats = {name: count.astype(int) for name, count in stats.items()}
@@ -188,7 +188,7 @@ def sampled_flights(
 def flights_of(
     kind: type[HybridTrajectory],
     scene: Scene,
-    path: PhasedPath,
+    path: HybridPath,
     status: str,
     hops: Float[np.ndarray, "hops 2"],
     times: Any,
@@ -198,7 +198,7 @@ def flights_of(
     states, place, spin_angle, work, distance = kind.parts_of(path.at(shown))
     ends = (status, path.end_time, {}, path, distance, kind.touching(path.numbers(shown)), hops)
     run = kind(shown, scene, states, place, spin_angle, work, *ends)
-    in_contact = sum(kind.work_in(one) for one in path.pieces)
+    in_contact = sum(kind.work_in(one) for one in path.segments)
     # What is left of the work is that of the impacts.
     run = run.with_stats(path, impact_loss=float(in_contact - path.state[-1]))
     return run if times is None else run.resampled(np.asarray(times)[np.asarray(times) <= run.end_time])

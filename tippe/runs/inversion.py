@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.hybrid import Journey
+from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import CROSSED, LOOSEST, REACHED_END, Outcome, run_bounds
 from nonholonomic.parameters import numbers
 from nonholonomic.validation import Bound, all_bounds, legal, nan_unless, require_all, require_scalars
@@ -51,11 +51,11 @@ def nan_if_illegal(found: Float[Array, ""], structure: Any, unchecked: bool, lea
     return nan_unless(permitted(structure, unchecked, leaves)[0], found) if unchecked else found
 
 
-def is_inverted(outcome: Outcome | Journey, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:
+def is_inverted(outcome: Outcome | HybridOutcome, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:
     """Which cells count as inverted: those that reached the angle, or that end above it where the last crossing counts."""
     if not last:
         return outcome.status == CROSSED
-    above = problem.crossing(jnp.asarray(outcome.state)) <= 0.0
+    above = problem.event_function(jnp.asarray(outcome.state)) <= 0.0
     return (outcome.status == REACHED_END) & above & jnp.isfinite(outcome.crossing_time)
 
 

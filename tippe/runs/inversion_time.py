@@ -9,21 +9,40 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from nonholonomic.derivatives import AbstractQuestion, ask, directions_by, in_groups, traced_march_with_slopes
-from nonholonomic.hybrid import AbstractPhase, Journey, traced_travel, traced_travel_with_slopes
-from nonholonomic.integration import CROSSED, FAILED, REACHED_END, UNRESOLVED, Settings, explicit_tableau, traced_march
-from nonholonomic.progress import telling
+from nonholonomic.derivatives import (
+    AbstractDifferentiableSolve,
+    differentiable_solve,
+    in_groups,
+    tangents_by,
+    traced_solve_ensemble_with_tangents,
+)
+from nonholonomic.hybrid import (
+    AbstractBatchedMode,
+    HybridOutcome,
+    traced_solve_hybrid,
+    traced_solve_hybrid_with_tangents,
+)
+from nonholonomic.integration import (
+    CROSSED,
+    FAILED,
+    REACHED_END,
+    UNRESOLVED,
+    Settings,
+    explicit_tableau,
+    traced_solve_ensemble,
+)
+from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, is_traced
 
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..modes.airborne import on_the_ground
 from ..modes.inversion_problem import InversionProblem
-from .cells import check_differentiable, driver_of
+from .cells import check_differentiable, run_kind_of
 from .inversion import check_event, check_run, is_inverted, nan_if_illegal, permitted
 
 
-@telling("simulating")
+@status_line("simulating")
 def inversion_time(
     scene: Scene,
     launch: Launch,
@@ -54,7 +73,7 @@ def inversion_time(
     if the integration failed, or if numbers inside a transformation are out of range.
 
     With `contact="hybrid"` and `SetValuedCoulomb` first derivatives go through flights, impacts, stick and slip
-    (`nonholonomic/hybrid/varied_phases.py`). Where an event on the way is grazing, so that within the tolerance it may
+    (`nonholonomic/hybrid/saltation.py`). Where an event on the way is grazing, so that within the tolerance it may
     not happen at all, the derivative is NaN; `inversion_table` says so in the variable `grazes`.
 
     **Raises:** `ValueError` for arguments outside these ranges, for second derivatives through changes of phase, and for
@@ -78,13 +97,13 @@ def inversion_time(
     explicit_tableau(solver)
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
     unchecked = any(is_traced(leaf) for leaf in leaves)
-    question = InversionQuestion if driver_of(scene).smooth else PhasedInversionQuestion
+    question = InversionSolve if run_kind_of(scene).smooth else HybridInversionSolve
     # The last two leaves, horizon and tolerance, do not move the event.
-    found = ask(question(len(leaves) - 2, structure, solver, crossing == "last", unchecked), *leaves)
+    found = differentiable_solve(question(len(leaves) - 2, structure, solver, crossing == "last", unchecked), *leaves)
     return nan_if_illegal(found, structure, unchecked, leaves)
 
 
-class InversionQuestion(AbstractQuestion):
+class InversionSolve(AbstractDifferentiableSolve):
     """When cells invert; the leaves are those of scene and launch, the angle, the horizon, the tolerance."""
 
     movable: int
@@ -109,7 +128,7 @@ class InversionQuestion(AbstractQuestion):
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         problem = self.problem(leaves[: self.movable], cells)
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
-        outcome, _ = traced_march(
+        outcome, _ = traced_solve_ensemble(
             problem,
             t1,
             jnp.asarray(cells),
@@ -124,11 +143,11 @@ class InversionQuestion(AbstractQuestion):
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         # Cells do not influence one another, so varying a parameter in all of them at once gives each its own derivative.
-        problem, directions, gather = directions_by(self.problem, active, leaves[: self.movable], cells)
+        problem, tangents, gather = tangents_by(self.problem, active, leaves[: self.movable], cells)
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
-        outcome, slopes = traced_march_with_slopes(
+        outcome, slopes = traced_solve_ensemble_with_tangents(
             problem,
-            directions,
+            tangents,
             t1,
             jnp.asarray(cells),
             Settings(tolerance, self.solver),
@@ -140,13 +159,13 @@ class InversionQuestion(AbstractQuestion):
         return time, [jnp.where(good, jnp.where(inverted, slope, 0.0), jnp.nan) for slope in gather(slopes)]
 
 
-class PhasedInversionQuestion(InversionQuestion):
-    """When cells invert whose runs have phases; the leaves are those of `InversionQuestion`."""
+class HybridInversionSolve(InversionSolve):
+    """When cells invert whose runs have phases; the leaves are those of `InversionSolve`."""
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
-        phases, first, problem, scene = self.phased((*leaves[: self.movable], tolerance), cells)
-        return self.named(may, self.journey(phases, first, problem, scene, t1, tolerance), problem, scene)
+        modes, first, problem, scene = self.hybrid((*leaves[: self.movable], tolerance), cells)
+        return self.named(may, self.hybrid_outcome(modes, first, problem, scene, t1, tolerance), problem, scene)
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
@@ -156,57 +175,57 @@ class PhasedInversionQuestion(InversionQuestion):
                 "second derivatives do not go through changes of phase: contact = 'hybrid', SetValuedCoulomb"
             )
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
-        built = directions_by(self.phased, active, (*leaves[: self.movable], tolerance), cells)
-        (phases, first, problem, scene), directions, gather = built
+        built = tangents_by(self.hybrid, active, (*leaves[: self.movable], tolerance), cells)
+        (modes, first, problem, scene), tangents, gather = built
         check_differentiable(scene)
         if self.last:
             # The slopes need the run up to the event alone, whose time is known then.
-            whole = self.journey(phases, first, problem, scene, t1, tolerance)
+            whole = self.hybrid_outcome(modes, first, problem, scene, t1, tolerance)
             t1 = jnp.where(jnp.isfinite(whole.crossing_time), whole.crossing_time, 0.0)
         settings = Settings(tolerance, self.solver)
 
-        def run(some: tuple[Any, ...]) -> tuple[tuple[Journey, Array], list[Float[Array, " cells"]]]:
+        def run(some: tuple[Any, ...]) -> tuple[tuple[HybridOutcome, Array], list[Float[Array, " cells"]]]:
             moved = tuple((one[0], one[2].states) for one in some)
-            given = (phases, moved, first, problem.states, t1, settings)
-            kinds = len(driver_of(scene).counts)
-            journey, found = traced_travel_with_slopes(*given, kinds=kinds, ends_on_event=not self.last)
-            return (journey, found.grazing), list(found.slopes)
+            given = (modes, moved, first, problem.states, t1, settings)
+            kinds = len(run_kind_of(scene).counts)
+            hybrid_outcome, found = traced_solve_hybrid_with_tangents(*given, kinds=kinds, ends_on_event=not self.last)
+            return (hybrid_outcome, found.grazing), list(found.slopes)
 
-        (journey, grazing), slopes = in_groups(run, directions)
-        time = self.named(may, whole if self.last else journey, problem, scene)
-        ended = journey.status == (REACHED_END if self.last else CROSSED)
+        (hybrid_outcome, grazing), slopes = in_groups(run, tangents)
+        time = self.named(may, whole if self.last else hybrid_outcome, problem, scene)
+        ended = hybrid_outcome.status == (REACHED_END if self.last else CROSSED)
         digits = ended & ~grazing
         # At the very start the event is there at once, whatever moves.
         happened = jnp.isfinite(time) & (time > 0.0)
         return time, [jnp.where(happened, jnp.where(digits, slope, jnp.nan), 0.0 * time) for slope in gather(slopes)]
 
-    def phased(self, leaves: tuple[Array, ...], cells: int | None) -> Any:
+    def hybrid(self, leaves: tuple[Array, ...], cells: int | None) -> Any:
         """The phases of some cells, the number of each one's first, problem and scene; the last leaf is the tolerance."""
         *own, tolerance = leaves
         scene, *_ = jax.tree.unflatten(self.structure, (*own, *(None,) * (self.structure.num_leaves - len(own))))
-        problem, phases_of = self.problem(tuple(own), cells), driver_of(scene).phases
-        assert phases_of is not None
-        return (*phases_of(scene, problem, tolerance, self.last), problem, scene)
+        problem, modes_of = self.problem(tuple(own), cells), run_kind_of(scene).modes
+        assert modes_of is not None
+        return (*modes_of(scene, problem, tolerance, self.last), problem, scene)
 
-    def journey(
+    def hybrid_outcome(
         self,
-        phases: tuple[AbstractPhase, ...],
+        modes: tuple[AbstractBatchedMode, ...],
         first: Int[Array, " cells"],
         problem: InversionProblem,
         scene: Scene,
         t1: Float[Array, "..."],
         tolerance: Float[Array, ""],
-    ) -> Journey:
+    ) -> HybridOutcome:
         """The runs of cells through their phases."""
-        settings, kinds = Settings(tolerance, self.solver), len(driver_of(scene).counts)
-        return traced_travel(phases, first, problem.states, t1, settings, kinds=kinds, passes=self.last)
+        settings, kinds = Settings(tolerance, self.solver), len(run_kind_of(scene).counts)
+        return traced_solve_hybrid(modes, first, problem.states, t1, settings, kinds=kinds, passes=self.last)
 
     def named(
-        self, may: Bool[Array, "..."], ended: Journey, problem: InversionProblem, scene: Scene
+        self, may: Bool[Array, "..."], ended: HybridOutcome, problem: InversionProblem, scene: Scene
     ) -> Float[Array, " cells"]:
         """The times of inversion."""
-        if driver_of(scene).aloft:
-            ended = ended._replace(state=on_the_ground(scene, ended.state, ended.phase))
+        if run_kind_of(scene).flight_state:
+            ended = ended._replace(state=on_the_ground(scene, ended.state, ended.mode))
         time = jnp.where(is_inverted(ended, problem, self.last), ended.crossing_time, jnp.inf)
         failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
         return jnp.where(may & ~failed, time, jnp.nan)

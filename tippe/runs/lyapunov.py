@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, Int, Shaped
 
 from nonholonomic.derivatives import exponent_of, growth
 from nonholonomic.geometry import cross
-from nonholonomic.integration import GUARD_LOST, REACHED_END, Settings, explicit_tableau, tolerance_bound
-from nonholonomic.progress import telling
+from nonholonomic.integration import LEFT_DOMAIN, REACHED_END, Settings, explicit_tableau, tolerance_bound
+from nonholonomic.progress import status_line
 from nonholonomic.validation import require
 
 from ..model.dynamics import LOSSES
@@ -20,7 +20,7 @@ from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import joined, parts
 from ..modes.inversion_problem import InversionProblem
-from .cells import driver_of
+from .cells import run_kind_of
 
 #: Stretches of time whose growth is recorded; half of them give the exponent and its scatter.
 STRETCHES = 32
@@ -57,7 +57,7 @@ class LyapunovExponent(NamedTuple):
     running: Float[np.ndarray, "stretches ..."]
 
 
-@telling("simulating")
+@status_line("simulating")
 def lyapunov_exponent(
     scene: Scene,
     launch: Launch,
@@ -98,7 +98,7 @@ def lyapunov_exponent(
         raise ValueError(f"scene = {scene!r} must be a Scene")
     if not isinstance(launch, Launch):
         raise ValueError(f"launch = {launch!r} must be a Launch")
-    if not driver_of(scene).smooth:
+    if not run_kind_of(scene).smooth:
         raise ValueError(
             "contact = 'hybrid' and SetValuedCoulomb have no exponents: variations end at a change of phase"
         )
@@ -119,7 +119,7 @@ def lyapunov_exponent(
     exponent, error = exponent_of(found.logarithm, float(t1))
     whole = found.status == REACHED_END
     lost = np.asarray(LOSSES)[np.asarray(problem.dynamics.loss(jnp.asarray(found.state)))]
-    words = np.select([whole, found.status == GUARD_LOST], ["reached_end", lost], "failed")
+    words = np.select([whole, found.status == LEFT_DOMAIN], ["reached_end", lost], "failed")
     times = t1 * np.arange(1, STRETCHES + 1) / STRETCHES
     passed = np.minimum(times[:, None], found.end_time)
     # A run that ends where it starts has not diverged from anything.
@@ -141,6 +141,6 @@ def _direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, "compon
     u1, u2, r1, r2, r3, *L = (magnitudes[i] * jnp.cos(1.0 + i) for i in range(8))
     e = parts(scene.state(launch)).axis
     frame, (place, _) = scene.frame, scene.start(launch)
-    place = frame.carriage(place, (scene.body.size, scene.body.size)).place_rate
+    place = frame.frame_motion(place, (scene.body.size, scene.body.size)).place_rate
     direction = joined((u1, u2), cross((r1, r2, r3), e), tuple(L), place)
     return jnp.broadcast_to(direction.reshape(len(direction), -1), (len(direction), cells))

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import Component, Vector, dot, scale, sum_vectors
-from nonholonomic.hybrid import PhasedPath
-from nonholonomic.integration import Followed, padded
+from nonholonomic.hybrid import HybridPath
+from nonholonomic.integration import DenseSolution, padded
 from nonholonomic.parameters import text_as_html
-from nonholonomic.progress import telling
+from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import is_traced, require, require_increasing
 from nonholonomic.views import Stage, Viewable, draw_portrait
@@ -164,7 +164,7 @@ class AbstractTrajectory(eqx.Module, Viewable):
         require_increasing(times, "times")
         return self.resampled(times)
 
-    @telling("reading off")
+    @status_line("reading off")
     def to_table(self) -> Table:
         """All that can be read off the run, as a `Table` over its times.
 
@@ -203,7 +203,7 @@ class AbstractTrajectory(eqx.Module, Viewable):
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
         return as_stages([self, *others], overlaid)
 
-    def with_stats(self, path: Followed | PhasedPath, **more: Any) -> Self:
+    def with_stats(self, path: DenseSolution | HybridPath, **more: Any) -> Self:
         """The same run with what it took, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and more."""
         energy, work = np.asarray(self.energy), np.asarray(self.work)
         stats = {
@@ -249,7 +249,7 @@ class AbstractTrajectory(eqx.Module, Viewable):
         axes = self.scene.frame.axes(self._place, self._path)
         return jnp.stack([dot(vector, directions) for directions in zip(*axes, strict=True)], axis=-1)
 
-    @telling("reading off")
+    @status_line("reading off")
     def __str__(self) -> str:
         if is_traced(self.t) or self.t.ndim > 1:
             return f"Trajectory of {self.t.shape} times"

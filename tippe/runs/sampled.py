@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.derivatives import sampled_run, sampled_run_by_diffrax
-from nonholonomic.integration import FAILED, GUARD_LOST, Settings
+from nonholonomic.integration import FAILED, LEFT_DOMAIN, Settings
 
 from ..model.dynamics import LOSSES
 from ..model.launch import Launch
@@ -21,13 +21,13 @@ STATUS = ("reached t1", "contact_lost", "failed", "jammed", "illegal", "does_not
 def ended(
     run: TrajectoryProblem,
     state: Float[Array, "components ..."],
-    guard_lost: Bool[Array, "..."],
+    left_domain: Bool[Array, "..."],
     failed: Bool[Array, "..."],
 ) -> Int[Array, "..."]:
     """The code in `STATUS` of a run that ended in some state."""
     codes = jnp.asarray([STATUS.index(word) for word in LOSSES])
     lost = codes[run.dynamics.loss(state[: len(run.state)])]
-    return jnp.where(guard_lost, lost, jnp.where(failed, STATUS.index("failed"), STATUS.index("reached t1")))
+    return jnp.where(left_domain, lost, jnp.where(failed, STATUS.index("failed"), STATUS.index("reached t1")))
 
 
 class Found(NamedTuple):
@@ -59,5 +59,5 @@ def sampled(
         found = sampled_run(trajectory_problem, (scene, launch), times, t1, settings)
     else:
         found = sampled_run_by_diffrax(run, times, t1, settings, adjoint)
-    status = ended(run, found.end_state, found.status == GUARD_LOST, found.status == FAILED)
+    status = ended(run, found.end_state, found.status == LEFT_DOMAIN, found.status == FAILED)
     return Found(found.states.T, found.riding.T, found.end_time, status, found.accepted, found.rejected)

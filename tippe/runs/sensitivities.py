@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.derivatives import compiled_march_with_slopes, directions_of, natural_size
-from nonholonomic.hybrid import Journey, travel_with_slopes
+from nonholonomic.derivatives import solve_ensemble_with_tangents, tangent_scale, tangents_of
+from nonholonomic.hybrid import HybridOutcome, solve_hybrid_with_tangents
 from nonholonomic.integration import Outcome, Settings
 from nonholonomic.parameters import full_name, numbers, with_numbers
 from nonholonomic.sweeps import Variable
@@ -35,7 +35,7 @@ def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
     return found
 
 
-def slope_names(names: list[str]) -> list[str]:
+def sensitivity_columns(names: list[str]) -> list[str]:
     """The table's variables: `time_by_mu` for `scene.friction.mu`, the full name where two numbers share a name."""
     ends = [name.rsplit(".", 1)[-1] for name in names]
     return [
@@ -44,7 +44,7 @@ def slope_names(names: list[str]) -> list[str]:
     ]
 
 
-def slope_variables(names: list[str], units: dict[str, str]) -> dict[str, Variable]:
+def sensitivity_variables(names: list[str], units: dict[str, str]) -> dict[str, Variable]:
     """The table's variables, with their units."""
 
     def unit(name: str) -> str:
@@ -53,11 +53,11 @@ def slope_variables(names: list[str], units: dict[str, str]) -> dict[str, Variab
 
     return {
         slope: Variable(unit(name), np.float64, long_name=f"inversion time by {name}")
-        for slope, name in zip(slope_names(names), names, strict=True)
+        for slope, name in zip(sensitivity_columns(names), names, strict=True)
     }
 
 
-def slopes_of_cells(
+def sensitivities_of_cells(
     roots: dict[str, Any],
     columns: dict[str, Any],
     names: list[str],
@@ -79,10 +79,10 @@ def slopes_of_cells(
 
     **Returns:** the `Outcome`, and name of the variable -> derivatives (size,). Source: implicit function theorem at the event.
     """
-    problem, directions, sizes = _problem_and_directions(roots, columns, names, jnp.asarray(angle, float), size)
-    outcome, slopes = compiled_march_with_slopes(
+    problem, tangents, sizes = _problem_and_tangents(roots, columns, names, jnp.asarray(angle, float), size)
+    outcome, slopes = solve_ensemble_with_tangents(
         problem,
-        directions,
+        tangents,
         jnp.asarray(t1, float),
         jnp.asarray(count),
         Settings(tolerance, solver),
@@ -90,11 +90,11 @@ def slopes_of_cells(
     )
     inverted = is_inverted(outcome, problem, last)
     found = [np.where(inverted, slope / moved, 0.0) for slope, moved in zip(slopes, sizes, strict=True)]
-    return outcome, dict(zip(slope_names(names), found, strict=True))
+    return outcome, dict(zip(sensitivity_columns(names), found, strict=True))
 
 
 @eqx.filter_jit
-def _problem_and_directions(
+def _problem_and_tangents(
     roots: dict[str, Any], columns: dict[str, Any], names: list[str], angle: Float[Array, ""], size: int
 ) -> tuple[InversionProblem, tuple[Any, ...], list[Float[Array, "..."]]]:
     """The problem of the cells, its tangents along the numbers to differentiate by, and by how much these move each."""
@@ -103,11 +103,11 @@ def _problem_and_directions(
         cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))
         return InversionProblem.of(cells["scene"], cells["launch"], angle, size)
 
-    return _with_directions(build, roots, columns, names)
+    return _with_tangents(build, roots, columns, names)
 
 
-def phased_slopes_of_cells(
-    phases_of: Callable[..., Any],
+def hybrid_sensitivities_of_cells(
+    modes_of: Callable[..., Any],
     roots: dict[str, Any],
     columns: dict[str, Any],
     names: list[str],
@@ -120,32 +120,32 @@ def phased_slopes_of_cells(
     solver: diffrax.AbstractERK | None,
     last: bool,
     kinds: int,
-) -> tuple[Journey, dict[str, Any], Bool[np.ndarray, " size"]]:
-    """What `slopes_of_cells` gives, for runs of several phases.
+) -> tuple[HybridOutcome, dict[str, Any], Bool[np.ndarray, " size"]]:
+    """What `sensitivities_of_cells` gives, for runs of several phases.
 
     **Arguments:** as there, and
 
-    - `phases_of`: the phases, as `Driver` has them.
+    - `modes_of`: the phases, as `RunKind` has them.
     - `t1`: horizon [s]; where the `last` crossing counts, its time in every cell, at which the runs end.
     - `kinds`: how many kinds of things are counted.
 
-    **Returns:** the `Journey`; name of the variable -> derivatives (size,); and where these have no digits, because an event
-    on the way was grazing. Source: saltation at every change of phase (`nonholonomic/hybrid/varied_phases.py`).
+    **Returns:** the `HybridOutcome`; name of the variable -> derivatives (size,); and where these have no digits, because
+    an event on the way was grazing. Source: saltation at every change of phase (`nonholonomic/hybrid/saltation.py`).
     """
     numbers = (jnp.asarray(angle, float), jnp.asarray(tolerance, float))
-    built = _phases_and_directions(phases_of, roots, columns, names, *numbers, size, last)
-    (phases, first, states), directions, sizes = built
-    directions = tuple((one[0], one[2]) for one in directions)
+    built = _modes_and_tangents(modes_of, roots, columns, names, *numbers, size, last)
+    (modes, first, states), tangents, sizes = built
+    tangents = tuple((one[0], one[2]) for one in tangents)
     settings = Settings(tolerance, solver)
-    given = (directions, np.asarray(first), np.asarray(states), t1, count, settings)
-    journey, found = travel_with_slopes(phases, *given, kinds=kinds, ends_on_event=not last)
+    given = (tangents, np.asarray(first), np.asarray(states), t1, count, settings)
+    hybrid_outcome, found = solve_hybrid_with_tangents(modes, *given, kinds=kinds, ends_on_event=not last)
     slopes = [slope / np.asarray(moved) for slope, moved in zip(found.slopes, sizes, strict=True)]
-    return journey, dict(zip(slope_names(names), slopes, strict=True)), found.grazing
+    return hybrid_outcome, dict(zip(sensitivity_columns(names), slopes, strict=True)), found.grazing
 
 
 @eqx.filter_jit
-def _phases_and_directions(
-    phases_of: Callable[..., Any],
+def _modes_and_tangents(
+    modes_of: Callable[..., Any],
     roots: dict[str, Any],
     columns: dict[str, Any],
     names: list[str],
@@ -159,20 +159,20 @@ def _phases_and_directions(
     def build(*moving: Any) -> Any:
         cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))
         problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
-        return (*phases_of(cells["scene"], problem, tolerance, last), problem.states)
+        return (*modes_of(cells["scene"], problem, tolerance, last), problem.states)
 
-    return _with_directions(build, roots, columns, names)
+    return _with_tangents(build, roots, columns, names)
 
 
-def _with_directions(
+def _with_tangents(
     build: Callable[..., Any], roots: dict[str, Any], columns: dict[str, Any], names: list[str]
 ) -> tuple[Any, tuple[Any, ...], list[Float[Array, "..."]]]:
     """What is built from the numbers to differentiate by, its tangents along them, and by how much these move each."""
     cells = with_numbers(roots, columns)
     values = {name: value for root, tree in cells.items() for name, value in numbers(root, tree).items()}
     point = tuple(jnp.asarray(values[name], float) for name in names)
-    sizes = [natural_size(value) for value in point]
+    sizes = [tangent_scale(value) for value in point]
     tangents = [
         tuple(size if row == k else jnp.zeros_like(size) for k, size in enumerate(sizes)) for row in range(len(names))
     ]
-    return build(*point), directions_of(build, point, tangents), sizes
+    return build(*point), tangents_of(build, point, tangents), sizes

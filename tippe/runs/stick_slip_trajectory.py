@@ -1,13 +1,13 @@
 """A single run through stick and slip, with its path."""
 
-from nonholonomic.hybrid import PhasedPath, follow_phases
+from nonholonomic.hybrid import HybridPath, solve_hybrid_dense
 from nonholonomic.integration import Settings
 
-from ..modes.stick_slip_runs import contact_phases
+from ..modes.sticking import contact_modes
 from ..modes.trajectory_problem import TrajectoryProblem
 
 
-def follow_stick_slip(run: TrajectoryProblem, t1: float, settings: Settings) -> PhasedPath:
+def solve_stick_slip_dense(run: TrajectoryProblem, t1: float, settings: Settings) -> HybridPath:
     """One run, phase by phase, until `t1` or until contact is lost.
 
     **Arguments:**
@@ -15,7 +15,7 @@ def follow_stick_slip(run: TrajectoryProblem, t1: float, settings: Settings) -> 
     - `run`: of a scene with `SetValuedCoulomb`.
     - `t1`, `settings`: as for `follow`.
 
-    **Returns:** a `PhasedPath`, whose counts tell how often slipping has turned into rolling.
+    **Returns:** a `HybridPath`, whose counts tell how often slipping has turned into rolling.
     """
-    both, first, state = contact_phases(run, settings.tolerance)
-    return follow_phases(both, int(first[0]), state[:, 0], t1, settings, kinds=1)
+    both, first, state = contact_modes(run, settings.tolerance)
+    return solve_hybrid_dense(both, int(first[0]), state[:, 0], t1, settings, kinds=1)

@@ -13,10 +13,10 @@ from nonholonomic.sweeps import Table, Variable, sweep
 from nonholonomic.validation import require_flag
 
 from ..model.scene import Scene
-from .cells import TIMES, CellRuns, check_differentiable, driver_of
+from .cells import TIMES, InversionRuns, check_differentiable, run_kind_of
 from .inversion import check_event
 from .launches import described, launches
-from .sensitivities import sensitivity_names, slope_variables
+from .sensitivities import sensitivity_names, sensitivity_variables
 from .time_error import COARSER, time_error
 
 
@@ -118,12 +118,12 @@ def inversion_table(
     solver = settings.for_single_runs if method == "diffrax" else settings.for_lanes
     explicit_tableau(solver)
     paths = sensitivity_names(roots, sensitivities)
-    driver = driver_of(scene)
+    run_kind = run_kind_of(scene)
     if paths:
         check_differentiable(scene)
-    if not driver.smooth and method == "diffrax":
+    if not run_kind.smooth and method == "diffrax":
         raise ValueError("method = 'diffrax' is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
-    runs = CellRuns(driver, float(t1), float(angle), crossing, solver, method, paths)
+    runs = InversionRuns(run_kind, float(t1), float(angle), crossing, solver, method, paths)
     job = InversionJob(runs, roots, float(tolerance), errors)
 
     request = {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
@@ -136,7 +136,7 @@ def inversion_table(
         }
     if paths:
         request |= {"sensitivities": paths}
-        variables = variables | slope_variables(paths, units)
+        variables = variables | sensitivity_variables(paths, units)
     return sweep(job, grid, variables, request, path=path, progress=progress, executor=executor)
 
 
@@ -146,14 +146,14 @@ class InversionJob(NamedTuple):
     `errors`: whether to run every cell again at ten times the tolerance.
     """
 
-    runs: CellRuns
+    runs: InversionRuns
     roots: dict[str, Any]
     tolerance: float
     errors: bool
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which the first `count` are to be run."""
-        runs, words = self.runs, self.runs.driver.words
+        runs, words = self.runs, self.runs.run_kind.words
         if runs.method == "diffrax" and count == 0:
             # The reference runs whole blocks: a call that is only meant to compile would compute the first one twice.
             return {}

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import scale, sum_vectors
-from nonholonomic.hybrid import PhasedPath
+from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import (
     LOOSEST,
-    Followed,
+    DenseSolution,
     Settings,
     explicit_tableau,
     follow,
@@ -22,7 +22,7 @@ from nonholonomic.integration import (
     run_bounds,
     times_bounds,
 )
-from nonholonomic.progress import telling
+from nonholonomic.progress import status_line
 from nonholonomic.validation import all_bounds, as_number, is_traced, legal, nan_unless, require_all, require_increasing
 from nonholonomic.xla_cpu import on_device
 
@@ -34,7 +34,7 @@ from .flight_trajectory import HybridTrajectory, sampled_hybrid, simulate_hybrid
 from .inversion import check_run
 from .observables import AbstractTrajectory, of_each_run
 from .sampled import STATUS, ended, sampled
-from .stick_slip_trajectory import follow_stick_slip
+from .stick_slip_trajectory import solve_stick_slip_dense
 
 
 class Trajectory(AbstractTrajectory):
@@ -114,7 +114,7 @@ class Trajectory(AbstractTrajectory):
         return eqx.tree_at(lambda one: (one.t, one.states, one.cyclic, one.spin_angle, one.work), self, found)
 
 
-@telling("simulating")
+@status_line("simulating")
 def simulate(
     scene: Scene,
     launch: Launch,
@@ -171,10 +171,10 @@ def simulate(
     if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, launch, times, t1, tolerance))):
         return _legal_or_nan(scene, launch, times, as_number(t1), as_number(tolerance), solver, adjoint)
     if scene.contact == "hybrid":
-        follow_flights = simulate_hybrid if scene.flies_in_closed_form else simulate_airborne
-        return follow_flights(scene, launch, float(t1), times, tolerance, solver)
+        solve_flights_dense = simulate_hybrid if scene.flies_in_closed_form else simulate_airborne
+        return solve_flights_dense(scene, launch, float(t1), times, tolerance, solver)
     run = TrajectoryProblem.of(scene, launch)
-    through = follow_stick_slip if scene.friction.set_valued else follow
+    through = solve_stick_slip_dense if scene.friction.set_valued else follow
     path = through(run, float(t1), Settings(tolerance, solver))
     trajectory = _as_trajectory(scene, run, path)
     if times is None:
@@ -251,12 +251,12 @@ def _parts(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:
 _ended = eqx.filter_jit(ended)
 
 
-def _as_trajectory(scene: Scene, run: TrajectoryProblem, path: Followed | PhasedPath) -> Trajectory:
+def _as_trajectory(scene: Scene, run: TrajectoryProblem, path: DenseSolution | HybridPath) -> Trajectory:
     # NumPy cuts these: JAX would compile every cut anew for every number of steps.
     states = np.asarray(path.states)
     times, end, last = on_device(path.times, path.times[-1], states[:, -1])
-    status = STATUS[int(_ended(run, last, jnp.asarray(path.guard_lost), jnp.asarray(path.failed)))]
-    sticks = {"sticks": int(path.counts[0])} if isinstance(path, PhasedPath) else {}
+    status = STATUS[int(_ended(run, last, jnp.asarray(path.left_domain), jnp.asarray(path.failed)))]
+    sticks = {"sticks": int(path.counts[0])} if isinstance(path, HybridPath) else {}
     return Trajectory(times, scene, *on_device(*_parts(len(run.state), states)), status, end, {}, path).with_stats(
         path, **sticks
     )

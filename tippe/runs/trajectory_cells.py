@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import Plane
-from nonholonomic.integration import FAILED, GUARD_LOST, LeadingProblem, Outcome, Settings, march_with_samples
+from nonholonomic.integration import FAILED, LEFT_DOMAIN, CoreProblem, Outcome, Settings, solve_with_samples
 from nonholonomic.xla_cpu import compiled_alone
 
 from ..model.launch import Launch
@@ -26,7 +26,7 @@ OF_THE_STATE = {"theta", "azimuth", "spin", "energy", "jellett", "normal_force",
 WITHOUT_DIRECTION = {"theta", "theta_rate", "eta", "spin", "energy", "jellett", "normal_force"}
 
 
-def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> LeadingProblem:
+def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> CoreProblem:
     """The runs of some cells with as much of a `TrajectoryProblem` as the named quantities need.
 
     That is the path for some of them only, and neither rotation nor work: on the plane a run without them takes half the time.
@@ -34,9 +34,9 @@ def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ..
     """
     run = TrajectoryProblem.of(scene, launch, cells)
     if scene.level and WITHOUT_DIRECTION.issuperset(names):
-        return LeadingProblem(dataclasses.replace(run, dynamics=scene.turning_dynamics), len(run.state))
+        return CoreProblem(dataclasses.replace(run, dynamics=scene.turning_dynamics), len(run.state))
     needed = {"position"} if isinstance(scene.surface, Plane) else set(QUANTITIES) - OF_THE_STATE
-    return LeadingProblem(run, run.leading if needed.isdisjoint(names) else run.up_to_path)
+    return CoreProblem(run, run.leading if needed.isdisjoint(names) else run.up_to_path)
 
 
 def _read(
@@ -66,7 +66,7 @@ def _read(
 # On its own, not inside other transformed functions: only so does it get the compiler's options.
 @compiled_alone
 def _followed(
-    problem: LeadingProblem,
+    problem: CoreProblem,
     scene: Scene,
     times: Float[Array, " times"],
     count: Int[Array, ""],
@@ -74,13 +74,13 @@ def _followed(
     names: tuple[str, ...],
 ) -> tuple[Outcome, Int[Array, " cells"], dict[str, Float[Array, "cells times ..."]]]:
     """How the runs end, the codes of that in `sampled.STATUS`, and the named quantities on the way."""
-    outcome, samples = march_with_samples(problem, times, times[-1], count, settings, one_kernel=True)
+    outcome, samples = solve_with_samples(problem, times, times[-1], count, settings, one_kernel=True)
     run = cast(TrajectoryProblem, problem.whole)
-    status = ended(run, outcome.state, outcome.status == GUARD_LOST, outcome.status == FAILED)
+    status = ended(run, outcome.state, outcome.status == LEFT_DOMAIN, outcome.status == FAILED)
     return outcome, status, {name: _read(run, scene, times, samples, name) for name in names}
 
 
-def follow_cells(
+def solve_cells(
     scene: Scene, launch: Launch, cells: int, times: Any, tolerance: float, names: tuple[str, ...], count: int
 ) -> dict[str, Array]:
     """The variables of some cells.

@@ -16,7 +16,7 @@ from ..model.scene import Scene
 from .cells import COUNTED
 from .launches import described, launches
 from .quantities import COMPONENTS, QUANTITIES
-from .trajectory_cells import follow_cells
+from .trajectory_cells import solve_cells
 
 #: The status of a run, in the order of `sampled.STATUS`; a word has no space in it, so that a file can list them.
 WORDS = ("reached_end", "contact_lost", "failed", "jammed")
@@ -130,7 +130,7 @@ class SamplingJob(NamedTuple):
         """The variables of some cells, of which the first `count` are to be run."""
         cells = with_numbers(self.roots, columns)
         size = next((len(values) for values in columns.values()), 1)
-        found = follow_cells(cells["scene"], cells["launch"], size, self.times, self.tolerance, self.names, count)
+        found = solve_cells(cells["scene"], cells["launch"], size, self.times, self.tolerance, self.names, count)
         return {name: np.asarray(values, np.int8 if name == "status" else None) for name, values in found.items()}
 
 

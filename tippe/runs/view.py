@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.parameters import told_apart
+from nonholonomic.parameters import distinguishing_labels
 from nonholonomic.views import (
     COLOURS,
     DARK,
@@ -21,9 +21,9 @@ from nonholonomic.views import (
     Trace,
     arena,
     ball,
+    distinguished_by_colour,
     rod,
     striped,
-    told_by_colour,
     turned,
 )
 
@@ -93,7 +93,7 @@ _turning = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     """Runs as they are drawn: a stage for each, or one for all if they are to be overlaid."""
     starts = [f"θ(0) = {float(run.theta[0]):.3g} rad, {float(run.spin[0]):.4g} rad/s" for run in runs]
-    names = told_apart(starts, [run.scene for run in runs])
+    names = distinguishing_labels(starts, [run.scene for run in runs])
     named = [(name, run.scene, motion(run)) for name, run in zip(names, runs, strict=True)]
     return stages([named] if overlaid else [[one] for one in named])
 
@@ -156,7 +156,7 @@ def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
         (_, scene, first), radius = group[0], float(group[0][1].body.size)
         points = np.concatenate([motion.contact for _, _, motion in group])
         ground = arena(scene.surface, points, first.normal[0], 4.0 * radius, 2.5 * radius)
-        shows = told_by_colour(
+        shows = distinguished_by_colour(
             tuple(show(one, motion, number + k, name) for k, (name, one, motion) in enumerate(group))
         )
         found.append(Stage("; ".join(name for name, _, _ in group), ground, shows))
@@ -186,5 +186,5 @@ def meshes(body: AbstractBody, colour: int) -> tuple[Mesh, ...]:
 def profile(body: AbstractBody) -> Float[np.ndarray, "points 2"]:
     """The meridian of a body about its centre of mass, from the top of its axis down: (distance from the axis, height) [m]."""
     theta = jnp.linspace(jnp.pi, 0.0, 49)
-    lever = body.outline.at(jnp.cos(theta))
+    lever = body.meridian.at(jnp.cos(theta))
     return np.stack([lever.radius * jnp.sin(theta), lever.offset - lever.radius * jnp.cos(theta)], axis=-1)

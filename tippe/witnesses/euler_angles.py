@@ -38,7 +38,7 @@ def across(scene: Scene) -> Across:
 
     **Raises:** `ValueError` for an arena that is curved in both directions.
     """
-    curvature, along = scene.frame.carriage(scene.frame.at_angle(0.0)[0], (1.0, 0.0)).turning
+    curvature, along = scene.frame.frame_motion(scene.frame.at_angle(0.0)[0], (1.0, 0.0)).turning
     if along is not None:
         raise ValueError(f"surface = {scene.surface!r} must be a Plane or a Cylinder for these coordinates")
     return Across(1.0, 0.0) if curvature is None else Across(1.0 / curvature, 1.0)
@@ -59,7 +59,7 @@ def from_vector_state(scene: Scene, state: Float[Array, " components"]) -> Float
     e, L = state[AXIS], state[MOMENTUM]
     spinning = jnp.cross(L, e) / scene.body.I1
     velocity = state[VELOCITY] + scene.body.offset * spinning[:2]
-    turning = scene.frame.carriage(tuple(state[PLACE]), (velocity[0], velocity[1])).turning
+    turning = scene.frame.frame_motion(tuple(state[PLACE]), (velocity[0], velocity[1])).turning
     seen = jnp.stack([a if b is None else a + b for a, b in zip(spinning, carried(tuple(e), turning), strict=True)])
 
     def angles(axis):

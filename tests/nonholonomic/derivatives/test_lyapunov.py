@@ -6,7 +6,7 @@ import numpy as np
 from close import assert_close
 
 from nonholonomic.derivatives import exponent_of, growth
-from nonholonomic.integration import GUARD_LOST, REACHED_END, AbstractProblem, Settings
+from nonholonomic.integration import LEFT_DOMAIN, REACHED_END, AbstractProblem, Settings
 
 
 class Shears(AbstractProblem):
@@ -23,10 +23,10 @@ class Shears(AbstractProblem):
     def field(self, time, state):
         return jnp.stack([self.a * state[0] + state[1], self.b * state[1], jnp.ones_like(state[2])])
 
-    def crossing(self, state):
+    def event_function(self, state):
         return None
 
-    def guard(self, time, state):
+    def domain_margin(self, time, state):
         return self.end - state[2]
 
 
@@ -43,10 +43,10 @@ class Lorenz(AbstractProblem):
         x, y, z = state
         return jnp.stack([10.0 * (y - x), x * (28.0 - z) - y, x * y - 8.0 / 3.0 * z])
 
-    def crossing(self, state):
+    def event_function(self, state):
         return None
 
-    def guard(self, time, state):
+    def domain_margin(self, time, state):
         return None
 
 
@@ -59,7 +59,7 @@ def test_known_rates_and_a_run_that_ends():
     """The greatest of a, b and 0, whichever it is; the growth to the very end; nothing after the guard."""
     a, b, end = np.array([0.5, -0.3, -0.3, 0.5]), np.array([0.2, 0.8, -0.2, 0.2]), np.array([1e3, 1e3, 1e3, 17.0])
     found = follow(Shears(*map(jnp.asarray, (a, b, end))), 40.0, 4)
-    assert found.status.tolist() == [REACHED_END] * 3 + [GUARD_LOST]
+    assert found.status.tolist() == [REACHED_END] * 3 + [LEFT_DOMAIN]
     assert_close(found.end_time, [40.0, 40.0, 40.0, 17.0], rtol=1e-9)
     exponent, error = exponent_of(found.logarithm, 40.0)
     assert_close(exponent[:3], [0.5, 0.8, 0.0], atol=2e-3)

@@ -9,10 +9,10 @@ import pytest
 from close import assert_close
 
 import nonholonomic.derivatives._adjoint as adjoint
-from nonholonomic.derivatives import directions_of
+from nonholonomic.derivatives import tangents_of
 from nonholonomic.derivatives._shared_values import sharing_values
-from nonholonomic.derivatives.slopes import march_with_slopes
-from nonholonomic.integration import CROSSED, GUARD_LOST, AbstractProblem, Settings
+from nonholonomic.derivatives.slopes import ensemble_solve_with_tangents
+from nonholonomic.integration import CROSSED, LEFT_DOMAIN, AbstractProblem, Settings
 
 MOVED = ("rate", "height", "growth")
 HEIGHTS = np.linspace(0.6, 4.0, 100)
@@ -34,10 +34,10 @@ class Decays(AbstractProblem):
     def field(self, time, state):
         return jnp.stack([-self.rate * (1.0 + self.growth * time) * state[0], jnp.ones_like(state[0])])
 
-    def crossing(self, state):
+    def event_function(self, state):
         return state[0] - 0.5
 
-    def guard(self, time, state):
+    def domain_margin(self, time, state):
         return self.patience - state[1]
 
 
@@ -58,8 +58,8 @@ def found_and_expected(names=MOVED, patience=1e3, heights=HEIGHTS, cells=100, **
             return Decays(*numbers, jnp.asarray(patience))
 
         given = (jnp.asarray(50.0), jnp.asarray(cells), Settings(1e-11, options.pop("solver", diffrax.Dopri8())))
-        directions = directions_of(build, point, tangents)
-        return march_with_slopes(build(*point), directions, *given, **({"one_kernel": True} | options))
+        directions = tangents_of(build, point, tangents)
+        return ensemble_solve_with_tangents(build(*point), directions, *given, **({"one_kernel": True} | options))
 
     outcome, slopes = run(point, tangents)
     every = jax.vmap(jax.grad(time_of_decay, (0, 1, 2)), (0, 0, None))(*point)
@@ -89,7 +89,7 @@ def test_a_cell_that_ends_otherwise_has_no_slope_and_leaves_the_others_theirs():
     outcome, slopes, expected = found_and_expected(patience=1.0, solver=diffrax.Dopri8())
     late = np.asarray(time_of_decay(RATES, HEIGHTS, 0.7)) > 1.0
     assert 20 < late.sum() < 80
-    assert (np.asarray(outcome.status) == np.where(late, GUARD_LOST, CROSSED)).all()
+    assert (np.asarray(outcome.status) == np.where(late, LEFT_DOMAIN, CROSSED)).all()
     for one, other in zip(slopes, expected, strict=True):
         assert_close(one, np.where(late, 0.0, other), rtol=1e-7)
 
@@ -111,8 +111,8 @@ def test_runs_longer_than_what_is_kept_are_repeated(kept, monkeypatch):
     _, whole, _ = found_and_expected(solver=diffrax.Dopri8())
     monkeypatch.setattr(adjoint, "PERIOD", 2)
     monkeypatch.setattr(adjoint, "KEPT", kept)
-    _, pieces, expected = found_and_expected(solver=diffrax.Dopri8())
-    for one, other, third in zip(whole, pieces, expected, strict=True):
+    _, segments, expected = found_and_expected(solver=diffrax.Dopri8())
+    for one, other, third in zip(whole, segments, expected, strict=True):
         assert_close(one, other, rtol=1e-12)
         assert_close(other, third, rtol=1e-7)
 
@@ -120,7 +120,7 @@ def test_runs_longer_than_what_is_kept_are_repeated(kept, monkeypatch):
 def test_the_starts_that_are_kept_are_spread_out(monkeypatch):
     """Of two hundred starts eight are kept: the first and the last always, the others with no gap above half of the run."""
     monkeypatch.setattr(adjoint, "KEPT", 8)
-    kept = adjoint.Kept.of(jnp.zeros(()))
+    kept = adjoint.Checkpoints.of(jnp.zeros(()))
     for index in range(1, 200):
         kept = kept.added(jnp.asarray(index), jnp.asarray(float(index)), jnp.asarray(True))
     indices = np.asarray(kept.index)
@@ -178,10 +178,10 @@ class AtRest(AbstractProblem):
         rate = -500.0 * (state[1] - self.rest)
         return jnp.stack([1.0 + state[1] + self.push, rate])
 
-    def crossing(self, state):
+    def event_function(self, state):
         return 1.0 - state[0]
 
-    def guard(self, time, state):
+    def domain_margin(self, time, state):
         return None
 
 
@@ -194,9 +194,9 @@ def test_a_component_at_rest_has_its_tangent_integrated(names):
 
     @eqx.filter_jit
     def run():
-        directions = directions_of(AtRest, point, tangents)
+        directions = tangents_of(AtRest, point, tangents)
         given = (jnp.asarray(5.0), jnp.asarray(4), Settings(1e-10))
-        return march_with_slopes(AtRest(*point), directions, *given, one_kernel=True)
+        return ensemble_solve_with_tangents(AtRest(*point), directions, *given, one_kernel=True)
 
     _, slopes = run()
     expected = {"rest": -(1.0 - 1.0 / 500.0), "push": -1.0}

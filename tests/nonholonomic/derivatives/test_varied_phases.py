@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 from close import assert_close
 
-from nonholonomic.derivatives import directions_of
-from nonholonomic.hybrid import AbstractPhase, Passage, traced_travel_with_slopes, travel_with_slopes
+from nonholonomic.derivatives import tangents_of
+from nonholonomic.hybrid import (
+    AbstractBatchedMode,
+    Transition,
+    solve_hybrid_with_tangents,
+    traced_solve_hybrid_with_tangents,
+)
 from nonholonomic.integration import CROSSED, REACHED_END, RUNNING, AbstractProblem, Settings
 
 CELLS = 8
@@ -29,14 +34,14 @@ class Fall(AbstractProblem):
     def field(self, time, state):
         return jnp.stack([state[1], -self.gravity + 0.0 * state[1], 0.0 * state[2]])
 
-    def crossing(self, state):
+    def event_function(self, state):
         return jnp.where(state[2] >= self.bounces, state[0] - self.level, 1.0)
 
-    def guard(self, time, state):
+    def domain_margin(self, time, state):
         return state[0]
 
 
-class Falls(AbstractPhase):
+class Falls(AbstractBatchedMode):
     """Down to the ground, and up again in closed form to where the ball turns back."""
 
     gravity: jax.Array
@@ -47,13 +52,13 @@ class Falls(AbstractPhase):
     def problem(self, state):
         return Fall(state, self.gravity, self.level, self.bounces)
 
-    def leave(self, state, left):
+    def reset_map(self, state, left):
         rebound = -self.restitution * state[1]
         rise = jnp.minimum(rebound / self.gravity, left)
         ends = rise < rebound / self.gravity
         height = rebound * rise - 0.5 * self.gravity * rise**2
-        return Passage(
-            phase=jnp.zeros(rise.shape, int),
+        return Transition(
+            mode=jnp.zeros(rise.shape, int),
             state=jnp.stack([height, rebound - self.gravity * rise, state[2] + 1.0]),
             elapsed=rise,
             status=jnp.where(ends, REACHED_END, RUNNING),
@@ -89,9 +94,9 @@ def balls():
         return (Falls(gravity, restitution, level, jnp.asarray(float(bounces))),), states
 
     tangents = [tuple(jnp.full_like(one, j == k) for j, one in enumerate(numbers)) for k in range(len(numbers))]
-    phases, states = build(*numbers)
+    modes, states = build(*numbers)
     expected = jax.vmap(jax.grad(time_of_level, (0, 1, 2, 3)), (0, None, 0, None, None))(*numbers, bounces)
-    given = (phases, directions_of(build, numbers, tangents), np.zeros(CELLS, int), np.asarray(states))
+    given = (modes, tangents_of(build, numbers, tangents), np.zeros(CELLS, int), np.asarray(states))
     return given, time_of_level(*numbers, bounces), np.stack([np.broadcast_to(one, CELLS) for one in expected])
 
 
@@ -99,11 +104,11 @@ def balls():
 def test_a_bouncing_ball(balls):
     """By the height, gravity, the restitution and the level, through five impacts and what follows each."""
     given, times, expected = balls
-    journey, found = travel_with_slopes(*given, 50.0, CELLS, settings_of(1e-10), kinds=1)
-    assert (journey.status == CROSSED).all()
-    assert (journey.counts == 5).all()
+    hybrid_outcome, found = solve_hybrid_with_tangents(*given, 50.0, CELLS, settings_of(1e-10), kinds=1)
+    assert (hybrid_outcome.status == CROSSED).all()
+    assert (hybrid_outcome.counts == 5).all()
     assert not found.grazing.any()
-    assert_close(journey.crossing_time, times, rtol=1e-9)
+    assert_close(hybrid_outcome.crossing_time, times, rtol=1e-9)
     assert_close(found.slopes, expected, rtol=1e-9)
 
 
@@ -112,16 +117,16 @@ def test_a_bouncing_ball_inside_a_transformation(balls):
     given, times, expected = balls
 
     @eqx.filter_jit
-    def run(phases, directions, first, states, times):
+    def run(modes, directions, first, states, times):
         settings = settings_of(1e-10)
         first = jnp.asarray(first)
-        return traced_travel_with_slopes(
-            phases, directions, first, states, times, settings, kinds=1, ends_on_event=False
+        return traced_solve_hybrid_with_tangents(
+            modes, directions, first, states, times, settings, kinds=1, ends_on_event=False
         )
 
-    journey, found = run(*given, times)
-    assert (journey.status == REACHED_END).all()
-    assert (journey.counts == 5).all()
+    hybrid_outcome, found = run(*given, times)
+    assert (hybrid_outcome.status == REACHED_END).all()
+    assert (hybrid_outcome.counts == 5).all()
     assert not found.grazing.any()
     assert_close(found.slopes, expected, rtol=1e-8)
 
@@ -138,14 +143,14 @@ class Over(AbstractProblem):
     def field(self, time, state):
         return jnp.stack([jnp.ones_like(state[0]), 0.0 * state[1]])
 
-    def crossing(self, state):
+    def event_function(self, state):
         return self.lives - state[0]
 
-    def guard(self, time, state):
+    def domain_margin(self, time, state):
         return state[1] - 1.0 - (state[0] - 1.0) ** 3
 
 
-class Flies(AbstractPhase):
+class Flies(AbstractBatchedMode):
     """Until it strikes the ground, where the ball begins anew, high up."""
 
     lives: jax.Array
@@ -153,11 +158,11 @@ class Flies(AbstractPhase):
     def problem(self, state):
         return Over(state, self.lives)
 
-    def leave(self, state, left):
+    def reset_map(self, state, left):
         zero = jnp.zeros_like(left)
         counts = jnp.ones((1, *left.shape), int)
         running = jnp.full(left.shape, RUNNING)
-        return Passage(zero.astype(int), jnp.stack([zero, zero + 20.0]), zero, running, zero + jnp.inf, counts)
+        return Transition(zero.astype(int), jnp.stack([zero, zero + 20.0]), zero, running, zero + jnp.inf, counts)
 
 
 def test_a_grazing_event_is_seen():
@@ -168,21 +173,21 @@ def test_a_grazing_event_is_seen():
         return (Flies(jnp.asarray(2.0)),), jnp.stack([0.0 * height, height])
 
     point = (jnp.asarray(1.0 + heights),)
-    phases, states = build(*point)
-    directions = directions_of(build, point, [(jnp.ones_like(heights),)])
+    modes, states = build(*point)
+    directions = tangents_of(build, point, [(jnp.ones_like(heights),)])
     first = jnp.zeros(len(heights), int)
 
     @eqx.filter_jit
-    def run(phases, directions, first, states):
-        return traced_travel_with_slopes(
-            phases, directions, first, states, jnp.asarray(9.0), settings_of(tolerance), kinds=1
+    def run(modes, directions, first, states):
+        return traced_solve_hybrid_with_tangents(
+            modes, directions, first, states, jnp.asarray(9.0), settings_of(tolerance), kinds=1
         )
 
-    journey, found = jax.tree.map(np.asarray, run(phases, directions, first, states))
-    assert (journey.status == CROSSED).all()
-    assert (journey.counts == 1).all()
+    hybrid_outcome, found = jax.tree.map(np.asarray, run(modes, directions, first, states))
+    assert (hybrid_outcome.status == CROSSED).all()
+    assert (hybrid_outcome.counts == 1).all()
     assert found.grazing[heights < 1e-8].all()
     assert not found.grazing[heights > 1e-7].any()
     good = ~found.grazing
-    assert_close(journey.crossing_time[good], 3.0 + np.cbrt(heights[good]), rtol=1e-9)
+    assert_close(hybrid_outcome.crossing_time[good], 3.0 + np.cbrt(heights[good]), rtol=1e-9)
     assert_close(found.slopes[0][good], np.cbrt(heights[good]) / heights[good] / 3.0, rtol=1e-2)

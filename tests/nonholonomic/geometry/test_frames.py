@@ -64,8 +64,8 @@ def moved(frame, start, velocity, time, steps=200):
     """Place and cyclic coordinates after moving with the given velocity components, by small Runge-Kutta steps."""
 
     def rate(both):
-        carriage = frame.carriage(both[0], velocity)
-        return carriage.place_rate, frame.cyclic_rate(both[1], velocity, carriage.turning)
+        frame_motion = frame.frame_motion(both[0], velocity)
+        return frame_motion.place_rate, frame.cyclic_rate(both[1], velocity, frame_motion.turning)
 
     def step(both, _):
         k1 = rate(both)
@@ -90,17 +90,17 @@ def test_the_frame_is_orthonormal_and_turns_as_stated(name):
     axes = np.array(frame.axes(place, cyclic), dtype=float)
     assert_close(axes @ axes.T, np.eye(3), atol=1e-10)
     assert_close(np.linalg.det(axes), 1.0, atol=1e-10)
-    carriage = frame.carriage(place, velocity)
-    rates = (carriage.place_rate, frame.cyclic_rate(cyclic, velocity, carriage.turning))
+    frame_motion = frame.frame_motion(place, velocity)
+    rates = (frame_motion.place_rate, frame.cyclic_rate(cyclic, velocity, frame_motion.turning))
     _, position_rate = jax.jvp(lambda *both: jnp.stack(frame.position(*both)), (place, cyclic), rates)
     assert_close(position_rate, 0.3 * axes[0] - 0.2 * axes[1], atol=1e-9)
-    o1, o2 = numbers(carriage.turning)
+    o1, o2 = numbers(frame_motion.turning)
     for axis, expected in enumerate((o1 * axes[2], o2 * axes[2], -(o1 * axes[0] + o2 * axes[1]))):
         _, rate = jax.jvp(lambda *both, axis=axis: jnp.stack(frame.axes(*both)[axis]), (place, cyclic), rates)
         assert_close(rate, expected, atol=1e-9)
     assert_close(numbers(frame.vertical(place)), axes[:, 2], atol=1e-10)
-    assert_close(numbers(carriage.vertical), axes[:, 2], atol=1e-10)
-    _, climb = jax.jvp(lambda place: jnp.asarray(frame.height(place)) * 1.0, (place,), (carriage.place_rate,))
+    assert_close(numbers(frame_motion.vertical), axes[:, 2], atol=1e-10)
+    _, climb = jax.jvp(lambda place: jnp.asarray(frame.height(place)) * 1.0, (place,), (frame_motion.place_rate,))
     assert_close(climb, position_rate[2], atol=1e-9)
 
 
@@ -114,15 +114,15 @@ def test_a_frame_of_its_own_is_the_carried_one_in_fewer_numbers(name):
     first = SURFACES[name][0].in_own_axes(own.axes(*start)[0])
     for frame, begin in ((own, start), (general, ((*place[:3], *first), ()))):
         here = moved(frame, begin, velocity, 0.2)
-        carriage = frame.carriage(here[0], velocity)
+        frame_motion = frame.frame_motion(here[0], velocity)
         height = float(frame.height(here[0]) - frame.height(begin[0]))
         found.append(
             np.concatenate(
                 [
                     np.ravel(np.array(frame.axes(*here), dtype=float)),
                     np.ravel(np.array(frame.position(*here), dtype=float)),
-                    numbers(carriage.turning),
-                    numbers(carriage.vertical),
+                    numbers(frame_motion.turning),
+                    numbers(frame_motion.vertical),
                     [height],
                 ]
             )
@@ -145,7 +145,7 @@ def test_room_is_left_where_the_ball_fits_and_ends_at_the_curvature_of_the_ball(
     for p, fits in ((0.021, True), (0.019, False)):
         frame = CarriedFrame.of(Paraboloid(p), DISTANCE, PULL)
         place, _ = frame.at_foot((jnp.zeros(()),) * 3)
-        room = float(frame.carriage(place, (jnp.asarray(0.1), jnp.asarray(0.0))).room)
+        room = float(frame.frame_motion(place, (jnp.asarray(0.1), jnp.asarray(0.0))).room)
         assert (room > 0.0) is fits
     assert_close(room, 1.0 - 0.02 / 0.019, atol=1e-12)
 

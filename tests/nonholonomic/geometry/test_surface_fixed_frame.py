@@ -19,10 +19,10 @@ class Waves(eqx.Module):
 
     height: float
     number: float
-    phase: np.ndarray
+    mode: np.ndarray
 
     def __call__(self, x, y):
-        first, second = self.phase
+        first, second = self.mode
         return self.height * jnp.sin(self.number * x + first) * jnp.cos(0.7 * self.number * y + second)
 
 
@@ -242,7 +242,7 @@ def test_numbers_of_a_function_are_numbers_of_the_surface():
 
     @jax.jit
     def heights(height, steep):
-        waves = Graph(Waves(height, 1.1, ground.height.phase))
+        waves = Graph(Waves(height, 1.1, ground.height.mode))
         valley = Graph(lambda x, y: steep * x * x)
         return [surface.elevation(surface.chart((0.5, -0.2))[0]) for surface in (waves, valley)]
 

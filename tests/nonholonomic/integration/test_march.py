@@ -13,16 +13,16 @@ from scipy.optimize import brentq
 from nonholonomic.integration import (
     CROSSED,
     FAILED,
-    GUARD_LOST,
+    LEFT_DOMAIN,
     REACHED_END,
     AbstractProblem,
     Oscillatory8,
     Settings,
-    compiled_march,
     explicit_tableau,
-    march_by_diffrax,
+    solve_by_diffrax,
+    solve_ensemble,
 )
-from nonholonomic.integration.march import march
+from nonholonomic.integration.ensemble import ensemble_solve
 
 pytestmark = pytest.mark.newest
 
@@ -41,10 +41,10 @@ class Oscillators(AbstractProblem):
     def field(self, time, state):
         return jnp.stack([self.frequency * state[1], -self.frequency * state[0]])
 
-    def crossing(self, state):
+    def event_function(self, state):
         return state[0] - self.level
 
-    def guard(self, time, state):
+    def domain_margin(self, time, state):
         return state[1] + self.floor
 
 
@@ -55,7 +55,7 @@ def run(frequency, level=0.5, floor=2.0, t1=10.0, lanes=8, tolerance=1e-10, solv
     frequency = jnp.atleast_1d(jnp.asarray(frequency, float))
     problem = Oscillators(frequency, jnp.asarray(level), jnp.asarray(floor))
     cells = frequency.shape[0]
-    return compiled_march(
+    return solve_ensemble(
         problem,
         jnp.asarray(t1),
         jnp.asarray(cells),
@@ -85,7 +85,7 @@ def test_cells_of_like_cost_leave_no_lane_idle():
 def test_the_guard_ends_a_run_where_it_vanishes():
     """y = -sin(w t) falls to -0.3 before x falls to 1/2."""
     outcome, _ = run([1.0, 3.0], floor=0.3)
-    assert (np.asarray(outcome.status) == GUARD_LOST).all()
+    assert (np.asarray(outcome.status) == LEFT_DOMAIN).all()
     assert_close(outcome.end_time, math.asin(0.3) / np.array([1.0, 3.0]), rtol=1e-9)
 
 
@@ -109,7 +109,7 @@ def test_the_last_crossing_of_many():
 def test_a_dip_between_the_ends_of_a_step_is_found():
     """The guard is negative for a third of a period; a loose tolerance makes steps of half of one."""
     outcome, _ = run([1.0], level=-2.0, floor=0.5, tolerance=1e-2)
-    assert outcome.status[0] == GUARD_LOST
+    assert outcome.status[0] == LEFT_DOMAIN
     assert_close(outcome.end_time, math.asin(0.5), atol=2e-2)
 
 
@@ -117,10 +117,10 @@ def test_padding_is_not_run():
     frequency = jnp.array([1.0, 2.0, 3.0, 4.0])
     problem = Oscillators(frequency, jnp.asarray(0.5), jnp.asarray(2.0))
     settings = Settings(1e-9, absolute=1.0, lanes=4)
-    outcome, iterations = compiled_march(problem, jnp.asarray(9.0), jnp.asarray(2), settings)
+    outcome, iterations = solve_ensemble(problem, jnp.asarray(9.0), jnp.asarray(2), settings)
     assert_close(outcome.crossing_time[:2], math.pi / 3.0 / frequency[:2], rtol=1e-8)
     assert outcome.steps[2:].tolist() == [0, 0]
-    _, nothing = compiled_march(problem, jnp.asarray(9.0), jnp.asarray(0), settings)
+    _, nothing = solve_ensemble(problem, jnp.asarray(9.0), jnp.asarray(0), settings)
     assert nothing == 0
     assert iterations > 0
 
@@ -140,7 +140,7 @@ def test_a_short_loss_between_the_stages_of_a_step_is_found(solver, depth):
     """The margin 1 - depth - sin(w t) is negative for sqrt(8 depth) / w; it ends the run at asin(1 - depth) / w."""
     frequency = np.geomspace(0.3, 4.0, 8)
     outcome, _ = run(frequency, level=-2.0, floor=1.0 - depth, tolerance=1e-8, solver=solver, t1=4.0 * math.pi / 0.3)
-    assert (np.asarray(outcome.status) == GUARD_LOST).all()
+    assert (np.asarray(outcome.status) == LEFT_DOMAIN).all()
     assert_close(outcome.end_time, math.asin(1.0 - depth) / frequency, rtol=1e-3)
 
 
@@ -165,7 +165,7 @@ def time_of(numbers):
     """When one oscillator reaches its level, w and level given; the exact time is acos(level) / w."""
     problem = Oscillators(numbers[:1], numbers[1:], jnp.asarray(2.0))
     settings = Settings(1e-12, absolute=1.0, lanes=1)
-    outcome, _ = march(problem, jnp.asarray(9.0), jnp.asarray(1), settings)
+    outcome, _ = ensemble_solve(problem, jnp.asarray(9.0), jnp.asarray(1), settings)
     return outcome.crossing_time[0]
 
 
@@ -196,10 +196,10 @@ class Growing(AbstractProblem):
     def field(self, time, state):
         return jnp.stack([0.05 * state[0] + state[1], 0.05 * state[1] - state[0]])
 
-    def crossing(self, state):
+    def event_function(self, state):
         return state[0] + 2.0
 
-    def guard(self, time, state):
+    def domain_margin(self, time, state):
         return None
 
 
@@ -212,8 +212,8 @@ def test_locating_an_event_adds_no_error_of_its_own(solver):
     slope = math.exp(exact / 20.0) * (math.cos(exact) / 20.0 - math.sin(exact))
     for tolerance in (1e-6, 1e-8, 1e-10):
         settings = Settings(tolerance, solver, absolute=1.0, lanes=1)
-        located, _ = compiled_march(Growing(), jnp.asarray(20.0), jnp.asarray(1), settings)
-        reached, _ = compiled_march(Growing(), jnp.asarray(exact), jnp.asarray(1), settings, passes=True)
+        located, _ = solve_ensemble(Growing(), jnp.asarray(20.0), jnp.asarray(1), settings)
+        reached, _ = solve_ensemble(Growing(), jnp.asarray(exact), jnp.asarray(1), settings, passes=True)
         error, state_error = float(located.crossing_time[0]) - exact, float(reached.state[0, 0]) + 2.0
         assert_close(error, -state_error / slope, rtol=0.2, atol=1e-11)
 
@@ -222,8 +222,8 @@ def test_an_interpolated_event_would_be_a_hundred_times_worse():
     """Dopri8 at 1e-10: Diffrax's dense output locates the same event with an error of 1e-8, this driver with 1e-11."""
     exact = brentq(lambda t: math.exp(t / 20.0) * math.cos(t) + 2.0, 15.0, 15.7, xtol=1e-15)
     settings = Settings(1e-10, diffrax.Dopri8(), absolute=1.0, lanes=1)
-    dense = march_by_diffrax(Growing(), jnp.asarray(20.0), settings)
-    located, _ = compiled_march(Growing(), jnp.asarray(20.0), jnp.asarray(1), settings)
+    dense = solve_by_diffrax(Growing(), jnp.asarray(20.0), settings)
+    located, _ = solve_ensemble(Growing(), jnp.asarray(20.0), jnp.asarray(1), settings)
     assert abs(float(located.crossing_time[0]) - exact) < 0.01 * abs(float(dense.crossing_time[0]) - exact)
 
 

@@ -10,7 +10,7 @@ from tuning.family import equations, free_directions, pair_of, unknowns_of
 from tuning.trees import error_coefficients, trees
 
 import tippe
-from nonholonomic.integration import Oscillatory8, Settings, compiled_march
+from nonholonomic.integration import Oscillatory8, Settings, solve_ensemble
 from nonholonomic.integration.oscillatory import CAUTION
 from tippe.modes.inversion_problem import InversionProblem
 
@@ -68,7 +68,7 @@ def test_off_the_plane_it_reaches_the_same_error_in_fewer_steps(arena):
     problem = InversionProblem.of(scene, tippe.Launch(np.linspace(0.05, 0.15, 8), 100.0, eta=0.3), 3.0, 8)
 
     def run(solver, tolerance):
-        found, _ = compiled_march(problem, jnp.asarray(1.5), jnp.asarray(8), Settings(tolerance, solver))
+        found, _ = solve_ensemble(problem, jnp.asarray(1.5), jnp.asarray(8), Settings(tolerance, solver))
         return np.asarray(found.state[2:5]), float(np.mean(found.steps))
 
     reference, _ = run(None, 1e-12)

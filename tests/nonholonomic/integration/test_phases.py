@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from close import assert_close
 
-from nonholonomic.hybrid import BETWEEN, AbstractPhase, Passage, Record, follow_phases, travel
+from nonholonomic.hybrid import (
+    BETWEEN,
+    AbstractBatchedMode,
+    Transition,
+    TransitionPath,
+    solve_hybrid,
+    solve_hybrid_dense,
+)
 from nonholonomic.integration import CROSSED, REACHED_END, RUNNING, UNRESOLVED, AbstractProblem, Settings
 
 GRAVITY, CLOSING = 9.81, 1e-3
@@ -32,14 +39,14 @@ class Motion(AbstractProblem):
     def field(self, time, state):
         return jnp.stack([state[1], self.acceleration + 0.0 * state[1], 0.0 * state[2]])
 
-    def crossing(self, state):
+    def event_function(self, state):
         return None
 
-    def guard(self, time, state):
+    def domain_margin(self, time, state):
         return state[0] if self.falls else None
 
 
-class Fall(AbstractPhase):
+class Fall(AbstractBatchedMode):
     """Down to the ground; then up again in closed form, to rest, or to the end at the last bounce."""
 
     restitution: jnp.ndarray
@@ -48,7 +55,7 @@ class Fall(AbstractPhase):
     def problem(self, state):
         return Motion(state, jnp.asarray(-GRAVITY), True)
 
-    def leave(self, state, left):
+    def reset_map(self, state, left):
         height, velocity, count = state
         speed = jnp.sqrt(velocity**2 + 2.0 * GRAVITY * height)
         # The ground is found to round-off of a step; the rest of the way, of either sign, is known.
@@ -59,14 +66,14 @@ class Fall(AbstractPhase):
         end = self.between((late, rebound, count), late + rise)
         end = jnp.where(rests & ~last, end * jnp.array([[0.0], [0.0], [1.0]]), end)
         cut = rise < rebound / GRAVITY
-        return Passage(
-            phase=jnp.where(rests, RESTING, FALLING),
+        return Transition(
+            mode=jnp.where(rests, RESTING, FALLING),
             state=end,
             elapsed=late + rise,
             status=jnp.where(last, CROSSED, jnp.where(cut & ~rests, REACHED_END, RUNNING)),
             crossing_time=jnp.where(last, late, jnp.inf),
             counts=jnp.ones((1, *count.shape), int),
-            record=Record(
+            record=TransitionPath(
                 (late + rise)[None], (late[None], rebound[None], count[None]), jnp.full((1, *count.shape), 3)
             ),
         )
@@ -78,13 +85,13 @@ class Fall(AbstractPhase):
         return jnp.stack([height, rebound - GRAVITY * time, count + 0.0 * time])
 
 
-class Rest(AbstractPhase):
+class Rest(AbstractBatchedMode):
     """On the ground."""
 
     def problem(self, state):
         return Motion(state, jnp.asarray(0.0), False)
 
-    def leave(self, state, left):
+    def reset_map(self, state, left):
         raise AssertionError("nothing ends it")
 
 
@@ -129,15 +136,15 @@ def padded(values):
 
 def table(t1, bounces, most_rounds=200):
     heights = padded(HEIGHTS)
-    phases = (Fall(jnp.asarray(padded(RESTITUTIONS)), jnp.asarray(padded(bounces), float)), Rest())
+    modes = (Fall(jnp.asarray(padded(RESTITUTIONS)), jnp.asarray(padded(bounces), float)), Rest())
     state = np.stack([heights, 0.0 * heights, 0.0 * heights])
     start = np.full(CELLS + PADDING, FALLING)
-    return travel(phases, start, state, t1, CELLS, SETTINGS, kinds=1, most_rounds=most_rounds)
+    return solve_hybrid(modes, start, state, t1, CELLS, SETTINGS, kinds=1, most_rounds=most_rounds)
 
 
 def single(ball, t1, bounces=np.inf):
-    phases = (Fall(jnp.array([ball.restitution]), jnp.array([float(bounces)])), Rest())
-    return follow_phases(phases, FALLING, jnp.array([ball.height, 0.0, 0.0]), t1, SETTINGS, kinds=1)
+    modes = (Fall(jnp.array([ball.restitution]), jnp.array([float(bounces)])), Rest())
+    return solve_hybrid_dense(modes, FALLING, jnp.array([ball.height, 0.0, 0.0]), t1, SETTINGS, kinds=1)
 
 
 def test_the_times_of_bounces_of_many_balls():
@@ -164,7 +171,7 @@ def test_the_states_of_many_balls_at_a_horizon(t1):
     assert_close(found.state[:, :CELLS], expected, atol=2e-13)
     assert found.counts[0, :CELLS].tolist() == expected[2].tolist()
     rests = [ball.rests_after == count for ball, count in zip(BALLS, expected[2], strict=True)]
-    assert (found.phase[:CELLS] == np.where(rests, RESTING, FALLING)).all()
+    assert (found.mode[:CELLS] == np.where(rests, RESTING, FALLING)).all()
     assert all(rests) == (t1 == 30.0)
 
 

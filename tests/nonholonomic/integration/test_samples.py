@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from close import assert_close
 
-from nonholonomic.integration import GUARD_LOST, REACHED_END, AbstractProblem, Settings, march_with_samples
+from nonholonomic.integration import LEFT_DOMAIN, REACHED_END, AbstractProblem, Settings, solve_with_samples
 
 CELLS = 40
 
@@ -24,10 +24,10 @@ class Oscillators(AbstractProblem):
     def field(self, time, state):
         return jnp.stack([state[1], -(self.rate**2) * state[0]])
 
-    def crossing(self, state):
+    def event_function(self, state):
         return None
 
-    def guard(self, time, state):
+    def domain_margin(self, time, state):
         return state[0] - self.least
 
 
@@ -37,7 +37,7 @@ RATES = jnp.linspace(1.0, 9.0, CELLS)
 def run(times, least=-2.0, tolerance=1e-10):
     problem = Oscillators(RATES, jnp.full(CELLS, least))
     given = (jnp.asarray(10.0), jnp.asarray(CELLS), Settings(tolerance, lanes=16))
-    return eqx.filter_jit(march_with_samples)(problem, jnp.asarray(times), *given)
+    return eqx.filter_jit(solve_with_samples)(problem, jnp.asarray(times), *given)
 
 
 @pytest.mark.parametrize("count", [3, 701])
@@ -61,7 +61,7 @@ def test_each_run_has_its_own_times():
 def test_after_the_end_there_are_no_numbers():
     times = np.linspace(0.0, 10.0, 201)
     outcome, samples = run(times, least=0.5)
-    assert np.all(outcome.status == GUARD_LOST)
+    assert np.all(outcome.status == LEFT_DOMAIN)
     ends = np.pi / 3.0 / np.asarray(RATES)
     assert_close(outcome.end_time, ends, rtol=1e-8)
     assert np.array_equal(np.isfinite(samples[..., 0]), times <= ends[:, None])

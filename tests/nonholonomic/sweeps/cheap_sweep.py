@@ -34,12 +34,12 @@ def block_of(columns):
 class CheapJob(NamedTuple):
     """A job for other processes. It notes each block that it begins as a file, of which each line names a process.
 
-    The process that begins block `deadly` for one of the first `deaths` times kills itself; every block takes `pause` [s].
+    The process that begins block `deadly` for one of the first `crashes` times kills itself; every block takes `pause` [s].
     """
 
     folder: Path
     deadly: int = -1
-    deaths: int = 0
+    crashes: int = 0
     pause: float = 0.0
 
     def __call__(self, columns, count):
@@ -48,7 +48,7 @@ class CheapJob(NamedTuple):
             with note.open("a") as stream:
                 stream.write(f"{os.getpid()}\n")
             time.sleep(self.pause)
-            if block_of(columns) == self.deadly and len(self.begun(self.deadly)) <= self.deaths:
+            if block_of(columns) == self.deadly and len(self.begun(self.deadly)) <= self.crashes:
                 os.kill(os.getpid(), signal.SIGKILL)
         return expected(columns["x"])
 

@@ -18,7 +18,7 @@ def process(_):
 if __name__ == "__main__":
     from mpi4py.futures import MPIPoolExecutor
 
-    running.block_for = lambda cells: 64
+    running.chunk_for = lambda cells: 64
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
     launches = {"theta": np.linspace(0.05, 0.6, 40), "spin": [80.0, 100.0, 190.0], "mu": [0.2, 0.3]}
     with MPIPoolExecutor() as executor:

@@ -11,7 +11,7 @@ from cheap_sweep import cheap_sweep, finished_blocks
 from nonholonomic.sweeps import Table
 
 
-class Blow(BaseException):
+class ContactImpulse(BaseException):
     """The end of the process at a chosen moment."""
 
 
@@ -19,7 +19,7 @@ class Blow(BaseException):
 FOR_THE_FOLDER, FOR_A_BLOCK, FOR_THE_FILE = 4, 4, 3
 
 
-def strike(monkeypatch, moment, torn, error):
+def resolve_impact(monkeypatch, moment, torn, error):
     """Have a sweep end at an operation on the disk: before a sync or a renaming, or in a block, of which a part is written."""
     count = itertools.count()
 
@@ -47,7 +47,7 @@ def strike(monkeypatch, moment, torn, error):
 def half_finished(path):
     """A sweep that was struck down after three blocks."""
     with pytest.MonkeyPatch.context() as patch:
-        strike(patch, FOR_THE_FOLDER + 3 * FOR_A_BLOCK, torn=0.5, error=Blow())
-        with pytest.raises(Blow):
+        resolve_impact(patch, FOR_THE_FOLDER + 3 * FOR_A_BLOCK, torn=0.5, error=ContactImpulse())
+        with pytest.raises(ContactImpulse):
             cheap_sweep(path)
     assert len(finished_blocks(Table.load(path))) == 3

@@ -22,7 +22,7 @@ import nonholonomic
 import stroller
 import tippe
 from nonholonomic.sweeps import Table, running
-from nonholonomic.sweeps.handing import Lost, handed_out
+from nonholonomic.sweeps.dispatch import ExecutorBroken, handed_out
 
 HERE = Path(__file__).parent
 
@@ -114,7 +114,7 @@ def test_trajectories_and_rides_from_other_processes_have_the_same_bits(processe
 
 @pytest.mark.parametrize("way", ["processes", "dask"])
 def test_a_block_whose_worker_dies_is_computed_by_another(way, tmp_path, request):
-    job = CheapJob(tmp_path, deadly=2, deaths=1)
+    job = CheapJob(tmp_path, deadly=2, crashes=1)
     table = cheap_sweep(tmp_path / "table.h5", job=job, executor=request.getfixturevalue(way))
     assert finished_blocks(table) == set(range(7))
     first, second = job.begun(2)
@@ -124,7 +124,7 @@ def test_a_block_whose_worker_dies_is_computed_by_another(way, tmp_path, request
 
 @pytest.mark.parametrize("way", ["processes", pytest.param("dask", marks=pytest.mark.slow)])
 def test_a_block_that_three_workers_die_of_is_failed_and_the_others_are_not(way, tmp_path, request):
-    job, path = CheapJob(tmp_path, deadly=2, deaths=99), tmp_path / "table.h5"
+    job, path = CheapJob(tmp_path, deadly=2, crashes=99), tmp_path / "table.h5"
     told = r"cells 16 to 23 \(x 0\.326\d* to 0\.469\d*\) are given up as failed: 3 workers or more died of them"
     with pytest.warns(RuntimeWarning, match=told):
         table = cheap_sweep(path, job=job, executor=request.getfixturevalue(way))
@@ -139,7 +139,7 @@ def test_a_block_that_three_workers_die_of_is_failed_and_the_others_are_not(way,
 
 def test_a_pool_that_breaks_ends_the_sweep_and_another_goes_on(processes, tmp_path):
     """Python's own pool has no more workers after the first that dies."""
-    job, path = CheapJob(tmp_path, deadly=3, deaths=1, pause=0.05), tmp_path / "table.h5"
+    job, path = CheapJob(tmp_path, deadly=3, crashes=1, pause=0.05), tmp_path / "table.h5"
     told = r"takes no more blocks .*; 24 of 50 cells are done, .*table\.h5 has"
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, spawn) as pool, pytest.raises(RuntimeError, match=told):
@@ -251,9 +251,9 @@ def pid():
 """
 
 
-def script(folder, guard):
+def script(folder, domain_margin):
     program = folder / "program.py"
-    program.write_text(SCRIPT.format(guard=guard))
+    program.write_text(SCRIPT.format(domain_margin=domain_margin))
     environment = os.environ | {"PYTHONPATH": str(HERE.parents[2])}
     return subprocess.Popen(
         [sys.executable, program], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -325,7 +325,7 @@ def test_who_computes_and_what_is_shown_is_checked_before_a_file_is_there(change
 def test_an_executor_that_is_shut_down_takes_no_blocks():
     pool = ThreadPoolExecutor(1)
     pool.shutdown()
-    with pytest.raises(Lost, match="takes no more blocks"):
+    with pytest.raises(ExecutorBroken, match="takes no more blocks"):
         next(handed_out(lambda block: pool.submit(abs, block), range(3), 2))
     with pytest.raises(RuntimeError, match=f"0 of {CELLS} cells are done, nothing is kept without path="):
         cheap_sweep(None, executor=pool)

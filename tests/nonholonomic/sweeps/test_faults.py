@@ -16,10 +16,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from cheap_sweep import BLOCK, cheap_sweep, finished_blocks, resumed
-from struck import FOR_A_BLOCK, FOR_THE_FILE, FOR_THE_FOLDER, Blow, strike
+from struck import FOR_A_BLOCK, FOR_THE_FILE, FOR_THE_FOLDER, ContactImpulse, resolve_impact
 
 from nonholonomic.sweeps import Table, running
-from nonholonomic.sweeps._blocks import Blocks
+from nonholonomic.sweeps._chunks import ChunkStore
 from nonholonomic.sweeps.layout import Layout
 
 pytestmark = pytest.mark.newest
@@ -51,17 +51,19 @@ def test_sweeps_killed_at_a_hundred_random_moments(tmp_path):
     assert files > 10
 
 
-@pytest.mark.parametrize("error", [Blow(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))], ids=["killed", "full"])
+@pytest.mark.parametrize(
+    "error", [ContactImpulse(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))], ids=["killed", "full"]
+)
 def test_every_moment_of_writing(tmp_path, error):
     """Struck down in each operation of the first three blocks, in the middle of it or before, and of the file: none is lost."""
     ends = FOR_THE_FOLDER + 7 * FOR_A_BLOCK
     for moment in (*range(FOR_THE_FOLDER, FOR_THE_FOLDER + 3 * FOR_A_BLOCK + 1), *range(ends, ends + FOR_THE_FILE)):
         path = tmp_path / f"{moment}.h5"
         with pytest.MonkeyPatch.context() as patch:
-            strike(patch, moment, torn=(moment % 3) / 2.0, error=error)
-            with pytest.raises(Blow if isinstance(error, Blow) else OSError) as raised:
+            resolve_impact(patch, moment, torn=(moment % 3) / 2.0, error=error)
+            with pytest.raises(ContactImpulse if isinstance(error, ContactImpulse) else OSError) as raised:
                 cheap_sweep(path)
-        if not isinstance(error, Blow):
+        if not isinstance(error, ContactImpulse):
             assert re.fullmatch(rf"cannot write {path}(\.blocks/\d\.npz)?: No space left on device", str(raised.value))
         after = finished_blocks(Table.load(path))
         written = (moment - FOR_THE_FOLDER) // FOR_A_BLOCK
@@ -176,7 +178,7 @@ def test_one_of_many_writers(tmp_path):
         gate.wait()
         for _ in range(10):
             try:
-                blocks = Blocks(path, LAYOUT)
+                blocks = ChunkStore(path, LAYOUT)
             except OSError as error:
                 refused.append(str(error))
                 continue
@@ -219,9 +221,9 @@ def test_another_version_is_told_or_refused(tmp_path, monkeypatch):
     path = tmp_path / "table.h5"
     now = running.versions()
     with monkeypatch.context() as patch:
-        strike(patch, 20, torn=0.0, error=Blow())
+        resolve_impact(patch, 20, torn=0.0, error=ContactImpulse())
         patch.setattr(running, "versions", lambda: now | {"jax": "0.0.1", "python": "2.7"})
-        with pytest.raises(Blow):
+        with pytest.raises(ContactImpulse):
             cheap_sweep(path)
     with pytest.warns(RuntimeWarning, match=rf"was begun with jax 0\.0\.1, now {now['jax']}: digits may differ"):
         table = cheap_sweep(path)

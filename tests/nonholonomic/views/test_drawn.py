@@ -6,7 +6,19 @@ import pytest
 from PIL import Image
 
 from nonholonomic.geometry import Cylinder, Graph, Implicit, Paraboloid, Plane, Sphere, Spheroid, Torus
-from nonholonomic.views import Arrow, Body, Curve, Show, Stage, Trace, arena, ball, page, told_by_colour, turned
+from nonholonomic.views import (
+    Arrow,
+    Body,
+    Curve,
+    Show,
+    Stage,
+    Trace,
+    arena,
+    ball,
+    distinguished_by_colour,
+    page,
+    turned,
+)
 from nonholonomic.views.animation import draw_curves, write_animation
 from nonholonomic.views.stage import matrices
 
@@ -114,6 +126,6 @@ def test_a_page_without_motion_has_no_script(tmp_path):
 
 def test_traces_of_several_runs_have_their_colours():
     (show,) = rolling().shows
-    assert told_by_colour((show,)) == (show,)
-    both = told_by_colour((show, show._replace(colour=0x2A6FB0)))
+    assert distinguished_by_colour((show,)) == (show,)
+    both = distinguished_by_colour((show, show._replace(colour=0x2A6FB0)))
     assert [one.traces[0].colour for one in both] == [0xC8412B, 0x2A6FB0]

@@ -9,18 +9,18 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Float
 
+from .dense import saved
 from .problem import AbstractProblem
-from .queue import Outcome
+from .scheduler import Outcome
 from .settings import Settings
-from .single_run import saved
-from .status import CROSSED, FAILED, GUARD_LOST, REACHED_END
+from .status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END
 
 #: A run that needs more has failed.
 MOST_STEPS = 100_000
 
 
 @eqx.filter_jit
-def march_by_diffrax(
+def solve_by_diffrax(
     problem: AbstractProblem,
     t1: Float[Array, ""],
     settings: Settings,
@@ -29,7 +29,7 @@ def march_by_diffrax(
 
     The guard is checked at the ends of steps; events are located on Diffrax's dense output.
 
-    **Arguments:** as for `march`, but any solver of Diffrax will do.
+    **Arguments:** as for `ensemble_solve`, but any solver of Diffrax will do.
 
     **Returns:** the `Outcome`.
     """
@@ -38,10 +38,12 @@ def march_by_diffrax(
 
     def one(here: AbstractProblem, state: Array, scale: Array) -> Outcome:
         conditions = {
-            CROSSED: None if problem.crossing(starts) is None else (lambda t, y, args, **_: args.crossing(y)),
-            GUARD_LOST: None
-            if problem.guard(starts[0], starts) is None
-            else (lambda t, y, args, **_: args.guard(t, y)),
+            CROSSED: None
+            if problem.event_function(starts) is None
+            else (lambda t, y, args, **_: args.event_function(y)),
+            LEFT_DOMAIN: None
+            if problem.domain_margin(starts[0], starts) is None
+            else (lambda t, y, args, **_: args.domain_margin(t, y)),
         }
         conditions = {code: condition for code, condition in conditions.items() if condition is not None}
         # Diffrax sees an event where a condition changes its sign: a cell that starts beyond one has ended.

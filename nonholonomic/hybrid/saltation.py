@@ -25,11 +25,11 @@ import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
-from ..derivatives.slopes import directions_of
-from ..derivatives.variation import VariationalProblem, where_moved
+from ..derivatives.slopes import tangents_of
+from ..derivatives.variation import VariationalProblem, where_active
 from ..integration import AbstractProblem, Settings
-from .phases import AbstractPhase, Journey, Passage, travel
-from .traced_phases import traced_travel
+from .ensemble import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid
+from .traced_ensemble import traced_solve_hybrid
 
 #: An event is grazing if numbers that change by the tolerance, as a part of their own size, or an error of the state that the
 #: tolerance allows, change its rate by more than this part. The derivative then errs by about as much.
@@ -52,11 +52,11 @@ class Clocked(AbstractProblem):
     def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
         return with_row(self.problem.field(time, state[:-1]), jnp.ones_like(state[-1]))
 
-    def crossing(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"] | None:
-        return self.problem.crossing(state[:-1])
+    def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"] | None:
+        return self.problem.event_function(state[:-1])
 
-    def guard(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.problem.guard(time, state[:-1])
+    def domain_margin(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.problem.domain_margin(time, state[:-1])
 
     def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
         return self.problem.margins(time, state[:-1])
@@ -67,7 +67,7 @@ def with_row(state: Float[Array, "components cells"], row: Float[Array, " cells"
     return jnp.concatenate([state, row[None]])
 
 
-class VariedPhase(AbstractPhase):
+class VariationalMode(AbstractBatchedMode):
     """A phase, and first variations of its runs behind the state: of the state and, last, of the time at which it began.
 
     The phase's equations must not depend on time.
@@ -76,8 +76,8 @@ class VariedPhase(AbstractPhase):
     - `ends_on_event`: as there; `tolerance`: relative, of the integration.
     """
 
-    phase: AbstractPhase
-    directions: tuple[Any, ...]
+    mode: AbstractBatchedMode
+    tangents: tuple[Any, ...]
     tolerance: Float[Array, ""]
     ends_on_event: bool = eqx.field(static=True)
 
@@ -90,46 +90,46 @@ class VariedPhase(AbstractPhase):
 
         point = (with_row(at[:-1], jnp.zeros_like(at[-1])), *numbers)
         tangents = [(one, *rates) for one, rates in zip(variations, self._rates(), strict=True)]
-        return VariationalProblem(clocked(*point), directions_of(clocked, point, tangents), self.ends_on_event)
+        return VariationalProblem(clocked(*point), tangents_of(clocked, point, tangents), self.ends_on_event)
 
-    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """What follows the phase itself, with variations. Counted in the last row are grazing events."""
-        return self.left_behind(state, left, lambda phase, record, left: ())[0]
+        return self.left_behind(state, left, lambda mode, record, left: ())[0]
 
     def left_behind(
         self, state: Float[Array, "components cells"], left: Float[Array, " cells"], seen: Callable[..., Any]
-    ) -> tuple[Passage, Any, Any]:
+    ) -> tuple[Transition, Any, Any]:
         """What follows the phase, as `leave` says it, and what is seen of the way to the next.
 
-        **Arguments:** `seen`: takes the phase, the `Record` of the way and `left`, and gives a tree of numbers.
+        **Arguments:** `seen`: takes the phase, the `TransitionPath` of the way and `left`, and gives a tree of numbers.
 
-        **Returns:** the `Passage`; the numbers; and their variations, with the directions first.
+        **Returns:** the `Transition`; the numbers; and their variations, with the directions first.
         """
         at, *variations = self.parts(state)
         at, lasted, count = at[:-1], at[-1], len(variations)
         numbers, build = self._moving()
         still = [jnp.zeros_like(number) for number in numbers]
-        rates = self.phase.problem(at).field(lasted, at)
+        rates = self.mode.problem(at).field(lasted, at)
 
         def met(at: Float[Array, "components cells"], *numbers: Array) -> tuple[Array, Array]:
             problem = build(*numbers).problem(at)
-            return jax.jvp(lambda at: problem.guard(lasted, at), (at,), (problem.field(lasted, at),))
+            return jax.jvp(lambda at: problem.domain_margin(lasted, at), (at,), (problem.field(lasted, at),))
 
         # Behind the variations stand an error of the state, and the way on in time.
         along = [(one[:-1], *moved) for one, moved in zip(variations, self._rates(), strict=True)]
         along += [(self._error(at, lasted, rates), *still), (rates, *still)]
-        (_, rate), (guards, changes) = _along(met, (at, *numbers), along)
+        (_, rate), (domain_margins, changes) = _along(met, (at, *numbers), along)
         # A phase that ended as it began has not met its event.
         happened = (lasted > 0.0) & (rate != 0.0)
         safe = jnp.where(happened, rate, 1.0)
-        later = jnp.where(happened, -guards[:-1] / safe, 0.0)
+        later = jnp.where(happened, -domain_margins[:-1] / safe, 0.0)
         log_rates = jnp.where(happened, (changes[:-1] + changes[-1] * later) / safe, 0.0)
 
         def passed(at: Float[Array, "components cells"], left: Float[Array, " cells"], *numbers: Array) -> Any:
-            phase = build(*numbers)
-            onward = phase.leave(at, left)
+            mode = build(*numbers)
+            onward = mode.reset_map(at, left)
             inside = jnp.zeros_like(left) if onward.log_rates is None else onward.log_rates
-            path = seen(phase, onward.record, left)
+            path = seen(mode, onward.record, left)
             return (onward.state, onward.elapsed, inside, path), onward._replace(record=None, log_rates=None)
 
         begins = jnp.concatenate([*[one[None, -1] for one in variations], jnp.zeros_like(lasted)[None]]) + later
@@ -162,7 +162,7 @@ class VariedPhase(AbstractPhase):
 
         if not variations:
             return shown(at), jnp.zeros((0, *shown(at).shape))
-        rates = self.phase.problem(at).field(lasted, at)
+        rates = self.mode.problem(at).field(lasted, at)
         # A phase that begins later is less far at the same time.
         along = [(one[:-1] - rates * one[-1], *moved) for one, moved in zip(variations, self._rates(), strict=True)]
         return _along(shown, (at, *numbers), along)
@@ -174,9 +174,9 @@ class VariedPhase(AbstractPhase):
 
         def time(at: Float[Array, "components cells"], began: Float[Array, " cells"], *numbers: Array) -> Any:
             problem = build(*numbers).problem(at)
-            if problem.crossing(at) is None:
+            if problem.event_function(at) is None:
                 return began
-            return began + delay(problem.crossing, at, problem.field(began, at))
+            return began + delay(problem.event_function, at, problem.field(began, at))
 
         point = (at[:-1], jnp.zeros_like(at[-1]), *numbers)
         tangents = [(one[:-1], one[-1], *rates) for one, rates in zip(variations, self._rates(), strict=True)]
@@ -184,7 +184,7 @@ class VariedPhase(AbstractPhase):
 
     def parts(self, state: Float[Array, "components cells"]) -> list[Float[Array, "components cells"]]:
         """The state with its clock, and the variations of both."""
-        return jnp.split(state, 1 + len(self.directions))
+        return jnp.split(state, 1 + len(self.tangents))
 
     def _error(
         self,
@@ -193,21 +193,21 @@ class VariedPhase(AbstractPhase):
         rates: Float[Array, "components cells"],
     ) -> Float[Array, "components cells"]:
         """What the state at the end of the phase may err by, over the tolerance: of what has changed, and of the magnitudes."""
-        sizes = jnp.minimum(self.phase.problem(at).start()[1], jnp.abs(rates) * lasted)
+        sizes = jnp.minimum(self.mode.problem(at).start()[1], jnp.abs(rates) * lasted)
         # Shares of both signs that are not likely to cancel.
         shares = [(-1.0) ** k * (0.5 + math.modf(0.618 * k)[0]) for k in range(len(sizes))]
         return jnp.asarray(shares)[:, None] * sizes
 
     def _moving(self) -> tuple[list[Array], Any]:
         """The phase's numbers that are moved, and the phase as a function of them."""
-        if not self.directions:
-            return [], lambda: self.phase
-        numbers, structure = jax.tree.flatten(where_moved(self.phase, self.directions[0]))
-        return numbers, lambda *numbers: eqx.combine(jax.tree.unflatten(structure, numbers), self.phase)
+        if not self.tangents:
+            return [], lambda: self.mode
+        numbers, structure = jax.tree.flatten(where_active(self.mode, self.tangents[0]))
+        return numbers, lambda *numbers: eqx.combine(jax.tree.unflatten(structure, numbers), self.mode)
 
     def _rates(self) -> list[list[Array]]:
         """For each direction the rates at which these numbers move."""
-        return [jax.tree.leaves(direction) for direction in self.directions]
+        return [jax.tree.leaves(direction) for direction in self.tangents]
 
 
 def delay(function: Any, state: Float[Array, "components cells"], rates: Float[Array, "components cells"]) -> Any:
@@ -235,10 +235,10 @@ class Slopes(NamedTuple):
     grazing: Bool[Array, " cells"]
 
 
-def travel_with_slopes(
-    phases: tuple[AbstractPhase, ...],
-    directions: tuple[tuple[tuple[Any, ...], Any], ...],
-    phase: Int[np.ndarray, " cells"],
+def solve_hybrid_with_tangents(
+    modes: tuple[AbstractBatchedMode, ...],
+    tangents: tuple[tuple[tuple[Any, ...], Any], ...],
+    mode: Int[np.ndarray, " cells"],
     state: Float[np.ndarray, "components cells"],
     t1: Float[np.ndarray, "..."],
     cells: int,
@@ -246,77 +246,77 @@ def travel_with_slopes(
     *,
     kinds: int,
     ends_on_event: bool = True,
-) -> tuple[Journey, Slopes]:
+) -> tuple[HybridOutcome, Slopes]:
     """Run every cell through its phases to its event, and differentiate the event's time in some directions.
 
-    **Arguments:** as for `travel`, and
+    **Arguments:** as for `solve_hybrid`, and
 
     - `directions`: for each, the tangents of the phases and that of the states, `None` for what does not move.
     - `ends_on_event`: whether runs end on the event; else they end at `t1`, which is then the event's time.
 
-    **Returns:** the `Journey`, and the `Slopes`, 0 where there is no event, or it is there at the start.
+    **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event, or it is there at the start.
     """
-    varied = varied_phases(phases, directions, settings.tolerance, ends_on_event)
-    start, parts = np.asarray(varied_start(jnp.asarray(state), directions)), 1 + len(directions)
-    ended = travel(varied, phase, start, t1, cells, settings, kinds=kinds + 1, parts=parts)
+    varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
+    start, parts = np.asarray(variational_start(jnp.asarray(state), tangents)), 1 + len(tangents)
+    ended = solve_hybrid(varied, mode, start, t1, cells, settings, kinds=kinds + 1, parts=parts)
     slopes = [np.asarray(_slopes(one, jnp.asarray(ended.state))) for one in varied]
-    return _own(ended, len(state)), Slopes(_of_phase(np, ended.phase, slopes), ended.counts[-1] > 0)
+    return _own(ended, len(state)), Slopes(_of_mode(np, ended.mode, slopes), ended.counts[-1] > 0)
 
 
-def traced_travel_with_slopes(
-    phases: tuple[AbstractPhase, ...],
-    directions: tuple[tuple[tuple[Any, ...], Any], ...],
-    phase: Int[Array, " cells"],
+def traced_solve_hybrid_with_tangents(
+    modes: tuple[AbstractBatchedMode, ...],
+    tangents: tuple[tuple[tuple[Any, ...], Any], ...],
+    mode: Int[Array, " cells"],
     state: Float[Array, "components cells"],
     t1: Float[Array, "..."],
     settings: Settings,
     *,
     kinds: int,
     ends_on_event: bool = True,
-) -> tuple[Journey, Slopes]:
-    """`travel_with_slopes` inside other transformed functions, for all cells; arguments and results are traced."""
-    varied = varied_phases(phases, directions, settings.tolerance, ends_on_event)
-    start, parts = varied_start(state, directions), 1 + len(directions)
-    ended = traced_travel(varied, phase, start, t1, settings, kinds=kinds + 1, parts=parts)
-    slopes = _of_phase(jnp, ended.phase, [one.slopes(ended.state) for one in varied])
+) -> tuple[HybridOutcome, Slopes]:
+    """`solve_hybrid_with_tangents` inside other transformed functions, for all cells; arguments and results are traced."""
+    varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
+    start, parts = variational_start(state, tangents), 1 + len(tangents)
+    ended = traced_solve_hybrid(varied, mode, start, t1, settings, kinds=kinds + 1, parts=parts)
+    slopes = _of_mode(jnp, ended.mode, [one.slopes(ended.state) for one in varied])
     return _own(ended, len(state)), Slopes(slopes, ended.counts[-1] > 0)
 
 
-def _own(ended: Journey, size: int) -> Journey:
+def _own(ended: HybridOutcome, size: int) -> HybridOutcome:
     """A journey without its variations."""
     return ended._replace(state=ended.state[:size], counts=ended.counts[:-1])
 
 
-def _of_phase(xp: Any, phase: Int[Array, " cells"], slopes: list[Float[Array, "directions cells"]]) -> Any:
+def _of_mode(xp: Any, mode: Int[Array, " cells"], slopes: list[Float[Array, "directions cells"]]) -> Any:
     """Of the slopes in every phase those of the phase in which each cell is."""
     found = xp.zeros_like(slopes[0])
     for number, some in enumerate(slopes):
-        found = xp.where(phase == number, some, found)
+        found = xp.where(mode == number, some, found)
     return found
 
 
 @eqx.filter_jit
-def _slopes(varied: VariedPhase, state: Float[Array, "components cells"]) -> Float[Array, "directions cells"]:
+def _slopes(varied: VariationalMode, state: Float[Array, "components cells"]) -> Float[Array, "directions cells"]:
     return varied.slopes(state)
 
 
-def varied_phases(
-    phases: tuple[AbstractPhase, ...],
-    directions: tuple[tuple[tuple[Any, ...], Any], ...],
+def variational_modes(
+    modes: tuple[AbstractBatchedMode, ...],
+    tangents: tuple[tuple[tuple[Any, ...], Any], ...],
     tolerance: Float[Array, ""],
     ends_on_event: bool,
-) -> tuple[VariedPhase, ...]:
-    """The phases with their variations. **Arguments:** as for `travel_with_slopes`."""
+) -> tuple[VariationalMode, ...]:
+    """The phases with their variations. **Arguments:** as for `solve_hybrid_with_tangents`."""
     return tuple(
-        VariedPhase(phase, tuple(direction[0][k] for direction in directions), tolerance, ends_on_event)
-        for k, phase in enumerate(phases)
+        VariationalMode(mode, tuple(direction[0][k] for direction in tangents), tolerance, ends_on_event)
+        for k, mode in enumerate(modes)
     )
 
 
-def varied_start(
-    state: Float[Array, "components cells"], directions: tuple[tuple[tuple[Any, ...], Any], ...]
+def variational_start(
+    state: Float[Array, "components cells"], tangents: tuple[tuple[tuple[Any, ...], Any], ...]
 ) -> Float[Array, "more cells"]:
     """States at the start with their clocks, and the variations of both behind them."""
     zero = jnp.zeros_like(state[0])
-    moved = [jnp.zeros_like(state) if direction[1] is None else direction[1] for direction in directions]
+    moved = [jnp.zeros_like(state) if direction[1] is None else direction[1] for direction in tangents]
     return jnp.concatenate([with_row(one, zero) for one in (state, *moved)])

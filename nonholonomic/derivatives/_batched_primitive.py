@@ -22,7 +22,8 @@ from jaxtyping import Array, Float
 class Request:
     """What is asked of some cells.
 
-    - `question`: an `AbstractQuestion`; `way`: (question, cells, leaves) -> what is found, a tree of arrays, the cells first.
+    - `question`: an `AbstractDifferentiableSolve`; `way`: (question, cells, leaves) -> what is found, a tree of arrays, the
+      cells first.
     - `wanted`: the numbers of the parts of the tree that are to be found, all if `None`; parts that are `None` count.
     """
 

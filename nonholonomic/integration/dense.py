@@ -22,13 +22,13 @@ PIECE = 2048
 LOOKS = np.arange(1, 8) / 8.0
 
 
-class Followed(NamedTuple):
+class DenseSolution(NamedTuple):
     """A run: its times and states, the pieces of its dense output, how it ended and how many steps it took."""
 
     times: Float[np.ndarray, " times"]
     states: Float[np.ndarray, "components times"]
-    pieces: list[Any]
-    guard_lost: bool
+    segments: list[Any]
+    left_domain: bool
     failed: bool
     accepted: int
     rejected: int
@@ -36,10 +36,10 @@ class Followed(NamedTuple):
     def at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "components times"]:
         """States at the given times, by the dense output; times must lie within the run."""
         states = np.repeat(self.states[:, :1], len(times), axis=1)
-        for piece in self.pieces:
-            here = (times > float(piece.t0)) & (times <= float(piece.t1))
+        for segment in self.segments:
+            here = (times > float(segment.t0)) & (times <= float(segment.t1))
             if here.any():
-                states[:, here] = np.asarray(_evaluate(piece, padded(times[here], len(times)))).T[:, : here.sum()]
+                states[:, here] = np.asarray(_evaluate(segment, padded(times[here], len(times)))).T[:, : here.sum()]
         return states
 
 
@@ -50,8 +50,8 @@ def padded(values: Float[np.ndarray, "... times"], least: int) -> Float[np.ndarr
 
 
 @eqx.filter_jit
-def _evaluate(piece: diffrax.Solution, times: Float[Array, " times"]) -> Float[Array, "times components"]:
-    return jax.vmap(piece.evaluate)(times)
+def _evaluate(segment: diffrax.Solution, times: Float[Array, " times"]) -> Float[Array, "times components"]:
+    return jax.vmap(segment.evaluate)(times)
 
 
 def saved(solution: diffrax.Solution) -> tuple[Any, Any]:
@@ -61,9 +61,9 @@ def saved(solution: diffrax.Solution) -> tuple[Any, Any]:
 
 def _guard(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array, " components"]) -> Float[Array, ""]:
     """The guard of a problem that has one."""
-    guard = problem.guard(time, state)
-    assert guard is not None
-    return guard
+    domain_margin = problem.domain_margin(time, state)
+    assert domain_margin is not None
+    return domain_margin
 
 
 def _control(settings: Settings, scales: Float[Array, " components"]) -> diffrax.PIDController:
@@ -83,7 +83,7 @@ def _piece(
     settings: Settings,
 ) -> tuple[diffrax.Solution, Float[Array, " steps"]]:
     """As many steps as the settings allow, and the least value of the guard seen in each."""
-    watched = problem.guard(t0, state) is not None
+    watched = problem.domain_margin(t0, state) is not None
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
         settings.for_single_runs,
@@ -95,7 +95,7 @@ def _piece(
         stepsize_controller=_control(settings, scales),
         saveat=diffrax.SaveAt(t0=True, steps=True, dense=True),
         max_steps=settings.max_steps,
-        event=diffrax.Event(lambda t, y, args, **_: args.guard(t, y) < 0.0) if watched else None,
+        event=diffrax.Event(lambda t, y, args, **_: args.domain_margin(t, y) < 0.0) if watched else None,
         throw=False,
     )
     ends, _ = saved(solution)
@@ -106,8 +106,8 @@ def _piece(
         at = begin + length * jnp.asarray([*LOOKS, 1.0])
         return jnp.min(jax.vmap(lambda t: _guard(problem, t, solution.evaluate(t)))(at))
 
-    guards = jax.vmap(least)(begins, lengths) if watched else jnp.ones_like(lengths)
-    return solution, guards
+    domain_margins = jax.vmap(least)(begins, lengths) if watched else jnp.ones_like(lengths)
+    return solution, domain_margins
 
 
 def follow(
@@ -117,7 +117,7 @@ def follow(
     *,
     first: float | None = None,
     t0: float = 0.0,
-) -> Followed:
+) -> DenseSolution:
     """Integrate one run step by step until `t1` or until the model ceases to hold.
 
     **Arguments:**
@@ -129,29 +129,29 @@ def follow(
     - `first`: length of the first step [s], by default selected as Diffrax does.
     - `t0`: when the run starts [s].
 
-    **Returns:** a `Followed` with the accepted steps; it ends where the guard reaches zero, found on the dense output.
+    **Returns:** a `DenseSolution` with the accepted steps; it ends where the guard reaches zero, found on the dense output.
     """
     state, scales = problem.start()
     state, scales = jnp.asarray(state), jnp.asarray(scales)
     time = jnp.asarray(t0, state.dtype)
-    times, states, pieces = [np.full(1, t0)], [np.asarray(state)[:, None]], []
+    times, states, segments = [np.full(1, t0)], [np.asarray(state)[:, None]], []
     accepted = rejected = 0
     end, lost, failed = jnp.asarray(t1, state.dtype), False, False
     length = None if first is None else jnp.asarray(first, state.dtype)
     # Compiled for the number of steps, so that it must not change with what is left of them.
     each = dataclasses.replace(settings, max_steps=min(PIECE, settings.max_steps))
-    margin = problem.guard(time, state)
+    margin = problem.domain_margin(time, state)
     if margin is not None and float(margin) <= 0.0:
-        return Followed(times[0], states[0], [], True, False, 0, 0)
+        return DenseSolution(times[0], states[0], [], True, False, 0, 0)
     while float(time) < t1 and not (lost or failed):
-        solution, guards = _piece(problem, time, end, length, state, scales, each)
+        solution, domain_margins = _piece(problem, time, end, length, state, scales, each)
         steps = int(solution.stats["num_accepted_steps"])
         accepted, rejected = accepted + steps, rejected + int(solution.stats["num_rejected_steps"])
         ts, ys = saved(solution)
         # Cut as NumPy arrays: a slice by JAX would be compiled for every number of steps.
         ts, ys = np.asarray(ts)[1 : steps + 1], np.asarray(ys)[1 : steps + 1].T
         finite = np.isfinite(ts) & np.all(np.isfinite(ys), axis=0)
-        out = np.flatnonzero(np.asarray(guards)[:steps] < 0.0)
+        out = np.flatnonzero(np.asarray(domain_margins)[:steps] < 0.0)
         if out.size:
             lost, steps = True, int(out[0]) + 1
             begin = float(ts[out[0] - 1]) if out[0] else float(time)
@@ -162,13 +162,15 @@ def follow(
         good = int(finite.sum()) if finite.all() else int(np.argmin(finite))
         times.append(ts[:good])
         states.append(ys[:, :good])
-        pieces.append(solution)
+        segments.append(solution)
         if good:
             length = jnp.asarray(ts[-1] - (ts[-2] if good > 1 else float(time)))
             time, state = jnp.asarray(ts[good - 1]), jnp.asarray(ys[:, good - 1])
         failed = failed or (not lost and bool(solution.result == diffrax.RESULTS.dt_min_reached))
         failed = failed or (not lost and float(time) < t1 and accepted + rejected >= settings.max_steps)
-    return Followed(np.concatenate(times), np.concatenate(states, axis=1), pieces, lost, failed, accepted, rejected)
+    return DenseSolution(
+        np.concatenate(times), np.concatenate(states, axis=1), segments, lost, failed, accepted, rejected
+    )
 
 
 @eqx.filter_jit
@@ -196,7 +198,7 @@ class _GivenSteps(diffrax.StepTo):
         return self.ts[1], 2
 
 
-class Sampled(NamedTuple):
+class SampledSolution(NamedTuple):
     """A run at given times: its states, NaN after its end; when and where it ended, and whether the guard ended it."""
 
     states: Float[Array, "components times"]
@@ -215,7 +217,7 @@ def sample(
     *,
     grid: Float[Array, " steps"] | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
-) -> Sampled:
+) -> SampledSolution:
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 
     The guard is checked at the ends of steps, and the run ends where it is zero on the dense output. Steps end on the times
@@ -225,16 +227,16 @@ def sample(
     [s], 0 the first and t1 the last, for a solver without an error estimate; `adjoint`: how Diffrax differentiates, by default
     forwards.
 
-    **Returns:** a `Sampled`.
+    **Returns:** a `SampledSolution`.
     """
     state, scales = problem.start()
-    margin = problem.guard(jnp.zeros_like(t1), state)
+    margin = problem.domain_margin(jnp.zeros_like(t1), state)
     watched = margin is not None
     # Diffrax sees an event where the guard changes its sign: a run that starts beyond it has ended.
     at_once = jnp.zeros((), bool) if margin is None else margin <= 0.0
     t1 = jnp.where(at_once, 0.0, t1)
     event = diffrax.Event(
-        lambda t, y, args, **_: args.guard(t, y), optimistix.Newton(1e-13, 1e-13) if watched else None
+        lambda t, y, args, **_: args.domain_margin(t, y), optimistix.Newton(1e-13, 1e-13) if watched else None
     )
     if times is None:
         assert grid is not None
@@ -266,4 +268,4 @@ def sample(
     # NaN rather than infinite: an angle computed from infinite components would look like an angle.
     states = jnp.where(times <= end, states.T, jnp.nan)
     counts = solution.stats
-    return Sampled(states, end, ends_at[0], lost, counts["num_accepted_steps"], counts["num_rejected_steps"])
+    return SampledSolution(states, end, ends_at[0], lost, counts["num_accepted_steps"], counts["num_rejected_steps"])

@@ -13,10 +13,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..xla_cpu import stored
 from .double_roots import missed_double_root, missed_loss
-from .event import Search, narrow
+from .event import Bracket, refine
 from .problem import AbstractProblem, crossing_time, side_of
 from .runge_kutta import Lanes, States, Step, explicit_step, inverse_root, scaled_error, watched_places
-from .status import CROSSED, FAILED, GUARD_LOST, REACHED_END, RUNNING
+from .status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING
 
 #: Step control as in Diffrax's I controller with its defaults.
 SAFETY, SHRINK, GROW = 0.9, 0.2, 10.0
@@ -39,7 +39,7 @@ class Control(NamedTuple):
     parts: int
 
 
-class Block(NamedTuple):
+class LaneState(NamedTuple):
     """The lanes of a block.
 
     - `cell`: which cell of the problem a lane runs; `status`: a code of `status.py`.
@@ -63,19 +63,19 @@ class Block(NamedTuple):
     margins: Float[Array, "margins lanes"] | None
     first_crossing: Lanes
     crossing_time: Lanes
-    searching: Bool[Array, " lanes"]
-    search: Search
+    bracketing: Bool[Array, " lanes"]
+    bracket: Bracket
     steps: Int[Array, " lanes"]
     rejected: Int[Array, " lanes"]
 
 
-def length_to_try(control: Control, block: Block) -> Lanes:
+def length_to_try(control: Control, lane_state: LaneState) -> Lanes:
     """Length of each lane's next step [s]: the last one ends on the horizon exactly, also where round-off would miss it."""
-    left = control.t1 - block.time
-    return jnp.where(~block.searching & (block.length >= left * (1.0 - 1e-12)), left, block.length)
+    left = control.t1 - lane_state.time
+    return jnp.where(~lane_state.bracketing & (lane_state.length >= left * (1.0 - 1e-12)), left, lane_state.length)
 
 
-def attempt(problem: AbstractProblem, control: Control, atol: States, block: Block) -> Block:
+def try_step(problem: AbstractProblem, control: Control, atol: States, lane_state: LaneState) -> LaneState:
     """Try a step in every lane of a block and decide what becomes of it.
 
     **Arguments:**
@@ -88,13 +88,15 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     **Returns:** the block after the attempt.
     """
 
-    tried_length = length_to_try(control, block)
-    crossing = side_of(problem, block.side)
-    start = (block.time, block.state, block.rate, tried_length)
-    tried = explicit_step(control.tableau, problem.field, problem.margins, crossing, *start, block.margins)
-    running = block.status == RUNNING
-    free = running & ~block.searching
-    error = scaled_error(*stop_gradient((tried.error, block.state, tried.state)), control.rtol, atol, control.parts)
+    tried_length = length_to_try(control, lane_state)
+    crossing = side_of(problem, lane_state.side)
+    start = (lane_state.time, lane_state.state, lane_state.rate, tried_length)
+    tried = explicit_step(control.tableau, problem.field, problem.margins, crossing, *start, lane_state.margins)
+    running = lane_state.status == RUNNING
+    free = running & ~lane_state.bracketing
+    error = scaled_error(
+        *stop_gradient((tried.error, lane_state.state, tried.state)), control.rtol, atol, control.parts
+    )
     # An event is located where the margin is round-off. Joined, with a barrier behind it, it is computed once; the compiler
     # would else fuse it into several kernels of different round-off, in one of which the event is found and in another not.
     error, margin = stored(error, stop_gradient(tried.watched))
@@ -102,48 +104,52 @@ def attempt(problem: AbstractProblem, control: Control, atol: States, block: Blo
     error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
     good = error <= 1.0
     # Negative in between: end the step there and look again, so that the first event of several is found.
-    event = missed_double_root(problem.crossing, block.side, (block.state, block.rate), tried, tried_length)
+    event = missed_double_root(
+        problem.event_function, lane_state.side, (lane_state.state, lane_state.rate), tried, tried_length
+    )
     loss = missed_loss(watched_places(control.tableau), stop_gradient(tried.margins), free & good)
     negative = jnp.minimum(tried.first_negative, stop_gradient(jnp.minimum(event, loss)))
     between = good & (negative < 1.0)
     beyond = good & ~between & (margin <= 0.0)
     forward = free & good & ~between & ~beyond
 
-    search, guess, found = narrow(block.searching, block.search, block.margin, margin, tried_length)
+    bracket, guess, found = refine(lane_state.bracketing, lane_state.bracket, lane_state.margin, margin, tried_length)
     hit = running & found
-    searching = (block.searching | (free & beyond)) & ~hit
+    bracketing = (lane_state.bracketing | (free & beyond)) & ~hit
     moved = forward | hit
-    time = jnp.where(moved, block.time + tried_length, block.time)
+    time = jnp.where(moved, lane_state.time + tried_length, lane_state.time)
 
     length = tried_length * _factor(error, good, control.order)
     length = jnp.where(between, tried_length * negative, length)
-    length = jnp.where(searching, guess, jnp.where(hit, search.stride, length))
-    status, side, first, latest = _fate(problem, control, block, tried, time, hit)
+    length = jnp.where(bracketing, guess, jnp.where(hit, bracket.stride, length))
+    status, side, first, latest = _classify(problem, control, lane_state, tried, time, hit)
     ended = running & (status == RUNNING) & moved & (time >= control.t1)
-    steps = block.steps + running
+    steps = lane_state.steps + running
     # Written so that a length that is not a number counts as stuck.
     tiny = 8.0 * jnp.finfo(time.dtype).eps * jnp.maximum(time, 1e-3)
-    stuck = free & ~forward & ~searching & ~(length > tiny)
-    stuck |= forward & (time == block.time) & (tried_length > 0.0)
+    stuck = free & ~forward & ~bracketing & ~(length > tiny)
+    stuck |= forward & (time == lane_state.time) & (tried_length > 0.0)
     failed = running & (status == RUNNING) & ~ended & (stuck | (steps >= control.max_steps))
     status = jnp.where(failed, FAILED, jnp.where(ended, REACHED_END, status))
-    return Block(
-        cell=block.cell,
+    return LaneState(
+        cell=lane_state.cell,
         status=status,
         time=jnp.where(ended, control.t1, time),
-        state=jnp.where(moved, tried.state, block.state),
-        rate=jnp.where(moved, tried.rate, block.rate),
+        state=jnp.where(moved, tried.state, lane_state.state),
+        rate=jnp.where(moved, tried.rate, lane_state.rate),
         length=length,
         side=side,
         # Just past a crossing the margin is round-off of either sign.
-        margin=jnp.where(hit, jnp.abs(margin), jnp.where(forward, margin, block.margin)),
-        margins=None if tried.margins is None else jnp.where(moved, stop_gradient(tried.margins[-1]), block.margins),
+        margin=jnp.where(hit, jnp.abs(margin), jnp.where(forward, margin, lane_state.margin)),
+        margins=None
+        if tried.margins is None
+        else jnp.where(moved, stop_gradient(tried.margins[-1]), lane_state.margins),
         first_crossing=first,
         crossing_time=latest,
-        searching=searching,
-        search=search,
+        bracketing=bracketing,
+        bracket=bracket,
         steps=steps,
-        rejected=block.rejected + (free & ~forward & ~beyond),
+        rejected=lane_state.rejected + (free & ~forward & ~beyond),
     )
 
 
@@ -153,24 +159,29 @@ def _factor(error: Lanes, good: Bool[Array, " lanes"], order: int) -> Lanes:
     return jnp.where(good, jnp.clip(factor, 1.0, GROW), jnp.clip(factor, SHRINK, SAFETY))
 
 
-def _fate(
-    problem: AbstractProblem, control: Control, block: Block, tried: Step, time: Lanes, hit: Bool[Array, " lanes"]
+def _classify(
+    problem: AbstractProblem,
+    control: Control,
+    lane_state: LaneState,
+    tried: Step,
+    time: Lanes,
+    hit: Bool[Array, " lanes"],
 ) -> tuple[Int[Array, " lanes"], Lanes, Lanes, Lanes]:
     """Status, side, first and latest crossing time of the lanes, where `hit` says that an event was located."""
-    crossing, margins = problem.crossing(tried.state), tried.margins
+    crossing, margins = problem.event_function(tried.state), tried.margins
     # The lesser of the two is what was located; by its sign it may be round-off.
-    by_guard = hit
+    by_margin = hit
     if crossing is not None:
-        lost = False if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0) <= block.side * crossing
-        by_guard = hit & lost
-    crossed = hit & ~by_guard
+        lost = False if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0) <= lane_state.side * crossing
+        by_margin = hit & lost
+    crossed = hit & ~by_margin
     if not control.passes:
-        status = jnp.where(hit, jnp.where(by_guard, GUARD_LOST, CROSSED), block.status)
-        return status, block.side, block.first_crossing, block.crossing_time
+        status = jnp.where(hit, jnp.where(by_margin, LEFT_DOMAIN, CROSSED), lane_state.status)
+        return status, lane_state.side, lane_state.first_crossing, lane_state.crossing_time
     # Only the way from positive to negative is the event; the way back does not count.
-    counts = crossed & (block.side > 0.0)
+    counts = crossed & (lane_state.side > 0.0)
     here = crossing_time(problem, time, tried.state)
-    first = jnp.where(counts & jnp.isinf(block.first_crossing), here, block.first_crossing)
-    latest = jnp.where(counts, here, block.crossing_time)
-    status = jnp.where(by_guard, GUARD_LOST, block.status)
-    return status, jnp.where(crossed, -block.side, block.side), first, latest
+    first = jnp.where(counts & jnp.isinf(lane_state.first_crossing), here, lane_state.first_crossing)
+    latest = jnp.where(counts, here, lane_state.crossing_time)
+    status = jnp.where(by_margin, LEFT_DOMAIN, lane_state.status)
+    return status, jnp.where(crossed, -lane_state.side, lane_state.side), first, latest

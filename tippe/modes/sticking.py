@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from nonholonomic.hybrid import AbstractPhase, Passage, Record
-from nonholonomic.integration import CROSSED, GUARD_LOST, REACHED_END, RUNNING, AbstractProblem
+from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
+from nonholonomic.integration import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import COS_THETA, NO_COSINE, Dynamics
-from ..model.onset import Onset
 from ..model.scene import Scene
-from ..model.stick_slip import AT_REST, Change, Kind, StickSlip
+from ..model.slip_onset import Onset
+from ..model.stick_slip import AT_REST, Change, ContactMode, StickSlip
 from .inversion_problem import InversionProblem
 from .trajectory_problem import TrajectoryProblem
 
@@ -22,14 +22,14 @@ from .trajectory_problem import TrajectoryProblem
 SLIPPING, ROLLING = range(2)
 
 
-class StickSlipPhase(AbstractPhase):
+class StickSlipMode(AbstractBatchedMode):
     """Slipping or rolling up to an angle of theta; `last` is whether the last crossing of it counts.
 
     With a single run whose path is kept, what a `TrajectoryProblem` carries rides along behind the first `size` components:
     `axial` is then the moment of inertia about the axis [kg m^2]. For the cells of a table both are `None`.
     """
 
-    kind: Kind
+    kind: ContactMode
     cos_angle: Float[Array, "..."]
     scales: Float[Array, "components cells"]
     last: bool = eqx.field(static=True)
@@ -50,7 +50,7 @@ class StickSlipPhase(AbstractPhase):
         onset, wait = motion
         return onset.at((passed - wait) / jnp.where(onset.length > 0.0, onset.length, 1.0))
 
-    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Stick, slip, or end where the contact is lost. It counts how often a slip has turned into rolling."""
         slipping = self._under(self.kind.both.slipping, state)
         change = self.kind.ended(state, self._size(state), lambda at: slipping.field(left, at), self.scales, left)
@@ -62,9 +62,9 @@ class StickSlipPhase(AbstractPhase):
         crossing = change.wait + fraction * length
         ends = crosses & (not self.last)
         status = jnp.where(change.elapsed >= left, REACHED_END, RUNNING)
-        status = jnp.where(change.lost, GUARD_LOST, jnp.where(ends, CROSSED, status))
-        return Passage(
-            phase=jnp.where(change.rolls, ROLLING, SLIPPING),
+        status = jnp.where(change.lost, LEFT_DOMAIN, jnp.where(ends, CROSSED, status))
+        return Transition(
+            mode=jnp.where(change.rolls, ROLLING, SLIPPING),
             state=jnp.where(ends, onset.at(fraction), change.state),
             elapsed=jnp.where(ends, crossing, change.elapsed),
             status=status,
@@ -77,7 +77,7 @@ class StickSlipPhase(AbstractPhase):
         """How many components the equations of motion know."""
         return len(state) if self.size is None else self.size
 
-    def _under(self, equations: Dynamics | Kind, state: Float[Array, "components cells"]) -> AbstractProblem:
+    def _under(self, equations: Dynamics | ContactMode, state: Float[Array, "components cells"]) -> AbstractProblem:
         """The motion from some states on under given equations."""
         if self.axial is None:
             return InversionProblem(equations, self.cos_angle, state, self.scales)
@@ -85,49 +85,49 @@ class StickSlipPhase(AbstractPhase):
         return TrajectoryProblem(equations, self.axial, own, path, self.scales, rest)
 
 
-def _recorded(change: Change) -> Record:
+def _recorded(change: Change) -> TransitionPath:
     """The beginning of a slip, where there is one."""
     ends = jnp.where(change.rolls | change.lost, jnp.inf, change.elapsed)
     motions = jax.tree.map(lambda leaf: leaf[None], (change.onset, change.wait))
-    return Record(ends[None], motions, jnp.ones((1, len(ends)), int))
+    return TransitionPath(ends[None], motions, jnp.ones((1, len(ends)), int))
 
 
-def phases(
+def modes(
     scene: Scene | None,
     problem: InversionProblem,
     tolerance: float,
     last: bool,
     axial: Float[Array, ""] | None = None,
     size: int | None = None,
-) -> tuple[tuple[AbstractPhase, ...], Int[Array, " cells"]]:
+) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]:
     """The phases of runs, and the number of that in which each starts.
 
     **Arguments:**
 
     - `problem`: of a scene with `SetValuedCoulomb` and its launches; it says all that is needed of the scene.
     - `tolerance`: relative, of the integration; `last`: whether the last crossing counts.
-    - `axial`, `size`: as for `StickSlipPhase`.
+    - `axial`, `size`: as for `StickSlipMode`.
     """
     both = problem.dynamics
     assert isinstance(both, StickSlip)
-    kinds = (Kind(both, jnp.asarray(tolerance, float), rolls) for rolls in (False, True))
-    found = tuple(StickSlipPhase(kind, problem.cos_angle, problem.scales, last, axial, size) for kind in kinds)
-    return found, _first_phase(both, problem.states)
+    kinds = (ContactMode(both, jnp.asarray(tolerance, float), rolls) for rolls in (False, True))
+    found = tuple(StickSlipMode(kind, problem.cos_angle, problem.scales, last, axial, size) for kind in kinds)
+    return found, _first_mode(both, problem.states)
 
 
 @compiled_setup
-def _first_phase(both: StickSlip, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+def _first_mode(both: StickSlip, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
     """The number of the phase in which each cell starts."""
     return jnp.where(both.slip_speed(states) <= AT_REST * both.speed, ROLLING, SLIPPING)
 
 
-def contact_phases(
+def contact_modes(
     run: TrajectoryProblem, tolerance: Any
-) -> tuple[tuple[AbstractPhase, ...], Int[Array, "1"], Float[Array, "components 1"]]:
+) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]:
     """The phases of one run whose path is kept, the number of the first, and the state there.
 
     **Arguments:** `run`: of a scene with `SetValuedCoulomb`; `tolerance`: relative, of the integration.
     """
     state, scales = run.start()
     problem = InversionProblem(run.dynamics, jnp.asarray(NO_COSINE), run.state[:, None], scales[:, None])
-    return (*phases(None, problem, tolerance, False, run.axial, len(run.state)), state[:, None])
+    return (*modes(None, problem, tolerance, False, run.axial, len(run.state)), state[:, None])

@@ -15,12 +15,12 @@ from jaxtyping import Array, Float, Int
 
 from ..xla_cpu import compiled_alone
 from .problem import AbstractProblem, crossing_time
-from .queue import Outcome, Queue
+from .scheduler import LaneScheduler, Outcome
 from .settings import Settings
 from .status import CROSSED
 
 
-def march(
+def ensemble_solve(
     problem: AbstractProblem,
     t1: Float[Array, "..."],
     cells: Int[Array, ""],
@@ -47,13 +47,13 @@ def march(
     **Returns:** the `Outcome`, and the number of lockstep iterations, each of which advanced a block of lanes.
     """
     options = {"passes": passes, "one_kernel": one_kernel, "parts": parts}
-    outcome, iterations = Queue.of(problem, t1, cells, settings, **options).outcome()
+    outcome, iterations = LaneScheduler.of(problem, t1, cells, settings, **options).outcome()
     return (outcome if passes else with_crossing_times(problem, outcome)), iterations
 
 
 def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
     """The outcome with the time of the event in the cells that ended on it, infinite in the others."""
-    if problem.crossing(outcome.state) is None:
+    if problem.event_function(outcome.state) is None:
         return outcome
     time = crossing_time(problem, outcome.end_time, outcome.state)
     # A cell that starts beyond the event is there at once.
@@ -62,8 +62,8 @@ def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
     return outcome._replace(first_crossing=time, crossing_time=time)
 
 
-#: `march`, compiled on its own, for use outside of other transformed functions.
-compiled_march = compiled_alone(functools.partial(march, one_kernel=True))
+#: `ensemble_solve`, compiled on its own, for use outside of other transformed functions.
+solve_ensemble = compiled_alone(functools.partial(ensemble_solve, one_kernel=True))
 
-#: `march`, for use inside other transformed functions.
-traced_march = eqx.filter_jit(march)
+#: `ensemble_solve`, for use inside other transformed functions.
+traced_solve_ensemble = eqx.filter_jit(ensemble_solve)

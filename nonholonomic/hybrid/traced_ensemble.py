@@ -1,4 +1,4 @@
-"""Motion in phases inside other transformed functions: what `travel` does on the host, as one traced loop."""
+"""Motion in phases inside other transformed functions: what `solve_hybrid` does on the host, as one traced loop."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..integration.march import traced_march
+from ..integration.ensemble import traced_solve_ensemble
 from ..integration.settings import Settings
-from ..integration.status import GUARD_LOST, RUNNING, UNRESOLVED
-from .phases import MOST_ROUNDS, AbstractPhase, Journey, marched, passed_on
+from ..integration.status import LEFT_DOMAIN, RUNNING, UNRESOLVED
+from .ensemble import MOST_ROUNDS, AbstractBatchedMode, HybridOutcome, after_reset, after_solve
 
 
-def traced_travel(
-    phases: tuple[AbstractPhase, ...],
-    phase: Int[Array, " cells"],
+def traced_solve_hybrid(
+    modes: tuple[AbstractBatchedMode, ...],
+    mode: Int[Array, " cells"],
     state: Float[Array, "components cells"],
     t1: Float[Array, "..."],
     settings: Settings,
@@ -24,53 +24,53 @@ def traced_travel(
     kinds: int,
     passes: bool = False,
     parts: int = 1,
-) -> Journey:
+) -> HybridOutcome:
     """Run every cell through its phases to its event, to `t1`, or to where the model ends.
 
     Cells are not gathered: in each round every phase marches all cells, those that are in another one for no time.
 
-    **Arguments:** as for `travel`.
+    **Arguments:** as for `solve_hybrid`.
 
-    **Returns:** a `Journey`, of traced numbers.
+    **Returns:** a `HybridOutcome`, of traced numbers.
     """
     size = state.shape[1]
     t1 = jnp.broadcast_to(t1, (size,))
     zero, none = jnp.zeros(size), jnp.zeros(size, int)
-    start = Journey(
+    start = HybridOutcome(
         status=jnp.full(size, RUNNING),
         crossing_time=jnp.full(size, jnp.inf),
         end_time=zero,
         state=state,
         steps=none,
         rejected=none,
-        phase=phase,
+        mode=mode,
         counts=jnp.zeros((kinds, size), int),
     )
 
-    def through(one: AbstractPhase, found: Journey, here: Bool[Array, " cells"]) -> Journey:
-        def march() -> Journey:
+    def through(one: AbstractBatchedMode, found: HybridOutcome, here: Bool[Array, " cells"]) -> HybridOutcome:
+        def ensemble_solve() -> HybridOutcome:
             there, now = of_cells(one, here), in_place_of(found, here)
             left = jnp.where(here, jnp.maximum(t1 - found.end_time, 0.0), 0.0)
             problem = there.problem(now.state)
-            outcome, _ = traced_march(problem, left, jnp.asarray(size), settings, passes=passes, parts=parts)
-            return chosen(here, marched(jnp, found, outcome, t1), found)
+            outcome, _ = traced_solve_ensemble(problem, left, jnp.asarray(size), settings, passes=passes, parts=parts)
+            return chosen(here, after_solve(jnp, found, outcome, t1), found)
 
-        found = jax.lax.cond(jnp.any(here), march, lambda: found)
-        return passing(one, found, here & (found.status == GUARD_LOST), t1)
+        found = jax.lax.cond(jnp.any(here), ensemble_solve, lambda: found)
+        return passing(one, found, here & (found.status == LEFT_DOMAIN), t1)
 
-    def one_round(carry: tuple[Journey, Int[Array, ""]]) -> tuple[Journey, Int[Array, ""]]:
+    def one_round(carry: tuple[HybridOutcome, Int[Array, ""]]) -> tuple[HybridOutcome, Int[Array, ""]]:
         found, rounds = carry
         # Selected before the round: a cell that changes its phase during it waits for the next round.
-        here = [(found.status == RUNNING) & (found.phase == number) for number in range(len(phases))]
-        for one, some in zip(phases, here, strict=True):
+        here = [(found.status == RUNNING) & (found.mode == number) for number in range(len(modes))]
+        for one, some in zip(modes, here, strict=True):
             found = through(one, found, some)
         return found, rounds + 1
 
     return in_rounds(one_round, start)
 
 
-def in_rounds(one_round: Callable[[Any], Any], start: Journey, *more: Any) -> Any:
-    """Go on round by round while a cell is under way. The carry is the `Journey`, what else there is, and the round."""
+def in_rounds(one_round: Callable[[Any], Any], start: HybridOutcome, *more: Any) -> Any:
+    """Go on round by round while a cell is under way. The carry is the `HybridOutcome`, what else there is, and the round."""
 
     def under_way(carry: Any) -> Bool[Array, ""]:
         return jnp.any(carry[0].status == RUNNING) & (carry[-1] < MOST_ROUNDS)
@@ -80,24 +80,26 @@ def in_rounds(one_round: Callable[[Any], Any], start: Journey, *more: Any) -> An
     return (found, *more) if more else found
 
 
-def passing(one: AbstractPhase, found: Journey, lost: Bool[Array, " cells"], t1: Float[Array, " cells"]) -> Journey:
+def passing(
+    one: AbstractBatchedMode, found: HybridOutcome, lost: Bool[Array, " cells"], t1: Float[Array, " cells"]
+) -> HybridOutcome:
     """The cells that are at the end of a phase, passed on to the phase that follows."""
 
-    def passed() -> Journey:
+    def passed() -> HybridOutcome:
         there, now = of_cells(one, lost), in_place_of(found, lost)
-        passage = there.leave(now.state, jnp.maximum(t1 - now.end_time, 0.0))
-        return chosen(lost, passed_on(jnp, found, passage, t1), found)
+        transition = there.reset_map(now.state, jnp.maximum(t1 - now.end_time, 0.0))
+        return chosen(lost, after_reset(jnp, found, transition, t1), found)
 
     return jax.lax.cond(jnp.any(lost), passed, lambda: found)
 
 
-def of_cells(phase: AbstractPhase, some: Bool[Array, " cells"]) -> AbstractPhase:
+def of_cells(mode: AbstractBatchedMode, some: Bool[Array, " cells"]) -> AbstractBatchedMode:
     """A phase of some cells; the numbers of the first of them stand in place of those of the others."""
-    numbers, rest = eqx.partition(phase, eqx.is_array)
+    numbers, rest = eqx.partition(mode, eqx.is_array)
     return eqx.combine(jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[..., _cell(some)], numbers), rest)
 
 
-def in_place_of(found: Journey, some: Bool[Array, " cells"]) -> Journey:
+def in_place_of(found: HybridOutcome, some: Bool[Array, " cells"]) -> HybridOutcome:
     """What is known of some cells, with the first of them in place of the others, whose states have another meaning."""
     return jax.tree.map(lambda values: values[..., _cell(some)], found)
 
@@ -106,6 +108,6 @@ def _cell(some: Bool[Array, " cells"]) -> Int[Array, " cells"]:
     return jnp.where(some, jnp.arange(some.size), jnp.argmax(some))
 
 
-def chosen(some: Bool[Array, " cells"], new: Journey, old: Journey) -> Journey:
+def chosen(some: Bool[Array, " cells"], new: HybridOutcome, old: HybridOutcome) -> HybridOutcome:
     """The new of some cells and the old of the others."""
     return jax.tree.map(lambda a, b: jnp.where(some, a, b), new, old)

@@ -14,12 +14,12 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from ..xla_cpu import in_one_kernel
-from .attempt import Block, Control, attempt
-from .event import Search
+from .event import Bracket
 from .problem import AbstractProblem, least_margin
 from .runge_kutta import explicit_tableau, first_length
 from .settings import Settings
-from .status import CROSSED, GUARD_LOST, REACHED_END, RUNNING
+from .status import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
+from .step import Control, LaneState, try_step
 
 #: What it costs to refill a block, in steps of the whole block, measured on a CPU. It is refilled when idle lanes have missed
 #: as many, so what is lost is at most twice what the best moment would have cost.
@@ -46,12 +46,12 @@ class Outcome(NamedTuple):
 class Progress(NamedTuple):
     """The block of lanes, how many cells have left the queue, and how many iterations the block has made."""
 
-    block: Block
-    queued: Int[Array, ""]
+    lane_state: LaneState
+    scheduler: Int[Array, ""]
     iterations: Int[Array, ""]
 
 
-class Queue(eqx.Module):
+class LaneScheduler(eqx.Module):
     """The cells of a problem at their starts, and how they are run.
 
     Leaves of `problem`, `t1`, `atols` and `fresh` are scalars or hold one number per cell in their last axis.
@@ -60,7 +60,7 @@ class Queue(eqx.Module):
     problem: AbstractProblem
     control: Control
     atols: Float[Array, "components cells"]
-    fresh: Block
+    fresh: LaneState
     cells: Int[Array, ""]
     lanes: int = eqx.field(static=True)
     one_kernel: bool = eqx.field(static=True)
@@ -76,10 +76,10 @@ class Queue(eqx.Module):
         passes: bool = False,
         one_kernel: bool = False,
         parts: int = 1,
-    ) -> "Queue":
+    ) -> "LaneScheduler":
         """The queue of a problem.
 
-        **Arguments:** as for `march`, and `parts`: the number of equal parts of the state, as for `Control`.
+        **Arguments:** as for `ensemble_solve`, and `parts`: the number of equal parts of the state, as for `Control`.
         """
         solver, rtol = settings.for_lanes, settings.tolerance
         control = Control(explicit_tableau(solver), solver.order(None), rtol, t1, settings.max_steps, passes, parts)
@@ -87,7 +87,7 @@ class Queue(eqx.Module):
         zero = jnp.zeros_like(starts[0])
         rates, atols = problem.field(zero, starts), settings.absolute * rtol * scales
         lengths = first_length(problem.field, zero, starts, rates, control.order, rtol, atols, parts)
-        fresh = _fresh_block(problem, control, starts, rates, jnp.minimum(stop_gradient(lengths), t1))
+        fresh = _fresh_lanes(problem, control, starts, rates, jnp.minimum(stop_gradient(lengths), t1))
         return cls(problem, control, atols, fresh, cells, settings.lanes_of(starts.shape[1], parts), one_kernel)
 
     @property
@@ -100,10 +100,10 @@ class Queue(eqx.Module):
         inside = jnp.minimum(cell, self.capacity - 1)
         return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., inside], tree)
 
-    def here(self, block: Block) -> tuple[AbstractProblem, Control, Float[Array, "components lanes"]]:
+    def here(self, lane_state: LaneState) -> tuple[AbstractProblem, Control, Float[Array, "components lanes"]]:
         """Problem, control and absolute tolerances of the cells in a block."""
-        control = self.control._replace(t1=self.pick(self.control.t1, block.cell))
-        return self.pick(self.problem, block.cell), control, self.pick(self.atols, block.cell)
+        control = self.control._replace(t1=self.pick(self.control.t1, lane_state.cell))
+        return self.pick(self.problem, lane_state.cell), control, self.pick(self.atols, lane_state.cell)
 
     def outcome(self) -> tuple[Outcome, Int[Array, ""]]:
         """Run every cell.
@@ -114,51 +114,53 @@ class Queue(eqx.Module):
         def period(carry: tuple[Progress, Outcome]) -> tuple[Progress, Outcome]:
             progress, outcome = carry
             progress = self.run(progress)
-            return self.refill(progress), self.store(outcome, progress.block)
+            return self.refill(progress), self.store(outcome, progress.lane_state)
 
         carry = (self.start(), self.empty())
         progress, outcome = jax.lax.while_loop(lambda carry: self.unfinished(carry[0]), period, carry)
-        return self.store(outcome, progress.block), progress.iterations
+        return self.store(outcome, progress.lane_state), progress.iterations
 
     def start(self) -> Progress:
         """The first cells, one in each lane."""
-        block = self._load(jnp.arange(self.lanes))
-        return Progress(block, jnp.minimum(self.lanes, self.cells), jnp.zeros((), int))
+        lane_state = self._load(jnp.arange(self.lanes))
+        return Progress(lane_state, jnp.minimum(self.lanes, self.cells), jnp.zeros((), int))
 
     def unfinished(self, progress: Progress) -> Bool[Array, ""]:
         """Whether a lane is running or a cell waiting."""
-        return jnp.any(progress.block.status == RUNNING) | (progress.queued < self.cells)
+        return jnp.any(progress.lane_state.status == RUNNING) | (progress.scheduler < self.cells)
 
-    def idle(self, block: Block) -> Int[Array, ""]:
+    def idle(self, lane_state: LaneState) -> Int[Array, ""]:
         """How many lanes have nothing to do."""
-        return jnp.sum(block.status != RUNNING)
+        return jnp.sum(lane_state.status != RUNNING)
 
     def goes_on(
-        self, block: Block, idle: Int[Array, ""], queued: Int[Array, ""], price: float = REFILL
+        self, lane_state: LaneState, idle: Int[Array, ""], scheduler: Int[Array, ""], price: float = REFILL
     ) -> Bool[Array, ""]:
         """Whether a block goes on; while cells wait it stops to be refilled as soon as that is worth it.
 
         **Arguments:** `idle`: steps that idle lanes have missed since it was filled; `queued`: how many cells have left the
         queue; `price`: what it costs to refill it, in steps of the whole block.
         """
-        refill = (queued < self.cells) & (idle >= price * self.lanes)
-        return jnp.any(block.status == RUNNING) & ~refill
+        refill = (scheduler < self.cells) & (idle >= price * self.lanes)
+        return jnp.any(lane_state.status == RUNNING) & ~refill
 
     def run(self, progress: Progress) -> Progress:
         """Let the block go on until it should be refilled, or ends."""
-        here = self.here(progress.block)
+        here = self.here(progress.lane_state)
 
-        def goes_on(carry: tuple[Block, Int[Array, ""], Int[Array, ""]]) -> Bool[Array, ""]:
-            block, idle, _ = carry
-            return self.goes_on(block, idle, progress.queued)
+        def goes_on(carry: tuple[LaneState, Int[Array, ""], Int[Array, ""]]) -> Bool[Array, ""]:
+            lane_state, idle, _ = carry
+            return self.goes_on(lane_state, idle, progress.scheduler)
 
-        def step(carry: tuple[Block, Int[Array, ""], Int[Array, ""]]) -> tuple[Block, Int[Array, ""], Int[Array, ""]]:
-            block, idle, iterations = carry
-            return attempt(*here, block), idle + self.idle(block), iterations + 1
+        def step(
+            carry: tuple[LaneState, Int[Array, ""], Int[Array, ""]],
+        ) -> tuple[LaneState, Int[Array, ""], Int[Array, ""]]:
+            lane_state, idle, iterations = carry
+            return try_step(*here, lane_state), idle + self.idle(lane_state), iterations + 1
 
-        start = (progress.block, jnp.zeros((), int), progress.iterations)
-        block, _, iterations = self.in_kernel(lambda carry: jax.lax.while_loop(goes_on, step, carry))(start)
-        return Progress(block, progress.queued, iterations)
+        start = (progress.lane_state, jnp.zeros((), int), progress.iterations)
+        lane_state, _, iterations = self.in_kernel(lambda carry: jax.lax.while_loop(goes_on, step, carry))(start)
+        return Progress(lane_state, progress.scheduler, iterations)
 
     def in_kernel(self, loop: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """A loop over steps, compiled into a single kernel if the queue's are."""
@@ -166,54 +168,56 @@ class Queue(eqx.Module):
 
     def refill(self, progress: Progress) -> Progress:
         """Give every idle lane the next cell that waits."""
-        block, queued, iterations = progress
-        idle = block.status != RUNNING
-        loaded = self._load(jnp.where(idle, jnp.minimum(queued + jnp.cumsum(idle) - 1, self.capacity), block.cell))
-        block = jax.tree.map(lambda new, old: jnp.where(idle, new, old), loaded, block)
-        return Progress(block, jnp.minimum(queued + jnp.sum(idle), self.cells), iterations)
+        lane_state, scheduler, iterations = progress
+        idle = lane_state.status != RUNNING
+        loaded = self._load(
+            jnp.where(idle, jnp.minimum(scheduler + jnp.cumsum(idle) - 1, self.capacity), lane_state.cell)
+        )
+        lane_state = jax.tree.map(lambda new, old: jnp.where(idle, new, old), loaded, lane_state)
+        return Progress(lane_state, jnp.minimum(scheduler + jnp.sum(idle), self.cells), iterations)
 
     def empty(self) -> Outcome:
         """An outcome of the right shapes, to be filled."""
         return _outcome_of(self.fresh)
 
-    def store(self, outcome: Outcome, block: Block) -> Outcome:
+    def store(self, outcome: Outcome, lane_state: LaneState) -> Outcome:
         """The outcome with the cells of a block that have ended."""
-        found = _outcome_of(block)
-        to = jnp.where((block.status != RUNNING) & (block.cell < self.cells), block.cell, self.capacity)
+        found = _outcome_of(lane_state)
+        to = jnp.where((lane_state.status != RUNNING) & (lane_state.cell < self.cells), lane_state.cell, self.capacity)
         return jax.tree.map(lambda all, some: all.at[..., to].set(some, mode="drop"), outcome, found)
 
-    def _load(self, cell: Int[Array, " lanes"]) -> Block:
-        block = self.pick(self.fresh, cell)
+    def _load(self, cell: Int[Array, " lanes"]) -> LaneState:
+        lane_state = self.pick(self.fresh, cell)
         # There may be fewer cells than lanes: the other lanes have nothing to do.
-        return block._replace(cell=cell, status=jnp.where(cell < self.cells, block.status, REACHED_END))
+        return lane_state._replace(cell=cell, status=jnp.where(cell < self.cells, lane_state.status, REACHED_END))
 
 
-def _outcome_of(block: Block) -> Outcome:
-    times = (block.first_crossing, block.crossing_time, block.time)
-    return Outcome(block.status, *times, block.state, block.steps, block.rejected)
+def _outcome_of(lane_state: LaneState) -> Outcome:
+    times = (lane_state.first_crossing, lane_state.crossing_time, lane_state.time)
+    return Outcome(lane_state.status, *times, lane_state.state, lane_state.steps, lane_state.rejected)
 
 
-def _fresh_block(
+def _fresh_lanes(
     problem: AbstractProblem,
     control: Control,
     states: Float[Array, "components cells"],
     rates: Float[Array, "components cells"],
     lengths: Float[Array, " cells"],
-) -> Block:
+) -> LaneState:
     """Every cell at its start; one that starts beyond the event or the guard has ended."""
     zero, none = jnp.zeros_like(lengths), jnp.zeros(lengths.shape, int)
     no = jnp.zeros(lengths.shape, bool)
-    crossing, guard = problem.crossing(states), problem.guard(zero, states)
+    crossing, domain_margin = problem.event_function(states), problem.domain_margin(zero, states)
     beyond = no
     if crossing is not None:
         # Exactly on the event, the direction of the motion decides.
-        falls = jax.jvp(problem.crossing, (states,), (rates,))[1] <= 0.0
+        falls = jax.jvp(problem.event_function, (states,), (rates,))[1] <= 0.0
         beyond = (crossing < 0.0) | ((crossing == 0.0) & (falls | (not control.passes)))
     side = jnp.where(beyond & control.passes, -1.0, 1.0).astype(lengths.dtype)
     status = jnp.where(beyond & (not control.passes), CROSSED, RUNNING)
-    if guard is not None:
-        status = jnp.where(guard <= 0.0, GUARD_LOST, status)
-    return Block(
+    if domain_margin is not None:
+        status = jnp.where(domain_margin <= 0.0, LEFT_DOMAIN, status)
+    return LaneState(
         cell=jnp.arange(lengths.shape[0]),
         status=status,
         time=zero,
@@ -225,8 +229,8 @@ def _fresh_block(
         margins=stop_gradient(jnp.stack(margins)) if (margins := problem.margins(zero, states)) else None,
         first_crossing=jnp.where(beyond, zero, jnp.inf),
         crossing_time=jnp.where(beyond, zero, jnp.inf),
-        searching=no,
-        search=Search(zero, zero, zero, zero, zero, none),
+        bracketing=no,
+        bracket=Bracket(zero, zero, zero, zero, zero, none),
         steps=none,
         rejected=none,
     )

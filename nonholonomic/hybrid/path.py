@@ -9,28 +9,28 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..integration.dense import DenseSolution, follow, padded
 from ..integration.problem import AbstractProblem
 from ..integration.settings import Settings
-from ..integration.single_run import Followed, follow, padded
-from ..integration.status import FAILED, GUARD_LOST, REACHED_END, RUNNING, UNRESOLVED
+from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 from ..xla_cpu import compiled_quickly
-from .phases import MOST_ROUNDS, AbstractPhase, Passage
+from .ensemble import MOST_ROUNDS, AbstractBatchedMode, Transition
 
 #: The number of a piece on the way between two phases.
 BETWEEN = -1
 
 
-class Piece(NamedTuple):
+class Segment(NamedTuple):
     """A part of a run: from `begin` to `end` [s], in the phase numbered `number`, or `BETWEEN` two phases.
 
-    `motion` is the `Followed` in the phase, its times counted from `begin`, or one stretch of a `Record`; `shown` are the times
-    [s] at which it is shown by default.
+    `motion` is the `DenseSolution` in the phase, its times counted from `begin`, or one stretch of a `TransitionPath`;
+    `shown` are the times [s] at which it is shown by default.
     """
 
     begin: float
     end: float
     number: int
-    phase: AbstractPhase
+    mode: AbstractBatchedMode
     motion: Any
     shown: Float[np.ndarray, " times"]
 
@@ -38,17 +38,17 @@ class Piece(NamedTuple):
         """What is shown at times within the piece."""
         passed = np.maximum(times - self.begin, 0.0)
         if self.number == BETWEEN:
-            return np.asarray(_between(self.phase, self.motion, jnp.asarray(np.minimum(passed, self.end - self.begin))))
-        return np.asarray(_shown(self.phase, jnp.asarray(self.motion.at(np.minimum(passed, self.motion.times[-1])))))
+            return np.asarray(_between(self.mode, self.motion, jnp.asarray(np.minimum(passed, self.end - self.begin))))
+        return np.asarray(_shown(self.mode, jnp.asarray(self.motion.at(np.minimum(passed, self.motion.times[-1])))))
 
 
-class PhasedPath(NamedTuple):
+class HybridPath(NamedTuple):
     """A run through several phases: its pieces in order, how and when [s] it ended, in what state, and what it took.
 
-    `status` is one of the codes of a `Journey`; `counts` says how often each kind of thing happened on the way.
+    `status` is one of the codes of a `HybridOutcome`; `counts` says how often each kind of thing happened on the way.
     """
 
-    pieces: list[Piece]
+    segments: list[Segment]
     status: int
     end_time: float
     state: Float[np.ndarray, " components"]
@@ -57,9 +57,9 @@ class PhasedPath(NamedTuple):
     rejected: int
 
     @property
-    def guard_lost(self) -> bool:
+    def left_domain(self) -> bool:
         """Whether the run ended where the model ceases to hold."""
-        return self.status == GUARD_LOST
+        return self.status == LEFT_DOMAIN
 
     @property
     def failed(self) -> bool:
@@ -67,14 +67,16 @@ class PhasedPath(NamedTuple):
         return self.status in (FAILED, UNRESOLVED)
 
     @property
-    def stays(self) -> list[Piece]:
+    def mode_segments(self) -> list[Segment]:
         """The pieces in phases, without those that were over as soon as they began."""
-        return [piece for piece in self.pieces if piece.number != BETWEEN and piece.end > piece.begin]
+        return [segment for segment in self.segments if segment.number != BETWEEN and segment.end > segment.begin]
 
     @property
     def times(self) -> Float[np.ndarray, " times"]:
         """The times [s] at which the run is shown by default: those of all its steps."""
-        return np.unique(np.minimum(np.concatenate([np.zeros(1), *(one.shown for one in self.pieces)]), self.end_time))
+        return np.unique(
+            np.minimum(np.concatenate([np.zeros(1), *(one.shown for one in self.segments)]), self.end_time)
+        )
 
     @property
     def states(self) -> Float[np.ndarray, "shown times"]:
@@ -83,109 +85,109 @@ class PhasedPath(NamedTuple):
 
     def numbers(self, times: Float[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
         """The numbers of the phases at given times, or `BETWEEN`."""
-        return np.array([piece.number for piece in self.pieces])[self._where(times)]
+        return np.array([segment.number for segment in self.segments])[self._where(times)]
 
     def at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "shown times"]:
         """What is shown at the given times, which must lie within the run; where a piece ends, before what happens there."""
         if not len(times):
-            return self.pieces[0].at(np.zeros(1))[:, :0]
+            return self.segments[0].at(np.zeros(1))[:, :0]
         where, found = self._where(times), []
         for index in np.unique(where):
             here = np.flatnonzero(where == index)
             # To one length, so that one program serves all pieces.
-            found.append((here, self.pieces[index].at(padded(times[here], len(times)))[:, : here.size]))
+            found.append((here, self.segments[index].at(padded(times[here], len(times)))[:, : here.size]))
         shown = np.empty((len(found[0][1]), len(times)))
         for here, values in found:
             shown[:, here] = values
         return shown
 
     def _where(self, times: Float[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
-        ends = np.array([piece.end for piece in self.pieces])
+        ends = np.array([segment.end for segment in self.segments])
         return np.minimum(np.searchsorted(ends, times), len(ends) - 1)
 
 
 @eqx.filter_jit
-def _problem(phase: AbstractPhase, state: Float[Array, " components"]) -> AbstractProblem:
+def _problem(mode: AbstractBatchedMode, state: Float[Array, " components"]) -> AbstractProblem:
     """The motion in a phase of one cell, as a problem without an axis of cells."""
-    lone = jax.tree.map(lambda leaf: leaf[..., 0] if eqx.is_array(leaf) and leaf.ndim else leaf, phase)
+    lone = jax.tree.map(lambda leaf: leaf[..., 0] if eqx.is_array(leaf) and leaf.ndim else leaf, mode)
     return lone.problem(state)
 
 
 @compiled_quickly
-def _leave(phase: AbstractPhase, state: Float[Array, " components"], left: Float[Array, ""]) -> Passage:
-    return phase.leave(state[:, None], left[None])
+def _leave(mode: AbstractBatchedMode, state: Float[Array, " components"], left: Float[Array, ""]) -> Transition:
+    return mode.reset_map(state[:, None], left[None])
 
 
 @eqx.filter_jit
-def _shown(phase: AbstractPhase, states: Float[Array, "components times"]) -> Float[Array, "shown times"]:
-    return phase.shown(states)
+def _shown(mode: AbstractBatchedMode, states: Float[Array, "components times"]) -> Float[Array, "shown times"]:
+    return mode.shown(states)
 
 
 @eqx.filter_jit
-def _between(phase: AbstractPhase, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
-    return phase.between(motion, passed)
+def _between(mode: AbstractBatchedMode, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
+    return mode.between(motion, passed)
 
 
-def follow_phases(
-    phases: tuple[AbstractPhase, ...],
+def solve_hybrid_dense(
+    modes: tuple[AbstractBatchedMode, ...],
     number: int,
     state: Float[Array, " components"],
     t1: float,
     settings: Settings,
     *,
     kinds: int,
-) -> PhasedPath:
+) -> HybridPath:
     """Follow one run through its phases to `t1`, to an event on the way between two of them, or to where the model ends.
 
     **Arguments:**
 
-    - `phases`: as for `travel`, of one cell; where they record the way between them, that is part of the path.
+    - `modes`: as for `solve_hybrid`, of one cell; where they record the way between them, that is part of the path.
     - `number`, `state`: the phase and the state in which the run starts.
     - `t1`: horizon [s].
     - `settings`: as for `follow`; the most steps are those of the whole run.
     - `kinds`: rows of `Passage.counts`.
 
-    **Returns:** a `PhasedPath`.
+    **Returns:** a `HybridPath`.
     """
-    pieces, counts, time, accepted, rejected = [], np.zeros(kinds, int), 0.0, 0, 0
+    segments, counts, time, accepted, rejected = [], np.zeros(kinds, int), 0.0, 0, 0
     status, state = RUNNING, jnp.asarray(state)
     for _ in range(MOST_ROUNDS):
-        phase = phases[number]
+        mode = modes[number]
         left = dataclasses.replace(settings, max_steps=settings.max_steps - accepted - rejected)
-        path = follow(_problem(phase, state), t1 - time, left)
+        path = follow(_problem(mode, state), t1 - time, left)
         accepted, rejected = accepted + path.accepted, rejected + path.rejected
-        pieces.append(_stay(phase, number, path, time))
-        time, state = pieces[-1].end, jnp.asarray(path.states[:, -1])
-        if path.failed or not path.guard_lost:
+        segments.append(_stay(mode, number, path, time))
+        time, state = segments[-1].end, jnp.asarray(path.states[:, -1])
+        if path.failed or not path.left_domain:
             status, time = (FAILED, time) if path.failed else (REACHED_END, t1)
             break
-        passage = _leave(phase, state, jnp.asarray(t1 - time))
-        pieces += _way(phase, passage, time)
-        counts += np.asarray(passage.counts)[:, 0]
-        number, status, state = int(passage.phase[0]), int(passage.status[0]), passage.state[:, 0]
-        time = t1 if status == REACHED_END else time + float(passage.elapsed[0])
+        transition = _leave(mode, state, jnp.asarray(t1 - time))
+        segments += _way(mode, transition, time)
+        counts += np.asarray(transition.counts)[:, 0]
+        number, status, state = int(transition.mode[0]), int(transition.status[0]), transition.state[:, 0]
+        time = t1 if status == REACHED_END else time + float(transition.elapsed[0])
         if not (np.isfinite(state).all() and np.isfinite(time)):
-            status, time = FAILED, pieces[-1].end
+            status, time = FAILED, segments[-1].end
         if status != RUNNING:
             break
     status = UNRESOLVED if status == RUNNING else status
-    return PhasedPath(pieces, status, time, np.asarray(state), counts, accepted, rejected)
+    return HybridPath(segments, status, time, np.asarray(state), counts, accepted, rejected)
 
 
-def _stay(phase: AbstractPhase, number: int, path: Followed, begin: float) -> Piece:
-    return Piece(begin, begin + float(path.times[-1]), number, phase, path, begin + path.times[1:])
+def _stay(mode: AbstractBatchedMode, number: int, path: DenseSolution, begin: float) -> Segment:
+    return Segment(begin, begin + float(path.times[-1]), number, mode, path, begin + path.times[1:])
 
 
-def _way(phase: AbstractPhase, passage: Passage, begin: float) -> list[Piece]:
+def _way(mode: AbstractBatchedMode, transition: Transition, begin: float) -> list[Segment]:
     """The pieces of a way between two phases that begins at a time [s]."""
-    if passage.record is None:
+    if transition.record is None:
         return []
-    ends = np.asarray(passage.record.ends)[:, 0]
-    ends, pieces = begin + ends[np.isfinite(ends)], []
-    motions, parts = jax.tree.map(np.asarray, (passage.record.motions, passage.record.shown))
+    ends = np.asarray(transition.record.ends)[:, 0]
+    ends, segments = begin + ends[np.isfinite(ends)], []
+    motions, parts = jax.tree.map(np.asarray, (transition.record.motions, transition.record.shown))
     for index, end in enumerate(ends):
         begin = float(ends[index - 1]) if index else begin
         motion = jax.tree.map(lambda leaf, index=index: leaf[index].copy(), motions)
         shown = begin + (end - begin) * np.linspace(0.0, 1.0, int(parts[index, 0]) + 1)[1:]
-        pieces.append(Piece(begin, float(end), BETWEEN, phase, motion, shown))
-    return pieces
+        segments.append(Segment(begin, float(end), BETWEEN, mode, motion, shown))
+    return segments

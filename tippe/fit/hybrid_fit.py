@@ -9,13 +9,13 @@ from nonholonomic.identification import of_data
 from nonholonomic.parameters import numbers, with_numbers
 
 from ..model.scene import Scene
-from ..runs.cells import CellRuns, driver_of
+from ..runs.cells import InversionRuns, run_kind_of
 from ..runs.extended_times import LEAST_ANGLE
 from ..runs.trajectory import simulate
 from .data import InversionTimes, Recording, column_of
 
 
-class PhasedModel(NamedTuple):
+class HybridModel(NamedTuple):
     """Predictions of all data of a scene with flights, impacts, stick and slip, as `SceneModel` gives them for one without.
 
     Times are found as in tables, all in one block; recordings are followed one by one. Parameters that the scene refuses have
@@ -70,13 +70,13 @@ class PhasedModel(NamedTuple):
         }
         columns |= {name: np.repeat([row[name] for row in rows], launches) for name in rows[0] if name != "t0"}
         t1, angle = float(data.t1), float(data.angle)
-        runs = CellRuns(driver_of(self.scene), t1, angle, "first", None, "ensemble", [])
+        runs = InversionRuns(run_kind_of(self.scene), t1, angle, "first", None, "ensemble", [])
         count = launches * len(rows)
         found = runs.results({"scene": self.scene, "launch": data.launch}, columns, self.tolerance, count)
         missing = np.log(angle / np.clip(np.asarray(found["end_theta"]), LEAST_ANGLE, angle))
         whole = np.maximum(np.log(angle / np.clip(columns["launch.theta"], LEAST_ANGLE, angle)), 1.0)
         time = np.where(np.isfinite(found["time"]), found["time"], t1 * (1.0 + missing / whole))
-        failed = np.asarray(found["status"]) == runs.driver.words.index("failed")
+        failed = np.asarray(found["status"]) == runs.run_kind.words.index("failed")
         return np.where(failed, np.nan, time).reshape(len(rows), launches)
 
     def _samples(self, data: Recording, row: dict[str, float]) -> Float[np.ndarray, " size"]:

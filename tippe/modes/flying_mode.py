@@ -3,12 +3,12 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from nonholonomic.hybrid import AbstractPhase
+from nonholonomic.hybrid import AbstractBatchedMode
 
 from ..model.scene import Scene
 
 
-class AbstractFlyingPhase(AbstractPhase):
+class AbstractFlyingMode(AbstractBatchedMode):
     """A phase of runs that go on through flights.
 
     - `scene`: with `contact="hybrid"`; `scales`: magnitudes by which absolute errors of the state are measured.

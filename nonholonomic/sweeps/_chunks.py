@@ -26,7 +26,7 @@ def folder_of(path: Path) -> Path:
     return path.with_name(path.name + ".blocks")
 
 
-class Blocks:
+class ChunkStore:
     """The finished blocks of a table's file.
 
     Each is complete and on the disk before it is counted, whenever the process dies, and whenever the machine does, as far as
@@ -61,20 +61,20 @@ class Blocks:
             self._check(begun)
             # The table says with what versions it was begun.
             self.layout = begun.layout
-        good = {block for block in range(self.layout.blocks) if stored is not None and stored.block(block) is not None}
-        self._whole = len(good) == self.layout.blocks
+        good = {chunk for chunk in range(self.layout.chunks) if stored is not None and stored.chunk(chunk) is not None}
+        self._whole = len(good) == self.layout.chunks
         if self._whole:
             self.finished = good
             return
         if not header.exists():
             self._begin(header)
         kept = {int(file.stem) for file in self.folder.glob("*.npz")}
-        damaged = {block for block in kept if read_block(self.folder, self.layout, block) is None}
+        damaged = {chunk for chunk in kept if read_chunk(self.folder, self.layout, chunk) is None}
         self.finished = kept - damaged
         if stored is not None:
-            damaged |= set(range(self.layout.blocks)) - good - self.finished
-            for block in sorted(good - self.finished):
-                self.write(block, stored.block(block))
+            damaged |= set(range(self.layout.chunks)) - good - self.finished
+            for chunk in sorted(good - self.finished):
+                self.write(chunk, stored.chunk(chunk))
             self.finished |= good
         for part in self.folder.glob("*.part"):
             part.unlink()
@@ -115,8 +115,8 @@ class Blocks:
         here, there = (json.loads(str(one.attributes.get("versions", "{}"))) for one in (ours, theirs))
         if difference is None and there.get("nonholonomic") != here.get("nonholonomic"):
             difference = f"nonholonomic is {there.get('nonholonomic')} there and {here.get('nonholonomic')} here"
-        if difference is None and (theirs.kinds, theirs.inner, theirs.block) != (ours.kinds, ours.inner, ours.block):
-            difference = f"it was not written by a sweep in {ours.blocks} blocks"
+        if difference is None and (theirs.kinds, theirs.inner, theirs.chunk) != (ours.kinds, ours.inner, ours.chunk):
+            difference = f"it was not written by a sweep in {ours.chunks} blocks"
         if difference is not None:
             what = self.path if begun.path == self.path else self.folder
             raise ValueError(f"{what} holds the result of another run: {difference}; give another path or remove it")
@@ -138,22 +138,22 @@ class Blocks:
         return Stored(self.path)
 
     def _all(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Iterator[tuple[int, dict[str, Values]]]:
-        for block, values in computed:
-            self.write(block, values)
-            yield block, values
-        for block in sorted(self.finished):
-            kept = read_block(self.folder, self.layout, block)
+        for chunk, values in computed:
+            self.write(chunk, values)
+            yield chunk, values
+        for chunk in sorted(self.finished):
+            kept = read_chunk(self.folder, self.layout, chunk)
             if kept is None:
-                raise OSError(f"cannot read {self.folder}: block {block} is damaged; the same call computes it again")
-            yield block, kept
+                raise OSError(f"cannot read {self.folder}: block {chunk} is damaged; the same call computes it again")
+            yield chunk, kept
 
-    def write(self, block: int, values: dict[str, Values]) -> None:
+    def write(self, chunk: int, values: dict[str, Values]) -> None:
         """Store a block.
 
         **Raises:** `OSError` that names the path if that fails; no block is then finished but those that were.
         """
         kinds = self.layout.kinds
-        with replacing(self.folder / f"{block}.npz") as scratch, scratch.open("wb") as stream:
+        with replacing(self.folder / f"{chunk}.npz") as scratch, scratch.open("wb") as stream:
             np.savez(stream, **{name: np.asarray(some, kinds[name]) for name, some in values.items()})
 
     def _locked(self) -> Any:
@@ -198,7 +198,7 @@ def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
     found, damaged = layout.empty(layout.cells), 0
     for file in folder.glob("*.npz"):
         first, end = layout.ends(int(file.stem))
-        values = read_block(folder, layout, int(file.stem))
+        values = read_chunk(folder, layout, int(file.stem))
         damaged += values is None
         for name, some in (values or {}).items():
             found[name][first:end] = some
@@ -206,20 +206,20 @@ def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
         # It was finished meanwhile.
         return None
     if damaged:
-        reason = f"{damaged} of its {layout.blocks} blocks do not match their checksums"
+        reason = f"{damaged} of its {layout.chunks} blocks do not match their checksums"
         raise OSError(f"cannot read {path}: it is damaged: {reason}")
     return layout, found
 
 
-def read_block(folder: Path, layout: Layout, block: int) -> dict[str, Values] | None:
+def read_chunk(folder: Path, layout: Layout, chunk: int) -> dict[str, Values] | None:
     """The variables of a block; `None` if they are not those that were written, by the checksums of the archive."""
     try:
         # NumPy does not close a file that it cannot read.
-        with (folder / f"{block}.npz").open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        with (folder / f"{chunk}.npz").open("rb") as file, np.load(file, allow_pickle=False) as archive:
             found = {name: archive[name] for name in layout.kinds}
     except (OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile):
         return None
-    first, end = layout.ends(block)
+    first, end = layout.ends(chunk)
     right = {name: (kind, (end - first, *layout.inner_shape(name))) for name, kind in layout.kinds.items()}
     return found if {name: (values.dtype, values.shape) for name, values in found.items()} == right else None
 

@@ -9,21 +9,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..derivatives.differentiable import directions_by
-from ..derivatives.sampling import AbstractSampling, Recipe, ask_for_samples
+from ..derivatives.differentiable import tangents_by
+from ..derivatives.sampling import AbstractSampling, ProblemSpec, solve_for_samples
 from ..derivatives.variation import in_groups
-from ..integration import GUARD_LOST, REACHED_END, RUNNING, Settings, march_with_samples
-from .phased_run import BETWEEN
-from .phases import AbstractPhase, Journey, Record, marched, passed_on
-from .traced_phases import in_rounds
-from .varied_phases import VariedPhase, varied_phases, varied_start
+from ..integration import LEFT_DOMAIN, REACHED_END, RUNNING, Settings, solve_with_samples
+from .ensemble import AbstractBatchedMode, HybridOutcome, TransitionPath, after_reset, after_solve
+from .path import BETWEEN
+from .saltation import VariationalMode, variational_modes, variational_start
+from .traced_ensemble import in_rounds
 
 #: From some modules (scene, launch, ...) and the tolerance to the phases of a single run, the number of the first, and the
 #: state there.
-Build = Callable[[Any, Array], tuple[tuple[AbstractPhase, ...], Array, Float[Array, "components 1"]]]
+Build = Callable[[Any, Array], tuple[tuple[AbstractBatchedMode, ...], Array, Float[Array, "components 1"]]]
 
 
-class PhasedSamples(NamedTuple):
+class HybridSamples(NamedTuple):
     """A run through several phases at given times, all floats.
 
     - `shown`: what the phases show, NaN after the end of the run; `number`: of the phase at each time, or `BETWEEN`.
@@ -41,14 +41,14 @@ class PhasedSamples(NamedTuple):
     counts: Float[Array, " kinds"]
 
 
-def phased_samples(
+def hybrid_samples(
     build: Build,
     modules: Any,
     times: Float[Array, " times"],
     t1: Float[Array, ""],
     settings: Settings,
     kinds: int,
-) -> PhasedSamples:
+) -> HybridSamples:
     """Run one cell through its phases inside a transformation and sample it, with derivatives that take part in step control.
 
     **Arguments:**
@@ -59,12 +59,12 @@ def phased_samples(
     - `settings`: with an explicit Runge-Kutta solver; the tolerance may be traced.
     - `kinds`: rows of `Passage.counts`.
 
-    **Returns:** `PhasedSamples`; what is shown and the time of the end have derivatives, NaN behind a grazing event.
+    **Returns:** `HybridSamples`; what is shown and the time of the end have derivatives, NaN behind a grazing event.
 
     **Raises:** `ValueError` for derivatives by the times, and for second derivatives.
     """
-    question = functools.partial(PhasedSampling, kinds=kinds)
-    return ask_for_samples(question, build, modules, _fixed(times), t1, settings)
+    question = functools.partial(HybridSampling, kinds=kinds)
+    return solve_for_samples(question, build, modules, _fixed(times), t1, settings)
 
 
 @eqx.filter_custom_jvp
@@ -80,50 +80,50 @@ def _refused(primals: Any, tangents: Any) -> Any:
     return primals[0], jnp.zeros_like(primals[0])
 
 
-class PhasedSampling(AbstractSampling):
+class HybridSampling(AbstractSampling):
     """Samples of a run through phases."""
 
     in_blocks = False
 
     movable: int
-    recipe: Recipe
+    spec: ProblemSpec
     places: Any = eqx.field(static=True)
     kinds: int = eqx.field(static=True)
 
-    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> PhasedSamples:
-        numbers, (*given, tolerance), recipe = self._sorted(leaves)
-        settings = recipe.settings.with_tolerance(tolerance)
-        found, _ = _follow(recipe.made(numbers, tolerance), (), given, settings, self.kinds)
+    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> HybridSamples:
+        numbers, (*given, tolerance), spec = self._sorted(leaves)
+        settings = spec.settings.with_tolerance(tolerance)
+        found, _ = _follow(spec.made(numbers, tolerance), (), given, settings, self.kinds)
         return jax.tree.map(lambda part: part[None], found)
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
-    ) -> tuple[PhasedSamples, list[PhasedSamples]]:
+    ) -> tuple[HybridSamples, list[HybridSamples]]:
         if again:
             raise ValueError("second derivatives do not go through changes of phase: contact = 'hybrid'")
-        numbers, (*given, tolerance), recipe = self._sorted(leaves)
-        settings = recipe.settings.with_tolerance(tolerance)
+        numbers, (*given, tolerance), spec = self._sorted(leaves)
+        settings = spec.settings.with_tolerance(tolerance)
 
         def build(numbers: tuple[Array, ...], cells: None) -> Any:
-            return recipe.made(numbers, tolerance)
+            return spec.made(numbers, tolerance)
 
-        built, directions, gather = directions_by(build, active, numbers, None)
+        built, tangents, gather = tangents_by(build, active, numbers, None)
 
-        def run(some: tuple[Any, ...]) -> tuple[PhasedSamples, list[PhasedSamples]]:
+        def run(some: tuple[Any, ...]) -> tuple[HybridSamples, list[HybridSamples]]:
             return _follow(built, tuple((one[0], one[2]) for one in some), given, settings, self.kinds)
 
-        found, slopes = in_groups(run, directions)
+        found, slopes = in_groups(run, tangents)
         return jax.tree.map(lambda part: part[None], (found, gather(slopes)))
 
 
 def _follow(
-    built: Any, directions: tuple[Any, ...], given: Sequence[Array], settings: Settings, kinds: int
-) -> tuple[PhasedSamples, list[PhasedSamples]]:
+    built: Any, tangents: tuple[Any, ...], given: Sequence[Array], settings: Settings, kinds: int
+) -> tuple[HybridSamples, list[HybridSamples]]:
     """The run, and its slope along each of the directions."""
-    (phases, first, state), (times, t1) = built, given
-    varied, start = varied_phases(phases, directions, settings.tolerance, False), varied_start(state, directions)
+    (modes, first, state), (times, t1) = built, given
+    varied, start = variational_modes(modes, tangents, settings.tolerance, False), variational_start(state, tangents)
     ended, filled = _followed(varied, first, start, times, t1, settings, kinds)
-    return _found(ended, filled, times, len(state), len(directions))
+    return _found(ended, filled, times, len(state), len(tangents))
 
 
 class Filled(NamedTuple):
@@ -145,38 +145,40 @@ class Filled(NamedTuple):
 
 
 def _followed(
-    phases: tuple[VariedPhase, ...],
+    modes: tuple[VariationalMode, ...],
     first: Array,
     state: Float[Array, "components 1"],
     times: Float[Array, " times"],
     t1: Float[Array, ""],
     settings: Settings,
     kinds: int,
-) -> tuple[Journey, Filled]:
-    """Round by round, as in `traced_travel`, with samples of every phase and of the way to the next."""
-    count, zero, none = len(phases[0].directions), jnp.zeros(1), jnp.zeros(1, int)
-    own = VariedPhase.parts(phases[0], state)[0][:-1]
-    rows = len(jax.eval_shape(phases[0].phase.shown, own))
-    start = Journey(none + RUNNING, zero + jnp.inf, zero, state, none, none, first, jnp.zeros((kinds + 1, 1), int))
+) -> tuple[HybridOutcome, Filled]:
+    """Round by round, as in `traced_solve_hybrid`, with samples of every phase and of the way to the next."""
+    count, zero, none = len(modes[0].tangents), jnp.zeros(1), jnp.zeros(1, int)
+    own = VariationalMode.parts(modes[0], state)[0][:-1]
+    rows = len(jax.eval_shape(modes[0].mode.shown, own))
+    start = HybridOutcome(
+        none + RUNNING, zero + jnp.inf, zero, state, none, none, first, jnp.zeros((kinds + 1, 1), int)
+    )
     missing = jnp.full((rows, len(times)), jnp.nan)
     empty = Filled(missing, jnp.zeros((count, *missing.shape)), missing[0], jnp.full((), jnp.inf))
 
-    def stay(one: VariedPhase, number: int, found: Journey, filled: Filled) -> tuple[Journey, Filled]:
+    def stay(one: VariationalMode, number: int, found: HybridOutcome, filled: Filled) -> tuple[HybridOutcome, Filled]:
         since, left = times - found.end_time, jnp.maximum(t1 - found.end_time, 0.0)
-        outcome, samples = march_with_samples(
+        outcome, samples = solve_with_samples(
             one.problem(found.state), since, left, jnp.asarray(1), settings, parts=1 + count
         )
-        after = marched(jnp, found, outcome, t1)
+        after = after_solve(jnp, found, outcome, t1)
         return after, filled.with_samples((since >= 0.0) & (times <= after.end_time), one.seen(samples[0].T), number)
 
-    def change(one: VariedPhase, found: Journey, filled: Filled) -> tuple[Journey, Filled]:
-        def seen(phase: AbstractPhase, record: Record | None, left: Float[Array, " 1"]) -> Any:
+    def change(one: VariationalMode, found: HybridOutcome, filled: Filled) -> tuple[HybridOutcome, Filled]:
+        def seen(mode: AbstractBatchedMode, record: TransitionPath | None, left: Float[Array, " 1"]) -> Any:
             # A time that stays as it is comes sooner after an event that is later, as the horizon does.
-            return None if record is None else _on_the_way(phase, record, times - t1 + left)
+            return None if record is None else _on_the_way(mode, record, times - t1 + left)
 
         left = jnp.maximum(t1 - found.end_time, 0.0)
-        passage, shown, variations = one.left_behind(found.state, left, seen)
-        after = passed_on(jnp, found, passage, t1)
+        transition, shown, variations = one.left_behind(found.state, left, seen)
+        after = after_reset(jnp, found, transition, t1)
         if shown is not None:
             inside = (times > found.end_time) & (times <= after.end_time)
             filled = filled.with_samples(inside, (shown, variations), BETWEEN)
@@ -187,13 +189,13 @@ def _followed(
 
     def one_round(carry: Any) -> Any:
         found, filled, rounds = carry
-        at = found.phase[0]
-        for number, one in enumerate(phases):
+        at = found.mode[0]
+        for number, one in enumerate(modes):
             under_way = (found.status[0] == RUNNING) & (at == number)
 
-            def here(one: VariedPhase = one, number: int = number, found: Any = found, filled: Any = filled) -> Any:
+            def here(one: VariationalMode = one, number: int = number, found: Any = found, filled: Any = filled) -> Any:
                 stayed = stay(one, number, found, filled)
-                return jax.lax.cond(stayed[0].status[0] == GUARD_LOST, lambda: change(one, *stayed), lambda: stayed)
+                return jax.lax.cond(stayed[0].status[0] == LEFT_DOMAIN, lambda: change(one, *stayed), lambda: stayed)
 
             found, filled = jax.lax.cond(under_way, here, lambda found=found, filled=filled: (found, filled))
         return found, filled, rounds + 1
@@ -201,18 +203,20 @@ def _followed(
     return in_rounds(one_round, start, empty)
 
 
-def _on_the_way(phase: AbstractPhase, record: Record, since: Float[Array, " times"]) -> Float[Array, "shown times"]:
+def _on_the_way(
+    mode: AbstractBatchedMode, record: TransitionPath, since: Float[Array, " times"]
+) -> Float[Array, "shown times"]:
     """What a path shows some times [s] after it has left a phase; nothing that means anything after the last stretch."""
     ends = record.ends[:, 0]
     stretch = jnp.minimum(jnp.searchsorted(jax.lax.stop_gradient(ends), jax.lax.stop_gradient(since)), len(ends) - 1)
     began = jnp.where(stretch > 0, ends[jnp.maximum(stretch - 1, 0)], 0.0)
     motions = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[stretch][..., 0], 0, -1), record.motions)
-    return phase.between(motions, jnp.where(jnp.isfinite(began), since - began, 0.0))
+    return mode.between(motions, jnp.where(jnp.isfinite(began), since - began, 0.0))
 
 
 def _found(
-    ended: Journey, filled: Filled, times: Float[Array, " times"], size: int, count: int
-) -> tuple[PhasedSamples, list[PhasedSamples]]:
+    ended: HybridOutcome, filled: Filled, times: Float[Array, " times"], size: int, count: int
+) -> tuple[HybridSamples, list[HybridSamples]]:
     """What is found, and its slope along each of the directions."""
     end_time, status, grazed = ended.end_time[0], ended.status[0], ended.counts[-1, 0] > 0
     late = jnp.where(times > filled.grazed, jnp.nan, 0.0)
@@ -221,8 +225,8 @@ def _found(
     later = [jnp.where(status == REACHED_END, 0.0, jnp.where(grazed, jnp.nan, one)) for one in later]
     numbers = (status, ended.steps[0], ended.rejected[0], ended.counts[:-1, 0])
     others = (part.astype(float) for part in numbers)
-    found = PhasedSamples(filled.shown, filled.number, end_time, ended.state[:size, 0], *others)
+    found = HybridSamples(filled.shown, filled.number, end_time, ended.state[:size, 0], *others)
     slopes = [
-        PhasedSamples(filled.variations[k] + late, None, later[k], None, None, None, None, None) for k in range(count)
+        HybridSamples(filled.variations[k] + late, None, later[k], None, None, None, None, None) for k in range(count)
     ]
     return found, slopes

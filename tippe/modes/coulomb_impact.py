@@ -15,13 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.geometry import Vector, dot, scale, sum_vectors
-from nonholonomic.integration import GUARD_LOST, AbstractProblem, Settings, traced_march
+from nonholonomic.integration import LEFT_DOMAIN, AbstractProblem, Settings, traced_solve_ensemble
 
 from ..model.dynamics import least
 from ..model.friction import SetValuedCoulomb, length
 from ..model.top import Top
 from .free_body import Ball, FreeBody
-from .impact import LARGEST, MOST_STEPS, TOLERANCE, Blow, Impact, approach, struck
+from .impact import LARGEST, MOST_STEPS, TOLERANCE, ContactImpulse, Impact, apply_impulse, approach
 
 Cells = Float[Array, " cells"]
 
@@ -57,41 +57,41 @@ class Skid(AbstractProblem):
         v1, v2, _ = self.velocity(state)
         return jnp.stack([-self.mu * v1, -self.mu * v2, length(v1, v2)]) / self.pace
 
-    def crossing(self, state: Float[Array, "3 cells"]) -> None:
+    def event_function(self, state: Float[Array, "3 cells"]) -> None:
         return None
 
-    def guard(self, time: Cells, state: Float[Array, "3 cells"]) -> Cells:
-        return least(self.impact.guard(state[2], state[:2]), self.slip_left(state))
+    def domain_margin(self, time: Cells, state: Float[Array, "3 cells"]) -> Cells:
+        return least(self.impact.domain_margin(state[2], state[:2]), self.slip_left(state))
 
     def slip_left(self, state: Float[Array, "3 cells"]) -> Cells:
         """Slip speed above that at which a slip has stopped, as a part of the speed of arrival."""
         return length(*self.velocity(state)[:2]) / self.pace - STOPS
 
 
-def strike_exactly(
+def resolve_coulomb_impact(
     body: Top, friction: SetValuedCoulomb, ball: Ball, free: FreeBody, restitution: Cells
 ) -> tuple[FreeBody, Bool[Array, " cells"]]:
     """The body after a sphere of it has struck the plane; where the contact sticks, its slip is zero but for round-off.
 
-    **Arguments, returns:** as for `strike`, of which it is the limit for a slip speed of 0.
+    **Arguments, returns:** as for `resolve_impact`, of which it is the limit for a slip speed of 0.
     """
     meets = approach(body, ball, free)
     impact = Impact(body, friction, meets, ball.radius, (1.0 + restitution) * jnp.maximum(-meets.velocity[2], 0.0))
     pace = jnp.maximum(length(*meets.velocity[:2]), impact.speed)
     skid = Skid(impact, friction.mu, pace)
     settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=0.1, max_steps=MOST_STEPS)
-    outcome, _ = traced_march(skid, jnp.asarray(LARGEST), jnp.asarray(pace.shape[0]), settings)
+    outcome, _ = traced_solve_ensemble(skid, jnp.asarray(LARGEST), jnp.asarray(pace.shape[0]), settings)
     stops = skid.slip_left(outcome.state) <= STOPS
     rates = skid.field(outcome.end_time, outcome.state)
     # An impact that ends while it slips is put right by one step of Newton's method, as in `Impact.ended`.
-    left, slope = jax.jvp(lambda at: impact.guard(at[2], at[:2]), (outcome.state,), (rates,))
+    left, slope = jax.jvp(lambda at: impact.domain_margin(at[2], at[:2]), (outcome.state,), (rates,))
     step = -left / jnp.where(slope == 0.0, 1.0, slope)
     step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
     state = jnp.where(stops, outcome.state, outcome.state + step * rates)
     blow = impact.blow(state[2], state[:2])
     onward = _onward(impact, friction.mu, blow.force)
     force = tuple(jnp.where(stops, a + b, a) for a, b in zip(blow.force, onward, strict=True))
-    return struck(body, meets, free, Blow(force, None)), outcome.status != GUARD_LOST
+    return apply_impulse(body, meets, free, ContactImpulse(force, None)), outcome.status != LEFT_DOMAIN
 
 
 def _onward(impact: Impact, mu: Float[Array, "..."], blow: Vector) -> Vector:

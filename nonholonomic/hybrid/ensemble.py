@@ -16,18 +16,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..integration.march import compiled_march
+from ..integration.ensemble import solve_ensemble
 from ..integration.problem import AbstractProblem
-from ..integration.queue import Outcome
+from ..integration.scheduler import Outcome
 from ..integration.settings import Settings
-from ..integration.status import FAILED, GUARD_LOST, REACHED_END, RUNNING, UNRESOLVED
+from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 from ..xla_cpu import compiled_quickly
 
 #: Rounds, and so phases of a single run, after which what is still under way is given up.
 MOST_ROUNDS = 2000
 
 
-class Record(NamedTuple):
+class TransitionPath(NamedTuple):
     """The way of a single run from one phase to the next, as stretches of motion of known form that follow one another.
 
     - `ends`: when each stretch ends [s], counted from the end of the phase; infinite where there are no more.
@@ -40,27 +40,27 @@ class Record(NamedTuple):
     shown: Int[Array, " stretches 1"]
 
 
-class Passage(NamedTuple):
+class Transition(NamedTuple):
     """What follows the end of a phase, one number per cell.
 
-    `status` is `RUNNING` where the motion goes on in the phase numbered `phase`, else how it ended; `state` is the state
+    `status` is `RUNNING` where the motion goes on in the phase numbered `mode`, else how it ended; `state` is the state
     then, `elapsed` [s] the time that passed on the way, `crossing_time` [s] when on the way the event was passed (for the
     last time), infinite if it was not; `counts` how often each kind of thing happened, a row for each kind. `record` is for a
     single run that keeps its path (`phased_run.py`); `None` where no time passes on the way, or where the path is not kept.
     `log_rates` is the sum of the logarithms of the rates at which events on the way are met; `None` if there are none.
     """
 
-    phase: Int[Array, " cells"]
+    mode: Int[Array, " cells"]
     state: Float[Array, "components cells"]
     elapsed: Float[Array, " cells"]
     status: Int[Array, " cells"]
     crossing_time: Float[Array, " cells"]
     counts: Int[Array, "kinds cells"]
-    record: Record | None = None
+    record: TransitionPath | None = None
     log_rates: Float[Array, " cells"] | None = None
 
 
-class AbstractPhase(eqx.Module):
+class AbstractBatchedMode(eqx.Module):
     """One phase of the motion. Its leaves are scalars, or hold one number per cell in their last axis."""
 
     @abc.abstractmethod
@@ -68,7 +68,7 @@ class AbstractPhase(eqx.Module):
         """The motion in this phase from the given states on; the problem's guard ends the phase."""
 
     @abc.abstractmethod
-    def leave(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
+    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """What follows where the guard has ended the phase.
 
         **Arguments:**
@@ -76,7 +76,7 @@ class AbstractPhase(eqx.Module):
         - `state`: the states there.
         - `left`: time [s] to the horizon.
 
-        **Returns:** a `Passage`, which ends with `REACHED_END` where it would take longer than `left`.
+        **Returns:** a `Transition`, which ends with `REACHED_END` where it would take longer than `left`.
         """
 
     def shown(self, state: Float[Array, "components times"]) -> Float[Array, "shown times"]:
@@ -88,7 +88,7 @@ class AbstractPhase(eqx.Module):
         raise NotImplementedError(f"{type(self).__name__} records stretches but does not say what they show")
 
 
-class Journey(NamedTuple):
+class HybridOutcome(NamedTuple):
     """How every cell ended, as in `march.Outcome`, in which phase, and how often each kind of thing happened on the way."""
 
     status: Int[np.ndarray, " cells"]
@@ -97,23 +97,25 @@ class Journey(NamedTuple):
     state: Float[np.ndarray, "components cells"]
     steps: Int[np.ndarray, " cells"]
     rejected: Int[np.ndarray, " cells"]
-    phase: Int[np.ndarray, " cells"]
+    mode: Int[np.ndarray, " cells"]
     counts: Int[np.ndarray, "kinds cells"]
 
 
 @eqx.filter_jit
-def _problem(phase: AbstractPhase, state: Float[Array, "components cells"]) -> AbstractProblem:
-    return phase.problem(state)
+def _problem(mode: AbstractBatchedMode, state: Float[Array, "components cells"]) -> AbstractProblem:
+    return mode.problem(state)
 
 
 @compiled_quickly
-def _leave(phase: AbstractPhase, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Passage:
-    return phase.leave(state, left)
+def _leave(
+    mode: AbstractBatchedMode, state: Float[Array, "components cells"], left: Float[Array, " cells"]
+) -> Transition:
+    return mode.reset_map(state, left)
 
 
-def travel(
-    phases: tuple[AbstractPhase, ...],
-    phase: Int[np.ndarray, " cells"],
+def solve_hybrid(
+    modes: tuple[AbstractBatchedMode, ...],
+    mode: Int[np.ndarray, " cells"],
     state: Float[np.ndarray, "components cells"],
     t1: float | Float[np.ndarray, " cells"],
     cells: int,
@@ -123,7 +125,7 @@ def travel(
     passes: bool = False,
     parts: int = 1,
     most_rounds: int = MOST_ROUNDS,
-) -> Journey:
+) -> HybridOutcome:
     """Run every cell through its phases to its event, to `t1`, or to where the model ends.
 
     It runs on the host, round by round, and is called with concrete numbers. All calls with the same number of cells, padding
@@ -131,39 +133,39 @@ def travel(
 
     **Arguments:**
 
-    - `phases`: the phases, of which `phase` and `Passage.phase` are numbers.
-    - `phase`, `state`: where every cell starts.
+    - `modes`: the phases, of which `mode` and `Passage.phase` are numbers.
+    - `mode`, `state`: where every cell starts.
     - `t1`: horizon [s], one for all or one per cell.
     - `cells`: how many cells to run; the rest is padding. With 0, the programs are compiled and nothing is run.
     - `settings`: with an explicit Runge-Kutta solver of Diffrax.
     - `kinds`: rows of `Passage.counts`.
-    - `passes`, `parts`: as for `march`.
+    - `passes`, `parts`: as for `ensemble_solve`.
     - `most_rounds`: a cell that needs more ends as `UNRESOLVED`.
 
-    **Returns:** a `Journey`.
+    **Returns:** a `HybridOutcome`.
     """
-    size, options = len(phase), {"passes": passes, "parts": parts}
+    size, options = len(mode), {"passes": passes, "parts": parts}
     t1 = np.broadcast_to(np.asarray(t1, float), size)
-    found = Journey(
+    found = HybridOutcome(
         status=np.full(size, RUNNING),
         crossing_time=np.full(size, np.inf),
         end_time=np.zeros(size),
         state=np.array(state),
         steps=np.zeros(size, int),
         rejected=np.zeros(size, int),
-        phase=np.array(phase),
+        mode=np.array(mode),
         counts=np.zeros((kinds, size), int),
     )
     found.status[cells:] = REACHED_END
     if cells == 0:
-        _compile(phases, found, t1, settings, options)
+        _compile(modes, found, t1, settings, options)
     for _ in range(most_rounds):
         # Selected before the round: a cell that changes its phase during it waits for the next round.
-        here = [np.flatnonzero((found.status == RUNNING) & (found.phase == number)) for number in range(len(phases))]
-        for one, some in zip(phases, here, strict=True):
+        here = [np.flatnonzero((found.status == RUNNING) & (found.mode == number)) for number in range(len(modes))]
+        for one, some in zip(modes, here, strict=True):
             if some.size:
                 _march(one, found, some, t1, settings, options)
-                lost = some[found.status[some] == GUARD_LOST]
+                lost = some[found.status[some] == LEFT_DOMAIN]
                 if lost.size:
                     _pass_on(one, found, lost, t1)
         if not (found.status == RUNNING).any():
@@ -173,8 +175,8 @@ def travel(
 
 
 def _compile(
-    phases: tuple[AbstractPhase, ...],
-    found: Journey,
+    modes: tuple[AbstractBatchedMode, ...],
+    found: HybridOutcome,
     t1: Float[np.ndarray, " cells"],
     settings: Settings,
     options: dict[str, Any],
@@ -182,88 +184,88 @@ def _compile(
     """Compile all programs by running none of the cells: two at once, for the compiler uses little more than one core."""
     none = np.arange(0)
     with ThreadPoolExecutor(2) as threads:
-        marches = [threads.submit(_march, one, found, none, t1, settings, options) for one in phases]
-        leaving = [threads.submit(_pass_on, one, found, none, t1) for one in phases]
+        marches = [threads.submit(_march, one, found, none, t1, settings, options) for one in modes]
+        leaving = [threads.submit(_pass_on, one, found, none, t1) for one in modes]
         for program in (*marches, *leaving):
             program.result()
 
 
 def _gather(
-    phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
+    mode: AbstractBatchedMode, found: HybridOutcome, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
 ) -> tuple[Any, ...]:
     """The phase, the states and the remaining times of some cells, padded to the size of the whole."""
     size = len(found.status)
     cell = np.concatenate([some, np.full(size - some.size, some[-1] if some.size else 0)])
-    numbers, rest = eqx.partition(phase, eqx.is_array)
+    numbers, rest = eqx.partition(mode, eqx.is_array)
     numbers = jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., cell], numbers)
     left = jnp.asarray(np.maximum(t1[cell] - found.end_time[cell], 0.0))
     return eqx.combine(numbers, rest), jnp.asarray(found.state[:, cell]), left
 
 
 def _march(
-    phase: AbstractPhase,
-    found: Journey,
+    mode: AbstractBatchedMode,
+    found: HybridOutcome,
     some: Int[np.ndarray, " some"],
     t1: Float[np.ndarray, " cells"],
     settings: Settings,
     options: dict[str, Any],
 ) -> None:
     """March some cells to the end of their phase and note what was found."""
-    phase, state, left = _gather(phase, found, some, t1)
-    problem = _problem(phase, state)
+    mode, state, left = _gather(mode, found, some, t1)
+    problem = _problem(mode, state)
     count = jnp.asarray(some.size)
-    outcome, _ = compiled_march(problem, left, count, settings, **options)
+    outcome, _ = solve_ensemble(problem, left, count, settings, **options)
     outcome = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], outcome)
-    _store(found, some, marched(np, _some(found, some), outcome, t1[some]))
+    _store(found, some, after_solve(np, _some(found, some), outcome, t1[some]))
 
 
 def _pass_on(
-    phase: AbstractPhase, found: Journey, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
+    mode: AbstractBatchedMode, found: HybridOutcome, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
 ) -> None:
     """Pass some cells on to the phase that follows and note what happened on the way."""
-    passage = _leave(*_gather(phase, found, some, t1))
-    passage = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], passage)
-    _store(found, some, passed_on(np, _some(found, some), passage, t1[some]))
+    transition = _leave(*_gather(mode, found, some, t1))
+    transition = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], transition)
+    _store(found, some, after_reset(np, _some(found, some), transition, t1[some]))
 
 
-def _some(found: Journey, some: Int[np.ndarray, " some"]) -> Journey:
-    return Journey(*(values[..., some] for values in found))
+def _some(found: HybridOutcome, some: Int[np.ndarray, " some"]) -> HybridOutcome:
+    return HybridOutcome(*(values[..., some] for values in found))
 
 
-def _store(found: Journey, some: Int[np.ndarray, " some"], new: Journey) -> None:
+def _store(found: HybridOutcome, some: Int[np.ndarray, " some"], new: HybridOutcome) -> None:
     for values, of_some in zip(found, new, strict=True):
         values[..., some] = of_some
 
 
-def marched(xp: Any, found: Journey, outcome: Outcome, t1: Float[Array, " cells"]) -> Journey:
+def after_solve(xp: Any, found: HybridOutcome, outcome: Outcome, t1: Float[Array, " cells"]) -> HybridOutcome:
     """What is known of cells after a march that ended as `outcome` says. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
     began = found.end_time
     # A cell that enters a phase beyond the event passed it earlier, unless it started there.
     passed = xp.isfinite(outcome.crossing_time) & ((outcome.crossing_time > 0.0) | xp.isinf(found.crossing_time))
-    return Journey(
+    return HybridOutcome(
         status=outcome.status,
         crossing_time=xp.where(passed, began + outcome.crossing_time, found.crossing_time),
         end_time=xp.where(outcome.status == REACHED_END, t1, began + outcome.end_time),
         state=outcome.state,
         steps=found.steps + outcome.steps,
         rejected=found.rejected + outcome.rejected,
-        phase=found.phase,
+        mode=found.mode,
         counts=found.counts,
     )
 
 
-def passed_on(xp: Any, found: Journey, passage: Passage, t1: Float[Array, " cells"]) -> Journey:
-    """What is known of cells after the passage from one phase to the next. **Arguments:** as for `marched`."""
-    passed = xp.isfinite(passage.crossing_time)
+def after_reset(xp: Any, found: HybridOutcome, transition: Transition, t1: Float[Array, " cells"]) -> HybridOutcome:
+    """What is known of cells after the passage from one phase to the next. **Arguments:** as for `after_solve`."""
+    passed = xp.isfinite(transition.crossing_time)
     # Non-finite states would be marched forever.
-    sound = xp.isfinite(passage.state).all(axis=0) & xp.isfinite(passage.elapsed)
-    return Journey(
-        status=xp.where(sound, passage.status, FAILED),
-        crossing_time=xp.where(passed, found.end_time + passage.crossing_time, found.crossing_time),
-        end_time=xp.where(passage.status == REACHED_END, t1, found.end_time + passage.elapsed),
-        state=passage.state,
+    sound = xp.isfinite(transition.state).all(axis=0) & xp.isfinite(transition.elapsed)
+    return HybridOutcome(
+        status=xp.where(sound, transition.status, FAILED),
+        crossing_time=xp.where(passed, found.end_time + transition.crossing_time, found.crossing_time),
+        end_time=xp.where(transition.status == REACHED_END, t1, found.end_time + transition.elapsed),
+        state=transition.state,
         steps=found.steps,
         rejected=found.rejected,
-        phase=passage.phase,
-        counts=found.counts + passage.counts,
+        mode=transition.mode,
+        counts=found.counts + transition.counts,
     )

@@ -239,9 +239,9 @@ class _Contact(eqx.Module):
         along = v / size
         across = jnp.stack([-along[1], along[0]])
         n, (M11, M12, M22) = self.lifted, self.inverse_mass
-        stiffness = 1.0 - self.mu * (n[0] * along[0] + n[1] * along[1])
-        share = self.mu * (n[0] * across[0] + n[1] * across[1]) / stiffness
-        x, y = self.mu * self.unloaded / stiffness * (across + share * along)
+        painleve_factor = 1.0 - self.mu * (n[0] * along[0] + n[1] * along[1])
+        share = self.mu * (n[0] * across[0] + n[1] * across[1]) / painleve_factor
+        x, y = self.mu * self.unloaded / painleve_factor * (across + share * along)
         pull = jnp.stack([M11 * x + M12 * y, M12 * x + M22 * y])
         # Stage by stage: across_j . pull_k, times what the step gives stage j of stage k.
         matrix = age * jnp.einsum("jk,ij...,ik...->jk...", WEIGHTS, across, pull)
