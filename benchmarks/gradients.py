@@ -3,8 +3,8 @@
     python benchmarks/gradients.py [--launches 1024]
 
 The reference problem (Rutstam's top on the plane, viscous friction, 100 rad/s, theta(0) from 0.05 to 0.15) and the same
-top in a cylinder: a table of times; the same table with the derivative by mu, and with those by six numbers; and the
-gradient of a scalar loss of 256 launches by reverse mode, `jax.grad` through `vmap(inversion_time)`, with two numbers
+top in a cylinder: a table of times; the same table with the derivative by mu, and with those by two, four and six numbers;
+and the gradient of a scalar loss of 256 launches by reverse mode, `jax.grad` through `vmap(inversion_time)`, with two numbers
 and with six. Cost is CPU time on one core, compilation apart, as a multiple of the table's, or, for the loss, of the loss's
 own. Error is the largest relative difference of the derivatives by mu to those at tolerance 1e-13, and that of one of
 them to extrapolated central differences. Run it alone: other work on the machine shows in every number.
@@ -95,6 +95,8 @@ def row_of(
     runs = {
         "table": timed(lambda: times(scene, theta, tolerance, []), 3),
         "one": timed(lambda: times(scene, theta, tolerance, ONE), 3),
+        "two": timed(lambda: times(scene, theta, tolerance, SIX[:2]), 2),
+        "four": timed(lambda: times(scene, theta, tolerance, SIX[:4]), 2),
         "six": timed(lambda: times(scene, theta, tolerance, SIX), 2),
     }
     for label, (values, *functions) in losses.items():
@@ -107,6 +109,8 @@ def row_of(
         "tolerance": f"{tolerance:.0e}",
         "table ms per launch": f"{base / len(theta) * 1e3:.3f}",
         "by mu": f"{runs['one'].cpu / base:.2f} x",
+        "by two": f"{runs['two'].cpu / base:.2f} x",
+        "by four": f"{runs['four'].cpu / base:.2f} x",
         "by six": f"{runs['six'].cpu / base:.2f} x",
         "reverse, two": f"{runs['gradient of two'].cpu / runs['loss of two'].cpu:.2f} x",
         "reverse, six": f"{runs['gradient of all'].cpu / runs['loss of all'].cpu:.2f} x",

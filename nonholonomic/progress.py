@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Any
 
 from .compilation_cache import is_off
+from .compiled_programs import forget_programs_if_many
 
 #: How often the line is written [s]; a call that ends sooner shows nothing. How often is looked whether it is time [s], and
 #: how long after the last call [s]: starting a thread for every call would cost short ones a millisecond.
@@ -171,7 +172,11 @@ _LINE = _Line()
 
 @contextmanager
 def status_line(doing: str, shown: bool = True) -> Iterator[Progress]:
-    """Says what a call is doing that takes long when it is new to the compiler; decorates functions, too."""
+    """Says what a call is doing that takes long when it is new to the compiler; decorates functions, too.
+
+    Before that, programs are forgotten if they take too much memory (`compiled_programs.py`).
+    """
+    forget_programs_if_many()
     with Progress(None, doing=doing, shown=shown) as line:
         yield line
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from nonholonomic import __version__
+from nonholonomic.command_line import interruptible
 from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.integration import ImplicitMidpoint
@@ -245,6 +246,6 @@ def main(arguments: list[str] | None = None) -> int:
 if __name__ == "__main__":
     # A job of seconds: a tenth of them would go into looking for garbage among all that JAX holds, here and at the end.
     gc.disable()
-    status = main()
+    status = interruptible(main, "stroller")
     gc.freeze()
     sys.exit(status)

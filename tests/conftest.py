@@ -2,7 +2,6 @@
 
 import gc
 import os
-from pathlib import Path
 
 import jax
 import pytest
@@ -10,6 +9,13 @@ from tops import rutstam_top
 
 import nonholonomic
 import tippe
+from nonholonomic.compiled_programs import (
+    PART_OF_MAPPINGS,
+    count_mappings,
+    most_mappings,
+    release_memory,
+    resident_memory,
+)
 
 #: The tests that a plain `pytest` chooses (`pyproject.toml`).
 ORDINARY = "not slow"
@@ -40,9 +46,9 @@ def pytest_configure(config: pytest.Config) -> None:
             os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 
-#: Memory mappings that a process may collect before it forgets its compiled programs; Linux allows 65 530, and a compiler that
-#: gets no more of them crashes.
-MOST_MAPPINGS = 35_000
+#: What a worker may hold after a module of tests [bytes] before it forgets its compiled programs; those that the next modules
+#: use too are read from the disk.
+MOST_MEMORY = 1_200_000_000
 
 # Tracing makes many long-lived objects, through which Python would look for cycles again and again.
 gc.set_threshold(100_000, 50, 100)
@@ -50,12 +56,14 @@ gc.set_threshold(100_000, 50, 100)
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled_programs():
-    """Let go of compiled programs before they exhaust the memory mappings that a process may have."""
+    """Let go of compiled programs before they exhaust the memory, or the mappings that Linux allows a process."""
     yield
-    mappings = Path("/proc/self/maps")
-    if mappings.exists() and mappings.read_bytes().count(b"\n") > MOST_MAPPINGS:
+    if resident_memory() > MOST_MEMORY:
+        release_memory()
+    if resident_memory() > MOST_MEMORY or count_mappings() > PART_OF_MAPPINGS * most_mappings():
         jax.clear_caches()
         gc.collect()
+        release_memory()
 
 
 @pytest.fixture(scope="session")

@@ -33,7 +33,7 @@ VEHICLE_HEIGHT = {"model": 0, "modes": 1, "runs": 2, "fit": 3}
 CHECKS = ("witnesses", "papers")
 
 MOST_LINES = 400
-MOST_FILES_OUTSIDE = 6
+MOST_FILES_OUTSIDE = 8
 
 
 class Arrow(NamedTuple):

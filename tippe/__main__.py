@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from nonholonomic import __version__
+from nonholonomic.command_line import interruptible
 from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.progress import Progress, status_line
@@ -342,6 +343,6 @@ def main(arguments: list[str] | None = None) -> int:
 if __name__ == "__main__":
     # A job of seconds: a fifth of them would go into looking for garbage among all that JAX holds, here and at the end.
     gc.disable()
-    status = main()
+    status = interruptible(main, "tippe")
     gc.freeze()
     sys.exit(status)

@@ -26,6 +26,7 @@ an inverted top is stable above 41.31 rad/s
 ```
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -34,13 +35,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.geometry import Plane
+from nonholonomic.geometry import CarriedFrame, Plane, Torus
 from nonholonomic.integration import sign_changes
 from nonholonomic.validation import as_number, require
 
 from .model.launch import Launch
 from .model.scene import Scene
-from .model.state import AXIS, joined, parts
+from .model.state import AXIS, PLACE, joined, parts
 from .model.top import Top
 
 
@@ -174,7 +175,8 @@ def standing_state(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = Fa
 def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = False) -> Float[Array, "k k"]:
     """Matrix [1/s] of the linear motion near a standing top, on any arena.
 
-    Components along n (of axis, angular momentum and vertical) change at second order only and are left out.
+    Components along n change at second order only and are left out, as are the frame's own direction and the places that a
+    symmetry makes equivalent (plane, cylinder, torus). A scene with `contact="hybrid"` counts as one with "stop".
 
     **Arguments:** as for `standing_state`.
 
@@ -185,11 +187,22 @@ def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = F
     >>> steady.standing_matrix(scene, 50.0, inverted=True).shape
     (6, 6)
     """
+    body = dataclasses.replace(scene.body, stem=None) if scene.contact == "hybrid" else scene.body
+    scene = dataclasses.replace(scene, body=body, contact="stop", restitution=None)
     state = standing_state(scene, spin, inverted)
-    across = [0, 1, 2, 3, 5, 6, *range(8, state.size - 1)]
+    across = [0, 1, 2, 3, 5, 6, *_places_across(scene)]
     scales = scene.scales(Launch(0.0, spin))
     jacobian = jax.jacfwd(scene.field)(state) * scales / scales[:, None]
     return jacobian[np.ix_(across, across)]
+
+
+def _places_across(scene: Scene) -> range:
+    """Which components of a state are places that differ near the arena's lowest point."""
+    count = max(len(scene.frame.place_scales) - 1, 0)
+    if isinstance(scene.frame, CarriedFrame):
+        # The foot (x, y, z), of which z is along n, and the first tangent, which is only the frame's choice of axes.
+        count = 1 if isinstance(scene.surface, Torus) else 2
+    return range(PLACE.start, PLACE.start + count)
 
 
 # Tumbling tops on the plane

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..validation import is_traced
-from ._batched_primitive import find
+from ._batched_primitive import Request, find
 from .slopes import tangents_of
 from .variation import tangent_scale
 
@@ -70,7 +70,7 @@ def differentiable_solve(question: AbstractDifferentiableSolve, *leaves: Float[A
 
     @jax.custom_jvp
     def found(*leaves):
-        return _of_one(question, lambda question, cells, *leaves: question.answer(cells, *leaves), *leaves)
+        return _of_one(Request(question), *leaves)
 
     @functools.partial(found.defjvp, symbolic_zeros=True)
     def variation(leaves, tangents):
@@ -100,7 +100,10 @@ def _change(question: AbstractDifferentiableSolve, value: Array, slopes: tuple[A
     def share(slope: Array, tangent: Array) -> Array:
         # Selected before and after, so that an infinite tangent or cotangent of an absent answer is dropped, not multiplied.
         kept = jnp.where(jnp.all(none), 0.0, tangent)
-        return jnp.where(none, 0.0, jnp.tensordot(slope, kept, axes=jnp.ndim(tangent)))
+        product = slope * kept
+        # Where the answer does not move, a cotangent that is not a number, such as that of theta at the pole, says nothing.
+        product = jnp.where(slope == 0.0, 0.0, product).sum(axis=tuple(range(jnp.ndim(value), jnp.ndim(product))))
+        return jnp.where(none, 0.0, product)
 
     return sum(share(slope, tangent) for slope, tangent in zip(slopes, tangents, strict=True))
 
@@ -112,20 +115,26 @@ def _with_slopes(
 
     @jax.custom_jvp
     def found(*leaves):
-        return _of_one(question, lambda question, *given: question.with_slopes(active, False, *given), *leaves)
+        return _of_one(Request(question, active), *leaves)
 
     @found.defjvp
     def second_variation(leaves, tangents):
         # Differentiated operation by operation, which those of a block are not.
-        once = functools.partial(question.with_slopes, active, True, 1)
-        return jax.jvp(lambda *numbers: _only(once(*numbers)), leaves, tangents)
+        return jax.jvp(functools.partial(_again, question, active), leaves, tangents)
 
     return found
 
 
-def _of_one(question: AbstractDifferentiableSolve, way: Callable[..., Any], *leaves: Float[Array, "..."]) -> Any:
-    """What is found of one run, in one of the ways of `_block.Request`."""
-    return find(question, way, *leaves) if question.in_blocks else _only(way(question, 1, *leaves))
+# Compiled as a whole even outside of `jit`.
+@eqx.filter_jit
+def _again(question: AbstractDifferentiableSolve, active: tuple[int, ...], *leaves: Float[Array, "..."]) -> Any:
+    """Answer and slopes of one run as operations that can be differentiated."""
+    return _only(question.with_slopes(active, True, 1, *leaves))
+
+
+def _of_one(request: Request, *leaves: Float[Array, "..."]) -> Any:
+    """What is found of one run."""
+    return find(request, *leaves) if request.question.in_blocks else _only(request.tree(1, *leaves))
 
 
 def _only(results: Any) -> Any:

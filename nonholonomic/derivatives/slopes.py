@@ -1,6 +1,7 @@
 """Derivatives of the event times of many cells along directions in which the numbers of a problem move.
 
-Along one direction its variation runs along (`variation.py`); along several every run is taken back once (`_adjoint.py`).
+Up to `MOST_FORWARD` directions are integrated forward, as variations beside the run (`variation.py`); more of them take one
+backward pass of every run (`_adjoint.py`).
 """
 
 import math
@@ -27,6 +28,11 @@ from ..integration import (
 from ..xla_cpu import compiled_alone
 from ._adjoint import solve_with_adjoint
 from .variation import VariationalProblem, in_groups, slopes_by_variations
+
+#: Up to this many directions are integrated forward, in pairs. Cost in tables of the same launches, at 1e-8, by 2, 3, 4 and 6
+#: numbers, forward and backward: on the plane 5.0, 7.3, 8.4, 15 and 7.8, 13, 7.4, 7.6 (jax 0.10) or 4.6, 6.9, 8.4, 14 and
+#: 8.5, 11, 10, 11 (jax 0.12); in a cylinder 5.2, 8.5, 9.5, 16 and 9.4, 12, 10, 12 (jax 0.10). By one number: 2.8.
+MOST_FORWARD = 4
 
 
 def ensemble_solve_with_tangents(
@@ -62,7 +68,7 @@ def ensemble_solve_with_tangents(
     def along(some: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
         return slopes_by_variations(problem, some, *given, one_kernel=one_kernel)
 
-    if one_kernel and len(tangents) > 1:
+    if one_kernel and len(tangents) > MOST_FORWARD:
         there, slopes = _slopes_by_adjoint(problem, tangents, *given)
     else:
         there, slopes = in_groups(along, tangents)

@@ -23,6 +23,7 @@ from .graph import Paraboloid as Paraboloid
 from .implicit import Implicit as Implicit
 from .linear import inverse as inverse
 from .linear import solve as solve
+from .planar_length import planar_length as planar_length
 from .plane import Plane as Plane
 from .quadric import AbstractQuadric as AbstractQuadric
 from .quadric import Sphere as Sphere

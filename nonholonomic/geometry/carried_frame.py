@@ -16,6 +16,7 @@ from ..validation import Bound, as_number
 from ..xla_cpu import stored
 from .cylinder import Cylinder
 from .frames import AbstractFrame, CylinderFrame, Fixed, FrameMotion, Place, PlaneFrame, SphereFrame, Tangent, along
+from .planar_length import planar_length
 from .plane import Plane
 from .quadric import Sphere
 from .surface import AbstractSurface
@@ -88,11 +89,18 @@ class CarriedFrame(AbstractFrame):
         zero = jnp.zeros_like(eta)
         names = [name for name, _ in self.surface.coordinates]
         place = tuple(eta if name == "eta" else zero for name in names)
-        return self.at_foot(self.surface.chart(place_named(self.surface, place))[0])
+        foot = self.surface.chart(place_named(self.surface, place))[0]
+        return self._start(foot, along_eta=isinstance(self.surface, Cylinder | Sphere))
 
     def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
+        return self._start(foot, along_eta=isinstance(self.surface, Cylinder))
+
+    def _start(self, foot: Fixed, along_eta: bool) -> tuple[Place, Place]:
+        """The frame at a foot. `along_eta`: whether t1 points as in `CylinderFrame`, along growing eta inside; the projection
+        of the x axis reverses its direction at eta = pi/2."""
         foot = tuple(jnp.broadcast_arrays(*(0.0 if x is None else x for x in foot)))
-        t1, _ = tangents(self.normal(foot))
+        normal = self.normal(foot)
+        t1 = (normal[2], jnp.zeros_like(normal[1]), -normal[0]) if along_eta else tangents(normal)[0]
         return (*foot, *t1), ()
 
     def normal(self, foot: Fixed) -> Fixed:
@@ -151,7 +159,7 @@ class CarriedFrame(AbstractFrame):
         foot, names = place[:3], [name for name, _ in self.surface.coordinates]
         if "eta" not in names:
             t1_up, t2_up, n_up = self.vertical(place)
-            return jnp.arctan2(jnp.hypot(t1_up, t2_up), n_up)
+            return jnp.arctan2(planar_length(t1_up, t2_up), n_up)
         eta = self.surface.place_at(foot)[names.index("eta")]
         return eta + 0.5 * jnp.pi if names[0] == "mu" else eta
 

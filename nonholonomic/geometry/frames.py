@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..validation import as_number
+from .planar_length import planar_length
 from .vector import Component, Vector, cross, dot, multiply, scale, subtract, sum_vectors, tangents
 
 #: What a frame integrates, as components along axis 0 of a state.
@@ -250,7 +251,7 @@ class SphereFrame(AbstractFrame):
         return carried(cyclic, turning)
 
     def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
-        return jnp.arctan2(jnp.hypot(place[0], place[1]), self._side * place[2])
+        return jnp.arctan2(planar_length(place[0], place[1]), self._side * place[2])
 
     def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
         x, z = cyclic, place

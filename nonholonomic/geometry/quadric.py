@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from ..validation import Bound, as_number, require
 from .level import AbstractLevel
+from .planar_length import planar_length
 from .surface import AbstractSurface, Place
 from .vector import Component, Vector, dot, multiply, scale, subtract, sum_vectors
 
@@ -61,7 +62,7 @@ class AbstractQuadric(AbstractSurface):
     def place_at(self, position: Vector) -> Place:
         equatorial, polar = self.semi_axes
         x, y, z = position
-        return (jnp.arctan2(y, x), jnp.arctan2(z / polar, jnp.hypot(x, y) / equatorial))
+        return (jnp.arctan2(y, x), jnp.arctan2(z / polar, planar_length(x, y) / equatorial))
 
     def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
         (equatorial, polar), (mu, eta) = self.semi_axes, place

@@ -33,6 +33,7 @@ from .scheduler import Outcome as Outcome
 from .scheduler import Progress as Progress
 from .settings import ABSOLUTE as ABSOLUTE
 from .settings import LOOSEST as LOOSEST
+from .settings import TIGHTEST as TIGHTEST
 from .settings import Settings as Settings
 from .settings import lanes_for as lanes_for
 from .settings import require_adaptive as require_adaptive

@@ -156,6 +156,13 @@ class ChunkStore:
         with replacing(self.folder / f"{chunk}.npz") as scratch, scratch.open("wb") as stream:
             np.savez(stream, **{name: np.asarray(some, kinds[name]) for name, some in values.items()})
 
+    def interrupted(self) -> str:
+        """What Ctrl-C leaves, and how to go on."""
+        numbers = {int(file.stem) for file in self.folder.glob("*.npz")} | self.finished
+        cells = self.layout.cells if self._whole else sum(map(self.layout.size, numbers))
+        total = with_spaces(self.layout.cells)
+        return f"saved {with_spaces(cells)} of {total} cells to {self.path}; run the same call again to resume"
+
     def _locked(self) -> Any:
         """Keep other processes from computing the same file; the system releases it when the process ends."""
         if fcntl is None:
@@ -182,6 +189,11 @@ class ChunkStore:
         if self._lock is not None:
             self.path.with_name(self.path.name + ".lock").unlink(missing_ok=True)
             self._lock.close()
+
+
+def with_spaces(count: int) -> str:
+    """A count with its digits in groups of three."""
+    return f"{count:,}".replace(",", " ")
 
 
 def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:

@@ -3,6 +3,7 @@
 import contextlib
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -94,8 +95,8 @@ _starting = threading.Lock()
 
 def _started(place: int, threads: int) -> ProcessPoolExecutor:
     """A process, which has its cores and its settings before its first line runs."""
-    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _leave_with_the_parent)
-    with _starting, _environment(_settings()), _cores(place, threads):
+    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin)
+    with _starting, _environment(_settings()), _cores(place, threads), _without_interrupts():
         # The process starts with the first call.
         begun = pool.submit(int)
     try:
@@ -145,6 +146,27 @@ def _cores(place: int, threads: int) -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, allowed)
+
+
+@contextlib.contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Have this thread, and processes that it starts, put off Ctrl-C."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _begin() -> None:
+    """Prepare a process: Ctrl-C on a terminal reaches it too, and ends it at once and without a traceback."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    _leave_with_the_parent()
 
 
 def _leave_with_the_parent() -> None:

@@ -14,9 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..compiled_programs import forget_programs_if_many
 from ..progress import Progress
 from ..validation import require_flag
-from ._chunks import ChunkStore
+from ._chunks import ChunkStore, with_spaces
 from ._file import LONG_NAMES, Stored
 from .dispatch import MAX_CRASHES, ExecutorBroken, handed_out
 from .grid import Axis, Variable, columns, size_of
@@ -65,7 +66,8 @@ def sweep(
 
     **Raises:** `ValueError` for an executor that is none, and if there is no file, and less memory than the table takes;
     `OSError` or `ValueError` if the file cannot be written or holds another request; `RuntimeError` if the executor breaks
-    down or a worker has other versions: what had finished is in the file.
+    down or a worker has other versions: what had finished is in the file. `KeyboardInterrupt` after Ctrl-C, with a message that
+    says how many cells are saved.
     """
     require_flag(progress, "progress")
     if executor is not None and not isinstance(executor, Executor):
@@ -75,11 +77,14 @@ def sweep(
     given = given if most is None else min(given, most)
     layout = layout_of(axes, inner, variables, request, given)
     layout = layout._replace(chunk=given * chunks_together(layout, given))
+    forget_programs_if_many()
     work = ChunkTask(job, axes, given)
     store = Held(layout) if path is None else ChunkStore(path, layout)
     try:
         found = store.filled(computed(work, layout, store.finished, executor, progress))
         return Table.of(found) if isinstance(found, Stored) else Table.laid_out(layout, found)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(store.interrupted()) from None
     except ExecutorBroken as error:
         kept = (
             "nothing is kept without path=" if path is None else f"{path} has what is done; the same call does the rest"
@@ -99,7 +104,7 @@ def computed(
         begun = executor is None
         if begun:
             if todo:
-                work.compile()
+                in_a_thread(work.compile)
             shown.begin(done)
         try:
             for chunk, values in handed_out(lambda chunk: submit(chunk * layout.chunk, layout.chunk), todo, HANDED_OUT):
@@ -163,8 +168,21 @@ class Held:
                 self._found[name][first:end] = some
         return self._found
 
+    def interrupted(self) -> str:
+        """What Ctrl-C leaves."""
+        return f"interrupted; none of {with_spaces(self._layout.cells)} cells is saved without path="
+
     def close(self) -> None:
         """Nothing is to be closed."""
+
+
+def in_a_thread(function: Callable[[], None]) -> None:
+    """Call a function in another thread, so that this one hears Ctrl-C: XLA compiles for many seconds without listening."""
+    pool = ThreadPoolExecutor(1)
+    try:
+        pool.submit(function).result()
+    finally:
+        pool.shutdown(wait=False)
 
 
 @contextlib.contextmanager

@@ -1,5 +1,7 @@
 """Steady motions of the tippe top: zeros of the field, thresholds against eigenvalues, groups."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -90,6 +92,46 @@ def test_eigenvalues_of_a_standing_top_change_sign_at_the_critical_spin(inverted
     sign = -1.0 if inverted else 1.0
     assert jnp.all(sign * standing_growth(scenes, critical * (1.0 + 1e-6), inverted) > 0.0)
     assert jnp.all(sign * standing_growth(scenes, critical * (1.0 - 1e-6), inverted) < 0.0)
+
+
+@pytest.mark.parametrize(
+    ("surface", "same"),
+    [
+        (tippe.Spheroid(0.3, 0.3), tippe.Sphere(0.3)),
+        (tippe.Paraboloid(0.3), tippe.Sphere(0.3)),
+        (tippe.Graph(lambda x, y: 0.3 - jnp.sqrt(0.09 - x * x - y * y)), tippe.Sphere(0.3)),
+    ],
+    ids=["spheroid", "paraboloid", "graph"],
+)
+def test_a_standing_top_feels_only_the_curvature_of_the_arena(surface, same):
+    """Arenas of one curvature at the lowest point have the same eigenvalues, whatever frame the equations are in."""
+    found, expected = (
+        np.linalg.eigvals(steady.standing_matrix(scene(0.3, 0.94, surface=one), 100.0, inverted=True))
+        for one in (surface, same)
+    )
+    assert len(found) == len(expected)
+    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(expected), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("surface", "growth"),
+    [
+        (tippe.Plane(), None),
+        (tippe.Cylinder(0.3), -0.1614),
+        (tippe.Sphere(0.3), -0.0760),
+        (tippe.Torus(0.6, 0.3), None),
+    ],
+    ids=["plane", "cylinder", "sphere", "torus"],
+)
+def test_a_standing_top_is_as_stable_whether_or_not_it_may_fly(surface, growth):
+    """Inverted, 100 rad/s: "hybrid" and "stop" agree, and no direction of symmetry counts as marginal."""
+    stops = scene(0.3, 0.94, surface=surface)
+    flies = dataclasses.replace(stops, contact="hybrid", restitution=0.5)
+    rates = [float(steady.growth_rate(steady.standing_matrix(one, 100.0, inverted=True))) for one in (stops, flies)]
+    assert rates[0] == rates[1]
+    assert rates[0] < -1e-3
+    if growth is not None:
+        assert rates[0] == pytest.approx(growth, rel=2e-3)
 
 
 def test_tops_of_groups_one_and_three_have_no_critical_spin():

@@ -1,21 +1,18 @@
 """The error estimate of a table's times: against references, near the threshold, and as digits."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
 from lagrange_top import inversion
+from random_scenes import IN_PHASES, SMOOTH, batch
 from tops import rutstam_top
 
 import tippe
-from nonholonomic.integration import Settings, solve_ensemble
 from nonholonomic.sweeps.digits import concise, concise_strings
 from tippe import steady
-from tippe.modes.inversion_problem import InversionProblem
 from tippe.runs.cells import InversionRuns, run_kind_of
-from tippe.runs.inversion import is_inverted
 from tippe.runs.table import InversionJob
-from tippe.runs.time_error import COARSER, time_error
+from tippe.runs.time_error import FINER, SAFETY, SAFETY_OF_HISTORIES, error_bound, errors_of, second_tolerance
 
 SCENE = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
 ANGLE = np.pi - 0.1
@@ -57,12 +54,12 @@ def test_times_through_the_threshold(near_threshold):
 
 @pytest.mark.parametrize("factor", [1.01, 1.2])
 def test_the_estimate_covers_the_error_near_the_threshold(near_threshold, factor):
-    """Above the true error, below a hundred times of it (twenty is due)."""
+    """Above the true error, below thirty times of it (five is due)."""
     cell = int(np.flatnonzero(factor == FACTORS)[0])
     status, time = reference(factor)
     assert status == "inverted"
     error = abs(near_threshold.time[cell] - time)
-    assert error < near_threshold.time_error[cell] < 100.0 * error
+    assert error < near_threshold.time_error[cell] < 30.0 * error
 
 
 @pytest.mark.slow
@@ -73,7 +70,7 @@ def test_the_estimate_covers_the_error_in_every_cell_through_the_threshold(near_
         known_status, known = reference(factor)
         assert known_status == status
         if status == "inverted":
-            assert abs(time - known) < estimate < 100.0 * abs(time - known)
+            assert abs(time - known) < estimate < 30.0 * abs(time - known)
 
 
 def test_digits_of_a_table(near_threshold):
@@ -92,7 +89,7 @@ def test_digits_of_a_table(near_threshold):
 
 def test_the_rest_of_the_table_is_that_without_errors(near_threshold):
     plain = tippe.inversion_table(SCENE, theta=0.1, spin=threshold_spins(FACTORS), t1=40.0, angle=ANGLE, tolerance=1e-8)
-    assert list(plain.variables) == [name for name in near_threshold.variables if name != "time_error"]
+    assert list(plain.variables) == [name for name in near_threshold.variables if not name.endswith("_error")]
     for name, values in plain.variables.items():
         assert (values == near_threshold.variables[name]).all()
     with pytest.raises(ValueError, match="the table has no 'time_error'"):
@@ -103,23 +100,47 @@ def test_the_rest_of_the_table_is_that_without_errors(near_threshold):
 
 def test_a_cell_on_which_the_runs_disagree_is_in_doubt():
     """A horizon between the two runs' times of one cell: the fine one has just not inverted, or just has."""
-    arguments = {"theta": 0.1, "spin": [100.0, 110.0], "t1": 20.0, "tolerance": 1e-8}
-    fine = tippe.inversion_table(SCENE, **arguments)
-    coarse = tippe.inversion_table(SCENE, **arguments | {"tolerance": 1e-8 * COARSER})
-    middle = 0.5 * float(fine.time[0] + coarse.time[0])
-    assert abs(fine.time[0] - coarse.time[0]) > 1e-8
+    arguments = {"theta": 0.1, "spin": [100.0, 110.0], "t1": 20.0, "tolerance": 1e-6}
+    first = tippe.inversion_table(SCENE, **arguments)
+    second = tippe.inversion_table(SCENE, **arguments | {"tolerance": 1e-6 / FINER})
+    middle = 0.5 * float(first.time[0] + second.time[0])
+    assert abs(first.time[0] - second.time[0]) > 1e-8
     table = tippe.inversion_table(SCENE, **arguments | {"t1": middle}, errors=True)
-    assert np.isinf(table.time_error[0])
+    assert np.isinf([table.time_error[0], table.end_time_error[0], table.end_theta_error[0]]).all()
+    assert table.status_error.tolist() == [1, 0]
     assert table.digits()[0] == table.status[0] + "?"
     assert np.isfinite(table.time_error[1])
-    assert_close(table.time[1], fine.time[1], rtol=1e-12)
+    assert_close(table.time[1], first.time[1], rtol=1e-12)
 
 
-def test_estimate_of_two_runs():
-    """Twice the difference; nothing to doubt where both have no time; everything where they disagree."""
-    time, coarse = np.array([5.0, np.inf, 5.0, np.inf, 0.0]), np.array([5.25, np.inf, np.inf, np.inf, 0.0])
-    found = time_error(time, coarse, np.array([True, True, False, False, True]))
-    assert found.tolist() == [0.5, 0.0, np.inf, np.inf, 0.0]
+def test_bound_of_two_runs():
+    """A multiple of the difference, greater after different histories; nothing to doubt where both have no time; everything
+    where they disagree; and no number is known better than to its round-off."""
+    time, second = np.array([5.0, 5.0, np.inf, 5.0, np.inf, 0.0]), np.array([5.25, 5.25, np.inf, np.inf, np.inf, 0.0])
+    agree, same = np.array([True, True, True, True, False, True]), np.array([True, False, True, True, True, True])
+    expected = [0.25 * SAFETY, 0.25 * SAFETY_OF_HISTORIES, 0.0, np.inf, np.inf, 0.0]
+    assert error_bound(time, second, agree, same).tolist() == expected
+    assert error_bound(np.array([5.0]), np.array([5.0]), np.array([True]), np.array([True])) == 5e-14
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "second"), [(1e-9, 1e-11), (1e-12, 1e-14), (3e-13, 3e-11), (1e-14, 1e-12), (1e-2, 1e-4)]
+)
+def test_the_second_tolerance_is_one_that_can_be_integrated_with(tolerance, second):
+    assert second_tolerance(tolerance) == pytest.approx(second, rel=1e-12)
+    assert second_tolerance(tolerance) >= 1e-14
+
+
+def test_a_hop_is_no_reason_for_a_lesser_error():
+    """A top that flies: 6e-9 s off at the default tolerance, by the same top at 1e-13; the bound says so, and so do those of
+    the end and the number of flights."""
+    scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3), contact="hybrid")
+    table = tippe.inversion_table(scene, theta=0.1, spin=155.0, t1=8.0, errors=True)
+    error = abs(float(table.time) - 5.96933253895)
+    assert 1e-9 < error < float(table.time_error) < 30.0 * error
+    assert_close(table.end_time_error, table.time_error, rtol=1e-3)
+    assert 0.0 < float(table.end_theta_error) < 1e-7
+    assert (table.hops_error, table.status_error) == (0, 0)
 
 
 CONCISE = [
@@ -153,8 +174,9 @@ def test_agreement_on_no_answer_is_no_agreement(monkeypatch):
     words = run_kind_of(scene).words
 
     def results(runs, *_):
+        ends = {"end_time": np.ones(len(words)), "end_theta": np.ones(len(words)), "hops": np.zeros(len(words), int)}
         times = {name: np.full(len(words), np.inf) for name in runs.times}
-        return times | {"status": np.arange(len(words), dtype=np.int8)}
+        return times | ends | {"status": np.arange(len(words), dtype=np.int8)}
 
     monkeypatch.setattr(InversionRuns, "results", results)
     runs = InversionRuns(run_kind_of(scene), 1.0, ANGLE, "both", None, "ensemble", [])
@@ -177,72 +199,48 @@ def test_the_file_keeps_the_errors(tmp_path):
 # Statistics over random scenes
 
 
-def random_scenes(random, count, surface, law):
-    """Scenes and launches as in `make_inversion_reference.py`, one number per cell."""
-    mass, R = random.uniform(0.005, 0.05, count), random.uniform(0.015, 0.03, count)
-    a, I3 = R * random.uniform(0.1, 0.35, count), mass * R * R * random.uniform(0.3, 0.45, count)
-    I1, theta, mu = (
-        I3 * random.uniform(0.9, 1.1, count),
-        random.uniform(0.05, 0.5, count),
-        random.uniform(0.1, 0.5, count),
-    )
-    alpha, gamma = a / R, I1 / I3
-    threshold = R * np.sqrt(mass * 9.81 * a * I3 * (1 + alpha) ** 4 / np.maximum(1 + alpha - gamma, 1e-3))
-    spin = threshold / (I3 * (R * np.cos(theta) - a)) * random.uniform(0.5, 3.0, count)
-    arena = {"plane": tippe.Plane, "cylinder": tippe.Cylinder, "sphere": tippe.Sphere}[surface]
-    arena = arena() if surface == "plane" else arena(R * random.uniform(5.0, 30.0, count))
-    friction = tippe.Viscous(mu) if law == "viscous" else tippe.Coulomb(mu, random.uniform(0.02, 0.2, count))
-    eta = np.zeros(count) if surface == "plane" else random.uniform(-1.0, 1.0, count)
-    launch = tippe.Launch(theta, np.minimum(spin, 400.0), eta, random.uniform(-np.pi, np.pi, count))
-    return tippe.Scene(tippe.Top(mass, R, a, I1, I3), arena, friction), launch
+def runs_of(kind, count, tolerances):
+    """The variables of random scenes of a kind (`random_scenes.py`) at each tolerance, and how many things are counted."""
+    scene, launch, columns = batch(kind, count)
+    runs = InversionRuns(run_kind_of(scene), 8.0, 0.95 * np.pi, "first", None, "ensemble", [])
+    roots = {"scene": scene, "launch": launch}
+    return {tolerance: runs.results(roots, columns, tolerance, count) for tolerance in tolerances}, runs.driver.counts
 
 
-def times(scene, launch, tolerance, crossing, t1=12.0):
-    """Times and codes of every cell at one tolerance."""
-    cells = launch.theta.size
-    problem = InversionProblem.of(scene, launch, 0.95 * np.pi, cells)
-    given = (problem, jnp.asarray(t1), jnp.asarray(cells), Settings(tolerance))
-    outcome, _ = solve_ensemble(*given, passes=crossing == "last")
-    inverted = np.asarray(is_inverted(outcome, problem, crossing == "last"))
-    return np.where(inverted, outcome.crossing_time, np.inf), np.where(inverted, -1, outcome.status)
+def judged(first, second, true, counts):
+    """How many times a table with errors has, how many err by more than the bound, for how many the bound is more than 30
+    times the error, and how many cells have a wrong status of which nothing is said."""
+    bounds = errors_of(first, second, ("time",), counts, (3, 6))
+    both = np.isfinite(first["time"]) & np.isfinite(true["time"]) & np.isfinite(bounds["time_error"])
+    bound = bounds["time_error"][both]
+    error = np.abs(first["time"][both] - true["time"][both])
+    # The reference has its own round-off.
+    error = np.maximum(error - 1e-13 * true["time"][both], 0.0)
+    unseen = (first["status"] != true["status"]) & (bounds["status_error"] == 0)
+    return np.array([both.sum(), (error > bound).sum(), (bound > 30.0 * (error + 1e-13)).sum(), unseen.sum()])
 
 
-KINDS = [
-    ("plane", "viscous"),
-    ("plane", "Coulomb"),
-    ("cylinder", "viscous"),
-    ("cylinder", "Coulomb"),
-    ("sphere", "viscous"),
-]
+def test_the_bound_holds_in_random_scenes():
+    """The short form of the study below: 200 tops on the plane, of which fifty invert."""
+    runs, counts = runs_of("plane-viscous-stop", 200, (1e-8, 1e-10, 1e-13))
+    cells, below, far_above, unseen = judged(*runs.values(), counts)
+    assert cells > 30
+    assert (below, unseen) == (0, 0)
+    assert far_above <= 0.1 * cells
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("crossing", ["first", "last"])
-def test_the_estimate_over_random_scenes(crossing):
-    """Of about 500 times, against 1e-13: how many errors exceed the estimate, and how many are below a hundredth of it.
-
-    Measured: 0.4 % and 2.1 % at 1e-10, 2.6 % and 2.5 % at 1e-9, 2.3 % and 8.9 % at 1e-8, 3.3 % and 33 % at 1e-7 (first
-    crossings; the last ones are much alike). Some of the first kind are short excursions past the angle over which both runs
-    step: then the error is that of a whole nutation.
-    """
-    found = {}
-    for number, (surface, law) in enumerate(KINDS):
-        scene, launch = random_scenes(np.random.default_rng((7, number)), 400, surface, law)
-        true, true_status = times(scene, launch, 1e-13, crossing)
-        runs = {tolerance: times(scene, launch, tolerance, crossing) for tolerance in (1e-10, 1e-9, 1e-8, 1e-7, 1e-6)}
-        for tolerance in (1e-10, 1e-9, 1e-8, 1e-7):
-            (time, status), (coarse, coarse_status) = runs[tolerance], runs[tolerance * COARSER]
-            estimate = time_error(time, coarse, status == coarse_status)
-            inverted = np.isfinite(time) & np.isfinite(true)
-            error = np.abs(np.where(inverted, time, 0.0) - np.where(inverted, true, 0.0))
-            both = inverted & np.isfinite(estimate)
-            below, far_above = both & (error > estimate), both & (estimate > 100.0 * error)
-            unseen = (status != true_status) & np.isfinite(estimate)
-            counts = np.array([both.sum(), below.sum(), far_above.sum(), unseen.sum()])
-            found[tolerance] = found.get(tolerance, 0) + counts
-    most = {1e-10: (0.015, 0.04), 1e-9: (0.04, 0.05), 1e-8: (0.06, 0.12), 1e-7: (0.06, 0.45)}
-    for tolerance, (cells, below, far_above, unseen) in found.items():
-        assert cells > 400
-        assert below <= most[tolerance][0] * cells
-        assert far_above <= most[tolerance][1] * cells
-        assert unseen <= 0.005 * cells
+def test_the_bound_holds_in_random_scenes_of_all_kinds():
+    """4500 scenes on eight arenas under five laws, against 1e-13; `docs/validation.md` has what is measured."""
+    tolerances = [10.0**-k for k in range(6, 14)]
+    total = {tolerance: np.zeros(4, int) for tolerance in tolerances[:-2]}
+    for kind in (*SMOOTH, *IN_PHASES):
+        runs, counts = runs_of(kind, 300, tolerances)
+        for k, tolerance in enumerate(tolerances[:-2]):
+            total[tolerance] += judged(*(runs[tolerances[j]] for j in (k, k + 2, -1)), counts)
+    for tolerance, (cells, below, far_above, unseen) in total.items():
+        print(f"{tolerance:.0e}: {cells} times, {below} below, {far_above} far above, {unseen} unseen")
+        assert cells > 1000
+        assert below <= 0.003 * cells
+        assert far_above <= 0.1 * cells
+        assert unseen <= 0.003 * cells

@@ -117,3 +117,34 @@ def test_later_samples_are_further_along():
         return tippe.simulate(scene, tippe.Launch(0.1, 155.0), 0.6, times=TIMES * stretch).theta[-1]
 
     assert_close(jax.grad(angle)(1.0), extrapolated(lambda s: float(angle(jnp.asarray(s))), 1.0, 1e-3), rtol=1e-5)
+
+
+def thetas_of_a_top_that_starts_along_the_normal(theta=0.0, azimuth=0.0, mu=0.3, surface=None, eta=0.0):
+    scene = tippe.Scene(rutstam_top(), surface or tippe.Plane(), tippe.Viscous(mu))
+    return tippe.simulate(scene, tippe.Launch(theta, 155.0, eta, azimuth), 0.5, times=TIMES).theta
+
+
+def test_theta_by_theta_at_the_pole_is_the_one_sided_derivative_forward_and_unknown_backward():
+    """In all azimuths alike, against launches beside the pole; by mu, which does not move the axis, it is 0."""
+    by_theta = jax.jit(jax.vmap(jax.jacfwd(thetas_of_a_top_that_starts_along_the_normal), (None, 0)))
+    found = by_theta(0.0, jnp.array([0.0, 1.0]))
+    beside = thetas_of_a_top_that_starts_along_the_normal(1e-5, 1.0) / 1e-5
+    assert_close(found[0], found[1], rtol=1e-7)
+    assert_close(found[1], beside, rtol=1e-6)
+    assert_close(found[0, [1, -1]], [0.606, 0.334], atol=6e-4)
+    backward = jax.grad(
+        lambda *numbers: thetas_of_a_top_that_starts_along_the_normal(numbers[0], 1.0, numbers[1])[-1], (0, 1)
+    )
+    by_theta, by_mu = backward(0.0, 0.3)
+    assert np.isnan(by_theta)
+    assert by_mu == 0.0
+
+
+def test_a_first_sample_at_the_pole_leaves_the_derivatives_of_the_others():
+    """On a slope the axis leaves the normal: d theta / d mu of all samples together, backward, against a difference."""
+
+    def total(mu):
+        return jnp.sum(thetas_of_a_top_that_starts_along_the_normal(0.0, mu=mu, surface=tippe.Sphere(0.3), eta=0.5))
+
+    expected = extrapolated(lambda mu: float(total(jnp.asarray(mu))), 0.3, 1e-3)
+    assert_close(jax.grad(total)(0.3), expected, rtol=1e-6)

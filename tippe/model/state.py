@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import Component, Tangent, Vector, dot, scale, sum_vectors
+from nonholonomic.geometry import Component, Tangent, Vector, dot, planar_length, scale, sum_vectors
 
 #: Where the parts stand in a state.
 VELOCITY, AXIS, MOMENTUM, PLACE = slice(0, 2), slice(2, 5), slice(5, 8), slice(8, None)
@@ -40,7 +40,7 @@ def joined(*some: tuple[Component, ...]) -> Float[Array, "components ..."]:
 
 def inclination(axis: Vector) -> Float[Array, "..."]:
     """The angle theta [rad] from the arena's normal to the axis, in [0, pi]."""
-    return jnp.arctan2(jnp.hypot(axis[0], axis[1]), axis[2])
+    return jnp.arctan2(planar_length(axis[0], axis[1]), axis[2])
 
 
 def angular_velocity(body: Any, axis: Vector, momentum: Vector) -> Vector:

@@ -66,6 +66,8 @@ class RunKind(NamedTuple):
 COUNTED = {"steps": "steps", "rejected": "rejected steps", "hops": "flights", "sticks": "changes from slip to rolling"}
 TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_time": "last inversion time"}
 
+NAMES = TIMES | {"end_time": "end of the run", "end_theta": "θ at the end of the run"}
+
 # Compiled once for all blocks.
 _on_the_ground = eqx.filter_jit(airborne.on_the_ground)
 _loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
@@ -144,6 +146,20 @@ class InversionRuns(NamedTuple):
             | self.run_kind.variables
             | ({"grazes": grazes} if self.slopes_by and not self.run_kind.smooth else {})
         )
+
+    @property
+    def error_variables(self) -> dict[str, Variable]:
+        """The table's variables that say how far others can be trusted (`time_error.py`)."""
+        bounds = dict.fromkeys((*self.times, "end_time"), "s") | {"end_theta": "rad"}
+        found = {
+            name: Variable(unit, np.float64, long_name=f"error of the {NAMES[name]}") for name, unit in bounds.items()
+        }
+        found |= {"status": Variable("1", np.int8, long_name="whether the two runs disagree on the status")}
+        found |= {
+            name: Variable("1", np.int64, long_name=f"difference of the two runs in {COUNTED[name]}")
+            for name in self.run_kind.counts
+        }
+        return {f"{name}_error": variable for name, variable in found.items()}
 
     def results(self, roots: dict[str, Any], columns: dict[str, Any], tolerance: float, count: int) -> dict[str, Any]:
         """The variables of some cells.

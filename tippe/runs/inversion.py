@@ -14,6 +14,7 @@ from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import CROSSED, LOOSEST, REACHED_END, Outcome, run_bounds
 from nonholonomic.parameters import numbers
 from nonholonomic.validation import Bound, all_bounds, legal, nan_unless, require_all, require_scalars
+from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.launch import Launch
 from ..model.scene import Scene
@@ -46,6 +47,8 @@ def permitted(
     return may, t1, jnp.min(tolerance)
 
 
+# One program where it is called on its own, not one for every comparison.
+@compiled_setup
 def nan_if_illegal(found: Float[Array, ""], structure: Any, unchecked: bool, leaves: list[Any]) -> Float[Array, ""]:
     """What was found, or NaN, and so every derivative of it, where numbers are not legal. **Arguments:** as for `permitted`."""
     return nan_unless(permitted(structure, unchecked, leaves)[0], found) if unchecked else found

@@ -55,8 +55,9 @@ def inversion_time(
     """Time at which theta reaches an angle; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
     The derivative is that of the event's time by the implicit function theorem; it is 0 where the result is infinite.
-    Differentiating by one parameter costs about as much again as the time itself, by any number of them four to seven
-    times as much (`nonholonomic/derivatives/slopes.py`); second derivatives take forward-mode passes.
+    The time and its derivative by one parameter cost about three times the time alone, by two parameters five times, by
+    three or four seven to ten times, and by any number more eight to thirteen times (`nonholonomic/derivatives/slopes.py`);
+    second derivatives take forward-mode passes.
 
     **Arguments:**
 

@@ -6,18 +6,17 @@ from concurrent.futures import Executor
 from typing import Any, NamedTuple
 
 import diffrax
-import numpy as np
 
 from nonholonomic.integration import Settings, explicit_tableau
-from nonholonomic.sweeps import Table, Variable, sweep
+from nonholonomic.sweeps import Table, sweep
 from nonholonomic.validation import require_flag
 
 from ..model.scene import Scene
-from .cells import TIMES, InversionRuns, check_differentiable, run_kind_of
+from .cells import InversionRuns, check_differentiable, run_kind_of
 from .inversion import check_event
 from .launches import described, launches
 from .sensitivities import sensitivity_names, sensitivity_variables
-from .time_error import COARSER, time_error
+from .time_error import errors_of, second_tolerance
 
 
 def inversion_table(
@@ -61,7 +60,9 @@ def inversion_table(
       `nonholonomic.integration.Oscillatory8()`, or `Dopri8()` for method "diffrax".
     - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which supports first
       crossings only.
-    - `errors`: whether to run every cell again at ten times the tolerance, for an estimate of the error of its time.
+    - `errors`: whether to run every cell again at a hundredth of the tolerance, for bounds of its errors; a table then costs
+      2.8 times as much. Below a tolerance of 1e-12 the second run has a hundred times the tolerance instead, and the bounds
+      are wider.
     - `sensitivities`: full names of parameters to differentiate the times by, such as `["scene.friction.mu", "launch.theta"]`;
       the end of a name will do where only one parameter fits.
     - `progress`: whether to show it, on a terminal or in a notebook; `NONHOLONOMIC_PROGRESS=0` hides it everywhere.
@@ -71,9 +72,11 @@ def inversion_table(
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
     "contact_lost", "failed", "jammed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was
-    lost or jammed, when and at what angle), `steps` and `rejected`. With `errors` also `time_error` [s], infinite where
-    the two runs disagree on the status or failed, 0 where they agree that there is no time; `Table.digits("time")`
-    shows the digits it leaves. With `sensitivities` also the derivative of `time` by each number, `time_by_mu` for
+    lost or jammed, when and at what angle), `steps` and `rejected`. With `errors` also `time_error` [s], a bound that is
+    infinite where the two runs disagree on the status or failed, 0 where they agree that there is no time;
+    `Table.digits("time")` shows the digits it leaves. The same for `end_time` and `end_theta`; `hops_error` and
+    `sticks_error` are the differences of the two runs, and `status_error` is 1 where the runs disagree on the status or
+    failed. With `sensitivities` also the derivative of `time` by each number, `time_by_mu` for
     `"scene.friction.mu"`, 0 where the top did not invert. It goes through flights, impacts, stick and slip; there
     `grazes` is 1 where an event on the way, such as a landing, was grazing, so that within the tolerance it may not
     happen at all: the derivative is then NaN (`SetValuedCoulomb` with `contact="hybrid"` has none). A scene with
@@ -131,9 +134,7 @@ def inversion_table(
     variables = runs.variables
     if errors:
         request |= {"errors": True}
-        variables = variables | {
-            f"{name}_error": Variable("s", np.float64, long_name=f"error of the {TIMES[name]}") for name in runs.times
-        }
+        variables = variables | runs.error_variables
     if paths:
         request |= {"sensitivities": paths}
         variables = variables | sensitivity_variables(paths, units)
@@ -143,7 +144,7 @@ def inversion_table(
 class InversionJob(NamedTuple):
     """What is asked of every cell, as data that can be sent to another process.
 
-    `errors`: whether to run every cell again at ten times the tolerance.
+    `errors`: whether to run every cell again at another tolerance.
     """
 
     runs: InversionRuns
@@ -159,11 +160,7 @@ class InversionJob(NamedTuple):
             return {}
         found = runs.results(self.roots, columns, self.tolerance, count)
         if self.errors:
-            coarse = runs._replace(slopes_by=[]).results(self.roots, columns, COARSER * self.tolerance, count)
-            # Two runs that ended before their answer agree on nothing.
-            silent = [words.index(word) for word in ("failed", "unresolved") if word in words]
-            agreed = (found["status"] == coarse["status"]) & ~np.isin(found["status"], silent)
-            for name in runs.times:
-                alike = agreed & (np.isfinite(found[name]) == np.isfinite(coarse[name]))
-                found[f"{name}_error"] = time_error(found[name], coarse[name], alike)
+            second = runs._replace(slopes_by=[]).results(self.roots, columns, second_tolerance(self.tolerance), count)
+            silent = tuple(words.index(word) for word in ("failed", "unresolved") if word in words)
+            found |= errors_of(found, second, runs.times, runs.run_kind.counts, silent)
         return found

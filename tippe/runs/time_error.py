@@ -1,32 +1,81 @@
-"""How far an inversion time can be trusted, from two runs of its cell at different tolerances."""
+"""How far the numbers of a table can be trusted, from a second run of each cell at another tolerance."""
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Num
 
-#: Ratio of the second run's tolerance to the first one's. With a pair of eighth order it costs three quarters of the first.
-COARSER = 10.0
+from nonholonomic.integration import TIGHTEST
 
-#: Ratio of the estimate to the difference of the two runs. The error grows as the tolerance, so the difference is nine times
-#: the first run's error; the rest is a margin for cells where the errors of the two runs happen to be close.
-SAFETY = 2.0
+#: Ratio of a tolerance to that of the second run, which with a pair of eighth order costs 1.8 times the first. The error of the
+#: second run is then a hundredth of the first one's, so that the difference of the two is the error of the first. A second run
+#: ten times finer leaves three to five times as many errors above the bound; one ten times coarser, twenty times as many at
+#: 1e-8 with a bound of twice the difference, which exceeds the error by more than 30 in a third of the cells.
+FINER = 100.0
+
+#: Ratio of the bound to the difference of the two runs. With 3 instead of it twice as many errors are above the bound.
+SAFETY = 5.0
+
+#: The same where the two runs differ in the number of flights or sticks on the way. Such a run is chaotic: the difference
+#: is that of two random histories, and up to 90 times smaller than the error.
+SAFETY_OF_HISTORIES = 100.0
+
+#: Least relative error of what accumulates round-off over thousands of steps.
+ROUND_OFF = 1e-14
 
 
-def time_error(
-    time: Float[np.ndarray, " cells"], coarse_time: Float[np.ndarray, " cells"], agreed: Bool[np.ndarray, " cells"]
+def second_tolerance(tolerance: float) -> float:
+    """Tolerance of the second run: a hundredth of the first one's, or a hundred times as large where the integration
+    allows no tighter one; the bound is then up to a hundred times wider."""
+    finer = tolerance / FINER
+    # The quotient of 1e-12 may be a rounding below the least tolerance.
+    return max(finer, TIGHTEST) if finer > 0.99 * TIGHTEST else tolerance * FINER
+
+
+def error_bound(
+    value: Float[np.ndarray, " cells"],
+    second: Float[np.ndarray, " cells"],
+    agree: Bool[np.ndarray, " cells"],
+    same_history: Bool[np.ndarray, " cells"],
 ) -> Float[np.ndarray, " cells"]:
-    """An estimate of the error of `time`, mostly twenty times the error itself (`tests/tippe/test_time_error.py`).
+    """A bound of the error of a number (`docs/validation.md` has how often it fails and how wide it is).
 
     **Arguments:**
 
-    - `time`: times [s], infinite where there is none.
-    - `coarse_time`: the same from a run whose tolerance is `COARSER` times as large.
-    - `agreed`: where the two runs agree on what happened.
+    - `value`: times [s], infinite where there is none, or other numbers.
+    - `second`: the same from the second run.
+    - `agree`: where the two runs agree on what happened.
+    - `same_history`: where they agree on how often each kind of event happened on the way.
 
-    **Returns:** the estimate [s]: infinite where the runs disagree, 0 where they agree that there is no time.
+    **Returns:** the bound, in units of the value: infinite where the runs disagree, 0 where they agree that there is no time.
     """
-    both = np.isfinite(time) & np.isfinite(coarse_time)
-    known = np.where(both, time, 0.0)
-    difference = np.abs(known - np.where(both, coarse_time, 0.0))
-    # No time is known better than to its rounding.
-    error = np.maximum(SAFETY * difference, np.finfo(time.dtype).eps * known)
-    return np.where(agreed, error, np.inf)
+    agree = agree & (np.isfinite(value) == np.isfinite(second))
+    both = np.isfinite(value) & np.isfinite(second)
+    known = np.where(both, value, 0.0)
+    difference = np.abs(known - np.where(both, second, 0.0))
+    bound = np.where(same_history, SAFETY, SAFETY_OF_HISTORIES) * difference
+    return np.where(agree, np.maximum(bound, ROUND_OFF * np.abs(known)), np.inf)
+
+
+def errors_of(
+    first: dict[str, Num[np.ndarray, " cells"]],
+    second: dict[str, Num[np.ndarray, " cells"]],
+    times: tuple[str, ...],
+    counts: tuple[str, ...],
+    silent: tuple[int, ...],
+) -> dict[str, Num[np.ndarray, " cells"]]:
+    """What a table with errors has besides: for each variable an error, under its name and "_error".
+
+    **Arguments:**
+
+    - `first`, `second`: the variables of the two runs of every cell.
+    - `times`, `counts`: which of them are times of crossings, and counts of events on the way.
+    - `silent`: codes of a status with which a run ends before its answer: two such runs agree on nothing.
+
+    **Returns:** bounds for the times, `end_time` and `end_theta`; for each count the difference of the runs; and 1 as
+    `status_error` where the runs disagree on the status or one is silent.
+    """
+    agree = (first["status"] == second["status"]) & ~np.isin(first["status"], silent)
+    counted = {name: np.abs(first[name] - second[name]) for name in counts}
+    same = np.all([difference == 0 for difference in counted.values()], axis=0) if counts else np.ones_like(agree)
+    bounds = {name: error_bound(first[name], second[name], agree, same) for name in (*times, "end_time", "end_theta")}
+    errors = bounds | {"status": (~agree).astype(np.int8)} | counted
+    return {f"{name}_error": np.asarray(error) for name, error in errors.items()}

@@ -9,12 +9,14 @@ import pytest
 from close import assert_close
 
 import nonholonomic.derivatives._adjoint as adjoint
+import nonholonomic.derivatives.slopes as slopes
 from nonholonomic.derivatives import tangents_of
 from nonholonomic.derivatives._shared_values import sharing_values
-from nonholonomic.derivatives.slopes import ensemble_solve_with_tangents
 from nonholonomic.integration import CROSSED, LEFT_DOMAIN, AbstractProblem, Settings
 
 MOVED = ("rate", "height", "growth")
+#: So many that the runs are differentiated backward.
+MANY = (*MOVED, "height", "rate")
 HEIGHTS = np.linspace(0.6, 4.0, 100)
 RATES = np.geomspace(3.0, 0.2, 100)
 
@@ -45,7 +47,7 @@ def time_of_decay(rate, height, growth):
     return (jnp.sqrt(1.0 + 2.0 * growth * jnp.log(2.0 * height) / rate) - 1.0) / growth
 
 
-def found_and_expected(names=MOVED, patience=1e3, heights=HEIGHTS, cells=100, **options):
+def found_and_expected(names=MANY, patience=1e3, heights=HEIGHTS, cells=100, **options):
     """Outcome, slopes by the named numbers, and what they should be; rate and height differ from cell to cell."""
     point = (jnp.asarray(RATES), jnp.asarray(heights), jnp.asarray(0.7))
     tangents = [
@@ -59,18 +61,21 @@ def found_and_expected(names=MOVED, patience=1e3, heights=HEIGHTS, cells=100, **
 
         given = (jnp.asarray(50.0), jnp.asarray(cells), Settings(1e-11, options.pop("solver", diffrax.Dopri8())))
         directions = tangents_of(build, point, tangents)
-        return ensemble_solve_with_tangents(build(*point), directions, *given, **({"one_kernel": True} | options))
+        return slopes.ensemble_solve_with_tangents(
+            build(*point), directions, *given, **({"one_kernel": True} | options)
+        )
 
-    outcome, slopes = run(point, tangents)
+    outcome, found = run(point, tangents)
     every = jax.vmap(jax.grad(time_of_decay, (0, 1, 2)), (0, 0, None))(*point)
-    return outcome, slopes, [every[MOVED.index(name)] for name in names]
+    return outcome, found, [every[MOVED.index(name)] for name in names]
 
 
 @pytest.mark.parametrize(
     ("names", "passes", "solver"),
     [
+        (MANY, False, diffrax.Dopri8()),
+        pytest.param(MANY, True, diffrax.Tsit5(), marks=pytest.mark.slow),
         (MOVED, False, diffrax.Dopri8()),
-        pytest.param(MOVED, True, diffrax.Tsit5(), marks=pytest.mark.slow),
         (("height", "rate"), True, diffrax.Dopri8()),
         pytest.param(("height", "height"), False, diffrax.Tsit5(), marks=pytest.mark.slow),
         pytest.param(("growth",), False, diffrax.Dopri8(), marks=pytest.mark.slow),
@@ -79,18 +84,32 @@ def found_and_expected(names=MOVED, patience=1e3, heights=HEIGHTS, cells=100, **
 )
 def test_the_slopes_are_those_of_the_closed_form(names, passes, solver):
     """For a field that depends on time, more cells than lanes, methods whose last stage is and is not their end."""
-    outcome, slopes, expected = found_and_expected(names, solver=solver, passes=passes)
+    outcome, found, expected = found_and_expected(names, solver=solver, passes=passes)
     assert_close(outcome.crossing_time, time_of_decay(RATES, HEIGHTS, 0.7), rtol=1e-9)
-    for one, other in zip(slopes, expected, strict=True):
+    for one, other in zip(found, expected, strict=True):
         assert_close(one, other, rtol=1e-7)
 
 
+@pytest.mark.parametrize(("count", "backward"), [(1, False), (2, False), (4, False), (5, True)])
+def test_few_directions_are_integrated_forward_and_many_backward(count, backward, monkeypatch):
+    """The forward passes of two numbers cost half as much as the backward one; those of six twice as much."""
+    passes = []
+
+    def solve_with_adjoint(*given, **options):
+        passes.append("backward")
+        return adjoint.solve_with_adjoint(*given, **options)
+
+    monkeypatch.setattr(slopes, "march_with_gradient", solve_with_adjoint)
+    jax.eval_shape(lambda: found_and_expected(MANY[:count], solver=diffrax.Dopri8())[1])
+    assert bool(passes) is backward
+
+
 def test_a_cell_that_ends_otherwise_has_no_slope_and_leaves_the_others_theirs():
-    outcome, slopes, expected = found_and_expected(patience=1.0, solver=diffrax.Dopri8())
+    outcome, found, expected = found_and_expected(patience=1.0, solver=diffrax.Dopri8())
     late = np.asarray(time_of_decay(RATES, HEIGHTS, 0.7)) > 1.0
     assert 20 < late.sum() < 80
     assert (np.asarray(outcome.status) == np.where(late, LEFT_DOMAIN, CROSSED)).all()
-    for one, other in zip(slopes, expected, strict=True):
+    for one, other in zip(found, expected, strict=True):
         assert_close(one, np.where(late, 0.0, other), rtol=1e-7)
 
 
@@ -98,10 +117,10 @@ def test_a_cell_that_ends_otherwise_has_no_slope_and_leaves_the_others_theirs():
 def test_padding_and_cells_beyond_the_event_have_no_slope(cells):
     """Some cells start beyond the event, and of the cells only some are run: fewer than lanes, and none."""
     heights = np.where(np.arange(100) % 3 == 0, 0.4, HEIGHTS)
-    outcome, slopes, expected = found_and_expected(heights=heights, cells=cells, solver=diffrax.Dopri8())
+    outcome, found, expected = found_and_expected(heights=heights, cells=cells, solver=diffrax.Dopri8())
     run = np.arange(100) < cells
     assert (np.asarray(outcome.status)[run] == CROSSED).all()
-    for one, other in zip(slopes, expected, strict=True):
+    for one, other in zip(found, expected, strict=True):
         assert_close(one, np.where(run & (heights > 0.5), other, 0.0), rtol=1e-7)
 
 
@@ -185,10 +204,10 @@ class AtRest(AbstractProblem):
         return None
 
 
-@pytest.mark.parametrize("names", [("rest",), ("rest", "push")])
+@pytest.mark.parametrize("names", [("rest",), ("rest", "push", "push", "push", "push")])
 def test_a_component_at_rest_has_its_tangent_integrated(names):
     """Steps judged by the run alone would reach the event in a few strides of which the tangent bears none: along one
-    direction, and on the way back by two."""
+    direction, and backward by five."""
     point = (jnp.zeros(4), jnp.zeros(4))
     tangents = [tuple(jnp.full(4, name == moved) * 1.0 for moved in ("rest", "push")) for name in names]
 
@@ -196,9 +215,9 @@ def test_a_component_at_rest_has_its_tangent_integrated(names):
     def run():
         directions = tangents_of(AtRest, point, tangents)
         given = (jnp.asarray(5.0), jnp.asarray(4), Settings(1e-10))
-        return ensemble_solve_with_tangents(AtRest(*point), directions, *given, one_kernel=True)
+        return slopes.ensemble_solve_with_tangents(AtRest(*point), directions, *given, one_kernel=True)
 
-    _, slopes = run()
+    _, found = run()
     expected = {"rest": -(1.0 - 1.0 / 500.0), "push": -1.0}
-    for name, slope in zip(names, slopes, strict=True):
+    for name, slope in zip(names, found, strict=True):
         assert_close(slope, np.full(4, expected[name]), rtol=1e-8)

@@ -172,6 +172,21 @@ def test_a_cylinder_turns_as_the_conventions_say():
     assert_close(np.array(frame.axes(*frame.at_angle(jnp.asarray(np.pi)))), np.eye(3), atol=1e-15)
 
 
+@pytest.mark.parametrize("name", ["cylinder", "sphere", "outside of a cylinder", "outside of a sphere"])
+def test_a_carried_frame_starts_with_the_axes_of_the_frame_of_its_own(name):
+    """At every eta, the papers' 1.571 included, and from a foot: `Launch` promises one t1 for all kinds of contact."""
+    own, general = frame_of(*SURFACES[name], DISTANCE, PULL), carried_frame(*SURFACES[name])
+    for eta in (0.0, 0.7, -1.5, 1.571, np.pi / 2.0, 2.0, -2.5, np.pi):
+        axes = [np.array(frame.axes(*frame.at_angle(jnp.asarray(eta))), dtype=float) for frame in (own, general)]
+        assert_close(axes[1], axes[0], atol=1e-12)
+        foot = tuple(jnp.asarray(x) for x in (0.3 * np.sin(eta), 0.0, -0.3 * np.cos(eta)))
+        if "sphere" in name:
+            foot = (foot[0], jnp.asarray(0.1), foot[2])
+            foot = scale(0.3 / jnp.sqrt(dot(foot, foot)), foot)
+        axes = [np.array(frame.axes(*frame.at_foot(foot)), dtype=float) for frame in (own, general)]
+        assert_close(axes[1], axes[0], atol=1e-12)
+
+
 def test_a_fixed_vector_keeps_its_length_in_a_turning_frame():
     vector, turning = (1.0, 2.0, 3.0), (0.4, -0.7)
     assert_close(dot(carried(vector, turning), vector), 0.0, atol=1e-15)

@@ -1,0 +1,160 @@
+"""Ctrl-C, by real signals to real processes: what is saved is said within two seconds, and nothing crashes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from cheap_sweep import resumed
+
+from nonholonomic.command_line import INTERRUPTED, PATIENCE
+
+pytestmark = pytest.mark.newest
+
+#: How long an answer to Ctrl-C may take [s].
+PROMPT = 2.0
+
+#: Keeps a thread in C for some seconds, deaf to signals, as XLA's compiler does; others go on.
+DEAF = "import hashlib\ndef deaf(): hashlib.pbkdf2_hmac('sha256', b'', b'', 30_000_000)\n"
+
+THREADS = """
+import sys, time
+from cheap_sweep import cheap_sweep
+cheap_sweep(sys.argv[1], lambda block: time.sleep(0.2))
+"""
+
+COMPILING = (
+    DEAF
+    + """
+import os, sys
+from cheap_sweep import cheap_sweep, expected
+def job(columns, count):
+    if not count:
+        print("begun", flush=True)
+        deaf()
+    return expected(columns["x"])
+try:
+    cheap_sweep(sys.argv[1], job=job)
+except KeyboardInterrupt as interrupt:
+    print(interrupt, flush=True)
+    os._exit(7)
+"""
+)
+
+PROCESSES = """
+import sys
+from pathlib import Path
+from cheap_sweep import CheapJob, cheap_sweep
+from nonholonomic import local_processes
+if __name__ == "__main__":
+    with local_processes(1) as processes:
+        cheap_sweep(sys.argv[1], job=CheapJob(Path(sys.argv[2]), pause=0.3), executor=processes)
+"""
+
+COMMAND = (
+    DEAF
+    + """
+from nonholonomic.command_line import interruptible
+def main():
+    print("begun", flush=True)
+    deaf()
+    return 0
+interruptible(main, "something")
+"""
+)
+
+
+def started(folder: Path, *arguments: str) -> subprocess.Popen:
+    """A process group of its own, as a shell starts a program on a terminal."""
+    paths = [str(Path(__file__).parent), *sys.path]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "XDG_CACHE_HOME": str(folder)}
+    return subprocess.Popen(
+        [sys.executable, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        start_new_session=True,
+        cwd=folder,
+    )
+
+
+def run(folder: Path, program: str, *arguments: str) -> subprocess.Popen:
+    """A program, from a file, as processes that it starts need one."""
+    (folder / "program.py").write_text(program)
+    return started(folder, str(folder / "program.py"), *arguments)
+
+
+def interrupted(process: subprocess.Popen) -> tuple[int, list[str], list[str], float]:
+    """Ctrl-C for a process and all that it has started: exit status, lines of both outputs, and how long it took [s]."""
+    since = time.monotonic()
+    os.killpg(process.pid, signal.SIGINT)
+    out, error = process.communicate(timeout=60)
+    return process.returncode, out.splitlines(), error.splitlines(), time.monotonic() - since
+
+
+def wait_for(condition, process: subprocess.Popen) -> None:
+    while not condition():
+        assert process.poll() is None, process.communicate()[1]
+        time.sleep(0.01)
+
+
+def blocks(path: Path) -> list[Path]:
+    return list(path.with_name(f"{path.name}.blocks").glob("*.npz"))
+
+
+@pytest.mark.parametrize("way", ["threads", "processes"])
+def test_a_table_says_what_is_saved_and_goes_on_from_there(way, tmp_path):
+    path = tmp_path / "table.h5"
+    process = run(tmp_path, THREADS if way == "threads" else PROCESSES, str(path), str(tmp_path))
+    wait_for(lambda: len(blocks(path)) >= 2, process)
+    status, out, error, passed = interrupted(process)
+    assert (status, out) == (-signal.SIGINT, [])
+    assert passed < PROMPT
+    saved = len(blocks(path))
+    assert 2 <= saved < 7
+    assert error[-1] == f"KeyboardInterrupt: saved {8 * saved} of 50 cells to {path}; run the same call again to resume"
+    # The processes of the executor say nothing.
+    assert sum(line.startswith("Traceback") for line in error) == 1
+    assert len(resumed(path)) == 7 - saved
+
+
+def test_a_table_is_heard_while_it_compiles(tmp_path):
+    process = run(tmp_path, COMPILING, "table.h5")
+    assert process.stdout.readline() == "begun\n"
+    status, out, _, passed = interrupted(process)
+    assert (status, out) == (7, ["saved 0 of 50 cells to table.h5; run the same call again to resume"])
+    assert passed < PROMPT
+
+
+def test_a_command_line_ends_while_it_compiles(tmp_path):
+    process = run(tmp_path, COMMAND)
+    assert process.stdout.readline() == "begun\n"
+    status, out, error, passed = interrupted(process)
+    assert (status, out) == (INTERRUPTED, [])
+    assert error == ["python -m something: interrupted; run the same command again to resume"]
+    assert PATIENCE <= passed < PROMPT
+
+
+def test_the_main_job_of_the_top_says_what_is_saved(tmp_path):
+    process = started(tmp_path, "-m", "tippe", "--theta", "0.1", "--t1", "5", "--out", "out")
+    folder = tmp_path / "out" / "cylinder.h5.blocks"
+    wait_for(lambda: (folder / "table.h5").exists(), process)
+    # It compiles for some seconds from here on.
+    time.sleep(0.5)
+    status, out, error, passed = interrupted(process)
+    assert (status, out) == (INTERRUPTED, [])
+    assert error == ["python -m tippe: saved 0 of 2 cells to out/cylinder.h5; run the same call again to resume"]
+    assert passed < PROMPT
+
+
+def test_the_main_job_of_the_stroller_ends_with_one_line(tmp_path):
+    process = started(tmp_path, "-m", "stroller", "--out", "out")
+    wait_for(lambda: (tmp_path / "out").exists(), process)
+    status, _, error, passed = interrupted(process)
+    assert status == INTERRUPTED
+    assert error == ["python -m stroller: interrupted; run the same command again to resume"]
+    assert passed < PROMPT + 0.5

@@ -1,0 +1,81 @@
+"""Compiled programs are forgotten before they exhaust the memory, with a warning of one line, and only then."""
+
+import logging
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from nonholonomic import compiled_programs
+from nonholonomic.compiled_programs import count_mappings, forget_programs_if_many, resident_memory
+
+pytestmark = [
+    pytest.mark.newest,
+    pytest.mark.skipif(count_mappings() == 0, reason="this system does not report mappings"),
+]
+
+
+@pytest.fixture
+def program():
+    """A compiled program that tells how often it was traced."""
+    traced = []
+
+    @jax.jit
+    def double(x):
+        traced.append(x)
+        return 2.0 * x
+
+    double(1.0)
+    return double, traced
+
+
+def test_what_a_process_uses_is_known():
+    assert 1e8 < resident_memory() < 1e11
+    assert 100 < count_mappings() < compiled_programs.most_mappings()
+
+
+def test_little_memory_forgets_nothing(program, caplog):
+    double, traced = program
+    assert not forget_programs_if_many(10**12)
+    assert double(3.0) == 6.0
+    assert len(traced) == 1
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("why", ["memory", "mappings"])
+def test_much_memory_or_many_mappings_forget_all_programs_with_one_line(why, program, caplog, monkeypatch):
+    double, traced = program
+    monkeypatch.setattr(compiled_programs, "MANY_MAPPINGS", 10)
+    monkeypatch.setattr(compiled_programs, "LITTLE_MEMORY", 1000)
+    if why == "mappings":
+        monkeypatch.setattr(compiled_programs, "most_mappings", lambda: 10)
+    with caplog.at_level(logging.WARNING):
+        assert forget_programs_if_many(1000 if why == "memory" else 10**12)
+    assert double(3.0) == 6.0
+    assert len(traced) == 2
+    (said,) = caplog.messages
+    assert said.endswith("memory mappings and are forgotten; the next calls compile again")
+    assert "\n" not in said
+
+
+def test_memory_that_programs_do_not_take_forgets_nothing(program):
+    """Such as a large table: forgetting programs would not help, in any call."""
+    double, traced = program
+    kept = jnp.zeros(1_000_000)
+    assert not forget_programs_if_many(1000) or count_mappings() > compiled_programs.MANY_MAPPINGS
+    assert double(3.0) == 6.0
+    assert len(traced) == 1
+    assert kept.nbytes
+
+
+def test_nothing_is_forgotten_while_a_program_is_traced(monkeypatch):
+    monkeypatch.setattr(compiled_programs, "MANY_MAPPINGS", 10)
+    forgot = []
+
+    @jax.jit
+    def inner(x):
+        forgot.append(forget_programs_if_many(1000))
+        return x
+
+    inner(1.0)
+    assert forgot == [False]
