@@ -67,17 +67,17 @@ def missed_loss(
 
     **Arguments:**
 
-    - `places`: the fractions of the step, 0 and 1 among them, at which the `margins` are known; `None` if there are none.
+    - `places`: the fractions of the step, from 0 to 1, at which the `margins` are known; these are `None` if there are none.
     - `free`: the lanes that matter.
     """
-    if margins is None:
+    if margins is None or len(places) < 3:
         return jnp.full(free.shape, 2.0)
     inside, at_end = jnp.min(margins[1:-1], axis=0), jnp.minimum(margins[0], margins[-1])
     lowest = jnp.minimum(inside, at_end)
     spread = jnp.max(margins, axis=0) - lowest
     suspect = (lowest < jnp.where(inside < at_end, SUSPECT_INSIDE, SUSPECT_AT_END) * spread) & (spread > FLAT) & free
 
-    def bracket() -> Lanes:
+    def first_minimum() -> Lanes:
         edges = np.linspace(0.0, 1.0, CELLS + 1)
         value, slope = _interpolated(places, edges, margins)
         width = 1.0 / CELLS
@@ -87,7 +87,7 @@ def missed_loss(
         return jnp.min(jnp.where(suspect & (at < 1.0) & (least < error), place, 2.0), axis=(0, 1))
 
     # A branch, for few steps come near to a zero.
-    return jax.lax.cond(jnp.any(suspect), bracket, lambda: jnp.full(free.shape, 2.0))
+    return jax.lax.cond(jnp.any(suspect), first_minimum, lambda: jnp.full(free.shape, 2.0))
 
 
 def _minimum(

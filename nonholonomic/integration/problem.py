@@ -44,7 +44,7 @@ class AbstractProblem(eqx.Module):
         """A function of order 1 that is positive while the model holds; `None` if it always does."""
 
     def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
-        """The smooth functions of which the guard is the least, for a search between the places at which it is evaluated."""
+        """The smooth functions of which `domain_margin` is the least; a step searches each of them for a missed double root."""
         domain_margin = self.domain_margin(time, state)
         return () if domain_margin is None else (domain_margin,)
 
