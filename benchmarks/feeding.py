@@ -141,11 +141,11 @@ def main() -> None:
         print(f"so one parent feeds {rate * options.each:.0f} workers that take {options.each:g} s a cell")
         # As many blocks of the same size for each worker, whatever the number of workers.
         size = -(-cells // took.blocks // 512) * 512
-        running.blocks_together, once = lambda layout, block: size // block, running.blocks_together
+        running.chunks_together, once = lambda layout, chunk: size // chunk, running.chunks_together
         few = size * options.workers * 8 >> 12 << 12
         ideal = few * options.each / options.workers
         took = run(few, options.workers, options.each, Path(folder))
-        running.blocks_together = once
+        running.chunks_together = once
         print(f"{few:.3g} cells in {took.blocks} blocks, {options.workers} workers that sleep for {ideal:.1f} s each:")
         print(
             f"  the last was done after {took.worked:.1f} s: they waited for {100 * (took.worked / ideal - 1):.1f} % of that"

@@ -20,10 +20,13 @@ CHAINS, LINKS = 8, 64
 def operations_per_step(problem: InversionProblem, tolerance: float) -> float:
     """Arithmetic operations of one attempted step of one lane: stages, error, step control and event."""
     cells = problem.states.shape[1]
-    queue = LaneScheduler.of(problem, jnp.asarray(30.0), jnp.asarray(cells), Settings(tolerance))
-    block = queue.start().block
-    here = queue.here(block)
-    return _counted(jax.make_jaxpr(lambda block: try_step(*here, block))(block).jaxpr) / queue.lanes
+    scheduler = LaneScheduler.of(problem, jnp.asarray(30.0), jnp.asarray(cells), Settings(tolerance))
+    lane_state = scheduler.start().lane_state
+    arguments = scheduler.here(lane_state)
+    return (
+        _counted(jax.make_jaxpr(lambda lane_state: try_step(*arguments, lane_state))(lane_state).jaxpr)
+        / scheduler.lanes
+    )
 
 
 def _counted(jaxpr: Jaxpr) -> float:

@@ -19,6 +19,7 @@ from .geometry import Plane as Plane
 from .geometry import Sphere as Sphere
 from .geometry import Spheroid as Spheroid
 from .geometry import Torus as Torus
+from .integration import Status as Status
 from .sweeps import local_processes as local_processes
 
 try:

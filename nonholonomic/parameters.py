@@ -1,8 +1,10 @@
 """The numbers of a scene by name: `"scene.body.offset"`, `"launch.place[0]"`; and as a person reads them, with their units."""
 
 import dataclasses
+import difflib
 import html
 import re
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -19,7 +21,8 @@ def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
     - `tree`: an `equinox.Module`.
     - `functions`: whether to go into modules that are functions, whose numbers may be arrays.
 
-    **Returns:** dotted name -> number, in the order in which the modules declare them; `None` for a number that is left out.
+    **Returns:** dotted name -> number, in the order in which the modules declare them; `None` for a number that is left
+    out, which the `units` of its module tell from another part that is.
     """
     found = {}
     for field in dataclasses.fields(tree):
@@ -28,7 +31,7 @@ def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
             found |= numbers(name, value, functions) if functions or not callable(value) else {}
         elif isinstance(value, tuple):
             found |= {f"{name}[{k}]": part for k, part in enumerate(value) if _is_number(part)}
-        elif value is None or _is_number(value):
+        elif _is_number(value) or (value is None and field.name in getattr(tree, "units", {})):
             found[name] = value
     return found
 
@@ -49,10 +52,10 @@ def with_numbers(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any
 
     **Raises:** `ValueError` for a name that no number of the trees has.
     """
-    known = [name for root, tree in roots.items() for name in numbers(root, tree)]
+    known = {name: number for root, tree in roots.items() for name, number in numbers(root, tree).items()}
     for name in values:
         if name not in known:
-            raise ValueError(f"unknown axis {name!r}: the numbers that can be varied are {', '.join(known)}")
+            raise _unknown_axis(name, [one for one, number in known.items() if number is not None])
     return {root: _replaced(root, tree, values) for root, tree in roots.items()}
 
 
@@ -64,11 +67,48 @@ def full_name(argument: str, name: str, known: list[str]) -> str:
 
     **Raises:** `ValueError` for a name that means none of them, or several.
     """
-    meant = [name] if name in known else [one for one in known if one.endswith("." + str(name))]
+    meant = _meant(name, known)
     if len(meant) != 1:
-        what = f"could be {' or '.join(meant)}" if meant else f"must be one of {', '.join(known)}"
+        what = f"could be {' or '.join(meant)}" if meant else f"must be one of {', '.join(known)}{likely(name, known)}"
         raise ValueError(f"{argument}: {name!r} {what}")
     return meant[0]
+
+
+def full_axes(axes: dict[str, Any], known: list[str]) -> dict[str, Any]:
+    """The axes of a grid by full names, which may be given by their ends, such as `"offset"`.
+
+    **Arguments:** `axes`: name -> values; `known`: the full names of what can be varied.
+
+    **Raises:** `ValueError` for a name that means none of them, or several, and for a number that is named twice.
+    """
+    found: dict[str, Any] = {}
+    for name, values in axes.items():
+        if not _meant(name, known):
+            raise _unknown_axis(name, known)
+        whole = full_name("axes", name, known)
+        if whole in found:
+            raise ValueError(f"axes: {whole!r} is named twice")
+        found[whole] = values
+    return found
+
+
+def _meant(name: Any, known: list[str]) -> list[str]:
+    """The full names that a name may mean."""
+    return [name] if name in known else [one for one in known if one.endswith("." + str(name))]
+
+
+def _unknown_axis(name: str, known: list[str]) -> ValueError:
+    short = {one.rsplit(".", 1)[-1]: one for one in known}
+    return ValueError(
+        f"unknown axis {name!r}: the numbers that can be varied are {', '.join(known)}"
+        f"{likely(name.rsplit('.', 1)[-1], short)}"
+    )
+
+
+def likely(name: Any, known: Iterable[str]) -> str:
+    """What a message about an unknown name adds: the known name that it resembles, if any."""
+    close = difflib.get_close_matches(str(name), list(known), 1)
+    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def _replaced(name: str, tree: Any, values: dict[str, Any]) -> Any:

@@ -182,7 +182,7 @@ def status_line(doing: str, shown: bool = True) -> Iterator[Progress]:
 
 
 def is_making_programs(thread: int) -> bool:
-    """Whether JAX is tracing or compiling in a thread."""
+    """Whether JAX is tracing or compiling in a thread; JAX does not report when it begins to. Costs 0.5 ms, twice a second."""
     frame = sys._current_frames().get(thread)
     while frame is not None:
         module, name = frame.f_globals.get("__name__"), frame.f_code.co_name

@@ -10,6 +10,7 @@ import operator
 import tempfile
 import warnings
 from collections.abc import Iterable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -21,6 +22,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from .parameters import as_html, as_text, contents, in_lines, one_line
+
+#: What the message about an angle above its bounds adds.
+IN_DEGREES = "; angles are in radians: did you mean np.radians({})?"
 
 
 def as_number(value: Any) -> Float[Array, "..."]:
@@ -73,6 +77,7 @@ def require(
     below: Any = None,
     at_most: Any = None,
     why: str = "",
+    unit: str = "",
 ) -> None:
     """Raise `ValueError` unless every number in `value` is finite and within the bounds.
 
@@ -82,6 +87,7 @@ def require(
     - `name`: what to call it in the message.
     - `above`, `at_least`, `below`, `at_most`: bounds, each a number.
     - `why`: a remark to append to the message.
+    - `unit`: "rad" for an angle, so that the message asks whether a number above its bounds is in degrees.
 
     **Raises:** `ValueError` that names the argument, its value and what is allowed.
     """
@@ -111,8 +117,10 @@ def require(
         numbers, limits = np.broadcast_arrays(numbers, np.asarray(bound, dtype=float))
         allowed = holds(numbers, limits)
         if not np.all(allowed):
-            message = f"{name} = {_first(numbers, allowed)} must be {words} {_first(limits, allowed)}"
-            raise ValueError(message + remark)
+            number = _first(numbers, allowed)
+            message = f"{name} = {number} must be {words} {_first(limits, allowed)}{remark}"
+            degrees = unit == "rad" and bound is at_most
+            raise ValueError(message + (IN_DEGREES.format(number) if degrees else ""))
 
 
 def require_scalars(values: dict[str, Any], otherwise: str) -> None:
@@ -120,6 +128,40 @@ def require_scalars(values: dict[str, Any], otherwise: str) -> None:
     for name, value in values.items():
         if value is not None and np.ndim(value) != 0:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; {otherwise}")
+
+
+def require_kind(value: Any, name: str, kind: type, example: str = "") -> None:
+    """Raise `ValueError` unless this is of a kind, such as a `Scene`.
+
+    The message about a module of the same name from another package, such as a stroller's scene for a top, names both
+    packages; otherwise it ends in the `example`.
+    """
+    if isinstance(value, kind):
+        return
+    wanted = kind.__name__.removeprefix("Abstract")
+    if type(value).__name__ == wanted:
+        theirs, ours = (one.__module__.partition(".")[0] for one in (type(value), kind))
+        raise ValueError(f"{name} is a {theirs}.{wanted} and must be a {ours}.{wanted}: the packages have one each")
+    raise ValueError(f"{name} = {value!r} must be a {wanted}{example}")
+
+
+def require_one_run(run: Any, action: str, many: str) -> None:
+    """Raise `ValueError` for a batch of runs. **Arguments:** `action`: what takes one run; `many`: what serves several."""
+    if np.ndim(run.t) != 1:
+        raise ValueError(
+            f"this is a batch of runs, with t of shape {np.shape(run.t)}, and {action} takes one run: take the first by "
+            f"jax.tree.map(lambda leaf: leaf[0], runs){many}"
+        )
+
+
+def require_outside(values: Any, caller: str, instead: str) -> None:
+    """Raise `ValueError` inside `jit`, `vmap` and `grad` for what runs on the host only.
+
+    **Arguments:** `values`: what was handed over; `caller`: the function; `instead`: what to use there.
+    """
+    # Inside `jit` a new array is traced even if all numbers are known.
+    if any(is_traced(leaf) for leaf in (as_number(0.0), *jax.tree.leaves(values))):
+        raise ValueError(f"{caller} cannot be called inside jit, vmap or grad: use {instead} there")
 
 
 def require_whole(value: Any, name: str, at_least: int) -> None:
@@ -165,6 +207,36 @@ def require_folder(path: Path, name: str) -> None:
         raise OSError(f"{name} = {path}: nothing can be written there: {error.strerror}") from None
 
 
+def require_file(path: Any, name: str, *endings: str) -> Path:
+    """Raise `ValueError` unless a path has one of the endings, and `OSError` unless a file can be written there.
+
+    **Returns:** the path.
+    """
+    try:
+        file = Path(path)
+    except TypeError:
+        raise ValueError(f"{name} = {path!r} must be the path of a file") from None
+    if file.suffix not in endings:
+        raise ValueError(f"{name} = {str(path)!r} must end in {' or '.join(endings)}")
+    if file.is_dir():
+        raise OSError(f"{name} = {file}: it is a folder")
+    try:
+        with tempfile.TemporaryFile(dir=file.parent):
+            pass
+    except OSError as error:
+        raise OSError(f"{name} = {file}: nothing can be written there: {error.strerror}") from None
+    return file
+
+
+def require_package(name: str, extra: str, purpose: str) -> None:
+    """Raise `ModuleNotFoundError` unless an optional package is installed. To be called before the work begins.
+
+    **Arguments:** `name`: of the package; `extra`: of this distribution that has it; `purpose`: what needs it.
+    """
+    if find_spec(name) is None:
+        raise ModuleNotFoundError(f"{purpose} needs {name}: pip install 'nonholonomic[{extra}]'", name=name)
+
+
 class Bound(NamedTuple):
     """A number, what to call it, and the range in which it is legal; as for `require`."""
 
@@ -175,6 +247,7 @@ class Bound(NamedTuple):
     below: Any = None
     at_most: Any = None
     why: str = ""
+    unit: str = ""
 
     def require(self) -> None:
         """Raise `ValueError` unless the number is legal or traced."""
@@ -212,11 +285,30 @@ class Bounded(eqx.Module):
         return None
 
     def __check_init__(self):
+        self._require_one_shape()
         require_all(self.bounds())
         suspicion = self.suspicion()
         if suspicion is not None:
             # From one place of the code, so that Python shows each of them once.
             warnings.warn(suspicion, UserWarning, stacklevel=1)
+
+    def _require_one_shape(self) -> None:
+        """Raise `ValueError` for lists of different lengths among the module's own numbers."""
+        shapes = {}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            parts = {f"{field.name}[{k}]": part for k, part in enumerate(value)} if isinstance(value, tuple) else {}
+            for name, part in (parts or {field.name: value}).items():
+                if isinstance(part, jax.Array | np.ndarray):
+                    shapes[name] = np.shape(part)
+        try:
+            np.broadcast_shapes(*shapes.values())
+        except ValueError:
+            lists = ", ".join(f"{name} of shape {shape}" for name, shape in shapes.items() if shape)
+            raise ValueError(
+                f"{type(self).__name__}: {lists}: the numbers of one object are scalars or lists of one length; a grid "
+                "of all combinations is made by the tables, such as inversion_table"
+            ) from None
 
     def __repr__(self) -> str:
         return one_line(self)

@@ -1,5 +1,7 @@
 """The stroller: a three-wheeled vehicle with nonholonomic constraints, on the plane and on curved grounds."""
 
+from types import ModuleType as _Module
+
 from nonholonomic import __version__ as __version__
 from nonholonomic.geometry import Cylinder as Cylinder
 from nonholonomic.geometry import Graph as Graph
@@ -11,6 +13,7 @@ from nonholonomic.geometry import Spheroid as Spheroid
 from nonholonomic.geometry import Torus as Torus
 from nonholonomic.identification import Free as Free
 from nonholonomic.integration import ImplicitMidpoint as ImplicitMidpoint
+from nonholonomic.integration import Status as Status
 
 from .fit.identify import identify as identify
 from .fit.recording import Recording as Recording
@@ -28,3 +31,8 @@ from .runs.simulate import simulate as simulate
 from .runs.table import Table as Table
 from .runs.table import sweep as sweep
 from .runs.trajectory import Trajectory as Trajectory
+
+# `import *` hands out what stands above, and not the rooms.
+__all__ = [
+    name for name, value in list(globals().items()) if not name.startswith("_") and not isinstance(value, _Module)
+]

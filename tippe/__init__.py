@@ -1,5 +1,7 @@
 """The tippe top: scenes, trajectories and inversion tables."""
 
+from types import ModuleType as _Module
+
 from nonholonomic import __version__ as __version__
 from nonholonomic.geometry import Cylinder as Cylinder
 from nonholonomic.geometry import Graph as Graph
@@ -11,6 +13,7 @@ from nonholonomic.geometry import Spheroid as Spheroid
 from nonholonomic.geometry import Torus as Torus
 from nonholonomic.identification import FitWarning as FitWarning
 from nonholonomic.identification import Free as Free
+from nonholonomic.integration import Status as Status
 from nonholonomic.sweeps import Table as Table
 
 from . import steady as steady
@@ -41,3 +44,9 @@ from .runs.table import inversion_table as inversion_table
 from .runs.trajectory import Trajectory as Trajectory
 from .runs.trajectory import simulate as simulate
 from .runs.trajectory_table import trajectory_table as trajectory_table
+
+# `import *` hands out what stands above, and not the rooms.
+__all__ = [
+    "steady",
+    *(name for name, value in list(globals().items()) if not name.startswith("_") and not isinstance(value, _Module)),
+]

@@ -134,7 +134,7 @@ def ball_that_rolls() -> Row:
         "closed form, velocity and slip [m/s of 1]",
         run.result.accepted + run.result.rejected,
         run.cpu,
-        "reached t1",
+        "completed",
     )
 
 

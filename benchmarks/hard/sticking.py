@@ -116,7 +116,7 @@ def the_law_itself() -> Row:
     """SetValuedCoulomb: the slip ends and the top rolls."""
     run = timed(lambda: final_theta(tippe.SetValuedCoulomb(0.3), diffrax.Dopri8(), 1e-9), 1)
     found = float(run.result.theta[-1])
-    slip = run.result.dense.stays[0]
+    slip = run.result.dense.mode_segments[0]
     return of_runs(
         "Cohen's top under Coulomb's law itself",
         f"slips to {slip.end:.5f} s, then rolls; theta(0.5 s) = {found:.6f} rad",

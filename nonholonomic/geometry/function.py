@@ -52,6 +52,11 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
     zeros = (jnp.zeros(()),) * len(arguments)
     try:
         traced = jax.make_jaxpr(value)(*zeros)
+    except jax.errors.JAXTypeError as error:
+        raise ValueError(
+            f"{name} = {value!r} cannot be traced by JAX: write it with jax.numpy in place of numpy and math, and with "
+            "jnp.where in place of `if`"
+        ) from error
     except TypeError as error:
         raise ValueError(f"{name} = {value!r} must be a function of ({', '.join(arguments)}): {error}") from error
     # The numbers of a module may be one for each lane.

@@ -45,7 +45,7 @@ class Plane(AbstractSurface):
 
     def bounds(self) -> Iterator[Bound]:
         if self.tilt is not None:
-            yield Bound(self.tilt, "tilt", at_least=-math.pi / 2.0, at_most=math.pi / 2.0)
+            yield Bound(self.tilt, "tilt", at_least=-math.pi / 2.0, at_most=math.pi / 2.0, unit="rad")
 
     @property
     def up(self) -> Vector:

@@ -78,7 +78,7 @@ class AbstractQuadric(AbstractSurface):
         if len(place) == 2:
             limit = math.pi / 2.0 + 1e-12
             why = "reduced latitude, from -pi/2 to pi/2"
-            yield Bound(place[1], "place[1]", at_least=-limit, at_most=limit, why=why)
+            yield Bound(place[1], "place[1]", at_least=-limit, at_most=limit, why=why, unit="rad")
 
 
 class Sphere(AbstractQuadric):

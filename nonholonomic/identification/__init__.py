@@ -9,6 +9,7 @@ from .csv import read_columns as read_columns
 from .data import free_numbers as free_numbers
 from .data import joined as joined
 from .data import of_data as of_data
+from .data import series_units as series_units
 from .identify import check_search as check_search
 from .identify import identify as identify
 from .likelihood import Measurements as Measurements

@@ -28,6 +28,11 @@ def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np
     return likelihood.joined([one.measurements for one in data]), labels, seen
 
 
+def series_units(data: tuple[Any, ...]) -> tuple[str, ...]:
+    """The unit of each series of the joined measurements. **Arguments:** `data`: each with `measurements`, `series_units`."""
+    return tuple(unit for one in data for unit in one.series_units[: 1 + int(np.max(one.measurements.series))])
+
+
 def of_data(parameters: dict[str, Any], k: int) -> dict[str, Any]:
     """The parameters of one set of data: those that all share, and its own without the prefix `data[k].`."""
     prefix = f"data[{k}]."

@@ -28,12 +28,14 @@ class LogDensity(eqx.Module):
     prediction it is about -1e8, without a slope.
 
     - `names`: of the unknowns, in the order of the coordinates; `start`: (unknowns,), where to start.
+    - `units`: name of an unknown -> its unit, where it is known.
     """
 
     problem: Problem
     measurements: Measurements
     priors: dict[str, Any]
     open_series: tuple[int, ...] = eqx.field(static=True)
+    series_units: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __repr__(self) -> str:
         return f"LogDensity of {', '.join(self.names)}, given {self.measurements.value.size} measurements"
@@ -45,10 +47,12 @@ class LogDensity(eqx.Module):
         measurements: Measurements,
         free: Any,
         priors: Any = None,
+        series_units: tuple[str, ...] = (),
     ) -> "LogDensity":
         """The posterior of a model.
 
-        **Arguments:** `model`, `measurements`, `free`: as for `identify`; `priors`: as for `tippe.log_density`.
+        **Arguments:** `model`, `measurements`, `free`: as for `identify`; `priors`: as for `tippe.log_density`;
+        `series_units`: the unit of each series of the measurements, if known.
         """
         unknowns = as_free(free)
         given = {name: one.prior for name, one in unknowns.items() if one.prior is not None} | dict(priors or {})
@@ -64,7 +68,11 @@ class LogDensity(eqx.Module):
         series, open_ = np.asarray(measurements.series), np.asarray(measurements.estimated)
         kept = {name: _as_leaves(prior) for name, prior in given.items()}
         return cls(
-            Problem(model, tuple(unknowns.items())), measurements, kept, tuple(np.unique(series[open_]).tolist())
+            Problem(model, tuple(unknowns.items())),
+            measurements,
+            kept,
+            tuple(np.unique(series[open_]).tolist()),
+            series_units,
         )
 
     @property
@@ -73,16 +81,41 @@ class LogDensity(eqx.Module):
         return (*self.problem.names, *(f"error[{k}]" for k in self.open_series))
 
     @property
+    def units(self) -> dict[str, str]:
+        """The units of the unknown errors, where they are known."""
+        known = {k: self.series_units[k] for k in self.open_series if k < len(self.series_units)}
+        return {f"error[{k}]": unit for k, unit in known.items()}
+
+    @property
+    def _first_errors(self) -> Float[Array, " errors"]:
+        """The first guesses of the unknown errors, one for each series."""
+        own = [self.measurements.estimated & (self.measurements.series == k) for k in self.open_series]
+        return jnp.array([self.measurements.error[jnp.argmax(one)] for one in own])
+
+    @property
     def start(self) -> Float[Array, " unknowns"]:
         """The coordinates from which to start."""
         values = [float(one.coordinate(one.start)) for one in self.problem.unknowns]
         return jnp.array([*values, *(0.0 for _ in self.open_series)])
 
     def values(self, coordinates: Float[Array, "... unknowns"]) -> dict[str, Float[Array, "..."]]:
-        """The unknowns at some coordinates: name -> (...,); of the errors, the factor on their first guess."""
-        numbers = len(self.problem.names)
+        """The unknowns at some coordinates: name -> (...,).
+
+        **Arguments:** `coordinates`: of all unknowns, or of a fit, which leaves out the errors: these are then the first guess.
+
+        **Raises:** `ValueError` for another number of coordinates.
+        """
+        numbers, coordinates = len(self.problem.names), jnp.asarray(coordinates, float)
+        if coordinates.shape[-1:] == (numbers,):
+            rest = jnp.zeros((*coordinates.shape[:-1], len(self.open_series)))
+            coordinates = jnp.concatenate([coordinates, rest], axis=-1)
+        if coordinates.shape[-1:] != (len(self.names),):
+            raise ValueError(
+                f"coordinates of shape {coordinates.shape} must have {len(self.names)} numbers along the last axis: "
+                f"{', '.join(self.names)}"
+            )
         found = self.problem.values(coordinates[..., :numbers])
-        errors = jnp.exp(coordinates[..., numbers:])
+        errors = self._first_errors * jnp.exp(coordinates[..., numbers:])
         return dict(zip(self.names, jnp.moveaxis(jnp.concatenate([found, errors], axis=-1), -1, 0), strict=True))
 
     def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:

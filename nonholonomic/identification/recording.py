@@ -138,6 +138,11 @@ class AbstractRecording(eqx.Module):
         return tuple(every[i] for i in self.seen)
 
     @property
+    def series_units(self) -> tuple[str, ...]:
+        """The unit of each column, which is a series of the measurements."""
+        return tuple(self.quantities.units[name] for name in self.columns)
+
+    @property
     def measurements(self) -> Measurements:
         """The samples as `Measurements`, a series for each column; missing ones are left out."""
         value = np.asarray(self.value).reshape(len(self.times), len(self.columns))

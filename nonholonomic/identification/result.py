@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..parameters import text_as_html
+from ..parameters import full_name, text_as_html
 from ..progress import status_line
+from ..validation import require_package
 from .levenberg_marquardt import minimise
 from .likelihood import Measurements
 from .problem import Linearised, Problem, linearise
@@ -139,7 +140,7 @@ class Identification:
     def interval(self, name: str, deviations: float = 1.96) -> tuple[float, float]:
         """The confidence interval of a parameter, symmetric in its coordinate and so within its bounds.
 
-        **Arguments:** `name`: of the parameter; `deviations`: half its width in standard errors, 1.96 for 95 %.
+        **Arguments:** `name`: of the parameter, or its end; `deviations`: half its width in standard errors, 1.96 for 95 %.
 
         **Raises:** `ValueError` for a name that was not free.
         """
@@ -155,7 +156,7 @@ class Identification:
 
         **Arguments:**
 
-        - `name`: of the parameter.
+        - `name`: of the parameter, or its end.
         - `values`: at which to hold it, by default 13 within three standard errors.
 
         **Returns:** a `Profile`.
@@ -165,7 +166,7 @@ class Identification:
         k = self._place(name)
         free = self.problem.unknowns[k]
         if values is None:
-            if not np.isfinite(self.standard_errors[name]):
+            if not np.isfinite(self.standard_errors[self.problem.names[k]]):
                 raise ValueError(f"values must be given for {name!r}, whose standard error is infinite")
             reach = 3.0 * np.sqrt(self.coordinate_covariance[k, k])
             values = np.asarray(free.value(jnp.asarray(self.coordinates[k] + np.linspace(-reach, reach, 13))))
@@ -194,14 +195,14 @@ class Identification:
 
         **Returns:** a matplotlib figure.
         """
+        require_package("matplotlib", "plot", "plot")
         from ..views import draw_fit
 
         return draw_fit(self)
 
     def _place(self, name: str) -> int:
-        if name not in self.estimates:
-            raise ValueError(f"name = {name!r} must be one of {', '.join(self.estimates)}")
-        return list(self.estimates).index(name)
+        known = list(self.estimates)
+        return known.index(full_name("name", name, known))
 
     def _repr_html_(self) -> str:
         return text_as_html(str(self))

@@ -18,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..parameters import readable_unit
 from ..progress import Progress, status_line
-from ..validation import require_flag, require_whole
+from ..validation import require_flag, require_package, require_whole
 from .posterior import LogDensity
 from .surrogate import Surrogate
 
@@ -45,6 +46,7 @@ class Draws(NamedTuple):
     - `values`: name -> (chains, draws); `coordinates`: (chains, draws, unknowns).
     - `r_hat`, `ess`: name -> number: the potential scale reduction, which should be below 1.01, and the effective number of
       independent draws.
+    - `units`: name -> unit, of the unknown errors.
     - `accepted`: which share of the proposals was accepted; `runs`: how many sets of numbers the model was run for.
     """
 
@@ -54,6 +56,7 @@ class Draws(NamedTuple):
     ess: dict[str, float]
     accepted: float
     runs: int
+    units: dict[str, str]
 
     @classmethod
     def of(
@@ -68,7 +71,7 @@ class Draws(NamedTuple):
         )
         # Of a single unknown they are numbers, not lists of one.
         named = (dict(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in found)
-        return cls(values, coordinates, *named, accepted=accepted, runs=runs)
+        return cls(values, coordinates, *named, accepted=accepted, runs=runs, units=density.units)
 
     def __str__(self) -> str:
         width = max(map(len, self.values))
@@ -77,7 +80,8 @@ class Draws(NamedTuple):
         for name, value in self.values.items():
             low, middle, high = np.quantile(value, (0.025, 0.5, 0.975))
             quality = f"R-hat {self.r_hat[name]:.4f}, ESS {self.ess[name]:.0f}"
-            lines.append(f"  {name:{width}}  {middle:.6g}  ({low:.6g}, {high:.6g})  {quality}")
+            unit = f" {readable_unit(self.units[name])}" if name in self.units else ""
+            lines.append(f"  {name:{width}}  {middle:.6g}  ({low:.6g}, {high:.6g}){unit}  {quality}")
         return "\n".join(lines)
 
 
@@ -105,9 +109,10 @@ def sample(
 
     **Returns:** `Draws`.
 
-    **Raises:** `ValueError` for numbers out of range and a covariance that is not finite and positive; `ImportError` without
-    BlackJAX.
+    **Raises:** `ValueError` for numbers out of range and a covariance that is not finite and positive; `ModuleNotFoundError`
+    without BlackJAX.
     """
+    require_package("blackjax", "bayes", "sample")
     for name, value, least in (("chains", chains, 2), ("warmup", warmup, 0), ("draws", draws, 2), ("seed", seed, 0)):
         require_whole(value, name, least)
     require_flag(progress, "progress")

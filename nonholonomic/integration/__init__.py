@@ -33,6 +33,7 @@ from .scheduler import Outcome as Outcome
 from .scheduler import Progress as Progress
 from .settings import ABSOLUTE as ABSOLUTE
 from .settings import LOOSEST as LOOSEST
+from .settings import MOST_STEPS as MOST_STEPS
 from .settings import TIGHTEST as TIGHTEST
 from .settings import Settings as Settings
 from .settings import lanes_for as lanes_for
@@ -43,10 +44,12 @@ from .settings import times_bounds as times_bounds
 from .settings import tolerance_bound as tolerance_bound
 from .status import CROSSED as CROSSED
 from .status import FAILED as FAILED
+from .status import FORMER_WORDS as FORMER_WORDS
 from .status import LEFT_DOMAIN as LEFT_DOMAIN
 from .status import REACHED_END as REACHED_END
 from .status import RUNNING as RUNNING
 from .status import UNRESOLVED as UNRESOLVED
+from .status import Status as Status
 from .step import LaneState as LaneState
 from .step import length_to_try as length_to_try
 from .step import try_step as try_step

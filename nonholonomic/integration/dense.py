@@ -81,19 +81,20 @@ def _piece(
     state: Float[Array, " components"],
     scales: Float[Array, " components"],
     settings: Settings,
+    dense: bool,
 ) -> tuple[diffrax.Solution, Float[Array, " steps"]]:
     """As many steps as the settings allow, and the least value of the guard seen in each."""
     watched = problem.domain_margin(t0, state) is not None
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-        settings.for_single_runs,
+        settings.for_single_runs if dense or watched else settings.for_steps_alone,
         t0,
         t1,
         first,
         state,
         args=problem,
         stepsize_controller=_control(settings, scales),
-        saveat=diffrax.SaveAt(t0=True, steps=True, dense=True),
+        saveat=diffrax.SaveAt(t0=True, steps=True, dense=dense or watched),
         max_steps=settings.max_steps,
         event=diffrax.Event(lambda t, y, args, **_: args.domain_margin(t, y) < 0.0) if watched else None,
         throw=False,
@@ -117,6 +118,7 @@ def follow(
     *,
     first: float | None = None,
     t0: float = 0.0,
+    dense: bool = True,
 ) -> DenseSolution:
     """Integrate one run step by step until `t1` or until the model ceases to hold.
 
@@ -128,6 +130,7 @@ def follow(
       failed.
     - `first`: length of the first step [s], by default selected as Diffrax does.
     - `t0`: when the run starts [s].
+    - `dense`: whether states within the steps will be asked for (`Followed.at`).
 
     **Returns:** a `DenseSolution` with the accepted steps; it ends where the guard reaches zero, found on the dense output.
     """
@@ -144,7 +147,7 @@ def follow(
     if margin is not None and float(margin) <= 0.0:
         return DenseSolution(times[0], states[0], [], True, False, 0, 0)
     while float(time) < t1 and not (lost or failed):
-        solution, domain_margins = _piece(problem, time, end, length, state, scales, each)
+        solution, domain_margins = _piece(problem, time, end, length, state, scales, each, dense)
         steps = int(solution.stats["num_accepted_steps"])
         accepted, rejected = accepted + steps, rejected + int(solution.stats["num_rejected_steps"])
         ts, ys = saved(solution)
@@ -249,7 +252,7 @@ def sample(
         controller = _GivenSteps(grid)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
-        settings.for_single_runs,
+        settings.for_single_runs if watched else settings.for_steps_alone,
         jnp.zeros_like(t1),
         t1,
         None,

@@ -12,11 +12,8 @@ from jaxtyping import Array, Float
 from .dense import saved
 from .problem import AbstractProblem
 from .scheduler import Outcome
-from .settings import Settings
+from .settings import MOST_STEPS, Settings
 from .status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END
-
-#: A run that needs more has failed.
-MOST_STEPS = 100_000
 
 
 @eqx.filter_jit

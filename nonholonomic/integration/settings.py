@@ -17,6 +17,9 @@ ABSOLUTE = 0.1
 #: The least and the greatest relative tolerance: below, steps are decided by round-off; above, steps are hardly controlled.
 TIGHTEST, LOOSEST = 1e-14, 1e-2
 
+#: Steps after which a run has failed that should be short: an impact, parameters tried by a fit, a run of the slow reference.
+MOST_STEPS = 100_000
+
 
 class Settings(eqx.Module):
     """How runs are integrated, whatever is asked of them.
@@ -52,6 +55,11 @@ class Settings(eqx.Module):
             raise ValueError(
                 f"solver = {self.solver!r} must have a dense output of its order, as Dopri8() has, where Diffrax integrates"
             )
+        return self.for_steps_alone
+
+    @property
+    def for_steps_alone(self) -> diffrax.AbstractSolver:
+        """The solver where Diffrax integrates and steps end wherever a state is asked for."""
         return diffrax.Dopri8() if self.solver is None else self.solver
 
     def with_tolerance(self, tolerance: Float[Array, ""] | None) -> Self:

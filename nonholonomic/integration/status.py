@@ -1,5 +1,68 @@
-"""The codes of how a run stands or has ended."""
+"""How a run stands or has ended: the codes that the integration uses, and what users are told."""
+
+import enum
+from typing import Self
 
 #: Still under way; at the horizon; on its event; where the model ceases to hold; given up by step control; given up
 #: because it changed its phase too often, or because the forces are not determined.
 RUNNING, REACHED_END, CROSSED, LEFT_DOMAIN, FAILED, UNRESOLVED = range(6)
+
+#: Words of earlier versions, which files and scripts hold.
+FORMER_WORDS = {"reached t1": "completed", "reached_end": "completed"}
+
+
+class Status(enum.IntEnum):
+    """How a run ended: the words of all functions of both packages, and the integers that stand for them in transformations.
+
+    Results outside of transformations and tables hold the word, such as "contact_lost"; runs inside `jit` and `vmap` hold the
+    integer. (A file has integers of its own, which its attribute `flag_meanings` explains.)
+
+    - `COMPLETED`: the run reached its horizon `t1`. `INVERTED` and `NOT_INVERTED`: whether the top had turned over by then, in
+      tables of inversion times, whose runs end at the inversion.
+    - `CONTACT_LOST`: the ground would have to pull. `JAMMED`: the equation for the normal force has no solution.
+      `DOES_NOT_FIT`: a curvature of the arena is that of the top. `RANK_LOST`: the projected heading of a stroller is
+      undetermined.
+    - `UNRESOLVED`: the model determines no motion, or the run changed its mode too often. `FAILED`: the integration was given
+      up. `ILLEGAL`: a number inside a transformation is out of range, and all results are NaN.
+    - `PENDING`: a cell of a table that has not been computed.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> tippe.Status(1).word, int(tippe.Status.of("contact_lost"))
+    ('contact_lost', 1)
+    >>> tippe.Status.of("reached t1").word  # the word of an earlier version
+    'completed'
+
+    ```
+    """
+
+    PENDING = -1
+    COMPLETED = 0
+    CONTACT_LOST = 1
+    FAILED = 2
+    JAMMED = 3
+    ILLEGAL = 4
+    DOES_NOT_FIT = 5
+    UNRESOLVED = 6
+    INVERTED = 7
+    NOT_INVERTED = 8
+    RANK_LOST = 9
+
+    @property
+    def word(self) -> str:
+        """The word for it in results and files."""
+        return self.name.lower()
+
+    @classmethod
+    def of(cls, word: str) -> Self:
+        """The status that a word, of this version or an earlier one, stands for.
+
+        **Raises:** `ValueError` for a word that stands for none.
+        """
+        known = {status.word: status for status in cls}
+        current = FORMER_WORDS.get(word, word)
+        if current not in known:
+            raise ValueError(f"word = {word!r} must be one of {', '.join(known)}")
+        return known[current]

@@ -59,8 +59,8 @@ class ChunkStore:
         begun = stored or (Stored(header) if header.exists() else None)
         if begun is not None:
             self._check(begun)
-            # The table says with what versions it was begun.
-            self.layout = begun.layout
+            # The table says with what versions it was begun; words that have been added since come behind its own.
+            self.layout = begun.layout._replace(words=layout_words(begun.layout.words, self.layout.words))
         good = {chunk for chunk in range(self.layout.chunks) if stored is not None and stored.chunk(chunk) is not None}
         self._whole = len(good) == self.layout.chunks
         if self._whole:
@@ -189,6 +189,11 @@ class ChunkStore:
         if self._lock is not None:
             self.path.with_name(self.path.name + ".lock").unlink(missing_ok=True)
             self._lock.close()
+
+
+def layout_words(begun: dict[str, tuple[str, ...]], ours: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    """The words of a table that goes on: ours where they begin like those with which it was begun, which stand otherwise."""
+    return {name: ours[name] if ours.get(name, ())[: len(words)] == words else words for name, words in begun.items()}
 
 
 def with_spaces(count: int) -> str:

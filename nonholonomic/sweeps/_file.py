@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..integration import FORMER_WORDS
 from .layout import PENDING, UNREACHED, Layout, Values, boxes
 
 if TYPE_CHECKING:
@@ -272,7 +273,11 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
         if LONG_NAME in array.attrs:
             long_names[name] = _attribute(array, LONG_NAME)
         if "flag_meanings" in array.attrs:
-            words[name] = tuple(_attribute(array, "flag_meanings").split())
+            meanings = _attribute(array, "flag_meanings").split()
+            # Words of earlier versions are read as those of today.
+            words[name] = (
+                tuple(FORMER_WORDS.get(word, word) for word in meanings) if name == "status" else tuple(meanings)
+            )
         else:
             units[name] = _attribute(array, "units")
         if name in dims:

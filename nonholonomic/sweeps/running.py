@@ -56,7 +56,7 @@ def sweep(
     - `variables`: what `job` returns.
     - `request`: plain data that says what is computed; it is stored in the table and guards the file.
     - `path`: file to write, block by block; if it holds part of the same request, only the rest is computed.
-    - `block`: how many cells `job` is given at once, by default `block_for` the number of cells; `most`: an upper limit
+    - `chunk`: how many cells `job` is given at once, by default `chunk_for` the number of cells; `most`: an upper limit
       to it, where results are large.
     - `inner`: the coordinates of the dimensions that results have besides the grid's, numbers or words.
     - `progress`: whether to show it, on a terminal or in a notebook.

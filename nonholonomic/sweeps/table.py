@@ -10,6 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from ..parameters import as_html, readable_unit
+from ..validation import require_package
 from ._chunks import unfinished
 from ._file import HELD, LONG_NAMES, Stored, StoredVariables, coded, replacing, write_file
 from .digits import concise_strings
@@ -102,7 +103,12 @@ class Table(eqx.Module):
         stays in its file, which is then read without its checksums).
 
         **Returns:** the dataset; `Table.save` and a sweep's file hold the same.
+
+        **Raises:** `ModuleNotFoundError`, with the line that installs it, for a package that is missing.
         """
+        require_package("xarray", "xarray", "to_xarray")
+        if chunks is not None:
+            require_package("dask", "xarray", "to_xarray with chunks")
         import xarray
 
         if chunks is not None and isinstance(self.variables, StoredVariables):
@@ -111,7 +117,7 @@ class Table(eqx.Module):
             for name, words in self.words.items():
                 known = np.array([*words, UNREACHED])
                 dataset[name] = dataset[name].copy(
-                    data=dataset[name].data.map_chunks(known.__getitem__, dtype=known.dtype)
+                    data=dataset[name].data.map_blocks(known.__getitem__, dtype=known.dtype)
                 )
             return dataset
 
@@ -124,6 +130,44 @@ class Table(eqx.Module):
         attributes = {name: value for name, value in self.attributes.items() if name != LONG_NAMES}
         dataset = xarray.Dataset(variables, coords, attributes)
         return dataset if chunks is None else dataset.chunk(chunks)
+
+    def to_dataframe(self) -> Any:
+        """The table as a `pandas.DataFrame` (needs pandas): a row for each cell, a column for each axis and each variable.
+
+        A table with variables that have dimensions of their own, such as "time", has a row for each point of these, too, and
+        the other variables are repeated. `attrs["units"]` of the frame are the units.
+
+        **Raises:** `ModuleNotFoundError`, with the line that installs it, if pandas is missing.
+
+        **Example:**
+
+        ```
+        >>> import numpy as np
+        >>> import tippe
+        >>> table = tippe.Table({"speed": np.array([1.0, 2.0])}, {"energy": np.array([0.5, 2.0])}, {"speed": "m s-1"}, {})
+        >>> print(table.to_dataframe())
+           speed  energy
+        0    1.0     0.5
+        1    2.0     2.0
+
+        ```
+        """
+        require_package("pandas", "pandas", "to_dataframe")
+        import pandas
+
+        dims = [*axes_of(self.coords, self.inner), *dict.fromkeys(dim for dims in self.inner.values() for dim in dims)]
+        shape = tuple(len(self.coords[dim]) for dim in dims)
+
+        def column(values: Values, own: tuple[str, ...]) -> Values:
+            # The variable's dimensions stand in the order of the table's.
+            spread = np.expand_dims(values, [k for k, dim in enumerate(dims) if dim not in own])
+            return np.broadcast_to(spread, shape).reshape(-1)
+
+        columns = {dim: column(self.coords[dim], (dim,)) for dim in dims}
+        columns |= {name: column(self.variables[name], self.dims(name)) for name in self.variables}
+        frame = pandas.DataFrame(columns)
+        frame.attrs["units"] = dict(self.units)
+        return frame
 
     def save(self, path: Any) -> None:
         """Write the table to an HDF5 file that `xarray.open_dataset(path, engine="h5netcdf")` opens as it is.
@@ -208,6 +252,7 @@ class Table(eqx.Module):
 
         **Raises:** `ValueError` for a variable that is not numeric, an unknown axis, or a table of one cell.
         """
+        require_package("matplotlib", "plot", "plot")
         from ..views import draw_table
 
         return draw_table(self, variable, at or {}, log, ax)

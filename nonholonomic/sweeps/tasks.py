@@ -12,6 +12,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from ..compiled_programs import forget_programs_if_many
 from .grid import Axis, columns, size_of
 from .layout import Values
 
@@ -85,6 +86,7 @@ _unpacking = threading.Lock()
 @functools.lru_cache(maxsize=4)
 def _unpacked(sent: bytes) -> ChunkTask:
     """The work, compiled: once in a process, however many parts of it come this way."""
+    forget_programs_if_many()
     work = pickle.loads(sent)
     work.compile()
     return work

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..parameters import readable_unit
+from ..parameters import likely, readable_unit
 
 if TYPE_CHECKING:
     from ..sweeps import Table
@@ -57,7 +57,10 @@ def draw_table(
     variable = _first_number(table) if variable is None else variable
     values = table.variables.get(variable)
     if values is None or values.dtype.kind == "U":
-        raise ValueError(f"variable = {variable!r} must be a numeric variable of the table")
+        known = [name for name, values in table.variables.items() if values.dtype.kind != "U"]
+        raise ValueError(
+            f"variable = {variable!r} must be a numeric variable of the table: {', '.join(known)}{likely(variable, known)}"
+        )
     dims = table.dims(variable)
     if not dims:
         raise ValueError("a table of one cell has nothing to draw")
@@ -95,7 +98,7 @@ def _drawn(table: "Table", variable: str, at: dict[str, float]) -> tuple[list[st
     cut = {}
     for name, value in at.items():
         if name not in dims:
-            raise ValueError(f"at: {name!r} must be one of {', '.join(dims)}")
+            raise ValueError(f"at: {name!r} must be one of {', '.join(dims)}{likely(name, dims)}")
         known = table.coords[name]
         if known.dtype.kind == "U":
             if value not in known:
@@ -210,4 +213,4 @@ def _column(table: "Table", argument: str, name: str) -> tuple[Any, str]:
         return table[variable][:, place], f"{name}, {component}{bracket}{unit}" if bracket else f"{unit}, {component}"
     known = [one for one in table.variables if one not in table.inner]
     known += [f"{one}.{part}" for one, dims in table.inner.items() for part in table.coords[dims[0]]]
-    raise ValueError(f"{argument} = {name!r} must be one of {', '.join(known)}")
+    raise ValueError(f"{argument} = {name!r} must be one of {', '.join(known)}{likely(name, known)}")

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..progress import status_line
+from ..validation import require_file, require_package
 from .animation import draw_curves, write_animation
 from .page import Page, page
 from .stage import Stage
@@ -27,17 +28,20 @@ class Viewable(abc.ABC):
 
         **Arguments:**
 
-        - `path`: file to write the page to, or `None`.
+        - `path`: file to write the page to, whose name ends in .html, or `None`.
         - `others`: more runs to be shown, whose time runs along.
         - `overlaid`: whether all are drawn in the arena of the first, otherwise side by side.
 
         **Returns:** a `Page`, with its `html`.
 
-        **Raises:** `ModuleNotFoundError` if k3d is not installed; `OSError` if the file cannot be written; `ValueError` for
-        a batch of runs.
+        **Raises:** before anything is drawn: `ModuleNotFoundError` if k3d is not installed, `OSError` if the file cannot be
+        written, `ValueError` for a file of another kind or a batch of runs.
 
         **Example:** `examples/a_page.py`.
         """
+        require_package("k3d", "view", "view")
+        if path is not None:
+            require_file(path, "path", ".html", ".htm")
         stages = self.stages(others, overlaid)
         found = page(stages, "; ".join(stage.title for stage in stages), speed=0.5)
         if path is not None:
@@ -58,6 +62,8 @@ class Viewable(abc.ABC):
 
         **Example:** `examples/a_page.py`.
         """
+        require_package("matplotlib", "plot", "animate")
+        require_file(path, "path", ".gif", ".mp4")
         write_animation(self.stages(others, overlaid), path, None if times is None else np.asarray(times, dtype=float))
 
     @status_line("drawing")
@@ -72,4 +78,5 @@ class Viewable(abc.ABC):
 
         **Example:** `examples/a_page.py`.
         """
+        require_package("matplotlib", "plot", "plot")
         return draw_curves(self.stages(others))

@@ -12,7 +12,7 @@ from nonholonomic.identification import Free, Identification, of_data, predicted
 from nonholonomic.integration import tolerance_bound
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.progress import status_line
-from nonholonomic.validation import as_number
+from nonholonomic.validation import as_number, require_kind
 
 from ..model.scene import Scene
 from ..runs.simulate import simulate
@@ -102,8 +102,7 @@ def identify(
     """
     generic.check_search(starts, spread, seed, max_steps, progress)
     with status_line("fitting", progress):
-        if not isinstance(scene, Scene):
-            raise ValueError(f"scene = {scene!r} must be a Scene")
+        require_kind(scene, "scene", Scene)
         data = tuple(data) if isinstance(data, list | tuple) else (data,)
         if not data or not all(isinstance(one, Recording) for one in data):
             raise ValueError(f"data = {data!r} must be a Recording, or a list of them")

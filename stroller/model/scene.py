@@ -9,7 +9,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane
-from nonholonomic.validation import Bound, Bounded, all_bounds, as_number, is_traced, legal, require_all, shown
+from nonholonomic.validation import (
+    Bound,
+    Bounded,
+    all_bounds,
+    as_number,
+    is_traced,
+    legal,
+    require_all,
+    require_kind,
+    shown,
+)
 
 from .dynamics import Dynamics, State, stacked
 from .friction import AbstractFriction, Frictionless
@@ -88,10 +98,9 @@ class Scene(Bounded):
     heading: str = eqx.field(static=True, default="intrinsic")
 
     def __check_init__(self):
-        parts = (("body", self.body, Stroller), ("surface", self.surface, AbstractSurface))
-        for name, part, kind in (*parts, ("friction", self.friction, AbstractFriction)):
-            if not isinstance(part, kind):
-                raise ValueError(f"{name} = {part!r} must be a {kind.__name__.removeprefix('Abstract')}")
+        require_kind(self.body, "body", Stroller)
+        require_kind(self.surface, "surface", AbstractSurface, ", such as stroller.Plane() or stroller.Sphere(10.0)")
+        require_kind(self.friction, "friction", AbstractFriction, " law, such as stroller.Damping(rolling=2.0)")
         require_word(self.fork, "fork", FORKS)
         require_word(self.heading, "heading", HEADINGS)
         self.surface.sign(self.side, DRIVES)

@@ -4,7 +4,7 @@ from typing import Any
 
 from nonholonomic.integration import ImplicitMidpoint, require_adaptive, require_adjoint, run_bounds, times_bounds
 from nonholonomic.parameters import numbers
-from nonholonomic.validation import require_all, require_increasing, require_scalars, require_whole
+from nonholonomic.validation import require_all, require_increasing, require_kind, require_scalars, require_whole
 
 from ..model.input import check_input
 from ..model.launch import Launch
@@ -13,13 +13,11 @@ from ..model.scene import Scene
 
 def check_run(scene: Any, launch: Any, t1: Any, input: Any, tolerance: Any) -> None:
     """Raise `ValueError` unless these are a scene, a launch it can start from, a positive horizon, an input, a tolerance."""
-    if not isinstance(scene, Scene):
-        raise ValueError(f"scene = {scene!r} must be a Scene")
-    if not isinstance(launch, Launch):
-        raise ValueError(f"launch = {launch!r} must be a Launch")
+    require_kind(scene, "scene", Scene)
+    require_kind(launch, "launch", Launch)
     require_all(run_bounds(t1, tolerance))
     values = numbers("scene", scene, functions=False) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
-    require_scalars(values, "axes of sweep take lists")
+    require_scalars(values, "axes of sweep take lists, and jax.vmap maps over them")
     scene.check(launch)
     check_input(input, scene, launch)
 

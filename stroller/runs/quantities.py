@@ -9,6 +9,7 @@ import numpy as np
 from nonholonomic.geometry import Plane
 from nonholonomic.parameters import description
 from nonholonomic.sweeps import Table, versions
+from nonholonomic.validation import require_one_run
 
 
 class Quantity(NamedTuple):
@@ -36,6 +37,7 @@ QUANTITIES = {
     "steering_power": Quantity("W", "power of the steering", lambda run: run.power.steering),
     "friction_power": Quantity("W", "power of friction", lambda run: sum(run.power[2:])),
     "side_force": Quantity("N", "side force", lambda run: run.side_force, "axle"),
+    "grip": Quantity("1", "friction that the tyres need", lambda run: run.grip(), "axle"),
     "load": Quantity("N", "load", lambda run: run.load, "axle"),
     "normal_force": Quantity("N", "normal force", lambda run: run.normal_force),
 }
@@ -81,7 +83,6 @@ def table_of_one(run: Any) -> Table:
 
     **Raises:** `ValueError` for a batch of runs.
     """
-    if np.ndim(run.t) != 1:
-        raise ValueError("a batch of runs is no table of one: stroller.sweep makes a table of many")
+    require_one_run(run, "to_table", "; stroller.sweep makes a table of many")
     request = description("scene", run.spec.ride.scene) | {"status": run.status}
     return table_of([run], [], request)

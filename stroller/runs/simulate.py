@@ -51,7 +51,7 @@ def simulate(
       of the scene's magnitudes.
     - `solver`: any adaptive solver of Diffrax for ordinary differential equations, or an `ImplicitMidpoint`; by default
       `diffrax.Dopri8()`, inside transformations, without `adjoint` and where every number is a scalar,
-      `nonholonomic.integration.Oscillatory8()`, which is refused elsewhere for its poor dense output.
+      `nonholonomic.integration.Oscillatory8()`.
     - `max_steps`: a run that needs more has failed; at least 1.
     - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
       parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax differentiates, which pays if a loss
@@ -95,7 +95,7 @@ def simulate(
 def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
     """The run of concrete numbers."""
     spec = RideSpec.of(ride)
-    if not isinstance(ride.settings.for_single_runs, diffrax.AbstractERK | ImplicitMidpoint):
+    if not isinstance(ride.settings.for_steps_alone, diffrax.AbstractERK | ImplicitMidpoint):
         return _read_off(spec, times, *_sampled(ride, times))
     steps, stats = followed(spec)
     return dataclasses.replace(_read_off(spec, times, steps.at(spec, np.asarray(times)), stats), steps=steps)

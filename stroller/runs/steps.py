@@ -49,7 +49,7 @@ class Steps(NamedTuple):
         def field(times: Lanes, states: States) -> States:
             return in_blocks(lambda *at: _field(spec, *at), times, states)
 
-        time, start, solver = self.times[which], self.states[:, which], spec.ride.settings.for_single_runs
+        time, start, solver = self.times[which], self.states[:, which], spec.ride.settings.for_steps_alone
         rates = [field(time, start)]
         if not isinstance(solver, diffrax.AbstractERK):
             # The cubic through states and rates at both ends; an implicit step cannot be repeated so cheaply.
@@ -86,7 +86,7 @@ def followed(spec: RideSpec) -> tuple[Steps, Stats]:
     ride = spec.ride
     problem = _problem(spec)
     if ride.grid is None:
-        path = follow(problem, float(ride.t1), ride.settings)
+        path = follow(problem, float(ride.t1), ride.settings, dense=False)
         return Steps(path.times, path.states), _counted(path.accepted, path.rejected, not path.failed)
     found = _on_grid(problem, spec)
     ends = np.asarray(ride.grid)

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.geometry import AbstractSurface
+from nonholonomic.geometry import AbstractSurface, Plane
 from nonholonomic.integration import FAILED, LEFT_DOMAIN, Settings, explicit_tableau, solve_ensemble
-from nonholonomic.parameters import description, with_numbers
+from nonholonomic.parameters import description, full_axes, numbers, with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, cells_to_check
 from nonholonomic.sweeps import sweep as computed
-from nonholonomic.validation import as_number
+from nonholonomic.validation import as_number, require_outside
 
 from ..model.dynamics import State
 from ..model.friction import Damping, RollingResistance
@@ -89,9 +89,10 @@ def sweep(
 
     - `scene`, `launch`, `input`: as for `simulate`, every number a scalar.
     - `t1`: end of every ride [s].
-    - `axes`: full name of a parameter -> values, such as `{"launch.speed": [1.0, 2.0], "scene.surface.polar": [0.8, 0.9]}`; the
-      parts of the place are `"launch.place[0]"` and `"launch.place[1]"`, the parameters of an input that is a module are
-      under `"input."`. The first axis varies slowest; without any, `{}`, the table has a single ride.
+    - `axes`: full name of a parameter, or the end of it that means one only -> values, such as
+      `{"launch.speed": [1.0, 2.0], "polar": [0.8, 0.9]}`; the parts of the place are `"launch.place[0]"` and
+      `"launch.place[1]"`, the parameters of an input that is a module are under `"input."`. The first axis varies slowest;
+      without any, `{}`, the table has a single ride.
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`.
@@ -124,13 +125,14 @@ def sweep(
 
     ```
     """
+    require_outside((scene, launch, t1, axes, input), "sweep", "simulate")
     check_run(scene, launch, t1, input, tolerance)
     if not isinstance(axes, dict) or not all(isinstance(number, str) for number in axes):
         raise ValueError(f"axes = {axes!r} must be a dictionary, full name of a parameter -> values")
     solver = Settings(tolerance, solver).for_lanes
     explicit_tableau(solver)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
-    grid = named_axes(axes, scene.surface, launch)
+    grid = named_axes(full_axes(axes, variable_numbers(roots)), scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.
     for cells in cells_to_check(grid):
         changed = with_numbers(roots, cells)
@@ -142,6 +144,13 @@ def sweep(
     request |= {one.number: "an axis" for one in grid}
     job = RideJob.of(roots, input, float(t1), float(tolerance), solver)
     return computed(job, grid, VARIABLES, request, path=path, progress=progress, executor=executor)
+
+
+def variable_numbers(roots: dict[str, Any]) -> list[str]:
+    """The full names of what can be varied: single numbers, those that are left out for 0 among them."""
+    found = {name: value for root, tree in roots.items() for name, value in numbers(root, tree).items()}
+    level = isinstance(roots["scene"].surface, Plane)
+    return [name for name, value in found.items() if np.ndim(value) == 0 and (level or name != "scene.body.centre")]
 
 
 class RideJob(NamedTuple):

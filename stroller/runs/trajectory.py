@@ -11,20 +11,24 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
-from nonholonomic.parameters import text_as_html
+from nonholonomic.parameters import likely, text_as_html
 from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Table
-from nonholonomic.validation import is_traced
+from nonholonomic.validation import is_traced, require_package
 from nonholonomic.views import Stage, Viewable, draw_portrait
 
 from ..model.dynamics import Power, State, padded
 from ..model.input import Input
 from ..model.scene import Scene
 from .crossings import crossings, watched
-from .quantities import table_of_one
+from .quantities import QUANTITIES, table_of_one
 from .ride import CONTACT_ROUND_OFF, RANK_LOST, RideSpec, Stats
 from .steps import Steps, followed
 from .view import as_stages
+
+#: The coefficient of friction [1] that no tyre exceeds on a dry road: 0.7 to 1.0 is usual, and 1.8 is that of racing slicks
+#: (Milliken and Milliken, Race Car Vehicle Dynamics (1995), chapter 2).
+MOST_GRIP = 1.8
 
 
 class Trajectory(eqx.Module, Viewable):
@@ -82,6 +86,12 @@ class Trajectory(eqx.Module, Viewable):
     spec: RideSpec
     steps: Steps | None
 
+    def __getattr__(self, name: str) -> Any:
+        # Reached for unknown names, and where reading a known one has raised this kind of error: it raises it again.
+        if name.startswith("_") or hasattr(type(self), name):
+            return object.__getattribute__(self, name)
+        raise AttributeError(f"the run has no {name!r}{likely(name, QUANTITIES)} It has {', '.join(QUANTITIES)}")
+
     @property
     def energy_residual(self) -> Float[Array, " times"]:
         """Energy minus its start and the work done since [J]: zero for an exact solution."""
@@ -104,9 +114,23 @@ class Trajectory(eqx.Module, Viewable):
         force = jnp.abs(self.side_force)
         return jnp.where(force == 0.0, 0.0, force / jnp.maximum(self.load, 0.0))
 
+    @property
+    def loaded_axles(self) -> tuple[str, ...]:
+        """The axles that carry a load: the rear one alone where the centre of mass is on it (`centre` 0)."""
+        return ("rear",) if self.spec.ride.scene.body.centre is None else ("rear", "front")
+
     def grip_margin(self, coefficient: Float[Array, ""]) -> Float[Array, "times 2"]:
         """Side force [N] that each axle has left before it slips, given a coefficient of friction [1]."""
         return coefficient * jnp.maximum(self.load, 0.0) - jnp.abs(self.side_force)
+
+    @property
+    def _grip_line(self) -> str:
+        """The greatest friction that each axle needs, and what slips if that is more than any tyre gives."""
+        needs = dict(zip(self.loaded_axles, np.max(np.asarray(self.grip()), axis=0), strict=False))
+        text = ", ".join(f"{name} axle {most:.3g}" for name, most in needs.items())
+        slips = " and ".join(name for name, most in needs.items() if most > MOST_GRIP)
+        remark = f": the {slips} wheels would slip, for a tyre gives at most {MOST_GRIP:g}" if slips else ""
+        return f"needed friction up to {text}{remark}"
 
     def with_steps(self) -> "Trajectory":
         """The same run with its steps."""
@@ -163,6 +187,7 @@ class Trajectory(eqx.Module, Viewable):
 
         **Raises:** `ValueError` for a batch of runs.
         """
+        require_package("xarray", "xarray", "to_xarray")
         return self.to_table().to_xarray()
 
     def save(self, path: Any) -> None:
@@ -184,6 +209,7 @@ class Trajectory(eqx.Module, Viewable):
 
         **Raises:** `ValueError` for an unknown variable.
         """
+        require_package("matplotlib", "plot", "portrait")
         return draw_portrait(self.to_table(), x, y, ax)
 
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
@@ -211,6 +237,7 @@ class Trajectory(eqx.Module, Viewable):
             f"work {float(self.work[-1]):.6g} J, residual {float(jnp.max(jnp.abs(self.energy_residual))):.1e} J",
             f"  normal force    {float(jnp.min(self.normal_force)):.6g} N to {float(jnp.max(self.normal_force)):.6g} N",
             f"  side forces     up to {shown(jnp.max(jnp.abs(self.side_force), axis=0))} N, rear and front",
+            f"  grip            {self._grip_line}",
             f"  no-slip         {float(jnp.max(jnp.abs(self.constraint))):.1e} m/s",
         ]
         error = float(jnp.max(self.wheelbase_error))

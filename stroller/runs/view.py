@@ -6,6 +6,7 @@ import numpy as np
 
 from nonholonomic.geometry import AbstractSurface
 from nonholonomic.parameters import distinguishing_labels
+from nonholonomic.validation import require_one_run
 from nonholonomic.views import (
     COLOURS,
     DARK,
@@ -39,11 +40,16 @@ ROLL_PER_FRAME = 0.5
 #: Length of the arrow of a force as great as the weight, in units of the wheelbase.
 WEIGHT = 1.0
 
+#: The most that is drawn of the coefficient of friction that the tyres need: it is infinite where the load vanishes.
+DRAWN_GRIP = 3.0
+
 GREEN, BLUE, VIOLET, GOLD = 0x1F8A4C, 0x1B6CA8, 0x7B4FA3, 0xE0A100
 
 
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     """Rides as they are drawn: a stage for each, or one for all if they are to be overlaid."""
+    for run in runs:
+        require_one_run(run, "a picture", ", and hand the others over as others=")
     rides = [run.spec.ride for run in runs]
     starts = [f"ride of {float(run.t[-1]):.3g} s" for run in runs]
     names = distinguishing_labels(starts, [ride.scene for ride in rides], [ride.launch for ride in rides])
@@ -74,8 +80,6 @@ def normals(surface: AbstractSurface, side: str | None, position: np.ndarray) ->
 
 def show(run: Any, number: int, name: str) -> Show:
     """One ride as it is drawn, the `number`-th of all."""
-    if run.t.ndim > 1:
-        raise ValueError(f"a batch of rides, of shape {run.t.shape}, cannot be shown: take one of them")
     scene = run.spec.ride.scene
     length, colour = float(scene.body.wheelbase), COLOURS[number % len(COLOURS)]
     radius, half = RADIUS * length, TRACK * length / 2.0
@@ -99,6 +103,7 @@ def show(run: Any, number: int, name: str) -> Show:
     weight = float(scene.body.mass * scene.gravity)
     forces = read(run.side_force) * WEIGHT * length / weight
     contacts = (position + 0.02 * radius * z, position + length * x + 0.02 * radius * z)
+    grip = np.asarray(run.grip())[:, : len(run.loaded_axles)]
     push = read(run.normal_force)[:, None] * WEIGHT * length / weight * z
     return Show(
         name,
@@ -128,6 +133,7 @@ def show(run: Any, number: int, name: str) -> Show:
             Curve("steering angle [rad]", read(run.steering)),
             Curve("energy [J]", read(run.energy)),
             Curve("normal force [N]", read(run.normal_force)),
+            Curve("friction that the tyres need [1]", read(np.minimum(grip, DRAWN_GRIP).max(axis=-1))),
         ),
     )
 

@@ -40,7 +40,7 @@ def slow_sweep(monkeypatch, stream, cells=6, block=3, waits=(1.3, 0.8), **option
     monkeypatch.setattr(sys, "stderr", stream)
     monkeypatch.setattr("nonholonomic.sweeps.running.workers", lambda: 1)
     x = axis("x", "x", "s", np.linspace(0.0, 1.0, cells))
-    sweep(compute, [x], {"value": Variable("m", float)}, {"what": "a test"}, block=block, **options)
+    sweep(compute, [x], {"value": Variable("m", float)}, {"what": "a test"}, chunk=block, **options)
     return stream.lines
 
 

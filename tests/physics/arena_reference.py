@@ -175,7 +175,7 @@ def row(case):
         dense_output=True,
     )
     end = run.t[-1]
-    found = {"status": "contact_lost" if run.t_events[0].size else "reached t1", "end_time": end}
+    found = {"status": "contact_lost" if run.t_events[0].size else "completed", "end_time": end}
     found |= dict(zip(("q1", "q2", "q3"), place, strict=True))
     for k in range(1, SAMPLES + 1):
         y = run.sol(min(k * case.t1 / SAMPLES, end) if case.t1 / SAMPLES * k <= end else end)

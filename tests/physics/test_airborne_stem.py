@@ -45,7 +45,7 @@ def check_against_the_program(number: int, surface: tippe.Cylinder | tippe.Parab
     )
     scene = stem_scene(surface, case.restitution)
     run = tippe.simulate(scene, launch, case.t1, tolerance=1e-12, solver=diffrax.Tsit5())
-    assert run.status == "reached t1"
+    assert run.status == "completed"
     seen = run.at(case.t1 * np.array(SAMPLES))
     for name, values, size in (("O", seen.position, case.radius), ("e", seen.axis, 1.0)):
         wanted = [[row[f"{name}{i}_{k}"] for i in range(3)] for k in range(1, len(SAMPLES) + 1)]
@@ -75,6 +75,7 @@ def test_both_spheres_bounce_in_a_cylinder():
     assert (started.distance[0][on_stem] > 0.0).all()
 
 
+@pytest.mark.filterwarnings("ignore:surface.radius = .* is larger than a room")
 def test_a_top_that_leans_ends_as_unresolved():
     """In a huge cylinder it rocks from sphere to sphere until both are at rest, when it would on the plane."""
     number = next(k for k, case in enumerate(ON_THE_PLANE) if case.theta == 2.4)
@@ -140,7 +141,7 @@ def test_torques_and_other_arenas():
         scene = tippe.Scene(TOP, surface, friction, contact="hybrid", restitution=0.3, side=side)
         launch = tippe.Launch(2.3, 150.0, place=place, velocity=(0.0, 0.2), angular_velocity=(40.0, -60.0, 0.0))
         run = tippe.simulate(scene, launch, 0.15, tolerance=1e-11)
-        assert run.status == "reached t1"
+        assert run.status == "completed"
         assert 1 in run.contact or len(run.hops) > 0
         assert run.stats["energy_residual"] < 1e-9 * float(run.energy[0])
         assert np.diff(run.energy).max() < 1e-9 * float(run.energy[0])

@@ -23,6 +23,12 @@ ROWS = [
 ]
 
 
+@pytest.mark.filterwarnings(
+    "ignore:spin = .* was it in rpm",
+    "ignore:surface.* is larger than a room",
+    "ignore:theta = 0.0 is exactly upright",
+    "ignore:friction = Frictionless",
+)
 @pytest.mark.parametrize("row", ROWS)
 def test_the_row_keeps_its_bound(row):
     found = row()
@@ -34,7 +40,7 @@ def test_a_broken_bound_is_the_exit_status(error, status, tmp_path, monkeypatch,
     """The table is printed and written all the same."""
 
     def the_case():
-        return Row("a case", "what happens", error, 1.0, "nothing", 1, 0.001, "reached t1")
+        return Row("a case", "what happens", error, 1.0, "nothing", 1, 0.001, "completed")
 
     class Subject:
         rows = staticmethod(lambda: [the_case])

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from drawn_strollers import KINDS, LANES, MORE_KINDS, batch_of
-from hypothesis import HealthCheck, Mode, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from nonholonomic.integration import LEFT_DOMAIN, REACHED_END, Settings, solve_ensemble
@@ -306,7 +306,7 @@ def batches(kind):
 ANGLES = st.floats(-math.pi, math.pi)
 EXPONENTS = st.tuples(st.integers(-8, 8), st.integers(-6, 6), st.integers(-5, 5))
 # A batch comes from a seed, so there is no simpler one to shrink to.
-COMMON = settings(deadline=None, database=None, modes=[Mode.generate], suppress_health_check=list(HealthCheck))
+COMMON = settings(deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
 FEW = settings(COMMON, max_examples=3, derandomize=True)
 MANY = settings(COMMON, max_examples=45, print_blob=True)
 

@@ -143,6 +143,7 @@ def test_a_run_that_fails_inside_a_transformation_is_not_a_number():
     assert np.isnan(jax.jit(lambda spin: time_of(spin=spin, tolerance=1e-8))(1e200))
 
 
+@pytest.mark.filterwarnings("ignore:theta = 0.0 is exactly upright")
 def test_a_top_exactly_upright_never_leaves():
     assert np.isinf(time_of(theta=0.0))
 
@@ -218,6 +219,7 @@ def test_a_launch_exactly_on_the_angle():
     assert np.isinf(last) or 0.0 <= last < 1.0
 
 
+@pytest.mark.filterwarnings("ignore:spin = .* was it in rpm")
 def test_a_field_that_is_no_number_fails_at_once():
     table = tippe.inversion_table(
         tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3)), theta=0.1, spin=[1e200, 100.0], t1=0.1

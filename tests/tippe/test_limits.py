@@ -11,6 +11,12 @@ import tippe
 #: Words that say why a run has no time.
 NO_TIME = ("not_inverted", "contact_lost")
 
+# These numbers are asked for on purpose.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:spin = .* was it in rpm"),
+    pytest.mark.filterwarnings("ignore:theta = 0.0 is exactly upright"),
+]
+
 
 def test_a_top_that_stands_exactly_never_inverts_and_its_time_has_no_slope():
     """theta(0) = 0: infinite, and the derivatives by theta, spin and mu are 0, not NaN."""

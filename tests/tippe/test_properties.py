@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from close import assert_close
-from hypothesis import HealthCheck, Mode, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import tippe
@@ -240,7 +240,7 @@ def check_everything(arena, batch, angle, exponents):
 ANGLES = st.floats(-math.pi, math.pi)
 EXPONENTS = st.tuples(st.integers(-8, 8), st.integers(-6, 6), st.integers(-10, 10))
 # A batch comes from a seed, so there is no simpler one to shrink to.
-COMMON = settings(deadline=None, database=None, modes=[Mode.generate], suppress_health_check=list(HealthCheck))
+COMMON = settings(deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
 FEW = settings(COMMON, max_examples=3, derandomize=True)
 MANY = settings(COMMON, max_examples=180, print_blob=True)
 

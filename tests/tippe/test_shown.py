@@ -75,7 +75,7 @@ def test_a_run_goes_to_xarray_and_to_a_file(run, tmp_path):
         np.testing.assert_array_equal(stored["axis"], run.axis)
     table = tippe.Table.load(tmp_path / "run.h5")
     np.testing.assert_array_equal(table["work"], run.work)
-    assert '"status": "reached t1"' in table.attributes["request"]
+    assert '"status": "completed"' in table.attributes["request"]
 
 
 def test_a_portrait_draws_one_quantity_over_another(run):
@@ -91,7 +91,7 @@ def test_a_portrait_draws_one_quantity_over_another(run):
 
 
 def test_a_run_shows_itself(run):
-    assert "reached t1" not in repr(run)
+    assert "completed" not in repr(run)
     assert "ran to 1 s" in run._repr_html_()
 
 

@@ -45,6 +45,38 @@ def test_every_cell_is_inversion_time(table, rutstam_scene_module):
     assert_close(table.end_theta, 0.95 * math.pi, atol=1e-7)
 
 
+def test_scattered_cells_are_those_of_the_grid(table, rutstam_scene_module, tmp_path):
+    """Launches that are no grid, in one call: the same numbers to the bit, and the columns among the variables."""
+    which = np.array([[0, 1], [2, 0], [1, 1], [2, 0]])
+    columns = {"theta": np.array(THETA)[which[:, 0]], "spin": np.array(SPIN)[which[:, 1]]}
+    arguments = {"t1": 12.0, "scattered": True, "path": tmp_path / "cells.h5"}
+    cells = tippe.inversion_table(rutstam_scene_module, **columns, **arguments)
+    assert cells.shape == (4,)
+    assert cells.dims("time") == ("cell",)
+    for name, values in columns.items():
+        np.testing.assert_array_equal(cells[name], values)
+    np.testing.assert_array_equal(cells.time, table.time[tuple(which.T)])
+    assert cells.units["theta"] == "rad"
+    again = tippe.inversion_table(rutstam_scene_module, **columns, **arguments)
+    np.testing.assert_array_equal(again.time, cells.time)
+    with pytest.raises(ValueError, match="another run: cells is"):
+        tippe.inversion_table(rutstam_scene_module, **columns | {"theta": columns["theta"][::-1]}, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("lists", "message"),
+    [
+        ({"theta": [0.1, 0.2], "spin": [100.0]}, "takes lists of one length, not theta of 2, spin of 1"),
+        ({"theta": 0.1, "spin": 100.0}, "takes lists of one length, not none"),
+        ({"theta": [0.1, 3.3], "spin": 100.0}, "theta = 3.3 must be at most"),
+        ({"theta": [0.1], "spin": 1.0, "scattered": 1}, "scattered = 1 must be True or False"),
+    ],
+)
+def test_scattered_cells_that_fit_no_columns_are_refused(rutstam_scene_module, lists, message):
+    with pytest.raises(ValueError, match=message):
+        tippe.inversion_table(rutstam_scene_module, t1=1.0, **{"scattered": True} | lists)
+
+
 @pytest.mark.parametrize("arena", [tippe.Plane(), pytest.param(tippe.Cylinder(0.3), marks=pytest.mark.slow)])
 def test_the_same_table_by_vmapped_diffrax(arena):
     """Equal to ten times the tolerance; status in every cell, contact loss among them."""
@@ -94,7 +126,7 @@ def test_a_further_axis_by_its_path(rutstam_scene_module):
 
 def test_grids_larger_than_a_block_are_cut_and_joined(rutstam_scene_module, monkeypatch):
     """The order of cells survives blocks, threads and refilled lanes."""
-    monkeypatch.setattr(sweeping, "block_for", lambda cells: 16)
+    monkeypatch.setattr(sweeping, "chunk_for", lambda cells: 16)
     theta, spin = np.linspace(0.05, 0.6, 9), np.linspace(60.0, 200.0, 11)
     asked = {"theta": theta, "spin": spin, "t1": 4.0, "tolerance": 1e-5, "solver": diffrax.Bosh3()}
     cut = tippe.inversion_table(rutstam_scene_module, **asked)
@@ -151,6 +183,7 @@ QUICK = ((0, 2), (17, 0))
         for kind, asked in enumerate(ASKED)
     ],
 )
+@pytest.mark.filterwarnings("ignore:friction = Frictionless")
 def test_every_scene_compiles(arena, law, asked):
     """XLA aborts on calls with arguments that they do not use: arenas and laws go through its single kernel here."""
     scene = tippe.Scene(rutstam_top(), arena, law)

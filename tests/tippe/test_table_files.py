@@ -67,7 +67,7 @@ def test_save_and_load_return_the_same(table, tmp_path):
 
 
 def test_an_interrupted_sweep_resumes_and_recomputes_no_finished_block(rutstam_scene_module, tmp_path, monkeypatch):
-    monkeypatch.setattr(sweeping, "block_for", lambda cells: 8)
+    monkeypatch.setattr(sweeping, "chunk_for", lambda cells: 8)
     monkeypatch.setattr(sweeping, "workers", lambda: 1)
     path, arguments = (
         tmp_path / "table.h5",
@@ -81,7 +81,7 @@ def test_an_interrupted_sweep_resumes_and_recomputes_no_finished_block(rutstam_s
     again = written_blocks.recorded(monkeypatch)
     whole = tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
     assert sorted(again + done) == [0, 1, 2]
-    monkeypatch.setattr(sweeping.Blocks, "write", written_blocks.WRITE)
+    monkeypatch.setattr(sweeping.ChunkStore, "write", written_blocks.WRITE)
     fresh = tippe.inversion_table(rutstam_scene_module, **arguments)
     np.testing.assert_array_equal(whole.status, fresh.status)
     assert_close(whole.end_theta, fresh.end_theta, atol=1e-12)
@@ -92,7 +92,7 @@ def test_an_interrupted_sweep_resumes_and_recomputes_no_finished_block(rutstam_s
 KILLED = """
 import sys, numpy as np, tippe
 from nonholonomic.sweeps import running as sweep
-sweep.block_for = lambda cells: 4
+sweep.chunk_for = lambda cells: 4
 sweep.workers = lambda: 1
 mass, radius = 0.02, 0.02
 top = tippe.Top(mass, radius, 0.006, 131 / 350 * mass * radius**2, 0.4 * mass * radius**2)
@@ -148,7 +148,7 @@ def test_a_table_killed_again_and_again_is_the_one_that_was_not(tmp_path, monkey
         assert enough <= len(after) < 200
         assert (cells[[block not in after for block in range(200)]] == "pending").all()
         finished = after
-    monkeypatch.setattr(sweeping, "block_for", lambda cells: 4)
+    monkeypatch.setattr(sweeping, "chunk_for", lambda cells: 4)
     top = tippe.Top(0.02, 0.02, 0.006, 131 / 350 * 0.02 * 0.02**2, 0.4 * 0.02 * 0.02**2)
     scene = tippe.Scene(top, tippe.Plane(), tippe.Viscous(0.3))
     arguments = {"theta": np.linspace(0.05, 0.3, 400), "spin": [80.0, 100.0], "t1": 5.0}
@@ -194,7 +194,7 @@ def test_unwritable_corrupt_and_foreign_files_are_named(rutstam_scene_module, tm
 def test_a_file_has_one_writer(rutstam_scene_module, tmp_path):
     """While one sweep computes a file, another is refused."""
     path, arguments = tmp_path / "table.h5", {"theta": THETA, "spin": SPIN, "t1": 0.1}
-    once = sweeping.Blocks.write
+    once = sweeping.ChunkStore.write
 
     def and_try_again(self, block, values):
         with pytest.raises(OSError, match="another process is writing it"):
@@ -202,7 +202,7 @@ def test_a_file_has_one_writer(rutstam_scene_module, tmp_path):
         once(self, block, values)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweeping.Blocks, "write", and_try_again)
+        patch.setattr(sweeping.ChunkStore, "write", and_try_again)
         table = tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
     assert (table.status == "not_inverted").all()
     assert list(tmp_path.iterdir()) == [path]

@@ -1,5 +1,6 @@
 """`simulate`: its times, its solvers, its transformations and what it refuses."""
 
+import dataclasses
 import math
 
 import diffrax
@@ -37,6 +38,19 @@ def test_given_times_and_dense_output_agree(rutstam_scene):
     assert_close(given.velocity[0], 0.0, atol=1e-15)
     with pytest.raises(ValueError, match=r"times = .* must be at most 1\.0 \(the run ends there\)"):
         whole.at([0.5, 1.5])
+
+
+def test_a_run_knows_its_inversion_time(rutstam_scene):
+    """As another integrator in another frame finds it: to the errors of both at the same tolerance."""
+    run = tippe.simulate(rutstam_scene, LAUNCH, 7.0)
+    assert_close(run.inversion_time, tippe.inversion_time(rutstam_scene, LAUNCH, 7.0), rtol=1e-7)
+    assert_close(run.at([run.inversion_time]).theta, 0.95 * np.pi, rtol=1e-12)
+    # Whatever the times of output; and what has not inverted by the end has no time.
+    assert tippe.simulate(rutstam_scene, LAUNCH, 7.0, times=[0.0, 1.0]).inversion_time == run.inversion_time
+    assert np.isinf(tippe.simulate(rutstam_scene, LAUNCH, 1.0).inversion_time)
+    assert tippe.simulate(rutstam_scene, tippe.Launch(3.1, 155.0), 1.0).inversion_time == 0.0
+    with pytest.raises(ValueError, match=r"use tippe\.inversion_time there"):
+        _ = dataclasses.replace(run, dense=None).inversion_time
 
 
 def test_illegal_numbers_in_a_batch_of_runs_give_nothing_that_looks_right(rutstam_scene):

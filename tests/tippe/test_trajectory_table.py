@@ -46,7 +46,7 @@ def test_every_cell_is_a_single_run(table, scene):
     assert list(table.coords) == ["launch.theta", "mu", "launch.spin", "time"]
     assert table.shape == (3, 2, 2)
     assert table.theta.shape == table.eta.shape == (3, 2, 2, 31)
-    assert set(table.status.ravel()) == {"reached_end", "contact_lost"}
+    assert set(table.status.ravel()) == {"completed", "contact_lost"}
     for i, theta in enumerate(THETA):
         run = single(scene, theta, 250.0)
         assert_close(table.theta[i, 1, 1, : len(run.t)], run.theta, atol=1e-7)
@@ -120,7 +120,7 @@ def test_further_axes_and_none(scene):
     one = tippe.trajectory_table(scene, theta=0.2, spin=100.0, times=TIMES)
     assert one.shape == ()
     assert one.theta.shape == (31,)
-    assert one.status == "reached_end"
+    assert one.status == "completed"
     assert_close(one.theta, turned.theta[0, 1], atol=1e-7)
     assert "theta [rad] x time (31)" in str(one)
 
@@ -137,15 +137,15 @@ def test_the_file_opens_in_xarray_as_the_table_does(table):
             assert dataset["mu"].attrs["units"] == "s m-1"
             cell = dataset["theta"].sel({"launch.theta": 0.2, "mu": 0.3, "launch.spin": 100.0})
             assert_close(cell.sel(time=1.5), table.theta[1, 1, 0, -1])
-        assert data["status"].attrs["flag_meanings"].split()[0] == "reached_end"
-    assert set(table.to_xarray()["status"].values.ravel()) == {"reached_end", "contact_lost"}
+        assert data["status"].attrs["flag_meanings"].split()[0] == "completed"
+    assert set(table.to_xarray()["status"].values.ravel()) == {"completed", "contact_lost"}
     assert loaded.inner == table.inner
     for name in table.variables:
         np.testing.assert_array_equal(loaded.variables[name], table.variables[name])
 
 
 def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(sweeping, "block_for", lambda cells: 64)
+    monkeypatch.setattr(sweeping, "chunk_for", lambda cells: 64)
     monkeypatch.setattr(sweeping, "workers", lambda: 1)
     path = tmp_path / "table.h5"
     arguments = {"theta": np.linspace(0.1, 1.6, 20), "spin": [*SPIN, 90.0, 130.0], "mu": MU, "times": TIMES}
@@ -155,7 +155,7 @@ def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scen
         tippe.trajectory_table(scene, path=path, **arguments)
     part = tippe.Table.load(path)
     assert (part.status == "pending").sum() == 96
-    assert np.isfinite(part.theta[part.status == "reached_end"]).all()
+    assert np.isfinite(part.theta[part.status == "completed"]).all()
     assert np.isnan(part.theta[part.status == "pending"]).all()
 
     again = written_blocks.recorded(monkeypatch)

@@ -28,6 +28,9 @@ QUANTITIES = Quantities(
     angles=frozenset({"azimuth", "eta"}),
 )
 
+#: How far [rad] a recorded theta may be outside [0, pi] if its errors are smaller, or not known.
+NOISE = 0.3
+
 #: Parameters by name, one value a row.
 Values = dict[str, Float[Array, " rows"]]
 
@@ -115,6 +118,11 @@ class InversionTimes(eqx.Module):
         return Measurements(np.where(before, -np.inf, first), self.error, upper=last, student=student)
 
     @property
+    def series_units(self) -> tuple[str, ...]:
+        """The unit of the only series of the measurements."""
+        return ("s",)
+
+    @property
     def size(self) -> int:
         """How many numbers are predicted."""
         return len(self.time)
@@ -177,6 +185,19 @@ class Recording(AbstractRecording):
     t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
     student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
     quantities: ClassVar[Quantities] = QUANTITIES
+
+    def __check_init__(self):
+        # Of the right shapes, if this comes to its end.
+        super().__check_init__()
+        if "theta" not in self.columns:
+            return
+        value, error = np.asarray(self.value), 0.0 if self.error is None else 5.0 * np.asarray(self.error)
+        reach = np.maximum(NOISE, np.broadcast_to(error, value.shape)).reshape(len(self.times), -1)
+        place = self.columns.index("theta")
+        theta, reach = value.reshape(reach.shape)[:, place], reach[:, place]
+        seen = ~np.isnan(theta)
+        theta, reach = theta[seen], reach[seen]
+        require(theta, "theta", at_least=-reach, at_most=math.pi + reach, why="with room for its errors", unit="rad")
 
 
 def predict_recordings(

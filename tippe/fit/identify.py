@@ -11,12 +11,13 @@ from nonholonomic import identification as generic
 from nonholonomic.identification import Free, Identification, of_data
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.progress import status_line
-from nonholonomic.validation import as_number
+from nonholonomic.validation import as_number, require_kind
 
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..runs.cells import run_kind_of
 from ..runs.inversion import check_run, check_smooth
+from ..runs.launches import variable_numbers
 from .data import InversionTimes, Recording, Values, predict_recordings
 from .hybrid_fit import HybridModel
 
@@ -120,8 +121,7 @@ def identify(
 
 def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) -> tuple[Any, ...]:
     """The sets of data as a tuple, once all is checked; `caller` is who needs derivatives, or `None`."""
-    if not isinstance(scene, Scene):
-        raise ValueError(f"scene = {scene!r} must be a Scene")
+    require_kind(scene, "scene", Scene)
     if caller is not None:
         check_smooth(scene, caller)
     data = tuple(data) if isinstance(data, list | tuple) else (data,)
@@ -133,7 +133,7 @@ def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) 
 
 def unknowns_of(scene: Scene, data: tuple[Any, ...], free: Any) -> dict[str, Free]:
     """The unknowns of a scene and its data by their full names, checked."""
-    of_scene = list(numbers("scene", scene))
+    of_scene = variable_numbers(scene)
     launches = [[name for name, value in numbers("launch", one.launch).items() if value is not None] for one in data]
     own = [names + ["t0"] * isinstance(one, Recording) for names, one in zip(launches, data, strict=True)]
     roots = {"scene": scene, "launch": data[0].launch}

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from nonholonomic.identification import LogDensity, joined
+from nonholonomic.identification import LogDensity, joined, series_units
 from nonholonomic.parameters import full_name
 
 from ..model.scene import Scene
@@ -44,4 +44,4 @@ def log_density(
         raise ValueError(f"priors = {priors!r} must be a dictionary, name of a number -> (mean, standard deviation)")
     named = {full_name("priors", name, list(unknowns)): prior for name, prior in (priors or {}).items()}
     measurements, _, seen = joined(data)
-    return LogDensity.of(SceneModel(scene, data, seen, tolerance), measurements, unknowns, named)
+    return LogDensity.of(SceneModel(scene, data, seen, tolerance), measurements, unknowns, named, series_units(data))

@@ -27,14 +27,12 @@ from nonholonomic.geometry import (
     subtract,
     sum_vectors,
 )
+from nonholonomic.integration import Status
 from nonholonomic.xla_cpu import stored
 
 from .body import AbstractBody, AbstractMeridian
 from .friction import AbstractFriction, ContactLoad, Slip
 from .state import parts
-
-#: Where the axis' component along n stands in the state: cos(theta).
-COS_THETA = 4
 
 #: No angle has this cosine: it stands for the angle of runs that go on through all of them.
 NO_COSINE = -2.0
@@ -53,7 +51,7 @@ FITS = 1e-4
 TURNING = 0.7
 
 #: How a contact can end; the index stands for the word.
-LOSSES = ("contact_lost", "jammed", "does_not_fit")
+LOSSES = (Status.CONTACT_LOST, Status.JAMMED, Status.DOES_NOT_FIT)
 
 
 class Motion(NamedTuple):

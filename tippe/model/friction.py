@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Component, Vector, add, dot, sum_vectors
-from nonholonomic.validation import Bound, Bounded, as_number
+from nonholonomic.validation import Bound, Bounded, as_number, require_kind
 
 
 class Slip(NamedTuple):
@@ -41,6 +41,10 @@ class ContactLoad(NamedTuple):
     def power(self, slip: Slip) -> Component:
         """Power per unit normal force, f.v_s + tau.w [m/s] (`tippe.md`, section 2)."""
         return add(dot(self.force, (slip.x, slip.y)), dot(self.torque, slip.turning))
+
+
+#: What the message about something that is no friction law adds.
+A_LAW = " law, such as tippe.Viscous(0.3) or tippe.Coulomb(mu=0.3, slip_speed=0.01)"
 
 
 class AbstractFriction(Bounded):
@@ -284,8 +288,7 @@ class Rolling(AbstractFriction):
     sliding: AbstractFriction
 
     def __check_init__(self):
-        if not isinstance(self.sliding, AbstractFriction):
-            raise ValueError(f"sliding = {self.sliding!r} must be a Friction, such as Coulomb(mu, slip_speed)")
+        require_kind(self.sliding, "sliding", AbstractFriction, A_LAW)
         if isinstance(self.sliding, Rolling) or self.sliding.set_valued:
             raise ValueError(
                 f"sliding = {self.sliding!r} must be a law of sliding that has a force at every slip velocity"

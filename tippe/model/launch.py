@@ -5,9 +5,11 @@ from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
+import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import Bound, Bounded, as_number
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced
 
 
 def as_numbers(value: Any) -> Any:
@@ -18,6 +20,10 @@ def as_numbers(value: Any) -> Any:
         return tuple(as_number(part) for part in value)
     except TypeError:
         return value
+
+
+#: Spins above this [rad/s] make one suspect revolutions a minute: by hand a top gets 100 to 300 rad/s, 1000 to 3000 rpm.
+FASTEST = 1000.0
 
 
 class Launch(Bounded):
@@ -52,7 +58,7 @@ class Launch(Bounded):
     >>> launch = tippe.Launch(0.1, 100.0, place=(0.5, 0.0), velocity=(0.0, 0.2))
     >>> scene = tippe.Scene(tippe.Top(0.02, 0.02, 0.006, 3e-6, 3.2e-6), tippe.Paraboloid(1.0), tippe.Viscous(0.3))
     >>> tippe.simulate(scene, launch, t1=0.1).status
-    'reached t1'
+    'completed'
 
     ```
     """
@@ -81,10 +87,21 @@ class Launch(Bounded):
             if value is not None and not (isinstance(value, tuple) and len(value) in counts):
                 raise ValueError(f"{name} = {value!r} must be {words}")
 
+    def suspicion(self) -> str | None:
+        if is_traced(self.spin) or not isinstance(self.spin, jax.Array) or self.spin.size == 0:
+            return None
+        fastest = float(np.max(np.abs(self.spin)))
+        if fastest <= FASTEST:
+            return None
+        return (
+            f"spin = {fastest:g} rad/s is {fastest * 30.0 / math.pi:.3g} revolutions a minute, fast for a top: was it in rpm? "
+            f"{fastest:g} rpm are {fastest * math.pi / 30.0:.4g} rad/s"
+        )
+
     def bounds(self) -> Iterator[Bound]:
-        yield Bound(self.theta, "theta", at_least=0.0, at_most=math.pi)
+        yield Bound(self.theta, "theta", at_least=0.0, at_most=math.pi, unit="rad")
         yield Bound(self.spin, "spin")
-        yield Bound(self.eta, "eta", at_least=-math.pi, at_most=math.pi)
+        yield Bound(self.eta, "eta", at_least=-math.pi, at_most=math.pi, unit="rad")
         if self.place is not None:
             yield Bound(self.eta, "eta", at_least=0.0, at_most=0.0, why="place is given")
         yield Bound(self.azimuth, "azimuth")

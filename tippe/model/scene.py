@@ -7,6 +7,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import (
@@ -26,11 +27,12 @@ from nonholonomic.geometry import (
     scale,
     sum_vectors,
 )
-from nonholonomic.validation import Bound, Bounded, as_number, require_all
+from nonholonomic.parameters import numbers
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_all, require_kind
 
 from .body import AbstractBody
 from .dynamics import TURNING, Dynamics
-from .friction import AbstractFriction, Frictionless
+from .friction import A_LAW, AbstractFriction, Frictionless
 from .launch import Launch
 from .state import inclination, joined, parts
 from .stick_slip import StickSlip
@@ -41,6 +43,10 @@ NEARLY_UPRIGHT = 1e-2
 
 #: How fast the foot of a top on a general arena is drawn back to it, over sqrt(g / R); `docs/tippe.md` has the drift.
 PULL = 1.0
+
+
+#: Arenas with a number above this [m] make one suspect another unit.
+LARGEST_ARENA = 20.0
 
 
 class Scene(Bounded):
@@ -58,7 +64,9 @@ class Scene(Bounded):
       `SetValuedCoulomb(mu)`.
     - `gravity`: acceleration of free fall [m/s^2], positive.
     - `contact`: "stop": a run ends where the contact is lost; "hybrid": it goes on through flights, impacts, and changes to
-      the stem and back (`phases/`). A top with a stem needs the latter. One that comes to rest on its sphere and its stem at
+      the stem and back (`modes/`). "stop" is the default, because the published models assume contact, because it holds for
+      every body and law, and because it compiles several times faster; a run that loses contact says how it ended, and that
+      "hybrid" follows the flight. A top with a stem needs "hybrid". One that comes to rest on its sphere and its stem at
       once leans on both on the level plane; on any other arena its run ends there as "unresolved".
     - `restitution`: Newton's coefficient e_N of impacts [1], in [0, 1], for "hybrid" only; `None` is 0.
     - `side`: "inside" or "outside" of a closed surface, "above" an open one; `None` is inside, or above.
@@ -96,12 +104,8 @@ class Scene(Bounded):
     def __check_init__(self):
         if not isinstance(self.body, AbstractBody):
             raise ValueError(f"body = {self.body!r} must be a Top, a SpheroidBody or a ConvexBody")
-        for name, part, kind in (
-            ("surface", self.surface, AbstractSurface),
-            ("friction", self.friction, AbstractFriction),
-        ):
-            if not isinstance(part, kind):
-                raise ValueError(f"{name} = {part!r} must be a {kind.__name__.removeprefix('Abstract')}")
+        require_kind(self.surface, "surface", AbstractSurface, ", such as tippe.Plane() or tippe.Cylinder(0.3)")
+        require_kind(self.friction, "friction", AbstractFriction, A_LAW)
         # This raises if the surface has no such side.
         self.surface.sign(self.side, "inside")
         if self.contact not in ("stop", "hybrid"):
@@ -133,6 +137,15 @@ class Scene(Bounded):
         yield from room_bounds(self.surface, self.surface.sign(self.side, "inside"), self.body.size)
         if self.restitution is not None:
             yield Bound(self.restitution, "restitution", at_least=0.0, at_most=1.0)
+
+    def suspicion(self) -> str | None:
+        for name, value in numbers("surface", self.surface, functions=False).items():
+            unit = self.surface.units.get(name.removeprefix("surface."), "1")
+            if unit == "m" and isinstance(value, jax.Array) and not is_traced(value) and np.any(value > LARGEST_ARENA):
+                size = float(np.max(np.asarray(value)))
+                unit = "mm" if size > 10.0 * LARGEST_ARENA else "cm"
+                return f"{name} = {size:g} m is larger than a room: was it in {unit}? There a top moves as on a Plane"
+        return None
 
     @property
     def frame(self) -> AbstractFrame:
@@ -193,7 +206,8 @@ class Scene(Bounded):
         counts_from_below = len(launch.place) == 2 and names[0] == "mu"
         for bound in surface.place_bounds(place_named(surface, launch.place), self.body.size):
             if counts_from_below and bound.name == "place[1]":
-                yield Bound(launch.place[1], "place[1]", at_least=0.0, at_most=math.pi, why="from the lowest point")
+                why = "from the lowest point"
+                yield Bound(launch.place[1], "place[1]", at_least=0.0, at_most=math.pi, why=why, unit="rad")
             else:
                 yield bound
 

@@ -33,13 +33,13 @@ from nonholonomic.hybrid import Transition
 from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup
 
-from ..model.dynamics import COS_THETA, Dynamics, stacked
+from ..model.dynamics import Dynamics, stacked
 from ..model.scene import Scene
-from ..model.state import joined, parts
+from ..model.state import COS_THETA, joined, parts
 from .coulomb_impact import resolve_coulomb_impact
 from .flying_mode import AbstractFlyingMode
 from .free_body import Ball, FreeBody, axis_rate, balls, energy, gap_rate, standing_on, still_parting
-from .impact import resolve_impact
+from .impact import CLOSING_SPEED, resolve_impact
 from .inversion_problem import InversionProblem
 
 #: The numbers of the phases. The last two are those of a top with a stem: that slides; or a sphere is about to strike, and the
@@ -48,10 +48,6 @@ SLIDING, FLYING, ON_STEM, STRIKING = range(4)
 
 #: Components of a state, behind which others may ride along.
 OWN = 14
-
-#: A rebound slower than this fraction of sqrt(g R) is none: the contact closes, as in `sliding.py`. Ten times the value moves
-#: places and axes after the last bounce by 5e-13, inversion times after 270 flights in a bowl by 3e-13 of themselves.
-CLOSING_SPEED = 1e-5
 
 
 class FlightState(NamedTuple):

@@ -20,7 +20,6 @@ from nonholonomic.xla_cpu import compiled_setup
 from ..model.scene import Scene
 from ..model.state import COS_THETA
 from .airborne import (
-    CLOSING_SPEED,
     FLYING,
     ON_STEM,
     OWN,
@@ -44,11 +43,8 @@ from .airborne import (
 )
 from .flying_mode import AbstractFlyingMode
 from .free_body import Ball, FreeBody, balls, energy, gap_rate
-from .impact import resolve_impact
+from .impact import CLOSING_SPEED, TOUCHING, resolve_impact
 from .inversion_problem import InversionProblem
-
-#: Two spheres are at the arena together if neither is farther from it than this fraction of R, as in `sliding.py`.
-TOUCHING = 1e-9
 
 #: How far the other sphere may be in the arena while it parts, as a fraction of R: where its landing was located a little late.
 OVERLAP = 1e-11

@@ -15,13 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from nonholonomic.geometry import Vector, dot, scale, sum_vectors
-from nonholonomic.integration import LEFT_DOMAIN, AbstractProblem, Settings, traced_solve_ensemble
+from nonholonomic.integration import LEFT_DOMAIN, MOST_STEPS, AbstractProblem, Settings, traced_solve_ensemble
 
 from ..model.dynamics import least
 from ..model.friction import SetValuedCoulomb, length
 from ..model.top import Top
 from .free_body import Ball, FreeBody
-from .impact import LARGEST, MOST_STEPS, TOLERANCE, ContactImpulse, Impact, apply_impulse, approach
+from .impact import LARGEST, TOLERANCE, ContactImpulse, Impact, apply_impulse, approach
 
 Cells = Float[Array, " cells"]
 

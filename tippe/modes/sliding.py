@@ -16,9 +16,9 @@ from nonholonomic.geometry import dot, multiply, scale
 from nonholonomic.hybrid import Transition, TransitionPath
 from nonholonomic.integration import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED, AbstractProblem
 
-from ..model.dynamics import COS_THETA, Dynamics, least, stacked
+from ..model.dynamics import Dynamics, least, stacked
 from ..model.scene import Scene
-from ..model.state import parts
+from ..model.state import COS_THETA, parts
 from ..model.top import Top
 from .flight import angle_reached, c_in_flight, cone, flown, fly
 from .flying_mode import AbstractFlyingMode
@@ -35,21 +35,11 @@ from .free_body import (
     standing_on,
     still_parting,
 )
-from .impact import resolve_impact
+from .impact import CLOSING_SPEED, TOUCHING, resolve_impact
 from .inversion_problem import InversionProblem
 from .leaning import LeaningDynamics, at_rest
 
 Cells = Float[Array, " cells"]
-
-#: A rebound slower than this fraction of sqrt(g R) is none: the contact closes. In the time T that the bounces to come would
-#: take, the sliding top gets the impulse that they would give it, so the error is as small as its square: ten times the value
-#: moves inversion times by 3e-12 of themselves where a top bounces, and by 4e-11 where it rocks from sphere to sphere, ever
-#: less, until it leans on both (`LeaningDynamics.stopped`); the value itself errs by 3e-13. Contact begins too early by T.
-CLOSING_SPEED = 1e-5
-
-#: Two spheres are at the plane together if neither is farther from it than this fraction of R. Ten times the value and a
-#: tenth of it change no bit of a time.
-TOUCHING = 1e-9
 
 #: Bounces in a row after which a run is given up.
 MOST_BOUNCES = 10_000

@@ -11,7 +11,7 @@ from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
 from nonholonomic.integration import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup
 
-from ..model.dynamics import COS_THETA, NO_COSINE, Dynamics
+from ..model.dynamics import NO_COSINE, Dynamics
 from ..model.scene import Scene
 from ..model.slip_onset import Onset
 from ..model.stick_slip import AT_REST, Change, ContactMode, StickSlip

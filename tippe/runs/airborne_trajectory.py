@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import scale, sum_vectors
 from nonholonomic.hybrid import BETWEEN, Segment, hybrid_samples, solve_hybrid_dense
-from nonholonomic.integration import Settings
+from nonholonomic.integration import Settings, Status
 
 from ..model.dynamics import LOSSES, NO_COSINE, Motion
 from ..model.launch import Launch
@@ -37,7 +37,6 @@ from ..modes.inversion_problem import InversionProblem
 from ..modes.trajectory_problem import TrajectoryProblem
 from .flight_trajectory import STATUS, HybridTrajectory, flights_of, sampled_flights
 from .observables import of_each_run
-from .sampled import STATUS as CODES
 
 
 class ArenaTrajectory(HybridTrajectory):
@@ -143,10 +142,10 @@ def simulate_airborne(
     exact = scene.friction.set_valued
     path = solve_hybrid_dense(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1 + exact)
     status = STATUS[path.status]
-    if status == "jammed":
+    if status == Status.JAMMED:
         status = LOSSES[int(loss(scene, jnp.asarray(path.state)))]
     hops = np.array([(one.begin, one.end) for one in path.mode_segments if one.number == FLYING]).reshape(-1, 2)
-    run = flights_of(StickSlipArenaTrajectory if exact else ArenaTrajectory, scene, path, status, hops, times)
+    run = flights_of(StickSlipArenaTrajectory if exact else ArenaTrajectory, scene, path, status.word, hops, times)
     if exact:
         run.stats["sticks"] = int(path.counts[1])
     return run
@@ -155,5 +154,5 @@ def simulate_airborne(
 def sampled_airborne(scene: Scene, launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:
     """Run one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, checked."""
     found = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, kinds=1)
-    codes = jnp.asarray([CODES.index(word) for word in LOSSES])
+    codes = jnp.array([int(status) for status in LOSSES])
     return sampled_flights(ArenaTrajectory, scene, times, found, codes[loss(scene, found.end_state)])

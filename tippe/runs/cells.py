@@ -19,6 +19,7 @@ from nonholonomic.integration import (
     UNRESOLVED,
     Outcome,
     Settings,
+    Status,
     solve_by_diffrax,
     solve_ensemble,
 )
@@ -82,6 +83,7 @@ def _at_the_end(
     return is_inverted(ended, problem, last), scene.theta(jnp.asarray(ended.state))
 
 
+#: The words of tables, in the order of the integers in their files, which is older than `Status`.
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit")
 SMOOTH = RunKind(WORDS, (), None)
 STICK_SLIP = RunKind((*WORDS, "unresolved"), ("sticks",), stick_slip_modes)
@@ -92,6 +94,14 @@ STICK_SLIP_FLY = RunKind((*WORDS, "unresolved"), ("hops", "sticks"), airborne_st
 
 #: The word for a run's status if it has not inverted; `not_inverted` for all others.
 WORD_OF_STATUS = {LEFT_DOMAIN: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
+
+
+def too_many_steps(t1: float, most: int, end: float) -> str:
+    """What a message says of a run that needed more steps than it may take."""
+    return (
+        f"t1 = {t1:g} s is too long: the run needs more than {most:_} steps, with which it came to {end:.4g} s; "
+        "take a shorter t1 or a larger tolerance"
+    ).replace("_", " ")
 
 
 def run_kind_of(scene: Scene) -> RunKind:
@@ -234,7 +244,7 @@ class InversionRuns(NamedTuple):
         """How the contacts ended with which runs ended: codes in `LOSSES`."""
         if self.run_kind is HYBRID:
             # It flies on where contact is lost, and fits everywhere.
-            return LOSSES.index("jammed")
+            return LOSSES.index(Status.JAMMED)
         state = jnp.asarray(state)
         return np.asarray(_flight_loss(scene, state) if self.run_kind.flight_state else _loss(scene.dynamics, state))
 
@@ -246,7 +256,7 @@ class InversionRuns(NamedTuple):
         code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
         lost = code == WORDS.index("contact_lost")
         if lost.any():
-            code = np.where(lost, np.array([WORDS.index(word) for word in LOSSES])[loss()], code)
+            code = np.where(lost, np.array([WORDS.index(status.word) for status in LOSSES])[loss()], code)
         times = {self.times[-1]: np.where(inverted, ended.crossing_time, np.inf)}
         if isinstance(ended, Outcome) and self.crossing == "both":
             times["first_time"] = np.asarray(ended.first_crossing)

@@ -15,7 +15,7 @@ from nonholonomic.derivatives import (
     in_groups,
     tangents_by,
 )
-from nonholonomic.integration import CROSSED, FAILED, LaneScheduler, Settings, crossing_time
+from nonholonomic.integration import CROSSED, FAILED, MOST_STEPS, LaneScheduler, Settings, crossing_time
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, is_traced
 
@@ -24,9 +24,6 @@ from ..model.scene import Scene
 from ..model.state import inclination, parts
 from ..modes.inversion_problem import InversionProblem
 from .inversion import check_event, check_run, check_smooth, nan_if_illegal, permitted
-
-#: A cell that needs more steps than this has failed: parameters tried by a fit may be far off.
-MOST_STEPS = 100_000
 
 #: The least angle [rad] distinguished from 0 in the penalty for a top that does not invert.
 LEAST_ANGLE = 1e-6
@@ -119,6 +116,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         """The extended times of every cell, and their derivatives along directions (as of `VariationalProblem`)."""
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         varied = VariationalProblem(problem, tangents, True)
+        # Parameters tried by a fit may be far off.
         settings = Settings(tolerance, max_steps=MOST_STEPS)
         queue = LaneScheduler.of(
             varied, t1, jnp.asarray(cells), settings, one_kernel=not again, parts=1 + len(tangents)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import BETWEEN, HybridPath, HybridSamples, Segment, hybrid_samples, solve_hybrid_dense
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Settings
+from nonholonomic.integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Settings, Status
 
 from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch
@@ -21,15 +21,20 @@ from ..modes.leaning import BOTH
 from ..modes.sliding import modes
 from ..modes.trajectory_problem import TrajectoryProblem
 from .observables import AbstractTrajectory, of_each_run
-from .sampled import STATUS as CODES
 
-STATUS = {REACHED_END: "reached t1", LEFT_DOMAIN: "jammed", FAILED: "failed", UNRESOLVED: "unresolved"}
+#: What users are told, by the code of the integration.
+STATUS = {
+    REACHED_END: Status.COMPLETED,
+    LEFT_DOMAIN: Status.JAMMED,
+    FAILED: Status.FAILED,
+    UNRESOLVED: Status.UNRESOLVED,
+}
 
 
 class HybridTrajectory(AbstractTrajectory):
     """A run through contacts, flights and impacts; vectors are arrays (times, 3) in the fixed frame (x, y, z).
 
-    `status` is "reached t1", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a row or
+    `status` is "completed", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a row or
     2000 contacts; sphere and stem on the plane together with so much friction that the forces are not determined; sphere and
     stem at rest together on another arena); the run ends at `end_time`. `contact` says at each time which sphere touches: 0
     the top's, 1 its stem's, 2 both, -1 none. At the time of an impact the values are those before it. `distance` is that of
@@ -40,7 +45,7 @@ class HybridTrajectory(AbstractTrajectory):
     drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J]. `rotation` and
     `angular_velocity` are those of `Trajectory`.
 
-    Inside a transformation `status` is a code as for `Trajectory`, 6 for "unresolved"; `hops` is `None`, `stats["hops"]`
+    Inside a transformation `status` is the integer of the `Status`; `hops` is `None`, `stats["hops"]`
     counts the flights. First derivatives by the scene and the launch go through flights and impacts; they are NaN behind an
     event that is grazing, so that within the tolerance it may not happen at all.
 
@@ -161,13 +166,13 @@ def simulate_hybrid(
     kinds, first, state = level_modes((scene, launch), tolerance)
     path = solve_hybrid_dense(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1)
     hops = np.array([(one.begin, one.end) for one in path.segments if one.number == BETWEEN]).reshape(-1, 2)
-    return flights_of(HybridTrajectory, scene, path, STATUS[path.status], hops, times)
+    return flights_of(HybridTrajectory, scene, path, STATUS[path.status].word, hops, times)
 
 
 def sampled_hybrid(scene: Scene, launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
     """Run one launch of a hybrid scene inside a transformation. **Arguments:** as for `simulate`, checked."""
     found = hybrid_samples(level_modes, (scene, launch), times, t1, settings, kinds=1)
-    return sampled_flights(HybridTrajectory, scene, times, found, jnp.asarray(CODES.index("jammed")))
+    return sampled_flights(HybridTrajectory, scene, times, found, jnp.asarray(int(Status.JAMMED)))
 
 
 def sampled_flights(
@@ -177,7 +182,7 @@ def sampled_flights(
     states, place, spin_angle, work, distance = kind.parts_of(found.shown)
     # After the end no sphere touches.
     number = jnp.where(jnp.isnan(found.number), BETWEEN, found.number).astype(int)
-    ended = {code: jnp.asarray(CODES.index(word)) for code, word in STATUS.items()} | {LEFT_DOMAIN: lost}
+    ended = {code: jnp.asarray(int(status)) for code, status in STATUS.items()} | {LEFT_DOMAIN: lost}
     status = sum(jnp.where(found.status == code, index, 0) for code, index in ended.items())
     stats = {"accepted": found.steps - found.rejected, "rejected": found.rejected, "hops": found.counts[0]}
     stats = {name: count.astype(int) for name, count in stats.items()}

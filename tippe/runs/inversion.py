@@ -1,6 +1,7 @@
 """Inversion: launches that end when the axis reaches an angle, and the checks of what is asked about them."""
 
 import math
+import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,9 +14,19 @@ from jaxtyping import Array, Bool, Float
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import CROSSED, LOOSEST, REACHED_END, Outcome, run_bounds
 from nonholonomic.parameters import numbers
-from nonholonomic.validation import Bound, all_bounds, legal, nan_unless, require_all, require_scalars
+from nonholonomic.validation import (
+    Bound,
+    all_bounds,
+    is_traced,
+    legal,
+    nan_unless,
+    require_all,
+    require_kind,
+    require_scalars,
+)
 from nonholonomic.xla_cpu import compiled_setup
 
+from ..model.friction import Frictionless
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..modes.inversion_problem import InversionProblem
@@ -62,21 +73,48 @@ def is_inverted(outcome: Outcome | HybridOutcome, problem: InversionProblem, las
     return (outcome.status == REACHED_END) & above & jnp.isfinite(outcome.crossing_time)
 
 
-def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any) -> None:
-    """Raise `ValueError` unless these are a scene, a launch, a positive horizon and a tolerance in range."""
-    if not isinstance(scene, Scene):
-        raise ValueError(f"scene = {scene!r} must be a Scene")
-    if not isinstance(launch, Launch):
-        raise ValueError(f"launch = {launch!r} must be a Launch")
+#: What the message about a list adds where a table is the better choice.
+LISTS = "inversion_table takes lists, and jax.vmap maps over them"
+
+
+def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LISTS) -> None:
+    """Raise `ValueError` unless these are a scene, a launch, a positive horizon and a tolerance in range.
+
+    **Arguments:** as for `inversion_time`; `lists`: what takes lists instead of single numbers. What a function holds, such as
+    that of a `Graph`, may be lists.
+    """
+    require_kind(scene, "scene", Scene)
+    require_kind(launch, "launch", Launch)
     require_all(run_bounds(t1, tolerance))
-    values = numbers("scene", scene) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
-    require_scalars(values, "inversion_table takes lists")
+    values = numbers("scene", scene, functions=False) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
+    require_scalars(values, lists)
     scene.check_start(launch)
+
+
+def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any) -> None:
+    """Warn of a scene without friction, and of a top that stands exactly upright on a level plane.
+
+    **Arguments:** `launch`: but for its theta; `theta`: one angle or several [rad].
+    """
+    if isinstance(scene.friction, Frictionless):
+        warnings.warn(
+            "friction = Frictionless(): without friction no top turns over; give the scene a law, such as "
+            "tippe.Scene(top, friction=tippe.Viscous(0.3))",
+            UserWarning,
+            stacklevel=4,
+        )
+    at_rest = launch.velocity is None and launch.angular_velocity is None
+    if scene.level and at_rest and not is_traced(theta) and np.any(np.asarray(theta) == 0.0):
+        warnings.warn(
+            "theta = 0.0 is exactly upright, where a top stays for ever: launch it at a small angle, such as 0.01 rad",
+            UserWarning,
+            stacklevel=4,
+        )
 
 
 def event_bounds(angle: Any) -> Iterator[Bound]:
     """The range of the angle [rad] to be reached."""
-    yield Bound(angle, "angle", above=0.0, at_most=math.pi)
+    yield Bound(angle, "angle", above=0.0, at_most=math.pi, unit="rad")
 
 
 def check_smooth(scene: Scene, caller: str) -> None:

@@ -1,12 +1,14 @@
 """The time of inversion of one launch, as a function for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
 
 import math
+import warnings
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from nonholonomic.derivatives import (
@@ -38,8 +40,8 @@ from ..model.launch import Launch
 from ..model.scene import Scene
 from ..modes.airborne import on_the_ground
 from ..modes.inversion_problem import InversionProblem
-from .cells import check_differentiable, run_kind_of
-from .inversion import check_event, check_run, is_inverted, nan_if_illegal, permitted
+from .cells import InversionRuns, check_differentiable, run_kind_of, too_many_steps
+from .inversion import check_event, check_run, is_inverted, nan_if_illegal, permitted, warn_if_it_cannot_invert
 
 
 @status_line("simulating")
@@ -77,8 +79,8 @@ def inversion_time(
     (`nonholonomic/hybrid/saltation.py`). Where an event on the way is grazing, so that within the tolerance it may
     not happen at all, the derivative is NaN; `inversion_table` says so in the variable `grazes`.
 
-    **Raises:** `ValueError` for arguments outside these ranges, for second derivatives through changes of phase, and for
-    derivatives with both, whose impacts may stop a slip.
+    **Raises:** `ValueError` for arguments outside these ranges, for a run that needs more than 2 000 000 steps, for second
+    derivatives through changes of phase, and for derivatives with both, whose impacts may stop a slip.
 
     **Example:**
 
@@ -96,12 +98,43 @@ def inversion_time(
     check_event(angle, crossing)
     solver = Settings(tolerance, solver).for_lanes
     explicit_tableau(solver)
+    warn_if_it_cannot_invert(scene, launch, launch.theta)
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
     unchecked = any(is_traced(leaf) for leaf in leaves)
     question = InversionSolve if run_kind_of(scene).smooth else HybridInversionSolve
     # The last two leaves, horizon and tolerance, do not move the event.
     found = differentiable_solve(question(len(leaves) - 2, structure, solver, crossing == "last", unchecked), *leaves)
+    if not is_traced(found) and not unchecked and np.isnan(found):
+        explain_failure(scene, launch, float(t1), float(angle), float(tolerance), crossing, solver)
     return nan_if_illegal(found, structure, unchecked, leaves)
+
+
+def explain_failure(
+    scene: Scene,
+    launch: Launch,
+    t1: float,
+    angle: float,
+    tolerance: float,
+    crossing: str,
+    solver: diffrax.AbstractERK,
+) -> None:
+    """Raise `ValueError` for a run that needed too many steps; warn of any other failure. The run is made once more.
+
+    **Arguments:** as for `inversion_time`.
+    """
+    runs = InversionRuns(run_kind_of(scene), t1, angle, crossing, solver, "ensemble", [])
+    cell = {
+        name: values[0] for name, values in runs.results({"scene": scene, "launch": launch}, {}, tolerance, 1).items()
+    }
+    most = Settings(tolerance, solver).max_steps
+    word = runs.run_kind.words[cell["status"]]
+    if word == "failed" and cell["steps"] >= most:
+        raise ValueError(too_many_steps(t1, most, cell["end_time"]))
+    warnings.warn(
+        f"the inversion time is NaN: the run ended as {word!r} at {cell['end_time']:.6g} s, at {cell['end_theta']:.6g} rad",
+        UserWarning,
+        stacklevel=4,
+    )
 
 
 class InversionSolve(AbstractDifferentiableSolve):

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from nonholonomic.parameters import description, numbers, with_numbers
+from nonholonomic.parameters import description, full_axes, numbers, with_numbers
 from nonholonomic.sweeps import Axis, axis, cells_to_check
+from nonholonomic.validation import require_kind
 
 from ..model.launch import Launch
 from ..model.scene import Scene
@@ -41,9 +42,29 @@ SEVERAL = {
     "angular_velocity": [(f"angular_velocity_{axis}", "rad s-1") for axis in ("t1", "t2", "n")],
 }
 
+#: What can be varied of a launch.
+NUMBERS_OF_A_LAUNCH = [f"launch.{name}" for name in ("theta", "spin", "eta", "azimuth")]
+NUMBERS_OF_A_LAUNCH += [
+    f"launch.{name}[{k}]"
+    for name, count in (("place", 3), ("velocity", 2), ("angular_velocity", 3))
+    for k in range(count)
+]
+
+
+def variable_numbers(scene: Scene) -> list[str]:
+    """The full names of what can be varied of a scene: single numbers, those that are left out for 0 among them."""
+    found = [name for name, value in numbers("scene", scene).items() if np.ndim(value) == 0]
+    return [name for name in found if name != "scene.restitution" or scene.contact == "hybrid"]
+
 
 def launches(
-    scene: Any, given: dict[str, Any], axes: Any, t1: Any, tolerance: Any, taken: Collection[str] = ()
+    scene: Any,
+    given: dict[str, Any],
+    axes: Any,
+    t1: Any,
+    tolerance: Any,
+    taken: Collection[str] = (),
+    scattered: bool = False,
 ) -> tuple[dict[str, Any], list[Axis], dict[str, str]]:
     """The scene and launch that all cells share, and the axes of the grid, its cells checked before anything compiles.
 
@@ -51,28 +72,29 @@ def launches(
 
     - `scene`: the scene, every number a scalar.
     - `given`: number of the launch, or "mu" for the scene's friction, its own if `None` -> a number or a list.
-    - `axes`: path of a number -> values, or `None`; those of a launch's several numbers are `"launch.place[0]"` and so on, and
-      what is left out of them is 0.
+    - `axes`: path of a number, or the end of it that means one only -> values, or `None`; those of a launch's several numbers
+      are `"launch.place[0]"` and so on, and what is left out of them is 0.
     - `t1`, `tolerance`: as for `inversion_table`.
     - `taken`: names that no axis may have; it then goes by its path, as do axes that would share a name.
+    - `scattered`: whether the lists are of one length and taken together, the k-th of each for the k-th cell.
 
     **Returns:** "scene" and "launch" with the numbers that are no axes, for `with_numbers`; the axes, the last varying
     fastest; and the units of numbers by their short names.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis.
     """
-    if not isinstance(scene, Scene):
-        raise ValueError(f"scene = {scene!r} must be a Scene")
+    require_kind(scene, "scene", Scene)
     if axes is not None and not (isinstance(axes, dict) and all(isinstance(number, str) for number in axes)):
         raise ValueError(f"axes = {axes!r} must be a dictionary, path of a number -> values")
+    axes = full_axes(axes or {}, [*variable_numbers(scene), *NUMBERS_OF_A_LAUNCH])
     known = numbers("scene.friction", scene.friction)
     of_mu = next((number for number in known if number.endswith(".mu")), "scene.friction.mu")
     paths = {name: of_mu if name == "mu" else f"launch.{name}" for name in given}
     values = {paths[name]: value for name, value in given.items() if name != "mu" or value is not None}
     for number in values:
-        if number in (axes or {}):
+        if number in axes:
             raise ValueError(f"axes: {number!r} is an argument of its own")
-    values |= axes or {}
+    values |= axes
     fixed = {number: value for number, value in values.items() if np.ndim(value) == 0}
     launch, several = _with_room(scene, values)
     units = UNITS | scene.body.units | scene.friction.units | dict(several.values())
@@ -88,10 +110,22 @@ def launches(
     roots = with_numbers({"scene": scene, "launch": launch}, fixed)
     check_run(roots["scene"], roots["launch"], t1, tolerance)
     # The modules check their numbers, which may be impossible only together.
-    for cells in cells_to_check(grid):
+    for cells in [rows(grid)] if scattered else cells_to_check(grid):
         looked_at = with_numbers(roots, cells)
         looked_at["scene"].check_start(looked_at["launch"])
     return roots, grid, units
+
+
+def rows(lists: list[Axis]) -> dict[str, Any]:
+    """The numbers of scattered cells: full name -> a value for each.
+
+    **Raises:** `ValueError` unless there are lists, all of one length.
+    """
+    lengths = {one.name: len(one.values) for one in lists}
+    if len(set(lengths.values())) != 1:
+        shown = ", ".join(f"{name} of {length}" for name, length in lengths.items()) or "none"
+        raise ValueError(f"scattered = True takes lists of one length, not {shown}; the other numbers are scalars")
+    return {one.number: one.values for one in lists}
 
 
 def _with_room(scene: Scene, values: Collection[str]) -> tuple[Launch, dict[str, tuple[str, str]]]:

@@ -13,9 +13,9 @@ from nonholonomic.derivatives import exponent_of, growth
 from nonholonomic.geometry import cross
 from nonholonomic.integration import LEFT_DOMAIN, REACHED_END, Settings, explicit_tableau, tolerance_bound
 from nonholonomic.progress import status_line
-from nonholonomic.validation import require
+from nonholonomic.validation import require, require_kind
 
-from ..model.dynamics import LOSSES
+from ..model.dynamics import LOSSES, NO_COSINE
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import joined, parts
@@ -31,7 +31,7 @@ class LyapunovExponent(NamedTuple):
 
     - `exponent`: mean rate [1/s] of exponential divergence in the second half of the run; NaN if the run ended early.
     - `error`: of the exponent [1/s]; an exponent below twice its error is no sign of chaos.
-    - `status`: "reached_end", "contact_lost", "jammed", "does_not_fit" or "failed".
+    - `status`: "completed", "contact_lost", "jammed", "does_not_fit" or "failed".
     - `end_time`: when the run ended [s]; `steps`: accepted and rejected ones.
     - `times`: [s], (32,), and `running`: the mean rate of divergence [1/s] from the start to each of them, (32, ...).
 
@@ -43,7 +43,7 @@ class LyapunovExponent(NamedTuple):
     >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
     >>> found = tippe.lyapunov_exponent(scene, tippe.Launch(1e-3, [155.0, 120.0]), t1=4.0, tolerance=1e-6)
     >>> print(found.status, found.running.shape)
-    ['reached_end' 'reached_end'] (32, 2)
+    ['completed' 'completed'] (32, 2)
 
     ```
     """
@@ -94,10 +94,8 @@ def lyapunov_exponent(
 
     ```
     """
-    if not isinstance(scene, Scene):
-        raise ValueError(f"scene = {scene!r} must be a Scene")
-    if not isinstance(launch, Launch):
-        raise ValueError(f"launch = {launch!r} must be a Launch")
+    require_kind(scene, "scene", Scene)
+    require_kind(launch, "launch", Launch)
     if not run_kind_of(scene).smooth:
         raise ValueError(
             "contact = 'hybrid' and SetValuedCoulomb have no exponents: variations end at a change of phase"
@@ -111,15 +109,15 @@ def lyapunov_exponent(
         raise ValueError(f"scene and launch must hold scalars or one number per launch, not arrays of shapes {shapes}")
     shape = shapes.pop() if shapes else ()
     cells = int(np.prod(shape, dtype=int))
-    # No angle has a cosine of 2, so only a contact that is lost or jams ends a run before the horizon.
+    # No angle has this cosine, so only a contact that is lost or jams ends a run before the horizon.
     problem = InversionProblem.of(scene, launch, jnp.pi, cells)
     # A turning frame turns by another angle for each launch, and that difference would count as divergence.
-    problem = dataclasses.replace(problem, dynamics=scene.dynamics, cos_angle=jnp.asarray(-2.0))
+    problem = dataclasses.replace(problem, dynamics=scene.dynamics, cos_angle=jnp.asarray(NO_COSINE))
     found = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, settings)
     exponent, error = exponent_of(found.logarithm, float(t1))
     whole = found.status == REACHED_END
-    lost = np.asarray(LOSSES)[np.asarray(problem.dynamics.loss(jnp.asarray(found.state)))]
-    words = np.select([whole, found.status == LEFT_DOMAIN], ["reached_end", lost], "failed")
+    lost = np.array([status.word for status in LOSSES])[np.asarray(problem.dynamics.loss(jnp.asarray(found.state)))]
+    words = np.select([whole, found.status == LEFT_DOMAIN], ["completed", lost], "failed")
     times = t1 * np.arange(1, STRETCHES + 1) / STRETCHES
     passed = np.minimum(times[:, None], found.end_time)
     # A run that ends where it starts has not diverged from anything.

@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Self
 
@@ -13,18 +14,24 @@ from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import Component, Vector, dot, scale, sum_vectors
 from nonholonomic.hybrid import HybridPath
-from nonholonomic.integration import DenseSolution, padded
-from nonholonomic.parameters import text_as_html
+from nonholonomic.integration import DenseSolution, Status, few_trials, padded
+from nonholonomic.parameters import likely, text_as_html
 from nonholonomic.progress import status_line
 from nonholonomic.sweeps import Table
-from nonholonomic.validation import is_traced, require, require_increasing
+from nonholonomic.validation import is_traced, require, require_increasing, require_package
 from nonholonomic.views import Stage, Viewable, draw_portrait
 
 from ..model.scene import Scene
 from ..model.state import angular_velocity, parts
-from .quantities import table_of
-from .sampled import STATUS
+from ..model.top import Top
+from .quantities import OF_ONE_RUN, QUANTITIES, table_of
 from .view import as_stages
+
+#: The angle [rad] that counts as inverted by default.
+INVERTED = 0.95 * math.pi
+
+#: Steps that come so near to the angle [rad] are looked at in so many parts.
+NEAR, LOOKS = 0.3, 8
 
 
 def of_each_run(function: Callable[[Any], Array]) -> property:
@@ -73,6 +80,13 @@ class AbstractTrajectory(eqx.Module, Viewable):
     #: The fields with a value for each time, along the last axis.
     by_time: ClassVar[tuple[str, ...]] = ("t", "states", "cyclic", "spin_angle", "work")
 
+    def __getattr__(self, name: str) -> Any:
+        # Reached for unknown names, and where reading a known one has raised this kind of error: it raises it again.
+        if name.startswith("_") or hasattr(type(self), name):
+            return object.__getattribute__(self, name)
+        known = [*QUANTITIES, *OF_ONE_RUN]
+        raise AttributeError(f"the run has no {name!r}{likely(name, known)} It has {', '.join(known)}")
+
     def padded(self) -> Self:
         """The run with the last of its times repeated, up to a power of two; without what observables do not need."""
         longer = {name: padded(np.asarray(getattr(self, name)), len(self.t)) for name in self.by_time}
@@ -96,6 +110,38 @@ class AbstractTrajectory(eqx.Module, Viewable):
     def theta(self) -> Float[Array, " times"]:
         """Angle from the normal to the axis [rad]."""
         return self.scene.theta(self.states)
+
+    @property
+    def inversion_time(self) -> float:
+        """Time [s] at which theta first reaches 0.95 pi, as `tippe.inversion_time` gives it; infinite if it has not by the end.
+
+        It is located on the run's dense output, to the tolerance of the run.
+
+        **Raises:** `ValueError` for a run that was made inside a transformation, and for a batch.
+        """
+        if self.dense is None:
+            raise ValueError(
+                "a run made inside jit, vmap or grad has no dense output to find the time on: use tippe.inversion_time there"
+            )
+
+        def beyond(times: Float[np.ndarray, " looks"]) -> Float[np.ndarray, " looks"]:
+            return np.asarray(self.resampled(times).theta) - INVERTED
+
+        times = np.asarray(self.dense.times)
+        value = beyond(times)
+        if value[0] >= 0.0:
+            return 0.0
+        # Between the ends of the steps theta may rise a little more.
+        last = np.argmax(value >= 0.0) if np.any(value >= 0.0) else len(value) - 1
+        near = np.flatnonzero(np.maximum(value[:last], value[1 : last + 1]) > -NEAR)
+        between = times[near] + np.arange(1, LOOKS)[:, None] / LOOKS * (times[near + 1] - times[near])
+        times = np.unique(np.concatenate([times[: last + 1], between.ravel()]))
+        value = beyond(times)
+        reached = np.flatnonzero(value >= 0.0)
+        if not reached.size:
+            return np.inf
+        k = reached[0]
+        return float(few_trials(beyond, times[k - 1 : k], times[k : k + 1], value[k - 1 : k], value[k : k + 1])[0])
 
     @of_each_run
     def theta_rate(self) -> Float[Array, " times"]:
@@ -177,6 +223,7 @@ class AbstractTrajectory(eqx.Module, Viewable):
 
         **Raises:** `ValueError` for a batch of runs.
         """
+        require_package("xarray", "xarray", "to_xarray")
         return self.to_table().to_xarray()
 
     def save(self, path: Any) -> None:
@@ -198,6 +245,7 @@ class AbstractTrajectory(eqx.Module, Viewable):
 
         **Raises:** `ValueError` for an unknown variable.
         """
+        require_package("matplotlib", "plot", "portrait")
         return draw_portrait(self.to_table(), x, y, ax)
 
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
@@ -253,12 +301,14 @@ class AbstractTrajectory(eqx.Module, Viewable):
     def __str__(self) -> str:
         if is_traced(self.t) or self.t.ndim > 1:
             return f"Trajectory of {self.t.shape} times"
-        word = self.status if isinstance(self.status, str) else STATUS[int(self.status)]
-        ending = {"reached t1": "ran to", "contact_lost": "lost contact at"}.get(word, f"{word} at")
+        word = self.status if isinstance(self.status, str) else Status(int(self.status)).word
+        ending = {"completed": "ran to", "contact_lost": "lost contact at"}.get(word, f"{word} at")
         lines = [
             f"Trajectory of {len(self.t)} times, {ending} {float(self.end_time):.6g} s",
             f"  theta: {float(self.theta[0]):.6g} to {float(self.theta[-1]):.6g} rad",
         ]
+        if word == "contact_lost" and self.scene.contact == "stop" and isinstance(self.scene.body, Top):
+            lines.append("  the top flies on from there in a Scene with contact='hybrid'")
         if "axis_drift" in self.stats:
             lines.append(f"  steps: {self.stats['accepted']} accepted, {self.stats['rejected']} rejected")
             lines.append(f"  drift of |e|: {self.stats['axis_drift']:.1e}")

@@ -7,6 +7,7 @@ import numpy as np
 
 from nonholonomic.parameters import description
 from nonholonomic.sweeps import Table, versions
+from nonholonomic.validation import require_one_run
 
 
 class Quantity(NamedTuple):
@@ -50,8 +51,7 @@ def table_of(run: Any) -> Table:
 
     **Raises:** `ValueError` for a batch of runs.
     """
-    if np.ndim(run.t) != 1:
-        raise ValueError("a batch of runs is no table of one: trajectory_table makes a table of many")
+    require_one_run(run, "to_table", "; trajectory_table makes a table of many")
     known = QUANTITIES | OF_ONE_RUN
     dims = [one.components for one in known.values() if one.components is not None]
     coords = {"time": np.asarray(run.t)} | {dim: np.array(COMPONENTS[dim]) for dim in dict.fromkeys(dims)}

@@ -7,15 +7,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.derivatives import sampled_run, sampled_run_by_diffrax
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, Settings
+from nonholonomic.integration import FAILED, LEFT_DOMAIN, Settings, Status
 
 from ..model.dynamics import LOSSES
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
-
-#: How a run can end; inside a transformation the index stands for the word.
-STATUS = ("reached t1", "contact_lost", "failed", "jammed", "illegal", "does_not_fit", "unresolved")
 
 
 def ended(
@@ -24,15 +21,14 @@ def ended(
     left_domain: Bool[Array, "..."],
     failed: Bool[Array, "..."],
 ) -> Int[Array, "..."]:
-    """The code in `STATUS` of a run that ended in some state."""
-    codes = jnp.asarray([STATUS.index(word) for word in LOSSES])
-    lost = codes[run.dynamics.loss(state[: len(run.state)])]
-    return jnp.where(left_domain, lost, jnp.where(failed, STATUS.index("failed"), STATUS.index("reached t1")))
+    """The `Status` of a run that ended in some state, as an integer."""
+    lost = jnp.array([int(status) for status in LOSSES])[run.dynamics.loss(state[: len(run.state)])]
+    return jnp.where(left_domain, lost, jnp.where(failed, int(Status.FAILED), int(Status.COMPLETED)))
 
 
 class Found(NamedTuple):
     """What is found of a run: `states`, and as `riding` what else a `TrajectoryProblem` carries, are NaN after the end;
-    `status` is a code in `STATUS`, a float."""
+    `status` is a `Status`, a float."""
 
     states: Float[Array, "components times"]
     riding: Float[Array, "riders times"]

@@ -1,20 +1,23 @@
 """Tables of inversion times over the grid of launches and friction."""
 
+import hashlib
 import math
+import warnings
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from typing import Any, NamedTuple
 
 import diffrax
+import numpy as np
 
 from nonholonomic.integration import Settings, explicit_tableau
-from nonholonomic.sweeps import Table, sweep
-from nonholonomic.validation import require_flag
+from nonholonomic.sweeps import Axis, Table, Variable, sweep
+from nonholonomic.validation import require_flag, require_outside
 
 from ..model.scene import Scene
-from .cells import InversionRuns, check_differentiable, run_kind_of
-from .inversion import check_event
-from .launches import described, launches
+from .cells import InversionRuns, check_differentiable, run_kind_of, too_many_steps
+from .inversion import check_event, warn_if_it_cannot_invert
+from .launches import described, launches, rows
 from .sensitivities import sensitivity_names, sensitivity_variables
 from .time_error import errors_of, second_tolerance
 
@@ -35,6 +38,7 @@ def inversion_table(
     axes: dict[str, Any] | None = None,
     solver: diffrax.AbstractERK | None = None,
     method: str = "ensemble",
+    scattered: bool = False,
     errors: bool = False,
     sensitivities: Sequence[str] = (),
     progress: bool = True,
@@ -55,11 +59,14 @@ def inversion_table(
       above it until `t1` (first crossings are ill-conditioned where theta oscillates about the angle); "both" for the two from
       one run, in the variables `first_time` and `last_time` in place of `time`, the status being that of the last.
     - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
-    - `axes`: further axes, full name of a parameter -> values, such as `{"scene.body.offset": [0.005, 0.006]}`.
+    - `axes`: further axes, full name of a parameter, or the end of it that means one only -> values, such as
+      `{"offset": [0.005, 0.006]}` for `"scene.body.offset"`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`, or `Dopri8()` for method "diffrax".
     - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which supports first
       crossings only.
+    - `scattered`: whether the lists are no axes of a grid but columns of one length: the k-th cell has the k-th number of each.
+      The table then has the only axis "cell", and the columns are among its variables.
     - `errors`: whether to run every cell again at a hundredth of the tolerance, for bounds of its errors; a table then costs
       2.8 times as much. Below a tolerance of 1e-12 the second run has a hundred times the tolerance instead, and the bounds
       are wider.
@@ -105,8 +112,10 @@ def inversion_table(
 
     ```
     """
+    require_outside((scene, theta, spin, eta, mu, azimuth, axes, t1, angle), "inversion_table", "inversion_time")
     check_event(angle, crossing, ("first", "last", "both"))
     require_flag(errors, "errors")
+    require_flag(scattered, "scattered")
     if method not in ("ensemble", "diffrax"):
         raise ValueError(f"method = {method!r} must be 'ensemble' or 'diffrax'")
     if method == "diffrax" and sensitivities:
@@ -116,7 +125,7 @@ def inversion_table(
     if method == "diffrax" and crossing != "first":
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     given = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
-    roots, grid, units = launches(scene, given, axes, t1, tolerance)
+    roots, grid, units = launches(scene, given, axes, t1, tolerance, scattered=scattered)
     settings = Settings(tolerance, solver)
     solver = settings.for_single_runs if method == "diffrax" else settings.for_lanes
     explicit_tableau(solver)
@@ -126,6 +135,8 @@ def inversion_table(
         check_differentiable(scene)
     if not run_kind.smooth and method == "diffrax":
         raise ValueError("method = 'diffrax' is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
+    looked_at = {one.number: one.values for one in grid}
+    warn_if_it_cannot_invert(scene, roots["launch"], looked_at.get("launch.theta", roots["launch"].theta))
     runs = InversionRuns(run_kind, float(t1), float(angle), crossing, solver, method, paths)
     job = InversionJob(runs, roots, float(tolerance), errors)
 
@@ -138,7 +149,27 @@ def inversion_table(
     if paths:
         request |= {"sensitivities": paths}
         variables = variables | sensitivity_variables(paths, units)
-    return sweep(job, grid, variables, request, path=path, progress=progress, executor=executor)
+    if scattered:
+        columns = rows(grid)
+        request |= {"cells": digest(columns)}
+        variables = {one.name: Variable(one.unit, np.float64, long_name=one.long_name) for one in grid} | variables
+        job = ScatteredJob(job, columns, {one.number: one.name for one in grid})
+        grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
+    table = sweep(job, grid, variables, request, path=path, progress=progress, executor=executor)
+    warn_of_long_runs(table, float(t1), settings.max_steps)
+    return table
+
+
+def warn_of_long_runs(table: Table, t1: float, most: int) -> None:
+    """Warn of runs that needed more steps than they may take; a table that stays in its file is not looked at."""
+    if not isinstance(table.variables, dict):
+        return
+    long = (table.variables["status"] == "failed") & (table.variables["steps"] >= most)
+    if long.any():
+        end = float(np.min(table.variables["end_time"][long]))
+        warnings.warn(
+            f"{long.sum()} of {long.size} runs have failed: {too_many_steps(t1, most, end)}", UserWarning, stacklevel=3
+        )
 
 
 class InversionJob(NamedTuple):
@@ -164,3 +195,27 @@ class InversionJob(NamedTuple):
             silent = tuple(words.index(word) for word in ("failed", "unresolved") if word in words)
             found |= errors_of(found, second, runs.times, runs.run_kind.counts, silent)
         return found
+
+
+class ScatteredJob(NamedTuple):
+    """A job whose cells are the rows of some columns; these are among the results.
+
+    `columns`: full name of a number -> its value in every cell; `names`: full name -> name of the variable.
+    """
+
+    job: InversionJob
+    columns: dict[str, Any]
+    names: dict[str, str]
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which the first `count` are to be run."""
+        chosen = {number: values[columns["cell"]] for number, values in self.columns.items()}
+        return self.job(chosen, count) | {self.names[number]: values for number, values in chosen.items()}
+
+
+def digest(columns: dict[str, Any]) -> str:
+    """A checksum of columns of numbers and of their names."""
+    whole = hashlib.sha256()
+    for name, values in columns.items():
+        whole.update(name.encode() + np.ascontiguousarray(values, float).tobytes())
+    return whole.hexdigest()[:16]

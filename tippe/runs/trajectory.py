@@ -15,6 +15,7 @@ from nonholonomic.integration import (
     LOOSEST,
     DenseSolution,
     Settings,
+    Status,
     explicit_tableau,
     follow,
     require_adaptive,
@@ -33,7 +34,7 @@ from .airborne_trajectory import sampled_airborne, simulate_airborne
 from .flight_trajectory import HybridTrajectory, sampled_hybrid, simulate_hybrid
 from .inversion import check_run
 from .observables import AbstractTrajectory, of_each_run
-from .sampled import STATUS, ended, sampled
+from .sampled import ended, sampled
 from .stick_slip_trajectory import solve_stick_slip_dense
 
 
@@ -45,8 +46,9 @@ class Trajectory(AbstractTrajectory):
     sphere those of the centre of mass; `contact` is where the body touches the arena, `normal` the arena's normal there.
     `rotation` (times, 3, 3) takes the body's axes to the fixed frame, and `angular_velocity` is the rate at which it turns.
 
-    `status` is "reached t1", "contact_lost", "failed", "jammed" or "does_not_fit"; inside a transformation it is a code 0, 1,
-    2, 3, 5, or 4, "illegal", for numbers out of range, for which everything is NaN. The run ends at `end_time`. The top does
+    `status` is the word of a `Status`: "completed", "contact_lost", "failed", "jammed" or "does_not_fit"; inside a
+    transformation it is the integer, also `Status.ILLEGAL` for numbers out of range, for which everything is NaN. The run ends
+    at `end_time`. The top does
     not fit where a curvature of the arena reaches that of its sphere, which then touches elsewhere too. It is jammed where the
     equation for the normal force ceases to have a solution, because friction pulls the top into the arena as hard as the
     normal force pushes it out: strong friction, a large offset and a slip along the axis do that. `stats` holds accepted and
@@ -157,11 +159,11 @@ def simulate(
     >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
     >>> run = tippe.simulate(scene, tippe.Launch(0.1, 155.0), t1=1.0, tolerance=1e-6)
     >>> print(f"{run.theta[-1]:.3f} rad, {run.spin[-1]:.1f} rad/s, {run.status}")
-    0.025 rad, 154.0 rad/s, reached t1
+    0.025 rad, 154.0 rad/s, completed
 
     ```
     """
-    check_run(scene, launch, t1, tolerance)
+    check_run(scene, launch, t1, tolerance, "jax.vmap(simulate) takes lists, and so does trajectory_table")
     require_adaptive(solver)
     require_adjoint(adjoint)
     if times is not None:
@@ -211,7 +213,7 @@ def _legal_or_nan(
         # Diffrax would differentiate the run of no length.
         scene, launch = nan_unless(may, (scene, launch))
     found = _traced(scene, launch, times, t1, tolerance, solver, adjoint)
-    status = jnp.where(may, found.status, STATUS.index("illegal"))
+    status = jnp.where(may, found.status, int(Status.ILLEGAL))
     return eqx.tree_at(lambda one: (one.t, one.status), nan_unless(may, found), (times, status))
 
 
@@ -255,7 +257,7 @@ def _as_trajectory(scene: Scene, run: TrajectoryProblem, path: DenseSolution | H
     # NumPy cuts these: JAX would compile every cut anew for every number of steps.
     states = np.asarray(path.states)
     times, end, last = on_device(path.times, path.times[-1], states[:, -1])
-    status = STATUS[int(_ended(run, last, jnp.asarray(path.left_domain), jnp.asarray(path.failed)))]
+    status = Status(int(_ended(run, last, jnp.asarray(path.left_domain), jnp.asarray(path.failed)))).word
     sticks = {"sticks": int(path.counts[0])} if isinstance(path, HybridPath) else {}
     return Trajectory(times, scene, *on_device(*_parts(len(run.state), states)), status, end, {}, path).with_stats(
         path, **sticks

@@ -73,7 +73,7 @@ def _followed(
     settings: Settings,
     names: tuple[str, ...],
 ) -> tuple[Outcome, Int[Array, " cells"], dict[str, Float[Array, "cells times ..."]]]:
-    """How the runs end, the codes of that in `sampled.STATUS`, and the named quantities on the way."""
+    """How the runs end, as integers of `Status`, and the named quantities on the way."""
     outcome, samples = solve_with_samples(problem, times, times[-1], count, settings, one_kernel=True)
     run = cast(TrajectoryProblem, problem.whole)
     status = ended(run, outcome.state, outcome.status == LEFT_DOMAIN, outcome.status == FAILED)

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nonholonomic.integration import Settings, times_bounds
+from nonholonomic.integration import Settings, Status, times_bounds
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
-from nonholonomic.validation import as_number, require, require_all, require_increasing
+from nonholonomic.validation import as_number, require, require_all, require_increasing, require_outside
 
 from ..model.scene import Scene
 from .cells import COUNTED
@@ -18,8 +18,8 @@ from .launches import described, launches
 from .quantities import COMPONENTS, QUANTITIES
 from .trajectory_cells import solve_cells
 
-#: The status of a run, in the order of `sampled.STATUS`; a word has no space in it, so that a file can list them.
-WORDS = ("reached_end", "contact_lost", "failed", "jammed")
+#: How a run may end, in the order of `Status`.
+WORDS = tuple(Status(code).word for code in range(Status.UNRESOLVED + 1))
 
 #: Numbers of the samples of a block, at most: 256 MB of them.
 MOST_SAMPLED = 1 << 25
@@ -53,7 +53,7 @@ def trajectory_table(
       The axes of a launch's numbers are called "launch.theta", "launch.eta" and "launch.spin", for `theta` is what becomes
       of it.
     - `times`: of the samples [s], increasing, from 0 or later; the last is the horizon.
-    - `axes`: further axes, path of a number -> values, such as `{"launch.azimuth": [0.0, 1.0]}`.
+    - `axes`: further axes, as for `inversion_table`, such as `{"azimuth": [0.0, 1.0]}`.
     - `quantities`: what to sample: any of "theta", "eta", "azimuth" [rad], "theta_rate", "spin" [rad/s], "energy" [J],
       "jellett" [kg m^3/s], "normal_force" [N], and the vectors "axis" [1], "position" [m], "velocity" [m/s], "angular_momentum"
       [kg m^2/s] and "slip" [m/s]; all as in `Trajectory`.
@@ -63,7 +63,7 @@ def trajectory_table(
 
     **Returns:** a `Table` with a variable for each quantity, which has the axes' dimensions and a last dimension "time"; a
     vector has one more behind it, "component" (x, y, z), for "slip" "tangent" (t1, t2). They are not a number after the end of
-    a run. Besides, over the axes: `status` ("reached_end" of the times, "contact_lost", "failed", "jammed"), `end_time` [s],
+    a run. Besides, over the axes: `status` (the word of a `Status`, "completed" at the last of the times), `end_time` [s],
     `steps` and `rejected`.
 
     **Raises:** `ValueError` for arguments out of range, an unknown axis or quantity, and for a scene with
@@ -81,10 +81,11 @@ def trajectory_table(
     >>> table.dims("theta"), table.theta.shape
     (('launch.theta', 'time'), (2, 11))
     >>> print(table.theta[:, -1].round(3), table.status)
-    [0.025 0.076] ['reached_end' 'reached_end']
+    [0.025 0.076] ['completed' 'completed']
 
     ```
     """
+    require_outside((scene, theta, spin, eta, mu, times, axes), "trajectory_table", "simulate with times=")
     names = _names(quantities)
     require_all(times_bounds(as_number(times), None))
     require_increasing(times, "times")

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.parameters import distinguishing_labels
+from nonholonomic.validation import require_one_run
 from nonholonomic.views import (
     COLOURS,
     DARK,
@@ -92,6 +93,8 @@ _turning = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis
 
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     """Runs as they are drawn: a stage for each, or one for all if they are to be overlaid."""
+    for run in runs:
+        require_one_run(run, "a picture", ", and hand the others over as others=")
     starts = [f"θ(0) = {float(run.theta[0]):.3g} rad, {float(run.spin[0]):.4g} rad/s" for run in runs]
     names = distinguishing_labels(starts, [run.scene for run in runs])
     named = [(name, run.scene, motion(run)) for name, run in zip(names, runs, strict=True)]
@@ -100,8 +103,6 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
 
 def motion(run: Any) -> Motion:
     """The motion of one run at times so close together that its turning is seen, where it can be told between its own."""
-    if run.t.ndim > 1:
-        raise ValueError(f"a batch of runs, of shape {run.t.shape}, cannot be shown: take one of them")
     if run.dense is not None:
         times = np.asarray(run.t)
         # Not the angle about the axis alone: half-way up a top turns across it, as fast.

@@ -178,7 +178,7 @@ def test_the_states_of_many_balls_at_a_horizon(t1):
 def test_a_single_ball_at_any_time():
     ball = BALLS[20]
     path = single(ball, 4.0)
-    ends = [piece.end for piece in path.stays]
+    ends = [piece.end for piece in path.mode_segments]
     assert_close(ends[:-1], [ball.bounce(number) for number in range(1, ball.rests_after + 1)], rtol=1e-14)
     assert path.counts.tolist() == [ball.rests_after]
     assert path.status == REACHED_END

@@ -67,7 +67,7 @@ def cheap_sweep(path, run=None, job=None, **options):
         return expected(columns["x"])
 
     grid = [axis("x", "x", "s", X)]
-    return sweep(job or compute, grid, VARIABLES, {"what": "a test"}, path=path, block=BLOCK, **options)
+    return sweep(job or compute, grid, VARIABLES, {"what": "a test"}, path=path, chunk=BLOCK, **options)
 
 
 def finished_blocks(table: Table) -> set[int]:

@@ -56,7 +56,7 @@ def assert_same_bits(one: Table, other: Table):
 
 @pytest.fixture
 def many_blocks(monkeypatch):
-    monkeypatch.setattr(running, "block_for", lambda cells: 64)
+    monkeypatch.setattr(running, "chunk_for", lambda cells: 64)
 
 
 TOP = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
@@ -66,7 +66,7 @@ TIMES = {"theta": np.linspace(0.05, 0.6, 40), "spin": [80.0, 100.0, 190.0], "mu"
 @pytest.fixture(scope="module")
 def by_threads():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(running, "block_for", lambda cells: 64)
+        patch.setattr(running, "chunk_for", lambda cells: 64)
         return tippe.inversion_table(TOP, **TIMES)
 
 
@@ -251,9 +251,9 @@ def pid():
 """
 
 
-def script(folder, domain_margin):
+def script(folder, guard):
     program = folder / "program.py"
-    program.write_text(SCRIPT.format(domain_margin=domain_margin))
+    program.write_text(SCRIPT.format(guard=guard))
     environment = os.environ | {"PYTHONPATH": str(HERE.parents[2])}
     return subprocess.Popen(
         [sys.executable, program], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

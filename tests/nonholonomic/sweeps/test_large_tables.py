@@ -30,7 +30,7 @@ def job(columns, count):
 
 def large_sweep(path, **options):
     inner = [axis("two", "two", "1", [1.0, 2.0])]
-    return sweep(job, [Y, X], VARIABLES, {"what": "a test"}, path=path, inner=inner, block=4096, **options)
+    return sweep(job, [Y, X], VARIABLES, {"what": "a test"}, path=path, inner=inner, chunk=4096, **options)
 
 
 @pytest.fixture
@@ -133,7 +133,7 @@ def test_a_billion_cells_are_refused_at_once(monkeypatch):
 
 def test_an_illegal_cell_inside_a_large_grid_ends_the_sweep_when_its_turn_comes(monkeypatch, tmp_path):
     monkeypatch.setattr("nonholonomic.sweeps.grid.CHECKED_WHOLE", 1)
-    monkeypatch.setattr(running, "block_for", lambda cells: 64)
+    monkeypatch.setattr(running, "chunk_for", lambda cells: 64)
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
     # The law of the checks is as that of a module, but not monotone.
     bounds = tippe.Viscous.bounds

@@ -113,3 +113,22 @@ def test_a_sweeps_file_too(tmp_path):
     found = cheap_sweep(path)
     with xarray.open_dataset(path, engine="h5netcdf") as data:
         assert set(data.variables) == {*found.coords, *found.variables}
+
+
+def test_a_table_goes_to_pandas_a_row_for_each_cell():
+    coords = {"theta": np.array([0.1, 0.2]), "mu": np.array([0.3, 0.4, 0.5])}
+    time = np.arange(6.0).reshape(2, 3)
+    words = np.where(time > 2.0, "inverted", "failed")
+    frame = Table(coords, {"time": time, "status": words}, {"time": "s"}, {}).to_dataframe()
+    assert list(frame.columns) == ["theta", "mu", "time", "status"]
+    assert frame.attrs["units"] == {"time": "s"}
+    chosen = frame[(frame.theta == 0.2) & (frame.mu == 0.4)]
+    assert (chosen.time.item(), chosen.status.item()) == (4.0, "inverted")
+    # What has dimensions of its own has a row for each of its points.
+    coords |= {"component": np.array(["x", "y"])}
+    slip = np.arange(12.0).reshape(2, 3, 2)
+    frame = Table(coords, {"time": time, "slip": slip}, {}, {}, inner={"slip": ("component",)}).to_dataframe()
+    assert len(frame) == 12
+    one = frame[(frame.theta == 0.2) & (frame.mu == 0.5) & (frame.component == "y")]
+    assert (one.time.item(), one.slip.item()) == (5.0, 11.0)
+    assert len(Table({}, {"time": np.array(3.0)}, {}, {}).to_dataframe()) == 1

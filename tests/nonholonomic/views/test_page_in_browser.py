@@ -89,7 +89,7 @@ def poses(driver, at: float, stage: int, bodies: int = 1) -> np.ndarray:
 def test_nothing_is_missing_without_a_network(browser):
     assert [entry for entry in browser.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")] == []
     assert browser.execute_script("return document.querySelectorAll('.scene canvas').length") >= 2
-    assert browser.execute_script("return document.querySelectorAll('.strip').length") == 6
+    assert browser.execute_script("return document.querySelectorAll('.strip').length") == 7
 
 
 def test_the_top_is_where_the_run_is(browser, top):
