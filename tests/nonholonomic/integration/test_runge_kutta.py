@@ -50,8 +50,8 @@ def test_a_step_is_that_of_diffrax(solver):
     places = watched_places(explicit_tableau(solver))
     assert len(places) == len(step.margins)
     moved = step.margins[:, 0, 0] - 10.0 - state[1, 0]
-    # The second component falls at the rate 1 + t at first.
-    np.testing.assert_allclose(moved, -(0.1 * places) - 0.5 * (0.1 * places) ** 2, atol=5e-4)
+    # The second component falls at the rate 1 + t at first; the first stages of Bosh3 are of first order.
+    np.testing.assert_allclose(moved, -(0.1 * places) - 0.5 * (0.1 * places) ** 2, atol=1.5e-3)
     # The first lane stays on its side; the last one is beyond it all along, where there are stages between start and end.
     assert step.first_negative[0] == 2.0
     between = [fraction for fraction in explicit_tableau(solver).c if fraction < 1.0]
