@@ -10,6 +10,7 @@ if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
 from .compilation_cache import enable_compilation_cache as enable_compilation_cache
+from .formulations import AbstractSystem as AbstractSystem
 from .geometry import AbstractSurface as AbstractSurface
 from .geometry import Cylinder as Cylinder
 from .geometry import Graph as Graph
@@ -21,6 +22,14 @@ from .geometry import Spheroid as Spheroid
 from .geometry import Torus as Torus
 from .integration import Status as Status
 from .sweeps import local_processes as local_processes
+from .systems import AbstractMode as AbstractMode
+from .systems import Hybrid as Hybrid
+from .systems import Recording as Recording
+from .systems import Trajectory as Trajectory
+from .systems import event_time as event_time
+from .systems import identify as identify
+from .systems import simulate as simulate
+from .systems import sweep as sweep
 
 try:
     __version__ = version("nonholonomic")

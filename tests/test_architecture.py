@@ -22,7 +22,8 @@ HEIGHT = {
     "hybrid": 2,
     "sweeps": 2,
     "identification": 3,
-    "views": 4,
+    "systems": 4,
+    "views": 5,
 }
 
 #: The same for the rooms of a vehicle.

@@ -68,7 +68,7 @@ def ensemble_solve_with_tangents(
     def along(some: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
         return slopes_by_variations(problem, some, *given, one_kernel=one_kernel)
 
-    if one_kernel and len(tangents) > MOST_FORWARD:
+    if one_kernel and problem.fits_one_kernel and len(tangents) > MOST_FORWARD:
         there, slopes = _slopes_by_adjoint(problem, tangents, *given)
     else:
         there, slopes = in_groups(along, tangents)

@@ -37,6 +37,14 @@ class VariationalProblem(AbstractProblem):
     tangents: tuple[Any, ...]
     ends_on_event: bool = eqx.field(static=True)
 
+    @property
+    def direction_decides(self) -> bool:
+        return self.problem.direction_decides
+
+    @property
+    def fits_one_kernel(self) -> bool:
+        return self.problem.fits_one_kernel
+
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         states, scales = self.problem.start()
 

@@ -3,6 +3,7 @@
 The forms agree where all of them apply, so each is a check of the others and of equations written out by hand.
 """
 
+from .formulation import AbstractFormulation as AbstractFormulation
 from .formulation import AbstractSystem as AbstractSystem
 from .formulation import ConstrainedConnection as ConstrainedConnection
 from .formulation import Coordinates as Coordinates

@@ -33,7 +33,32 @@ START_TOLERANCE = 1e-9
 
 
 class AbstractSystem(eqx.Module):
-    """The data of a mechanical system with n coordinates and k linear constraints on its velocity."""
+    """A mechanical system with n coordinates and k linear constraints on its velocity, by its data.
+
+    Subclass it, declare the numbers of your model as fields, set `dimension` to the number of coordinates, and write functions
+    of one set of coordinates: the `metric`, and as needed `potential`, `constraints`, `force` and `frame`. The equations of
+    motion follow; `nonholonomic.simulate`, `event_time`, `sweep` and `identify` run them.
+
+    **Example:** a bead on a parabolic wire z = x^2 / 2, which oscillates in about 2 pi / sqrt(g).
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Bead(nonholonomic.AbstractSystem):
+    ...     gravity: float = 9.81
+    ...     dimension = 1
+    ...
+    ...     def metric(self, q):
+    ...         return (1.0 + q[0] ** 2)[None, None]
+    ...
+    ...     def potential(self, q):
+    ...         return 0.5 * self.gravity * q[0] ** 2
+    >>> quarter = nonholonomic.event_time(Bead(), ([0.01], [0.0]), t1=5.0, event=lambda t, y: y[0])
+    >>> print(f"{4.0 * quarter:.4f} s, small oscillations: {2.0 * jnp.pi / jnp.sqrt(9.81):.4f} s")
+    2.0061 s, small oscillations: 2.0061 s
+
+    ```
+    """
 
     @property
     @abc.abstractmethod

@@ -30,6 +30,7 @@ from .quadric import Sphere as Sphere
 from .quadric import Spheroid as Spheroid
 from .surface import CLOSED as CLOSED
 from .surface import AbstractSurface as AbstractSurface
+from .surface import BallGap as BallGap
 from .surface import Place as Place
 from .torus import Torus as Torus
 from .vector import Component as Component

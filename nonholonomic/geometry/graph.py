@@ -5,14 +5,22 @@ from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..validation import Bound, as_number
 from .function import as_function, partials, second_derivative
-from .level import AbstractDifferentiated, AbstractLevel
+from .level import AbstractLevel
 from .surface import OPEN, AbstractSurface, Place
 from .vector import Component, Vector, dot, scale, subtract, sum_vectors, tangents
+
+#: Newton steps to the nearest point of a paraboloid from above it: as many as its worst positions need.
+NEWTON_STEPS = 12
+
+#: A distance [m] that is as good as none, by which numbers can be divided.
+TINY = 1e-100
 
 
 class AbstractOpen(AbstractSurface):
@@ -40,7 +48,7 @@ class AbstractOpen(AbstractSurface):
         """Height z [m] of the surface at (x, y) [m]."""
 
 
-class Paraboloid(AbstractOpen, AbstractLevel):
+class Paraboloid(AbstractOpen):
     """The bowl z = (x^2 + y^2) / (2 p).
 
     **Arguments:**
@@ -88,8 +96,41 @@ class Paraboloid(AbstractOpen, AbstractLevel):
     def offset(self, position: Vector) -> Component:
         return (position[2] - self.ground(position[0], position[1])) * self.normal(position)[2]
 
+    def nearest(self, position: Vector) -> Vector:
+        # At a distance s from the axis, s^3 / (2 p^2) + (1 - z / p) s = r: the greatest root is nearest of all. Above it the
+        # cubic is convex, so that Newton's method falls to it.
+        x, y, z = position
+        square = x * x + y * y
+        r = jnp.sqrt(jnp.maximum(square, TINY * TINY))
+        rise, bend = 1.0 - z / self.p, 1.0 / (2.0 * self.p * self.p)
 
-class Graph(AbstractOpen, AbstractDifferentiated):
+        def fallen(s: Component, r: Component, rise: Component, bend: Component) -> Component:
+            return s - ((bend * s * s + rise) * s - r) / (3.0 * bend * s * s + rise)
+
+        held = jax.lax.stop_gradient((r, rise, bend))
+        s = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, s: fallen(s, *held), _above_the_root(*held))
+        s = fallen(s, r, rise, bend)
+        # On the axis, above the centre of curvature, all directions are as near.
+        part, x = s / r, x + jnp.where(square == 0.0, TINY, 0.0)
+        return (part * x, part * y, s * s / (2.0 * self.p))
+
+
+def _above_the_root(r: Component, rise: Component, bend: Component) -> Component:
+    """A number not below the greatest root s of bend s^3 + rise s = r, for r and bend above 0."""
+    bound = jnp.sqrt(jnp.maximum(-rise / bend, 0.0)) + jnp.cbrt(r / bend)
+    return jnp.where(rise > 0.0, jnp.minimum(bound, r / jnp.where(rise > 0.0, rise, 1.0)), bound)
+
+
+def _disc(sectors: int, starts: int) -> Float[np.ndarray, "sectors starts 3"]:
+    """Points spread evenly over sectors of the unit disc of x and y."""
+    distance = np.sqrt((np.arange(starts) + 0.5) / starts)
+    # The golden section keeps the angles of neighbouring distances apart.
+    part = (np.arange(starts) * 0.5 * (np.sqrt(5.0) - 1.0)) % 1.0
+    angle = 2.0 * np.pi * (np.arange(sectors)[:, None] + part) / sectors
+    return np.stack([distance * np.cos(angle), distance * np.sin(angle), 0.0 * angle], axis=2)
+
+
+class Graph(AbstractOpen, AbstractLevel):
     """The surface z = height(x, y) of any smooth function.
 
     **Arguments:**
@@ -112,10 +153,19 @@ class Graph(AbstractOpen, AbstractDifferentiated):
     ```
     """
 
+    starts: ClassVar[Float[np.ndarray, "sectors starts 3"]] = _disc(5, 12)
+
     height: Any = eqx.field(converter=lambda given: as_function(given, "height", ("x", "y")))
 
     def ground(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
         return self.height(x, y)
+
+    def level(self, position: Vector) -> Component:
+        return position[2] - self.height(position[0], position[1])
+
+    def onto(self, position: Vector) -> Vector:
+        x, y, z = jnp.broadcast_arrays(*position)
+        return (x, y, self.height(x, y) + 0.0 * z)
 
     def gradient(self, position: Vector) -> Vector:
         slope = partials(self.height, position[:2])
@@ -123,6 +173,3 @@ class Graph(AbstractOpen, AbstractDifferentiated):
 
     def second_derivative(self, position: Vector, a: Vector, b: Vector) -> Component:
         return -second_derivative(self.height, position[:2], a[:2], b[:2])
-
-    def offset(self, position: Vector) -> Component:
-        return (position[2] - self.height(position[0], position[1])) * self.normal(position)[2]

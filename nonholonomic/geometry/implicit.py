@@ -4,15 +4,24 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
 
 from .function import as_function, partials, second_derivative
-from .level import AbstractDifferentiated
+from .level import AbstractLevel
 from .surface import DIVIDED, Place
-from .vector import Component, Vector, dot, tangents
+from .vector import Component, Vector, tangents
 
 
-class Implicit(AbstractDifferentiated):
+def _sphere() -> Float[np.ndarray, "6 9 3"]:
+    """Points spread over the unit sphere, as a square grid on each side of a cube, seen from its middle."""
+    a, b = np.meshgrid(*[np.tan(np.pi / 4.0 * np.array([-2.0, 0.0, 2.0]) / 3.0)] * 2)
+    sides = [np.stack([a, b, side + 0.0 * a], axis=-1).reshape(-1, 3) for side in (-1.0, 1.0)]
+    points = np.stack([np.roll(side, axis, axis=1) for axis in range(3) for side in sides])
+    return points / np.linalg.norm(points, axis=-1, keepdims=True)
+
+
+class Implicit(AbstractLevel):
     """The surface function(x, y, z) = 0 in the fixed frame; the room where bodies are is where the function is positive.
 
     A place on it is (x, y, z) [m]; east is the projection of x on the surface, or of y where the normal is along x, and
@@ -40,6 +49,8 @@ class Implicit(AbstractDifferentiated):
     sides: ClassVar[Mapping[str, float]] = DIVIDED
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("x", "m"), ("y", "m"), ("z", "m"))
 
+    starts: ClassVar[Float[np.ndarray, "sectors starts 3"]] = _sphere()
+
     function: Any = eqx.field(converter=lambda given: as_function(given, "function", ("x", "y", "z")))
 
     def gradient(self, position: Vector) -> Vector:
@@ -49,9 +60,8 @@ class Implicit(AbstractDifferentiated):
     def second_derivative(self, position: Vector, a: Vector, b: Vector) -> Component:
         return second_derivative(self.function, position, a, b)
 
-    def offset(self, position: Vector) -> Component:
-        gradient = self.gradient(position)
-        return self.function(*position) / jnp.sqrt(dot(gradient, gradient))
+    def level(self, position: Vector) -> Component:
+        return self.function(*position)
 
     def elevation(self, position: Vector) -> Component:
         return position[2]

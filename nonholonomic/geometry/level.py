@@ -1,57 +1,129 @@
-"""Surfaces on which a function is zero: what follows from its first and second derivatives."""
+"""Surfaces on which a function is zero, known by the function and its derivatives alone.
+
+Both searches here are minimisations. The nearest point minimises the distance over the surface, which may have many local
+minima for positions farther than the surface's least radius of curvature. The places where the nearest point can be are
+therefore divided into sectors, and a descent starts at the best of some points in each. The gap below a ball needs no nearest
+point: the ball touches where the function is least over the ball, so the search never leaves the ball, however far the surface
+is. The gap is negative only where a point of the ball is in the arena.
+
+Each descent is Newton's method with the curvature kept positive and steps cut to a trust region (Nocedal and Wright, Numerical
+Optimization, chapter 4). A last Newton step carries the derivatives (implicit function theorem).
+"""
 
 import abc
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any, ClassVar, NamedTuple, Self
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
-from .surface import AbstractSurface
+from .surface import AbstractSurface, BallGap
 from .vector import Component, Vector, dot, scale, subtract, sum_vectors, tangents
 
-#: Newton steps to the nearest point. They double its digits, so that a few are enough.
-STEPS = 8
+#: Most steps of a search. Most take three to six; ten times as many move no point.
+MOST_STEPS = 40
+
+#: Least curvature of what is minimised, relative to that above a flat surface, with which a step is computed.
+LEAST_CURVATURE = 0.05
+
+#: A search has ended where a step is shorter than this fraction of the distance; the last step squares it.
+SETTLED = 1e-8
+
+#: Steps shorter than this fraction are taken unseen: what they gain is round-off.
+UNSEEN = 1e-4
+
+
+class Quadratic(NamedTuple):
+    """The symmetric matrix ((a, b), (b, c)) and a vector (x, y), over lanes."""
+
+    a: Component
+    b: Component
+    c: Component
+    x: Component
+    y: Component
+
+    @property
+    def least_eigenvalue(self) -> Component:
+        """The lesser eigenvalue of the matrix."""
+        return 0.5 * (self.a + self.c) - jnp.sqrt((0.5 * (self.a - self.c)) ** 2 + self.b**2)
+
+    def solved(self) -> tuple[Component, Component]:
+        """Solution s of matrix times s = vector, with the eigenvalues raised to `LEAST_CURVATURE` where they are less."""
+        raised = jnp.maximum(LEAST_CURVATURE - jax.lax.stop_gradient(self.least_eigenvalue), 0.0)
+        a, c = self.a + raised, self.c + raised
+        per_determinant = 1.0 / (a * c - self.b * self.b)
+        return (c * self.x - self.b * self.y) * per_determinant, (a * self.y - self.b * self.x) * per_determinant
+
+
+class Descent(NamedTuple):
+    """Where a search is: at a vector, with the value there, the longest step that is allowed next, and whether it has ended."""
+
+    at: Float[Array, "3 ..."]
+    value: Float[Array, "..."]
+    reach: Float[Array, "..."]
+    ended: Bool[Array, "..."]
+
+
+def descended(
+    step: Callable[[Vector], tuple[Component, Component, Vector, Vector]],
+    onto: Callable[[Vector], Vector],
+    value: Callable[[Vector], Component],
+    start: Vector,
+    size: Component,
+    reach: Component,
+) -> Vector:
+    """A local minimum of a function of a vector that is held on a surface.
+
+    **Arguments:**
+
+    - `step`: Newton's step, as two components, and the unit tangents along which they are.
+    - `onto`: brings a vector back to the surface; `value`: what is minimised.
+    - `start`: a vector on the surface; `size`: by which steps are measured; `reach`: the longest first step.
+    """
+
+    def going_on(carry: tuple[Descent, Any]) -> Bool[Array, ""]:
+        there, count = carry
+        return ~jnp.all(there.ended) & (count < MOST_STEPS)
+
+    def once(carry: tuple[Descent, Any]) -> tuple[Descent, Any]:
+        there, count = carry
+        at = vector_of(there.at)
+        s1, s2, t1, t2 = step(at)
+        length = jnp.sqrt(s1 * s1 + s2 * s2)
+        cut = jnp.minimum(1.0, there.reach / jnp.where(length > 0.0, length, 1.0))
+        moved = onto(vector_of(sum_vectors(at, scale(cut * s1, t1), scale(cut * s2, t2))))
+        after = value(moved)
+        better = (after <= there.value) | (length <= UNSEEN * size)
+        taken = better & ~there.ended
+        # What is not a number ends the search too.
+        ended = there.ended | ~(length > SETTLED * size)
+        new = Descent(
+            at=jnp.where(taken, _stacked(moved), there.at),
+            value=jnp.where(taken, after, there.value),
+            reach=jnp.where(better, 2.0, 0.25) * there.reach,
+            ended=ended,
+        )
+        return new, count + 1
+
+    first = _stacked(start)
+    zero = jnp.zeros_like(first[0])
+    begin = Descent(first, value(start) + zero, reach + zero, zero > 0.0)
+    found, _ = jax.lax.while_loop(going_on, once, (begin, jnp.zeros((), int)))
+    return vector_of(found.at)
 
 
 class AbstractLevel(AbstractSurface):
-    """A surface whose nearest points are found by Newton's method, from its normal and shape operator."""
+    """A surface on which a function is zero, and positive in the room where bodies are."""
+
+    #: Points about a position from which the search for the nearest point may start; its distance is less than 1 in their unit.
+    starts: ClassVar[Float[np.ndarray, "sectors starts 3"]]
 
     @abc.abstractmethod
-    def offset(self, position: Vector) -> Component:
-        """Distance [m] of a position from the surface, to first order: the function over the size of its gradient."""
-
-    def nearest(self, position: Vector) -> Vector:
-        first = jnp.stack(jnp.broadcast_arrays(*self._down(position)))
-        foot = jax.lax.fori_loop(0, STEPS, lambda _, foot: jnp.stack(self._closer(position, _vector(foot))), first)
-        return self._down(_vector(foot))
-
-    def _down(self, position: Vector) -> Vector:
-        """A position moved along its normal to the surface, to first order."""
-        away = scale(self.offset(position), self.normal(position))
-        return _vector(subtract(a, b) for a, b in zip(position, away, strict=True))
-
-    def _closer(self, position: Vector, foot: Vector) -> Vector:
-        """One step: where r = q + d n(q) + w, the foot q moves along the surface by s with s + d n'(s) = w."""
-        q = self._down(foot)
-        n = self.normal(q)
-        away = tuple(subtract(a, b) for a, b in zip(position, q, strict=True))
-        d, (t1, t2) = dot(away, n), tangents(n)
-        both = jnp.broadcast_arrays(*t1, *t2)
-        rates = self.normal_rate(q, _vector(jnp.stack(pair) for pair in zip(both[:3], both[3:], strict=True)))
-        (a, b), (c, e) = d * dot(rates, t1), d * dot(rates, t2)
-        a, e, w1, w2 = 1.0 + a, 1.0 + e, dot(away, t1), dot(away, t2)
-        per_determinant = 1.0 / (a * e - b * c)
-        s1, s2 = (e * w1 - b * w2) * per_determinant, (a * w2 - c * w1) * per_determinant
-        return _vector(sum_vectors(q, scale(s1, t1), scale(s2, t2)))
-
-
-def _vector(components: Iterable[Component]) -> Vector:
-    x, y, z = components
-    return (x, y, z)
-
-
-class AbstractDifferentiated(AbstractLevel):
-    """A surface that gives only a function's first and second derivatives, which automatic differentiation finds."""
+    def level(self, position: Vector) -> Component:
+        """The function at a position [m]."""
 
     @abc.abstractmethod
     def gradient(self, position: Vector) -> Vector:
@@ -61,13 +133,17 @@ class AbstractDifferentiated(AbstractLevel):
     def second_derivative(self, position: Vector, a: Vector, b: Vector) -> Component:
         """Second derivative of the function at a position [m], along two vectors."""
 
+    def offset(self, position: Vector) -> Component:
+        gradient = self.gradient(position)
+        return self.level(position) / jnp.sqrt(dot(gradient, gradient))
+
     def normal(self, position: Vector) -> Vector:
         gradient = self.gradient(position)
         return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), gradient)
 
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
         together = jnp.broadcast_arrays(*position, *velocity)
-        return jax.jvp(self.normal, (_vector(together[:3]),), (_vector(together[3:]),))[1]
+        return jax.jvp(self.normal, (vector_of(together[:3]),), (vector_of(together[3:]),))[1]
 
     def bending(self, position: Vector, a: Vector, b: Vector) -> tuple[Component, Component, Component]:
         # Along the surface the change of the gradient's size is across a and b.
@@ -79,3 +155,100 @@ class AbstractDifferentiated(AbstractLevel):
     def gaussian_curvature(self, position: Vector) -> Component:
         aa, ab, bb = self.bending(position, *tangents(self.normal(position)))
         return aa * bb - ab * ab
+
+    def onto(self, position: Vector) -> Vector:
+        for _ in range(2):
+            away = scale(self.offset(position), self.normal(position))
+            position = vector_of(subtract(a, b) for a, b in zip(position, away, strict=True))
+        return position
+
+    def nearest(self, position: Vector) -> Vector:
+        surface, place = _held(self), jax.lax.stop_gradient(position)
+        first = surface.onto(place)
+        within = jnp.sqrt(_square(place, first))
+        starts = jnp.asarray(self.starts)
+
+        def step(foot: Vector) -> tuple[Component, Component, Vector, Vector]:
+            t1, t2, quadratic = surface._about(place, foot)
+            return *quadratic.solved(), t1, t2
+
+        def in_sector(k: Any, nearest: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
+            def start(i: Any, nearest: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
+                about = vector_of(x + within * starts[k, i, axis] for axis, x in enumerate(place))
+                return nearer(nearest, surface.onto(about))
+
+            begin = vector_of(jax.lax.fori_loop(0, self.starts.shape[1], start, _stacked(first)))
+            searched = (step, surface.onto, lambda foot: _square(place, foot), begin, within, 0.25 * within)
+            return nearer(nearest, descended(*searched))
+
+        def nearer(old: Float[Array, "3 ..."], new: Vector) -> Float[Array, "3 ..."]:
+            return jnp.where(_square(place, new) < _square(place, vector_of(old)), _stacked(new), old)
+
+        foot = vector_of(jax.lax.fori_loop(0, len(self.starts), in_sector, _stacked(first)))
+        t1, t2, quadratic = self._about(position, foot)
+        s1, s2 = quadratic.solved()
+        return self.onto(vector_of(sum_vectors(foot, scale(s1, t1), scale(s2, t2))))
+
+    def ball_gap(self, centre: Vector, radius: Component, side: float) -> BallGap:
+        surface, place, size = _held(self), jax.lax.stop_gradient(centre), jax.lax.stop_gradient(radius)
+
+        def step(normal: Vector) -> tuple[Component, Component, Vector, Vector]:
+            t1, t2, quadratic = surface._under(place, size, normal)
+            return *quadratic.solved(), t1, t2
+
+        def value(normal: Vector) -> Component:
+            return surface.level(_lowered(place, size, normal))
+
+        normal = descended(step, _unit, value, surface.normal(place), 1.0, 0.5)
+        t1, t2, quadratic = self._under(centre, radius, normal)
+        s1, s2 = quadratic.solved()
+        normal = _unit(vector_of(sum_vectors(normal, scale(s1, t1), scale(s2, t2))))
+        lowest = _lowered(centre, radius, normal)
+        gap = self.offset(lowest)
+        return BallGap(_lowered(lowest, gap, normal), normal, gap)
+
+    def _about(self, position: Vector, foot: Vector) -> tuple[Vector, Vector, Quadratic]:
+        """Two tangents at a foot, and the square of the distance to a position along them: half its second derivatives, and
+        minus half its first ones."""
+        n = self.normal(foot)
+        away = vector_of(subtract(a, b) for a, b in zip(position, foot, strict=True))
+        d, (t1, t2) = dot(away, n), tangents(n)
+        aa, ab, bb = self.bending(foot, t1, t2)
+        return t1, t2, Quadratic(1.0 + d * aa, d * ab, 1.0 + d * bb, dot(away, t1), dot(away, t2))
+
+    def _under(self, centre: Vector, radius: Component, normal: Vector) -> tuple[Vector, Vector, Quadratic]:
+        """Two tangents of a ball at its point against a normal, and the function along them, per unit gradient and radius: its
+        second derivatives by the normal, and minus its first ones."""
+        lowest, (t1, t2) = _lowered(centre, radius, normal), tangents(normal)
+        m = self.normal(lowest)
+        aa, ab, bb = self.bending(lowest, t1, t2)
+        along = dot(m, normal)
+        return t1, t2, Quadratic(along + radius * aa, radius * ab, along + radius * bb, dot(m, t1), dot(m, t2))
+
+
+def vector_of(components: Iterable[Component]) -> Vector:
+    """Three components as a vector."""
+    x, y, z = components
+    return (x, y, z)
+
+
+def _held(surface: Self) -> Self:
+    """A surface by whose numbers nothing is differentiated."""
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, surface)
+
+
+def _stacked(vector: Vector) -> Float[Array, "3 ..."]:
+    return jnp.stack(jnp.broadcast_arrays(*vector))
+
+
+def _square(a: Vector, b: Vector) -> Component:
+    away = vector_of(subtract(x, y) for x, y in zip(a, b, strict=True))
+    return dot(away, away)
+
+
+def _unit(vector: Vector) -> Vector:
+    return vector_of(scale(1.0 / jnp.sqrt(dot(vector, vector)), vector))
+
+
+def _lowered(position: Vector, distance: Component, normal: Vector) -> Vector:
+    return vector_of(subtract(x, distance * n) for x, n in zip(position, normal, strict=True))

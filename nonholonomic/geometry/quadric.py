@@ -6,14 +6,20 @@ from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..validation import Bound, as_number, require
-from .level import AbstractLevel
 from .planar_length import planar_length
 from .surface import AbstractSurface, Place
 from .vector import Component, Vector, dot, multiply, scale, subtract, sum_vectors
+
+#: Newton steps to the nearest point of a spheroid: as many as its worst positions need.
+NEWTON_STEPS = 12
+
+#: A distance [m] that is as good as none, by which numbers can be divided.
+TINY = 1e-100
 
 
 class AbstractQuadric(AbstractSurface):
@@ -116,7 +122,7 @@ class Sphere(AbstractQuadric):
         return jnp.sqrt(dot(position, position)) - self.radius
 
 
-class Spheroid(AbstractQuadric, AbstractLevel):
+class Spheroid(AbstractQuadric):
     """An ellipsoid of revolution with a vertical axis, oblate or prolate.
 
     **Arguments:**
@@ -175,3 +181,26 @@ class Spheroid(AbstractQuadric, AbstractLevel):
     def offset(self, position: Vector) -> Component:
         gradient = self.gradient(position)
         return 0.5 * (dot(position, gradient) - 1.0) / jnp.sqrt(dot(gradient, gradient))
+
+    def nearest(self, position: Vector) -> Vector:
+        # q = (1 + t N)^-1 r, with the greatest t for which q is on the surface: of all solutions the nearest point. The inverse
+        # length of N^1/2 q is almost linear in t, so Newton's method needs few steps (Moré and Sorensen, SIAM Journal on
+        # Scientific and Statistical Computing 4 (1983) 553).
+        equatorial, polar = self.semi_axes
+        x, y, z = position
+        # Where all directions are as near, the one of growing coordinates is taken.
+        across, along = jnp.sqrt(jnp.maximum(x * x + y * y, TINY * TINY)), jnp.maximum(jnp.abs(z), TINY)
+        least = jnp.minimum(equatorial, polar)
+        numbers = (equatorial * across, polar * along, equatorial**2 - least**2, polar**2 - least**2)
+
+        def closer(s: Component, u: Component, v: Component, p: Component, q: Component) -> Component:
+            a, b = u / (s + p), v / (s + q)
+            square = a * a + b * b
+            return s + square * (jnp.sqrt(square) - 1.0) / (a * a / (s + p) + b * b / (s + q))
+
+        u, v, p, q = held = jax.lax.stop_gradient(numbers)
+        s = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, s: closer(s, *held), jnp.maximum(u - p, v - q))
+        s = closer(s, *numbers)
+        outwards, upwards = equatorial**2 / (s + numbers[2]), polar**2 / (s + numbers[3])
+        x = x + jnp.where((x == 0.0) & (y == 0.0), TINY, 0.0)
+        return (outwards * x, outwards * y, upwards * (z + jnp.where(z == 0.0, TINY, 0.0)))

@@ -14,13 +14,13 @@ Vectors are tuples of three components, each a number or an array over lanes, or
 
 import abc
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..validation import Bound, Bounded
-from .vector import Component, Vector, dot, subtract
+from .vector import Component, Vector, dot, scale, subtract
 
 Place = tuple[Float[Array, "..."], ...]
 
@@ -32,6 +32,19 @@ ROUND_OFF = 1e-9
 CLOSED: Mapping[str, float] = {"outside": 1.0, "inside": -1.0}
 OPEN: Mapping[str, float] = {"above": 1.0}
 DIVIDED: Mapping[str, float] = {"positive": 1.0}
+
+
+class BallGap(NamedTuple):
+    """The gap between a ball and a surface.
+
+    - `foot`: the point [m] that the ball is about to touch; `normal`: from it towards the ball.
+    - `gap`: distance [m] between them, to first order where the surface is given by a function alone; negative where the ball
+      is in the arena, and only there.
+    """
+
+    foot: Vector
+    normal: Vector
+    gap: Component
 
 
 class AbstractSurface(Bounded):
@@ -87,14 +100,32 @@ class AbstractSurface(Bounded):
 
     @abc.abstractmethod
     def nearest(self, position: Vector) -> Vector:
-        """The nearest point [m] of the surface to a position [m] closer to it than its least radius of curvature."""
+        """The point [m] of the surface that is nearest to a position [m]; one of them where several are."""
+
+    def onto(self, position: Vector) -> Vector:
+        """A position [m] that has drifted off the surface, brought back to it."""
+        return self.nearest(position)
+
+    def ball_gap(self, centre: Vector, radius: Component, side: float) -> BallGap:
+        """Where a ball is about to touch the surface.
+
+        **Arguments:** `centre`: of the ball [m]; `radius`: of the ball [m], less than the radii of curvature where the surface
+        is hollow; `side`: 1.0 if the ball is on the side to which n points, else -1.0.
+        """
+        foot = self.nearest(centre)
+        foot = tuple(0.0 * centre[0] if part is None else part for part in foot)
+        normal = scale(side, self.normal(foot))
+        away = tuple(subtract(a, b) for a, b in zip(centre, foot, strict=True))
+        return BallGap(
+            (foot[0], foot[1], foot[2]), (normal[0], normal[1], normal[2]), subtract(dot(away, normal), radius)
+        )
 
     def offset(self, position: Vector) -> Component:
         """`distance` [m], to first order where that is cheaper: for positions next to the surface."""
         return self.distance(position)
 
     def distance(self, position: Vector) -> Component:
-        """Distance [m] of a position from the surface, positive on the side to which n points; limited as `nearest` is."""
+        """Distance [m] of a position from the surface, positive on the side to which n points."""
         foot = self.nearest(position)
         away = (subtract(position[0], foot[0]), subtract(position[1], foot[1]), subtract(position[2], foot[2]))
         return dot(away, self.normal(foot))

@@ -45,6 +45,14 @@ class Clocked(AbstractProblem):
     problem: AbstractProblem
     began: Float[Array, " cells"]
 
+    @property
+    def direction_decides(self) -> bool:
+        return self.problem.direction_decides
+
+    @property
+    def fits_one_kernel(self) -> bool:
+        return self.problem.fits_one_kernel
+
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         states, scales = self.problem.start()
         return with_row(states, self.began), with_row(scales, jnp.full_like(self.began, UNMEASURED))
@@ -260,7 +268,7 @@ def solve_hybrid_with_tangents(
     start, parts = np.asarray(variational_start(jnp.asarray(state), tangents)), 1 + len(tangents)
     ended = solve_hybrid(varied, mode, start, t1, cells, settings, kinds=kinds + 1, parts=parts)
     slopes = [np.asarray(_slopes(one, jnp.asarray(ended.state))) for one in varied]
-    return _own(ended, len(state)), Slopes(_of_mode(np, ended.mode, slopes), ended.counts[-1] > 0)
+    return _own(ended, len(state)), Slopes(_of_mode(np, ended, slopes), ended.counts[-1] > 0)
 
 
 def traced_solve_hybrid_with_tangents(
@@ -278,7 +286,7 @@ def traced_solve_hybrid_with_tangents(
     varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
     start, parts = variational_start(state, tangents), 1 + len(tangents)
     ended = traced_solve_hybrid(varied, mode, start, t1, settings, kinds=kinds + 1, parts=parts)
-    slopes = _of_mode(jnp, ended.mode, [one.slopes(ended.state) for one in varied])
+    slopes = _of_mode(jnp, ended, [one.slopes(ended.state) for one in varied])
     return _own(ended, len(state)), Slopes(slopes, ended.counts[-1] > 0)
 
 
@@ -287,11 +295,15 @@ def _own(ended: HybridOutcome, size: int) -> HybridOutcome:
     return ended._replace(state=ended.state[:size], counts=ended.counts[:-1])
 
 
-def _of_mode(xp: Any, mode: Int[Array, " cells"], slopes: list[Float[Array, "directions cells"]]) -> Any:
-    """Of the slopes in every phase those of the phase in which each cell is."""
-    found = xp.zeros_like(slopes[0])
+def _of_mode(xp: Any, ended: HybridOutcome, slopes: list[Float[Array, "directions cells"]]) -> Any:
+    """Of the slopes in every mode those of the mode in which each cell is.
+
+    A run that has ended between two modes is in none of them: its event is the end of the mode before, whose variation is the
+    last row.
+    """
+    found = xp.reshape(ended.state, (1 + len(slopes[0]), -1, len(ended.mode)))[1:, -1]
     for number, some in enumerate(slopes):
-        found = xp.where(mode == number, some, found)
+        found = xp.where(ended.mode == number, some, found)
     return found
 
 

@@ -17,6 +17,7 @@ from .posterior import LogDensity as LogDensity
 from .recording import AbstractRecording as AbstractRecording
 from .recording import Quantities as Quantities
 from .recording import as_quantity as as_quantity
+from .recording import model_times as model_times
 from .recording import predicted as predicted
 from .result import Identification as Identification
 from .sampling import Draws as Draws

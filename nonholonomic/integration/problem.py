@@ -23,6 +23,20 @@ class AbstractProblem(eqx.Module):
         their own without the rest; `None` for all of them."""
         return None
 
+    @property
+    def direction_decides(self) -> bool:
+        """Whether the direction of motion decides on which side of a zero of the crossing function or the guard a run starts.
+
+        A run that starts beyond the event then waits for the next time the crossing function falls through zero; otherwise it
+        ends at once.
+        """
+        return False
+
+    @property
+    def fits_one_kernel(self) -> bool:
+        """Whether XLA can compile a loop over the field into a single kernel on a CPU (`xla_cpu.in_one_kernel`)."""
+        return True
+
     @abc.abstractmethod
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
         """State at the start of every cell, and the magnitudes by which its absolute errors are measured."""
@@ -54,6 +68,14 @@ class CoreProblem(AbstractProblem):
 
     whole: AbstractProblem
     size: int = eqx.field(static=True)
+
+    @property
+    def direction_decides(self) -> bool:
+        return self.whole.direction_decides
+
+    @property
+    def fits_one_kernel(self) -> bool:
+        return self.whole.fits_one_kernel
 
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
         state, scales = self.whole.start()

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..xla_cpu import in_one_kernel
 from .event import Bracket
 from .problem import AbstractProblem, least_margin
-from .runge_kutta import explicit_tableau, first_length
+from .runge_kutta import Lanes, States, explicit_tableau, first_length
 from .settings import Settings
 from .status import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
 from .step import Control, LaneState, try_step
@@ -24,6 +24,10 @@ from .step import Control, LaneState, try_step
 #: What it costs to refill a block, in steps of the whole block, measured on a CPU. It is refilled when idle lanes have missed
 #: as many, so what is lost is at most twice what the best moment would have cost.
 REFILL = 0.25
+
+#: How far ahead the direction of motion is looked at, in first steps; and below which fraction of the change until then a start
+#: counts as one at a zero.
+SOON, AT_ZERO = 1e-2, 1e-6
 
 
 class Outcome(NamedTuple):
@@ -164,7 +168,7 @@ class LaneScheduler(eqx.Module):
 
     def in_kernel(self, loop: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """A loop over steps, compiled into a single kernel if the queue's are."""
-        return in_one_kernel(loop) if self.one_kernel else loop
+        return in_one_kernel(loop) if self.one_kernel and self.problem.fits_one_kernel else loop
 
     def refill(self, progress: Progress) -> Progress:
         """Give every idle lane the next cell that waits."""
@@ -205,8 +209,14 @@ def _fresh_lanes(
     lengths: Float[Array, " cells"],
 ) -> LaneState:
     """Every cell at its start; one that starts beyond the event or the guard has ended."""
-    zero, none = jnp.zeros_like(lengths), jnp.zeros(lengths.shape, int)
+    zero = jnp.zeros_like(lengths)
     no = jnp.zeros(lengths.shape, bool)
+    if problem.direction_decides:
+        inside = _holds(problem, problem.event_function, states, rates, lengths)
+        valid = _holds(problem, lambda at: problem.domain_margin(zero, at), states, rates, lengths)
+        side = jnp.ones_like(zero) if inside is None else jnp.where(inside, 1.0, -1.0).astype(zero.dtype)
+        status = jnp.full(zero.shape, RUNNING) if valid is None else jnp.where(valid, RUNNING, LEFT_DOMAIN)
+        return _lanes_at_start(problem, states, rates, lengths, side, status, jnp.full_like(zero, jnp.inf))
     crossing, domain_margin = problem.event_function(states), problem.domain_margin(zero, states)
     beyond = no
     if crossing is not None:
@@ -217,6 +227,20 @@ def _fresh_lanes(
     status = jnp.where(beyond & (not control.passes), CROSSED, RUNNING)
     if domain_margin is not None:
         status = jnp.where(domain_margin <= 0.0, LEFT_DOMAIN, status)
+    return _lanes_at_start(problem, states, rates, lengths, side, status, jnp.where(beyond, zero, jnp.inf))
+
+
+def _lanes_at_start(
+    problem: AbstractProblem,
+    states: Float[Array, "components cells"],
+    rates: Float[Array, "components cells"],
+    lengths: Float[Array, " cells"],
+    side: Float[Array, " cells"],
+    status: Int[Array, " cells"],
+    crossing_time: Float[Array, " cells"],
+) -> LaneState:
+    """Every cell at its start, on a side of the event."""
+    zero, none = jnp.zeros_like(lengths), jnp.zeros(lengths.shape, int)
     return LaneState(
         cell=jnp.arange(lengths.shape[0]),
         status=status,
@@ -227,10 +251,31 @@ def _fresh_lanes(
         side=side,
         margin=stop_gradient(least_margin(problem, side, zero, states, rates)),
         margins=stop_gradient(jnp.stack(margins)) if (margins := problem.margins(zero, states)) else None,
-        first_crossing=jnp.where(beyond, zero, jnp.inf),
-        crossing_time=jnp.where(beyond, zero, jnp.inf),
-        bracketing=no,
+        first_crossing=crossing_time,
+        crossing_time=crossing_time,
+        bracketing=jnp.zeros(lengths.shape, bool),
         bracket=Bracket(zero, zero, zero, zero, zero, none),
         steps=none,
         rejected=none,
     )
+
+
+def _holds(
+    problem: AbstractProblem,
+    function: Callable[[States], Lanes | None],
+    states: Float[Array, "components cells"],
+    rates: Float[Array, "components cells"],
+    lengths: Float[Array, " cells"],
+) -> Bool[Array, " cells"] | None:
+    """Where a function of the state is positive at the start; at a zero, up to round-off, whether it is about to be."""
+    value, zero = function(states), jnp.zeros_like(lengths)
+    if value is None:
+        return None
+
+    def slope(at: States) -> Lanes:
+        return jax.jvp(function, (at,), (problem.field(zero, at),))[1]
+
+    first, second = jax.jvp(slope, (states,), (rates,))
+    ahead = SOON * lengths
+    change = ahead * (first + 0.5 * ahead * second)
+    return jnp.where(jnp.abs(value) <= AT_ZERO * jnp.abs(change), change > 0.0, value > 0.0)

@@ -177,7 +177,12 @@ def _classify(
     crossed = hit & ~by_margin
     if not control.passes:
         status = jnp.where(hit, jnp.where(by_margin, LEFT_DOMAIN, CROSSED), lane_state.status)
-        return status, lane_state.side, lane_state.first_crossing, lane_state.crossing_time
+        if not problem.direction_decides:
+            return status, lane_state.side, lane_state.first_crossing, lane_state.crossing_time
+        # A run that waited beyond the event is before it now.
+        returns = crossed & (lane_state.side < 0.0)
+        status, side = jnp.where(returns, lane_state.status, status), jnp.where(returns, 1.0, lane_state.side)
+        return status, side, lane_state.first_crossing, lane_state.crossing_time
     # Only the way from positive to negative is the event; the way back does not count.
     counts = crossed & (lane_state.side > 0.0)
     here = crossing_time(problem, time, tried.state)

@@ -245,3 +245,21 @@ def test_the_time_of_inversion_of_the_regularised_law_is_creep():
     table = tippe.inversion_table(scene, theta=0.1, spin=100.0, t1=40.0, axes={"scene.friction.slip_speed": speeds})
     assert_close(table.time, [5.91, 10.8, 25.5], rtol=6e-3)
     assert_close(np.diff(table.time) / np.diff(1.0 / speeds), 0.05, rtol=0.05)
+
+
+def test_a_launch_on_the_stem_slips_off_a_slope():
+    """At theta = pi, upright but for round-off: where it slips at once, and where it first rolls."""
+    slope, bowl = tippe.Plane(0.9), tippe.Sphere(0.2)
+    for surface, launch in ((slope, tippe.Launch(np.pi, 0.0)), (bowl, tippe.Launch(np.pi, 50.0, eta=1.2))):
+        run = tippe.simulate(tippe.Scene(rutstam_top(), surface, tippe.SetValuedCoulomb(0.3)), launch, 0.15)
+        assert run.status == "completed"
+        assert run.stats["energy_residual"] < 1e-9
+
+
+def test_a_slip_begins_where_errors_have_taken_the_axis_off_unit_length():
+    """A top that the step controller lost at .443 s, after rolling, at |e| - 1 = 3e-7."""
+    top = tippe.Top(0.016689, 0.0138854, 0.0009348046138502779, 9.319925953256214e-07, 1.136765490128233e-06)
+    launch = tippe.Launch(1.72241, 71.4738, velocity=(-0.34865, -0.087693), angular_velocity=(-4.4575, -42.746, 56.47))
+    run = tippe.simulate(scene_of(top, 0.12078), launch, 0.6)
+    assert run.status == "completed"
+    assert run.stats["sticks"] > 3

@@ -275,3 +275,14 @@ def test_both_crossings_have_no_one_derivative():
     scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
     with pytest.raises(ValueError, match="crossing = 'both' must be 'first' or 'last' for sensitivities"):
         tippe.inversion_table(scene, theta=[0.1], spin=100.0, t1=1.0, crossing="both", sensitivities=["friction.mu"])
+
+
+def test_lists_of_places_on_a_closed_surface():
+    """By (x, y, z), of which (0, 0, 0) is no place: where the top starts is checked cell by cell."""
+    scene = tippe.Scene(rutstam_top(), tippe.Sphere(0.3), tippe.Viscous(0.3))
+    given = {"theta": 0.1, "spin": 100.0, "t1": 0.01, "tolerance": 1e-6}
+    places = {"launch.place[0]": [0.18, -0.18], "launch.place[2]": -0.24}
+    table = tippe.inversion_table(scene, axes=places, **given)
+    assert (table.status == "not_inverted").all()
+    with pytest.raises(ValueError, match="distance"):
+        tippe.inversion_table(scene, axes=places | {"launch.place[0]": [0.18, 0.2]}, **given)

@@ -160,7 +160,9 @@ def begin(
         _, moved, change, rates = iterated(age, times)
         unsettled = jnp.max(length(*change), axis=0) / contact.speed
         highest = age * jnp.abs(jnp.einsum("s,cs...->c...", HIGHEST, rates))
-        error = jnp.maximum(jnp.max((highest / scales)[:size], axis=0), unsettled)
+        # The scales of a launch that stands upright but for round-off are next to nothing.
+        sizes = jnp.maximum(scales, jnp.max(jnp.abs(moved), axis=1))
+        error = jnp.maximum(jnp.max((highest / sizes)[:size], axis=0), unsettled)
         # The contact must persist, or the slip would pass by its loss.
         lost = jnp.min(slipping.contact_margin(moved[:size]), axis=0) <= 0.0
         error = jnp.where(jnp.isfinite(error) & ~lost, error, jnp.inf)

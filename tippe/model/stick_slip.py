@@ -116,8 +116,14 @@ class StickSlip(eqx.Module):
         return length(slip.x, slip.y)
 
     def stopped(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """The state after the blow that stops the slip."""
+        """The state after the blow that stops the slip, its axis at unit length.
+
+        Errors of the steps take the axis off that, and the slip that a blow leaves is only as small as they are: where a slip
+        begins, round-off is all that its direction can bear.
+        """
         nothing = jnp.zeros_like(state[0])
+        axis = state[2:5]
+        state = state.at[2:5].set(axis / jnp.sqrt(jnp.sum(axis * axis, axis=0)))
         return self.rolling.with_slip(state, Slip(nothing, nothing))
 
     def lifts_off(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import (
     CarriedFrame,
@@ -30,7 +30,7 @@ from nonholonomic.geometry import (
     tangents,
 )
 from nonholonomic.hybrid import Transition
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, AbstractProblem
+from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import Dynamics, stacked
@@ -48,6 +48,10 @@ SLIDING, FLYING, ON_STEM, STRIKING = range(4)
 
 #: Components of a state, behind which others may ride along.
 OWN = 14
+
+#: How far a sphere may be from the arena where its flight ends, as a fraction of its radius, and by how much the normal there
+#: may differ from that of the contact. Located landings are within 1e-9.
+LANDED = 1e-6
 
 
 class FlightState(NamedTuple):
@@ -74,13 +78,35 @@ class Below(NamedTuple):
 
 
 def below(scene: Scene, flying: FlightState, ball: Ball | None = None) -> Below:
-    """What a flying top has below one of its spheres, by default its own."""
+    """The nearest point of the arena to the centre of a sphere, by default the top's own: theta is measured there."""
     frame, ball = carried_frame(scene), balls(scene.body)[0] if ball is None else ball
-    centre = sum_vectors(flying.place, scale(ball.offset, flying.axis))
+    centre = centre_of(flying, ball)
     foot = tuple(0.0 * centre[0] if part is None else part for part in scene.surface.nearest(centre))
     n = frame.normal(foot)
     away = dot(tuple(subtract(a, b) for a, b in zip(centre, foot, strict=True)), n)
     return Below(foot, (*tangents(n), n), away - ball.radius)
+
+
+def landing_site(scene: Scene, flying: FlightState, ball: Ball) -> Below:
+    """Where a sphere is about to touch the arena: the nearest point as it lands. Before that only the gap's sign is known."""
+    centre = centre_of(flying, ball)
+    site, zero = scene.surface.ball_gap(centre, ball.radius, carried_frame(scene).side), jnp.zeros_like(flying.place[0])
+    n = tuple(zero if part is None else part + zero for part in site.normal)
+    return Below(site.foot, (*tangents(n), n), site.gap)
+
+
+def centre_of(flying: FlightState, ball: Ball) -> Vector:
+    """The centre of a sphere of a flying top."""
+    x, y, z = sum_vectors(flying.place, scale(ball.offset, flying.axis))
+    return x, y, z
+
+
+def missed(scene: Scene, site: Below, ball: Ball) -> Bool[Array, "..."]:
+    """Whether a flight has not ended where a sphere touches the arena, so that no motion may go on from there."""
+    n = carried_frame(scene).normal(site.foot)
+    turned = tuple(subtract(a, b) for a, b in zip(n, site.axes[2], strict=True))
+    # Written so that what is not a number is a miss.
+    return ~((jnp.abs(site.gap) < LANDED * ball.radius) & (dot(turned, turned) < LANDED**2))
 
 
 def carried_frame(scene: Scene) -> CarriedFrame:
@@ -131,7 +157,7 @@ def gap_margin(scene: Scene, flying: FlightState, ball: Ball, rounding: float = 
 
     **Arguments:** `rounding`: what is allowed besides that.
     """
-    body, ground = scene.body, below(scene, flying, ball)
+    body, ground = scene.body, landing_site(scene, flying, ball)
     rate = gap_rate(body, ball, as_free_body(scene, flying, ground, ball))
     far = sum(jnp.abs(part) for part in flying.place)
     rounding = rounding + 4.0 * jnp.finfo(far.dtype).eps * far / body.radius
@@ -237,7 +263,7 @@ def lift_off(
     body, frame, (u, e, L, place) = scene.body, carried_frame(scene), parts(state[:OWN])
     ball = balls(body)[0] if ball is None else ball
     # Errors of the steps take the foot off the arena: a flight that began below it would end where it begins.
-    place = (*scene.surface.nearest(place[:3]), *place[3:])
+    place = (*scene.surface.onto(place[:3]), *place[3:])
     axes = frame.own_axes(place)
     velocity = (*u, -ball.offset * axis_rate(body, e, L)[2])
     centre = sum_vectors(place[:3], scale(ball.radius, axes[2]))
@@ -271,9 +297,9 @@ class Fly(AbstractFlyingMode):
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Strike the arena; rebound, or slide on where the rebound would be slow. It counts the flights that begin."""
-        scene, flying = self.scene, flight_state(state)
-        ground = below(scene, flying)
-        ball, free, zero = balls(scene.body)[0], as_free_body(scene, flying, ground), jnp.zeros_like(state[0])
+        scene, flying, ball = self.scene, flight_state(state), balls(self.scene.body)[0]
+        ground = landing_site(scene, flying, ball)
+        free, zero = as_free_body(scene, flying, ground), jnp.zeros_like(state[0])
         speed = jnp.maximum(-gap_rate(scene.body, ball, free), 0.0)
         bounce = zero if scene.restitution is None else scene.restitution + zero
         rebounds = bounce * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
@@ -291,7 +317,7 @@ class Fly(AbstractFlyingMode):
             mode=jnp.where(rebounds, FLYING, SLIDING),
             state=after,
             elapsed=zero,
-            status=jnp.where(fails, FAILED, RUNNING),
+            status=jnp.where(missed(scene, ground, ball), UNRESOLVED, jnp.where(fails, FAILED, RUNNING)),
             crossing_time=jnp.full_like(zero, jnp.inf),
             counts=rebounds.astype(int)[None],
         )

@@ -37,7 +37,9 @@ from .airborne import (
     gap_margin,
     in_contact,
     in_flight,
+    landing_site,
     lift_off,
+    missed,
     standing,
     to_frame,
 )
@@ -169,7 +171,8 @@ class FlyBoth(Fly):
         main, stem = (gap_margin(scene, flying, ball) for ball in balls(scene.body))
         number = (stem < main).astype(int)
         own, other = own_and_other(scene, number)
-        ground = below(scene, flying, own)
+        ground = landing_site(scene, flying, own)
+        astray = missed(scene, ground, own)
         # Where the landing was located a little below the arena, the next phase would end where it begins.
         flying = flying._replace(place=tuple(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
         ground = ground._replace(gap=zero)
@@ -189,7 +192,7 @@ class FlyBoth(Fly):
             mode=jnp.where(blow.throws, STRIKING, jnp.where(blow.rebounds, FLYING, slides)),
             state=after,
             elapsed=zero,
-            status=jnp.where(blow.fails, FAILED, jnp.where(blow.rests, UNRESOLVED, RUNNING)),
+            status=jnp.where(astray | blow.rests, UNRESOLVED, jnp.where(blow.fails, FAILED, RUNNING)),
             crossing_time=jnp.full_like(zero, jnp.inf),
             counts=(blow.rebounds & ~blow.throws).astype(int)[None],
         )
@@ -224,7 +227,7 @@ def apply_impulse(scene: Scene, flying: FlightState, ground: Below, own: Ball, o
     thrown = flying._replace(
         velocity=from_frame(after.velocity, ground.axes), momentum=from_frame(after.momentum, ground.axes)
     )
-    beside = below(scene, flying, other)
+    beside = landing_site(scene, flying, other)
     before, now = (gap_rate(body, other, as_free_body(scene, one, beside, other)) for one in (flying, thrown))
     touches = beside.gap < TOUCHING * body.radius
     rests = touches & ~rebounds & (speed <= closing) & (jnp.abs(before) <= closing)
@@ -247,7 +250,7 @@ def modes(
     """
     given, (main, stem) = (scene, problem.scales, problem.cos_angle, rides), balls(scene.body)
     started = flight_state(lift_off(scene, problem.states[:OWN], False, main))
-    first = jnp.where(below(scene, started, stem).gap < 0.0, ON_STEM, SLIDING)
+    first = jnp.where(landing_site(scene, started, stem).gap < 0.0, ON_STEM, SLIDING)
     slides = [SlideOnOne(*given, jnp.asarray(number)) for number in (0, 1)]
     flies, strikes = (FlyBoth(*given, jnp.asarray(strikes)) for strikes in (False, True))
     return (slides[0], flies, slides[1], strikes), first

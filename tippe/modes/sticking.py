@@ -14,6 +14,7 @@ from nonholonomic.xla_cpu import compiled_setup
 from ..model.dynamics import NO_COSINE, Dynamics
 from ..model.scene import Scene
 from ..model.slip_onset import Onset
+from ..model.state import COS_THETA
 from ..model.stick_slip import AT_REST, Change, ContactMode, StickSlip
 from .inversion_problem import InversionProblem
 from .trajectory_problem import TrajectoryProblem

@@ -145,7 +145,9 @@ def simulate_airborne(
     if status == Status.JAMMED:
         status = LOSSES[int(loss(scene, jnp.asarray(path.state)))]
     hops = np.array([(one.begin, one.end) for one in path.mode_segments if one.number == FLYING]).reshape(-1, 2)
-    run = flights_of(StickSlipArenaTrajectory if exact else ArenaTrajectory, scene, path, status.word, hops, times)
+    run = flights_of(
+        StickSlipArenaTrajectory if exact else ArenaTrajectory, scene, path, status.word, hops, times, tolerance
+    )
     if exact:
         run.stats["sticks"] = int(path.counts[1])
     return run

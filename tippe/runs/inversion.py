@@ -78,7 +78,16 @@ LISTS = "inversion_table takes lists, and jax.vmap maps over them"
 
 
 def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LISTS) -> None:
-    """Raise `ValueError` unless these are a scene, a launch, a positive horizon and a tolerance in range.
+    """Raise `ValueError` unless these are a scene, a launch with a place on it, a positive horizon and a tolerance in range.
+
+    **Arguments:** as for `check_numbers`.
+    """
+    check_numbers(scene, launch, t1, tolerance, lists)
+    scene.check_start(launch)
+
+
+def check_numbers(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LISTS) -> None:
+    """Raise `ValueError` unless these are a scene, a launch, a positive horizon and a tolerance in range, each by itself.
 
     **Arguments:** as for `inversion_time`; `lists`: what takes lists instead of single numbers. What a function holds, such as
     that of a `Graph`, may be lists.
@@ -88,7 +97,6 @@ def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LIS
     require_all(run_bounds(t1, tolerance))
     values = numbers("scene", scene, functions=False) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
     require_scalars(values, lists)
-    scene.check_start(launch)
 
 
 def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any) -> None:

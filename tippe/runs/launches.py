@@ -13,7 +13,7 @@ from nonholonomic.validation import require_kind
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.top import Top
-from .inversion import check_run
+from .inversion import check_numbers
 
 UNITS = Top.units | Scene.units | Launch.units
 
@@ -108,7 +108,8 @@ def launches(
             unit, long_name = units.get(name, "1"), LONG_NAMES.get(name, name)
             grid.append(axis(name if alone else number, number, unit, values[number], long_name))
     roots = with_numbers({"scene": scene, "launch": launch}, fixed)
-    check_run(roots["scene"], roots["launch"], t1, tolerance)
+    # The numbers that axes stand for are 0 here, which may be no place of the arena: starts are checked cell by cell.
+    check_numbers(roots["scene"], roots["launch"], t1, tolerance)
     # The modules check their numbers, which may be impossible only together.
     for cells in [rows(grid)] if scattered else cells_to_check(grid):
         looked_at = with_numbers(roots, cells)

@@ -1,0 +1,215 @@
+"""A user's hybrid system as problems and phases of the engine.
+
+A user writes functions of one state. Here they are mapped over lanes component by component, so that what they compute is laid
+out as in equations written for the engine: components along the first axis, lanes last. Time is one more component of the
+state where a function depends on it.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Bool, Float, Int
+
+from ..hybrid import AbstractBatchedMode, Transition
+from ..integration import CROSSED, FAILED, LEFT_DOMAIN, RUNNING, AbstractProblem, Lanes, States
+from .form import Form, OfRun
+from .mode import State
+from .tracing import spelled_out
+
+#: A function counts as zero if changing every component of the state by this fraction of its size could make it so: at the end
+#: of a mode, which is located to a fraction of a step; and up to round-off.
+AT_END, ROUND_OFF = 1e-8, 1e-14
+
+#: The magnitude by which errors of the time are measured [s]: it has none, and no share in step control.
+UNMEASURED = 1e9
+
+
+class ModeProblem(AbstractProblem):
+    """The motion in one mode, up to the event or the end of the mode.
+
+    `numbers`: those of the system; `states`, `scales`: as `start` returns them.
+    """
+
+    numbers: tuple[Float[Array, "..."], ...]
+    states: Float[Array, "components cells"]
+    scales: Float[Array, "components cells"]
+    form: Form = eqx.field(static=True)
+    mode: int = eqx.field(static=True)
+
+    @property
+    def direction_decides(self) -> bool:
+        return True
+
+    @property
+    def fits_one_kernel(self) -> bool:
+        return self.form.traits.elementary
+
+    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
+        return self.states, self.scales
+
+    def field(self, time: Lanes, state: States) -> States:
+        rates = self._over_lanes(lambda *run: tuple(self.form.function("field", self.mode)(*run)), state)
+        clock = (jnp.ones_like(state[0]),) if self.form.traits.timed else ()
+        return jnp.stack((*rates, *clock))
+
+    def event_function(self, state: States) -> Lanes | None:
+        return self._over_lanes(self.form.function("event"), state) if self.form.has_event else None
+
+    def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
+        if self.form.traits.ends[self.mode]:
+            return self._over_lanes(self.form.function("margin", self.mode), state)
+        # What changes between modes asks for a guard in each.
+        return None if self.form.traits.smooth else jnp.ones_like(state[0])
+
+    def _over_lanes(self, function: OfRun, state: States) -> Any:
+        """A user's function in every lane."""
+
+        def of_run(numbers: Sequence[Array], parts: tuple[Array, ...]) -> Any:
+            return function(numbers, *time_and_state(self.form, parts))
+
+        parts = tuple(state)
+        if parts[0].ndim == 0:
+            return spelled_out(of_run)(self.numbers, parts)
+        axes = tuple(0 if jnp.ndim(number) else None for number in self.numbers)
+        return jax.vmap(spelled_out(of_run), in_axes=(axes, 0))(self.numbers, parts)
+
+
+def time_and_state(form: Form, parts: tuple[Array, ...]) -> tuple[Array, State]:
+    """Time and state of one run, from its components; a time that matters nowhere is no number."""
+    if form.traits.timed:
+        return parts[-1], jnp.stack(parts[:-1])
+    return jnp.asarray(jnp.nan), jnp.stack(parts)
+
+
+class BatchedMode(AbstractBatchedMode):
+    """A mode as a phase of the engine, of cells with `numbers` and `scales` as in `ModeProblem`."""
+
+    numbers: tuple[Float[Array, "..."], ...]
+    scales: Float[Array, "components cells"]
+    form: Form = eqx.field(static=True)
+    mode: int = eqx.field(static=True)
+
+    def problem(self, state: Float[Array, "components cells"]) -> ModeProblem:
+        return ModeProblem(self.numbers, state, self.scales, self.form, self.mode)
+
+    def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
+        """The reset, or the end of the run for a mode without one.
+
+        An event at the end of the mode comes before the reset, and one that the reset jumps over is passed by it: the run then
+        has ended between two modes.
+        """
+        axes = tuple(0 if jnp.ndim(number) else None for number in self.numbers)
+        return jax.vmap(self._reset_one, in_axes=(axes, 1, 1), out_axes=_TRANSITION_AXES)(
+            self.numbers, state, self.scales
+        )
+
+    def _reset_one(
+        self, numbers: Sequence[Array], state: Float[Array, " components"], scales: Float[Array, " components"]
+    ) -> Transition:
+        form = self.form
+        function = (
+            form.function("margin", self.mode)
+            if form.traits.ends[self.mode]
+            else lambda numbers, t, y: 1.0 + 0.0 * y[0]
+        )
+        margin = _Watched(form, self.mode, function, numbers, scales)
+        value, slope = margin.along(state)
+        # The end was located to a fraction of a step, not before the zero; the way back is known.
+        close = margin.is_near_zero(state, AT_END) & (slope < 0.0) & (value < 0.0)
+        late = jnp.where(close, -value / jnp.where(close, slope, 1.0), 0.0)
+        state = state + late * margin.rate(state)
+        none = jnp.zeros((), int)
+        if not form.traits.resets[self.mode]:
+            nothing = jnp.full_like(late, jnp.inf)
+            return Transition(none + self.mode, state, late, none + LEFT_DOMAIN, nothing, none[None])
+        t, y = time_and_state(form, tuple(state))
+        after, number = form.function("reset", self.mode)(numbers, t, y)
+        number = jnp.asarray(number).astype(int)
+        after = jnp.concatenate([after, state[form.size :]])
+        status = jnp.where((number >= 0) & (number < form.modes), RUNNING, FAILED)
+        if not form.has_event:
+            return Transition(number, after, late, status, jnp.full_like(late, jnp.inf), none[None] + 1)
+        event = _Watched(form, self.mode, form.function("event"), numbers, scales)
+        before, falling = event.along(state)
+        ends = event.is_near_zero(state, ROUND_OFF) & (falling < 0.0)
+        jumps = ~ends & (before > 0.0) & (event.value(after) <= 0.0)
+        crossed = ends | jumps
+        return Transition(
+            mode=jnp.where(ends, self.mode, jnp.where(jumps, form.modes, number)),
+            state=jnp.where(ends, state, after),
+            elapsed=late,
+            status=jnp.where(crossed, CROSSED, status),
+            crossing_time=jnp.where(crossed, late, jnp.inf),
+            counts=jnp.where(ends, 0, 1)[None],
+        )
+
+
+#: Where the cells of a `Transition` are, for `vmap`.
+_AXES: Any = (0, 1, 0, 0, 0, 1, None, None)
+_TRANSITION_AXES = Transition(*_AXES)
+
+
+class _Watched(eqx.Module):
+    """A function of one run that ends a mode or is timed: what it is for a state with its time."""
+
+    form: Form = eqx.field(static=True)
+    mode: int = eqx.field(static=True)
+    function: OfRun = eqx.field(static=True)
+    numbers: Sequence[Array]
+    scales: Float[Array, " components"]
+
+    def value(self, state: Float[Array, " components"]) -> Float[Array, ""]:
+        return self.function(self.numbers, *time_and_state(self.form, tuple(state)))
+
+    def rate(self, state: Float[Array, " components"]) -> Float[Array, " components"]:
+        """Rate of the state in the mode."""
+        rate = self.form.function("field", self.mode)(self.numbers, *time_and_state(self.form, tuple(state)))
+        return jnp.concatenate([rate, jnp.ones(len(state) - self.form.size)])
+
+    def along(self, state: Float[Array, " components"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Value and rate."""
+        return jax.jvp(self.value, (state,), (self.rate(state),))
+
+    def is_near_zero(self, state: Float[Array, " components"], fraction: float) -> Bool[Array, ""]:
+        """Whether changing each component by a fraction of its size could make the function zero."""
+        slopes = jax.jacfwd(self.value)(state)
+        sizes = jnp.abs(state) + jnp.where(self.scales < UNMEASURED, self.scales, 0.0)
+        return jnp.abs(self.value(state)) <= fraction * jnp.sum(jnp.abs(slopes) * sizes)
+
+
+class Cells(eqx.Module):
+    """Runs of a system: its numbers and the components of the starts, each a scalar or one per cell."""
+
+    numbers: tuple[Float[Array, "..."], ...]
+    start: tuple[Float[Array, "..."], ...]
+    form: Form = eqx.field(static=True)
+
+    def states(self, cells: int | None) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
+        """States at the start, with their time if it matters, and the magnitudes of their errors.
+
+        The magnitudes are the largest component of a start, where that is not greater than 1, and 1 otherwise.
+        """
+        shape = () if cells is None else (cells,)
+        states = jnp.stack([jnp.broadcast_to(part, shape) for part in self.start])
+        largest = jnp.max(jnp.abs(stop_gradient(states)), axis=0)
+        scales = jnp.broadcast_to(jnp.where(largest > 0.0, jnp.minimum(largest, 1.0), 1.0), states.shape)
+        if not self.form.traits.timed:
+            return states, scales
+        clock = jnp.zeros((1, *shape))
+        return jnp.concatenate([states, clock]), jnp.concatenate([scales, clock + UNMEASURED])
+
+    def problem(self, cells: int | None) -> ModeProblem:
+        """The problem of a system whose runs are smooth."""
+        return ModeProblem(self.numbers, *self.states(cells), self.form, self.form.first)
+
+    def modes(
+        self, cells: int
+    ) -> tuple[tuple[BatchedMode, ...], Int[Array, " cells"], Float[Array, "components cells"]]:
+        """The phases of a system with resets, the number of the first, and the states there."""
+        states, scales = self.states(cells)
+        phases = tuple(BatchedMode(self.numbers, scales, self.form, mode) for mode in range(self.form.modes))
+        return phases, jnp.full(cells, self.form.first), states

@@ -1,0 +1,212 @@
+"""The time of an event of a user's system, as a function for `jit`, `vmap`, `grad`, `jvp` and their compositions."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from ..derivatives import (
+    AbstractDifferentiableSolve,
+    differentiable_solve,
+    in_groups,
+    tangents_by,
+    traced_solve_ensemble_with_tangents,
+)
+from ..hybrid import HybridOutcome, traced_solve_hybrid, traced_solve_hybrid_with_tangents
+from ..integration import (
+    CROSSED,
+    FAILED,
+    LOOSEST,
+    UNRESOLVED,
+    Outcome,
+    Settings,
+    explicit_tableau,
+    run_bounds,
+    traced_solve_ensemble,
+)
+from ..progress import status_line
+from ..validation import as_number, legal
+from .engine import Cells
+from .mode import Event
+from .system import System, check_run, run_of
+
+
+@status_line("simulating")
+def event_time(
+    system: System,
+    start: Any,
+    t1: Float[ArrayLike, ""],
+    event: Event | None = None,
+    tolerance: float = 1e-9,
+    solver: diffrax.AbstractERK | None = None,
+) -> Float[Array, ""]:
+    """Time of the first event of a run; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
+
+    The event is the first time after the start at which a function of time and state falls through zero, along the motion
+    or by a reset. Runs that start at the zero, or beyond it, are timed when they fall through it the next time. Under `vmap`
+    all runs are lanes of one batch.
+
+    Derivatives by the start, by every number of the system and of the event are exact: by the implicit function theorem at the
+    event and the saltation matrix at every reset (`nonholonomic/hybrid/varied_phases.py`). They are 0 where the time is
+    infinite.
+
+    **Arguments:**
+
+    - `system`: a `Hybrid`, or an `AbstractSystem`.
+    - `start`: state at time 0, (components,); of an `AbstractSystem`, the coordinates and their rates, (q, rate).
+    - `t1`: horizon [s], positive.
+    - `event`: a function `event(t, y)` of time [s] and state; by default the system's own. The state of an `AbstractSystem` is
+      that of `Trajectory.state`: the coordinates, and behind them their rates.
+    - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2]. The absolute tolerance is a tenth of it, in units of
+      the largest component of the start where that is below 1.
+    - `solver`: an explicit Runge-Kutta solver of Diffrax, by default `nonholonomic.integration.Oscillatory8()`.
+
+    **Returns:** the time [s]; infinite if there is no event by `t1`, or the run ends before; NaN if the integration failed or
+    resets follow one another without end, or if numbers inside a transformation are out of range. Where a mode may end or not
+    within the tolerance, because its margin only touches zero, derivatives are NaN.
+
+    **Raises:** `ValueError` for arguments out of range, functions that return something else than they should, and second
+    derivatives through resets.
+
+    **Example:** the fifth bounce of a ball.
+
+    ```
+    >>> import jax
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Ball(nonholonomic.AbstractMode):
+    ...     restitution: float
+    ...
+    ...     def field(self, t, y):
+    ...         return jnp.array([y[1], -9.81, 0.0])
+    ...
+    ...     def margin(self, t, y):
+    ...         return y[0]
+    ...
+    ...     def reset(self, t, y):
+    ...         return jnp.array([0.0, -self.restitution * y[1], y[2] + 1.0]), 0
+    >>> def fifth(restitution):
+    ...     ball = nonholonomic.Hybrid([Ball(restitution)])
+    ...     start = jnp.array([1.0, 0.0, 0.0])
+    ...     return nonholonomic.event_time(ball, start, t1=9.0, event=lambda t, y: 4.5 - y[2])
+    >>> time, slope = jax.value_and_grad(fifth)(0.8)
+    >>> print(f"{time:.6f} s, {slope:.6f} s")
+    2.584070 s, 5.146087 s
+
+    ```
+    """
+    check_run(system, start, t1, tolerance)
+    run = run_of(system, start, event)
+    if not run.cells.form.has_event:
+        raise ValueError("event = None: the system has no event of its own; pass event=, a function of time and state")
+    explicit_tableau(Settings(tolerance, solver).for_lanes)
+    return _time(run.cells, as_number(t1), as_number(tolerance), solver)
+
+
+# Compiled as a whole, so that further calls with the same functions need no tracing.
+@eqx.filter_jit
+def _time(
+    cells: Cells, t1: Float[Array, ""], tolerance: Float[Array, ""], solver: diffrax.AbstractERK | None
+) -> Float[Array, ""]:
+    numbers, structure = jax.tree.flatten(cells)
+    movable = [number for number in numbers if eqx.is_inexact_array(number)]
+    others = [number for number in numbers if not eqx.is_inexact_array(number)]
+    places = tuple(eqx.is_inexact_array(number) for number in numbers)
+    question = SmoothEvent if cells.form.traits.smooth else HybridEvent
+    return differentiable_solve(question(len(movable), structure, places, solver), *movable, *others, t1, tolerance)
+
+
+class SmoothEvent(AbstractDifferentiableSolve):
+    """When the events of cells are whose runs are smooth.
+
+    The leaves are the numbers of `Cells`, those that are floats first, the horizon and the tolerance.
+
+
+    `structure`: of the `Cells`; `places`: which of its leaves are floats.
+    """
+
+    movable: int
+    # JAX's PyTreeDef, which type checkers take for a variable.
+    structure: Any = eqx.field(static=True)
+    places: tuple[bool, ...] = eqx.field(static=True)
+    solver: diffrax.AbstractERK | None
+
+    def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
+        return jnp.isinf(value)
+
+    def of_leaves(self, leaves: tuple[Array, ...]) -> Cells:
+        """The cells."""
+        floats, others = iter(leaves[: self.movable]), iter(leaves[self.movable :])
+        return jax.tree.unflatten(self.structure, [next(floats if is_float else others) for is_float in self.places])
+
+    def permitted(self, leaves: tuple[Array, ...]) -> tuple[Bool[Array, "..."], Float[Array, "..."], Settings]:
+        """Which cells have a legal horizon, tolerance and start; the horizons, 0 for the others; and the settings.
+
+        One tolerance serves a batch: the smallest.
+        """
+        *_, t1, tolerance = leaves
+        may = legal(run_bounds(t1, tolerance))
+        may = may & jnp.isfinite(jnp.asarray(sum(self.of_leaves(leaves).start)))
+        return may, jnp.where(may, t1, 0.0), Settings(jnp.min(jnp.where(may, tolerance, LOOSEST)), self.solver)
+
+    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
+        may, t1, settings = self.permitted(leaves)
+        problem = self.of_leaves(leaves).problem(cells)
+        outcome, _ = traced_solve_ensemble(problem, t1, jnp.asarray(cells), settings, one_kernel=True)
+        return _named(may, outcome)
+
+    def with_slopes(
+        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
+        def build(movable: tuple[Array, ...], cells: int | None) -> Any:
+            return self.of_leaves((*movable, *leaves[self.movable :])).problem(cells)
+
+        may, t1, settings = self.permitted(leaves)
+        problem, directions, gather = tangents_by(build, active, leaves[: self.movable], cells)
+        outcome, slopes = traced_solve_ensemble_with_tangents(
+            problem, directions, t1, jnp.asarray(cells), settings, one_kernel=not again
+        )
+        time = _named(may, outcome)
+        return time, [jnp.where(jnp.isinf(time), 0.0, slope + 0.0 * time) for slope in gather(slopes)]
+
+
+class HybridEvent(SmoothEvent):
+    """When the events of cells are whose runs have resets."""
+
+    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
+        may, t1, settings = self.permitted(leaves)
+        phases, first, states = self.of_leaves(leaves).modes(cells)
+        return _named(may, traced_solve_hybrid(phases, first, states, t1, settings, kinds=1))
+
+    def with_slopes(
+        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
+        if again:
+            raise ValueError("second derivatives do not go through resets; differentiate a gradient by differences")
+
+        def build(movable: tuple[Array, ...], cells: int | None) -> Any:
+            assert cells is not None
+            return self.of_leaves((*movable, *leaves[self.movable :])).modes(cells)
+
+        may, t1, settings = self.permitted(leaves)
+        (phases, first, states), directions, gather = tangents_by(build, active, leaves[: self.movable], cells)
+
+        def run(some: tuple[Any, ...]) -> tuple[tuple[HybridOutcome, Array], list[Float[Array, " cells"]]]:
+            moved = tuple((one[0], one[2]) for one in some)
+            journey, found = traced_solve_hybrid_with_tangents(phases, moved, first, states, t1, settings, kinds=1)
+            return (journey, found.grazing), list(found.slopes)
+
+        (journey, grazing), slopes = in_groups(run, directions)
+        time = _named(may, journey)
+        slopes = [jnp.where(grazing, jnp.nan, slope) for slope in gather(slopes)]
+        return time, [jnp.where(jnp.isinf(time), 0.0, slope + 0.0 * time) for slope in slopes]
+
+
+def _named(may: Bool[Array, "..."], ended: Outcome | HybridOutcome) -> Float[Array, " cells"]:
+    """The times of the events: infinite where there is none, NaN where the run could not be finished."""
+    time = jnp.where(ended.status == CROSSED, ended.crossing_time, jnp.inf)
+    failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
+    return jnp.where(may & ~failed, time, jnp.nan)

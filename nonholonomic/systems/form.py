@@ -1,0 +1,165 @@
+"""A user's hybrid system without its numbers: what JAX compiles a program for, and what tracing its functions shows."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .mode import Hybrid, State
+from .tracing import depends_on_first, is_elementary, spelled_out
+
+#: A function of the numbers, the time and the state of one run.
+OfRun = Callable[[Sequence[Array], Array, State], Any]
+
+
+def is_number(leaf: Any) -> bool:
+    """Whether a leaf of a system is a number or an array of numbers, which may differ from cell to cell."""
+    return eqx.is_array(leaf) or isinstance(leaf, np.ndarray | np.inexact | float)
+
+
+@dataclasses.dataclass(frozen=True)
+class Form:
+    """A hybrid system without its numbers, which are listed one by one, those of an array in its order.
+
+    - `structure`: of the tree of numbers; `kinds`: shape and type of each leaf.
+    - `rest`, `rest_structure`: the leaves that are no numbers.
+    - `modes`: how many there are; `first`: that in which runs start; `has_event`: whether there is an event.
+    - `size`: how many components the state has.
+    """
+
+    structure: Any
+    kinds: tuple[tuple[tuple[int, ...], Any], ...]
+    rest: tuple[Hashable, ...]
+    rest_structure: Any
+    modes: int
+    first: int
+    has_event: bool
+    size: int
+
+    @classmethod
+    def of(cls, hybrid: Hybrid, size: int) -> tuple["Form", tuple[Array, ...]]:
+        """The form of a system whose states have so many components, and its numbers."""
+        tree, others = eqx.partition(hybrid, is_number)
+        leaves, structure = jax.tree.flatten(tree)
+        arrays = [jnp.asarray(leaf) for leaf in leaves]
+        rest, rest_structure = jax.tree.flatten(others)
+        kinds = tuple((array.shape, array.dtype) for array in arrays)
+        modes = (len(hybrid.modes), hybrid.first, hybrid.event is not None)
+        form = cls(structure, kinds, tuple(rest), rest_structure, *modes, size)
+        return form, tuple(
+            number for array in arrays for number in (jnp.unstack(array.ravel()) if array.ndim else [array])
+        )
+
+    def system(self, numbers: Sequence[Array]) -> Hybrid:
+        """The system with some numbers, each a scalar."""
+        leaves, begin = [], 0
+        for shape, _ in self.kinds:
+            end = begin + math.prod(shape)
+            leaves.append(jnp.stack(numbers[begin:end]).reshape(shape) if shape else numbers[begin])
+            begin = end
+        rest = jax.tree.unflatten(self.rest_structure, self.rest)
+        return eqx.combine(jax.tree.unflatten(self.structure, leaves), rest)
+
+    def function(self, name: str, mode: int = 0) -> OfRun:
+        """One of the user's functions: "field", "margin" or "reset" of a mode, or "event"."""
+
+        def called(numbers: Sequence[Array], t: Array, y: State) -> Any:
+            system = self.system(numbers)
+            function = system.event if name == "event" else getattr(system.modes[mode], name)
+            assert function is not None
+            return function(t, y)
+
+        return called
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """The shapes of what the functions take."""
+        types = [jax.ShapeDtypeStruct((), kind) for shape, kind in self.kinds for _ in range(math.prod(shape))]
+        real = jnp.result_type(float)
+        return tuple(types), jax.ShapeDtypeStruct((), real), jax.ShapeDtypeStruct((self.size,), real)
+
+    @property
+    def traits(self) -> "Traits":
+        """What tracing the functions shows."""
+        return _traits(self)
+
+
+class Traits(NamedTuple):
+    """What tracing a hybrid system's functions shows.
+
+    - `timed`: whether a function depends on time, which then is one more component of the state.
+    - `elementary`: whether all that is asked within steps fits a single kernel.
+    - `ends`, `resets`: of each mode, whether it has a margin, and a reset too.
+    """
+
+    timed: bool
+    elementary: bool
+    ends: tuple[bool, ...]
+    resets: tuple[bool, ...]
+
+    @property
+    def smooth(self) -> bool:
+        """Whether a run is one smooth motion, without resets."""
+        return len(self.ends) == 1 and not self.resets[0]
+
+
+@functools.lru_cache(maxsize=256)
+def _traits(form: Form) -> Traits:
+    """The traits of a form, whose functions are checked by the way.
+
+    **Raises:** `ValueError` that names a function that returns something else than it should.
+    """
+    ends, resets, within, others = [], [], [], []
+    for k in range(form.modes):
+        _require_shape(form, "field", k, (form.size,))
+        ends.append(jax.eval_shape(form.function("margin", k), *form.arguments) is not None)
+        reset = jax.eval_shape(form.function("reset", k), *form.arguments) if ends[k] else None
+        resets.append(reset is not None)
+        within.append(form.function("field", k))
+        if ends[k]:
+            _require_shape(form, "margin", k, ())
+            within.append(form.function("margin", k))
+        if reset is not None:
+            _require_pair(form, k, reset)
+            others.append(form.function("reset", k))
+    if form.has_event:
+        _require_shape(form, "event", 0, ())
+        within.append(form.function("event"))
+
+    def seen(functions: list[OfRun]) -> Callable[..., Any]:
+        return lambda t, y, *numbers: [function(numbers, t, y) for function in functions]
+
+    numbers, t, y = form.arguments
+    timed = depends_on_first(seen([*within, *others]), t, y, *numbers)
+    return Traits(timed, is_elementary(spelled_out(seen(within)), t, y, *numbers), tuple(ends), tuple(resets))
+
+
+def _require_shape(form: Form, name: str, mode: int, shape: tuple[int, ...]) -> None:
+    """Raise `ValueError` unless a function returns an array of floats of a shape."""
+    what = name if name == "event" else f"modes[{mode}].{name}"
+    result = jax.eval_shape(form.function(name, mode), *form.arguments)
+    if not hasattr(result, "shape") or result.shape != shape:
+        wanted = "one number" if shape == () else f"an array of shape {shape}, like the state"
+        got = f"an array of shape {result.shape}" if hasattr(result, "shape") else repr(result)
+        raise ValueError(f"{what}(t, y) must return {wanted}, not {got}; jnp.array([...]) makes an array of numbers")
+    if not jnp.issubdtype(result.dtype, jnp.floating):
+        raise ValueError(f"{what}(t, y) must return floats, not {result.dtype}: it must be smooth")
+
+
+def _require_pair(form: Form, mode: int, result: Any) -> None:
+    """Raise `ValueError` unless a reset returns a state and a whole number."""
+    expected = f"modes[{mode}].reset(t, y) must return (state, number of the next mode)"
+    if not isinstance(result, tuple) or len(result) != 2:
+        raise ValueError(f"{expected}, not {result!r}")
+    state, number = (jax.eval_shape(lambda part=part: part) if callable(part) else part for part in result)
+    if getattr(state, "shape", None) != (form.size,):
+        raise ValueError(f"{expected}; its state has the shape {getattr(state, 'shape', state)}, not ({form.size},)")
+    if getattr(number, "shape", None) != () or not jnp.issubdtype(number.dtype, jnp.integer):
+        raise ValueError(f"{expected}; its number is {number!r}, not a whole number")

@@ -1,0 +1,182 @@
+"""Numbers of a user's system from recorded runs."""
+
+import dataclasses
+import itertools
+import re
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .. import identification as generic
+from ..formulations import AbstractSystem
+from ..identification import AbstractRecording, Identification, Quantities, as_quantity, model_times, of_data
+from ..integration import tolerance_bound
+from ..progress import status_line
+from ..validation import as_number, as_number_or_none
+from .mode import Hybrid
+from .numbers import Named, check_again
+from .simulate import simulate
+from .system import System, check_run
+
+
+@dataclasses.dataclass(frozen=True)
+class Components(Quantities):
+    """The components of a state, whatever their number: "y0" and so on, or "q0", "rate0" and so on."""
+
+    def of(self, quantity: Any) -> tuple[str, ...]:
+        names = quantity if isinstance(quantity, tuple) else (quantity,)
+        wrong = [name for name in names if not (isinstance(name, str) and re.fullmatch(r"(y|q|rate)\d+", name))]
+        if wrong or not names or len(set(names)) < len(names):
+            raise ValueError(
+                f"quantity = {quantity!r} must name components, such as 'y0' or ('q0', 'rate0'), each once"
+            )
+        return names
+
+
+class Recording(AbstractRecording):
+    """A recorded run of a user's system: some components of its state at the readings of a clock.
+
+    **Arguments:**
+
+    - `launch`: the start, as for `simulate`.
+    - `times`: (times,), increasing.
+    - `value`: (times,) for one component, (times, columns) for several; NaN where a sample is missing.
+    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: to be estimated for each column
+      from the scatter about the fit.
+    - `quantity`: what was recorded: the names of components, as in `Trajectory.names`, such as "y0" or ("q0", "q1").
+    - `t0`: the clock's reading at the start.
+    - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None`: Gaussian.
+
+    **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
+
+    **Example:**
+
+    >>> import nonholonomic
+    >>> heights = nonholonomic.Recording([1.0, 0.0], [0.1, 0.2], [0.95, 0.80], 0.01, "y0")
+    >>> heights.labels
+    ('y0(0.1 s)', 'y0(0.2 s)')
+    """
+
+    quantity: str | tuple[str, ...] = eqx.field(static=True, default="y0", converter=as_quantity)
+    t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
+    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    quantities: ClassVar[Quantities] = Components({}, {}, frozenset())
+
+
+class SystemModel(eqx.Module):
+    """Predictions of all recordings of a system, in the form that `nonholonomic.identification.identify` expects.
+
+    `seen` says which of the predictions were measured.
+    """
+
+    system: System
+    data: tuple[Recording, ...]
+    seen: Int[Array, " n"]
+    tolerance: Float[Array, ""] = eqx.field(converter=as_number)
+
+    def __call__(self, parameters: dict[str, Float[Array, " rows"]]) -> Float[Array, "rows n"]:
+        parts = [
+            jax.vmap(lambda row, one=one: self._predict(one, row))(of_data(parameters, k))
+            for k, one in enumerate(self.data)
+        ]
+        return jnp.concatenate(parts, axis=1)[:, self.seen]
+
+    def _predict(self, recording: Recording, row: dict[str, Array]) -> Float[Array, " samples"]:
+        """What is recorded of one run, a time after the other."""
+        named = numbers_of(self.system, recording)
+        tree = named.tree(named.replaced(row))
+        times = model_times(recording.times, row.get("t0", recording.t0))
+        start = tree["start"]
+        start = (start["q"], start["rate"]) if isinstance(start, dict) else start
+        run = simulate(tree["system"], start, times[-1], times=times, tolerance=self.tolerance)
+        places = [run.names.index(name) for name in recording.columns]
+        return run.state[:, jnp.asarray(places)].reshape(-1)
+
+
+def numbers_of(system: System, recording: Recording) -> Named:
+    """The numbers of a system and of the start of a recording, by name."""
+    start = recording.launch
+    if isinstance(system, AbstractSystem):
+        start = dict(zip(("q", "rate"), map(as_number, start), strict=True))
+    return Named.of({"system": system, "start": start if isinstance(start, dict) else as_number(start)})
+
+
+def identify(
+    system: System,
+    data: Any,
+    free: dict[str, Any],
+    *,
+    starts: int = 1,
+    spread: float = 2.0,
+    seed: int = 0,
+    tolerance: float = 1e-8,
+    max_steps: int = 60,
+    progress: bool = True,
+) -> Identification:
+    """Numbers of a user's system and its starts from recorded runs, with their errors and with what is not determined.
+
+    **Arguments:**
+
+    - `system`: a `Hybrid`, or an `AbstractSystem`; what is not free is taken from it.
+    - `data`: a `Recording`, or a list of several to be fitted together.
+    - `free`: full name of a number -> a `nonholonomic.identification.Free` or only the value from which to start:
+      `"system.modes[0].drag"`, or `"drag"` where nothing else ends so; `"start[0]"`, `"start.q[0]"`. A start, or `"t0"`, the
+      reading of a recording's clock at the start, is the same in all recordings; `"data[1].start[0]"` is that of the second,
+      and `"data[*].t0"` stands for one of each. Through resets `"t0"` cannot be free.
+    - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
+    - `tolerance`: relative tolerance of the integration.
+
+    **Returns:** an `Identification`, with its `verdict`; of which it warns (`FitWarning`) if it is not good.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown name.
+
+    **Example:**
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Decay(nonholonomic.AbstractMode):
+    ...     rate: float
+    ...
+    ...     def field(self, t, y):
+    ...         return -self.rate * y
+    >>> data = nonholonomic.Recording([1.0], [0.5, 1.0, 1.5], [0.37, 0.135, 0.05], 0.005)
+    >>> fit = nonholonomic.identify(nonholonomic.Hybrid([Decay(1.0)]), data, {"rate": 1.0}, progress=False)
+    >>> print(f"{fit.estimates['system.modes[0].rate']:.2f}")
+    2.00
+
+    ```
+    """
+    data = tuple(data) if isinstance(data, list | tuple) else (data,)
+    for one in data:
+        if not isinstance(one, Recording):
+            raise ValueError(f"data = {one!r} must be a nonholonomic.Recording, or a list of them")
+        check_run(system, one.launch, one.times[-1], tolerance)
+    tolerance_bound(tolerance).require()
+    generic.check_search(starts, spread, seed, max_steps, progress)
+    if isinstance(system, Hybrid):
+        system = dataclasses.replace(system, event=None)
+    named = [numbers_of(system, one) for one in data]
+    own = [[name for name in numbers.movable if name.startswith("start")] + ["t0"] for numbers in named]
+    known = [name for name in named[0].movable if name.startswith("system")]
+
+    def check(values: dict[str, float]) -> None:
+        check_again(named[0].tree(named[0].replaced({name: jnp.asarray(value) for name, value in values.items()})))
+
+    with status_line("fitting", progress):
+        unknowns = generic.free_numbers(free, [*known, *dict.fromkeys(itertools.chain(*own))], own, check)
+        measurements, labels, seen = generic.joined(data)
+        return generic.identify(
+            SystemModel(system, data, jnp.asarray(seen), tolerance),
+            measurements,
+            unknowns,
+            starts=starts,
+            spread=spread,
+            seed=seed,
+            max_steps=max_steps,
+            labels=labels,
+            progress=progress,
+        )

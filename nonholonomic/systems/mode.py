@@ -1,0 +1,121 @@
+"""A user's own hybrid system: smooth modes with resets between them, as functions of one state."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+State = Float[Array, " components"]
+
+#: A function of time [s] and state whose fall through zero is timed.
+Event = Callable[[Float[Array, ""], State], Float[Array, ""]]
+
+
+class AbstractMode(eqx.Module):
+    """A mode of a hybrid system: its equations of motion, when it ends, and what follows.
+
+    Subclass it, declare the numbers of your model as fields, and write functions of one time and one state with `jax.numpy`.
+    Every field that is a float or an array can be swept, fitted and differentiated by. A mode that never ends needs `field`
+    alone.
+
+    **Example:** a ball that falls and bounces.
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Ball(nonholonomic.AbstractMode):
+    ...     gravity: float = 9.81
+    ...     restitution: float = 0.8
+    ...
+    ...     def field(self, t, y):
+    ...         return jnp.array([y[1], -self.gravity])
+    ...
+    ...     def margin(self, t, y):
+    ...         return y[0]
+    ...
+    ...     def reset(self, t, y):
+    ...         return jnp.array([0.0, -self.restitution * y[1]]), 0
+    >>> ball = nonholonomic.Hybrid([Ball()], event=lambda t, y: y[1])
+    >>> time = nonholonomic.event_time(ball, jnp.array([1.0, 0.0]), t1=5.0)
+    >>> print(f"highest again after {time:.4f} s")
+    highest again after 0.8127 s
+
+    ```
+    """
+
+    @abc.abstractmethod
+    def field(self, t: Float[Array, ""], y: State) -> State:
+        """Rate of change of the state.
+
+        **Arguments:** `t`: time [s]; `y`: state, (components,).
+
+        **Returns:** the rate, (components,).
+        """
+
+    def margin(self, t: Float[Array, ""], y: State) -> Float[Array, ""] | None:
+        """A smooth function that is positive while the mode holds and falls through zero where it ends.
+
+        **Arguments:** as for `field`.
+
+        **Returns:** a number, or `None`, the default, for a mode that never ends.
+        """
+        return None
+
+    def reset(self, t: Float[Array, ""], y: State) -> tuple[State, Any] | None:
+        """What follows where the margin has fallen to zero.
+
+        A reset may leave the state at zero margin if the margin then rises, as that of a ball that has just bounced.
+
+        **Arguments:** as for `field`, where the mode ends.
+
+        **Returns:** the state with which the run goes on, (components,), and the number of the next mode in `Hybrid.modes`, a
+        whole number that may depend on the state; or `None`, the default, for a run that ends there.
+        """
+        return None
+
+
+class Hybrid(eqx.Module):
+    """A hybrid system: modes of one state, and the event that is timed.
+
+    **Arguments:**
+
+    - `modes`: the modes, whose states have the same components.
+    - `event`: a function of time [s] and state, `event(t, y)`, or `None`. The event is the first time after the start at which
+      the function falls through zero, along the motion or by a reset. A function that is an `equinox.Module` can have
+      numbers of its own.
+    - `first`: number of the mode in which runs start.
+
+    **Raises:** `ValueError` for modes that are none, an event that is no function, and a first mode that does not exist.
+
+    **Example:** as for `AbstractMode`.
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Decay(nonholonomic.AbstractMode):
+    ...     rate: float
+    ...
+    ...     def field(self, t, y):
+    ...         return -self.rate * y
+    >>> decay = nonholonomic.Hybrid([Decay(rate=2.0)], event=lambda t, y: y[0] - 0.5)
+    >>> print(f"{nonholonomic.event_time(decay, jnp.array([1.0]), t1=5.0):.6f} s")  # ln(2) / 2
+    0.346574 s
+
+    ```
+    """
+
+    modes: tuple[AbstractMode, ...] = eqx.field(converter=lambda modes: tuple(modes))
+    event: Event | None = None
+    first: int = eqx.field(static=True, default=0)
+
+    def __check_init__(self):
+        wrong = [mode for mode in self.modes if not isinstance(mode, AbstractMode)]
+        if not self.modes or wrong:
+            what = f"modes holds {wrong[0]!r}" if wrong else "modes is empty"
+            raise ValueError(f"{what}: it must hold one AbstractMode or more, such as [Flying(), Sliding()]")
+        if self.event is not None and not callable(self.event):
+            raise ValueError(f"event = {self.event!r} must be a function event(t, y) of time and state, or None")
+        if not isinstance(self.first, int) or not 0 <= self.first < len(self.modes):
+            raise ValueError(f"first = {self.first!r} must be the number of a mode, from 0 to {len(self.modes) - 1}")

@@ -1,0 +1,129 @@
+"""Follow one run of a user's system."""
+
+import dataclasses
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from ..derivatives import sampled_run
+from ..hybrid import AbstractBatchedMode, hybrid_samples
+from ..integration import FAILED, LOOSEST, Settings, explicit_tableau, run_bounds, times_bounds
+from ..progress import status_line
+from ..validation import as_known, as_number, is_traced, legal, nan_unless, require_all, require_increasing
+from .engine import Cells, ModeProblem
+from .mode import Hybrid
+from .system import Run, System, check_run, run_of
+from .trajectory import Trajectory
+
+#: How many times are saved if none are asked for.
+DEFAULT_TIMES = 201
+
+
+@status_line("simulating")
+def simulate(
+    system: System,
+    start: Any,
+    t1: Float[ArrayLike, ""],
+    times: Float[ArrayLike, " times"] | None = None,
+    tolerance: Float[ArrayLike, ""] = 1e-9,
+    solver: diffrax.AbstractERK | None = None,
+) -> Trajectory:
+    """Follow one run of a system to `t1`; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
+
+    A run goes on through all resets, and through the system's event. Derivatives go through resets by the saltation matrix.
+
+    **Arguments:**
+
+    - `system`, `start`, `tolerance`, `solver`: as for `event_time`.
+    - `t1`: end of the run [s], positive.
+    - `times`: times [s] to report, increasing, within [0, t1]; by default 201 equally spaced ones.
+
+    **Returns:** a `Trajectory`, whose `status` says how the run ended.
+
+    **Raises:** `ValueError` for arguments out of range, times that do not increase, functions that return something else than
+    they should, and second derivatives through resets.
+
+    **Example:** a pendulum as an `AbstractSystem`.
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Pendulum(nonholonomic.AbstractSystem):
+    ...     length: float
+    ...     dimension = 1
+    ...
+    ...     def metric(self, q):
+    ...         return jnp.array([[self.length**2]])
+    ...
+    ...     def potential(self, q):
+    ...         return -9.81 * self.length * jnp.cos(q[0])
+    >>> run = nonholonomic.simulate(Pendulum(length=1.0), ([0.1], [0.0]), t1=2.0, times=[1.0, 2.0])
+    >>> print(run.status, run.state.round(4))
+    completed [[-0.1     0.0026]
+     [ 0.0999 -0.0052]]
+
+    ```
+    """
+    check_run(system, start, t1, tolerance)
+    end = as_known(t1)
+    if times is None:
+        times = jnp.linspace(0.0, end, DEFAULT_TIMES) if is_traced(end) else np.linspace(0.0, end, DEFAULT_TIMES)
+    require_increasing(times, "times")
+    require_all(times_bounds(times, t1))
+    explicit_tableau(Settings(as_number(tolerance), solver).for_lanes)
+    if isinstance(system, Hybrid):
+        system = dataclasses.replace(system, event=None)
+    run = run_of(system, start, None)
+    return _sampled(run, as_number(times), as_number(t1), as_number(tolerance), solver)
+
+
+@eqx.filter_jit
+def _sampled(
+    run: Run,
+    times: Float[Array, " times"],
+    t1: Float[Array, ""],
+    tolerance: Float[Array, ""],
+    solver: diffrax.AbstractERK | None,
+) -> Trajectory:
+    """The run, or NaN and "failed" where a traced number is out of range."""
+    cells = run.cells
+    may = jnp.all(legal([*run_bounds(t1, tolerance), *times_bounds(times, t1)])) & jnp.all(jnp.diff(times) > 0.0)
+    settings = Settings(jnp.where(may, tolerance, LOOSEST), solver)
+    horizon, at = jnp.where(may, t1, 0.0), jnp.where(may, times, 0.0)
+    if cells.form.traits.smooth:
+        found = sampled_run(_problem, cells, at, horizon, settings)
+        states, reached = found.states, jnp.all(jnp.isfinite(found.states), axis=1)
+        mode, switches = jnp.where(reached, cells.form.first, -1), jnp.zeros(())
+        status, steps = found.status, found.accepted + found.rejected
+    else:
+        found = hybrid_samples(_modes, cells, at, horizon, settings, 1)
+        states, mode, switches = found.shown.T, jnp.where(jnp.isnan(found.number), -1, found.number), found.counts[0]
+        status, steps = found.status, found.steps
+    states = jax.vmap(run.shown)(nan_unless(may, states))
+    return Trajectory(
+        t=times,
+        state=states,
+        mode=mode.astype(int),
+        end_time=nan_unless(may, found.end_time),
+        switches=switches.astype(int),
+        steps=steps.astype(int),
+        rejected=found.rejected.astype(int),
+        code=jnp.where(may, status, FAILED).astype(int),
+        names=run.names,
+    )
+
+
+def _problem(cells: Cells, count: int | None) -> ModeProblem:
+    return cells.problem(count)
+
+
+def _modes(
+    cells: Cells, tolerance: Array
+) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " 1"], Float[Array, "components 1"]]:
+    """The modes of one run, its first and its start."""
+    return cells.modes(1)

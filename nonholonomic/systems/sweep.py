@@ -1,0 +1,273 @@
+"""Tables of many runs of a user's system, over a grid of its numbers and starts."""
+
+import dataclasses
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..derivatives import solve_ensemble_with_tangents, tangent_scale, tangents_of
+from ..formulations import AbstractSystem
+from ..hybrid import HybridOutcome, solve_hybrid, solve_hybrid_with_tangents
+from ..integration import (
+    CROSSED,
+    FAILED,
+    LEFT_DOMAIN,
+    UNRESOLVED,
+    Outcome,
+    Settings,
+    explicit_tableau,
+    solve_ensemble,
+)
+from ..parameters import full_name
+from ..sweeps import Table, Variable, axis
+from ..sweeps import sweep as computed
+from ..validation import as_number
+from .engine import Cells
+from .mode import Event, Hybrid
+from .numbers import Named, check_again, short_names
+from .system import Run, System, check_run, run_of
+from .tracing import dependent_outputs
+
+#: How a run can end, and the code of each word but the first.
+WORDS = ("event", "completed", "stopped", "failed", "unresolved")
+CODES = {LEFT_DOMAIN: 2, FAILED: 3, UNRESOLVED: 4}
+
+
+def sweep(
+    system: System,
+    start: Any,
+    t1: float,
+    *,
+    axes: dict[str, Any],
+    event: Event | None = None,
+    tolerance: float = 1e-9,
+    solver: diffrax.AbstractERK | None = None,
+    sensitivities: Sequence[str] = (),
+    path: Any = None,
+    progress: bool = True,
+    executor: Executor | None = None,
+) -> Table:
+    """Event times and ends of all runs over a grid of numbers, in one batched call on all cores.
+
+    **Arguments:**
+
+    - `system`, `start`, `event`, `tolerance`, `solver`: as for `event_time`. Without any event runs end at `t1`.
+    - `t1`: horizon [s].
+    - `axes`: full name of a number -> values, such as `{"system.modes[0].drag": [0.1, 0.2], "start[1]": [0.0, 1.0]}`; the end
+      of a name will do where a single number has it. The start of an `AbstractSystem` has the names `"start.q[0]"` and
+      `"start.rate[0]"`, an event that is an `equinox.Module` those of its numbers, such as `"event.level"` or
+      `"system.event.level"`. The first axis varies slowest.
+    - `sensitivities`: names of numbers to differentiate the times by.
+    - `path`: HDF5 file to write, block by block. A call that was interrupted resumes from it.
+    - `progress`: whether to show it, on a terminal or in a notebook.
+    - `executor`: who computes: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes`; by default a
+      thread for each core. For other processes, classes and functions must be defined at the top of a module.
+
+    **Returns:** a `Table` with `time` [s] of the event, infinite without one; `status`: "event", "completed" where the run
+    reached `t1`, "stopped" where a mode without a reset ended, "failed" or "unresolved"; `end_time` [s]; the state at the end,
+    `y0` and so on, or `q0`, `rate0` and so on; `steps` and `rejected`; and for a system with resets `switches`, their number.
+    With `sensitivities` also the derivative of `time` by each number, `time_by_drag` for `"system.modes[0].drag"`, and for a
+    system with resets `grazes`: 1 where the derivative is NaN because the margin of a mode only touched zero.
+
+    **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
+    `RuntimeError` for an executor that breaks down, or a worker with other versions.
+
+    **Example:**
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Decay(nonholonomic.AbstractMode):
+    ...     rate: float
+    ...
+    ...     def field(self, t, y):
+    ...         return -self.rate * y
+    >>> decay = nonholonomic.Hybrid([Decay(rate=2.0)], event=lambda t, y: y[0] - 0.5)
+    >>> table = nonholonomic.sweep(decay, [1.0], t1=1.0, axes={"rate": [0.5, 1.0, 2.0]}, progress=False)
+    >>> print(table.time.round(6), table.status)
+    [     inf 0.693147 0.346574] ['completed' 'event' 'event']
+
+    ```
+    """
+    check_run(system, start, t1, tolerance)
+    if not isinstance(axes, dict) or not all(isinstance(name, str) for name in axes):
+        raise ValueError(f"axes = {axes!r} must be a dictionary, name of a number -> values")
+    explicit_tableau(Settings(tolerance, solver).for_lanes)
+    if isinstance(system, Hybrid) and event is not None:
+        system, event = dataclasses.replace(system, event=event), None
+    mechanical = isinstance(system, AbstractSystem)
+    begin = dict(zip(("q", "rate"), map(as_number, start), strict=True)) if mechanical else as_number(start)
+    named = Named.of({"system": system, "start": begin, "event": event})
+    full = {full_name("axes", name, named.movable): values for name, values in axes.items()}
+    by = [full_name("sensitivities", name, named.movable) for name in sensitivities]
+    shorts = short_names([*full, *(name for name in by if name not in full)])
+    grid = [axis(shorts[name], name, "1", values) for name, values in full.items()]
+    for one in grid:
+        for value in one.values:
+            check_again(named.tree(named.replaced({one.number: jnp.asarray(value)})))
+    job = SweepJob(named, float(t1), float(tolerance), solver, tuple(by))
+    run = _run(named.tree(named.values))
+    if by and not run.cells.form.has_event:
+        raise ValueError("sensitivities are those of the event's time: pass event=, a function of time and state")
+    values = {name: float(value) for name, value in zip(named.names, named.values, strict=True)}
+    request = {
+        "system": type(system).__name__,
+        "event": _function(system.event if isinstance(system, Hybrid) else event),
+    }
+    request |= {name: value for name, value in values.items() if name not in full}
+    request |= {name: "an axis" for name in full} | {"sensitivities": by}
+    request |= {
+        "t1": float(t1),
+        "tolerance": float(tolerance),
+        "solver": type(Settings(tolerance, solver).for_lanes).__name__,
+    }
+    return computed(job, grid, job.variables(run, shorts), request, path=path, progress=progress, executor=executor)
+
+
+def _function(event: Any) -> Any:
+    return None if event is None else getattr(event, "__qualname__", type(event).__name__)
+
+
+def _run(tree: dict[str, Any]) -> Run:
+    """The run of a system, start and event."""
+    start = tree["start"]
+    return run_of(tree["system"], (start["q"], start["rate"]) if isinstance(start, dict) else start, tree["event"])
+
+
+class SweepJob(NamedTuple):
+    """What is asked of every cell, as data that can be sent to another process; see `sweep`."""
+
+    named: Named
+    t1: float
+    tolerance: float
+    solver: diffrax.AbstractERK | None
+    by: tuple[str, ...]
+
+    @classmethod
+    def of(cls, tree: dict[str, Any], *rest: Any) -> "SweepJob":
+        """The job for a system, start and event."""
+        return cls(Named.of(tree), *rest)
+
+    def __reduce__(self) -> Any:
+        # The structure of a tree of a user's classes cannot be pickled; the tree can.
+        return SweepJob.of, (self.named.tree(self.named.values), *self[1:])
+
+    def variables(self, run: Run, shorts: dict[str, str]) -> dict[str, Variable]:
+        """The variables of the table."""
+        event, smooth = run.cells.form.has_event, run.cells.form.traits.smooth
+        found = {"time": Variable("s", np.float64, long_name="time of the event")} if event else {}
+        found |= {"status": Variable("1", np.int8, WORDS, long_name="how the run ended")}
+        found |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
+        found |= {name: Variable("1", np.float64, long_name=f"{name} at the end") for name in run.names}
+        counts = {"steps": "steps", "rejected": "rejected steps"} | ({} if smooth else {"switches": "resets"})
+        found |= {name: Variable("1", np.int64, long_name=words) for name, words in counts.items()}
+        found |= {f"time_by_{shorts[name]}": Variable("1", np.float64) for name in self.by}
+        if self.by and not smooth:
+            found |= {"grazes": Variable("1", np.int8, long_name="whether the end of a mode was grazing")}
+        return found
+
+    def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
+        """The variables of some cells, of which the first `count` are to be run."""
+        size = next((len(values) for values in columns.values()), 1)
+        cells, tangents, scales = _cells(self.named, columns, self.by, size)
+        settings, traits = Settings(jnp.asarray(self.tolerance), self.solver), cells.form.traits
+        grazing, slopes = None, []
+        if traits.smooth:
+            problem, counted, t1 = cells.problem(size), jnp.asarray(count), jnp.asarray(self.t1)
+            if self.by:
+                outcome, slopes = solve_ensemble_with_tangents(problem, tangents, t1, counted, settings)
+            else:
+                outcome, _ = solve_ensemble(problem, t1, counted, settings)
+        else:
+            modes, first, states = cells.modes(size)
+            begin = (np.asarray(first), np.asarray(states), np.asarray(self.t1), count, settings)
+            if self.by:
+                outcome, found = solve_hybrid_with_tangents(modes, tangents, *begin, kinds=1)
+                slopes, grazing = found.slopes, np.asarray(found.grazing)
+            else:
+                outcome = solve_hybrid(modes, *begin, kinds=1)
+        crossed = np.asarray(outcome.status) == CROSSED
+        shorts = short_names([*columns, *(name for name in self.by if name not in columns)])
+        found = {
+            f"time_by_{shorts[name]}": np.asarray(slope) / np.asarray(scale)
+            for name, slope, scale in zip(self.by, slopes, scales, strict=True)
+        }
+        found = {name: np.where(crossed, slope, 0.0) for name, slope in found.items()}
+        if grazing is not None:
+            found = {name: np.where(crossed & grazing, np.nan, slope) for name, slope in found.items()}
+            found |= {"grazes": (crossed & grazing).astype(np.int8)}
+        return found | self._ends(cells, columns, outcome, crossed, size)
+
+    def _ends(
+        self, cells: Cells, columns: dict[str, Any], outcome: Outcome | HybridOutcome, crossed: Any, size: int
+    ) -> dict[str, Any]:
+        """What the table says of the ends of runs."""
+        status = np.asarray(outcome.status)
+        words = np.select([crossed, *(status == code for code in CODES)], [0, *CODES.values()], 1)
+        found = {"time": np.where(crossed, outcome.crossing_time, np.inf)} if cells.form.has_event else {}
+        if cells.form.has_event:
+            found["time"] = np.where(words >= CODES[FAILED], np.nan, found["time"])
+        counts = {"steps": outcome.steps, "rejected": outcome.rejected}
+        if isinstance(outcome, HybridOutcome):
+            counts |= {"switches": outcome.counts[0]}
+        states = _shown(self.named, columns, jnp.asarray(outcome.state), size)
+        found |= {"status": words.astype(np.int8), "end_time": np.asarray(outcome.end_time)}
+        return found | {name: np.asarray(values) for name, values in (counts | states).items()}
+
+
+@eqx.filter_jit
+def _cells(named: Named, columns: dict[str, Any], by: tuple[str, ...], size: int) -> tuple[Cells, Any, list[Array]]:
+    """The cells, their tangents by some numbers, and by how much these move each."""
+    values = named.replaced({name: jnp.asarray(column) for name, column in columns.items()})
+    varied = [k for k, name in enumerate(named.names) if name in columns or name in by]
+
+    def of_one(*numbers: Array) -> Cells:
+        every = list(named.values)
+        for k, number in zip(varied, numbers, strict=True):
+            every[k] = number
+        return _run(named.tree(tuple(every))).cells
+
+    point = tuple(jnp.broadcast_to(values[k], (size,)).astype(float) for k in varied)
+
+    def of_all(*numbers: Array) -> Cells:
+        first = [number[0] for number in numbers]
+        alone, many = of_one(*first), jax.vmap(of_one, axis_size=size)(*numbers)
+        depends = dependent_outputs(of_one, *first)
+        leaves = [a if d else b for a, b, d in zip(jax.tree.leaves(many), jax.tree.leaves(alone), depends, strict=True)]
+        return jax.tree.unflatten(jax.tree.structure(alone), leaves)
+
+    def problem(*moving: Array) -> Any:
+        every = list(point)
+        for name, number in zip(by, moving, strict=True):
+            every[varied.index(named.names.index(name))] = number
+        cells = of_all(*every)
+        if cells.form.traits.smooth:
+            return cells.problem(size)
+        modes, _, states = cells.modes(size)
+        return modes, states
+
+    where = [varied.index(named.names.index(name)) for name in by]
+    scales = [tangent_scale(point[k]) for k in where]
+    rows = [tuple(scale if i == j else jnp.zeros_like(scale) for j, scale in enumerate(scales)) for i in range(len(by))]
+    tangents = tangents_of(problem, tuple(point[k] for k in where), rows) if by else ()
+    return of_all(*point), tangents, scales
+
+
+@eqx.filter_jit
+def _shown(named: Named, columns: dict[str, Any], states: Array, size: int) -> dict[str, Array]:
+    """The states as the user knows them, component by component."""
+    values = named.replaced({name: jnp.asarray(column) for name, column in columns.items()})
+    axes = tuple(0 if name in columns else None for name in named.names)
+
+    def of_one(state: Array, *numbers: Array) -> Array:
+        return _run(named.tree(numbers)).shown(state)
+
+    parts = jax.vmap(of_one, in_axes=(1, *axes), out_axes=1)(states, *values)
+    return dict(zip(_run(named.tree(named.values)).names, parts, strict=True))

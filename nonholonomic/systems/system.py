@@ -1,0 +1,142 @@
+"""What can be run: a hybrid system, or a mechanical system, whose equations of motion make it one."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..formulations import AbstractFormulation, AbstractSystem, Hamel, Multipliers
+from ..integration import run_bounds
+from ..validation import as_number, is_traced, require, require_all
+from .engine import Cells
+from .form import Form
+from .mode import AbstractMode, Event, Hybrid, State
+from .tracing import with_own_numbers
+
+#: How much of itself a start's velocity may violate the constraints by.
+VIOLATION = 1e-9
+
+#: What `simulate`, `event_time`, `sweep` and `identify` take.
+System = Hybrid | AbstractSystem
+
+
+class MechanicalMode(AbstractMode):
+    """The motion of a mechanical system, in the state of one of its formulations."""
+
+    formulation: AbstractFormulation
+
+    def field(self, t: Float[Array, ""], y: State) -> State:
+        return self.formulation.field(t, y)
+
+
+class MechanicalEvent(eqx.Module):
+    """An event of a mechanical system, as a function of the formulation's state."""
+
+    formulation: AbstractFormulation
+    event: Event
+
+    def __call__(self, t: Float[Array, ""], y: State) -> Float[Array, ""]:
+        return self.event(t, jnp.concatenate(self.formulation.split(y)))
+
+
+def formulation_of(system: AbstractSystem) -> AbstractFormulation:
+    """The equations of motion that a mechanical system is run with.
+
+    They are in the quasi-velocities of its own frame, if it has one, which obey the constraints exactly; otherwise with
+    Lagrange multipliers.
+    """
+    has_frame = type(system).frame is not AbstractSystem.frame
+    return Hamel(system) if has_frame else Multipliers(system)
+
+
+class Run(NamedTuple):
+    """A run as the engine takes it; `formulation`: of a mechanical system, whose state the engine's is; otherwise `None`."""
+
+    cells: Cells
+    formulation: AbstractFormulation | None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the components of a state in tables."""
+        if self.formulation is None:
+            return tuple(f"y{k}" for k in range(self.cells.form.size))
+        return tuple(f"{name}{k}" for name in ("q", "rate") for k in range(self.formulation.system.dimension))
+
+    def shown(self, state: Float[Array, " components"]) -> State:
+        """A state of the engine as the user knows it."""
+        state = state[: self.cells.form.size]
+        return state if self.formulation is None else jnp.concatenate(self.formulation.split(state))
+
+
+def run_of(system: System, start: Any, event: Event | None) -> Run:
+    """A run of a system from a start, with an event, by default the system's own."""
+    if isinstance(system, AbstractSystem):
+        formulation = formulation_of(system)
+        q, rate = (as_number(part) for part in start)
+        state = formulation.state(q, rate)
+        if event is not None:
+            event = with_own_numbers(event, jnp.zeros(()), jnp.concatenate([q, rate]))
+            event = MechanicalEvent(formulation, event)
+        hybrid = Hybrid([MechanicalMode(formulation)], event)
+    else:
+        formulation, state = None, as_number(start)
+        hybrid = system
+        if event is not None:
+            hybrid = dataclasses.replace(system, event=with_own_numbers(event, jnp.zeros(()), state))
+    form, numbers = Form.of(hybrid, state.size)
+    form.traits  # noqa: B018  Traced here, so that what is wrong with a user's function is said before anything compiles.
+    return Run(Cells(numbers, tuple(jnp.unstack(state)), form), formulation)
+
+
+def check_run(system: Any, start: Any, t1: Any, tolerance: Any) -> None:
+    """Raise `ValueError` unless these are a system, a start of it, a positive horizon and a tolerance in range."""
+    if not isinstance(system, Hybrid | AbstractSystem):
+        hint = "; wrap modes in nonholonomic.Hybrid([...])" if isinstance(system, AbstractMode) else ""
+        raise ValueError(f"system = {system!r} must be a Hybrid or an AbstractSystem{hint}")
+    if isinstance(system, AbstractSystem):
+        _check_mechanical_start(system, start)
+    else:
+        _check_vector(start, "start", None)
+    require_all(run_bounds(t1, tolerance))
+    for name, number in {"t1": t1, "tolerance": tolerance}.items():
+        if np.ndim(number) != 0:
+            raise ValueError(f"{name} must be one number, not of shape {np.shape(number)}; jax.vmap or sweep runs many")
+
+
+def _check_vector(value: Any, name: str, size: int | None) -> None:
+    require(value, name)
+    shape = f"({'components' if size is None else size},)"
+    if np.ndim(value) != 1 or np.size(value) == 0 or size not in (None, np.size(value)):
+        raise ValueError(f"{name} must be of shape {shape}, not {np.shape(value)}; jax.vmap or sweep runs many")
+
+
+def _check_mechanical_start(system: AbstractSystem, start: Any) -> None:
+    if not isinstance(start, tuple | list) or len(start) != 2:
+        raise ValueError(f"start = {start!r} must be a pair (q, rate) of coordinates and their rates")
+    for name, part in zip(("q", "rate"), start, strict=True):
+        _check_vector(part, f"start: {name}", system.dimension)
+    q, rate = (as_number(part) for part in start)
+    constraints = system.constraints(q)
+    if constraints.shape[1:] != q.shape:
+        raise ValueError(
+            f"constraints(q) must be of shape (k, {q.size}), a row for each constraint, not {constraints.shape}"
+        )
+    if not constraints.size:
+        return
+    violation, frame = constraints @ rate, constraints @ system.frame(q)[:, : system.freedom]
+    if is_traced(violation) or is_traced(frame):
+        return
+    worst = float(jnp.max(jnp.abs(violation)))
+    if worst > VIOLATION * float(jnp.max(jnp.abs(constraints)) * jnp.max(jnp.abs(rate))):
+        raise ValueError(
+            f"start: rate = {np.asarray(rate)} violates the constraints by {worst:.3g}; constraints(q) @ rate must be 0"
+        )
+    has_frame = type(system).frame is not AbstractSystem.frame
+    if has_frame and float(jnp.max(jnp.abs(frame))) > VIOLATION * float(jnp.max(jnp.abs(constraints))):
+        raise ValueError(
+            f"frame(q): the constraints must annihilate its first {system.freedom} columns, and do so only up to "
+            f"{float(jnp.max(jnp.abs(frame))):.3g}; leave it out to run with Lagrange multipliers"
+        )

@@ -1,0 +1,136 @@
+"""What JAX sees of a user's functions: which of their arguments matter, and which operations they are made of."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Jaxpr, Literal
+from jaxtyping import Array
+
+from ..validation import is_traced
+
+#: Operations that XLA compiles into a single kernel on a CPU, forwards and backwards. A function with any other, such as
+#: those of LAPACK, scatters and sorts, is compiled without that.
+ELEMENTARY = """
+    abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e broadcast_in_dim cbrt ceil clamp
+    concatenate convert_element_type copy copy_p cos cosh custom_jvp_call custom_vjp_call digamma div eq erf erf_inv erfc exp
+    exp2 expand_dims expm1 floor full ge gt integer_pow iota is_finite jit le lgamma log log1p logistic lt max min mul ne neg
+    nextafter not optimization_barrier or pad pjit pow reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rem
+    reshape rev round rsqrt select_and_n select_n sign sin sinh slice split sqrt square squeeze stop_gradient sub tan tanh
+    transpose xor zeros_like
+"""
+
+#: Products with at most this many terms are written as sums of products, which every compiler of XLA takes.
+MOST_TERMS = 1 << 12
+
+
+def spelled_out(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function with products of small matrices as sums.
+
+    XLA calls a library for a product, which costs more than the product and does not fit a single kernel.
+    """
+
+    def evaluated(*args: Any) -> Any:
+        closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+        results = _evaluated(closed.jaxpr, closed.consts, jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(shape), results)
+
+    return evaluated
+
+
+def _evaluated(jaxpr: Jaxpr, consts: Any, args: list[Any]) -> list[Any]:
+    values: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True)) | dict(
+        zip(jaxpr.invars, args, strict=True)
+    )
+
+    def read(variable: Any) -> Any:
+        return variable.val if isinstance(variable, Literal) else values[variable]
+
+    for equation in jaxpr.eqns:
+        inputs, primitive = [read(variable) for variable in equation.invars], equation.primitive
+        if primitive.name == "dot_general":
+            left, right = inputs
+            results = [_product(left, right, equation.params["dimension_numbers"])]
+        elif primitive.name in ("jit", "pjit"):
+            inner = equation.params["jaxpr"]
+            results = _evaluated(inner.jaxpr, inner.consts, inputs)
+        else:
+            results = primitive.bind(*inputs, **primitive.get_bind_params(equation.params))
+            results = results if primitive.multiple_results else [results]
+        values |= dict(zip(equation.outvars, results, strict=True))
+    return [read(variable) for variable in jaxpr.outvars]
+
+
+def _product(left: Array, right: Array, dimensions: Any) -> Array:
+    """The sum over the contracted axes; batch axes come first, then those of the left and those of the right."""
+    (sums, right_sums), (batch, right_batch) = dimensions
+    free = [k for k in range(left.ndim) if k not in (*sums, *batch)]
+    right_free = [k for k in range(right.ndim) if k not in (*right_sums, *right_batch)]
+    terms = math.prod(left.shape) * math.prod(right.shape[k] for k in right_free)
+    if terms > MOST_TERMS:
+        return jax.lax.dot_general(left, right, dimensions)
+    whole = jnp.transpose(left, (*batch, *free, *sums))
+    other = jnp.transpose(right, (*right_batch, *right_free, *right_sums))
+    shape = [left.shape[k] for k in batch], [left.shape[k] for k in free], [right.shape[k] for k in right_free]
+    contracted = [left.shape[k] for k in sums]
+    whole = whole.reshape(*shape[0], *shape[1], *(1 for _ in shape[2]), *contracted)
+    other = other.reshape(*shape[0], *(1 for _ in shape[1]), *shape[2], *contracted)
+    return jnp.sum(whole * other, axis=tuple(range(-len(contracted), 0))) if contracted else whole * other
+
+
+def is_elementary(function: Callable[..., Any], *args: Any) -> bool:
+    """Whether a function and its derivatives consist of operations that fit a single kernel."""
+
+    def pulled_back(*args: Any) -> Any:
+        values, pull = jax.vjp(function, *args)
+        return pull(jax.tree.map(jnp.ones_like, values))
+
+    try:
+        closed = jax.make_jaxpr(pulled_back)(*args)
+    except ValueError:
+        # A loop without a fixed number of rounds has no backward pass.
+        return False
+    return set(_operations(closed.jaxpr)) <= set(ELEMENTARY.split())
+
+
+def _operations(jaxpr: Jaxpr) -> Iterator[str]:
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_jaxpr):
+            if _is_jaxpr(inner):
+                yield from _operations(getattr(inner, "jaxpr", inner))
+
+
+def _is_jaxpr(value: Any) -> bool:
+    return hasattr(getattr(value, "jaxpr", value), "eqns")
+
+
+def depends_on_first(function: Callable[..., Any], first: Any, *args: Any) -> bool:
+    """Whether a function's results depend on its first argument, a number."""
+    closed = jax.make_jaxpr(function)(first, *args)
+    return any(_reached(closed.jaxpr, closed.jaxpr.invars[:1]))
+
+
+def dependent_outputs(function: Callable[..., Any], *args: Any) -> list[bool]:
+    """Which of a function's results depend on its arguments."""
+    closed = jax.make_jaxpr(function)(*args)
+    return _reached(closed.jaxpr, closed.jaxpr.invars)
+
+
+def _reached(jaxpr: Jaxpr, inputs: Sequence[Any]) -> list[bool]:
+    """Which outputs depend on some of the inputs."""
+    reached = set(inputs)
+    for equation in jaxpr.eqns:
+        if any(not isinstance(variable, Literal) and variable in reached for variable in equation.invars):
+            reached |= set(equation.outvars)
+    return [not isinstance(variable, Literal) and variable in reached for variable in jaxpr.outvars]
+
+
+def with_own_numbers(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
+    """The function itself, or where it closes over traced numbers, such as those of an enclosing `jax.grad`, a module that
+    holds them."""
+    consts = jax.make_jaxpr(function)(*args).consts
+    return eqx.filter_closure_convert(function, *args) if any(is_traced(const) for const in consts) else function

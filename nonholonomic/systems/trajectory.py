@@ -1,0 +1,122 @@
+"""One run of a user's system at given times."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
+from ..sweeps import Table
+from ..validation import is_traced
+
+#: The words for how a run without an event ends, by its code.
+WORDS = {REACHED_END: "completed", LEFT_DOMAIN: "stopped", FAILED: "failed", UNRESOLVED: "unresolved"}
+
+
+class Trajectory(eqx.Module):
+    """A run of a user's system at given times, which are the first axis of its arrays; a batch made by `jax.vmap` has one more.
+
+    - `t`: times [s], (times,).
+    - `state`: (times, components), NaN after the end of the run; of an `AbstractSystem` the coordinates, and behind them their
+      rates. At the time of a reset it is the state before.
+    - `mode`: number of the mode, (times,), -1 after the end.
+    - `end_time`: when the run ended [s]; `switches`: how many resets there were.
+    - `steps`, `rejected`: steps of the integration, and how many of them were rejected.
+    - `code`: what `status` puts in words.
+    - `names`: of the components in tables.
+
+    **Example:**
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> import nonholonomic
+    >>> class Decay(nonholonomic.AbstractMode):
+    ...     rate: float
+    ...
+    ...     def field(self, t, y):
+    ...         return -self.rate * y
+    >>> run = nonholonomic.simulate(nonholonomic.Hybrid([Decay(2.0)]), [1.0], 1.0, times=[0.5, 1.0])
+    >>> print(run.status, run.state.shape, f"{run.state[-1, 0]:.6f}")  # exp(-2)
+    completed (2, 1) 0.135335
+
+    ```
+    """
+
+    t: Float[Array, " times"]
+    state: Float[Array, "times components"]
+    mode: Int[Array, " times"]
+    end_time: Float[Array, ""]
+    switches: Int[Array, ""]
+    steps: Int[Array, ""]
+    rejected: Int[Array, ""]
+    code: Int[Array, ""]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def status(self) -> Any:
+        """How the run ended: "completed" at `t1`; "stopped" where a mode without a reset ended; "failed"; or "unresolved" where
+        resets followed one another without end.
+
+        An array of words for a batch of runs; inside a transformation the code.
+        """
+        if is_traced(self.code):
+            return self.code
+        words = np.vectorize(WORDS.get, otypes=[object])(np.asarray(self.code))
+        return str(words) if words.ndim == 0 else words.astype(str)
+
+    def to_table(self) -> Table:
+        """The run as a `Table` over its times.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        if np.ndim(self.t) != 1 or np.ndim(self.state) != 2:
+            raise ValueError("a batch of runs is no table of one: nonholonomic.sweep makes a table of many")
+        columns = dict(zip(self.names, np.asarray(self.state).T, strict=True)) | {"mode": np.asarray(self.mode)}
+        return Table({"time": np.asarray(self.t)}, columns, {"time": "s"}, {"status": self.status})
+
+    def to_xarray(self) -> Any:
+        """The run as an `xarray.Dataset` over "time" (needs xarray).
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        return self.to_table().to_xarray()
+
+    def save(self, path: Any) -> None:
+        """Write the run to an HDF5 file that `tippe.Table.load` and xarray (`engine="h5netcdf"`) read.
+
+        **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for a batch of runs.
+        """
+        self.to_table().save(path)
+
+    def portrait(self, x: str, y: str, ax: Any = None) -> Any:
+        """Draw one component over another, a phase portrait (needs matplotlib).
+
+        **Arguments:** `x`, `y`: names of components, such as "y0" and "y1"; `ax`: axes of matplotlib to draw in.
+
+        **Returns:** the matplotlib figure, or `ax`.
+        """
+        from ..views import draw_portrait
+
+        return draw_portrait(self.to_table(), x, y, ax)
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the components over time (needs matplotlib).
+
+        **Arguments:** `ax`: axes of matplotlib to draw in, instead of a new figure.
+
+        **Returns:** the matplotlib figure, or `ax`.
+        """
+        import matplotlib.pyplot as plt
+
+        figure, own = (None, ax) if ax is not None else plt.subplots()
+        for name, component in zip(self.names, np.asarray(self.state).T, strict=True):
+            own.plot(np.asarray(self.t), component, label=name)
+        own.set_xlabel("time [s]")
+        own.legend()
+        return own if figure is None else figure
+
+    def __repr__(self) -> str:
+        shape = "x".join(map(str, jnp.shape(self.state)))
+        return f"Trajectory(status={self.status}, state of shape {shape}, {', '.join(self.names)})"

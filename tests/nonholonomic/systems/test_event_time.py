@@ -1,0 +1,190 @@
+"""Event times of users' own systems against closed forms, with their derivatives."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from close import assert_close
+from own_modes import GRAVITY, Ball, Bounces, Sleigh, bounce
+
+from nonholonomic import AbstractMode, Hybrid, event_time, simulate
+
+START = jnp.array([1.0, 0.0, 0.0])
+
+
+def fifth_bounce(height, restitution, gravity):
+    """Time of the fifth bounce, which ends on a jump of the event function."""
+    ball = Hybrid([Ball(restitution, gravity)], event=Bounces(5.0))
+    return event_time(ball, jnp.stack([height, 0.0 * height, 0.0 * height]), 20.0)
+
+
+def test_the_time_of_the_fifth_bounce_and_its_gradient():
+    """sqrt(2 h / g) (1 + 2 (e + ... + e^4)), by height, restitution and gravity; a reset jumps over the event."""
+    point = (jnp.asarray(1.0), jnp.asarray(0.8), jnp.asarray(GRAVITY))
+    time, slopes = jax.value_and_grad(fifth_bounce, (0, 1, 2))(*point)
+    expected = jax.grad(lambda *numbers: bounce(*numbers, 5), (0, 1, 2))(*point)
+    assert_close(time, bounce(*point, 5), rtol=1e-13)
+    assert_close(jnp.stack(slopes), jnp.stack(expected), rtol=1e-12)
+
+
+def test_a_batch_of_balls_is_one_block():
+    heights = jnp.linspace(0.5, 2.0, 8)
+    times = jax.jit(jax.vmap(fifth_bounce, (0, None, None)))(heights, 0.8, GRAVITY)
+    assert_close(times, jax.vmap(lambda height: bounce(height, 0.8, GRAVITY, 5))(heights), rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("event", "start", "expected"),
+    [
+        # The event is the end of the mode.
+        (lambda t, y: y[0], [1.0, 0.0, 0.0], bounce(1.0, 0.8, GRAVITY, 1)),
+        # Starts on the event: the start does not count, and the ball rises first.
+        (lambda t, y: y[0], [0.0, 3.0, 0.0], 6.0 / GRAVITY),
+        # Starts on the event and falls: the next fall through zero is the apex after the bounce.
+        (lambda t, y: y[1], [1.0, 0.0, 0.0], 1.8 * bounce(1.0, 0.8, GRAVITY, 1)),
+        # Starts beyond the event, and crosses it downwards on the second fall.
+        (lambda t, y: y[0] - 0.5, [0.4, 0.0, 0.0], jnp.inf),
+        # A function of time alone.
+        (lambda t, y: 0.7 - t, [1.0, 0.0, 0.0], 0.7),
+    ],
+)
+def test_the_event_is_the_first_fall_through_zero_after_the_start(event, start, expected):
+    assert_close(event_time(Hybrid([Ball()], event=event), jnp.array(start), 2.0), expected, rtol=1e-12)
+
+
+def test_an_event_may_close_over_what_is_differentiated():
+    """The ball falls through a level after its second bounce; the level is that of an enclosing gradient."""
+
+    def time(level):
+        return event_time(Hybrid([Ball()]), START, 9.0, event=lambda t, y: jnp.where(y[2] > 1.5, y[0] - level, -1.0))
+
+    def exact(level):
+        speed = 0.64 * jnp.sqrt(2.0 * GRAVITY)
+        return bounce(1.0, 0.8, GRAVITY, 2) + (speed + jnp.sqrt(speed**2 - 2.0 * GRAVITY * level)) / GRAVITY
+
+    # The run starts beyond the event, and waits there until it has passed the level upwards.
+    value, slope = jax.value_and_grad(time)(0.1)
+    expected, expected_slope = jax.value_and_grad(exact)(0.1)
+    assert_close(value, expected, rtol=1e-12)
+    assert_close(slope, expected_slope, rtol=1e-10)
+
+
+class Decay(AbstractMode):
+    """y' = -rate y."""
+
+    rate: jax.Array
+
+    def field(self, t, y):
+        return -self.rate * y
+
+
+class Level(eqx.Module):
+    """An event: the first component falls to a level."""
+
+    level: float
+
+    def __call__(self, t, y):
+        return y[0] - self.level
+
+
+def half_life(rate, level):
+    return event_time(Hybrid([Decay(rate)], event=Level(level)), jnp.ones(1), 9.0)
+
+
+def test_a_smooth_system_has_second_derivatives():
+    """t = ln(1 / level) / rate: first and second derivatives by both."""
+    point = (jnp.asarray(2.0), jnp.asarray(0.5))
+
+    def exact(rate, level):
+        return -jnp.log(level) / rate
+
+    assert_close(half_life(*point), exact(*point), rtol=1e-12)
+    assert_close(jnp.stack(jax.grad(half_life, (0, 1))(*point)), jnp.stack(jax.grad(exact, (0, 1))(*point)), rtol=1e-10)
+    curvature = jax.jvp(jax.grad(half_life), point, (1.0, 0.0))[1]
+    assert_close(curvature, jax.grad(jax.grad(exact))(*point), rtol=1e-7)
+
+
+def test_no_event_is_infinite_and_has_no_derivative():
+    time, slope = jax.value_and_grad(half_life)(jnp.asarray(0.01), 0.5)
+    assert jnp.isinf(time)
+    assert slope == 0.0
+
+
+class Pull(AbstractMode):
+    """A linear field with a matrix of numbers, through LAPACK: no kernel of its own can hold it."""
+
+    matrix: jax.Array
+
+    def field(self, t, y):
+        return -jnp.linalg.solve(self.matrix, y)
+
+
+def test_arrays_and_any_operation_of_jax_may_be_used():
+    """y' = -A^-1 y with A = diag(a, b): y1 falls to 1/2 at a ln 2; by a matrix, whose other entries matter not here."""
+
+    def time(matrix):
+        return event_time(Hybrid([Pull(matrix)], event=Level(0.5)), jnp.array([1.0, 1.0]), 5.0)
+
+    matrix = jnp.diag(jnp.array([0.5, 2.0]))
+    value, slopes = jax.value_and_grad(time)(matrix)
+    assert_close(value, 0.5 * jnp.log(2.0), rtol=1e-12)
+    # With y' = -y1 / a + (A12 / (a b)) y2, A12 > 0 slows the fall; A21 acts on the second component alone.
+    assert_close(slopes[0, 0], jnp.log(2.0), rtol=1e-9)
+    assert_close(slopes[1], 0.0, atol=1e-12)
+
+
+def sleigh_turn(speed):
+    """When the sleigh has turned by half a radian."""
+    start = (jnp.zeros(3), jnp.array([1.0, 0.0, 0.0]) * speed + jnp.array([0.0, 0.0, 1.3]))
+    return event_time(Sleigh(), start, 4.0, event=lambda t, y: 0.5 - y[2])
+
+
+@pytest.mark.slow
+def test_a_sleigh_from_metric_and_constraint():
+    """Its equations v' = a w^2, (I + m a^2) w' = -m a v w, integrated by a method of another program (SciPy)."""
+    from scipy.integrate import solve_ivp
+
+    sleigh = Sleigh()
+    turning = sleigh.inertia + sleigh.mass * sleigh.ahead**2
+
+    def exact(speed):
+        def field(t, y):
+            return [sleigh.ahead * y[1] ** 2, -sleigh.mass * sleigh.ahead * y[0] * y[1] / turning, y[1]]
+
+        def half(t, y):
+            return y[2] - 0.5
+
+        half.terminal = True
+        return solve_ivp(field, (0, 4), [speed, 1.3, 0.0], "DOP853", events=half, rtol=1e-13, atol=1e-13).t_events[0][0]
+
+    time, slope = jax.jvp(sleigh_turn, (0.8,), (1.0,))
+    assert_close(time, exact(0.8), rtol=1e-10)
+    assert_close(slope, (exact(0.801) - exact(0.799)) / 0.002, rtol=1e-6)
+
+
+def test_wrong_functions_are_refused_before_anything_compiles():
+    class Wrong(Ball):
+        def field(self, t, y):
+            return y[1]
+
+    class Odd(Ball):
+        def reset(self, t, y):
+            return y
+
+    with pytest.raises(ValueError, match=r"modes\[0\]\.field\(t, y\) must return an array of shape \(3,\)"):
+        simulate(Hybrid([Wrong()]), START, 1.0)
+    with pytest.raises(ValueError, match=r"modes\[0\]\.reset\(t, y\) must return \(state, number"):
+        simulate(Hybrid([Odd()]), START, 1.0)
+    with pytest.raises(ValueError, match=r"event\(t, y\) must return one number"):
+        event_time(Hybrid([Ball()]), START, 1.0, event=lambda t, y: y)
+    with pytest.raises(ValueError, match="event = None: the system has no event"):
+        event_time(Hybrid([Ball()]), START, 1.0)
+    with pytest.raises(ValueError, match="modes is empty"):
+        Hybrid([])
+    with pytest.raises(ValueError, match="wrap modes in nonholonomic"):
+        simulate(Ball(), START, 1.0)
+    with pytest.raises(ValueError, match="violates the constraints"):
+        simulate(Sleigh(), (np.zeros(3), np.array([0.0, 1.0, 0.0])), 1.0)
+    with pytest.raises(ValueError, match=r"start: q must be of shape \(3,\)"):
+        simulate(Sleigh(), (np.zeros(2), np.zeros(3)), 1.0)

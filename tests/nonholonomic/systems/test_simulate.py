@@ -1,0 +1,124 @@
+"""Trajectories of users' own systems against closed forms, with their derivatives through resets."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from close import assert_close
+from own_modes import GRAVITY, Ball, Sleigh, bounce, final_turn
+
+from nonholonomic import AbstractMode, Hybrid, simulate
+
+TIMES = jnp.array([0.3, 0.7, 1.1, 1.5])
+
+
+def exact(height, restitution, time):
+    """Height and velocity of a ball before its third bounce."""
+    bounces = [bounce(height, restitution, GRAVITY, number) for number in (1, 2)]
+    speed = jnp.sqrt(2.0 * GRAVITY * height)
+    count = int(time > bounces[0]) + int(time > bounces[1])
+    since = time - (bounces[count - 1] if count else 0.0)
+    start = restitution**count * speed if count else 0.0
+    place = 0.0 if count else height
+    return jnp.stack([place + start * since - 0.5 * GRAVITY * since**2, start - GRAVITY * since])
+
+
+def states(height, restitution):
+    start = jnp.stack([height, 0.0 * height, 0.0 * height])
+    return simulate(Hybrid([Ball(restitution)]), start, 1.5, times=TIMES).state
+
+
+def test_a_ball_and_its_derivatives_through_two_bounces():
+    """The saltation matrix is exact for an impact, in both directions of differentiation."""
+    point = (jnp.asarray(1.0), jnp.asarray(0.8))
+    expected = jnp.stack([exact(*point, float(time)) for time in TIMES])
+    slopes = jnp.stack([jnp.stack(jax.jacfwd(exact, (0, 1))(*point, float(time)), axis=-1) for time in TIMES])
+    assert_close(states(*point)[:, :2], expected, atol=1e-13)
+    assert_close(jnp.stack(jax.jacrev(states, (0, 1))(*point), axis=-1)[:, :2], slopes, atol=1e-11)
+
+
+class Stick(AbstractMode):
+    """A block at rest on a belt: place and velocity; it slips where the spring pulls more than friction holds."""
+
+    grip: float = 1.0
+    belt: float = 0.5
+
+    def field(self, t, y):
+        return jnp.array([self.belt, 0.0])
+
+    def margin(self, t, y):
+        return self.grip - y[0]
+
+    def reset(self, t, y):
+        return y, 1
+
+
+class Slip(AbstractMode):
+    """It slips back under the spring x'' = -x + friction, until its velocity is that of the belt again."""
+
+    friction: float = 1.0
+    belt: float = 0.5
+
+    def field(self, t, y):
+        return jnp.array([y[1], self.friction - y[0]])
+
+    def margin(self, t, y):
+        return self.belt - y[1]
+
+    def reset(self, t, y):
+        return jnp.array([y[0], self.belt]), 0
+
+
+def test_stick_and_slip_where_the_end_of_sticking_is_tangential():
+    """With equal friction at rest and in motion the block slips without a kink: x = 1 + v sin(t - 1 / v) from x = 1 on."""
+    run = simulate(Hybrid([Stick(), Slip()]), jnp.array([0.0, 0.5]), 5.0, times=jnp.array([1.0, 3.0, 5.0]))
+    assert run.status == "completed"
+    assert run.mode.tolist() == [0, 1, 1]
+    assert_close(run.state[0], [0.5, 0.5], atol=1e-12)
+    since = np.array([1.0, 3.0])
+    assert_close(run.state[1:, 0], 1.0 + 0.5 * np.sin(since), atol=1e-9)
+    assert_close(run.state[1:, 1], 0.5 * np.cos(since), atol=1e-9)
+
+
+class Melting(AbstractMode):
+    """A mode that ends, without a reset, when its state has fallen to zero."""
+
+    def field(self, t, y):
+        return -jnp.ones(1)
+
+    def margin(self, t, y):
+        return y[0]
+
+
+def test_a_mode_without_a_reset_stops_the_run():
+    run = simulate(Hybrid([Melting()]), jnp.array([1.0]), 2.0, times=jnp.array([0.5, 1.5]))
+    assert run.status == "stopped"
+    assert_close(run.end_time, 1.0, rtol=1e-12)
+    assert_close(run.state[0], 0.5, rtol=1e-12)
+    assert np.isnan(run.state[1]).all()
+    assert run.mode.tolist() == [0, -1]
+
+
+def test_resets_without_end_are_unresolved():
+    """A ball that loses a fifth of its speed at each bounce comes to rest after a finite time and infinitely many of them."""
+    run = simulate(Hybrid([Ball(0.2)]), jnp.array([1.0, 0.0, 0.0]), 5.0, times=jnp.array([0.2, 4.0]))
+    assert run.status in ("unresolved", "failed")
+    assert np.isnan(run.state[1]).all()
+
+
+def test_the_sleigh_turns_to_its_final_heading():
+    """From a turn on the spot the heading turns by pi / (2 a) sqrt(I / m + a^2) in the end; energy and constraint hold."""
+    sleigh = Sleigh()
+    run = simulate(sleigh, (jnp.zeros(3), jnp.array([0.0, 0.0, 2.0])), 40.0, times=jnp.array([1.0, 40.0]))
+    assert run.status == "completed"
+    assert_close(run.state[-1, 2], final_turn(sleigh, 2.0), rtol=1e-8)
+    energies = [sleigh.energy(state[:3], state[3:]) for state in run.state]
+    assert_close(energies, 0.5 * (0.4 + 1.7 * 0.09) * 4.0, rtol=1e-9)
+    assert_close([sleigh.constraints(state[:3]) @ state[3:] for state in run.state], 0.0, atol=1e-9)
+
+
+def test_a_trajectory_is_a_table():
+    run = simulate(Hybrid([Melting()]), jnp.array([1.0]), 0.5, times=jnp.array([0.25, 0.5]))
+    table = run.to_table()
+    assert_close(table.y0, [0.75, 0.5], rtol=1e-12)
+    assert table.attributes["status"] == "completed"
+    assert run.to_xarray()["y0"].dims == ("time",)

@@ -1,0 +1,93 @@
+"""Tables of users' own systems against closed forms, with their derivatives, files and other processes."""
+
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from close import assert_close
+from own_modes import GRAVITY, Ball, Bounces, Sleigh, bounce
+
+from nonholonomic import AbstractMode, Hybrid, sweep
+from nonholonomic.systems.numbers import Named
+from nonholonomic.systems.sweep import SweepJob
+
+HEIGHTS, RESTITUTIONS = np.array([0.5, 1.0, 2.0]), np.array([0.7, 0.8])
+BALL = Hybrid([Ball()], event=Bounces(3.0))
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    """The third bounces of balls, whose table is kept in a file."""
+    path = tmp_path_factory.mktemp("balls") / "balls.h5"
+    axes = {"start[0]": HEIGHTS, "restitution": RESTITUTIONS}
+    given = {"axes": axes, "sensitivities": ["restitution", "modes[0].gravity"], "path": path, "progress": False}
+    first = sweep(BALL, [1.0, 0.0, 0.0], 1.4, **given)
+    again = sweep(BALL, [1.0, 0.0, 0.0], 1.4, **given)
+    assert_close(again.time, first.time)
+    return again
+
+
+def test_a_table_of_bounces_and_its_derivatives(table):
+    """Times, and derivatives by the restitution and gravity, through two impacts and a third that ends the run."""
+
+    def time(height, restitution, gravity):
+        return bounce(height, restitution, gravity, 3)
+
+    heights, restitutions = np.meshgrid(HEIGHTS, RESTITUTIONS, indexing="ij")
+    expected = np.vectorize(time)(heights, restitutions, GRAVITY)
+    happens = expected < 1.4
+    assert 0 < happens.sum() < happens.size
+    assert (table.status == np.where(happens, "event", "completed")).all()
+    assert_close(table.time, np.where(happens, expected, np.inf), rtol=1e-13)
+    slopes = jax.vmap(jax.grad(time, (1, 2)), (0, 0, None))(heights.ravel(), restitutions.ravel(), GRAVITY)
+    for name, slope in zip(("restitution", "gravity"), slopes, strict=True):
+        assert_close(table[f"time_by_{name}"].ravel(), np.where(happens.ravel(), slope, 0.0), rtol=1e-11)
+    assert (table.switches[happens] == 3).all()
+    assert (table.grazes == 0).all()
+    assert_close(table.y2[happens], 3.0)
+    assert_close(table.coords["start_0"], HEIGHTS)
+
+
+def test_a_job_may_be_sent_to_another_process():
+    named = Named.of({"system": BALL, "start": jnp.array([1.0, 0.0, 0.0]), "event": None})
+    job = SweepJob(named, 1.4, 1e-9, None, ())
+    sent = pickle.loads(pickle.dumps(job))
+    assert sent.named.names == job.named.names
+    assert_close(sent.named.values, job.named.values)
+
+
+def test_a_mechanical_system_has_a_table_over_its_start_and_numbers():
+    """The sleigh keeps its energy (m v^2 + J w^2) / 2 in every cell, whatever it is."""
+    axes = {"rate[2]": [0.5, 1.0], "ahead": [0.2, 0.3]}
+    table = sweep(Sleigh(), (np.zeros(3), np.array([1.0, 0.0, 0.0])), 2.0, axes=axes, progress=False)
+    assert (table.status == "completed").all()
+    turning = 0.4 + 1.7 * np.array([0.2, 0.3]) ** 2
+    before = 1.7 + turning * np.array([[0.5], [1.0]]) ** 2
+    along = table.rate0 * np.cos(table.q2) + table.rate1 * np.sin(table.q2)
+    assert_close(1.7 * along**2 + turning * table.rate2**2, before, rtol=1e-9)
+    assert table.dims("q2") == ("rate_2", "ahead")
+
+
+class Checked(AbstractMode):
+    """A mode that checks its number."""
+
+    rate: float
+
+    def __check_init__(self):
+        if np.any(np.asarray(self.rate) < 0.0):
+            raise ValueError(f"rate = {self.rate} must not be negative")
+
+    def field(self, t, y):
+        return -self.rate * y
+
+
+def test_what_is_wrong_with_a_table_is_said_before_anything_compiles():
+    system = Hybrid([Checked(1.0)])
+    with pytest.raises(ValueError, match=r"rate = -1.0 must not be negative"):
+        sweep(system, [1.0], 1.0, axes={"rate": [1.0, -1.0]})
+    with pytest.raises(ValueError, match=r"axes: 'drag' must be one of start\[0\], system.modes\[0\].rate"):
+        sweep(system, [1.0], 1.0, axes={"drag": [1.0]})
+    with pytest.raises(ValueError, match="sensitivities are those of the event's time"):
+        sweep(system, [1.0], 1.0, axes={}, sensitivities=["rate"])

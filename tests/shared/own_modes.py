@@ -1,0 +1,67 @@
+"""Users' own systems with closed forms, which several tests share."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from nonholonomic import AbstractMode, AbstractSystem
+
+GRAVITY = 9.81
+
+
+class Ball(AbstractMode):
+    """A ball that falls and bounces: height [m], velocity [m/s], number of bounces."""
+
+    restitution: float = 0.8
+    gravity: float = GRAVITY
+
+    def field(self, t, y):
+        return jnp.array([y[1], -self.gravity, 0.0])
+
+    def margin(self, t, y):
+        return y[0]
+
+    def reset(self, t, y):
+        return jnp.array([0.0, -self.restitution * y[1], y[2] + 1.0]), 0
+
+
+class Bounces(eqx.Module):
+    """An event: so many bounces. The count jumps over zero."""
+
+    count: float
+
+    def __call__(self, t, y):
+        return self.count - 0.5 - y[2]
+
+
+def bounce(height, restitution, gravity, number):
+    """When a ball dropped from a height strikes the ground for the n-th time [s]."""
+    speed = jnp.sqrt(2.0 * gravity * height)
+    return speed / gravity * (1.0 + 2.0 * sum(restitution**k for k in range(1, number)))
+
+
+class Sleigh(AbstractSystem):
+    """Chaplygin's sleigh: a blade at (x, y) under the heading q[2], the centre of mass a distance ahead of it."""
+
+    mass: float = 1.7
+    inertia: float = 0.4
+    ahead: float = 0.3
+
+    dimension = 3
+
+    def metric(self, q):
+        c, s, lever = jnp.cos(q[2]), jnp.sin(q[2]), self.mass * self.ahead
+        turning = self.inertia + lever * self.ahead
+        return jnp.array([[self.mass, 0.0, -lever * s], [0.0, self.mass, lever * c], [-lever * s, lever * c, turning]])
+
+    def constraints(self, q):
+        return jnp.array([[-jnp.sin(q[2]), jnp.cos(q[2]), 0.0]])
+
+
+def final_turn(sleigh, rate):
+    """By how much a sleigh turns that starts with its blade at rest and turns at a rate [rad/s].
+
+    With J = I + m a^2 and v' = a omega^2, J omega' = -m a v omega, the energy m v^2 + J omega^2 is constant: omega =
+    W sech(k t), v = sqrt(J / m) W tanh(k t) with k = a W sqrt(m / J), and the turn is W pi / (2 k).
+    """
+    turning = sleigh.inertia + sleigh.mass * sleigh.ahead**2
+    return jnp.pi / (2.0 * sleigh.ahead) * jnp.sqrt(turning / sleigh.mass) * jnp.sign(rate)
