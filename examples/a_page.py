@@ -1,4 +1,4 @@
-"""See a top turn over: a page that moves, an animation for slides, and the curves (needs k3d and matplotlib).
+"""See a top turn over: a page that moves, an animation for slides, and the curves (needs the extras `view` and `plot`).
 
 The same launch in the cylinder and on the plane, side by side. Open `page-out/tops.html` in a browser; it needs no network.
 """

@@ -1,4 +1,4 @@
-"""Two launches of one top, overlaid: above Jellett's threshold it turns over, below it does not (needs k3d)."""
+"""Two launches of one top, overlaid: above Jellett's threshold it turns over, below it does not (needs the extra `view`)."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Two strollers coast over hills from the same place, with headings that differ a little (needs k3d)."""
+"""Two strollers coast over hills from the same place, with headings that differ a little (needs the extra `view`)."""
 
 from pathlib import Path
 from typing import Any

@@ -15,6 +15,7 @@ from nonholonomic.identification import Free as Free
 from nonholonomic.integration import ImplicitMidpoint as ImplicitMidpoint
 from nonholonomic.integration import Status as Status
 
+from . import presets as presets
 from .fit.identify import identify as identify
 from .fit.recording import Recording as Recording
 from .fit.recording import read_recording as read_recording
@@ -27,6 +28,7 @@ from .model.input import Steady as Steady
 from .model.launch import Launch as Launch
 from .model.scene import Scene as Scene
 from .model.stroller import Stroller as Stroller
+from .runs.explore import explore as explore
 from .runs.simulate import simulate as simulate
 from .runs.table import Table as Table
 from .runs.table import sweep as sweep

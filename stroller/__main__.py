@@ -5,6 +5,7 @@ import gc
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from html import escape
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,6 +22,7 @@ from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require, require_folder
 from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html
+from nonholonomic.xla_cpu import compile_quickly
 
 from .model.friction import Damping, Frictionless
 from .model.launch import Launch
@@ -145,7 +147,7 @@ def audit(name: str, runs: dict[str, Trajectory]) -> list[str]:
     return lines
 
 
-def tolerance_curve(options: argparse.Namespace, helm: Helm, shown: Progress) -> list[str]:
+def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
     """The largest residual of energy against work over the tolerance of Dopri8, for the last ride."""
     (ground, ride), (scene, launch) = list(scenes(options).items())[-1]
     lines = [f"Dopri8 {ground}, {ride}: residual [J] of energy against work over the tolerance"]
@@ -154,8 +156,17 @@ def tolerance_curve(options: argparse.Namespace, helm: Helm, shown: Progress) ->
         run = simulate(scene, launch, options.t1, helm, times=jnp.linspace(0.0, options.t1, 3), tolerance=tolerance)
         residual = float(jnp.max(jnp.abs(run.energy_residual)))
         lines.append(f"  {tolerance:7.0e}  {residual:8.1e}  in {int(run.stats.steps)} steps")
-        shown.advance(1)
     return lines
+
+
+def audited(options: argparse.Namespace, helm: Helm, name: tuple[str, str]) -> tuple[Trajectory, list[str]]:
+    """One ride by Dopri8, and its energy audit by both integrators."""
+    scene, launch = scenes(options)[name]
+    runs = {
+        "Dopri8": simulate(scene, launch, options.t1, helm, tolerance=options.tolerance),
+        "midpoint": simulate(scene, launch, options.t1, helm, solver=ImplicitMidpoint(options.step)),
+    }
+    return runs["Dopri8"], audit(", ".join(name), runs)
 
 
 def table(options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory]) -> Table:
@@ -168,7 +179,7 @@ def table(options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory])
 def write_page(
     options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory], words: list[str], drawing: Path | None
 ) -> Path:
-    """The page of the main job: the rides in motion where K3D is installed, the audit, and the picture if there is one."""
+    """The page of the main job: the rides in motion where three.js is installed, the audit, and the picture if there is one."""
     groups: dict[str, list[tuple[int, Trajectory]]] = {}
     for number, ((ground, _), run) in enumerate(rides.items()):
         groups.setdefault(ground, []).append((number, run))
@@ -204,20 +215,21 @@ def main(arguments: list[str] | None = None) -> int:
             f"{'residual':>10s} {'slip [m/s]':>10s} {'N min [N]':>10s} {'steps':>6s}  status"
         )
         rides, audits, helm, asked = {}, [], Helm(options.force, options.steer, options.period), scenes(options)
-        print(heading)
-        with Progress(2 * len(asked) + len(TOLERANCES), "ride") as counted:
+        print(heading, flush=True)
+        # Their programs are compiled side by side, for the compiler uses little more than one core.
+        with Progress(len(asked) + 1, "ride") as counted, ThreadPoolExecutor(2) as threads:
             counted.begin()
-            for name, (scene, launch) in asked.items():
-                runs = {
-                    "Dopri8": simulate(scene, launch, options.t1, helm, tolerance=options.tolerance),
-                    "midpoint": simulate(scene, launch, options.t1, helm, solver=ImplicitMidpoint(options.step)),
-                }
-                rides[name] = runs["Dopri8"]
-                audits += audit(", ".join(name), runs)
+            curves = threads.submit(tolerance_curve, options, helm)
+            for name, (ride, lines) in zip(
+                asked, threads.map(lambda name: audited(options, helm, name), asked), strict=True
+            ):
+                rides[name] = ride
+                audits += lines
                 with counted.aside():
-                    print("\n".join(audits[-len(runs) :]), flush=True)
-                counted.advance(2)
-            curve = tolerance_curve(options, helm, counted)
+                    print("\n".join(lines), flush=True)
+                counted.advance(1)
+            curve = curves.result()
+            counted.advance(1)
             with counted.aside():
                 print("\n" + "\n".join(curve), flush=True)
         with status_line("drawing") as line:
@@ -246,6 +258,7 @@ def main(arguments: list[str] | None = None) -> int:
 if __name__ == "__main__":
     # A job of seconds: a tenth of them would go into looking for garbage among all that JAX holds, here and at the end.
     gc.disable()
+    compile_quickly()
     status = interruptible(main, "stroller")
     gc.freeze()
     sys.exit(status)

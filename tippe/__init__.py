@@ -16,6 +16,7 @@ from nonholonomic.identification import Free as Free
 from nonholonomic.integration import Status as Status
 from nonholonomic.sweeps import Table as Table
 
+from . import presets as presets
 from . import steady as steady
 from .fit.csv import read_recording as read_recording
 from .fit.data import InversionTimes as InversionTimes
@@ -35,6 +36,7 @@ from .model.launch import Launch as Launch
 from .model.scene import Scene as Scene
 from .model.top import Stem as Stem
 from .model.top import Top as Top
+from .runs.explore import explore as explore
 from .runs.extended_times import extended_inversion_time as extended_inversion_time
 from .runs.flight_trajectory import HybridTrajectory as HybridTrajectory
 from .runs.inversion_time import inversion_time as inversion_time

@@ -1,4 +1,4 @@
-"""The main job, `python -m tippe`: the papers' two inversion tables, and the same launches on the plane."""
+"""The main job, `python -m tippe`: a wooden top that climbs onto its stem, on a table and in a cylinder."""
 
 import argparse
 import gc
@@ -11,300 +11,177 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from nonholonomic import __version__
 from nonholonomic.command_line import interruptible
 from nonholonomic.compilation_cache import enable_compilation_cache
-from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
+from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import require_folder
-from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
-from nonholonomic.xla_cpu import compiled_quickly
+from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html, table_as_html
+from nonholonomic.xla_cpu import compile_quickly
 
-from .model.friction import AbstractFriction, Coulomb, Viscous
+from . import presets, steady
+from .model.friction import Coulomb
 from .model.launch import Launch
 from .model.scene import Scene
-from .model.top import Top
-from .papers import paper
+from .papers import tables as paper_tables
 from .runs.plot import Panel, draw_launches
 from .runs.table import inversion_table
 from .runs.trajectory import simulate
-from .runs.view import Motion, stages
 
-#: The arenas that have names, and what their numbers are.
-SURFACES = {
-    "sphere RADIUS": Sphere,
-    "spheroid EQUATORIAL POLAR": Spheroid,
-    "torus RING TUBE": Torus,
-    "paraboloid P": Paraboloid,
-    "plane TILT": Plane,
-}
+TOPS = {top.__name__: top for top in (presets.wooden, presets.rutstam, presets.cohen, presets.leine_glocker)}
 
-#: Times at which theta is drawn, and the tops on the page.
-SAMPLES = 3000
+#: Times at which theta is drawn, and how long the run is that is shown [s].
+SAMPLES, SHOWN = 1500, 5.0
 
-
-class Help(argparse.ArgumentDefaultsHelpFormatter):
-    """Shows the default of every option that has one."""
-
-    def _get_help_string(self, action: argparse.Action) -> str | None:
-        return action.help if action.default is None else super()._get_help_string(action)
+#: What ends a run, as the table says it.
+WORDS = {"not_inverted": "not in time", "contact_lost": "lost contact", "does_not_fit": "no room"}
 
 
 def parser() -> argparse.ArgumentParser:
-    """The options of the main job; the defaults are the declared top and the papers' launches."""
+    """The options of the main job."""
     command = argparse.ArgumentParser(
         prog="python -m tippe",
-        description="Inversion times of a tippe top inside a cylinder (the paper's Tables 2 and 3) and on the plane. "
-        "Prints them beside the printed ones, writes an HDF5 table for each arena and a picture of theta(t).",
-        formatter_class=Help,
+        description="A tippe top turns over, through flights and onto its stem: inversion times over the inclination and the "
+        "friction, on a table and in a cylinder, in one batched call each; a picture, and a page in which the top climbs onto "
+        "its stem. `python -m tippe --paper --help` has the tables of the papers.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
-    top = command.add_argument_group("the top (the paper's Table 1 lost its numbers: these are Rutstam's)")
-    top.add_argument("--mass", type=float, default=0.02, help="mass [kg]")
-    top.add_argument("--radius", type=float, default=0.02, help="radius R of the sphere [m]")
-    top.add_argument("--offset", type=float, default=0.006, help="distance of the centre of mass from the centre [m]")
-    top.add_argument("--I1", type=float, help="transverse moment of inertia [kg m^2] (default: 131/350 m R^2)")
-    top.add_argument("--I3", type=float, help="axial moment of inertia [kg m^2] (default: 2/5 m R^2)")
-    scene = command.add_argument_group("the scene")
-    scene.add_argument("--cylinder-radius", type=float, default=0.3, help="radius of the cylinder [m]")
-    scene.add_argument(
-        "--mu", type=float, default=0.3, help="friction: viscous [s/m], or Coulomb [1] with --slip-speed"
+    command.add_argument(
+        "--paper", action="store_true", help="the papers' Tables 2 and 3 beside computed times, instead"
     )
-    scene.add_argument("--slip-speed", type=float, help="regularised Coulomb friction with this slip speed [m/s]")
-    scene.add_argument(
-        "--surface",
-        nargs="+",
-        metavar=("NAME", "NUMBER"),
-        help="another arena, by its name and numbers [m, rad]: " + ", ".join(SURFACES),
+    command.add_argument("--top", choices=list(TOPS), default="wooden", help="one of `tippe.presets`")
+    command.add_argument(
+        "--theta", type=float, nargs="+", default=[3.0, 6.0, 12.0, 18.0], help="inclinations theta(0) [deg]"
     )
-    scene.add_argument("--gravity", type=float, default=9.81, help="acceleration of free fall [m/s^2]")
-    launch = command.add_argument_group("the launches")
-    launch.add_argument(
-        "--theta", type=float, nargs="+", default=list(paper.THETAS), help="inclinations theta(0) [rad]"
-    )
-    launch.add_argument("--eta", type=float, nargs="+", default=[0.0, math.pi / 2.0], help="places eta(0) [rad]")
-    launch.add_argument("--beta1", type=float, default=paper.BETA1, help="I3 w3 at the start [kg m^2/s]")
-    launch.add_argument(
-        "--spin", type=float, help="spin w3 at the start [rad/s] instead of --beta1; --spin=-100 if negative"
-    )
-    run = command.add_argument_group("the run")
-    run.add_argument("--t1", type=float, default=60.0, help="horizon [s]")
-    run.add_argument("--angle", type=float, default=0.95 * math.pi, help="angle that counts as inverted [rad]")
-    run.add_argument("--tolerance", type=float, default=1e-9, help="relative tolerance of the integration")
-    run.add_argument(
-        "--out",
-        type=Path,
-        default=Path("tippe-out"),
-        help="folder for the tables and the picture; another run needs another",
+    command.add_argument("--rpm", type=float, default=1900.0, help="spin at the start [revolutions per minute]")
+    command.add_argument("--mu", type=float, nargs="+", default=[0.1, 0.2, 0.3, 0.4, 0.5], help="Coulomb friction [1]")
+    command.add_argument("--slip-speed", type=float, default=0.05, help="slip below which friction falls to zero [m/s]")
+    command.add_argument("--cylinder-radius", type=float, default=0.3, help="radius of the cylinder [m]")
+    command.add_argument("--t1", type=float, default=10.0, help="horizon [s]")
+    command.add_argument("--tolerance", type=float, default=1e-6, help="relative tolerance of the integration")
+    command.add_argument(
+        "--out", type=Path, default=Path("tippe-out"), help="folder for the tables, the picture and the page"
     )
     return command
 
 
 def scenes(options: argparse.Namespace) -> dict[str, Scene]:
-    """The two arenas with the declared top, and the one that is asked for."""
-    inertia = options.mass * options.radius**2
-    I1 = 131.0 / 350.0 * inertia if options.I1 is None else options.I1
-    I3 = 0.4 * inertia if options.I3 is None else options.I3
-    top = Top(options.mass, options.radius, options.offset, I1, I3)
-    friction: AbstractFriction = Viscous(options.mu)
-    if options.slip_speed is not None:
-        friction = Coulomb(options.mu, options.slip_speed)
-    arenas = {"cylinder": Cylinder(options.cylinder_radius), "plane": Plane()}
-    if options.surface is not None:
-        arenas["surface"] = surface_of(options.surface)
-    return {name: Scene(top, arena, friction, options.gravity) for name, arena in arenas.items()}
+    """The two arenas, with the middle one of the frictions."""
+    top, law = TOPS[options.top](), Coulomb(middle(options.mu), options.slip_speed)
+    arenas = {"plane": Plane(), "cylinder": Cylinder(options.cylinder_radius)}
+    return {name: Scene(top, arena, law, contact="hybrid") for name, arena in arenas.items()}
 
 
-def surface_of(words: list[str]) -> AbstractSurface:
-    """An arena by its name and numbers.
-
-    **Raises:** `ValueError` for a name or numbers that no arena has.
-    """
-    name, *numbers = words
-    for known, kind in SURFACES.items():
-        if known.split()[0] == name and len(numbers) == len(known.split()) - 1:
-            try:
-                given = [float(number) for number in numbers]
-            except ValueError:
-                break
-            return kind(*given)
-    raise ValueError(f"--surface {' '.join(words)} must be one of: {', '.join(SURFACES)}")
-
-
-def shown_name(options: argparse.Namespace, arena: str) -> str:
-    """What an arena is called where it is shown."""
-    return " ".join(options.surface) if arena == "surface" else arena
-
-
-def counts_eta(scene: Scene) -> bool:
-    """Whether an arena has places by eta; on others every launch starts at the origin."""
-    return any(name == "eta" for name, _ in scene.surface.coordinates)
-
-
-def spin_of(options: argparse.Namespace, scene: Scene) -> float:
-    """The launches' spin [rad/s]."""
-    return options.beta1 / float(scene.body.I3) if options.spin is None else options.spin
-
-
-def tables(options: argparse.Namespace) -> dict[str, Table]:
-    """The table of each arena, first and last crossing of the angle, written to its file."""
-    arenas, found = scenes(options), {}
-    require_folder(options.out, "--out")
-    for name, scene in arenas.items():
-        found[name] = inversion_table(
-            scene,
-            theta=options.theta,
-            eta=options.eta if counts_eta(scene) else 0.0,
-            spin=spin_of(options, scene),
-            t1=options.t1,
-            angle=options.angle,
-            tolerance=options.tolerance,
-            crossing="both",
-            path=options.out / f"{name}.h5",
-        )
-    return found
-
-
-def printed_times(options: argparse.Namespace, eta: float) -> list[str] | None:
-    """The paper's column for a place, if these are its launches."""
-    for table in (paper.TABLE_2, paper.TABLE_3):
-        if list(options.theta) == [row.theta for row in table.rows] and math.isclose(eta, table.eta):
-            return ["-" if row.time is None else f"{row.time:g}" for row in table.rows]
-    return None
-
-
-def columns(options: argparse.Namespace, found: dict[str, Table]) -> list[tuple[str, list[str]]]:
-    """The columns of the report: a heading of two words or more, and an entry for every theta(0)."""
-    shown = [("theta(0)|[rad]", [f"{theta:.4g}" for theta in options.theta])]
-    places = []
-    for arena, scene in scenes(options).items():
-        etas = [(f"eta={eta:.4g}", (slice(None), i)) for i, eta in enumerate(options.eta)]
-        places += [(arena, *place) for place in (etas if counts_eta(scene) else [("", (slice(None),))])]
-    for arena, place, cells in places:
-        table = found[arena]
-        for crossing, times in (("first", table.first_time), ("last", table.last_time)):
-            entries = [_entry(t, word) for t, word in zip(times[cells], table.status[cells], strict=True)]
-            shown.append((f"{shown_name(options, arena)} {place}|{crossing} [s]", entries))
-        printed = printed_times(options, options.eta[cells[1]]) if arena == "cylinder" else None
-        if printed is not None:
-            shown.append(("paper|[s]", printed))
-    return shown
-
-
-def _entry(seconds: float, word: str) -> str:
-    if math.isfinite(seconds):
-        return f"{seconds:.4f}"
-    words = {"not_inverted": "-", "contact_lost": "lost contact", "does_not_fit": "no room"}
-    return words.get(word, word)
-
-
-def report(options: argparse.Namespace, found: dict[str, Table]) -> str:
-    """The tables side by side, as text."""
-    shown = columns(options, found)
-    heads = [heading.split("|") for heading, _ in shown]
-    widths = [max(len(text) for text in (*head, *entries)) for head, (_, entries) in zip(heads, shown, strict=True)]
-    rows = [list(row) for row in zip(*heads, strict=True)]
-    rows += [list(row) for row in zip(*(entries for _, entries in shown), strict=True)]
-    lines = [*described(options), ""]
-    lines += ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join(lines)
+def middle(values: list[float]) -> float:
+    """The middle one of some values."""
+    return sorted(values)[len(values) // 2]
 
 
 def described(options: argparse.Namespace) -> list[str]:
-    """What the report is about, in some lines."""
-    scene = scenes(options)["cylinder"]
-    body = scene.body
+    """What the job is about, in some lines."""
+    top, mm = TOPS[options.top](), lambda length: f"{1e3 * float(length):.3g} mm"
+    alpha, gamma = steady.proportions(top)
+    stem = "no stem" if top.stem is None else f"a stem {mm(2.0 * top.stem.radius)} thick"
+    launch = Launch.degrees(middle(options.theta), options.rpm)
     return [
-        "Inversion of a tippe top: time at which theta reaches "
-        f"{options.angle:.4g} rad, for the first time (first) and for good (last).",
-        f"Top: m = {float(body.mass):g} kg, R = {float(body.radius):g} m, a = {float(body.offset):g} m, "
-        f"I1 = {float(body.I1):.4g}, I3 = {float(body.I3):.4g} kg m^2; friction {_friction(scene.friction)}; "
-        f"cylinder {options.cylinder_radius:g} m.",
-        "The paper's Table 1 lost its numbers, so this top is a declared one (Rutstam's): compare trends, not digits.",
-        f"-: not inverted within {options.t1:g} s.",
+        f"A {options.top} top: {1e3 * float(top.mass):.3g} g, {mm(2.0 * top.radius)} across, {stem}, "
+        f"its centre of mass {mm(top.offset)} below the centre.",
+        f"I1 / I3 = {float(gamma):.3f} lies {'' if steady.group(top) == 'II' else 'not '}between 1 - a / R = "
+        f"{1.0 - float(alpha):.3f} and 1 + a / R = {1.0 + float(alpha):.3f}, so it can "
+        f"{'' if steady.group(top) == 'II' else 'not '}turn over.",
+        f"Spun at {options.rpm:g} rpm ({float(launch.spin):.4g} rad/s), inclined by theta(0); Coulomb friction mu.",
     ]
 
 
-def _friction(law: AbstractFriction) -> str:
-    if isinstance(law, Coulomb):
-        return f"Coulomb mu = {float(law.mu):g}, slip speed {float(law.slip_speed):g} m/s"
-    assert isinstance(law, Viscous)
-    return f"viscous mu = {float(law.mu):g} s/m"
+def tables(options: argparse.Namespace) -> tuple[dict[str, Table], Any]:
+    """The table of each arena, written to its file, and the run that is shown: the middle launch on the plane.
 
-
-@compiled_quickly
-def moving(scene: Scene, launches: Launch, times: Any, tolerance: Any) -> Motion:
-    """What is drawn of every launch until the last of the times, in one batched run."""
-    return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
-
-
-def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, Motion]]:
-    """The times that are drawn, up to `t1` [s], and what is drawn of every launch in each arena.
-
-    All numbers are arrays: a program is compiled anew for another Python number, so the picture and the page would not share
-    theirs. The arenas' programs are compiled side by side, for the compiler uses little more than one core.
+    The programs of both arenas are compiled side by side, for the compiler uses little more than one core.
     """
-    arenas, times = scenes(options), np.linspace(0.0, t1, SAMPLES)
-    tolerance = np.asarray(options.tolerance)
-    with Progress(len(arenas), "arena", "compiling what is drawn"), ThreadPoolExecutor(2) as threads:
-        found = threads.map(lambda scene: moving(scene, starts(options, scene)[1], times, tolerance), arenas.values())
-        return times, dict(zip(arenas, found, strict=True))
+    arenas, spin = scenes(options), float(Launch.degrees(0.0, options.rpm).spin)
+    thetas = [float(Launch.degrees(theta, 0.0).theta) for theta in options.theta]
+
+    def table(name: str) -> Table:
+        return inversion_table(
+            arenas[name],
+            theta=thetas,
+            spin=spin,
+            mu=options.mu,
+            t1=options.t1,
+            tolerance=options.tolerance,
+            path=options.out / f"{name}.h5",
+            progress=False,
+        )
+
+    def run() -> Any:
+        return simulate(
+            arenas["plane"], Launch(middle(thetas), spin), min(SHOWN, options.t1), tolerance=options.tolerance
+        )
+
+    with Progress(len(arenas) + 1, "job", "compiling") as counted, ThreadPoolExecutor(2) as threads:
+        counted.begin()
+        cylinder, plane, shown = threads.submit(table, "cylinder"), threads.submit(table, "plane"), threads.submit(run)
+        for job in (plane, shown, cylinder):
+            job.result()
+            counted.advance(1)
+    return {"plane": plane.result(), "cylinder": cylinder.result()}, shown.result()
 
 
-def starts(options: argparse.Namespace, scene: Scene) -> tuple[list[float], Launch]:
-    """The places eta(0) of an arena, and the launches from all of them, place after place."""
-    etas = options.eta if counts_eta(scene) else [0.0]
-    eta, theta = (values.ravel() for values in np.meshgrid(etas, options.theta, indexing="ij"))
-    return etas, Launch(theta, np.full_like(theta, spin_of(options, scene)), eta, np.zeros_like(theta))
+def rows_of(options: argparse.Namespace, table: Table) -> list[list[str]]:
+    """The entries of a table, a number or a word each, under its two headings."""
+    rows = [["theta(0)", *(f"mu = {mu:g}" for mu in options.mu)]]
+    for theta, times, words in zip(options.theta, table.time, table.status, strict=True):
+        entries = [f"{t:.2f}" if math.isfinite(t) else WORDS.get(w, w) for t, w in zip(times, words, strict=True)]
+        rows.append([f"{theta:g} deg", *entries])
+    return rows
 
 
-def picture(options: argparse.Namespace, found: dict[str, Table]) -> Any:
-    """theta(t) of every launch."""
-    times, runs = drawn(options, options.t1)
-    panels, thetas = [], np.asarray(options.theta)
-    for arena, scene in scenes(options).items():
-        etas, _ = starts(options, scene)
-        shown = np.asarray(runs[arena].theta).reshape(len(etas), len(thetas), -1)
-        ends = found[arena].last_time.reshape(len(thetas), len(etas))
-        for i, eta in enumerate(etas):
-            name = shown_name(options, arena)
-            title = f"{name}, η(0) = {eta:.4g}" if counts_eta(scene) else name
-            panels.append(Panel(title, times, shown[i], thetas, ends[:, i]))
-    return draw_launches(panels, options.angle)
+def headings(options: argparse.Namespace) -> dict[str, str]:
+    """What is said over the table of each arena."""
+    return {
+        "plane": "on a table [s]",
+        "cylinder": f"in a cylinder of {100.0 * options.cylinder_radius:g} cm radius [s]",
+    }
 
 
-def motions(options: argparse.Namespace, found: dict[str, Table]) -> list[Stage]:
-    """The most upright launch that turns over while it can be followed, or else the first to turn over, in both arenas."""
-    ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in found.values()]).max(axis=0)
-    # No longer than the spin can be followed from one sample to the next.
-    longest = SAMPLES / max(abs(spin_of(options, scene)) for scene in scenes(options).values())
-    tilt = np.where(ends + 0.5 <= longest, options.theta, np.inf)
-    row = int(np.argmin(tilt if np.isfinite(tilt).any() else ends))
-    last = min(options.t1, longest, float(ends[row]) + 0.5)
-    (_, runs), groups = drawn(options, last), []
-    for arena, scene in scenes(options).items():
-        name = f"{shown_name(options, arena)}, θ(0) = {options.theta[row]:.4g} rad"
-        groups.append([(name, scene, Motion(*(np.asarray(part)[row] for part in runs[arena])))])
-    return stages(groups)
+def report(options: argparse.Namespace, found: dict[str, Table]) -> str:
+    """The tables as text."""
+    lines = []
+    for name, heading in headings(options).items():
+        rows = rows_of(options, found[name])
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines += ["", f"Time until it has turned over, {heading}"]
+        lines += ["  ".join(entry.rjust(width) for entry, width in zip(row, widths, strict=True)) for row in rows]
+    return "\n".join(lines)
 
 
-def write_page(options: argparse.Namespace, found: dict[str, Table], drawing: Path | None) -> Path:
-    """The page of the main job: two tops in motion where K3D is installed, the tables, and the picture if there is one."""
-    intro, rows = (
-        described(options),
-        [list(row) for row in zip(*(heading.split("|") for heading, _ in columns(options, found)), strict=True)],
-    )
-    rows += [list(row) for row in zip(*(entries for _, entries in columns(options, found)), strict=True)]
-    below = "<h2>Inversion times</h2>" + table_as_html(rows, 2)
-    below += "".join(f'<p class="note">{escape(line)}</p>' for line in intro)
-    below += "" if drawing is None else "<h2>θ(t) of every launch</h2>" + picture_as_html(drawing)
+def picture(options: argparse.Namespace, run: Any) -> Any:
+    """theta(t) of the run that is shown."""
+    times = np.linspace(0.0, float(run.end_time), SAMPLES)
+    theta = np.asarray(run.at(times).theta)
+    above = np.flatnonzero(theta > 0.95 * np.pi)
+    end = times[above[0]] if len(above) else np.inf
+    title = f"{options.top} top, {options.rpm:g} rpm, mu = {middle(options.mu):g}, on a table"
+    return draw_launches([Panel(title, times, theta[None], theta[:1], np.array([end]))], 0.95 * np.pi)
+
+
+def write_page(options: argparse.Namespace, found: dict[str, Table], run: Any, drawing: Path | None) -> Path:
+    """The page of the main job: the top in motion where three.js is installed, the tables, and the picture if there is one."""
+    below = ""
+    for name, heading in headings(options).items():
+        below += f"<h2>Time until it has turned over, {heading}</h2>" + table_as_html(rows_of(options, found[name]), 1)
+    below += "".join(f'<p class="note">{escape(line)}</p>' for line in described(options))
+    below += "" if drawing is None else "<h2>θ(t)</h2>" + picture_as_html(drawing)
     above = "" if can_view() else f'<p class="note">{NO_VIEW}</p>'
-    path = options.out / "index.html"
-    page(motions(options, found) if can_view() else [], "A tippe top turns over", 0.5, above, below).save(path)
+    path, stages = options.out / "index.html", []
+    if can_view():
+        stages = run.stages()
+    page(stages, "A tippe top climbs onto its stem", 0.2, above, below).save(path)
     return path
 
 
@@ -315,34 +192,43 @@ def main(arguments: list[str] | None = None) -> int:
 
     **Returns:** the exit status: 0, or 2 for input that cannot be used.
     """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if "--paper" in arguments:
+        return paper_tables.main([word for word in arguments if word != "--paper"])
     options = parser().parse_args(arguments)
     enable_compilation_cache()
     started = time.perf_counter()
     try:
-        found = tables(options)
-        print(report(options, found))
-        with status_line("drawing"):
+        print("\n".join(described(options)), flush=True)
+        require_folder(options.out, "--out")
+        found, run = tables(options)
+        print(report(options, found), flush=True)
+        with status_line("drawing") as line:
             written, drawing = [options.out / f"{arena}.h5" for arena in found], None
             if find_spec("matplotlib") is None:
-                print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
+                with line.aside():
+                    print(
+                        "No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr
+                    )
             else:
                 drawing = options.out / "theta.png"
-                picture(options, found).savefig(drawing, dpi=130)
+                picture(options, run).savefig(drawing, dpi=130)
                 written.append(drawing)
-            shown = write_page(options, found, drawing)
+            shown = write_page(options, found, run, drawing)
     except (ValueError, OSError) as error:
         print(f"python -m tippe: {error}", file=sys.stderr)
         return 2
     cells = sum(table.status.size for table in found.values())
     print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
     print(f"Wrote {', '.join(map(str, written))}.")
-    print(f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}")
+    print(f"To see the top climb onto its stem, open {shown}{'' if can_view() else f'. {NO_VIEW}'}")
     return 0
 
 
 if __name__ == "__main__":
     # A job of seconds: a fifth of them would go into looking for garbage among all that JAX holds, here and at the end.
     gc.disable()
+    compile_quickly()
     status = interruptible(main, "tippe")
     gc.freeze()
     sys.exit(status)

@@ -24,9 +24,12 @@ from .reference import solve_by_diffrax as solve_by_diffrax
 from .runge_kutta import Lanes as Lanes
 from .runge_kutta import Stages as Stages
 from .runge_kutta import States as States
+from .runge_kutta import Step as Step
 from .runge_kutta import explicit_tableau as explicit_tableau
 from .runge_kutta import moved_state as moved_state
 from .runge_kutta import over_stages as over_stages
+from .runge_kutta import stages_to_look as stages_to_look
+from .runge_kutta import watched_places as watched_places
 from .samples import solve_with_samples as solve_with_samples
 from .scheduler import LaneScheduler as LaneScheduler
 from .scheduler import Outcome as Outcome
@@ -51,6 +54,7 @@ from .status import RUNNING as RUNNING
 from .status import UNRESOLVED as UNRESOLVED
 from .status import Status as Status
 from .step import LaneState as LaneState
+from .step import after_step as after_step
 from .step import length_to_try as length_to_try
 from .step import try_step as try_step
 from .zeros import few_trials as few_trials

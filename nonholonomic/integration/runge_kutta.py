@@ -77,7 +77,7 @@ def explicit_step(
     """
     # The last stage of a method whose steps end with a stage is the end of the step, below.
     inner = len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
-    looks = _stages_to_look(tableau.c)
+    looks = stages_to_look(tableau.c)
     places, looked = jnp.asarray(tableau.c[:inner]), jnp.asarray(np.isin(np.arange(inner), looks))
     rows = jnp.asarray(np.searchsorted(looks, np.arange(inner)) + 1)
 
@@ -117,7 +117,7 @@ def explicit_step(
 
 def watched_places(tableau: diffrax.ButcherTableau) -> Float[np.ndarray, " places"]:
     """The fractions of a step at which its margins are known: its start, some stages between, and its end."""
-    return np.array([0.0, *(tableau.c[stage] for stage in _stages_to_look(tableau.c)), 1.0])
+    return np.array([0.0, *(tableau.c[stage] for stage in stages_to_look(tableau.c)), 1.0])
 
 
 def lesser(margin: Lanes | None, crossing: Lanes | None, like: Lanes) -> Lanes:
@@ -137,7 +137,7 @@ def over_stages(stages: int, do: Callable[[Int[Array, ""], Any], Any], start: An
     return jax.lax.fori_loop(0, stages, do, start, unroll=jax.default_backend() != "cpu")
 
 
-def _stages_to_look(fractions: Float[np.ndarray, " stages"]) -> list[int]:
+def stages_to_look(fractions: Float[np.ndarray, " stages"]) -> list[int]:
     """The stages nearest to 1/4, 1/2 and 3/4 of the step: the places at which its inside is checked."""
     between = [stage for stage, fraction in enumerate(fractions) if 0.0 < fraction < 1.0]
     nearest = {min(between, key=lambda stage: abs(fractions[stage] - part)) for part in (0.25, 0.5, 0.75) if between}

@@ -92,6 +92,18 @@ def try_step(problem: AbstractProblem, control: Control, atol: States, lane_stat
     crossing = side_of(problem, lane_state.side)
     start = (lane_state.time, lane_state.state, lane_state.rate, tried_length)
     tried = explicit_step(control.tableau, problem.field, problem.margins, crossing, *start, lane_state.margins)
+    return after_step(problem, control, atol, lane_state, tried_length, tried)
+
+
+def after_step(
+    problem: AbstractProblem, control: Control, atol: States, lane_state: LaneState, tried_length: Lanes, tried: Step
+) -> LaneState:
+    """Decide what becomes of each lane after a step was tried.
+
+    **Arguments:** as for `try_step`; `tried_length` is the length of the steps [s], `tried` their results.
+
+    **Returns:** the lanes after the step.
+    """
     running = lane_state.status == RUNNING
     free = running & ~lane_state.bracketing
     error = scaled_error(

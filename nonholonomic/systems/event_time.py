@@ -94,7 +94,7 @@ def event_time(
     ...     return nonholonomic.event_time(ball, start, t1=9.0, event=lambda t, y: 4.5 - y[2])
     >>> time, slope = jax.value_and_grad(fifth)(0.8)
     >>> print(f"{time:.6f} s, {slope:.6f} s")
-    2.584070 s, 5.146087 s
+    2.584160 s, 5.931215 s
 
     ```
     """

@@ -146,7 +146,7 @@ def identify(
     >>> data = nonholonomic.Recording([1.0], [0.5, 1.0, 1.5], [0.37, 0.135, 0.05], 0.005)
     >>> fit = nonholonomic.identify(nonholonomic.Hybrid([Decay(1.0)]), data, {"rate": 1.0}, progress=False)
     >>> print(f"{fit.estimates['system.modes[0].rate']:.2f}")
-    2.00
+    1.99
 
     ```
     """

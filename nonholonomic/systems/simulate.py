@@ -63,9 +63,8 @@ def simulate(
     ...     def potential(self, q):
     ...         return -9.81 * self.length * jnp.cos(q[0])
     >>> run = nonholonomic.simulate(Pendulum(length=1.0), ([0.1], [0.0]), t1=2.0, times=[1.0, 2.0])
-    >>> print(run.status, run.state.round(4))
-    completed [[-0.1     0.0026]
-     [ 0.0999 -0.0052]]
+    >>> print(f"{run.status}, {run.state[-1, 0]:.6f} rad, {run.state[-1, 1]:.6f} rad/s")
+    completed, 0.099974 rad, 0.007169 rad/s
 
     ```
     """

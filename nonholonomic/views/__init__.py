@@ -11,8 +11,11 @@ from .meshes import wheel as wheel
 from .page import NO_VIEW as NO_VIEW
 from .page import Page as Page
 from .page import can_view as can_view
+from .page import data_script as data_script
+from .page import json_script as json_script
 from .page import page as page
 from .page import picture_as_html as picture_as_html
+from .page import script as script
 from .page import table_as_html as table_as_html
 from .plot import draw_portrait as draw_portrait
 from .plot import draw_table as draw_table

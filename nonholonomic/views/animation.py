@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .page import ANGLE, among, finite, view_from
+from .arena import FINE
+from .page import ANGLE, among, view_from
 from .plot import new_figure
-from .stage import Show, Stage, css, matrices, nearest
+from .stage import Show, Stage, css, finite, matrices, nearest
 
 #: Pictures a second, how many of them by default, and their dots per inch.
 RATE, FRAMES, DOTS = 25, 150, 80
@@ -122,12 +123,27 @@ class _Space:
         axes.set_axis_off()
         axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.8)
         axes.set_title(f"{stage.title} ({stage.arena.spacing})", fontsize="medium")
+        self.floor = axes.add_collection3d(Poly3DCollection([np.zeros((3, 3))], linewidths=0.3, zorder=0))
+        mesh = stage.arena.mesh
+        # Every quarter of the mesh's lines, which is as fine as is seen.
+        index = np.arange(len(mesh.vertices)).reshape(FINE, FINE)[::4, ::4]
+        self.tiles = mesh.vertices[np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], axis=-1)]
+        self.tiles = self.tiles.reshape(-1, 4, 3)
+        front = np.cross(*(mesh.vertices[mesh.triangles[0]][[1, 2]] - mesh.vertices[mesh.triangles[0]][0]))
+        across = np.cross(self.tiles[:, 1] - self.tiles[:, 0], self.tiles[:, 2] - self.tiles[:, 0])
+        across *= np.sign(np.sum(across[0] * front))
+        self.tile_colours = _lit(across, mesh.colour)
         self.ground = axes.add_collection3d(
             Line3DCollection([np.zeros((2, 3))], colors="0.75", linewidths=0.6, zorder=1)
         )
-        lines = [(trace.colour, 2 if trace.about is None else 3) for show in stage.shows for trace in show.traces]
+        lines = [
+            (trace.colour, 2 if trace.about is None else 3)
+            for show in stage.shows
+            for trace in show.traces
+            if trace.shown
+        ]
         self.traces = [axes.plot([], [], [], color=css(c), linewidth=0.9, zorder=z)[0] for c, z in lines]
-        arrows = [arrow.colour for show in stage.shows for arrow in show.arrows]
+        arrows = [arrow.colour for show in stage.shows for arrow in show.arrows if arrow.shown]
         self.arrows = [axes.plot([], [], [], color=css(c), linewidth=2.2, zorder=3)[0] for c in arrows]
         self.solids = axes.add_collection3d(Poly3DCollection([np.zeros((3, 3))], linewidths=0.3, zorder=4))
 
@@ -140,6 +156,10 @@ class _Space:
             reach += apart - self.apart
         for axis, centre in zip("xyz", middle, strict=True):
             getattr(self.axes, f"set_{axis}lim")(centre - reach, centre + reach)
+        within = np.linalg.norm(self.tiles.mean(axis=1) - middle, axis=-1) < 1.6 * reach
+        self.floor.set_verts(self.tiles[within])
+        self.floor.set_facecolor(self.tile_colours[within])
+        self.floor.set_edgecolor(self.tile_colours[within])
         near = [line for whole in self.stage.arena.lines for line in _pieces(whole, middle, 1.6 * reach)]
         self.ground.set_segments(near)
         triangles, colours, traces, arrows = [], [], iter(self.traces), iter(self.arrows)
@@ -151,12 +171,12 @@ class _Space:
                     corners = (mesh.vertices @ turn.T + body.position[now])[mesh.triangles]
                     triangles.append(corners)
                     colours.append(_shaded(corners, mesh.colour))
-            for trace in show.traces:
+            for trace in filter(lambda trace: trace.shown, show.traces):
                 points = finite(trace.points[: now + 1]) + (0.0 if trace.about is None else trace.about[now])
                 points = np.where(np.linalg.norm(points - middle, axis=-1, keepdims=True) < 1.6 * reach, points, np.nan)
                 next(traces).set_data_3d(*points.T)
-            for arrow in show.arrows:
-                ends = np.stack([arrow.start[now], arrow.start[now] + arrow.vector[now]])
+            for arrow in filter(lambda arrow: arrow.shown, show.arrows):
+                ends = np.stack([arrow.start[now], arrow.start[now] + arrow.drawn[now]])
                 next(arrows).set_data_3d(*ends.T)
         self.solids.set_verts(np.concatenate(triangles))
         # Edges of the same colour close the seams between triangles.
@@ -176,7 +196,11 @@ def _pieces(line: np.ndarray, middle: np.ndarray, reach: float) -> list[np.ndarr
 
 
 def _shaded(corners: Float[np.ndarray, "triangles 3 3"], colour: int) -> Float[np.ndarray, "triangles 3"]:
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-30)
+    return _lit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), colour)
+
+
+def _lit(across: Float[np.ndarray, "faces 3"], colour: int) -> Float[np.ndarray, "faces 3"]:
+    """A colour as bright as faces with these normals, of any length, are lit."""
+    across = across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-30)
     base = np.array([colour >> 16 & 255, colour >> 8 & 255, colour & 255]) / 255.0
     return base * (SHADE + (1.0 - SHADE) * np.clip(across @ LIGHT, 0.0, 1.0))[:, None]

@@ -47,7 +47,16 @@ def arena(
     along = [(np.full(FINE, a), np.linspace(*second, FINE)) for a in marks(first, step_1)]
     along += [(np.linspace(*first, FINE), np.full(FINE, b)) for b in marks(second, step_2)]
     lines = chart.grid(*np.moveaxis(np.array(along), 1, 0)) if along else ()
-    return Arena(Mesh(mesh.reshape(-1, 3), of_grid(FINE, FINE), GREY), tuple(lines), words, normal)
+    ground = facing(Mesh(mesh.reshape(-1, 3), of_grid(FINE, FINE), GREY), points, normal)
+    return Arena(ground, tuple(lines), words, normal)
+
+
+def facing(mesh: Mesh, points: Float[np.ndarray, "points 3"], normal: Float[np.ndarray, " 3"]) -> Mesh:
+    """The mesh of a surface with its front towards the room, where `normal` points at the first of the points."""
+    corners = mesh.vertices[mesh.triangles]
+    nearest = corners[np.argmin(np.linalg.norm(corners.mean(axis=1) - points[0], axis=-1))]
+    front = np.cross(nearest[1] - nearest[0], nearest[2] - nearest[0]) @ normal
+    return mesh if front > 0.0 else mesh._replace(triangles=mesh.triangles[:, ::-1])
 
 
 # Compiled as a whole: every operation by itself would be compiled for every shape.

@@ -1,11 +1,14 @@
-"""One page that holds everything: a view in three dimensions that moves, drawn by K3D, and strips of curves (needs k3d)."""
+"""One page that holds everything: a view in three dimensions that moves, drawn by three.js, and strips of curves.
+
+The page is one HTML file without any request to a network. `page.html` is its frame; `stage.js` draws a stage, `strips.js` the
+curves, and `player.js` unpacks the data and sets the time. three.js comes from the package jupyter-threejs-sage.
+"""
 
 import base64
-import contextlib
 import html
 import json
 import zlib
-from collections.abc import Iterator
+from collections.abc import Sequence
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,20 +17,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .meshes import revolved
-from .stage import Arrow, Mesh, Points, Show, Stage, css
+from .stage import Mesh, Show, Stage, css, finite
 
 #: How fast time may run.
 SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 
 #: What a page without motion says.
-NO_VIEW = "The page is without motion: k3d is not installed (pip install 'nonholonomic[view]')."
+NO_VIEW = "The page is without motion: jupyter-threejs-sage is not installed (pip install 'nonholonomic[view]')."
+
+#: Where three.js lies in its package.
+PACKAGE, LIBRARY = "jupyter_threejs_sage", ("static", "r130", "three.min.js")
+
+SCRIPTS = ("stage.js", "strips.js", "player.js")
 
 LINES = 0x7C8896
 BACKGROUND = 0xFBFBFA
 
-#: Opening angle of the camera [deg].
-ANGLE = 35.0
+#: Opening angle of the camera [deg], and how high it stands over the ground, in units of its distance along it.
+ANGLE, RISE = 35.0, 0.30
 
 
 class Page(NamedTuple):
@@ -43,19 +50,27 @@ class Page(NamedTuple):
         Path(path).write_text(self.html, encoding="utf-8")
 
     def _repr_html_(self) -> str:
-        return f'<iframe srcdoc="{html.escape(self.html)}" style="width:100%;height:820px;border:0" loading="lazy"></iframe>'
+        style = "width:100%;height:820px;border:0"
+        return f'<iframe srcdoc="{html.escape(self.html)}" style="{style}" allow="fullscreen" loading="lazy"></iframe>'
 
     def __repr__(self) -> str:
         return f"Page of {len(self.html) / 1e6:.2f} MB; save(path) writes it, and a notebook shows it"
 
 
 def can_view() -> bool:
-    """Whether K3D is installed."""
-    return find_spec("k3d") is not None
+    """Whether three.js is installed."""
+    return find_spec(PACKAGE) is not None
 
 
 def page(
-    stages: list[Stage], title: str, speed: float = 1.0, above: str = "", below: str = "", height: int = 460
+    stages: list[Stage],
+    title: str,
+    speed: float = 1.0,
+    above: str = "",
+    below: str = "",
+    height: int = 460,
+    scripts: Sequence[str] = (),
+    autoplay: bool = True,
 ) -> Page:
     """A page with some stages beside each other, whose times run together.
 
@@ -65,12 +80,14 @@ def page(
     - `title`: of the page; `above`, `below`: HTML around the view.
     - `speed`: how fast time runs at first, one of `SPEEDS`.
     - `height`: of each stage in pixels.
+    - `scripts`: HTML of more scripts, put in after those of the page, such as `script` makes.
+    - `autoplay`: whether the page plays once when it is first seen.
 
-    **Raises:** `ModuleNotFoundError` if there are stages and K3D is not installed.
+    **Raises:** `ModuleNotFoundError` if there are stages and jupyter-threejs-sage is not installed.
     """
     parts = {"TITLE": html.escape(title), "HEIGHT": str(height), "ABOVE": above, "BELOW": below, "VIEW": ""}
     if stages:
-        parts["VIEW"] = _view(stages, speed)
+        parts["VIEW"] = "\n".join([_view(stages, speed, autoplay), *scripts])
     whole = _template("page.html")
     for name, text in parts.items():
         whole = whole.replace(f"[{name}]", text)
@@ -83,12 +100,32 @@ def table_as_html(rows: list[list[str]], heads: int) -> str:
     for number, row in enumerate(rows):
         kind = "th" if number < heads else "td"
         parts.append("<tr>" + "".join(f"<{kind}>{html.escape(entry)}</{kind}>" for entry in row) + "</tr>")
-    return f"<table>{''.join(parts)}</table>"
+    return f'<div class="wide"><table>{"".join(parts)}</table></div>'
 
 
 def picture_as_html(path: Path) -> str:
     """A PNG file as an HTML image that carries its data."""
     return f'<img style="max-width:100%" alt="" src="data:image/png;base64,{_coded(path.read_bytes())}">'
+
+
+def script(text: str) -> str:
+    """JavaScript as an HTML script."""
+    return f"<script>{_safe(text)}</script>"
+
+
+def data_script(name: str, data: bytes) -> str:
+    """Bytes as an HTML script that is only read, by its id: deflated, in base64."""
+    return f'<script type="text/plain" id="{name}">{_coded(zlib.compress(data, 9))}</script>'
+
+
+def json_script(name: str, value: Any) -> str:
+    """A value as an HTML script that is only read, by its id: JSON."""
+    return f'<script type="application/json" id="{name}">{_safe(json.dumps(value))}</script>'
+
+
+def _safe(text: str) -> str:
+    # A browser takes "</script>" for the end of a script wherever it stands, even in data.
+    return text.replace("</", "<\\/")
 
 
 def _template(name: str) -> str:
@@ -99,146 +136,101 @@ def _coded(data: bytes) -> str:
     return base64.b64encode(data).decode("ascii")
 
 
-def _script(name: str, text: str, kind: str = "text/plain") -> str:
-    # A browser takes "</script>" for the end of a script wherever it stands, even in data.
-    safe = text.replace("</", "<\\/")
-    return f'<script type="{kind}" id="{name}">{safe}</script>'
-
-
-def _view(stages: list[Stage], speed: float) -> str:
+def _view(stages: list[Stage], speed: float, autoplay: bool) -> str:
     if not can_view():
-        raise ModuleNotFoundError("a view needs K3D: pip install 'nonholonomic[view]'")
-    library = files("k3d").joinpath("static", "standalone.js").read_bytes()
+        raise ModuleNotFoundError("a view needs three.js: pip install 'nonholonomic[view]'")
     numbers = _Numbers()
-    duration = max(float(show.times[-1]) for stage in stages for show in stage.shows)
     facts = {
-        "duration": duration,
         "speed": speed,
-        "speeds": [(f"{one:g} x real time" if one != 1.0 else "real time", one) for one in SPEEDS],
-        "stages": [],
+        "speeds": [(f"{factor:g} x real time" if factor != 1.0 else "real time", factor) for factor in SPEEDS],
+        "autoplay": autoplay,
+        "stages": [_stage(stage, numbers) for stage in stages],
     }
-    snapshots = []
-    for number, stage in enumerate(stages):
-        snapshot, fact = _stage(stage, numbers)
-        facts["stages"].append(fact | {"snapshot": f"snapshot{number}"})
-        snapshots.append(_script(f"snapshot{number}", _coded(snapshot)))
     return "\n".join(
         [
-            _script("library", _coded(zlib.compress(library, 9))),
-            _script("facts", json.dumps(facts), "application/json"),
-            _script("numbers", _coded(zlib.compress(numbers.packed(), 9))),
-            *snapshots,
-            f"<script>{_template('page.js')}</script>",
+            data_script("library", files(PACKAGE).joinpath(*LIBRARY).read_bytes()),
+            json_script("facts", facts),
+            data_script("floats", numbers.floats),
+            data_script("whole", numbers.whole),
+            *(script(_template(name)) for name in SCRIPTS),
         ]
     )
 
 
 class _Numbers:
-    """Arrays one after the other; each is known by where it begins and how many numbers it has."""
+    """Arrays one after the other, floats and whole numbers; each array is known by its beginning and its length.
+
+    Floats are kept byte plane by byte plane and whole numbers as differences, which compress better, and equal arrays once.
+    """
 
     def __init__(self):
-        self.parts: list[np.ndarray] = []
-        self.length = 0
+        self.parts: dict[str, list[np.ndarray]] = {"<f4": [], "<i4": []}
+        self.places: dict[bytes, tuple[int, int]] = {}
+        self.lengths = {"<f4": 0, "<i4": 0}
 
     def add(self, values: np.ndarray) -> tuple[int, int]:
-        flat = np.ascontiguousarray(values, dtype="<f4").ravel()
-        begin, self.length = self.length, self.length + flat.size
-        self.parts.append(flat)
-        return begin, flat.size
+        """Add floats."""
+        return self._add(np.ascontiguousarray(values, dtype="<f4").ravel(), "<f4")
 
-    def packed(self) -> bytes:
-        return np.concatenate(self.parts).tobytes()
+    def add_whole(self, values: np.ndarray) -> tuple[int, int]:
+        """Add whole numbers."""
+        return self._add(np.diff(np.ravel(values), prepend=0).astype("<i4"), "<i4")
 
+    def _add(self, flat: np.ndarray, kind: str) -> tuple[int, int]:
+        key = kind.encode() + flat.tobytes()
+        if key not in self.places:
+            self.places[key] = (self.lengths[kind], flat.size)
+            self.lengths[kind] += flat.size
+            self.parts[kind].append(flat)
+        return self.places[key]
 
-def _stage(stage: Stage, numbers: _Numbers) -> tuple[bytes, dict[str, Any]]:
-    """K3D's snapshot of what a stage draws, and what the script needs to know of it."""
-    import k3d
+    @property
+    def floats(self) -> bytes:
+        joined = np.concatenate(self.parts["<f4"])
+        return joined.view(np.uint8).reshape(-1, 4).T.tobytes()
 
-    with _unseen():
-        return _drawn(k3d, stage, numbers)
-
-
-@contextlib.contextmanager
-def _unseen() -> Iterator[None]:
-    """K3D's widgets are not told to a notebook, which would keep megabytes of what the page holds anyway."""
-    import comm
-
-    told, comm.create_comm = comm.create_comm, comm.DummyComm
-    try:
-        yield
-    finally:
-        comm.create_comm = told
+    @property
+    def whole(self) -> bytes:
+        return np.concatenate(self.parts["<i4"]).tobytes()
 
 
-def _drawn(k3d: Any, stage: Stage, numbers: "_Numbers") -> tuple[bytes, dict[str, Any]]:
-    from ipywidgets import Widget
-
-    plot = k3d.plot(
-        camera_auto_fit=False,
-        grid_visible=False,
-        menu_visibility=False,
-        camera_fov=ANGLE,
-        background_color=BACKGROUND,
-        camera_mode="orbit",
-        axes_helper=0.0,
-    )
-    drawn = _Drawn(k3d, plot)
-    drawn.mesh(stage.arena.mesh, side="double")
-    drawn.grid(stage.arena.lines)
+def _stage(stage: Stage, numbers: _Numbers) -> dict[str, Any]:
+    """What the script needs to know of a stage."""
     camera, follow = view_from(stage)
-    plot.camera = camera
-    shows = [_show(show, drawn, numbers) for show in stage.shows]
     keys = [(stage.arena.spacing, "")]
-    for show in stage.shows:
-        keys += [(show.name, css(show.colour))] if len(stage.shows) > 1 else []
-    alone = len(stage.shows) == 1
-    for show in stage.shows[:1]:
-        # Traces of several runs have the runs' colours.
-        keys += [(one.name, css(one.colour)) for one in (*(show.traces if alone else ()), *show.arrows)]
-    fact = {"title": stage.title, "keys": keys, "follow": follow, "size": _size(stage), "shows": shows}
-    snapshot = plot.get_binary_snapshot(9)
-    # Widgets are kept until they are closed; a plot of K3D closes something else.
-    for one in (*plot.objects, plot):
-        Widget.close(one.layout)
-        Widget.close(one)
-    return snapshot, fact
+    if len(stage.shows) > 1:
+        keys += [(show.name, css(show.colour)) for show in stage.shows]
+    arena = _mesh(stage.arena.mesh, numbers) | {"lines": [numbers.add(line) for line in stage.arena.lines]}
+    return {
+        "title": stage.title,
+        "keys": keys,
+        "notes": list(dict.fromkeys(show.note for show in stage.shows if show.note)),
+        "follow": follow,
+        "camera": (camera[:3], camera[3:6]),
+        "angle": ANGLE,
+        "size": _size(stage),
+        "background": css(BACKGROUND),
+        "lines": css(LINES),
+        "arena": arena,
+        "runs": [_show(show, numbers) for show in stage.shows],
+    }
 
 
-class _Drawn:
-    """A plot of K3D, and how meshes and lines get into it; each gives its id."""
-
-    def __init__(self, k3d: Any, plot: Any):
-        self.k3d, self.plot = k3d, plot
-
-    def mesh(self, mesh: Mesh, side: str = "double") -> int:
-        vertices, triangles = mesh.vertices.astype("f4"), mesh.triangles.astype("u4")
-        return self._add(self.k3d.mesh(vertices, triangles, color=mesh.colour, flat_shading=False, side=side))
-
-    def line(self, points: Points, colour: int, width: float) -> int:
-        return self._add(self.k3d.line(points.astype("f4"), color=colour, shader="thick", width=width))
-
-    def grid(self, lines: tuple[np.ndarray, ...]) -> int:
-        ends = np.cumsum([len(line) for line in lines])
-        begins = np.setdiff1d(np.arange(ends[-1]), ends - 1)
-        pairs = np.stack([begins, begins + 1], axis=-1).astype("u4")
-        points = np.concatenate(lines).astype("f4")
-        kind = {"indices_type": "segment", "shader": "simple"}
-        return self._add(self.k3d.lines(points, pairs, color=LINES, **kind))
-
-    def _add(self, one: Any) -> int:
-        self.plot += one
-        return one.id
+def _mesh(mesh: Mesh, numbers: _Numbers) -> dict[str, Any]:
+    vertices, triangles = numbers.add(mesh.vertices), numbers.add_whole(mesh.triangles)
+    return {"vertices": vertices, "triangles": triangles, "colour": css(mesh.colour)}
 
 
-def _show(show: Show, drawn: _Drawn, numbers: _Numbers) -> dict[str, Any]:
+def _show(show: Show, numbers: _Numbers) -> dict[str, Any]:
     return {
         "name": show.name,
         "colour": css(show.colour),
         "times": numbers.add(show.times),
+        "normal": numbers.add(show.normal),
         "bodies": [
             {
                 "name": body.name,
-                "ids": [drawn.mesh(mesh) for mesh in body.meshes],
+                "meshes": [_mesh(mesh, numbers) for mesh in body.meshes],
                 "position": numbers.add(body.position),
                 "turning": numbers.add(body.turning),
             }
@@ -246,34 +238,25 @@ def _show(show: Show, drawn: _Drawn, numbers: _Numbers) -> dict[str, Any]:
         ],
         "traces": [
             {
-                "id": drawn.line(finite(trace.points), trace.colour, trace.width),
+                "name": trace.name,
+                "shown": trace.shown,
+                "colour": css(trace.colour),
+                "width": trace.width,
+                "points": numbers.add(finite(trace.points)),
                 "about": None if trace.about is None else numbers.add(trace.about),
             }
             for trace in show.traces
         ],
-        "arrows": [_arrow(arrow, drawn, numbers) for arrow in show.arrows],
+        "arrows": [
+            arrow._asdict()
+            | {
+                "colour": css(arrow.colour),
+                "start": numbers.add(finite(arrow.start)),
+                "vector": numbers.add(finite(arrow.vector)),
+            }
+            for arrow in show.arrows
+        ],
         "curves": [{"label": curve.label, "values": numbers.add(curve.values)} for curve in show.curves],
-    }
-
-
-def finite(points: Points) -> Points:
-    """Points, those that are not numbers replaced by the last before them."""
-    good = np.all(np.isfinite(points), axis=-1)
-    last = np.maximum.accumulate(np.where(good, np.arange(len(points)), 0))
-    return np.nan_to_num(points[last])
-
-
-def _arrow(arrow: Arrow, drawn: _Drawn, numbers: _Numbers) -> dict[str, Any]:
-    """A shaft one metre long, which the script scales, and a tip, which it moves to the shaft's end."""
-    head = 5.0 * arrow.width
-    shaft = revolved([(0.0, 1.0), (arrow.width, 1.0), (arrow.width, 0.0), (0.0, 0.0)], arrow.colour)
-    tip = revolved([(0.0, head), (2.4 * arrow.width, 0.0), (0.0, 0.0)], arrow.colour)
-    return {
-        "shaft": drawn.mesh(shaft),
-        "tip": drawn.mesh(tip),
-        "head": head,
-        "start": numbers.add(finite(arrow.start)),
-        "vector": numbers.add(finite(arrow.vector)),
     }
 
 
@@ -297,11 +280,11 @@ def view_from(stage: Stage) -> tuple[list[float], bool]:
     follow = bool(reach > 4.0 * size)
     if follow:
         middle, apart = among(np.stack([path[0] for path in paths]))
-        reach = 2.0 * size + apart
+        reach = 1.1 * size + apart
     normal = stage.arena.normal
     aside = np.array([0.35, -1.0, 0.0])
     aside = aside - (aside @ normal) * normal
-    direction = 0.55 * normal + aside / np.linalg.norm(aside)
+    direction = RISE * normal + aside / np.linalg.norm(aside)
     distance = 1.05 * (reach + 1.6 * size) / np.sin(np.radians(ANGLE) / 2.0)
     place = middle + distance * direction / np.linalg.norm(direction)
     return [*place.tolist(), *middle.tolist(), 0.0, 0.0, 1.0], follow

@@ -29,23 +29,43 @@ class Body(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """A line that grows as time goes on; `about`, if any, is a moving point to which its points are relative."""
+    """A line that grows as time goes on; `about`, if any, is a moving point to which its points are relative.
+
+    `shown`: whether a page shows it before somebody switches it on.
+    """
 
     name: str
     points: Points
     colour: int
     width: float
     about: Points | None = None
+    shown: bool = True
 
 
 class Arrow(NamedTuple):
-    """An arrow that changes: where it starts, and its vector as long as it is drawn [m]; `name` says what its length means."""
+    """A vector that changes: where it starts, and its components in `unit`.
+
+    It is drawn `scale` metres long for each unit, and no longer than `limit` [m]. Where `through`, it is seen through the body
+    and has a ball at its start; `shown`: whether a page shows it before somebody switches it on.
+    """
 
     name: str
     start: Points
     vector: Points
+    unit: str
+    scale: float
     colour: int
     width: float
+    limit: float | None = None
+    through: bool = False
+    shown: bool = True
+
+    @property
+    def drawn(self) -> Points:
+        """The vectors as long as they are drawn [m]."""
+        lengths = self.scale * np.linalg.norm(self.vector, axis=-1, keepdims=True)
+        longest = lengths if self.limit is None else np.minimum(lengths, self.limit)
+        return self.scale * self.vector * np.divide(longest, lengths, out=np.ones_like(lengths), where=lengths > 0.0)
 
 
 class Curve(NamedTuple):
@@ -56,16 +76,21 @@ class Curve(NamedTuple):
 
 
 class Show(NamedTuple):
-    """One run as it is drawn: `size` is a length [m] of the body, `colour` that of its curves."""
+    """One run as it is drawn: `size` is a length [m] of the body, `colour` that of its curves.
+
+    `normal` is the arena's unit normal where the body is, into the room; `note` warns of what the model leaves out.
+    """
 
     name: str
     colour: int
     times: Float[np.ndarray, " times"]
+    normal: Points
     size: float
     bodies: tuple[Body, ...]
     traces: tuple[Trace, ...]
     arrows: tuple[Arrow, ...]
     curves: tuple[Curve, ...]
+    note: str = ""
 
 
 class Arena(NamedTuple):
@@ -100,6 +125,13 @@ def distinguished_by_colour(shows: tuple[Show, ...]) -> tuple[Show, ...]:
     return tuple(
         show._replace(traces=tuple(trace._replace(colour=show.colour) for trace in show.traces)) for show in shows
     )
+
+
+def finite(points: Points) -> Points:
+    """Points, those that are not numbers replaced by the last before them."""
+    good = np.all(np.isfinite(points), axis=-1)
+    last = np.maximum.accumulate(np.where(good, np.arange(len(points)), 0))
+    return np.nan_to_num(points[last])
 
 
 def css(colour: int) -> str:

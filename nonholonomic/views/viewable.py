@@ -22,7 +22,7 @@ class Viewable(abc.ABC):
 
     @status_line("drawing")
     def view(self, path: Any = None, others: Sequence[Any] = (), overlaid: bool = False) -> Page:
-        """A page in which the run moves: body, arena, traces, arrows, and curves over time (needs k3d).
+        """A page in which the run moves: body, arena, traces, arrows, and curves over time (needs jupyter-threejs-sage).
 
         It is one file that needs no network; a notebook shows what is returned.
 
@@ -34,12 +34,12 @@ class Viewable(abc.ABC):
 
         **Returns:** a `Page`, with its `html`.
 
-        **Raises:** before anything is drawn: `ModuleNotFoundError` if k3d is not installed, `OSError` if the file cannot be
-        written, `ValueError` for a file of another kind or a batch of runs.
+        **Raises:** before anything is drawn: `ModuleNotFoundError` if jupyter-threejs-sage is not installed, `OSError` if the
+        file cannot be written, `ValueError` for a file of another kind or a batch of runs.
 
         **Example:** `examples/a_page.py`.
         """
-        require_package("k3d", "view", "view")
+        require_package("jupyter_threejs_sage", "view", "view")
         if path is not None:
             require_file(path, "path", ".html", ".htm")
         stages = self.stages(others, overlaid)

@@ -101,7 +101,8 @@ class Dynamics(eqx.Module):
         """The state with sin^2 + cos^2 of the steering angle corrected to 1."""
         first = self.surface.axes + self.heading.axes(self.surface) + 3
         sine, cosine = state[first], state[first + 1]
-        return state.at[first : first + 2].multiply(1.0 / jnp.sqrt(sine * sine + cosine * cosine))
+        unit = state[first : first + 2] * (1.0 / jnp.sqrt(sine * sine + cosine * cosine))
+        return jnp.concatenate([state[:first], unit, state[first + 2 :]])
 
     def inertia(self, direction: Vector, lead: Component, sine: Component, cosine: Component) -> Component:
         """Reduced mass M_w = m cos^2(phi) d.d + J nu^2 sin^2(phi) / l^2 [kg] of the front wheel's speed."""

@@ -21,6 +21,11 @@ from ..model.scene import Scene
 
 #: Reduced mass, relative to its largest, below which the constraints count as having lost rank.
 RANK_LOST = 1e-8
+
+#: The coefficient of friction [1] that no tyre exceeds on a dry road: 0.7 to 1.0 is usual, and 1.8 is that of racing slicks
+#: (Milliken and Milliken, Race Car Vehicle Dynamics (1995), chapter 2).
+MOST_GRIP = 1.8
+
 #: Pull on the ground, relative to the weight, that still counts as round-off.
 CONTACT_ROUND_OFF = 1e-12
 

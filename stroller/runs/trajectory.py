@@ -22,13 +22,9 @@ from ..model.input import Input
 from ..model.scene import Scene
 from .crossings import crossings, watched
 from .quantities import QUANTITIES, table_of_one
-from .ride import CONTACT_ROUND_OFF, RANK_LOST, RideSpec, Stats
+from .ride import CONTACT_ROUND_OFF, MOST_GRIP, RANK_LOST, RideSpec, Stats
 from .steps import Steps, followed
 from .view import as_stages
-
-#: The coefficient of friction [1] that no tyre exceeds on a dry road: 0.7 to 1.0 is usual, and 1.8 is that of racing slicks
-#: (Milliken and Milliken, Race Car Vehicle Dynamics (1995), chapter 2).
-MOST_GRIP = 1.8
 
 
 class Trajectory(eqx.Module, Viewable):

@@ -27,6 +27,7 @@ from nonholonomic.views import (
 )
 
 from ..model.scene import DRIVES
+from .ride import MOST_GRIP
 
 #: Lengths in units of the wheelbase, which is all that the model knows: radius and width of the wheels, and the track.
 RADIUS, WIDTH, TRACK = 0.2, 0.07, 0.8
@@ -101,14 +102,15 @@ def show(run: Any, number: int, name: str) -> Show:
     ahead = read(_integral(given, np.asarray(run.front_speed) / radius))
     rear = wheel(radius, WIDTH * length, (DARK, PALE))
     weight = float(scene.body.mass * scene.gravity)
-    forces = read(run.side_force) * WEIGHT * length / weight
+    forces, scale = read(run.side_force), WEIGHT * length / weight
     contacts = (position + 0.02 * radius * z, position + length * x + 0.02 * radius * z)
     grip = np.asarray(run.grip())[:, : len(run.loaded_axles)]
-    push = read(run.normal_force)[:, None] * WEIGHT * length / weight * z
+    push = read(run.normal_force)[:, None] * z
     return Show(
         name,
         colour,
         times,
+        normal,
         SIZE * length,
         (
             Body("frame", axle, _turning(x, y, z), frame(length, colour)),
@@ -122,11 +124,11 @@ def show(run: Any, number: int, name: str) -> Show:
         ),
         (
             # Above the axle the basket would hide it.
+            Arrow("normal force", axle - 1.4 * half * y, push, "N", scale, VIOLET, 0.035 * length),
+            Arrow("side force, rear", contacts[0], forces[:, :1] * y, "N", scale, GOLD, 0.035 * length, 2.0 * length),
             Arrow(
-                f"normal force ({WEIGHT:g} wheelbase: the weight)", axle - 1.4 * half * y, push, VIOLET, 0.035 * length
+                "side force, front", contacts[1], forces[:, 1:] * left, "N", scale, GOLD, 0.035 * length, 2.0 * length
             ),
-            Arrow("side force, rear (as long)", contacts[0], forces[:, :1] * y, GOLD, 0.035 * length),
-            Arrow("side force, front", contacts[1], forces[:, 1:] * left, GOLD, 0.035 * length),
         ),
         (
             Curve("speed [m/s]", read(run.speed)),
@@ -135,6 +137,17 @@ def show(run: Any, number: int, name: str) -> Show:
             Curve("normal force [N]", read(run.normal_force)),
             Curve("friction that the tyres need [1]", read(np.minimum(grip, DRAWN_GRIP).max(axis=-1))),
         ),
+        grip_warning(run),
+    )
+
+
+def grip_warning(run: Any) -> str:
+    """What to say of a ride that needs more grip than tyres give; nothing of others."""
+    needed = float(np.max(np.asarray(run.grip())[:, : len(run.loaded_axles)]))
+    return (
+        f"needs friction {needed:.2g}, more than any tyre gives: a real stroller would slip"
+        if needed > MOST_GRIP
+        else ""
     )
 
 

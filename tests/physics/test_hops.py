@@ -313,3 +313,18 @@ def test_a_table_starts_on_the_wall():
 def test_what_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make(leine_glocker_top())
+
+
+def test_the_wooden_top_of_the_classroom_climbs_onto_its_stem():
+    """It stands on its stem in the end, faster than it must; the shape and the friction are those of `tippe.presets`."""
+    scene = tippe.presets.classroom()
+    run = tippe.simulate(scene, tippe.Launch.degrees(theta=6, rpm=1900), 4.0, tolerance=1e-10)
+    assert run.theta[-1] > 3.0
+    assert run.contact[-1] == 1
+    assert abs(run.spin[-1]) > steady.inverted_critical_spin(scene)
+    assert run.stats["energy_residual"] < 1e-8 * run.energy[0]
+    # The centre of mass has risen, from R - a to that of the stem, by 10 mm.
+    assert run.energy[-1] < run.energy[0]
+    rise = (run.position[-1] - run.position[0])[2] - float(scene.body.offset) * (run.axis[-1] - run.axis[0])[2]
+    standing = float(scene.body.stem.radius + scene.body.stem.offset) - float(scene.body.radius - scene.body.offset)
+    assert_close(rise, standing, rtol=0.02)

@@ -153,7 +153,7 @@ def test_main_job(tmp_path, capsys):
     assert all(float(columns[-5]) < 1e-11 for columns in audit)
     assert (tmp_path / "rides.png").stat().st_size > 10_000
     page = (tmp_path / "index.html").read_text()
-    assert 'id="snapshot0"' in page
+    assert 'id="floats"' in page
     assert audit[0][-1] in page
     assert f"To see it, open {tmp_path / 'index.html'}" in printed
     with xarray.open_dataset(tmp_path / "rides.h5", engine="h5netcdf") as stored:

@@ -1,17 +1,21 @@
-"""`python -m tippe`."""
+"""`python -m tippe`, and `python -m tippe --paper`."""
 
 import json
 
 import jax
+import numpy as np
 import pytest
 import xarray
 
-from tippe.__main__ import drawn, main, parser
+import tippe
+from tippe import __main__ as job
+from tippe.__main__ import main
+from tippe.papers.tables import drawn, parser
 
-SMALL = ["--theta", "0.1", "0.3", "--eta", "0", "--t1", "12", "--tolerance", "1e-7"]
+SMALL = ["--paper", "--theta", "0.1", "0.3", "--eta", "0", "--t1", "12", "--tolerance", "1e-7"]
 
 
-def test_the_main_job_prints_writes_and_draws(tmp_path, capsys):
+def test_the_papers_tables_are_printed_written_and_drawn(tmp_path, capsys):
     assert main([*SMALL, "--out", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
     assert "Table 1 lost its numbers" in printed
@@ -22,7 +26,7 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys):
     assert printed.rstrip().endswith(f"To see it, open {shown}")
     page = shown.read_text()
     assert "<td>9.98" in page
-    assert 'id="snapshot1"' in page
+    assert 'id="floats"' in page
     assert "data:image/png" in page
     with xarray.open_dataset(tmp_path / "out" / "cylinder.h5", engine="h5netcdf") as data:
         assert data["first_time"].dims == ("theta", "eta")
@@ -35,13 +39,47 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys):
     assert "scene.friction.mu is 0.3 there and 0.2 here" in printed
 
 
+def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rutstam_scene):
+    """Its own scenes fly and change to the stem; these have programs that other tests compile, too."""
+    monkeypatch.setattr(job, "scenes", lambda options: {"plane": rutstam_scene, "cylinder": rutstam_scene})
+    arguments = ["--theta", "6", "18", "--mu", "0.2", "0.3", "--rpm", "1480", "--t1", "8", "--out", str(tmp_path)]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith(
+        "A wooden top: 17.8 g, 40 mm across, a stem 10 mm thick, its centre of mass 1.77 mm below"
+    )
+    assert "I1 / I3 = 0.952 lies between 1 - a / R = 0.911 and 1 + a / R = 1.089, so it can turn over." in printed
+    assert printed.rstrip().endswith(f"To see the top climb onto its stem, open {tmp_path / 'index.html'}")
+    rows = [line.split() for line in printed.splitlines() if line.strip().startswith("18 deg")]
+    run = tippe.simulate(rutstam_scene, tippe.Launch.degrees(18, 1480), 8.0)
+    first = run.t[np.argmax(np.asarray(run.theta) > 0.95 * np.pi)]
+    # A step of the run is up to 0.05 s long.
+    assert [float(row[-1]) for row in rows] == pytest.approx([float(first)] * 2, abs=0.06)
+    with xarray.open_dataset(tmp_path / "plane.h5", engine="h5netcdf") as data:
+        assert data["time"].dims == ("theta", "mu")
+    page = (tmp_path / "index.html").read_text()
+    assert "<td>18 deg</td>" in page
+    assert 'id="floats"' in page
+    assert "data:image/png" in page
+
+
+@pytest.mark.slow
+def test_the_wooden_top_turns_over_in_four_fifths_of_the_launches(tmp_path, capsys):
+    """On the table and in the cylinder; each cell is a number or a word, and the page's top stands on its stem in the end."""
+    assert main(["--out", str(tmp_path)]) == 0
+    for arena in ("plane", "cylinder"):
+        table = tippe.Table.load(tmp_path / f"{arena}.h5")
+        assert np.mean(table.status == "inverted") >= 0.8
+    assert "nan" not in capsys.readouterr().out
+
+
 def test_picture_and_page_share_their_programs(caplog):
     """The page shows a shorter time, and other jobs have another tolerance; neither is compiled anew."""
-    drawn(parser().parse_args(SMALL), 12.0)
+    drawn(parser().parse_args(SMALL[1:]), 12.0)
     # For all threads, which `jax.log_compiles` is not.
     jax.config.update("jax_log_compiles", True)
     try:
-        times, runs = drawn(parser().parse_args([*SMALL, "--tolerance", "1e-6"]), 2.0)
+        times, runs = drawn(parser().parse_args([*SMALL[1:], "--tolerance", "1e-6"]), 2.0)
     finally:
         jax.config.update("jax_log_compiles", False)
     assert runs["plane"].theta.shape == (2, len(times))
@@ -71,6 +109,8 @@ def test_bad_input_is_one_clear_line(arguments, message, capsys, tmp_path):
 
 
 def test_every_option_is_explained():
+    for word in ("[deg]", "revolutions per minute", "--paper", "tippe.presets", "[m/s]"):
+        assert word in job.parser().format_help()
     printed = parser().format_help()
     for word in ("mass [kg]", "cylinder", "[rad/s]", "slip speed", "horizon", "Table 1"):
         assert word in printed

@@ -6,10 +6,11 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require
 
 
 def as_numbers(value: Any) -> Any:
@@ -75,6 +76,37 @@ class Launch(Bounded):
     angular_velocity: tuple[Float[Array, "..."], ...] | None = eqx.field(
         converter=as_numbers, default=None, kw_only=True
     )
+
+    @classmethod
+    def degrees(cls, theta: Any, rpm: Any, *, eta: Any = 0.0, azimuth: Any = 0.0, **others: Any) -> "Launch":
+        """A start in degrees and revolutions per minute.
+
+        **Arguments:**
+
+        - `theta`: angle [deg] from the arena's normal to the axis, in [0, 180].
+        - `rpm`: spin about the axis [revolutions per minute].
+        - `eta`, `azimuth`: as for `Launch`, in degrees.
+        - `others`: `place`, `velocity` and `angular_velocity`, as for `Launch`, in SI units.
+
+        **Returns:** a `Launch`, whose numbers are in SI units.
+
+        **Raises:** `ValueError` for numbers outside these ranges.
+
+        **Example:**
+
+        ```
+        >>> import tippe
+        >>> tippe.Launch.degrees(theta=6, rpm=1800)
+        Launch(theta=0.10472 rad, spin=188.496 rad/s, eta=0 rad, azimuth=0 rad)
+
+        ```
+        """
+        for value, name, largest in ((theta, "theta", 180.0), (eta, "eta", 180.0), (azimuth, "azimuth", None)):
+            least = 0.0 if name == "theta" else None if largest is None else -largest
+            require(value, name, at_least=least, at_most=largest, why="in degrees")
+        require(rpm, "rpm")
+        theta, eta, azimuth = (jnp.radians(as_number(angle)) for angle in (theta, eta, azimuth))
+        return cls(theta, as_number(rpm) * (2.0 * jnp.pi / 60.0), eta, azimuth, **others)
 
     def __check_init__(self):
         allowed = {

@@ -141,7 +141,12 @@ class Scene(Bounded):
     def suspicion(self) -> str | None:
         for name, value in numbers("surface", self.surface, functions=False).items():
             unit = self.surface.units.get(name.removeprefix("surface."), "1")
-            if unit == "m" and isinstance(value, jax.Array) and not is_traced(value) and np.any(value > LARGEST_ARENA):
+            if (
+                unit == "m"
+                and isinstance(value, jax.Array)
+                and not is_traced(value)
+                and np.any(np.asarray(value) > LARGEST_ARENA)
+            ):
                 size = float(np.max(np.asarray(value)))
                 unit = "mm" if size > 10.0 * LARGEST_ARENA else "cm"
                 return f"{name} = {size:g} m is larger than a room: was it in {unit}? There a top moves as on a Plane"

@@ -1,7 +1,7 @@
 """The body: an eccentric sphere whose mass is symmetric about the axis through its two centres."""
 
 from collections.abc import Iterator
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Vector
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require
 
 from .body import AbstractBody, Round
+from .turned import Shape
 
 #: Units in which moments of inertia are given by mistake, in kg m^2.
 INERTIAS = {"kg cm^2": 1e-4, "kg mm^2": 1e-6, "g cm^2": 1e-7, "g mm^2": 1e-9}
@@ -91,6 +92,64 @@ class Top(AbstractBody):
     I1: Float[Array, "..."] = eqx.field(converter=as_number)
     I3: Float[Array, "..."] = eqx.field(converter=as_number)
     stem: Stem | None = None
+
+    @classmethod
+    def turned(
+        cls,
+        radius: Any,
+        density: Any,
+        *,
+        cut: Any,
+        stem_radius: Any,
+        stem_length: Any,
+        hole_radius: Any = 0.0,
+        hole_depth: Any = 0.0,
+    ) -> "Top":
+        """A top turned from one material: a sphere with its cap cut off, a cylindrical stem, and a hole around the stem if any.
+
+        Mass, offset, I1, I3 and the stem follow from the shape in closed form, and can be differentiated by it. The top
+        touches with its sphere or with the half ball at the stem's end. `tippe.steady.group` says whether it turns over.
+
+        **Arguments:** (lengths in metres)
+
+        - `radius`: radius of the sphere.
+        - `density`: density of the material [kg/m^3]: beech 700, acrylic 1180, aluminium 2700.
+        - `cut`: height of the flat above the centre of the sphere, less than `radius`: what lies above it is cut off.
+        - `stem_radius`: radius of the stem, which is a cylinder that ends in a half ball.
+        - `stem_length`: how far the stem stands out above the flat.
+        - `hole_radius`, `hole_depth`: a hole drilled from the flat around the stem, which stands on its bottom.
+
+        **Returns:** a `Top`.
+
+        **Raises:** `ValueError` for a shape that cannot be turned, whose centre of mass lies above the centre of the sphere, or
+        whose rim would touch the table before its stem.
+
+        The formulas are the integrals over thin discs (Landau and Lifshitz, Mechanics, section 32), in `tippe/model/turned.py`.
+
+        **Example:** a beech ball 4 cm across, drilled around a stem 1 cm thick.
+
+        ```
+        >>> import tippe
+        >>> shape = {"cut": 0.015, "stem_radius": 0.005, "stem_length": 0.012, "hole_radius": 0.012, "hole_depth": 0.020}
+        >>> top = tippe.Top.turned(0.020, 700.0, **shape)
+        >>> print(f"{1e3 * top.mass:.1f} g, centre of mass {1e3 * top.offset:.2f} mm below the centre")
+        17.8 g, centre of mass 1.77 mm below the centre
+        >>> tippe.steady.group(top)
+        'II'
+
+        ```
+        """
+        require(density, "density", above=0.0)
+        lengths = {"radius": radius, "cut": cut, "stem_radius": stem_radius, "stem_length": stem_length}
+        shape = Shape.checked(lengths | {"hole_radius": hole_radius, "hole_depth": hole_depth})
+        moments = shape.moments
+        offset = -moments.first / moments.volume
+        why = "the centre of mass lies above the centre of the sphere: shorten the stem, or drill a hole around it"
+        require(offset, "offset", at_least=0.0, why=why)
+        transverse = moments.transverse - moments.volume * offset**2
+        stem = Stem(shape.stem_radius, shape.tip + offset)
+        density = as_number(density)
+        return cls(density * moments.volume, shape.radius, offset, density * transverse, density * moments.axial, stem)
 
     def __check_init__(self):
         if self.stem is not None and not isinstance(self.stem, Stem):

@@ -36,15 +36,15 @@ def draw_launches(panels: list[Panel], angle: float) -> Any:
     for drawing, panel in zip(drawings, panels, strict=True):
         colours = colormaps["viridis"](np.linspace(0.0, 0.92, len(panel.starts)))
         for theta, start, end, colour in zip(panel.theta, panel.starts, panel.ends, colours, strict=True):
-            drawing.plot(panel.times, theta, color=colour, linewidth=0.9, label=f"{start:.4g}")
+            drawing.plot(panel.times, theta, color=colour, linewidth=1.2, label=f"{start:.4g}")
             if np.isfinite(end):
                 drawing.plot(
                     end,
                     np.interp(end, panel.times, theta),
                     "o",
                     color=colour,
-                    markersize=5,
-                    markeredgecolor="white",
+                    markersize=9,
+                    markeredgecolor="black",
                     zorder=3,
                 )
         drawing.axhline(angle, color="0.5", linewidth=0.8, linestyle="--")

@@ -37,14 +37,18 @@ TURN_PER_FRAME = 0.4
 MOST_FRAMES = 12_000
 LEAST_FRAMES = 400
 
-#: Lengths in units of the radius: of the axis as it is drawn from the centre, and of the arrows for the weight and for the
-#: longest slip.
-AXIS, WEIGHT, SLIP = 1.6, 1.5, 3.0
+#: Lengths in units of the radius: of the axis as it is drawn from the centre, and of the arrows for the weight, for the
+#: longest slip, and for the angular velocity and momentum at the start.
+AXIS, WEIGHT, SLIP, SPIN = 1.6, 1.5, 2.0, 2.5
+
+#: How far beside the contact the normal force is drawn, in units of the radius.
+BESIDE = 1.35
 
 #: Slips above this quantile are not drawn longer: the first moments would hide the rest.
 COMMON_SLIP = 0.9
 
 GREEN, VIOLET, BLUE, GOLD = 0x1F8A4C, 0x7B4FA3, 0x1B6CA8, 0xE0A100
+BLACK, TEAL, PINK = 0x23262B, 0x008C95, 0xC2378E
 
 
 class Motion(NamedTuple):
@@ -61,6 +65,8 @@ class Motion(NamedTuple):
     energy: Float[Array, " times"]
     jellett: Float[Array, " times"]
     normal_force: Float[Array, " times"]
+    angular_velocity: Float[Array, "times 3"]
+    angular_momentum: Float[Array, "times 3"]
 
     @classmethod
     def of(cls, run: Any) -> "Motion":
@@ -72,6 +78,8 @@ class Motion(NamedTuple):
         if isinstance(body, Top) and body.stem is not None:
             stem = position + (body.stem.offset - body.offset) * axis - body.stem.radius * normal
             contact = jnp.where((run.contact == 1)[:, None], stem, contact)
+        turning = run.angular_velocity
+        along = jnp.sum(turning * axis, axis=-1, keepdims=True)
         return cls(
             run.t,
             position,
@@ -84,6 +92,8 @@ class Motion(NamedTuple):
             run.energy,
             run.jellett,
             run.normal_force,
+            turning,
+            body.I1 * turning + (body.I3 - body.I1) * along * axis,
         )
 
 
@@ -118,29 +128,19 @@ def show(scene: Scene, motion: Motion, number: int, name: str) -> Show:
     body, colour = scene.body, COLOURS[number % len(COLOURS)]
     motion = Motion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
     radius, weight = float(body.size), float(body.mass * scene.gravity)
-    tip = AXIS * radius
-    speed = np.linalg.norm(motion.slip, axis=-1)
-    longest = max(float(np.quantile(speed, COMMON_SLIP)), 1e-12)
-    slip = motion.slip * (SLIP * radius / np.maximum(speed, longest))[:, None]
-    turning = turned(motion.rotation)
-    force = (WEIGHT * radius / weight * motion.normal_force)[:, None] * motion.normal
     lifted = motion.contact + 0.02 * radius * motion.normal
-    # Within the sphere it could not be seen.
-    beside = lifted + 1.35 * radius * aside(motion.normal)
     return Show(
         name,
         colour,
         motion.times,
+        motion.normal,
         radius,
-        (Body("top", motion.position, turning, meshes(body, colour)),),
+        (Body("top", motion.position, turned(motion.rotation), meshes(body, colour)),),
         (
             Trace("contact", lifted, GREEN, 0.06 * radius),
-            Trace("path of the axis", tip * motion.axis, BLUE, 0.012 * radius, about=motion.position),
+            Trace("path of the axis", AXIS * radius * motion.axis, BLUE, 0.012 * radius, motion.position, False),
         ),
-        (
-            Arrow(f"normal force ({WEIGHT:g} R: the weight)", beside, force, VIOLET, 0.05 * radius),
-            Arrow(f"slip ({SLIP:g} R: {longest:.2g} m/s or more)", lifted, slip, GOLD, 0.05 * radius),
-        ),
+        arrows(motion, float(body.offset) if isinstance(body, Top) else 0.0, radius, weight),
         (
             Curve("θ, normal to axis [rad]", motion.theta),
             Curve("energy [J]", motion.energy),
@@ -148,6 +148,32 @@ def show(scene: Scene, motion: Motion, number: int, name: str) -> Show:
             Curve("normal force [N]", motion.normal_force),
         ),
     )
+
+
+def arrows(motion: Motion, offset: float, radius: float, weight: float) -> tuple[Arrow, ...]:
+    """Forces and slip at the contact, weight, angular velocity and momentum at the centre of mass."""
+    lifted = motion.contact + 0.02 * radius * motion.normal
+    # Within the sphere it could not be seen.
+    beside = lifted + BESIDE * radius * np.asarray(aside(motion.normal))
+    centre = motion.position - offset * motion.axis
+    speed = np.linalg.norm(motion.slip, axis=-1)
+    common = max(float(np.quantile(speed, COMMON_SLIP)), 1e-12)
+    down = np.broadcast_to([0.0, 0.0, -weight], centre.shape)
+    push, width = motion.normal_force[:, None] * motion.normal, 0.05 * radius
+    found = [
+        Arrow("normal force", beside, push, "N", WEIGHT * radius / weight, VIOLET, width),
+        Arrow("slip", lifted, motion.slip, "m/s", SLIP * radius / common, GOLD, width, SLIP * radius),
+        Arrow(
+            "weight at the centre of mass", centre, down, "N", WEIGHT * radius / weight, BLACK, width, None, True, False
+        ),
+    ]
+    for name, vector, unit, colour in (
+        ("angular velocity", motion.angular_velocity, "rad/s", TEAL),
+        ("angular momentum", motion.angular_momentum, "kg m²/s", PINK),
+    ):
+        scale = SPIN * radius / max(float(np.linalg.norm(vector, axis=-1).max()), 1e-300)
+        found.append(Arrow(name, centre, vector, unit, scale, colour, width, None, True, False))
+    return tuple(found)
 
 
 def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
@@ -165,11 +191,12 @@ def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
     return found
 
 
-def aside(normal: Float[np.ndarray, "times 3"]) -> Float[np.ndarray, "times 3"]:
+def aside(normal: Float[Array, "times 3"]) -> Float[Array, "times 3"]:
     """Unit vectors across the normal, towards x, or towards y where the normal is along x."""
-    towards = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    across = towards - np.sum(towards * normal, axis=-1, keepdims=True) * normal
-    return across / np.linalg.norm(across, axis=-1, keepdims=True)
+    x, y = jnp.array([[1.0, 0.0, 0.0]]), jnp.array([[0.0, 1.0, 0.0]])
+    towards = jnp.where(jnp.abs(normal[:, :1]) < 0.9, x, y)
+    across = towards - jnp.sum(towards * normal, axis=-1, keepdims=True) * normal
+    return across / jnp.linalg.norm(across, axis=-1, keepdims=True)
 
 
 def meshes(body: AbstractBody, colour: int) -> tuple[Mesh, ...]:
@@ -177,11 +204,22 @@ def meshes(body: AbstractBody, colour: int) -> tuple[Mesh, ...]:
     if not isinstance(body, Top):
         return striped(profile(body), (colour, PALE))
     radius = float(body.radius)
-    sphere = ball(radius, (colour, PALE))
     if body.stem is None:
+        sphere = ball(radius, (colour, PALE))
         return (*sphere, rod(0.10 * radius, 0.9 * radius, AXIS * radius - 0.16 * radius, 0.16 * radius, DARK))
     knob, end = float(body.stem.radius), float(body.stem.offset - body.offset)
-    return (*sphere, rod(0.8 * knob, 0.0, end, knob, DARK))
+    return (*striped(truncated(radius, knob, end), (colour, PALE)), rod(0.999 * knob, 0.0, end, knob, DARK))
+
+
+def truncated(radius: float, knob: float, end: float) -> Float[np.ndarray, "points 2"]:
+    """The meridian of a ball whose cap is cut off, about its centre, from the flat down.
+
+    A top does not say where it was cut; its rim must lie above what touches the arena before the stem does.
+    """
+    lowest = min(radius * (radius - knob) / end, 0.9 * radius)
+    polar = np.linspace(np.arccos((radius - 0.8 * (radius - lowest)) / radius), np.pi, 25)
+    ball = radius * np.stack([np.sin(polar), np.cos(polar)], axis=-1)
+    return np.concatenate([[[0.0, ball[0, 1]]], ball])
 
 
 def profile(body: AbstractBody) -> Float[np.ndarray, "points 2"]:

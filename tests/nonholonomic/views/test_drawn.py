@@ -1,5 +1,10 @@
 """Arenas, animations and pages of what is no run: a ball that somebody rolls along a line."""
 
+import base64
+import json
+import re
+import zlib
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -62,10 +67,11 @@ def rolling(surface=None) -> Stage:
         "a ball",
         0xC8412B,
         times,
+        np.tile([0.0, 0.0, 1.0], (41, 1)),
         radius,
         (body,),
         (Trace("path", foot, 0x1F8A4C, 0.01),),
-        (Arrow("up", foot, np.tile([0.0, 0.0, radius], (41, 1)), 0x7B4FA3, 0.01),),
+        (Arrow("up", foot, np.tile([0.0, 0.0, 2.0], (41, 1)), "N", radius, 0x7B4FA3, 0.01, 1.5 * radius),),
         (Curve("x [m]", position[:, 0]), Curve("z [m]", position[:, 2])),
     )
     ground = arena(Plane(), foot, np.array([0.0, 0.0, 1.0]), 0.2, 0.1)
@@ -105,16 +111,44 @@ def test_curves_are_drawn_and_what_is_constant_is_flat():
     assert high - low > 1e-5
 
 
-def test_a_page_leaves_no_widgets_behind():
-    """A notebook would keep each of them, with all its numbers."""
-    import comm
-    from ipywidgets.widgets.widget import _instances
+def test_an_arrow_is_drawn_by_its_scale_up_to_its_limit():
+    (arrow,) = rolling().shows[0].arrows
+    np.testing.assert_allclose(arrow.drawn, np.tile([0.0, 0.0, 0.15], (41, 1)), rtol=1e-14)
+    np.testing.assert_allclose(arrow._replace(limit=None).drawn, np.tile([0.0, 0.0, 0.2], (41, 1)), rtol=1e-14)
+    assert not np.any(arrow._replace(vector=0.0 * arrow.vector).drawn)
 
-    told, before, opened = comm.create_comm, set(_instances), []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(comm, "create_comm", lambda **options: opened.append(options) or told(**options))
-        assert "snapshot0" in page([rolling()], "a ball").html
-    assert (set(_instances), opened, comm.create_comm) == (before, [], told)
+
+def test_the_front_of_an_arena_is_towards_the_room():
+    """Inside and outside of a cylinder: triangles turn counterclockwise as seen from the side of the normal."""
+    point = np.array([[0.0, 0.0, -0.5]])
+    for normal in (np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])):
+        vertices, triangles, _ = arena(Cylinder(0.5), point, normal, 0.1, 0.03).mesh
+        corners = vertices[triangles]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert np.all(across @ normal > 0.0)
+
+
+def test_a_page_holds_its_numbers_in_single_precision():
+    """Floats byte plane by byte plane, whole numbers as differences, each array where the facts say; equal arrays once."""
+    stage, html = rolling(), page([rolling(), rolling()], "a ball").html
+    data = {name: re.search(rf'id="{name}">([^<]*)<', html).group(1) for name in ("facts", "floats", "whole")}
+    facts = json.loads(data["facts"])
+    planes, steps = (zlib.decompress(base64.b64decode(data[name])) for name in ("floats", "whole"))
+    floats = np.frombuffer(planes, np.uint8).reshape(4, -1).T.copy().view("<f4").ravel()
+    (show,) = stage.shows
+    fact = facts["stages"][0]["runs"][0]
+    assert fact == facts["stages"][1]["runs"][0]
+    for (begin, length), values in (
+        (fact["times"], show.times),
+        (fact["bodies"][0]["turning"], show.bodies[0].turning),
+        (fact["arrows"][0]["vector"], show.arrows[0].vector),
+    ):
+        np.testing.assert_allclose(floats[begin : begin + length], values.ravel(), rtol=1e-6, atol=1e-12)
+    begin, length = facts["stages"][0]["arena"]["triangles"]
+    triangles = np.cumsum(np.frombuffer(steps, "<i4")[begin : begin + length])
+    np.testing.assert_array_equal(triangles, stage.arena.mesh.triangles.ravel())
+    # The page of two balls, with three.js.
+    assert len(html) < 4e5
 
 
 def test_a_page_without_motion_has_no_script(tmp_path):

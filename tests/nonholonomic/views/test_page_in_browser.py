@@ -59,7 +59,7 @@ def browser(stages, tmp_path_factory):
         driver.execute_cdp_cmd("Network.emulateNetworkConditions", off)
         path = tmp_path_factory.mktemp("page") / "runs.html"
         # Small pictures, as a processor has to draw them here.
-        page(stages, "Both models", height=100).save(path)
+        page(stages, "Both models", height=100, autoplay=False).save(path)
         driver.get(path.as_uri())
         wait(driver, "return !!window.player")
         yield driver
@@ -135,7 +135,7 @@ def test_the_camera_keeps_all_runs_of_a_place_in_sight(browser):
         browser.execute_script(f"player.seek({at!r})")
         camera, target = np.array(
             browser.execute_script(
-                "const { camera, controls } = player.stages[1].world;"
+                "const { camera, controls } = player.stages[1];"
                 "return [camera.position.toArray(), controls.target.toArray()]"
             )
         )
@@ -144,6 +144,90 @@ def test_the_camera_keeps_all_runs_of_a_place_in_sight(browser):
             matrix = browser.execute_script(f"return player.matrix(1, {run}, 0)")
             away = np.array(matrix).reshape(4, 4)[3, :3] - camera
             assert away @ ahead / np.linalg.norm(away) > np.cos(np.radians(ANGLE / 2.0))
+
+
+CENTRES = """
+return [...document.querySelectorAll('#controls button, #controls input, #controls select, .buttons button, .chip')]
+  .map((one) => { one.scrollIntoView({ block: 'center' }); const box = one.getBoundingClientRect();
+    const seen = document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2);
+    return one === seen || one.contains(seen) || seen?.tagName || 'nothing'; })
+"""
+
+
+def test_controls_lie_under_nothing_and_nothing_overflows(browser):
+    """At 500 px, in the page itself and in the frame of a notebook or of the gallery."""
+    for inside in (False, True):
+        if inside:
+            browser.execute_script(
+                "const frame = document.createElement('iframe'); frame.id = 'frame'; frame.src = location.href;"
+                "frame.style = 'position: fixed; inset: 0; width: 480px; height: 490px; z-index: 99; background: #fff';"
+                "document.body.append(frame)"
+            )
+            browser.switch_to.frame("frame")
+            wait(browser, "return !!window.player")
+        found = browser.execute_script(CENTRES)
+        assert len(found) > 15
+        assert set(found) == {True}
+        assert browser.execute_script("return document.documentElement.scrollWidth <= innerWidth")
+    browser.switch_to.default_content()
+    browser.execute_script("document.getElementById('frame').remove(); scrollTo(0, 0)")
+
+
+def test_the_camera_never_goes_under_the_floor(browser):
+    """Wherever it is put, it is drawn from over the tangent plane at the body, less the body's size."""
+    below, size = browser.execute_script(
+        "const s = player.stages[0], [x, y, z] = s.focus; s.camera.position.set(x, y - 0.05, z - 1); s.render();"
+        "const away = s.camera.position.clone().sub(s.controls.target), n = s.runs[0].normal;"
+        "const over = away.x * n[0] + away.y * n[1] + away.z * n[2]; s.reset(); s.render(); return [over, s.size]"
+    )
+    assert below > -size
+
+
+def test_arrows_are_labelled_in_their_units_and_switched_off(browser, top):
+    browser.execute_script("player.seek(0.3)")
+    chip = browser.find_elements("css selector", "figure:first-child .chip")[2]
+    assert chip.text == f"normal force {float(top.at([0.3]).normal_force[0]):.3g} N"
+    label = (
+        "return [...document.querySelectorAll('figure:first-child .force')]"
+        ".filter((one) => one.style.display !== 'none').length"
+    )
+    shown = browser.execute_script(label)
+    browser.execute_script("arguments[0].click()", chip)
+    assert browser.execute_script(label) == shown - 1
+    browser.execute_script("arguments[0].click()", chip)
+
+
+def test_keys_move_time_and_a_click_on_a_curve_seeks(browser):
+    from selenium.webdriver import ActionChains, Keys
+
+    set_speed(browser, 0.5)
+    browser.execute_script("document.activeElement.blur(); player.seek(0.2)")
+    ActionChains(browser).send_keys(Keys.ARROW_RIGHT).perform()
+    assert browser.execute_script("return player.time()") == pytest.approx(0.22)
+    ActionChains(browser).send_keys(Keys.END).perform()
+    assert browser.execute_script("return player.time()") == 1.0
+    canvas = browser.find_element("css selector", ".strip canvas")
+    browser.execute_script("arguments[0].scrollIntoView({ block: 'center' })", canvas)
+    ActionChains(browser).move_to_element(canvas).click().perform()
+    # The middle of the canvas, whose axis begins at 58 and ends 4 pixels before its edge.
+    width = canvas.size["width"]
+    assert browser.execute_script("return player.time()") == pytest.approx((width / 2 - 58) / (width - 62), abs=0.01)
+
+
+def test_a_run_is_replaced_while_the_page_is_open(browser, top):
+    """As a live simulation does it: other times, poses and curves in the same stage."""
+    before = browser.execute_script("return player.duration()")
+    browser.execute_script(
+        "const run = player.stages[0].fact.runs[0];"
+        "window.kept = { times: run.times, bodies: run.bodies.map((one) => ({ ...one })) };"
+        "player.setRun(0, 0, { times: new Float64Array([0, 2]), bodies: [{ position: new Float32Array([0, 0, 0, 1, 2, 3]),"
+        "turning: new Float32Array([0, 0, 0, 1, 0, 0, 0, 1]) }] })"
+    )
+    assert browser.execute_script("return player.duration()") == 2.0
+    (pose,) = poses(browser, 1.0, 0)
+    np.testing.assert_allclose(pose[:3, 3], [0.5, 1.0, 1.5], atol=SINGLE)
+    browser.execute_script("player.setRun(0, 0, window.kept)")
+    assert browser.execute_script("return player.duration()") == before
 
 
 def test_the_slider_sets_the_time(browser):

@@ -1,0 +1,14 @@
+"""Pages in which sliders simulate anew, in the browser, with equations that are written from their jaxprs."""
+
+from .frame import Frame as Frame
+from .frame import quaternion as quaternion
+from .javascript import javascript as javascript
+from .live import Answer as Answer
+from .live import LiveRun as LiveRun
+from .live import Summary as Summary
+from .live import live_page as live_page
+from .live import programs as programs
+from .simulator import Simulator as Simulator
+from .slider import Slider as Slider
+from .slider import ends_of as ends_of
+from .slider import sliders_of as sliders_of

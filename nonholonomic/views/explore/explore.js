@@ -1,0 +1,124 @@
+// Sliders that simulate anew while they move: the answer in words, the run for the player, the map, the page's address.
+"use strict";
+(async () => {
+  const { facts, answer, motion, allowed } = window.live, { sliders, words, layout } = facts;
+  const [asks, moves] = [integrator(answer), integrator(motion)];
+  const box = document.getElementById("explore"), result = document.getElementById("result");
+  const element = (kind, parent, properties = {}) => parent.appendChild(Object.assign(document.createElement(kind), properties));
+  const initial = sliders.map((slider) => slider.value);
+  let values = [...initial], player = null, median = [];
+
+  const digits = (number, count = 4) => !Number.isFinite(number) ? "–" : number === 0 ? "0"
+    : Math.abs(number) < 1e-3 || Math.abs(number) >= 1e5 ? number.toExponential(count - 1) : number.toPrecision(count);
+  const knobs = sliders.map((slider, k) => {
+    const label = element("label", document.getElementById("knobs")), title = element("span", label, { textContent: slider.label });
+    const shown = element("output", label);
+    const input = element("input", label, { type: "range", min: 0, max: 1000, step: 1, name: slider.name });
+    input.addEventListener("input", () => {
+      const part = Number(input.value) / 1000;
+      set(values.map((value, j) => (j === k ? slider.low + part * (slider.high - slider.low) : value)), input);
+    });
+    return { input, shown, title };
+  });
+
+  // The run as the player takes it, in so many frames.
+  function recorded(most) {
+    const run = moves.trajectory(values, "frame"), first = run.read([0])[0];
+    const frames = Math.round(Math.min(most, Math.max(300, (run.end * first[first.length - 1]) / 0.4)));
+    const times = Float64Array.from({ length: frames }, (_, k) => (run.end * k) / (frames - 1)), rows = run.read(times);
+    let column = 0;
+    const take = (width) => {
+      const found = new Float64Array(width * frames);
+      rows.forEach((row, k) => { for (let c = 0; c < width; c++) found[width * k + c] = row[column + c]; });
+      column += width;
+      return found;
+    };
+    const list = (count, make) => Array.from({ length: count }, (_, k) => make(k));
+    return {
+      times,
+      normal: take(3),
+      bodies: list(layout.bodies, () => ({ position: take(3), turning: take(4) })),
+      traces: list(layout.traces.length, (k) => ({ points: take(3), about: layout.traces[k] ? take(3) : null })),
+      arrows: list(layout.arrows, () => ({ start: take(3), vector: take(3) })),
+      curves: list(layout.curves, () => ({ values: take(1) })),
+    };
+  }
+
+  function tell(outcome, run, took) {
+    const [status, found] = outcome, word = (words[status] || "illegal").replace(/_/g, " ");
+    const rows = facts.summaries.map(({ label, unit, curve }) => {
+      const all = run.curves[curve].values, [begin, end] = [all[0], all[all.length - 1]];
+      const drift = Math.max(...all.map((one) => Math.abs(one - begin))) / Math.abs(begin);
+      if (drift < 1e-5) return `<dt>${label}</dt><dd>${digits(begin)} ${unit}</dd><dt></dt><dd>constant to ${drift.toExponential(0)}</dd>`;
+      return `<dt>${label}</dt><dd>${digits(begin)} → ${digits(end)} ${unit}</dd>`;
+    });
+    const big = Number.isFinite(found) ? `${digits(found)} ${facts.answer.unit}` : word;
+    result.innerHTML = `<span>${facts.answer.label}</span><strong>${big}</strong>` +
+      `<span class="word">${Number.isFinite(found) ? word : "&nbsp;"}</span><dl>${rows.join("")}</dl>`;
+    median = [...median, took].slice(-51);
+    const middle = [...median].sort((a, b) => a - b)[median.length >> 1];
+    document.getElementById("timing").textContent = `Integrated in your browser in ${middle.toFixed(1)} ms, by the equations and the method of the tables.`;
+  }
+
+  // Simulates what the sliders say: `most` frames, fewer while a knob moves.
+  function simulate(most) {
+    const began = performance.now();
+    if (!allowed(values, [])[0]) {
+      result.innerHTML = "<strong>not possible</strong><span>These numbers do not fit together: there is no such top or arena.</span>";
+      return;
+    }
+    asks.run(values);
+    const outcome = asks.read("outcome", values), took = performance.now() - began;
+    const run = recorded(most);
+    tell(outcome, run, took);
+    if (player) player.setRun(0, 0, run);
+    live.outcome = { status: words[outcome[0]], value: outcome[1], end: run.times[run.times.length - 1] };
+  }
+
+  let waiting = false, later = 0;
+  function set(wanted, source = null) {
+    values = wanted.map((value, k) => Math.min(sliders[k].high, Math.max(sliders[k].low, value)));
+    knobs.forEach(({ input, shown }, k) => {
+      const { low, high, unit } = sliders[k];
+      if (input !== source) input.value = (1000 * (values[k] - low)) / (high - low);
+      shown.textContent = `${digits(values[k], 3)} ${unit}`;
+      input.setAttribute("aria-valuetext", shown.textContent);
+    });
+    map.update(values);
+    clearTimeout(later);
+    later = setTimeout(() => { simulate(3000); remember(); }, 150);
+    if (waiting) return;
+    waiting = true;
+    requestAnimationFrame(() => { waiting = false; simulate(400); });
+  }
+
+  // The page's address names the sliders, so that a copied link opens the same run.
+  const short = (value) => String(Number(value.toPrecision(8)));
+  function remember() {
+    const address = values.every((value, k) => value === initial[k]) ? "" : new URLSearchParams(sliders.map((slider, k) => [slider.name, short(values[k])]));
+    // A page within a page may have no address to be changed.
+    try { history.replaceState(null, "", `#${address}`); } catch (error) { /* It is only not linkable. */ }
+  }
+  function fromAddress() {
+    const named = new URLSearchParams(location.hash.slice(1));
+    return sliders.map((slider) => {
+      const value = named.has(slider.name) ? Number(named.get(slider.name)) : NaN;
+      return Number.isFinite(value) ? value : slider.value;
+    });
+  }
+
+  const map = makeMap(document.getElementById("map"), window.live, integrator, (wanted) => set(wanted));
+  const reset = () => set([...initial]);
+  document.getElementById("reset").addEventListener("click", reset);
+  document.addEventListener("keydown", (event) => {
+    if (event.key === "r" && !event.ctrlKey && !event.metaKey && !event.altKey) reset();
+  });
+  window.addEventListener("hashchange", () => set(fromAddress()));
+  Object.assign(live, { set, map, values: () => values, simulate, asks, moves, player: () => player });
+  set(fromAddress());
+  if (window.views) {
+    player = await window.views.ready;
+    simulate(3000);
+  }
+  live.ready = true;
+})();

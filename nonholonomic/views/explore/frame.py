@@ -1,0 +1,56 @@
+"""What a page shows at one time of a run, as the player takes it (`player.js`)."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Three = Float[Array, "3"]
+
+
+class Frame(NamedTuple):
+    """One moment of a run; bodies, traces, arrows and curves in the order of the `Show` that the page has been made with.
+
+    - `normal`: of the arena, into the room; `bodies`: place [m] and quaternion (x, y, z, w) of each.
+    - `traces`: the point of each [m], and the point that it is relative to, or `None`.
+    - `arrows`: start [m] and vector of each, in its unit; `curves`: a number for each.
+    - `turning_rate`: how fast the fastest part turns [rad/s], which says how many frames a run needs.
+    """
+
+    normal: Three
+    bodies: tuple[tuple[Three, Float[Array, "4"]], ...]
+    traces: tuple[tuple[Three, Three | None], ...]
+    arrows: tuple[tuple[Three, Three], ...]
+    curves: tuple[Float[Array, ""], ...]
+    turning_rate: Float[Array, ""]
+
+    def layout(self) -> dict[str, Any]:
+        """How many there are of each kind, for those who read the numbers one after another."""
+        return {
+            "bodies": len(self.bodies),
+            "traces": [about is not None for _, about in self.traces],
+            "arrows": len(self.arrows),
+            "curves": len(self.curves),
+        }
+
+
+def quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:
+    """The quaternion (x, y, z, w) of a rotation matrix, from its largest component (Shepperd 1978)."""
+    m, trace = rotation, rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
+    # Four times the products of the quaternion's components: a row for each.
+    skew = (m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
+    even = (m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1])
+    squares = [1.0 - trace + 2.0 * m[k, k] for k in range(3)]
+    rows = jnp.stack(
+        [
+            jnp.stack([squares[0], even[0], even[1], skew[0]]),
+            jnp.stack([even[0], squares[1], even[2], skew[1]]),
+            jnp.stack([even[1], even[2], squares[2], skew[2]]),
+            jnp.stack([*skew, 1.0 + trace]),
+        ]
+    )
+    best = rows[0]
+    for k in range(1, 4):
+        # The first k that were compared left their largest in `best`.
+        best = jnp.where(rows[k, k] > jnp.max(jnp.stack([rows[j, j] for j in range(k)])), rows[k], best)
+    return best / jnp.sqrt(jnp.sum(best * best))

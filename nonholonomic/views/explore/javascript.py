@@ -1,0 +1,391 @@
+"""A writer of JavaScript: it turns a function that JAX can trace into a JavaScript function of the same numbers.
+
+The function's jaxpr is written element by element: an array becomes as many scalars as it has elements. Slices, stacks and the
+like then cost nothing, and elements that no result needs are left out. Loops and branches that depend on numbers stay loops and
+branches. Of the packages that read jaxprs none writes JavaScript.
+"""
+
+import functools
+import itertools
+import math
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Literal
+
+#: A number: of Python where it is known, else the name or text that stands for it in JavaScript. A value is an array of them.
+Number = str | float
+Value = np.ndarray
+Values = list[Value]
+
+#: JavaScript for what is done element by element.
+_MATH = "abs sqrt cbrt sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp expm1 log log1p sign floor ceil"
+_PAIRS = {"add": "+", "add_any": "+", "sub": "-", "mul": "*", "div": "/", "rem": "%", "eq": "==", "ne": "!=", "lt": "<"}
+_PAIRS |= {"le": "<=", "gt": ">", "ge": ">=", "and": "&", "or": "|", "xor": "^"}
+ELEMENTWISE = {name: f"Math.{name}({{}})" for name in _MATH.split()}
+ELEMENTWISE |= {name: f"{{}} {sign} {{}}" for name, sign in _PAIRS.items()}
+ELEMENTWISE |= {name: f"Math.{name}({{}}, {{}})" for name in ("max", "min", "pow", "atan2")}
+ELEMENTWISE |= {"neg": "-{}", "square": "{0} * {0}", "rsqrt": "1 / Math.sqrt({})", "exp2": "Math.pow(2, {})"}
+ELEMENTWISE |= {"clamp": "Math.min(Math.max({1}, {0}), {2})", "logistic": "1 / (1 + Math.exp(-{}))"}
+ELEMENTWISE |= {"is_finite": "Number.isFinite({})"}
+CHOICE = "{0} ? {2} : {1}"
+
+#: What of it is worked out in Python where all numbers are known: indices, mostly.
+KNOWN: dict[str, Callable[..., Number]] = {
+    name: getattr(operator, name) for name in ("add", "sub", "mul", "lt", "le", "gt", "ge", "eq", "ne")
+}
+KNOWN |= {"max": max, "min": min, "clamp": lambda low, value, high: min(max(value, low), high)}
+KNOWN |= {CHOICE: lambda which, no, yes: yes if which else no}
+
+#: What takes numbers from one place to another; with NumPy where JAX would compile a program for each.
+MOVES: dict[str, Callable[..., Any]] = {
+    "reshape": lambda x, new_sizes, **_: x.reshape(new_sizes),
+    "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
+    "concatenate": lambda *parts, dimension: np.concatenate(parts, dimension),
+    "stack": lambda *parts, axis=0, **_: np.stack(parts, axis),
+    "unstack": lambda x, axis=0, **_: _rows(x, axis),
+    "slice": lambda x, start_indices, limit_indices, strides: x[
+        tuple(map(slice, start_indices, limit_indices, strides or (1,) * x.ndim))
+    ],
+    "broadcast_in_dim": lambda x, shape, broadcast_dimensions, **_: np.broadcast_to(
+        np.expand_dims(x, [k for k in range(len(shape)) if k not in broadcast_dimensions]), shape
+    ),
+}
+
+#: The same, with places that are numbers too: which of the operands they are.
+INDEXED = {"dynamic_slice": slice(1, None), "dynamic_update_slice": slice(2, None), "gather": slice(1, 2)}
+INDEXED |= {"scatter": slice(1, 2)} | {name: slice(0) for name in ("pad", "split", "transpose", "rev")}
+
+SAME = ("stop_gradient", "optimization_barrier", "copy", "copy_p", "reduce_precision")
+REDUCTIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"}
+REDUCTIONS |= {"reduce_and": "and", "reduce_or": "or"}
+
+#: Loops that are no longer are written out.
+WRITTEN_OUT = 16
+
+#: Stands among the names for the way out of a loop.
+LEAVES = "break"
+
+
+def javascript(name: str, function: Callable[..., Any], *arguments: Any) -> str:
+    """A function in JavaScript.
+
+    **Arguments:**
+
+    - `name`: of the function in JavaScript.
+    - `function`: what JAX can trace.
+    - `arguments`: examples of its arguments, arrays or trees of arrays.
+
+    **Returns:** the text of a function that takes a list of numbers for each argument, the elements of its leaves one after
+    another, and a list into which it writes those of the result, and which it returns.
+
+    **Raises:** `ValueError` for a primitive of JAX that it cannot write.
+
+    **Example:**
+
+    ```
+    >>> import jax.numpy as jnp
+    >>> from nonholonomic.views.explore import javascript
+    >>> print(javascript("turn", lambda x: jnp.stack([-x[1], x[0] ** 2]), jnp.zeros(2)))
+    function turn(a0, out) {
+      const v0 = a0[0];
+      const v1 = a0[1];
+      const v2 = -v1;
+      const v3 = v0 * v0;
+      out[0] = v2;
+      out[1] = v3;
+      return out;
+    }
+
+    ```
+    """
+    closed = jax.make_jaxpr(function)(*arguments)
+    block, values = _Block(itertools.count(), {}), []
+    for number, argument in enumerate(arguments):
+        names = (f"a{number}[{place}]" for place in itertools.count())
+        shapes = [np.zeros(leaf.shape) for leaf in jax.tree.leaves(argument)]
+        values += [_map(lambda _, names=names: block.name(next(names)), shape) for shape in shapes]
+    results = _flat(block.call(closed, values))
+    lines = [
+        *block.lines(results),
+        *(f"out[{k}] = {_text(number)};" for k, number in enumerate(results)),
+        "return out;",
+    ]
+    heads = [*(f"a{number}" for number in range(len(arguments))), "out"]
+    return f"function {name}({', '.join(heads)}) {{\n" + "\n".join(f"  {line}" for line in lines) + "\n}\n"
+
+
+def _text(number: Number) -> str:
+    if isinstance(number, str):
+        return number
+    if isinstance(number, bool | np.bool_):
+        return str(bool(number)).lower()
+    text = repr(float(number)) if isinstance(number, float) else str(int(number))
+    text = text.replace("inf", "Infinity").replace("nan", "NaN")
+    return f"({text})" if text.startswith("-") else text
+
+
+def _value(array: Any) -> Value:
+    """A known array as numbers of Python."""
+    return np.asarray(array).astype(object)
+
+
+def _map(function: Callable[..., Number], *values: Value) -> Value:
+    """A function of numbers, for every element of some values."""
+    return np.asarray(np.frompyfunc(function, len(values), 1)(*values), object)
+
+
+class _Block:
+    """Statements one after another: each names numbers, reads others, and has lines of text."""
+
+    def __init__(self, names: Any, known: dict[str, str]):
+        self.names, self.known = names, known
+        self.statements: list[tuple[list[Number], set[str], list[str]]] = []
+
+    def name(self, text: str, *reads: Number) -> str:
+        """The name of what an expression gives, which is written once only."""
+        if text not in self.known:
+            self.known[text] = f"v{next(self.names)}"
+            line = f"const {self.known[text]} = {text};"
+            self.statements.append(([self.known[text]], set(_strings(reads)), [line]))
+        return self.known[text]
+
+    def inner(self) -> "_Block":
+        """A block inside this one, which knows what this one knows."""
+        return _Block(self.names, dict(self.known))
+
+    def lines(self, needed: Sequence[Number]) -> list[str]:
+        """The lines that lead to some numbers."""
+        return [line for _, _, lines in self._needed(needed) for line in lines]
+
+    def reads(self, needed: Sequence[Number]) -> set[str]:
+        """The names that are read on the way to some numbers."""
+        return set(_strings(needed)).union(*(reads for _, reads, _ in self._needed(needed)))
+
+    def _needed(self, needed: Sequence[Number]) -> list[tuple[list[Number], set[str], list[str]]]:
+        wanted, kept = set(_strings(needed)), []
+        for statement in reversed(self.statements):
+            if not wanted.isdisjoint(statement[0]):
+                wanted |= statement[1]
+                kept.append(statement)
+        return kept[::-1]
+
+    def call(self, closed: Any, arguments: Sequence[Value]) -> Values:
+        """The values that a jaxpr gives."""
+        jaxpr, constants = (closed.jaxpr, closed.consts) if isinstance(closed, ClosedJaxpr) else (closed, ())
+        values = dict(zip(jaxpr.constvars, map(_value, constants), strict=True))
+        values |= dict(zip(jaxpr.invars, arguments, strict=True))
+
+        def read(atom: Any) -> Value:
+            return _value(atom.val) if isinstance(atom, Literal) else values[atom]
+
+        for equation in jaxpr.eqns:
+            results = self.apply(equation, [read(atom) for atom in equation.invars])
+            values |= dict(zip(equation.outvars, results, strict=True))
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def apply(self, equation: Any, inputs: Values) -> Values:
+        """What one equation gives."""
+        name, parameters = equation.primitive.name, equation.params
+        if name in SAME:
+            return inputs
+        if name in ("while", "cond", "scan"):
+            return getattr(self, f"{name}_")(inputs, **parameters)
+        for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
+            if key in parameters:
+                return self.call(parameters[key], inputs)
+        if name in MOVES:
+            moved = MOVES[name](*inputs, **{key: parameters[key] for key in parameters if key != "sharding"})
+            return moved if isinstance(moved, list) else [np.asarray(moved, object)]
+        if name in INDEXED:
+            return self.indexed(equation, inputs, range(len(inputs))[INDEXED[name]])
+        if name in REDUCTIONS:
+            return [self.reduced(REDUCTIONS[name], inputs[0], parameters["axes"])]
+        if name == "dot_general":
+            return [self.product(*inputs, *parameters["dimension_numbers"])]
+        if name == "iota":
+            return [_value(np.indices(parameters["shape"])[parameters["dimension"]])]
+        if name in ("argmin", "argmax"):
+            return [self.extreme("lt" if name == "argmin" else "gt", inputs[0], parameters["axes"][0])]
+        return [self.each(self.kind(equation), *inputs)]
+
+    def kind(self, equation: Any) -> str:
+        """What is done element by element: the name of a primitive, or JavaScript."""
+        name, parameters, types = (
+            equation.primitive.name,
+            equation.params,
+            [atom.aval.dtype for atom in equation.invars],
+        )
+        if name == "integer_pow":
+            power = " * ".join(["{0}"] * abs(parameters["y"])) or "1"
+            return power if parameters["y"] >= 0 else f"1 / ({power})"
+        if name == "select_n":
+            last = len(types) - 1
+            chain = "".join(f"{{0}} == {k - 1} ? {{{k}}} : " for k in range(1, last)) + f"{{{last}}}"
+            return CHOICE if types[0] == np.bool_ else chain
+        if name == "not":
+            return "!{}" if types[0] == np.bool_ else "~{}"
+        if name == "div" and np.issubdtype(types[0], np.integer):
+            return "Math.trunc({} / {})"
+        if name == "convert_element_type":
+            if parameters["new_dtype"] == np.bool_:
+                return "{} != 0"
+            cut = np.issubdtype(parameters["new_dtype"], np.integer) and np.issubdtype(types[0], np.floating)
+            return "Math.trunc({})" if cut else "+{}" if types[0] == np.bool_ else "{}"
+        if name not in ELEMENTWISE:
+            raise ValueError(
+                f"the primitive {name!r} of JAX cannot be written in JavaScript; can the function be written with "
+                f"{', '.join(sorted(ELEMENTWISE))}?"
+            )
+        return name
+
+    def each(self, kind: str, *values: Value) -> Value:
+        """Something done element by element."""
+        return _map(functools.partial(self.element, kind), *values)
+
+    def element(self, kind: str, *numbers: Number) -> Number:
+        if kind in KNOWN and not _strings(numbers):
+            return KNOWN[kind](*numbers)
+        if kind == "{}":
+            return numbers[0]
+        return self.name(ELEMENTWISE.get(kind, kind).format(*map(_text, numbers)), *numbers)
+
+    def reduced(self, kind: str, value: Value, axes: Sequence[int]) -> Value:
+        """Elements along some axes, put together one by one."""
+        for axis in sorted(axes, reverse=True):
+            value = functools.reduce(functools.partial(self.each, kind), _rows(value, axis))
+        return np.asarray(value, object)
+
+    def product(self, a: Value, b: Value, contracted: Any, together: Any) -> Value:
+        """The product of two arrays, summed over some axes of both, with other axes of both side by side."""
+        shapes, factors = [], []
+        for value, summed, beside in zip((a, b), contracted, together, strict=True):
+            free = [k for k in range(value.ndim) if k not in (*summed, *beside)]
+            shape = [[value.shape[k] for k in axes] for axes in (beside, free, summed)]
+            factors.append(np.transpose(value, [*beside, *free, *summed]).reshape([math.prod(part) for part in shape]))
+            shapes.append(shape)
+        whole = self.reduced("add", self.each("mul", factors[0][:, :, None], factors[1][:, None]), [3])
+        return whole.reshape([*shapes[0][0], *shapes[0][1], *shapes[1][1]])
+
+    def extreme(self, kind: str, value: Value, axis: int) -> Value:
+        """The place of the first extreme element along an axis."""
+        rows = _rows(value, axis)
+        place, best = _value(np.zeros(rows[0].shape, int)), rows[0]
+        for number, row in enumerate(rows[1:], 1):
+            better = self.each(kind, row, best)
+            place = self.each(CHOICE, better, place, _value(np.full(place.shape, number)))
+            best = self.each(CHOICE, better, best, row)
+        return place
+
+    def indexed(self, equation: Any, inputs: Values, indices: Sequence[int]) -> Values:
+        """Numbers taken from places that may be known only in JavaScript: there all possible ones are told apart."""
+        pool = _flat([value for k, value in enumerate(inputs) if k not in indices])
+        places = [(k, index) for k in indices for index in np.ndindex(inputs[k].shape)]
+        unknown = [(k, index) for k, index in places if isinstance(inputs[k][index], str)]
+        values: Values = []
+
+        def numbered(value: Value, labels: Any) -> Value:
+            return np.fromiter(labels, int, value.size).reshape(value.shape)
+
+        def picked(places: Value) -> Value:
+            # A gather beyond the end fills with a number that is none of the labels.
+            return _map(lambda k: pool[k] if 0 <= k < len(pool) else math.nan, places)
+
+        # One more than there are: an index beyond the end has a meaning of its own.
+        options = range(max(inputs[0].shape, default=0) + 1)
+        for option in itertools.product(options, repeat=len(unknown)):
+            labels, same = iter(range(len(pool))), []
+            operands = [value.copy() if k in indices else numbered(value, labels) for k, value in enumerate(inputs)]
+            for (k, index), choice in zip(unknown, option, strict=True):
+                operands[k][index] = choice
+                same.append(self.each("eq", np.asarray(inputs[k][index], object), _value(choice)))
+            moved = equation.primitive.bind(*(operand.astype(int) for operand in operands), **equation.params)
+            results = [picked(np.asarray(part)) for part in (moved if equation.primitive.multiple_results else [moved])]
+            if values:
+                chosen = functools.reduce(functools.partial(self.each, "and"), same)
+                results = [self.each(CHOICE, chosen, *pair) for pair in zip(values, results, strict=True)]
+            values = results
+        return values
+
+    def loop(self, head: str, carry: Values, step: Callable[["_Block", Values], Values]) -> Values:
+        """What is carried through a loop, each step of which gives what is carried on."""
+        variables = self.variables(carry)
+        names, starts, block = _flat(variables), _flat(carry), self.inner()
+        # A variable may be carried on as another one, so all are read before any is written.
+        after = [
+            block.name(f"({number})", number) if number in names and number != name else number
+            for name, number in zip(names, _flat(step(block, variables)), strict=True)
+        ]
+        moved = [f"{name} = {_text(number)};" for name, number in zip(names, after, strict=True) if name != number]
+        needed = [*after, LEAVES]
+        begin = [f"let {name} = {_text(start)};" for name, start in zip(names, starts, strict=True)]
+        lines = [*begin, f"{head} {{", *(f"  {line}" for line in (*block.lines(needed), *moved)), "}"]
+        self.statements.append((names, block.reads(needed).union(_strings(starts)), lines))
+        return variables
+
+    def variables(self, values: Sequence[Value]) -> Values:
+        """New names, as many as there are numbers in some values."""
+        return [_map(lambda _: f"v{next(self.names)}", value) for value in values]
+
+    def while_(self, inputs: Values, cond_jaxpr: Any, body_jaxpr: Any, cond_nconsts: int, body_nconsts: int) -> Values:
+        of_cond, of_body = inputs[:cond_nconsts], inputs[cond_nconsts : cond_nconsts + body_nconsts]
+
+        def step(block: "_Block", carry: Values) -> Values:
+            goes_on = block.call(cond_jaxpr, [*of_cond, *carry])[0].item()
+            block.statements.append(([LEAVES], set(_strings([goes_on])), [f"if (!{_text(goes_on)}) break;"]))
+            return block.call(body_jaxpr, [*of_body, *carry])
+
+        return self.loop("while (true)", inputs[cond_nconsts + body_nconsts :], step)
+
+    def scan_(self, inputs: Values, jaxpr: Any, length: int, reverse: bool, **counts: Any) -> Values:
+        if "ft_in" in counts:
+            # jax 0.11 and later.
+            num_consts, num_carry, _ = map(len, counts["ft_in"].unpack())
+        else:
+            num_consts, num_carry = counts["num_consts"], counts["num_carry"]
+        constants, carry = inputs[:num_consts], inputs[num_consts : num_consts + num_carry]
+        rows, results = (
+            inputs[num_consts + num_carry :],
+            len((jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr).outvars) - num_carry,
+        )
+        if not rows and not results and length > WRITTEN_OUT:
+            head = f"for (let k = 0; k < {length}; k++)"
+            return self.loop(head, carry, lambda block, carry: block.call(jaxpr, [*constants, *carry]))
+        stacked: list[Any] = [None] * length
+        for k in reversed(range(length)) if reverse else range(length):
+            after = self.call(jaxpr, [*constants, *carry, *(np.asarray(row[k], object) for row in rows)])
+            carry, stacked[k] = after[:num_carry], after[num_carry:]
+        return [*carry, *(np.stack(parts) for parts in zip(*stacked, strict=True))]
+
+    def cond_(self, inputs: Values, branches: Sequence[Any], **_: Any) -> Values:
+        number, operands = inputs[0].item(), inputs[1:]
+        if not isinstance(number, str):
+            return self.call(branches[int(number)], operands)
+        blocks = [self.inner() for _ in branches]
+        ends = [block.call(branch, operands) for block, branch in zip(blocks, branches, strict=True)]
+        variables, flat = self.variables(ends[0]), [_flat(end) for end in ends]
+        names, lines, reads = _flat(variables), [], {number}
+        lines += [f"let {', '.join(_strings(names))};"] if names else []
+        for k, (block, end) in enumerate(zip(blocks, flat, strict=True)):
+            last = k == len(blocks) - 1
+            lines += [("} else " if k else "") + ("{" if last else f"if ({number} == {k}) {{")]
+            lines += [f"  {line}" for line in block.lines(end)]
+            lines += [f"  {name} = {_text(value)};" for name, value in zip(names, end, strict=True)]
+            reads |= block.reads(end)
+        self.statements.append((names, reads, [*lines, "}"]))
+        return variables
+
+
+def _rows(value: Value, axis: int) -> Values:
+    return [np.asarray(row, object) for row in np.moveaxis(value, axis, 0)]
+
+
+def _flat(values: Sequence[Value]) -> list[Number]:
+    return [number for value in values for number in value.ravel()]
+
+
+def _strings(numbers: Sequence[Number]) -> list[str]:
+    return [number for number in numbers if isinstance(number, str)]

@@ -1,0 +1,101 @@
+"""A page with sliders: what it is made of, and how that gets into one file."""
+
+import json
+from collections.abc import Callable
+from importlib.resources import files
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ...integration import Status
+from ..page import Page, page, script
+from ..stage import Stage
+from .frame import Frame
+from .javascript import javascript
+from .simulator import Simulator, written
+from .slider import Slider
+
+Numbers = Float[Array, " numbers"]
+
+
+class Answer(NamedTuple):
+    """What is asked of every run, and shown as a map: its `label` and `unit`, and the `simulator` that finds it.
+
+    The simulator has the reading "outcome": how the run ended, a `Status`, and the number asked for, or
+    infinity.
+    """
+
+    label: str
+    unit: str
+    simulator: Simulator
+
+
+class Summary(NamedTuple):
+    """A curve of the `Show` that is also told in numbers, from the start of a run to its end."""
+
+    label: str
+    unit: str
+    curve: int
+
+
+class LiveRun(NamedTuple):
+    """What a page with sliders shows.
+
+    - `title`: of the page.
+    - `sliders`: and `allowed`, whether their numbers are legal together.
+    - `answer`: what is asked of a run.
+    - `motion`: the run as it is drawn, with the reading "frame", a `Frame`.
+    - `summaries`: numbers that are told beside the answer.
+    """
+
+    title: str
+    sliders: tuple[Slider, ...]
+    allowed: Callable[[Numbers], Bool[Array, ""]]
+    answer: Answer
+    motion: Simulator
+    summaries: tuple[Summary, ...]
+
+
+def live_page(live: LiveRun, stage: Stage) -> Page:
+    """The page of a run with sliders.
+
+    **Arguments:** `stage`: with one run, for its arena, meshes and names.
+
+    **Raises:** `ModuleNotFoundError` if the library for views is not installed; `ValueError` for equations that cannot be
+    written in JavaScript.
+    """
+    # Its name and its warning are those of one run.
+    drawn = stage._replace(title="", shows=tuple(show._replace(note="") for show in stage.shows))
+    scripts = [script(text) for text in (programs(live), _file("map.js"), _file("explore.js"))]
+    return page([drawn], live.title, above=_file("explore.html"), scripts=scripts, autoplay=False)
+
+
+def programs(live: LiveRun) -> str:
+    """The JavaScript that simulates: what is known of the sliders, all functions and the integrator, without a page."""
+    values = jnp.array([slider.value for slider in live.sliders])
+    facts = {
+        "sliders": [slider._asdict() for slider in live.sliders],
+        "words": {int(status): status.word for status in Status},
+        "answer": {"label": live.answer.label, "unit": live.answer.unit},
+        "summaries": [summary._asdict() for summary in live.summaries],
+        "layout": _layout(live.motion, values),
+    }
+    parts = {
+        "facts": json.dumps(facts),
+        "answer": written(live.answer.simulator, values),
+        "motion": written(live.motion, values),
+        "allowed": javascript("", live.allowed, values),
+    }
+    return (
+        f"window.live = {{{', '.join(f'{name}: {text}' for name, text in parts.items())}}};\n{_file('integrator.js')}"
+    )
+
+
+def _layout(motion: Simulator, values: Numbers) -> dict[str, Any]:
+    return Frame(*eqx.filter_eval_shape(lambda values: motion.read("frame", values), values)).layout()
+
+
+def _file(name: str) -> str:
+    return files("nonholonomic.views.explore").joinpath(name).read_text(encoding="utf-8")

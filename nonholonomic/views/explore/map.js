@@ -1,0 +1,157 @@
+// A map of runs over two of the sliders, filled in the background by workers, coarse cells first.
+"use strict";
+
+function makeMap(box, live, integrator, choose) {
+  const across = 40, up = 30, levels = [8, 4, 2, 1], chunk = 24;
+  const { sliders, words, answer } = live.facts;
+  const [canvas, legend, selects] = [box.querySelector("canvas"), box.querySelector("#legend"), box.querySelectorAll("select")];
+  const colours = { not_inverted: "#dde1e6", completed: "#dde1e6", contact_lost: "#e9a23b", failed: "#c8412b", jammed: "#8c5a3c",
+    does_not_fit: "#7b4fa3", unresolved: "#c8412b", rank_lost: "#7b4fa3", illegal: "#ffffff" };
+  const stops = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
+
+  // Every cell once, those of the coarsest grid first.
+  const cells = levels.flatMap((level, k) => {
+    const found = [];
+    for (let y = 0; y < up; y += level) for (let x = 0; x < across; x += level)
+      if (k === 0 || x % levels[k - 1] || y % levels[k - 1]) found.push({ x, y, level });
+    return found;
+  });
+  let values = sliders.map((slider) => slider.value), axes = [0, Math.min(1, sliders.length - 1)], results = [], round = 0, next = 0;
+
+  // A program of its own for each worker, from the page's own text, so that it works from disk.
+  const text = (model) => `{${Object.entries(model).map(([key, part]) =>
+    `${key}: ${typeof part === "function" ? part : JSON.stringify(part)}`).join(",")}}`;
+  const program = `${integrator}
+    const work = integrator(${text(live.answer)}), allowed = ${live.allowed};
+    onmessage = ({ data: { round, first, runs } }) => postMessage({ round, first, found: runs.map((values) =>
+      allowed(values, [])[0] ? (work.run(values), work.read("outcome", values)) : [-1, Infinity]) });`;
+  const workers = [];
+  try {
+    const address = URL.createObjectURL(new Blob([program], { type: "text/javascript" }));
+    const count = Math.max(1, Math.min(4, (navigator.hardwareConcurrency || 2) - 1));
+    for (let k = 0; k < count; k++) workers.push(new Worker(address));
+  } catch (error) {
+    legend.textContent = "This browser allows a page on disk no workers, so there is no map.";
+  }
+  const place = (slider, part) => slider.low + part * (slider.high - slider.low);
+  const at = (cell) => values.map((value, k) => k === axes[1] ? place(sliders[k], (cell.y + 0.5) / up)
+    : k === axes[0] ? place(sliders[k], (cell.x + 0.5) / across) : value);
+
+  function feed(worker) {
+    worker.idle = next >= cells.length;
+    if (worker.idle) return;
+    worker.postMessage({ round, first: next, runs: cells.slice(next, next + chunk).map(at) });
+    next += chunk;
+  }
+  for (const worker of workers) {
+    worker.idle = true;
+    worker.onmessage = ({ data }) => {
+      if (data.round === round) {
+        data.found.forEach((one, k) => { results[data.first + k] = one; });
+        redraw();
+      }
+      feed(worker);
+    };
+  }
+
+  function colour(part) {
+    const k = Math.min(stops.length - 2, Math.floor(part * (stops.length - 1))), rest = part * (stops.length - 1) - k;
+    return `rgb(${stops[k].map((low, c) => Math.round(low + rest * (stops[k + 1][c] - low))).join(",")})`;
+  }
+  const short = (number) => Number(number.toPrecision(3)).toString();
+  let drawing = false;
+  function redraw() {
+    if (drawing) return;
+    drawing = true;
+    requestAnimationFrame(() => { drawing = false; draw(); });
+  }
+  const left = 44, bottom = 34;
+  function draw() {
+    const ratio = window.devicePixelRatio || 1, [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    if (!width) return;
+    [canvas.width, canvas.height] = [width * ratio, height * ratio];
+    const pen = canvas.getContext("2d");
+    pen.scale(ratio, ratio);
+    const [w, h] = [width - left - 2, height - bottom - 2];
+    const known = results.filter(Boolean), finite = known.map((one) => one[1]).filter(Number.isFinite);
+    const [low, high] = [Math.min(...finite), Math.max(...finite)];
+    pen.fillStyle = "#f3f4f6";
+    pen.fillRect(left, 2, w, h);
+    cells.forEach((cell, k) => {
+      if (!results[k]) return;
+      const [status, value] = results[k];
+      pen.fillStyle = Number.isFinite(value) ? colour(high > low ? (value - low) / (high - low) : 0.5) : colours[words[status]] || "#ffffff";
+      // Towards its own side of the next pixel, so that no seams are seen.
+      const [x0, x1] = [cell.x, Math.min(across, cell.x + cell.level)].map((x) => Math.round(left + (x / across) * w));
+      const [y0, y1] = [cell.y, Math.min(up, cell.y + cell.level)].map((y) => Math.round(2 + h - (y / up) * h));
+      pen.fillRect(x0, y1, x1 - x0, y0 - y1);
+    });
+    const [first, second] = axes.map((k) => sliders[k]);
+    pen.fillStyle = "#6b7280";
+    pen.font = "11px system-ui, sans-serif";
+    const label = (one) => one.label + (one.unit ? ` [${one.unit}]` : "");
+    pen.textAlign = "left"; pen.fillText(short(first.low), left, height - 19);
+    pen.textAlign = "right"; pen.fillText(short(first.high), left + w, height - 19);
+    pen.fillText(short(second.high), left - 5, 11); pen.fillText(short(second.low), left - 5, 2 + h);
+    pen.textAlign = "center"; pen.fillText(label(first), left + w / 2, height - 5);
+    pen.save(); pen.translate(11, 2 + h / 2); pen.rotate(-Math.PI / 2); pen.fillText(label(second), 0, 0); pen.restore();
+    const x = left + ((values[axes[0]] - first.low) / (first.high - first.low)) * w;
+    const y = 2 + h - ((values[axes[1]] - second.low) / (second.high - second.low)) * h;
+    for (const [style, thick] of [["#ffffff", 4], ["#23262b", 2]]) {
+      pen.strokeStyle = style; pen.lineWidth = thick;
+      pen.beginPath(); pen.arc(x, y, 6, 0, 7); pen.stroke();
+    }
+    showLegend(known, low, high);
+  }
+  function showLegend(known, low, high) {
+    if (!workers.length) return;
+    const entries = [];
+    if (low <= high) {
+      const shades = [0, 0.25, 0.5, 0.75, 1].map(colour).join(",");
+      entries.push(`<span>${answer.label} ${short(low)}<span class="scale" style="background:linear-gradient(90deg,${shades})"></span>${short(high)} ${answer.unit}</span>`);
+    }
+    for (const status of new Set(known.filter((one) => !Number.isFinite(one[1])).map((one) => one[0]))) {
+      const word = words[status] || "illegal";
+      entries.push(`<span><i style="background:${colours[word] || "#fff"};border:1px solid #dde1e6"></i>${word.replace(/_/g, " ")}</span>`);
+    }
+    legend.innerHTML = entries.join("");
+  }
+
+  // The map is begun anew where another slider than those along its axes has moved.
+  function update(now, force = false) {
+    const other = force || now.some((value, k) => value !== values[k] && !axes.includes(k));
+    values = [...now];
+    if (other) {
+      [results, next] = [[], 0];
+      round += 1;
+      workers.filter((worker) => worker.idle).forEach(feed);
+    }
+    redraw();
+  }
+  function setAxes(first, second) {
+    axes = [first, second];
+    selects.forEach((select, k) => { select.value = axes[k]; });
+    update(values, true);
+  }
+  selects.forEach((select, k) => {
+    sliders.forEach((slider, number) => select.add(new Option(`${k ? "↑" : "→"} ${slider.label}`, number)));
+    select.hidden = sliders.length < 2;
+    select.addEventListener("change", () => {
+      const wanted = Number(select.value), other = axes[1 - k];
+      // Both axes alike would be a line: they change places instead.
+      const [first, second] = k === 0 ? [wanted, wanted === other ? axes[0] : other] : [wanted === other ? axes[1] : other, wanted];
+      setAxes(first, second);
+    });
+  });
+  function pick(event) {
+    const frame = canvas.getBoundingClientRect(), part = (number) => Math.min(1, Math.max(0, number));
+    const parts = [part((event.clientX - frame.left - left) / (frame.width - left - 2)),
+      part(1 - (event.clientY - frame.top - 2) / (frame.height - bottom - 2))];
+    choose(values.map((value, k) => k === axes[1] ? place(sliders[k], parts[1]) : k === axes[0] ? place(sliders[k], parts[0]) : value));
+  }
+  canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); pick(event); });
+  canvas.addEventListener("pointermove", (event) => { if (event.buttons) pick(event); });
+  window.addEventListener("resize", redraw);
+  setAxes(...axes);
+  return { update, results: () => results, done: () => results.filter(Boolean).length === cells.length, cells, at };
+}

@@ -1,0 +1,78 @@
+"""The sliders of a page: parameters of a scene and a launch, and the ranges in which they can be set."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...parameters import full_name, numbers, readable_unit, with_numbers
+
+#: Parameters with which what is drawn would have to be drawn anew.
+DRAWN = ("scene.surface.", "scene.body.radius", "scene.body.equatorial", "scene.body.polar", "scene.body.wheelbase")
+
+
+class Slider(NamedTuple):
+    """A slider: its `name` in the page's address, the `path` of its parameter, a `label`, its unit, its range and its value."""
+
+    name: str
+    path: str
+    label: str
+    unit: str
+    low: float
+    high: float
+    value: float
+
+
+def sliders_of(ranges: Any, roots: dict[str, Any], labels: dict[str, str], units: dict[str, str]) -> tuple[Slider, ...]:
+    """The sliders that a user asks for.
+
+    **Arguments:**
+
+    - `ranges`: name of a parameter -> (lowest, highest) value.
+    - `roots`: "scene" and "launch".
+    - `labels`, `units`: of parameters by their short names.
+
+    **Raises:** `ValueError` for an unknown name, a range that is none, and numbers that the modules do not allow.
+    """
+    if not (isinstance(ranges, dict) and ranges and all(isinstance(name, str) for name in ranges)):
+        raise ValueError(
+            f"sliders = {ranges!r} must be a dictionary, name of a parameter -> (low, high), such as "
+            '{"theta": (0.05, 0.5)}'
+        )
+    known = {path: value for root, tree in roots.items() for path, value in numbers(root, tree).items()}
+    scalars = [path for path, value in known.items() if value is not None and np.ndim(value) == 0]
+    sliders = []
+    for name, ends in ranges.items():
+        path = full_name("sliders", name, scalars)
+        low, high = _ends(name, ends)
+        if path.startswith(DRAWN):
+            raise ValueError(
+                f"sliders[{name!r}]: {path} changes what is drawn, the arena or the size of the body, which the page keeps; "
+                "write a page for each value"
+            )
+        value, short = float(known[path]), path.rsplit(".", 1)[-1]
+        if not low <= value <= high:
+            raise ValueError(
+                f"sliders[{name!r}] = {ends!r} must contain the parameter's own value, {value:g}: the page starts there"
+            )
+        for end in (low, high):
+            # The modules check the number.
+            with_numbers(roots, {path: end})
+        unit = readable_unit(units.get(short, "1"))
+        sliders.append(Slider(name, path, labels.get(short, short.replace("_", " ")), unit, low, high, value))
+    return tuple(sliders)
+
+
+def ends_of(sliders: tuple[Slider, ...]) -> list[tuple[str, float]]:
+    """The path of every slider with each end of its range."""
+    return [(slider.path, end) for slider in sliders for end in (slider.low, slider.high)]
+
+
+def _ends(name: str, ends: Any) -> tuple[float, float]:
+    try:
+        low, high = (float(end) for end in ends)
+    except (TypeError, ValueError):
+        low, high = math.nan, math.nan
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise ValueError(f"sliders[{name!r}] = {ends!r} must be two numbers, (low, high), with low < high")
+    return low, high

@@ -1,0 +1,237 @@
+// Plays runs on stages: unpacks what Python wrote, sets poses for a time, and has the controls of time and camera.
+"use strict";
+window.views = window.views || {};
+(() => {
+  const text = (id) => document.getElementById(id).textContent;
+  const bytes = (coded) => Uint8Array.from(atob(coded), (letter) => letter.charCodeAt(0));
+  const inflated = (coded) => new Response(new Blob([bytes(coded)]).stream().pipeThrough(new DecompressionStream("deflate")));
+
+  // Floats came byte plane by byte plane, whole numbers as differences: both are shorter so when deflated.
+  async function arrays() {
+    const planes = new Uint8Array(await (await inflated(text("floats"))).arrayBuffer()), count = planes.length / 4;
+    const joined = new Uint8Array(planes.length);
+    for (let byte = 0; byte < 4; byte++) for (let k = 0; k < count; k++) joined[4 * k + byte] = planes[byte * count + k];
+    const floats = new Float32Array(joined.buffer), steps = new Int32Array(await (await inflated(text("whole"))).arrayBuffer());
+    return {
+      floats: ([begin, length]) => floats.subarray(begin, begin + length),
+      whole: ([begin, length]) => { let sum = 0; return Uint32Array.from(steps.subarray(begin, begin + length), (step) => (sum += step)); },
+    };
+  }
+  async function library() {
+    const exports = {};
+    new Function("exports", "module", await (await inflated(text("library"))).text())(exports, {});
+    return exports;
+  }
+  function unpacked(stage, { floats, whole }) {
+    const mesh = (one) => ({ ...one, vertices: floats(one.vertices), triangles: whole(one.triangles) });
+    return {
+      ...stage,
+      arena: { ...mesh(stage.arena), lines: stage.arena.lines.map(floats) },
+      runs: stage.runs.map((run) => ({
+        ...run,
+        times: floats(run.times),
+        normal: floats(run.normal),
+        bodies: run.bodies.map((one) => ({ ...one, position: floats(one.position), turning: floats(one.turning), meshes: one.meshes.map(mesh) })),
+        traces: run.traces.map((one) => ({ ...one, points: floats(one.points), about: one.about && floats(one.about) })),
+        arrows: run.arrows.map((one) => ({ ...one, start: floats(one.start), vector: floats(one.vector) })),
+        curves: run.curves.map((one) => ({ ...one, values: floats(one.values) })),
+      })),
+    };
+  }
+
+  const point = (values, [k, part]) =>
+    [0, 1, 2].map((c) => (values.length > 3 ? (1 - part) * values[3 * k + c] + part * values[3 * k + 3 + c] : values[c]));
+  function turning(values, [k, part]) {
+    const a = values.subarray(4 * k, 4 * k + 4), b = values.length > 4 ? values.subarray(4 * k + 4, 4 * k + 8) : a;
+    let cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3];
+    const sign = cosine < 0 ? -1 : 1;
+    cosine = Math.min(1, Math.abs(cosine));
+    const angle = Math.acos(cosine), sine = Math.sin(angle);
+    const [p, q] = sine < 1e-4 ? [1 - part, part] : [Math.sin((1 - part) * angle) / sine, Math.sin(part * angle) / sine];
+    const mixed = [0, 1, 2, 3].map((c) => p * a[c] + sign * q * b[c]), length = Math.hypot(...mixed);
+    return mixed.map((c) => c / length);
+  }
+
+  class Player {
+    constructor(root, facts, stages, THREE) {
+      Object.assign(this, { facts, root, listeners: [], now: 0, running: false, before: null, turn: false });
+      const { element } = views, boxes = element("div", root, { id: "stages" });
+      boxes.classList.toggle("several", stages.length > 1);
+      this.stages = stages.map((fact) => this.figure(element("figure", boxes), fact, THREE));
+      this.bar(element("div", root, { id: "controls" }));
+      this.strips = new views.Strips(element("div", root, { id: "strips" }), () => this.runs(), (time) => { this.play(false); this.seek(time); });
+      this.measure();
+      this.keys();
+      this.seek(0);
+      for (const stage of this.stages) stage.firstSpan = stage.span;
+      this.seek(0);
+    }
+    runs() { return this.stages.flatMap((stage) => stage.fact.runs); }
+    measure() {
+      this.length = Math.max(...this.runs().map((run) => run.times[run.times.length - 1]));
+      this.slider.max = this.length;
+    }
+
+    figure(figure, fact, THREE) {
+      const { element } = views, box = element("div", figure, { className: "scene" }), caption = element("figcaption", figure);
+      const stage = new views.Stage(THREE, box, fact), buttons = element("div", box, { className: "buttons" });
+      const button = (words, title, act) => element("button", buttons, { textContent: words, title, type: "button", onclick: act });
+      stage.follows = fact.follow;
+      const follow = button("Follow", "the camera moves along with the body", () => toggle(follow, (stage.follows = !stage.follows)));
+      const orbit = button("Orbit", "the camera goes round the body", () => { toggle(orbit, (stage.orbits = !stage.orbits)); this.spin(); });
+      button("From above", "look down on the arena", () => stage.fromAbove());
+      button("Reset", "the first view", () => { toggle(follow, (stage.follows = fact.follow)); toggle(orbit, (stage.orbits = false)); stage.reset(); stage.render(); });
+      const toggle = (one, on) => one.setAttribute("aria-pressed", String(on));
+      toggle(follow, stage.follows); toggle(orbit, false);
+      element("b", caption, { textContent: fact.title });
+      for (const note of fact.notes) element("span", caption, { className: "warning", textContent: note });
+      for (const [words, colour] of fact.keys) {
+        const key = element("span", caption, { className: "key" });
+        if (colour) element("i", key).style.background = colour;
+        key.append(words);
+      }
+      const chip = (kind, { name, colour, shown }, k) => {
+        const one = element("button", caption, { className: "chip", type: "button", title: "show or hide" });
+        element("i", one).style.background = colour;
+        one.append(name);
+        one.onclick = () => { const on = !stage.runs[0][kind][k].shown; stage.show(kind, k, on); toggle(one, on); this.seek(this.now); };
+        toggle(one, shown);
+        return element("span", one);
+      };
+      // Traces of several runs have the runs' colours, which are told beside their names.
+      fact.runs[0].traces.forEach((trace, k) => chip("traces", fact.runs.length > 1 ? { ...trace, colour: "#6b7280" } : trace, k));
+      stage.values = fact.runs[0].arrows.map((arrow, k) => chip("arrows", arrow, k));
+      return stage;
+    }
+
+    bar(controls) {
+      const { element } = views;
+      this.button = element("button", controls, { id: "play", type: "button", title: "space", onclick: () => this.play(!this.running) });
+      this.slider = element("input", controls, { id: "slider", type: "range", min: 0, max: 1, step: "any", value: 0, ariaLabel: "time" });
+      this.slider.addEventListener("input", () => { this.play(false); this.seek(Number(this.slider.value)); });
+      this.clock = element("span", controls, { id: "clock" });
+      this.speeds = element("select", controls, { id: "speed", title: "speed" });
+      for (const [words, factor] of this.facts.speeds) element("option", this.speeds, { textContent: words, value: factor, selected: factor === this.facts.speed });
+      if (this.root.requestFullscreen) {
+        element("button", controls, { id: "full", type: "button", textContent: "Full screen", title: "f", onclick: () => this.fullScreen() });
+      }
+      this.button.textContent = "▶ play";
+    }
+    fullScreen() { if (document.fullscreenElement) document.exitFullscreen(); else this.root.requestFullscreen(); }
+    keys() {
+      const acts = {
+        Space: () => this.play(!this.running),
+        ArrowRight: () => { this.play(false); this.seek(this.now + this.frame()); },
+        ArrowLeft: () => { this.play(false); this.seek(this.now - this.frame()); },
+        Home: () => this.seek(0),
+        End: () => this.seek(this.length),
+        KeyF: () => this.fullScreen(),
+      };
+      document.addEventListener("keydown", (event) => {
+        const { target } = event, act = acts[event.code], own = target === this.slider;
+        if (!act || event.ctrlKey || event.metaKey || event.altKey) return;
+        if (/^(INPUT|SELECT|TEXTAREA)$/.test(target.tagName) && !own) return;
+        if (event.code === "Space" && target.tagName === "BUTTON") return;
+        event.preventDefault();
+        act();
+      });
+    }
+    // A picture further at the speed chosen.
+    frame() { return Number(this.speeds.value) / 25; }
+
+    // Replace what is shown of a run: arrays as Python writes them; those left out stay.
+    setRun(s, r, run) {
+      const stage = this.stages[s], fact = stage.fact.runs[r];
+      const merged = (name) => run[name] && run[name].forEach((one, k) => Object.assign(fact[name][k], one));
+      if (run.times) fact.times = run.times;
+      if (run.normal) fact.normal = run.normal;
+      ["bodies", "traces", "arrows", "curves"].forEach(merged);
+      (run.traces || []).forEach((trace, k) => { if (trace.points) stage.setPoints(stage.runs[r].traces[k], trace.points); });
+      this.measure();
+      this.strips.refresh();
+      this.seek(this.now);
+    }
+    show(stage, r, time) {
+      const run = stage.fact.runs[r], at = views.place(run.times, time), count = at[0] + at[1];
+      stage.setNormal(r, point(run.normal, at));
+      run.bodies.forEach((body, k) => stage.setPose(r, k, point(body.position, at), turning(body.turning, at)));
+      run.traces.forEach((trace, k) => stage.setTrace(r, k, Math.round(count), trace.about && point(trace.about, at)));
+      run.arrows.forEach((arrow, k) => stage.setArrow(r, k, point(arrow.start, at), point(arrow.vector, at)));
+      return point(run.bodies[0].position, at);
+    }
+    seek(wanted) {
+      this.now = Math.min(Math.max(wanted, 0), this.length);
+      for (const stage of this.stages) {
+        stage.look(stage.fact.runs.map((_, r) => this.show(stage, r, this.now)), stage.follows);
+        stage.render();
+        stage.values.forEach((value, k) => {
+          const { size, unit } = stage.runs[0].arrows[k];
+          value.textContent = ` ${views.digits(size, 3)} ${unit}`;
+        });
+      }
+      this.strips.draw(this.now);
+      this.slider.value = this.now;
+      this.clock.textContent = `${this.now.toFixed(3)} s of ${this.length.toFixed(2)} s`;
+      for (const listener of this.listeners) listener(this.now);
+    }
+    play(wanted) {
+      this.touched = true;
+      if (wanted && this.now >= this.length) this.seek(0);
+      this.running = wanted;
+      this.button.textContent = wanted ? "❚❚ pause" : "▶ play";
+      this.before = null;
+      if (wanted) requestAnimationFrame((now) => this.step(now));
+    }
+    step(now) {
+      if (!this.running) return;
+      if (this.before !== null) this.seek(this.now + ((now - this.before) / 1000) * Number(this.speeds.value));
+      this.before = now;
+      if (this.now >= this.length) this.play(false); else requestAnimationFrame((next) => this.step(next));
+    }
+    spin() {
+      if (this.turn || !this.stages.some((stage) => stage.orbits)) return;
+      this.turn = true;
+      const round = () => {
+        const turned = this.stages.filter((stage) => stage.orbits);
+        for (const stage of turned) {
+          stage.controls.autoRotate = true;
+          stage.controls.update();
+          stage.controls.autoRotate = false;
+          stage.render();
+        }
+        this.turn = turned.length > 0;
+        if (this.turn) requestAnimationFrame(round);
+      };
+      requestAnimationFrame(round);
+    }
+    // Play once, as soon as the stages are seen, for those who have not asked for less motion.
+    autoplay() {
+      if (matchMedia("(prefers-reduced-motion: reduce)").matches) return;
+      const watch = new IntersectionObserver((entries) => {
+        if (!entries.some((entry) => entry.isIntersecting)) return;
+        watch.disconnect();
+        if (!this.touched) this.play(true);
+      }, { threshold: 0.3 });
+      watch.observe(this.stages[0].box);
+    }
+  }
+
+  views.ready = (async () => {
+    const facts = JSON.parse(text("facts")), [unpack, THREE] = await Promise.all([arrays(), library()]);
+    const player = new Player(document.getElementById("view"), facts, facts.stages.map((stage) => unpacked(stage, unpack)), THREE);
+    if (facts.autoplay) player.autoplay();
+    const handle = {
+      seek: (time) => { player.touched = true; player.seek(time); },
+      play: (wanted) => player.play(wanted),
+      setRun: (s, r, run) => player.setRun(s, r, run),
+      onSeek: (listener) => player.listeners.push(listener),
+      time: () => player.now,
+      playing: () => player.running,
+      duration: () => player.length,
+      stages: player.stages,
+      matrix: (stage, run, body) => player.stages[stage].matrix(run, body),
+    };
+    window.player = handle;
+    return handle;
+  })();
+})();

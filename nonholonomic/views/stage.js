@@ -1,0 +1,303 @@
+// One stage: an arena and bodies in three dimensions, drawn by three.js. It knows poses, not times; player.js sets them.
+"use strict";
+window.views = window.views || {};
+(() => {
+  const { sqrt, cos, max, min, hypot } = Math;
+  //: Corners whose normals differ by less are drawn as a smooth surface [cosine].
+  const CREASE = cos(0.8);
+  //: Least height of the camera over the tangent plane, over its distance: it cannot look from under the floor.
+  const LOWEST = 0.06;
+  const element = (kind, parent, properties = {}) => parent.appendChild(Object.assign(document.createElement(kind), properties));
+
+  // Meshes of one body as corners with normals: those of the triangles around a corner, averaged where no edge is sharp.
+  function creased(meshes) {
+    const faces = new Map(), parts = [];
+    for (const { vertices, triangles } of meshes) {
+      const count = triangles.length, positions = new Float32Array(3 * count), flat = new Float32Array(count), keys = [];
+      for (let k = 0; k < count; k++) for (let c = 0; c < 3; c++) positions[3 * k + c] = vertices[3 * triangles[k] + c];
+      for (let k = 0; k < count; k += 3) {
+        const [a, b, c] = [0, 1, 2].map((j) => positions.subarray(3 * (k + j), 3 * (k + j) + 3));
+        const [u, v] = [b, c].map((end) => [end[0] - a[0], end[1] - a[1], end[2] - a[2]]);
+        const normal = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+        flat.set(normal, k);
+        for (const corner of [a, b, c]) {
+          const key = [...corner].map((x) => Math.round(x * 1e6)).join();
+          keys.push(key);
+          if (!faces.has(key)) faces.set(key, []);
+          faces.get(key).push(normal);
+        }
+      }
+      parts.push({ positions, flat, keys });
+    }
+    return parts.map(({ positions, flat, keys }) => {
+      const normals = new Float32Array(positions.length);
+      keys.forEach((key, k) => {
+        const own = flat.subarray(k - (k % 3), k - (k % 3) + 3), size = hypot(...own) || 1, sum = [0, 0, 0];
+        for (const other of faces.get(key)) {
+          const along = own[0] * other[0] + own[1] * other[1] + own[2] * other[2];
+          if (along >= CREASE * size * hypot(...other)) for (let c = 0; c < 3; c++) sum[c] += other[c];
+        }
+        const length = hypot(...sum) || 1;
+        for (let c = 0; c < 3; c++) normals[3 * k + c] = sum[c] / length;
+      });
+      return { positions, normals };
+    });
+  }
+
+  class Stage {
+    // `fact`: what Python wrote of a stage, its arrays unpacked; `box`: an element that it fills.
+    constructor(THREE, box, fact) {
+      Object.assign(this, { THREE, box, fact, size: fact.size, focus: null, span: 1 });
+      this.renderer = new THREE.WebGLRenderer({ antialias: true });
+      this.renderer.setPixelRatio(min(window.devicePixelRatio || 1, 2));
+      this.renderer.shadowMap.enabled = true;
+      this.renderer.shadowMap.type = THREE.PCFSoftShadowMap;
+      box.appendChild(this.renderer.domElement);
+      this.labels = element("div", box, { className: "labels" });
+      this.scene = new THREE.Scene();
+      this.scene.background = new THREE.Color(fact.background);
+      this.camera = new THREE.PerspectiveCamera(fact.angle, 1, 0.01 * this.size, 1e4 * this.size);
+      this.camera.up.set(0, 0, 1);
+      this.controls = new THREE.OrbitControls(this.camera, this.renderer.domElement);
+      this.controls.addEventListener("change", () => this.render());
+      this.light();
+      this.arena(fact.arena);
+      this.runs = fact.runs.map((run) => this.run(run));
+      this.reset();
+      new ResizeObserver(() => this.resize()).observe(box);
+      this.resize();
+    }
+
+    light() {
+      const { THREE, scene, size } = this;
+      scene.add(new THREE.HemisphereLight(0xffffff, 0xc9cdd3, 0.6));
+      this.sun = new THREE.DirectionalLight(0xffffff, 0.4);
+      this.sun.castShadow = true;
+      this.sun.shadow.mapSize.set(2048, 2048);
+      this.sun.shadow.radius = 3;
+      this.sun.shadow.bias = -2e-3;
+      scene.add(this.sun, this.sun.target);
+      this.shadowOver(3.5 * size);
+    }
+    shadowOver(reach) {
+      const view = this.sun.shadow.camera;
+      Object.assign(view, { left: -reach, right: reach, top: reach, bottom: -reach, near: 0.1 * reach, far: 12 * reach });
+      view.updateProjectionMatrix();
+      this.reach = reach;
+    }
+
+    geometry({ positions, normals }) {
+      const { THREE } = this, geometry = new THREE.BufferGeometry();
+      geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+      if (normals) geometry.setAttribute("normal", new THREE.BufferAttribute(normals, 3));
+      return geometry;
+    }
+    // Drawn from the side of the room only, so that a wall between camera and body hides nothing.
+    arena({ vertices, triangles, colour, lines }) {
+      const { THREE } = this, geometry = this.geometry({ positions: vertices });
+      geometry.setIndex(new THREE.BufferAttribute(triangles, 1));
+      geometry.computeVertexNormals();
+      const ground = new THREE.Mesh(geometry, new THREE.MeshPhongMaterial({ color: colour, specular: 0, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 }));
+      ground.receiveShadow = true;
+      this.scene.add(ground);
+      const pairs = [];
+      for (const line of lines) for (let k = 0; k + 5 < line.length; k += 3) pairs.push(...line.subarray(k, k + 6));
+      const grid = this.geometry({ positions: new Float32Array(pairs) });
+      this.scene.add(new THREE.LineSegments(grid, new THREE.LineBasicMaterial({ color: this.fact.lines, transparent: true, opacity: 0.55 })));
+    }
+
+    run(fact) {
+      const bodies = fact.bodies.map((body) => this.body(body.meshes));
+      const traces = fact.traces.map((trace) => this.trace(trace));
+      const arrows = fact.arrows.map((arrow) => this.arrow(arrow));
+      const name = this.fact.runs.length > 1 ? element("span", this.labels, { className: "name", textContent: fact.name }) : null;
+      if (name) name.style.background = fact.colour;
+      return { bodies, traces, arrows, name, normal: [0, 0, 1] };
+    }
+    body(meshes) {
+      const { THREE, scene } = this, group = new THREE.Group();
+      creased(meshes).forEach((part, k) => {
+        const material = new THREE.MeshPhongMaterial({ color: meshes[k].colour, specular: 0x2a2a2a, shininess: 35, side: THREE.DoubleSide });
+        const mesh = new THREE.Mesh(this.geometry(part), material);
+        mesh.castShadow = true;
+        group.add(mesh);
+      });
+      scene.add(group);
+      return group;
+    }
+    trace({ colour, width, points, shown }) {
+      const { THREE, scene, size } = this;
+      const material = new THREE.LineMaterial({ color: new THREE.Color(colour).getHex(), linewidth: max(1.2, min(3, (45 * width) / size)) });
+      const line = new THREE.Line2(new THREE.LineGeometry(), material);
+      line.frustumCulled = false;
+      scene.add(line);
+      const drawn = { line, shown };
+      this.setPoints(drawn, points);
+      return drawn;
+    }
+    setPoints(trace, points) {
+      trace.line.geometry.dispose();
+      trace.line.geometry = new this.THREE.LineGeometry();
+      trace.line.geometry.setPositions(points.length > 3 ? points : [...points, ...points]);
+    }
+    // A shaft one unit long, which is scaled, and a tip; what is seen through the body has a ball where it starts.
+    arrow({ colour, width, through, unit, scale, limit, shown }) {
+      const { THREE, scene } = this, group = new THREE.Group(), head = 5 * width;
+      const material = new THREE.MeshPhongMaterial({ color: colour, specular: 0, depthTest: !through, transparent: through });
+      const part = (geometry) => {
+        const mesh = new THREE.Mesh(geometry, material);
+        mesh.renderOrder = through ? 2 : 0;
+        group.add(mesh);
+        return mesh;
+      };
+      const shaft = part(new THREE.CylinderGeometry(width, width, 1, 20).translate(0, 0.5, 0));
+      const tip = part(new THREE.ConeGeometry(2.4 * width, head, 24).translate(0, head / 2, 0));
+      if (through) part(new THREE.SphereGeometry(1.8 * width, 20, 14));
+      scene.add(group);
+      const label = element("span", this.labels, { className: "force" });
+      label.style.color = colour;
+      return { group, shaft, tip, head, unit, scale, limit: limit ?? Infinity, label, shown, size: 0 };
+    }
+
+    // Setters: what a player, or a live simulation, calls.
+    setPose(run, body, position, quaternion) {
+      const group = this.runs[run].bodies[body];
+      group.position.set(...position);
+      group.quaternion.set(...quaternion);
+    }
+    setTrace(run, trace, count, about) {
+      const { line, shown } = this.runs[run].traces[trace];
+      line.geometry.instanceCount = max(0, count);
+      line.visible = shown && count > 0;
+      if (about) line.position.set(...about);
+    }
+    setArrow(run, number, start, vector) {
+      const arrow = this.runs[run].arrows[number], { group, shaft, tip } = arrow;
+      arrow.size = hypot(...vector);
+      const length = min(arrow.size * arrow.scale, arrow.limit), head = min(arrow.head, 0.6 * length);
+      group.visible = arrow.shown && length > 0.02 * arrow.head;
+      if (!group.visible) return;
+      group.position.set(...start);
+      group.quaternion.setFromUnitVectors(new this.THREE.Vector3(0, 1, 0), new this.THREE.Vector3(...vector).normalize());
+      shaft.scale.set(1, max(length - head, 1e-9), 1);
+      tip.position.set(0, length - head, 0);
+      tip.scale.setScalar(max(head / arrow.head, 1e-9));
+      arrow.length = length;
+    }
+    setNormal(run, normal) { this.runs[run].normal = normal; }
+    // Of all runs: `kind` is "arrows" or "traces".
+    show(kind, number, shown) { for (const run of this.runs) run[kind][number].shown = shown; }
+
+    // Where the bodies are, and how far apart; a camera that follows keeps its place relative to them.
+    look(points, follow) {
+      const focus = [0, 1, 2].map((c) => points.reduce((sum, point) => sum + point[c], 0) / points.length);
+      const apart = max(...points.map((point) => hypot(...point.map((x, c) => x - focus[c]))));
+      const span = 3.6 * this.size + apart, { camera, controls } = this;
+      if (this.focus && follow) {
+        ["x", "y", "z"].forEach((axis, c) => {
+          const away = ((camera.position[axis] - controls.target[axis]) * span) / this.span;
+          controls.target[axis] += focus[c] - this.focus[c];
+          camera.position[axis] = controls.target[axis] + away;
+        });
+      }
+      [this.focus, this.span] = [focus, span];
+      const wanted = apart + 3.5 * this.size;
+      if (wanted > 1.2 * this.reach || wanted < 0.6 * this.reach) this.shadowOver(wanted);
+      const near = this.runs.map((run) => run.bodies[0].position).every((place, k, all) => place.distanceTo(all[0]) < this.size);
+      this.runs.forEach(({ bodies }, k) => bodies.forEach((group) => group.children.forEach(({ material }) => {
+        // Bodies in one place are told apart: all but the first are seen through.
+        Object.assign(material, { transparent: k > 0 && near, opacity: k > 0 && near ? 0.5 : 1 });
+      })));
+    }
+    reset() {
+      const [place, target] = this.fact.camera;
+      this.camera.position.set(...place);
+      this.controls.target.set(...target);
+      if (this.focus) this.recentre();
+      this.controls.update();
+    }
+    // The first view's direction and distance, about the place where the bodies are now.
+    recentre() {
+      const [place, target] = this.fact.camera;
+      if (!this.fact.follow) return;
+      const scale = this.span / this.firstSpan;
+      this.controls.target.set(...this.focus);
+      this.camera.position.set(...this.focus.map((x, c) => x + (place[c] - target[c]) * scale));
+    }
+    fromAbove() {
+      const { camera, controls } = this, distance = camera.position.distanceTo(controls.target), normal = this.runs[0].normal;
+      // Not along `up` itself, where the camera could turn either way.
+      const tilted = new this.THREE.Vector3(...normal).add(new this.THREE.Vector3(0, -0.02, 0)).normalize();
+      camera.position.copy(controls.target).addScaledVector(tilted, distance);
+      controls.update();
+      this.render();
+    }
+
+    resize() {
+      const { clientWidth: width, clientHeight: height } = this.box;
+      if (!width || !height) return;
+      this.renderer.setSize(width, height);
+      for (const { traces } of this.runs) for (const { line } of traces) line.material.resolution.set(width, height);
+      this.camera.aspect = width / height;
+      // In a narrow picture as much is seen across as is seen up and down in a square one.
+      this.camera.fov = 2 * Math.atan(Math.tan((this.fact.angle * Math.PI) / 360) / min(1, this.camera.aspect)) * 180 / Math.PI;
+      this.camera.updateProjectionMatrix();
+      this.render();
+    }
+    // Keep the camera over the floor on which the first body is.
+    aboveTheFloor() {
+      if (!this.focus) return;
+      const { camera, controls } = this, normal = new this.THREE.Vector3(...this.runs[0].normal);
+      const away = camera.position.clone().sub(controls.target), distance = away.length();
+      const height = away.dot(normal) + this.size, least = LOWEST * distance;
+      if (height < least) camera.position.addScaledVector(normal, least - height);
+      camera.lookAt(controls.target);
+    }
+    render() {
+      const { camera, scene, sun, focus } = this;
+      this.aboveTheFloor();
+      const distance = camera.position.distanceTo(this.controls.target);
+      Object.assign(camera, { near: 0.02 * distance, far: 20 * distance + 200 * this.size });
+      camera.updateProjectionMatrix();
+      if (focus) {
+        const normal = this.runs[0].normal, aside = [-0.35, -0.22, 0.25];
+        sun.target.position.set(...focus);
+        sun.position.set(...focus.map((x, c) => x + 5 * this.reach * (normal[c] + aside[c])));
+      }
+      this.renderer.render(scene, camera);
+      this.write();
+    }
+    // Names of bodies, and the forces' newtons, where they are on the screen.
+    write() {
+      const { camera, box, THREE } = this, width = box.clientWidth, height = box.clientHeight;
+      const onScreen = (point) => {
+        const at = point.clone().project(camera);
+        return [((at.x + 1) / 2) * width, ((1 - at.y) / 2) * height, at.z < 1 && Math.abs(at.x) < 1 && Math.abs(at.y) < 1];
+      };
+      const put = (label, [x, y, seen], lift) => {
+        label.style.display = seen ? "" : "none";
+        label.style.transform = `translate(${x.toFixed(1)}px, ${(y - lift).toFixed(1)}px)`;
+      };
+      this.runs.forEach((run, k) => {
+        if (run.name) {
+          const over = new THREE.Vector3(...run.normal).multiplyScalar(1.7 * this.size).add(run.bodies[0].position);
+          put(run.name, onScreen(over), 18 + 22 * k);
+        }
+        for (const arrow of run.arrows) {
+          if (arrow.unit !== "N" || !arrow.group.visible || k > 0) { arrow.label.style.display = "none"; continue; }
+          const end = new THREE.Vector3(0, arrow.length, 0).applyQuaternion(arrow.group.quaternion).add(arrow.group.position);
+          arrow.label.textContent = `${views.digits(arrow.size, 3)} N`;
+          put(arrow.label, onScreen(end), 14);
+        }
+      });
+    }
+    // The matrix of a body in the scene, column after column.
+    matrix(run, body) {
+      const group = this.runs[run].bodies[body];
+      group.updateMatrixWorld(true);
+      return [...group.matrixWorld.elements];
+    }
+  }
+
+  Object.assign(window.views, { Stage, element });
+})();

@@ -1,0 +1,118 @@
+// Strips of curves over time, one for each label, with the curves of all runs in it.
+"use strict";
+window.views = window.views || {};
+(() => {
+  const digits = (v, count = 4) =>
+    v === 0 ? "0" : Math.abs(v) < 1e-3 || Math.abs(v) >= 1e5 ? v.toExponential(2) : v.toPrecision(count);
+
+  // Where a time lies among the times of a run: the index before it, and how far it is towards the next.
+  function place(times, time) {
+    let low = 0, high = times.length - 1;
+    if (high < 1 || time <= times[0]) return [0, 0];
+    if (time >= times[high]) return [high - 1, 1];
+    while (high - low > 1) {
+      const middle = (low + high) >> 1;
+      if (times[middle] <= time) low = middle; else high = middle;
+    }
+    return [low, (time - times[low]) / (times[high] - times[low])];
+  }
+
+  const LEFT = 58, FOOT = 4;
+
+  class Strips {
+    // `runs()`: those with their `times`, `colour` and `curves`; `seek(time)`: called where somebody points and clicks.
+    constructor(parent, runs, seek) {
+      Object.assign(this, { runs, seek, now: 0, pointed: null });
+      const labels = [...new Set(runs().flatMap((run) => run.curves.map((curve) => curve.label)))];
+      this.strips = labels.map((label) => {
+        const box = views.element("div", parent, { className: "strip" }), head = views.element("div", box, { className: "head" });
+        views.element("span", head, { textContent: label });
+        const value = views.element("span", head, { className: "value" }), canvas = views.element("canvas", box);
+        const strip = { label, canvas, value };
+        const at = (event) => {
+          const edge = canvas.getBoundingClientRect(), part = (event.clientX - edge.left - LEFT) / (edge.width - LEFT - 4);
+          return Math.min(Math.max(part, 0), 1) * this.duration;
+        };
+        canvas.addEventListener("pointermove", (event) => {
+          if (event.buttons) seek(at(event)); else { this.pointed = at(event); this.draw(this.now); }
+        });
+        canvas.addEventListener("pointerleave", () => { this.pointed = null; this.draw(this.now); });
+        canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); this.pointed = null; seek(at(event)); });
+        return strip;
+      });
+      this.refresh();
+      new ResizeObserver(() => { this.strips.forEach((strip) => { strip.pale = null; }); this.draw(this.now); }).observe(parent);
+    }
+    // Read the runs anew: their values or times have changed.
+    refresh() {
+      const runs = this.runs();
+      this.duration = Math.max(...runs.map((run) => run.times[run.times.length - 1]));
+      for (const strip of this.strips) {
+        strip.curves = runs.flatMap((run) => run.curves.filter((curve) => curve.label === strip.label)
+          .map((curve) => ({ times: run.times, values: curve.values, colour: run.colour })));
+        let low = Infinity, high = -Infinity;
+        for (const curve of strip.curves) for (const v of curve.values) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
+        // What is constant but for round-off is drawn as a constant.
+        const least = 1e-3 * Math.max(Math.abs(low), Math.abs(high)) || 1;
+        if (!(high - low > least)) { low -= least; high += least; }
+        Object.assign(strip, { low, high, pale: null });
+      }
+    }
+    paint(strip) {
+      const { canvas } = strip, ratio = window.devicePixelRatio || 1;
+      const width = Math.max(1, Math.round(canvas.clientWidth * ratio)), height = Math.max(1, Math.round(canvas.clientHeight * ratio));
+      canvas.width = width; canvas.height = height;
+      const [x0, x1, y0, y1] = [LEFT * ratio, width - 4 * ratio, height - FOOT * ratio, 6 * ratio];
+      const x = (t) => x0 + (t / this.duration) * (x1 - x0);
+      const y = (v) => y0 + ((v - strip.low) / (strip.high - strip.low)) * (y1 - y0);
+      const drawn = (alpha, thick) => {
+        const layer = Object.assign(document.createElement("canvas"), { width, height }), pen = layer.getContext("2d");
+        Object.assign(pen, { globalAlpha: alpha, lineWidth: thick * ratio, lineJoin: "round" });
+        for (const curve of strip.curves) {
+          pen.strokeStyle = curve.colour; pen.beginPath();
+          let down = false;
+          curve.values.forEach((v, k) => {
+            if (!Number.isFinite(v)) { down = false; return; }
+            if (down) pen.lineTo(x(curve.times[k]), y(v)); else pen.moveTo(x(curve.times[k]), y(v));
+            down = true;
+          });
+          pen.stroke();
+        }
+        return layer;
+      };
+      Object.assign(strip, { x, y, x0, x1, y0, y1, ratio, pale: drawn(0.28, 1), strong: drawn(1, 1.5) });
+    }
+    draw(time) {
+      this.now = time;
+      for (const strip of this.strips) this.drawOne(strip, time);
+    }
+    drawOne(strip, time) {
+      if (!strip.pale) this.paint(strip);
+      const { canvas, x0, x1, y0, y1, ratio } = strip, pen = canvas.getContext("2d"), now = strip.x(time);
+      pen.clearRect(0, 0, canvas.width, canvas.height);
+      Object.assign(pen, { fillStyle: "#6b7280", font: `${11 * ratio}px system-ui, sans-serif`, textAlign: "right" });
+      pen.fillText(digits(strip.high), x0 - 6 * ratio, y1 + 6 * ratio);
+      pen.fillText(digits(strip.low), x0 - 6 * ratio, y0);
+      Object.assign(pen, { strokeStyle: "#dde1e6", lineWidth: ratio });
+      pen.strokeRect(x0, y1, x1 - x0, y0 - y1);
+      pen.drawImage(strip.pale, 0, 0);
+      pen.save(); pen.beginPath(); pen.rect(0, 0, now, canvas.height); pen.clip(); pen.drawImage(strip.strong, 0, 0); pen.restore();
+      const upright = (at, dashes) => {
+        pen.strokeStyle = "#23262b"; pen.setLineDash(dashes); pen.beginPath(); pen.moveTo(at, y0); pen.lineTo(at, y1); pen.stroke(); pen.setLineDash([]);
+      };
+      upright(now, []);
+      if (this.pointed !== null) upright(strip.x(this.pointed), [3 * ratio, 3 * ratio]);
+      const shown = this.pointed ?? time;
+      strip.value.textContent = this.pointed === null ? "" : `${shown.toFixed(3)} s: `;
+      for (const { times, values, colour } of strip.curves) {
+        const [k, part] = place(times, shown), v = values[Math.min(Math.round(k + part), values.length - 1)];
+        views.element("span", strip.value, { textContent: ` ${Number.isFinite(v) ? digits(v) : "-"}` }).style.color = colour;
+        if (Number.isFinite(v) && shown <= times[times.length - 1] + 1e-9) {
+          pen.fillStyle = colour; pen.beginPath(); pen.arc(strip.x(shown), strip.y(v), 3 * ratio, 0, 7); pen.fill();
+        }
+      }
+    }
+  }
+
+  Object.assign(window.views, { Strips, place, digits });
+})();

@@ -1,0 +1,240 @@
+"""A page with sliders in which a ride is simulated anew in the browser."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from nonholonomic.geometry import Plane
+from nonholonomic.integration import FAILED, LEFT_DOMAIN, AbstractProblem, LaneState, Settings, Status
+from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.progress import status_line
+from nonholonomic.views import Page, Stage, arena
+from nonholonomic.views.explore import (
+    Answer,
+    Frame,
+    LiveRun,
+    Simulator,
+    Slider,
+    Summary,
+    ends_of,
+    live_page,
+    quaternion,
+    sliders_of,
+)
+
+from ..model.dynamics import State
+from ..model.input import Input
+from ..model.launch import Launch
+from ..model.scene import DRIVES, Scene
+from .checks import check_run
+from .ride import Ride, RideProblem, RideSpec, Stats, as_module
+from .simulate import simulate
+from .table import LONG_NAMES, UNITS
+from .trajectory import read_off
+from .view import RADIUS, TRACK
+
+Numbers = Float[Array, " numbers"]
+
+#: The tolerance in the page, and that of the runs that only say how far the ground is drawn.
+TOLERANCE = 1e-7
+DRAWN = 1e-5
+
+#: Steps after which a run in the page is given up: some hundred milliseconds.
+MOST_STEPS = 50_000
+
+
+@status_line("writing a page")
+def explore(
+    scene: Scene,
+    launch: Launch,
+    path: Any = None,
+    sliders: dict[str, tuple[float, float]] | None = None,
+    t1: float = 8.0,
+    input: Input | None = None,
+) -> Page:
+    """Make a page with sliders that simulates the ride again, in the browser, while you move a slider.
+
+    The page is one file that needs no network; a notebook shows the returned `Page`. The equations of motion, the Runge-Kutta
+    pair and the step-size control are generated from those of `simulate` and of tables, at a tolerance of 1e-7. In the
+    background, a map of how far the ride leads over two of the sliders fills in; click it to set both. The page's address holds
+    the sliders: a copied link opens the same ride. Press space to play or pause, r to reset the sliders.
+
+    **Arguments:**
+
+    - `scene`, `launch`, `input`: the ride at the start, as for `simulate`.
+    - `path`: file to write the page to, or `None`.
+    - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name will do where only one parameter fits, such
+      as "launch.speed", "launch.steering" or "inertia". By default speed, steering angle, heading and friction.
+    - `t1`: horizon [s].
+
+    **Returns:** a `Page`, with its `html`.
+
+    **Raises:** `ValueError` for arguments out of range, an unknown slider, or equations with an operation of JAX that cannot
+    be written in JavaScript; `ModuleNotFoundError` if the library for views is not installed; `OSError` if the file cannot be
+    written.
+
+    **Example:** a page with two sliders.
+
+    ```
+    >>> import stroller
+    >>> body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
+    >>> scene = stroller.Scene(body, friction=stroller.Damping(2.0, 1.0, 0.2, 0.05))
+    >>> launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=2.0)
+    >>> page = stroller.explore(scene, launch, sliders={"speed": (0.5, 3.0), "launch.steering": (-0.5, 0.5)}, t1=2.0)
+    >>> len(page.html) < 2.5e6
+    True
+
+    ```
+    """
+    check_run(scene, launch, t1, input, TOLERANCE)
+    roots: dict[str, Any] = {"scene": scene, "launch": launch}
+    if isinstance(input, eqx.Module):
+        roots["input"] = input
+    knobs = sliders_of(default_ranges(scene, launch) if sliders is None else sliders, roots, LONG_NAMES, UNITS)
+    shapes = [roots, *(with_numbers(roots, {path: end}) for path, end in ends_of(knobs))]
+    page = live_page(live_run(roots, knobs, float(t1), input), stage(shapes, float(t1), input))
+    if path is not None:
+        page.save(path)
+    return page
+
+
+def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input: Any) -> LiveRun:
+    """What the page shows of a scene, a launch and an input, `roots`, some of whose numbers are those of sliders."""
+    settings = Settings(TOLERANCE, max_steps=MOST_STEPS)
+    controls = as_module(input, roots["scene"], roots["launch"])
+
+    def modules(values: Numbers) -> tuple[Scene, Launch, Input | None]:
+        replaced = with_numbers(roots, {knob.path: value for knob, value in zip(knobs, values, strict=True)})
+        return replaced["scene"], replaced["launch"], replaced.get("input", controls)
+
+    def moment(values: Numbers, problem: "RollingRide", lane: LaneState) -> Frame:
+        return frame(*modules(values), problem, lane)
+
+    asked = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
+    # On a plane contact is never lost, and nothing is watched for.
+    watched = not isinstance(roots["scene"].surface, Plane)
+    ride = Simulator(lambda values: RideProblem.of(*modules(values), 1, watched), t1, settings, asked, watched)
+    return LiveRun(
+        title=f"Stroller on a {type(roots['scene'].surface).__name__.lower()}",
+        sliders=knobs,
+        allowed=lambda values: modules(values)[0].may_start(modules(values)[1]),
+        answer=Answer("distance from the start", "m", ride),
+        motion=Simulator(lambda values: RollingRide.of(*modules(values)), t1, settings, {"frame": moment}),
+        summaries=(Summary("speed", "m/s", 0), Summary("energy", "J", 2)),
+    )
+
+
+def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
+    """The sliders if a user names none: speed, steering angle, heading, and what friction has."""
+    speed, steering, heading = float(launch.speed), abs(float(launch.steering)), float(launch.heading)
+    ranges = {
+        "launch.speed": (min(0.0, 2.0 * speed), max(3.0, 2.0 * speed)),
+        "launch.steering": (-max(0.9, steering), max(0.9, steering)),
+        "launch.heading": (heading - math.pi, heading + math.pi),
+    }
+    friction = {
+        path: float(value) for path, value in numbers("scene.friction", scene.friction).items() if value is not None
+    }
+    return ranges | {
+        path: (0.0, 3.0 * value) for path, value in friction.items() if value > 0.0 and path.endswith("ing")
+    }
+
+
+class RollingRide(AbstractProblem):
+    """A ride with the angles by which its left, right and front wheel have rolled."""
+
+    ride: RideProblem
+
+    @classmethod
+    def of(cls, scene: Scene, launch: Launch, controls: Input | None) -> "RollingRide":
+        """The problem of one cell."""
+        return cls(RideProblem.of(scene, launch, controls, 1, False))
+
+    def start(self) -> tuple[State, State]:
+        state, scales = self.ride.start()
+        return jnp.concatenate([state, jnp.zeros((3, 1))]), jnp.concatenate([scales, jnp.ones((3, 1))])
+
+    def field(self, time: Float[Array, "..."], state: State) -> State:
+        """The ride's field; each rear wheel rolls as fast as the ground passes below it, half a track from the middle."""
+        length = self.ride.dynamics.body.wheelbase
+        motion = self.ride.dynamics.geometry(state[:-3]).motion
+        aside = 0.5 * TRACK * length * motion.yaw_rate
+        speeds = jnp.stack([motion.speed - aside, motion.speed + aside, motion.front_speed])
+        return jnp.concatenate([self.ride.field(time, state[:-3]), speeds / (RADIUS * length)])
+
+    def event_function(self, state: State) -> None:
+        return None
+
+    def domain_margin(self, time: Float[Array, "..."], state: State) -> Any:
+        return self.ride.domain_margin(time, state[:-3])
+
+
+def outcome(problem: RideProblem, lane: LaneState) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    """How a ride ended, a `Status`, and how far from its start [m], infinite where it is not completed."""
+    first, last = problem.dynamics.unpack(problem.states)[0], problem.dynamics.unpack(lane.state)[0]
+    apart = [(a - b) ** 2 for a, b in zip(first, last, strict=True) if a is not None and b is not None]
+    status = jnp.where(jnp.isfinite(lane.first_crossing), int(Status.CONTACT_LOST), int(Status.COMPLETED))
+    status = jnp.where(lane.status == LEFT_DOMAIN, int(Status.RANK_LOST), status)
+    status = jnp.where(lane.status == FAILED, int(Status.FAILED), status)[0]
+    return status, jnp.where(status == int(Status.COMPLETED), jnp.sqrt(sum(apart))[0], jnp.inf)
+
+
+def stage(runs: list[dict[str, Any]], t1: float, controls: Any) -> Stage:
+    """The first of some scenes and launches as it is drawn, on a piece of the ground on which all of them are."""
+    rides = [simulate(run["scene"], run["launch"], t1, run.get("input", controls), tolerance=DRAWN) for run in runs]
+    (first,), length = rides[0].stages(), float(runs[0]["scene"].body.wheelbase)
+    points = np.concatenate([np.asarray(ride.position) for ride in rides])
+    return first._replace(arena=arena(runs[0]["scene"].surface, points, first.arena.normal, 3.0 * length, length))
+
+
+def frame(scene: Scene, launch: Launch, controls: Input | None, problem: RollingRide, lane: LaneState) -> Frame:
+    """What is drawn of a stroller at one time, as `view.show` orders it."""
+    spec = RideSpec.of(Ride(scene, launch, controls, jnp.zeros(()), Settings(TOLERANCE), None))
+    run = read_off(spec, lane.time, lane.state[:-3], Stats(jnp.zeros(()), jnp.zeros(()), jnp.asarray(True)))
+    length, position, heading = scene.body.wheelbase, run.position[0], run.direction[0]
+    normal = scene.surface.sign(scene.side, DRIVES) * fixed_normal(scene, position)
+    x = heading / jnp.linalg.norm(heading)
+    y = jnp.cross(normal, x)
+    y = y / jnp.linalg.norm(y)
+    z = jnp.cross(x, y)
+    cosine, sine = jnp.cos(run.steering[0]), jnp.sin(run.steering[0])
+    forward, left = cosine * x + sine * y, cosine * y - sine * x
+    radius, half = RADIUS * length, 0.5 * TRACK * length
+    axle, front = position + radius * z, position + length * x + radius * z
+    rolled = lane.state[-3:, 0]
+    contacts = (position + 0.02 * radius * z, position + length * x + 0.02 * radius * z)
+    return Frame(
+        normal=normal,
+        bodies=(
+            (axle, quaternion(jnp.stack([x, y, z], axis=-1))),
+            (axle + half * y, rolling(x, y, z, rolled[0])),
+            (axle - half * y, rolling(x, y, z, rolled[1])),
+            (front, rolling(forward, left, z, rolled[2])),
+        ),
+        traces=((contacts[0], None), (contacts[1], None)),
+        arrows=(
+            (axle - 1.4 * half * y, run.normal_force[0] * z),
+            (contacts[0], run.side_force[0, 0] * y),
+            (contacts[1], run.side_force[0, 1] * left),
+        ),
+        curves=(run.speed[0], run.steering[0], run.energy[0], run.normal_force[0]),
+        turning_rate=jnp.maximum(jnp.abs(run.speed[0]), jnp.abs(run.front_speed[0])) / radius,
+    )
+
+
+def rolling(x: Array, y: Array, z: Array, angle: Float[Array, ""]) -> Float[Array, "4"]:
+    """The quaternion of a wheel with axes x (ahead), y (its axle) and z, that has rolled by an angle."""
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    return quaternion(jnp.stack([cosine * x - sine * z, y, sine * x + cosine * z], axis=-1))
+
+
+def fixed_normal(scene: Scene, position: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The ground's outward normal at a point, in the fixed frame."""
+    surface = scene.surface
+    own = surface.normal(surface.in_own_axes((position[0], position[1], position[2])))
+    x, y, z = (jnp.zeros(()) if part is None else jnp.asarray(part) + 0.0 for part in own)
+    return jnp.stack([jnp.asarray(part) for part in surface.in_fixed_frame((x, y, z))])

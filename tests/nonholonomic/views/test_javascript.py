@@ -1,0 +1,125 @@
+"""What is written in JavaScript computes what the function computes, in a real browser."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from browser import needs_browser, open_browser
+
+from nonholonomic.views.explore import javascript
+
+X = np.array([0.3, -1.2, 2.5])
+
+
+def loop(x):
+    """The two numbers change places, forty times."""
+    return jax.lax.fori_loop(0, 40, lambda k, pair: (pair[1], 0.9 * pair[0] + x[2]), (x[0], x[1]))
+
+
+def until(x):
+    return jax.lax.while_loop(lambda pair: pair[1] < 5, lambda pair: (jnp.sin(pair[0]), pair[1] + 1), (x[0], 0))
+
+
+def newton(x):
+    """The cube root of 2.5, by a loop that ends when it is found."""
+    return jax.lax.while_loop(
+        lambda y: abs(y**3 - x[2]) > 1e-12, lambda y: y - (y**3 - x[2]) / (3.0 * y**2), x[0] + 1.0
+    )
+
+
+def of_two(x):
+    return jax.lax.cond(x[0] > 0.0, lambda: (2.0 * x, x[0]), lambda: (3.0 * x, x[1]))
+
+
+def of_three(x):
+    return jax.lax.switch((x[2] > 0.0).astype(int) + 1, [lambda: x, lambda: x + 1.0, lambda: 5.0 * x])
+
+
+def everything(x):
+    """Functions of one number, where they are defined."""
+    a, b = jnp.abs(x) + 1.0, jnp.tanh(x)
+    named = (
+        jnp.exp(x),
+        jnp.expm1(x),
+        jnp.log(a),
+        jnp.log1p(a),
+        jnp.sqrt(a),
+        jnp.cbrt(a),
+        jnp.sin(x),
+        jnp.cos(x),
+        jnp.tan(x),
+    )
+    named += (jnp.arcsin(b), jnp.arccos(b), jnp.arctan(x), jnp.arctan2(x, a), jnp.sinh(x), jnp.cosh(x), jnp.tanh(x))
+    named += (jnp.arcsinh(x), jnp.arccosh(a), jnp.arctanh(b), a**x, a**-3, jnp.exp2(x), jax.lax.rsqrt(a), jnp.sign(x))
+    return (
+        *named,
+        jnp.floor(x),
+        jnp.ceil(x),
+        jnp.mod(x, 0.7),
+        jnp.maximum(x, 0.0),
+        jnp.clip(x, -1.0, 1.0),
+        jax.nn.sigmoid(x),
+    )
+
+
+def array_work(x):
+    """Sums, products, extremes and places that are known only as it runs."""
+    which = (x[2] > 0.0).astype(int)
+    matrix = jnp.outer(x, x) + jnp.eye(3)
+    picked = (x[which], x[which + jnp.arange(2)], x.at[which].set(7.0), jax.lax.dynamic_slice(x, (which,), (2,)))
+    whole = (matrix @ x, matrix.T.ravel(), x @ x, jnp.prod(x), jnp.max(x), jnp.min(x), jnp.argmin(x), jnp.argmax(x))
+    return (*picked, *whole, jnp.any(x > 2.0), jnp.all(x > 2.0), x[::-1], jnp.linalg.norm(x), jnp.hypot(x[0], x[1]))
+
+
+def slopes(x):
+    """What automatic differentiation makes of a function."""
+    return jax.grad(lambda y: jnp.sin(y[0]) * y[1] ** 3 / jnp.sqrt(1.0 + y[2] ** 2))(x)
+
+
+FUNCTIONS = [loop, until, newton, of_two, of_three, everything, array_work, slopes]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with open_browser() as driver:
+        yield driver
+
+
+@needs_browser
+@pytest.mark.parametrize("function", FUNCTIONS, ids=lambda function: function.__name__)
+def test_the_browser_computes_what_jax_computes(browser, function):
+    text = javascript("", function, jnp.asarray(X))
+    numbers = browser.execute_script(f"return ({text})({json.dumps(X.tolist())}, []).map(Number)")
+    expected = np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(function(jnp.asarray(X)))])
+    np.testing.assert_allclose(np.array(numbers, float), expected, rtol=1e-14, atol=1e-15)
+
+
+@needs_browser
+def test_no_number_is_lost_that_is_not_finite(browser):
+    text = javascript(
+        "", lambda x: (x / 0.0, 0.0 * x / 0.0, jnp.inf * x, jnp.where(x > 1.0, x, -jnp.inf)), jnp.ones(())
+    )
+    assert browser.execute_script(f"return ({text})([-2], []).map(String)") == [
+        "-Infinity",
+        "NaN",
+        "-Infinity",
+        "-Infinity",
+    ]
+
+
+def test_what_no_result_needs_is_left_out():
+    text = javascript("f", lambda x: jnp.stack([jnp.sin(x[0]), jnp.cos(x[1])])[0], jnp.asarray(X))
+    assert "Math.sin" in text
+    assert "Math.cos" not in text
+
+
+def test_what_is_computed_twice_is_written_once():
+    text = javascript("f", lambda x: jnp.exp(x[0]) + jnp.exp(x[0]) * x[1], jnp.asarray(X))
+    assert text.count("Math.exp") == 1
+
+
+def test_an_unknown_primitive_is_named():
+    with pytest.raises(ValueError, match="primitive 'lgamma' of JAX"):
+        javascript("f", jax.lax.lgamma, jnp.asarray(X))

@@ -1,0 +1,245 @@
+"""The page with sliders, in a real browser without a network: it says what the tables say, and everything on it can be used."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from browser import needs_browser, open_browser, wait
+from tops import rutstam_top
+
+import tippe
+from nonholonomic.views.explore import programs, sliders_of
+from tippe.runs.explore import TOLERANCE, live_run
+
+pytestmark = needs_browser
+
+#: How far times and end states in the browser may be from those of tables. They differ by round-off, which some runs magnify.
+CLOSE = 1e-6
+
+RANGES = {"theta": (0.02, 0.6), "spin": (60.0, 200.0), "mu": (0.05, 1.0)}
+
+
+def hills(x, y):
+    return x * x + 0.8 * y * y + 0.1 * jnp.sin(3.0 * x) * y * y
+
+
+PLACED = {"place": (0.1, 0.05)}
+ARENAS = {
+    "plane": (tippe.Plane(), {}),
+    "cylinder": (tippe.Cylinder(0.3), {"eta": 0.3}),
+    "sphere": (tippe.Sphere(0.5), {"eta": 0.3}),
+    "paraboloid": (tippe.Paraboloid(0.5), PLACED),
+    "graph": (tippe.Graph(hills), PLACED),
+}
+LAWS = {"viscous": tippe.Viscous(0.3), "Coulomb": tippe.Coulomb(0.3, 0.02)}
+#: Horizons [s] by which some launches have turned over, and some have not.
+HORIZONS = {"viscous": 6.5, "Coulomb": 4.0}
+CASES = [(arena, law) for arena in ARENAS for law in LAWS]
+#: Those of the ordinary run: the turning frame, and an arena that is a user's function.
+SHORT = [("plane", "viscous"), ("graph", "Coulomb")]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with open_browser("1100,800") as driver:
+        yield driver
+
+
+def launches_of(arena: str, law: str, seed: int) -> tuple[tippe.Scene, tippe.Launch, dict[str, np.ndarray]]:
+    """A scene, a launch on it, and a grid of fifty random launches."""
+    surface, place = ARENAS[arena]
+    rng = np.random.default_rng(seed)
+    counts = {"theta": 5, "spin": 5, "mu": 2}
+    grid = {name: np.sort(rng.uniform(*ends, counts[name])) for name, ends in RANGES.items()}
+    return tippe.Scene(rutstam_top(), surface, LAWS[law]), tippe.Launch(0.1, 155.0, **place), grid
+
+
+def table_of(scene: tippe.Scene, launch: tippe.Launch, grid: dict[str, np.ndarray], t1: float) -> tippe.Table:
+    place = {} if launch.place is None else {f"launch.place[{k}]": float(x) for k, x in enumerate(launch.place)}
+    options = {"eta": float(launch.eta), "axes": place, "t1": t1, "tolerance": TOLERANCE, "progress": False}
+    return tippe.inversion_table(scene, **grid, **options)
+
+
+@pytest.mark.parametrize(
+    ("arena", "law"), [pytest.param(*case, marks=() if case in SHORT else pytest.mark.slow) for case in CASES]
+)
+def test_the_browser_says_what_the_table_says(browser, arena, law):
+    scene, launch, grid = launches_of(arena, law, CASES.index((arena, law)))
+    roots = {"scene": scene, "launch": launch}
+    live = live_run(roots, sliders_of(RANGES, roots, {}, {}), HORIZONS[law])
+    table = table_of(scene, launch, grid, HORIZONS[law])
+    theta, mu, spin = (values.ravel() for values in np.meshgrid(grid["theta"], grid["mu"], grid["spin"], indexing="ij"))
+    runs = json.dumps(np.stack([theta, spin, mu], axis=-1).tolist())
+    browser.get("about:blank")
+    script = f"""{programs(live)}
+        const asks = integrator(live.answer), at = live.answer.lane, text = (x) => Number.isFinite(x) ? x : String(x);
+        return {runs}.map((values) => {{
+          const lane = asks.run(values), cosine = lane[at.state + 4];
+          return [...asks.read("outcome", values), lane[at.time], Math.acos(Math.max(-1, Math.min(1, cosine)))].map(text);
+        }})"""
+    status, time, end, angle = np.array(browser.execute_script(script), dtype=float).T
+    assert [tippe.Status(int(code)).word for code in status] == list(np.ravel(table.status))
+    np.testing.assert_allclose(time, np.ravel(table.time), rtol=CLOSE)
+    np.testing.assert_allclose(end, np.ravel(table.end_time), rtol=CLOSE)
+    np.testing.assert_allclose(angle, np.ravel(table.end_theta), atol=CLOSE)
+    # Several ways to end, or little would be compared.
+    assert len(set(status)) > 1
+
+
+@pytest.fixture(scope="module")
+def page(browser, rutstam_scene, tmp_path_factory):
+    """The page of Rutstam's top, with two sliders, opened from disk."""
+    path = tmp_path_factory.mktemp("page") / "top.html"
+    written = tippe.explore(
+        rutstam_scene, tippe.Launch(0.1, 155.0), path, {"theta": (0.05, 0.5), "spin": (60.0, 200.0)}, t1=7.0
+    )
+    browser.get_log("browser")
+    browser.get_log("performance")
+    browser.get(path.as_uri())
+    wait(browser, "return !!(window.live && live.ready)")
+    return written
+
+
+def reset(browser):
+    browser.execute_script("document.getElementById('reset').click()")
+    wait(browser, "return live.values()[0] === 0.1 && live.values()[1] === 155")
+
+
+def test_the_page_needs_no_network_and_complains_of_nothing(browser, page):
+    assert len(page.html) < 2.5e6
+    assert [entry for entry in browser.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")] == []
+    events = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
+    requests = [event["params"]["request"]["url"] for event in events if event["method"] == "Network.requestWillBeSent"]
+    assert requests
+    assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
+
+
+def test_it_shows_the_time_of_the_launch_and_the_run(browser, page, rutstam_scene):
+    run = tippe.simulate(rutstam_scene, tippe.Launch(0.1, 155.0), 7.0, times=[0.0, 2.0, 7.0])
+    time = float(tippe.inversion_time(rutstam_scene, tippe.Launch(0.1, 155.0), 7.0))
+    assert f"{time:.3f} s" in browser.find_element("id", "result").text
+    assert "inverted" in browser.find_element("id", "result").text
+    read = "return live.moves.trajectory(live.values(), 'frame').read([0, 2, 7]).map((row) => [...row])"
+    rows = np.array(browser.execute_script(read))
+    np.testing.assert_allclose(rows[:, 3:6], run.position, atol=CLOSE)
+    theta, energy, jellett, force = rows[:, -5:-1].T
+    np.testing.assert_allclose(theta, run.theta, atol=3e-6)
+    np.testing.assert_allclose(energy, run.energy, rtol=CLOSE)
+    np.testing.assert_allclose(jellett, run.jellett, rtol=CLOSE)
+    np.testing.assert_allclose(force, run.normal_force, rtol=3e-6)
+    np.testing.assert_allclose(np.linalg.norm(rows[:, 6:10], axis=1), 1.0, atol=1e-15)
+
+
+def test_a_slider_simulates_anew(browser, page, rutstam_scene):
+    reset(browser)
+    browser.execute_script(
+        "const s = document.querySelector('input[name=spin]'); s.value = 250; s.dispatchEvent(new Event('input'))"
+    )
+    wait(browser, "return live.outcome.status === 'not_inverted' || live.outcome.value > 6")
+    theta, spin = browser.execute_script("return live.values()")
+    assert (theta, spin) == pytest.approx((0.1, 95.0))
+    time = float(tippe.inversion_time(rutstam_scene, tippe.Launch(theta, spin), 7.0))
+    found = browser.execute_script("return Number.isFinite(live.outcome.value) ? live.outcome.value : 1e300")
+    assert found == pytest.approx(min(time, 1e300), rel=CLOSE)
+    # The drawn top is that of the new run.
+    drawn = browser.execute_script("player.seek(1.0); return player.matrix(0, 0, 0)")
+    there = tippe.simulate(rutstam_scene, tippe.Launch(theta, spin), 1.0, times=[1.0])
+    np.testing.assert_allclose(np.array(drawn).reshape(4, 4)[3, :3], there.position[0], atol=1e-4)
+
+
+def test_the_address_holds_the_sliders(browser, page):
+    reset(browser)
+    browser.execute_script("live.set([0.25, 120])")
+    wait(browser, "return location.hash.includes('0.25')")
+    link = browser.current_url
+    assert link.endswith("#theta=0.25&spin=120")
+    browser.get("about:blank")
+    browser.get(link)
+    wait(browser, "return !!(window.live && live.ready)")
+    assert browser.execute_script("return live.values()") == [0.25, 120]
+    browser.execute_script("location.hash = '#theta=0.3'")
+    wait(browser, "return live.values()[0] === 0.3")
+    assert browser.execute_script("return live.values()[1]") == 155
+
+
+def test_the_map_fills_and_a_click_sets_the_sliders(browser, page, rutstam_scene):
+    reset(browser)
+    wait(browser, "return live.map.results().filter(Boolean).length > 60")
+    cell = "const k = 37, cell = live.map.at(live.map.cells[k]); return [cell, live.map.results()[k]]"
+    (theta, spin), (status, time) = browser.execute_script(cell)
+    table = tippe.inversion_table(rutstam_scene, theta=theta, spin=spin, t1=7.0, tolerance=TOLERANCE, progress=False)
+    assert tippe.Status(status).word == table.status
+    assert time is None or time == pytest.approx(float(table.time), rel=CLOSE)
+    browser.execute_script(
+        """const canvas = document.querySelector('#map canvas'), frame = canvas.getBoundingClientRect();
+        const [clientX, clientY] = [frame.left + 0.8 * frame.width, frame.top + 0.2 * frame.height];
+        const at = { bubbles: true, pointerId: 1, clientX, clientY };
+        canvas.setPointerCapture = () => {};
+        canvas.dispatchEvent(new PointerEvent('pointerdown', at))"""
+    )
+    theta, spin = browser.execute_script("return live.values()")
+    assert 0.35 < theta < 0.5
+    assert 150.0 < spin < 200.0
+
+
+def test_keys_play_and_reset(browser, page):
+    from selenium.webdriver.common.keys import Keys
+
+    reset(browser)
+    browser.execute_script("player.play(false); player.seek(0.5); live.set([0.4, 100])")
+    body = browser.find_element("tag name", "body")
+    body.send_keys(" ")
+    wait(browser, "return player.time() > 0.51")
+    body.send_keys(" ")
+    assert not browser.execute_script("return player.playing()")
+    body.send_keys("r")
+    wait(browser, "return live.values()[0] === 0.1")
+    slider = browser.find_element("css selector", "input[name=theta]")
+    slider.send_keys(Keys.ARROW_RIGHT)
+    assert browser.execute_script("return live.values()[0]") == pytest.approx(0.1 + 0.45 / 1000, abs=0.45 / 1000)
+
+
+def test_numbers_that_do_not_fit_together_are_refused_in_the_page(browser, rutstam_scene):
+    roots = {"scene": rutstam_scene, "launch": tippe.Launch(0.1, 155.0)}
+    live = live_run(roots, sliders_of({"theta": (0.05, 0.5)}, roots, {}, {}), 7.0)
+    browser.get("about:blank")
+    script = f"{programs(live)} return [[0.3], [-0.3], [4.0]].map((values) => Boolean(live.allowed(values, [])[0]))"
+    assert browser.execute_script(script) == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sliders": {"spinn": (1.0, 2.0)}}, "sliders: 'spinn'"),
+        ({"sliders": {"theta": (0.5, 0.2)}}, r"sliders\['theta'\] = \(0.5, 0.2\) must be two numbers"),
+        ({"sliders": {"theta": (0.2, 0.5)}}, "must contain the parameter's own value, 0.1"),
+        ({"sliders": {"theta": (0.05, 4.0)}}, "theta"),
+        ({"sliders": {"radius": (0.01, 0.03)}}, "drawn"),
+        ({"sliders": {}}, "must be a dictionary"),
+        ({"t1": 0.0}, "t1"),
+    ],
+)
+def test_what_is_no_slider_is_refused(rutstam_scene, change, message):
+    with pytest.raises(ValueError, match=message):
+        tippe.explore(rutstam_scene, tippe.Launch(0.1, 155.0), **change)
+
+
+def test_runs_with_modes_are_refused():
+    launch = tippe.Launch(0.1, 155.0)
+    with pytest.raises(ValueError, match="contact = 'hybrid' must be 'stop' for explore"):
+        tippe.explore(tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), contact="hybrid"), launch)
+    with pytest.raises(ValueError, match="SetValuedCoulomb must be a law without modes"):
+        tippe.explore(tippe.Scene(rutstam_top(), friction=tippe.SetValuedCoulomb(0.3)), launch)
+
+
+@pytest.mark.slow
+def test_a_run_takes_at_most_thirty_milliseconds(browser, page):
+    """The fastest of some: other programs, and the map's workers, share the processor."""
+    reset(browser)
+    script = """return [...Array(21)].map((_, k) => {
+        const begin = performance.now();
+        live.asks.run([0.1 + k / 100, 155]);
+        return performance.now() - begin;
+    })"""
+    assert min(browser.execute_script(script)) < 30.0

@@ -1,0 +1,342 @@
+"""The papers' two inversion tables beside computed times: `python -m tippe --paper`.
+
+The printed times and the computed ones have different trends: the paper lost the numbers of its top, and its own equations of
+motion are not those of a top (`docs/tippe_paper.md`). The same launches run on the plane, too.
+"""
+
+import argparse
+import math
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from html import escape
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from nonholonomic import __version__
+from nonholonomic.compilation_cache import enable_compilation_cache
+from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
+from nonholonomic.progress import Progress, status_line
+from nonholonomic.sweeps import Table
+from nonholonomic.validation import require_folder
+from nonholonomic.views import NO_VIEW, Stage, can_view, page, picture_as_html, table_as_html
+from nonholonomic.xla_cpu import compiled_quickly
+
+from ..model.friction import AbstractFriction, Coulomb, Viscous
+from ..model.launch import Launch
+from ..model.scene import Scene
+from ..model.top import Top
+from ..runs.plot import Panel, draw_launches
+from ..runs.table import inversion_table
+from ..runs.trajectory import simulate
+from ..runs.view import Motion, stages
+from . import paper
+
+#: The arenas that have names, and what their numbers are.
+SURFACES = {
+    "sphere RADIUS": Sphere,
+    "spheroid EQUATORIAL POLAR": Spheroid,
+    "torus RING TUBE": Torus,
+    "paraboloid P": Paraboloid,
+    "plane TILT": Plane,
+}
+
+#: Times at which theta is drawn, and the tops on the page.
+SAMPLES = 3000
+
+
+class Help(argparse.ArgumentDefaultsHelpFormatter):
+    """Shows the default of every option that has one."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        return action.help if action.default is None else super()._get_help_string(action)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options of the main job; the defaults are the declared top and the papers' launches."""
+    command = argparse.ArgumentParser(
+        prog="python -m tippe --paper",
+        description="Inversion times of a tippe top inside a cylinder (the paper's Tables 2 and 3) and on the plane. "
+        "Prints them beside the printed ones, writes an HDF5 table for each arena and a picture of theta(t).",
+        formatter_class=Help,
+    )
+    command.add_argument("--version", action="version", version=f"nonholonomic {__version__}")
+    top = command.add_argument_group("the top (the paper's Table 1 lost its numbers: these are Rutstam's)")
+    top.add_argument("--mass", type=float, default=0.02, help="mass [kg]")
+    top.add_argument("--radius", type=float, default=0.02, help="radius R of the sphere [m]")
+    top.add_argument("--offset", type=float, default=0.006, help="distance of the centre of mass from the centre [m]")
+    top.add_argument("--I1", type=float, help="transverse moment of inertia [kg m^2] (default: 131/350 m R^2)")
+    top.add_argument("--I3", type=float, help="axial moment of inertia [kg m^2] (default: 2/5 m R^2)")
+    scene = command.add_argument_group("the scene")
+    scene.add_argument("--cylinder-radius", type=float, default=0.3, help="radius of the cylinder [m]")
+    scene.add_argument(
+        "--mu", type=float, default=0.3, help="friction: viscous [s/m], or Coulomb [1] with --slip-speed"
+    )
+    scene.add_argument("--slip-speed", type=float, help="regularised Coulomb friction with this slip speed [m/s]")
+    scene.add_argument(
+        "--surface",
+        nargs="+",
+        metavar=("NAME", "NUMBER"),
+        help="another arena, by its name and numbers [m, rad]: " + ", ".join(SURFACES),
+    )
+    scene.add_argument("--gravity", type=float, default=9.81, help="acceleration of free fall [m/s^2]")
+    launch = command.add_argument_group("the launches")
+    launch.add_argument(
+        "--theta", type=float, nargs="+", default=list(paper.THETAS), help="inclinations theta(0) [rad]"
+    )
+    launch.add_argument("--eta", type=float, nargs="+", default=[0.0, math.pi / 2.0], help="places eta(0) [rad]")
+    launch.add_argument("--beta1", type=float, default=paper.BETA1, help="I3 w3 at the start [kg m^2/s]")
+    launch.add_argument(
+        "--spin", type=float, help="spin w3 at the start [rad/s] instead of --beta1; --spin=-100 if negative"
+    )
+    run = command.add_argument_group("the run")
+    run.add_argument("--t1", type=float, default=60.0, help="horizon [s]")
+    run.add_argument("--angle", type=float, default=0.95 * math.pi, help="angle that counts as inverted [rad]")
+    run.add_argument("--tolerance", type=float, default=1e-9, help="relative tolerance of the integration")
+    run.add_argument(
+        "--out",
+        type=Path,
+        default=Path("tippe-paper-out"),
+        help="folder for the tables and the picture; another run needs another",
+    )
+    return command
+
+
+def scenes(options: argparse.Namespace) -> dict[str, Scene]:
+    """The two arenas with the declared top, and the one that is asked for."""
+    inertia = options.mass * options.radius**2
+    I1 = 131.0 / 350.0 * inertia if options.I1 is None else options.I1
+    I3 = 0.4 * inertia if options.I3 is None else options.I3
+    top = Top(options.mass, options.radius, options.offset, I1, I3)
+    friction: AbstractFriction = Viscous(options.mu)
+    if options.slip_speed is not None:
+        friction = Coulomb(options.mu, options.slip_speed)
+    arenas = {"cylinder": Cylinder(options.cylinder_radius), "plane": Plane()}
+    if options.surface is not None:
+        arenas["surface"] = surface_of(options.surface)
+    return {name: Scene(top, arena, friction, options.gravity) for name, arena in arenas.items()}
+
+
+def surface_of(words: list[str]) -> AbstractSurface:
+    """An arena by its name and numbers.
+
+    **Raises:** `ValueError` for a name or numbers that no arena has.
+    """
+    name, *numbers = words
+    for known, kind in SURFACES.items():
+        if known.split()[0] == name and len(numbers) == len(known.split()) - 1:
+            try:
+                given = [float(number) for number in numbers]
+            except ValueError:
+                break
+            return kind(*given)
+    raise ValueError(f"--surface {' '.join(words)} must be one of: {', '.join(SURFACES)}")
+
+
+def shown_name(options: argparse.Namespace, arena: str) -> str:
+    """What an arena is called where it is shown."""
+    return " ".join(options.surface) if arena == "surface" else arena
+
+
+def counts_eta(scene: Scene) -> bool:
+    """Whether an arena has places by eta; on others every launch starts at the origin."""
+    return any(name == "eta" for name, _ in scene.surface.coordinates)
+
+
+def spin_of(options: argparse.Namespace, scene: Scene) -> float:
+    """The launches' spin [rad/s]."""
+    return options.beta1 / float(scene.body.I3) if options.spin is None else options.spin
+
+
+def tables(options: argparse.Namespace) -> dict[str, Table]:
+    """The table of each arena, first and last crossing of the angle, written to its file."""
+    arenas, found = scenes(options), {}
+    require_folder(options.out, "--out")
+    for name, scene in arenas.items():
+        found[name] = inversion_table(
+            scene,
+            theta=options.theta,
+            eta=options.eta if counts_eta(scene) else 0.0,
+            spin=spin_of(options, scene),
+            t1=options.t1,
+            angle=options.angle,
+            tolerance=options.tolerance,
+            crossing="both",
+            path=options.out / f"{name}.h5",
+        )
+    return found
+
+
+def printed_times(options: argparse.Namespace, eta: float) -> list[str] | None:
+    """The paper's column for a place, if these are its launches."""
+    for table in (paper.TABLE_2, paper.TABLE_3):
+        if list(options.theta) == [row.theta for row in table.rows] and math.isclose(eta, table.eta):
+            return ["-" if row.time is None else f"{row.time:g}" for row in table.rows]
+    return None
+
+
+def columns(options: argparse.Namespace, found: dict[str, Table]) -> list[tuple[str, list[str]]]:
+    """The columns of the report: a heading of two words or more, and an entry for every theta(0)."""
+    shown = [("theta(0)|[rad]", [f"{theta:.4g}" for theta in options.theta])]
+    places = []
+    for arena, scene in scenes(options).items():
+        etas = [(f"eta={eta:.4g}", (slice(None), i)) for i, eta in enumerate(options.eta)]
+        places += [(arena, *place) for place in (etas if counts_eta(scene) else [("", (slice(None),))])]
+    for arena, place, cells in places:
+        table = found[arena]
+        for crossing, times in (("first", table.first_time), ("last", table.last_time)):
+            entries = [_entry(t, word) for t, word in zip(times[cells], table.status[cells], strict=True)]
+            shown.append((f"{shown_name(options, arena)} {place}|{crossing} [s]", entries))
+        printed = printed_times(options, options.eta[cells[1]]) if arena == "cylinder" else None
+        if printed is not None:
+            shown.append(("paper|[s]", printed))
+    return shown
+
+
+def _entry(seconds: float, word: str) -> str:
+    if math.isfinite(seconds):
+        return f"{seconds:.4f}"
+    words = {"not_inverted": "-", "contact_lost": "lost contact", "does_not_fit": "no room"}
+    return words.get(word, word)
+
+
+def report(options: argparse.Namespace, found: dict[str, Table]) -> str:
+    """The tables side by side, as text."""
+    shown = columns(options, found)
+    heads = [heading.split("|") for heading, _ in shown]
+    widths = [max(len(text) for text in (*head, *entries)) for head, (_, entries) in zip(heads, shown, strict=True)]
+    rows = [list(row) for row in zip(*heads, strict=True)]
+    rows += [list(row) for row in zip(*(entries for _, entries in shown), strict=True)]
+    lines = [*described(options), ""]
+    lines += ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join(lines)
+
+
+def described(options: argparse.Namespace) -> list[str]:
+    """What the report is about, in some lines."""
+    scene = scenes(options)["cylinder"]
+    body = scene.body
+    return [
+        "Inversion of a tippe top: time at which theta reaches "
+        f"{options.angle:.4g} rad, for the first time (first) and for good (last).",
+        f"Top: m = {float(body.mass):g} kg, R = {float(body.radius):g} m, a = {float(body.offset):g} m, "
+        f"I1 = {float(body.I1):.4g}, I3 = {float(body.I3):.4g} kg m^2; friction {_friction(scene.friction)}; "
+        f"cylinder {options.cylinder_radius:g} m.",
+        "The paper's Table 1 lost its numbers, so this top is a declared one (Rutstam's): compare trends, not digits.",
+        f"-: not inverted within {options.t1:g} s.",
+    ]
+
+
+def _friction(law: AbstractFriction) -> str:
+    if isinstance(law, Coulomb):
+        return f"Coulomb mu = {float(law.mu):g}, slip speed {float(law.slip_speed):g} m/s"
+    assert isinstance(law, Viscous)
+    return f"viscous mu = {float(law.mu):g} s/m"
+
+
+@compiled_quickly
+def moving(scene: Scene, launches: Launch, times: Any, tolerance: Any) -> Motion:
+    """What is drawn of every launch until the last of the times, in one batched run."""
+    return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
+
+
+def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, Motion]]:
+    """The times that are drawn, up to `t1` [s], and what is drawn of every launch in each arena.
+
+    All numbers are arrays: a program is compiled anew for another Python number, so the picture and the page would not share
+    theirs. The arenas' programs are compiled side by side, for the compiler uses little more than one core.
+    """
+    arenas, times = scenes(options), np.linspace(0.0, t1, SAMPLES)
+    tolerance = np.asarray(options.tolerance)
+    with Progress(len(arenas), "arena", "compiling what is drawn"), ThreadPoolExecutor(2) as threads:
+        found = threads.map(lambda scene: moving(scene, starts(options, scene)[1], times, tolerance), arenas.values())
+        return times, dict(zip(arenas, found, strict=True))
+
+
+def starts(options: argparse.Namespace, scene: Scene) -> tuple[list[float], Launch]:
+    """The places eta(0) of an arena, and the launches from all of them, place after place."""
+    etas = options.eta if counts_eta(scene) else [0.0]
+    eta, theta = (values.ravel() for values in np.meshgrid(etas, options.theta, indexing="ij"))
+    return etas, Launch(theta, np.full_like(theta, spin_of(options, scene)), eta, np.zeros_like(theta))
+
+
+def picture(options: argparse.Namespace, found: dict[str, Table]) -> Any:
+    """theta(t) of every launch."""
+    times, runs = drawn(options, options.t1)
+    panels, thetas = [], np.asarray(options.theta)
+    for arena, scene in scenes(options).items():
+        etas, _ = starts(options, scene)
+        shown = np.asarray(runs[arena].theta).reshape(len(etas), len(thetas), -1)
+        ends = found[arena].last_time.reshape(len(thetas), len(etas))
+        for i, eta in enumerate(etas):
+            name = shown_name(options, arena)
+            title = f"{name}, η(0) = {eta:.4g}" if counts_eta(scene) else name
+            panels.append(Panel(title, times, shown[i], thetas, ends[:, i]))
+    return draw_launches(panels, options.angle)
+
+
+def motions(options: argparse.Namespace, found: dict[str, Table]) -> list[Stage]:
+    """The most upright launch that turns over while it can be followed, or else the first to turn over, in both arenas."""
+    ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in found.values()]).max(axis=0)
+    # No longer than the spin can be followed from one sample to the next.
+    longest = SAMPLES / max(abs(spin_of(options, scene)) for scene in scenes(options).values())
+    tilt = np.where(ends + 0.5 <= longest, options.theta, np.inf)
+    row = int(np.argmin(tilt if np.isfinite(tilt).any() else ends))
+    last = min(options.t1, longest, float(ends[row]) + 0.5)
+    (_, runs), groups = drawn(options, last), []
+    for arena, scene in scenes(options).items():
+        name = f"{shown_name(options, arena)}, θ(0) = {options.theta[row]:.4g} rad"
+        groups.append([(name, scene, Motion(*(np.asarray(part)[row] for part in runs[arena])))])
+    return stages(groups)
+
+
+def write_page(options: argparse.Namespace, found: dict[str, Table], drawing: Path | None) -> Path:
+    """The page of the main job: two tops in motion where three.js is installed, the tables, and the picture if there is one."""
+    intro, rows = (
+        described(options),
+        [list(row) for row in zip(*(heading.split("|") for heading, _ in columns(options, found)), strict=True)],
+    )
+    rows += [list(row) for row in zip(*(entries for _, entries in columns(options, found)), strict=True)]
+    below = "<h2>Inversion times</h2>" + table_as_html(rows, 2)
+    below += "".join(f'<p class="note">{escape(line)}</p>' for line in intro)
+    below += "" if drawing is None else "<h2>θ(t) of every launch</h2>" + picture_as_html(drawing)
+    above = "" if can_view() else f'<p class="note">{NO_VIEW}</p>'
+    path = options.out / "index.html"
+    page(motions(options, found) if can_view() else [], "A tippe top turns over", 0.5, above, below).save(path)
+    return path
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the main job.
+
+    **Arguments:** `arguments`: the command line, by default that of the process.
+
+    **Returns:** the exit status: 0, or 2 for input that cannot be used.
+    """
+    options = parser().parse_args(arguments)
+    enable_compilation_cache()
+    started = time.perf_counter()
+    try:
+        found = tables(options)
+        print(report(options, found))
+        with status_line("drawing"):
+            written, drawing = [options.out / f"{arena}.h5" for arena in found], None
+            if find_spec("matplotlib") is None:
+                print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
+            else:
+                drawing = options.out / "theta.png"
+                picture(options, found).savefig(drawing, dpi=130)
+                written.append(drawing)
+            shown = write_page(options, found, drawing)
+    except (ValueError, OSError) as error:
+        print(f"python -m tippe --paper: {error}", file=sys.stderr)
+        return 2
+    cells = sum(table.status.size for table in found.values())
+    print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
+    print(f"Wrote {', '.join(map(str, written))}.")
+    print(f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}")
+    return 0
