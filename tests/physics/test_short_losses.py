@@ -88,7 +88,9 @@ def test_losses_do_not_depend_on_the_tolerance():
     errs by 1e-5 m g there and vanishes; at 1e-7 the cell passes that minimum and loses contact in the next nutation.
     """
     grid = {"theta": np.linspace(0.05, 0.6, 8), "spin": np.linspace(165.0, 320.0, 8), "t1": 8.0}
-    loose, middle, tight = (tippe.inversion_table(SCENE, tolerance=tolerance, **grid) for tolerance in (1e-6, 1e-7, 1e-11))
+    loose, middle, tight = (
+        tippe.inversion_table(SCENE, tolerance=tolerance, **grid) for tolerance in (1e-6, 1e-7, 1e-11)
+    )
     assert (np.asarray(tight.status) == "contact_lost").sum() == 58
     assert (middle.status == tight.status).all()
     assert_close(middle.end_time, tight.end_time, atol=1e-5)
