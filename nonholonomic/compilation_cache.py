@@ -99,9 +99,9 @@ def user_folder() -> Path:
 
     **Raises:** `RuntimeError` if the user has no home.
     """
-    given = os.environ.get("XDG_CACHE_HOME", "")
+    cache_home = os.environ.get("XDG_CACHE_HOME", "")
     # The specification of XDG_CACHE_HOME has relative paths ignored.
-    return (Path(given) if os.path.isabs(given) else Path.home() / ".cache") / "nonholonomic"
+    return (Path(cache_home) if os.path.isabs(cache_home) else Path.home() / ".cache") / "nonholonomic"
 
 
 def environment_name() -> str:

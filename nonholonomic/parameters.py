@@ -24,16 +24,16 @@ def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
     **Returns:** dotted name -> number, in the order in which the modules declare them; `None` for a number that is left
     out, which the `units` of its module tell from another part that is.
     """
-    found = {}
+    values = {}
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
         if isinstance(value, eqx.Module):
-            found |= numbers(name, value, functions) if functions or not callable(value) else {}
+            values |= numbers(name, value, functions) if functions or not callable(value) else {}
         elif isinstance(value, tuple):
-            found |= {f"{name}[{k}]": part for k, part in enumerate(value) if _is_number(part)}
+            values |= {f"{name}[{k}]": part for k, part in enumerate(value) if _is_number(part)}
         elif _is_number(value) or (value is None and field.name in getattr(tree, "units", {})):
-            found[name] = value
-    return found
+            values[name] = value
+    return values
 
 
 def _is_number(value: Any) -> bool:
@@ -121,7 +121,7 @@ def _replaced(name: str, tree: Any, values: dict[str, Any]) -> Any:
             parts = tuple(values.get(f"{below}[{k}]", part) for k, part in enumerate(value))
             if any(f"{below}[{k}]" in values for k in range(len(value))):
                 changes[field.name] = parts
-        elif isinstance(value, eqx.Module) and any(one.startswith(below + ".") for one in values):
+        elif isinstance(value, eqx.Module) and any(path.startswith(below + ".") for path in values):
             changes[field.name] = _replaced(below, value, values)
     return dataclasses.replace(tree, **changes) if changes else tree
 
@@ -131,18 +131,18 @@ def description(root: str, tree: Any) -> dict[str, Any]:
 
     A function has nothing but its name to show.
     """
-    found = {root: type(tree).__name__}
+    fields = {root: type(tree).__name__}
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
         if isinstance(value, eqx.Module):
-            found |= description(name, value)
+            fields |= description(name, value)
         elif isinstance(value, tuple):
-            found[name] = [np.asarray(part).tolist() for part in value]
+            fields[name] = [np.asarray(part).tolist() for part in value]
         else:
-            found[name] = np.asarray(value).tolist() if isinstance(value, jax.Array | np.ndarray) else value
+            fields[name] = np.asarray(value).tolist() if isinstance(value, jax.Array | np.ndarray) else value
             if callable(value):
-                found[name] = getattr(value, "__qualname__", repr(value))
-    return found
+                fields[name] = getattr(value, "__qualname__", repr(value))
+    return fields
 
 
 #: Numbers of an array that are shown; of a longer one the first and the last.
@@ -155,9 +155,9 @@ def readable_unit(unit: str) -> str:
     """A unit as a person writes it, "kg m²/s" for "kg m2 s-1"; an empty string for "1"."""
     above, below = [], []
     for part in unit.split():
-        found = re.fullmatch(r"([A-Za-z]+)(-?\d+)?", part)
-        if found is not None:
-            name, power = found[1], int(found[2] or 1)
+        match = re.fullmatch(r"([A-Za-z]+)(-?\d+)?", part)
+        if match is not None:
+            name, power = match[1], int(match[2] or 1)
             (above if power > 0 else below).append(name + (str(abs(power)) if abs(power) > 1 else ""))
     text = " ".join(above) or ("1" if below else "")
     if below:
@@ -177,20 +177,20 @@ def as_text(value: Any, unit: str = "1") -> str:
         return f"({', '.join(as_text(part) for part in value)}){behind}"
     if isinstance(value, jax.Array | np.ndarray | float) and np.asarray(value).dtype.kind in "fiu":
         numbers = np.asarray(value)
-        some = numbers.ravel()
-        if some.size <= SHOWN:
-            text = ", ".join(f"{number:.6g}" for number in some)
+        values = numbers.ravel()
+        if values.size <= SHOWN:
+            text = ", ".join(f"{number:.6g}" for number in values)
         else:
-            text = f"{some[0]:.6g}, {some[1]:.6g}, ..., {some[-1]:.6g}, {some.size} numbers"
+            text = f"{values[0]:.6g}, {values[1]:.6g}, ..., {values[-1]:.6g}, {values.size} numbers"
         return (text if numbers.ndim == 0 else f"[{text}]") + behind
     return getattr(value, "__qualname__", None) or repr(value)
 
 
 def contents(module: Any) -> list[tuple[str, str]]:
     """What a module holds, field by field: (name, value as text); what is left out is left out."""
-    found = [(field.name, getattr(module, field.name, None)) for field in dataclasses.fields(module)]
+    fields = [(field.name, getattr(module, field.name, None)) for field in dataclasses.fields(module)]
     units = getattr(module, "units", {})
-    return [(name, as_text(value, units.get(name, "1"))) for name, value in found if value is not None]
+    return [(name, as_text(value, units.get(name, "1"))) for name, value in fields if value is not None]
 
 
 def one_line(module: Any) -> str:
@@ -212,7 +212,9 @@ def distinguishing_labels(starts: list[str], *groups: list[Any]) -> list[str]:
     **Returns:** the names. Those that would be the same are numbered.
     """
     apart = [differences(group) for group in groups]
-    names = [", ".join([start, *(part for one in apart for part in one[k])]) for k, start in enumerate(starts)]
+    names = [
+        ", ".join([start, *(part for difference in apart for part in difference[k])]) for k, start in enumerate(starts)
+    ]
     return [
         name if names.count(name) == 1 else f"{name} ({names[: k + 1].count(name)})" for k, name in enumerate(names)
     ]
@@ -220,19 +222,19 @@ def distinguishing_labels(starts: list[str], *groups: list[Any]) -> list[str]:
 
 def differences(modules: list[Any]) -> list[list[str]]:
     """For each of some modules, as text, what the others do not have like it: its kind, or some of its numbers."""
-    if len({type(one) for one in modules}) > 1:
-        return [[type(one).__name__] for one in modules]
-    found: list[list[str]] = [[] for _ in modules]
+    if len({type(module) for module in modules}) > 1:
+        return [[type(module).__name__] for module in modules]
+    labels: list[list[str]] = [[] for _ in modules]
     for field in dataclasses.fields(modules[0]):
-        values = [getattr(one, field.name) for one in modules]
+        values = [getattr(module, field.name) for module in modules]
         if all(isinstance(value, eqx.Module) for value in values):
             parts = differences(values)
         else:
             unit = getattr(modules[0], "units", {}).get(field.name, "1")
             texts = [as_text(value, unit) for value in values]
             parts = [[f"{field.name} {text}"] if len(set(texts)) > 1 else [] for text in texts]
-        found = [before + part for before, part in zip(found, parts, strict=True)]
-    return found
+        labels = [before + part for before, part in zip(labels, parts, strict=True)]
+    return labels
 
 
 def as_html(title: str, rows: list[tuple[str, ...]]) -> str:

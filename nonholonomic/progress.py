@@ -74,8 +74,8 @@ class Progress:
         self._caller, self._start = threading.get_ident(), time.time()
         if self._heard:
             with _LINE.lock:
-                outer = [one for one in _LINE.speakers if one._caller == self._caller]
-                self._shown &= all(one._shown for one in outer)
+                outer = [speaker for speaker in _LINE.speakers if speaker._caller == self._caller]
+                self._shown &= all(speaker._shown for speaker in outer)
                 self._inner = bool(outer)
                 if self._shown:
                     self._tqdm = bar_class()
@@ -95,13 +95,13 @@ class Progress:
         if self._bar is not None and time.time() - self._written < INTERVAL:
             return
         self._written = time.time()
-        made = is_making_programs(self._caller)
+        compiling = is_making_programs(self._caller)
         if self._bar is None:
             self._bar = self._line()
         if self._since is None:
-            self._bar.set_description_str("compiling" if made else self._doing, refresh=False)
+            self._bar.set_description_str("compiling" if compiling else self._doing, refresh=False)
         else:
-            self._bar.set_description("compiling" if made else None, refresh=False)
+            self._bar.set_description("compiling" if compiling else None, refresh=False)
         self._bar.refresh()
 
     def _line(self) -> Any:
@@ -157,10 +157,10 @@ class _Line:
                 self._update()
 
     def _update(self) -> None:
-        shown = [one for one in self.speakers if one._shown and time.time() - one._start >= INTERVAL]
+        shown = [speaker for speaker in self.speakers if speaker._shown and time.time() - speaker._start >= INTERVAL]
         if not shown:
             return
-        told = next((one for one in reversed(shown) if one._total is not None), shown[0])
+        told = next((speaker for speaker in reversed(shown) if speaker._total is not None), shown[0])
         for other in shown:
             if other is not told:
                 other._clear()
@@ -186,7 +186,7 @@ def is_making_programs(thread: int) -> bool:
     frame = sys._current_frames().get(thread)
     while frame is not None:
         module, name = frame.f_globals.get("__name__"), frame.f_code.co_name
-        if any(module == one and name.startswith(begin) for one, begin in COMPILERS):
+        if any(module == compiler and name.startswith(begin) for compiler, begin in COMPILERS):
             return True
         frame = frame.f_back
     return False

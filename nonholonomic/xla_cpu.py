@@ -60,20 +60,20 @@ def stored(*values: Float[Array, "..."] | None) -> tuple[Float[Array, "..."] | N
 
 
 def written_in_place(
-    whole: Float[Array, "stack ..."], one: Float[Array, "..."], at: Int[Array, ""]
+    whole: Float[Array, "stack ..."], entry: Float[Array, "..."], at: Int[Array, ""]
 ) -> Float[Array, "stack ..."]:
     """A stack of arrays with one of them replaced, in place: 1.2 times for a Runge-Kutta step over `at[].set`, which checks the
     index, and over `dynamic_update_index_in_dim`, which is a call of its own and so copies. It can go when XLA inlines that."""
-    start = (at, *(0 for _ in one.shape))
-    return jax.lax.dynamic_update_slice(whole, one[None], start, allow_negative_indices=False)
+    start = (at, *(0 for _ in entry.shape))
+    return jax.lax.dynamic_update_slice(whole, entry[None], start, allow_negative_indices=False)
 
 
 def written_by_component(
-    whole: Float[Array, "stack components lanes"], one: Float[Array, "components lanes"], at: Int[Array, ""]
+    whole: Float[Array, "stack components lanes"], entry: Float[Array, "components lanes"], at: Int[Array, ""]
 ) -> Float[Array, "stack components lanes"]:
     """`written_in_place`, every component by itself, from where it is computed: joined first they are copied twice, which costs
     a quarter of a Runge-Kutta step. It can go when XLA fuses a concatenation with the update that it is for."""
-    for row, component in enumerate(one):
+    for row, component in enumerate(entry):
         whole = jax.lax.dynamic_update_slice(whole, component[None, None], (at, row, 0), allow_negative_indices=False)
     return whole
 
@@ -117,8 +117,8 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
             # XLA 0.10.2 aborts on a call with an argument that it does not use. So each is looked at, from behind a
             # barrier, for what is known to be constant would not be.
-            given = jax.lax.optimization_barrier([*closed.consts, *jax.tree.leaves(argument)])
-            results, _ = jax.lax.optimization_barrier(jax.jit(looking_at_all)(*given))
+            arguments = jax.lax.optimization_barrier([*closed.consts, *jax.tree.leaves(argument)])
+            results, _ = jax.lax.optimization_barrier(jax.jit(looking_at_all)(*arguments))
         return jax.tree.unflatten(jax.tree.structure(shape), results)
 
     return called

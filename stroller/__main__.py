@@ -119,7 +119,7 @@ def scenes(options: argparse.Namespace) -> dict[tuple[str, str], tuple[Scene, La
     """The rides, without and with friction on each surface: (ground, friction) -> scene and launch."""
     body = Stroller(options.mass, options.wheelbase, options.inertia, options.steering_inertia)
     laws = dict(zip(RIDES, (Frictionless(), Damping(*options.damping)), strict=True))
-    found = {}
+    rides = {}
     for name in dict.fromkeys(options.surface):
         ground = GROUNDS[name]
         surface = ground.build(options)
@@ -128,8 +128,8 @@ def scenes(options: argparse.Namespace) -> dict[tuple[str, str], tuple[Scene, La
         where = f"{side} the {name}" if two_sided else name
         launch = Launch(ground.top if side == "outside" else ground.place, ground.heading, options.speed)
         for ride, law in laws.items():
-            found[where, ride] = (Scene(body, surface, law, options.gravity, side=side, fork=options.fork), launch)
-    return found
+            rides[where, ride] = (Scene(body, surface, law, options.gravity, side=side, fork=options.fork), launch)
+    return rides
 
 
 def audit(name: str, runs: dict[str, Trajectory]) -> list[str]:

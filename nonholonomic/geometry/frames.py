@@ -136,11 +136,11 @@ class PlaneFrame(AbstractFrame):
         return jnp.zeros_like(cyclic[0])
 
     def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
-        zero, one = jnp.zeros_like(cyclic[0]), jnp.ones_like(cyclic[0])
+        zero, unit = jnp.zeros_like(cyclic[0]), jnp.ones_like(cyclic[0])
         if self.slope is None:
-            return (one, zero, zero), (zero, one, zero), (zero, zero, one)
-        sine, cosine = one * self.slope[0], one * self.slope[1]
-        return (cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)
+            return (unit, zero, zero), (zero, unit, zero), (zero, zero, unit)
+        sine, cosine = unit * self.slope[0], unit * self.slope[1]
+        return (cosine, zero, sine), (zero, unit, zero), (-sine, zero, cosine)
 
     def position(self, place: Place, cyclic: Place) -> Fixed:
         x, y = (*place, *cyclic)
@@ -199,8 +199,8 @@ class CylinderFrame(AbstractFrame):
 
     def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
         sine, cosine = place
-        zero, one = jnp.zeros_like(sine), jnp.ones_like(sine)
-        return (cosine, zero, sine), (zero, one, zero), (-sine, zero, cosine)
+        zero, unit = jnp.zeros_like(sine), jnp.ones_like(sine)
+        return (cosine, zero, sine), (zero, unit, zero), (-sine, zero, cosine)
 
     def position(self, place: Place, cyclic: Place) -> Fixed:
         sine, cosine = place

@@ -32,12 +32,12 @@ class Closure(eqx.Module):
     def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
         single = [k for k, constant in enumerate(self.program.constvars) if constant.aval.shape == ()]
 
-        def one(*given: Float[Array, ""]) -> Float[Array, ""]:
-            there = dict(zip(single, given, strict=False))
-            numbers = [there.get(k, number) for k, number in enumerate(self.numbers)]
-            return jax.core.eval_jaxpr(self.program, numbers, *given[len(single) :])[0]
+        def value(*scalars: Float[Array, ""]) -> Float[Array, ""]:
+            replaced = dict(zip(single, scalars, strict=False))
+            numbers = [replaced.get(k, number) for k, number in enumerate(self.numbers)]
+            return jax.core.eval_jaxpr(self.program, numbers, *scalars[len(single) :])[0]
 
-        return jnp.vectorize(one)(*(self.numbers[k] for k in single), *at)
+        return jnp.vectorize(value)(*(self.numbers[k] for k in single), *at)
 
 
 def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module:
@@ -61,9 +61,9 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
         raise ValueError(f"{name} = {value!r} must be a function of ({', '.join(arguments)}): {error}") from error
     # The numbers of a module may be one for each lane.
     shapes = {(), *(leaf.shape for leaf in jax.tree.leaves(value) if eqx.is_array(leaf))}
-    given = traced.out_avals
-    if len(given) != 1 or given[0].shape not in shapes or not jnp.issubdtype(given[0].dtype, jnp.floating):
-        shown = ", ".join(map(str, given))
+    results = traced.out_avals
+    if len(results) != 1 or results[0].shape not in shapes or not jnp.issubdtype(results[0].dtype, jnp.floating):
+        shown = ", ".join(map(str, results))
         raise ValueError(f"{name} = {value!r} must give one number for numbers {', '.join(arguments)}, not {shown}")
     if isinstance(value, eqx.Module):
         return value
@@ -75,7 +75,9 @@ def partials(function: Callable[..., Any], at: tuple[Any, ...]) -> tuple[Float[A
     """Partial derivatives of a function of several numbers, each a number or an array over lanes."""
 
     def along(k: int) -> Float[Array, "..."]:
-        return jax.jvp(lambda one: function(*at[:k], one, *at[k + 1 :]), (at[k],), (jnp.ones_like(at[k]),))[1]
+        return jax.jvp(
+            lambda coordinate: function(*at[:k], coordinate, *at[k + 1 :]), (at[k],), (jnp.ones_like(at[k]),)
+        )[1]
 
     return tuple(along(k) for k in range(len(at)))
 
@@ -86,4 +88,4 @@ def second_derivative(
     """Second derivative of a function of several numbers along two vectors, each component a number or an array over lanes."""
     size, numbers = len(at), tuple(jnp.broadcast_arrays(*at, *a, *b))
     place, first, second = numbers[:size], numbers[size : 2 * size], numbers[2 * size :]
-    return jax.jvp(lambda *here: jax.jvp(function, here, first)[1], place, second)[1]
+    return jax.jvp(lambda *point: jax.jvp(function, point, first)[1], place, second)[1]

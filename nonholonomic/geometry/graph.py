@@ -155,7 +155,7 @@ class Graph(AbstractOpen, AbstractLevel):
 
     starts: ClassVar[Float[np.ndarray, "sectors starts 3"]] = _disc(5, 12)
 
-    height: Any = eqx.field(converter=lambda given: as_function(given, "height", ("x", "y")))
+    height: Any = eqx.field(converter=lambda height: as_function(height, "height", ("x", "y")))
 
     def ground(self, x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
         return self.height(x, y)

@@ -51,7 +51,7 @@ class Implicit(AbstractLevel):
 
     starts: ClassVar[Float[np.ndarray, "sectors starts 3"]] = _sphere()
 
-    function: Any = eqx.field(converter=lambda given: as_function(given, "function", ("x", "y", "z")))
+    function: Any = eqx.field(converter=lambda function: as_function(function, "function", ("x", "y", "z")))
 
     def gradient(self, position: Vector) -> Vector:
         slope = partials(self.function, position)

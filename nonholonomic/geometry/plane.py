@@ -70,8 +70,8 @@ class Plane(AbstractSurface):
         return position[:2]
 
     def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
-        one = jnp.ones_like(place[0])
-        return (place[0], place[1], None), (one, jnp.zeros_like(one), None), (jnp.zeros_like(one), one, None)
+        unit = jnp.ones_like(place[0])
+        return (place[0], place[1], None), (unit, jnp.zeros_like(unit), None), (jnp.zeros_like(unit), unit, None)
 
     def in_fixed_frame(self, vector: Vector) -> tuple[Any, Any, Any]:
         x, y, z = vector

@@ -100,34 +100,34 @@ def _times(table: dict[str, list[str]], columns: Mapping[str, Any], fps: Any, pa
     return _column(table, "time", columns["time"], "s", path)
 
 
-def _column(table: dict[str, list[str]], name: str, given: Any, si: str, path: Any) -> np.ndarray:
+def _column(table: dict[str, list[str]], name: str, header_and_unit: Any, si: str, path: Any) -> np.ndarray:
     """A column in SI units, NaN where it is empty."""
-    header, size = _parts(name, given, si)
+    header, size = _parts(name, header_and_unit, si)
     if header not in table:
         raise ValueError(f"columns: {header!r} must be one of the headers of {str(path)!r}: {', '.join(table)}")
-    found = []
+    values = []
     for number, cell in enumerate(table[header], start=2):
         try:
-            found.append(float(cell) if cell else math.nan)
+            values.append(float(cell) if cell else math.nan)
         except ValueError:
             raise ValueError(f"{header} = {cell!r} in line {number} of {str(path)!r} is not a number") from None
-    return size * np.array(found)
+    return size * np.array(values)
 
 
-def _errors(table: dict[str, list[str]], name: str, given: Any, si: str, path: Any) -> np.ndarray:
+def _errors(table: dict[str, list[str]], name: str, header_and_unit: Any, si: str, path: Any) -> np.ndarray:
     """The standard errors of a column."""
-    first, size = _parts(name, given, si)
+    first, size = _parts(name, header_and_unit, si)
     if isinstance(first, str):
-        return _column(table, name, given, si, path)
+        return _column(table, name, header_and_unit, si, path)
     require(first, f"error of {name}", above=0.0)
     return np.full(len(next(iter(table.values()))), size * float(first))
 
 
-def _parts(name: str, given: Any, si: str) -> tuple[Any, float]:
+def _parts(name: str, header_and_unit: Any, si: str) -> tuple[Any, float]:
     """Header, or number, and how many SI units one of the file is."""
-    if not isinstance(given, tuple) or len(given) != 2:
-        raise ValueError(f"columns: {name!r} = {given!r} must be (header, unit), such as ('tilt', 'deg')")
-    first, unit = given
+    if not isinstance(header_and_unit, tuple) or len(header_and_unit) != 2:
+        raise ValueError(f"columns: {name!r} = {header_and_unit!r} must be (header, unit), such as ('tilt', 'deg')")
+    first, unit = header_and_unit
     known = UNITS[si]
     if isinstance(unit, str):
         if unit not in known:

@@ -21,11 +21,11 @@ def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np
     **Arguments:** `data`: each with `measurements`, `labels`, `seen`, and `size`, how many numbers are predicted for it.
     """
     labels = tuple(
-        f"{i + 1}: {label}" if len(data) > 1 else label for i, one in enumerate(data) for label in one.labels
+        f"{i + 1}: {label}" if len(data) > 1 else label for i, source in enumerate(data) for label in source.labels
     )
-    before = np.cumsum([0, *(one.size for one in data)])
-    seen = np.concatenate([first + one.seen for first, one in zip(before, data, strict=False)])
-    return likelihood.joined([one.measurements for one in data]), labels, seen
+    before = np.cumsum([0, *(source.size for source in data)])
+    seen = np.concatenate([first + source.seen for first, source in zip(before, data, strict=False)])
+    return likelihood.joined([source.measurements for source in data]), labels, seen
 
 
 def series_units(data: tuple[Any, ...]) -> tuple[str, ...]:
@@ -60,24 +60,24 @@ def free_numbers(
 
     **Raises:** `ValueError` for an unknown name, or starts that are refused.
     """
-    given: dict[str, Free] = {}
-    for short, one in as_free(free).items():
+    unknowns: dict[str, Free] = {}
+    for short, unknown in as_free(free).items():
         for name in _full_names(short, known, own):
-            if name in given:
+            if name in unknowns:
                 raise ValueError(f"free: {name!r} is named twice")
-            given[name] = one
-    for name in given:
-        if name.startswith("data[") and name.split(".", 1)[1] in given:
+            unknowns[name] = unknown
+    for name in unknowns:
+        if name.startswith("data[") and name.split(".", 1)[1] in unknowns:
             raise ValueError(f"free: {name!r} is named twice, alone and for all data")
     for k in range(len(own)):
-        check({name: one.start for name, one in of_data(given, k).items()})
+        check({name: unknown.start for name, unknown in of_data(unknowns, k).items()})
     lower = {}
-    for name, one in given.items():
+    for name, unknown in unknowns.items():
         try:
-            check({name.split(".", 1)[1] if name.startswith("data[") else name: -(abs(one.start) or 1.0)})
+            check({name.split(".", 1)[1] if name.startswith("data[") else name: -(abs(unknown.start) or 1.0)})
         except ValueError:
             lower[name] = 0.0
-    return as_free(given, lower)
+    return as_free(unknowns, lower)
 
 
 def _full_names(short: str, known: list[str], own: list[list[str]]) -> list[str]:

@@ -86,23 +86,23 @@ def identify(
     problem = Problem(model, tuple(unknowns.items()), step)
     with status_line("fitting", progress):
         begins = draw_starts(unknowns, starts, spread, seed)
-        ends, there = _fitted(problem, begins, measurements, max_steps, progress)
+        ends, at_ends = _fitted(problem, begins, measurements, max_steps, progress)
         for _ in range(ROUNDS if np.any(np.asarray(measurements.estimated)) else 0):
-            best = int(np.argmin(there.deviance))
-            errors = estimated_errors(measurements, there.prediction[best], len(unknowns))
+            best = int(np.argmin(at_ends.deviance))
+            errors = estimated_errors(measurements, at_ends.prediction[best], len(unknowns))
             change = np.max(np.abs(np.log(errors / np.asarray(measurements.error))))
             measurements = measurements.with_errors(errors)
             if change > SETTLED:
                 ends = minimise(problem, ends.coordinates, measurements, max_steps=max_steps, progress=progress)
-            there = linearise(problem, ends.coordinates, measurements)
+            at_ends = linearise(problem, ends.coordinates, measurements)
             if change <= SETTLED:
                 break
-        if not np.any(np.isfinite(there.prediction)):
+        if not np.any(np.isfinite(at_ends.prediction)):
             raise ValueError("model: no start led to finite predictions")
-        found = summarise(problem, measurements, labels, begins, ends.coordinates, ends.converged, there)
-    if not found.verdict.good:
-        warnings.warn("; ".join(found.verdict.concerns), FitWarning, stacklevel=2)
-    return found
+        result = summarise(problem, measurements, labels, begins, ends.coordinates, ends.converged, at_ends)
+    if not result.verdict.good:
+        warnings.warn("; ".join(result.verdict.concerns), FitWarning, stacklevel=2)
+    return result
 
 
 def _fitted(
@@ -113,22 +113,22 @@ def _fitted(
     A run is followed from its start on: late samples, whole turns off, would lead to a minimum of their own.
     """
     ends = minimise(problem, begins, measurements, max_steps=max_steps, progress=progress)
-    there = linearise(problem, ends.coordinates, measurements)
+    at_ends = linearise(problem, ends.coordinates, measurements)
     longest = float(np.max(np.asarray(measurements.time)))
     if not longest > 0.0:
-        return ends, there
+        return ends, at_ends
     at = begins
     for part in PARTS:
-        some = down_weighted(measurements, part * longest)
-        at = minimise(problem, at, some, max_steps=max_steps, progress=progress).coordinates
+        early_measurements = down_weighted(measurements, part * longest)
+        at = minimise(problem, at, early_measurements, max_steps=max_steps, progress=progress).coordinates
     others = minimise(problem, at, measurements, max_steps=max_steps, progress=progress)
     by_parts = linearise(problem, others.coordinates, measurements)
-    better = by_parts.deviance < there.deviance
+    better = by_parts.deviance < at_ends.deviance
 
     def chosen(new: Any, old: Any) -> Any:
         return np.where(better.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
 
-    return jax.tree.map(chosen, others, ends), jax.tree.map(chosen, by_parts, there)
+    return jax.tree.map(chosen, others, ends), jax.tree.map(chosen, by_parts, at_ends)
 
 
 def check_search(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: Any) -> None:

@@ -79,36 +79,36 @@ def minimise(
     rows, unknowns = at.shape
     measurements = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (rows, leaf.shape[-1])), measurements)
     moving = np.array([k for k in range(unknowns) if k != held], int)
-    bounded = [one.has_lower or one.has_upper for one in problem.unknowns]
+    bounded = [unknown.has_lower or unknown.has_upper for unknown in problem.unknowns]
     reach = np.where(bounded, FARTHEST, np.inf)[moving]
     done, steps = np.zeros(rows, bool), np.zeros(rows, int)
     with Progress(rows, "fit", shown=progress) as shown:
-        here = _Fit.of(linearise(problem, at, measurements), moving)
+        current = _Fit.of(linearise(problem, at, measurements), moving)
         shown.begin()
         scale, damping = np.zeros((rows, len(moving))), np.full(rows, FIRST_DAMPING)
-        free = max(here.residual.shape[1] - len(moving), 1)
-        history = [here.deviance]
-        done |= _promise(here) < CONVERGED
+        free = max(current.residual.shape[1] - len(moving), 1)
+        history = [current.deviance]
+        done |= _promise(current) < CONVERGED
         for step in range(1, max_steps + 1):
             if done.all():
                 break
-            scale = np.maximum(scale, np.sum(here.jacobian**2, axis=1))
-            move, promised = _step(here, scale, damping, reach)
+            scale = np.maximum(scale, np.sum(current.jacobian**2, axis=1))
+            move, promised = _step(current, scale, damping, reach)
             tried = at.copy()
             tried[:, moving] += move
-            there = _Fit.of(linearise(problem, tried, measurements, ~done), moving)
-            gain = here.deviance - there.deviance
+            trial = _Fit.of(linearise(problem, tried, measurements, ~done), moving)
+            gain = current.deviance - trial.deviance
             better = ~done & (gain > 0.0)
             damping = np.where(better, np.where(gain > GOOD * promised, EASED, 1.0), HARDENED) * damping
             at[better] = tried[better]
-            here = _Fit(*(_chosen(better, new, old) for new, old in zip(there, here, strict=True)))
-            history.append(here.deviance)
+            current = _Fit(*(_chosen(better, new, old) for new, old in zip(trial, current, strict=True)))
+            history.append(current.deviance)
             steps[~done] = step
-            left = _promise(here)
+            left = _promise(current)
             ended = (left < CONVERGED) | (~better & (left < NEGLIGIBLE))
             if step >= PATIENCE:
-                excess = np.maximum(here.deviance - BAD * free, 1.0)
-                ended |= history[-1 - PATIENCE] - here.deviance < STALLED * excess
+                excess = np.maximum(current.deviance - BAD * free, 1.0)
+                ended |= history[-1 - PATIENCE] - current.deviance < STALLED * excess
             shown.advance(int(np.sum(ended & ~done)), steps=step)
             done |= ended
     return Ends(at, done, steps)
@@ -122,9 +122,9 @@ class _Fit(NamedTuple):
     jacobian: Float[np.ndarray, "rows residuals moving"]
 
     @classmethod
-    def of(cls, there: Linearised, moving: Int[np.ndarray, " moving"]) -> "_Fit":
-        deviance = np.where(np.isfinite(there.deviance), there.deviance, np.inf)
-        return cls(deviance, there.whole_residual, there.whole_jacobian[..., moving])
+    def of(cls, linearised: Linearised, moving: Int[np.ndarray, " moving"]) -> "_Fit":
+        deviance = np.where(np.isfinite(linearised.deviance), linearised.deviance, np.inf)
+        return cls(deviance, linearised.whole_residual, linearised.whole_jacobian[..., moving])
 
 
 def _chosen(better: Bool[np.ndarray, " rows"], new: np.ndarray, old: np.ndarray) -> np.ndarray:
@@ -133,24 +133,24 @@ def _chosen(better: Bool[np.ndarray, " rows"], new: np.ndarray, old: np.ndarray)
 
 
 def _step(
-    here: _Fit,
+    current: _Fit,
     scale: Float[np.ndarray, "rows moving"],
     damping: Float[np.ndarray, " rows"],
     reach: Float[np.ndarray, " moving"],
 ) -> tuple[Float[np.ndarray, "rows moving"], Float[np.ndarray, " rows"]]:
     """The damped step of every row, cut to the reach, and by how much it would lower -2 log posterior of a linear model."""
     unit = np.where(scale > 0.0, scale, 1.0)
-    squares = np.einsum("rni,rnj->rij", here.jacobian, here.jacobian)
-    slope = np.einsum("rni,rn->ri", here.jacobian, here.residual)
+    squares = np.einsum("rni,rnj->rij", current.jacobian, current.jacobian)
+    slope = np.einsum("rni,rn->ri", current.jacobian, current.residual)
     damped = squares + (damping[:, None] * unit)[..., None] * np.eye(unit.shape[1])
     move = -np.linalg.solve(damped, slope[..., None])[..., 0]
     move = move / np.maximum(1.0, np.max(np.abs(move) / reach, axis=1, keepdims=True))
     return move, -np.einsum("ri,rij,rj->r", move, squares, move) - 2.0 * np.sum(move * slope, axis=1)
 
 
-def _promise(here: _Fit) -> Float[np.ndarray, " rows"]:
+def _promise(current: _Fit) -> Float[np.ndarray, " rows"]:
     """By how much an undamped step would lower -2 log posterior, to first order in the model."""
-    norms = np.linalg.norm(here.jacobian, axis=1, keepdims=True)
-    sides, values, _ = np.linalg.svd(here.jacobian / np.where(norms > 0.0, norms, 1.0), full_matrices=False)
+    norms = np.linalg.norm(current.jacobian, axis=1, keepdims=True)
+    sides, values, _ = np.linalg.svd(current.jacobian / np.where(norms > 0.0, norms, 1.0), full_matrices=False)
     seen = values > ROUND_OFF * np.max(values, axis=1, keepdims=True, initial=0.0)
-    return np.sum(np.where(seen, np.einsum("rni,rn->ri", sides, here.residual), 0.0) ** 2, axis=1)
+    return np.sum(np.where(seen, np.einsum("rni,rn->ri", sides, current.residual), 0.0) ** 2, axis=1)

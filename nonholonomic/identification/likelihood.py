@@ -66,21 +66,23 @@ class Measurements(eqx.Module):
         if np.ndim(value) == 0 or np.size(value) == 0:
             raise ValueError(f"value must be a non-empty list, not of shape {np.shape(value)}")
         shape = np.shape(value)
-        given = {"error": error, "censored": censored, "period": period, "student": student}
-        for name, one in (given | {"upper": 0.0 if upper is None else upper}).items():
-            if np.shape(one) not in ((), shape):
-                raise ValueError(f"{name} must be one number or of the shape {shape} of value, not {np.shape(one)}")
+        arguments = {"error": error, "censored": censored, "period": period, "student": student}
+        for name, argument in (arguments | {"upper": 0.0 if upper is None else upper}).items():
+            if np.shape(argument) not in ((), shape):
+                raise ValueError(
+                    f"{name} must be one number or of the shape {shape} of value, not {np.shape(argument)}"
+                )
         value = np.asarray(value, float)
         upper = np.where(censored, np.inf, value) if upper is None else np.broadcast_to(upper, shape)
         require(value[~(np.isneginf(value) & np.isfinite(upper))], "value")
         if np.any(np.isnan(upper)) or np.any(upper < value):
             raise ValueError(f"upper = {upper!r} must be at least value")
         for name in ("period", "student"):
-            if not np.all(np.asarray(given[name]) > 0.0):
-                raise ValueError(f"{name} = {given[name]!r} must be positive, or infinite")
+            if not np.all(np.asarray(arguments[name]) > 0.0):
+                raise ValueError(f"{name} = {arguments[name]!r} must be positive, or infinite")
 
-        def each(one: Any, kind: Any) -> Any:
-            return jnp.broadcast_to(jnp.asarray(one, kind), shape)
+        def each(argument: Any, kind: Any) -> Any:
+            return jnp.broadcast_to(jnp.asarray(argument, kind), shape)
 
         self.value, self.upper, self.error = each(value, float), each(upper, float), each(error, float)
         self.period, self.student = each(period, float), each(student, float)
@@ -111,13 +113,13 @@ class Measurements(eqx.Module):
         both = low & high & self.censored
         middle = jnp.where(both, 0.5 * (self.value + self.upper), 0.0)
         half = jnp.where(both, 0.5 * (self.upper - self.value) / self.error, 1.0)
-        found = jnp.select(
+        residuals = jnp.select(
             [~self.censored, both, low],
             [self._of_value(at), between((at - middle) / self.error, half), one_sided(above)],
             -one_sided(below),
         )
         beyond = low & ~high & (prediction == jnp.inf)
-        return jnp.where(known, found, jnp.where(beyond, 0.0, MISSING))
+        return jnp.where(known, residuals, jnp.where(beyond, 0.0, MISSING))
 
     def _of_value(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
         """The residual of what was measured itself."""
@@ -160,15 +162,15 @@ class Measurements(eqx.Module):
 
     def with_errors(self, error: Float[Array, "... n"]) -> "Measurements":
         """The same with other errors."""
-        return eqx.tree_at(lambda one: one.error, self, jnp.broadcast_to(error, self.error.shape))
+        return eqx.tree_at(lambda measurements: measurements.error, self, jnp.broadcast_to(error, self.error.shape))
 
 
 def joined(parts: list[Measurements]) -> Measurements:
     """The measurements of several sets, one after the other; their series are numbered on."""
     first, whole = 0, []
-    for one in parts:
-        whole.append(eqx.tree_at(lambda part: part.series, one, one.series + first))
-        first += int(np.max(one.series)) + 1
+    for part in parts:
+        whole.append(eqx.tree_at(lambda part: part.series, part, part.series + first))
+        first += int(np.max(part.series)) + 1
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *whole)
 
 
@@ -207,17 +209,17 @@ def estimated_errors(measurements: Measurements, prediction: Any, unknowns: int)
     errors = np.array(measurements.error)
     series, open_ = np.asarray(measurements.series), np.asarray(measurements.estimated)
     off = np.asarray(measurements.standardised(jnp.asarray(prediction))) * errors
-    for one in np.unique(series[open_]):
-        here = (series == one) & open_ & np.isfinite(off)
-        n = np.sum(here)
+    for number in np.unique(series[open_]):
+        in_series = (series == number) & open_ & np.isfinite(off)
+        n = np.sum(in_series)
         share = max(1.0 - unknowns / off.size, 1.0 / off.size)
-        freedom = np.asarray(measurements.student)[here]
-        scale = math.sqrt(np.sum(off[here] ** 2) / (n * share)) if n else 1.0
+        freedom = np.asarray(measurements.student)[in_series]
+        scale = math.sqrt(np.sum(off[in_series] ** 2) / (n * share)) if n else 1.0
         if n and np.all(np.isfinite(freedom)):
             for _ in range(50):
-                weight = (freedom + 1.0) / (freedom + (off[here] / scale) ** 2)
-                scale = math.sqrt(np.sum(weight * off[here] ** 2) / (n * share))
-        errors[(series == one) & open_] = max(scale, 1e-300)
+                weight = (freedom + 1.0) / (freedom + (off[in_series] / scale) ** 2)
+                scale = math.sqrt(np.sum(weight * off[in_series] ** 2) / (n * share))
+        errors[(series == number) & open_] = max(scale, 1e-300)
     return errors
 
 

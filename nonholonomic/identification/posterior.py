@@ -55,8 +55,10 @@ class LogDensity(eqx.Module):
         `series_units`: the unit of each series of the measurements, if known.
         """
         unknowns = as_free(free)
-        given = {name: one.prior for name, one in unknowns.items() if one.prior is not None} | dict(priors or {})
-        for name, prior in given.items():
+        all_priors = {name: unknown.prior for name, unknown in unknowns.items() if unknown.prior is not None} | dict(
+            priors or {}
+        )
+        for name, prior in all_priors.items():
             if name not in unknowns:
                 raise ValueError(f"priors: {name!r} must be one of {', '.join(unknowns)}")
             if not callable(prior):
@@ -66,7 +68,7 @@ class LogDensity(eqx.Module):
                     )
                 require(prior[1], f"standard deviation of the prior of {name}", above=0.0)
         series, open_ = np.asarray(measurements.series), np.asarray(measurements.estimated)
-        kept = {name: _as_leaves(prior) for name, prior in given.items()}
+        kept = {name: _as_leaves(prior) for name, prior in all_priors.items()}
         return cls(
             Problem(model, tuple(unknowns.items())),
             measurements,
@@ -95,7 +97,7 @@ class LogDensity(eqx.Module):
     @property
     def start(self) -> Float[Array, " unknowns"]:
         """The coordinates from which to start."""
-        values = [float(one.coordinate(one.start)) for one in self.problem.unknowns]
+        values = [float(unknown.coordinate(unknown.start)) for unknown in self.problem.unknowns]
         return jnp.array([*values, *(0.0 for _ in self.open_series)])
 
     def values(self, coordinates: Float[Array, "... unknowns"]) -> dict[str, Float[Array, "..."]]:
@@ -114,9 +116,9 @@ class LogDensity(eqx.Module):
                 f"coordinates of shape {coordinates.shape} must have {len(self.names)} numbers along the last axis: "
                 f"{', '.join(self.names)}"
             )
-        found = self.problem.values(coordinates[..., :numbers])
+        unknowns = self.problem.values(coordinates[..., :numbers])
         errors = self._first_errors * jnp.exp(coordinates[..., numbers:])
-        return dict(zip(self.names, jnp.moveaxis(jnp.concatenate([found, errors], axis=-1), -1, 0), strict=True))
+        return dict(zip(self.names, jnp.moveaxis(jnp.concatenate([unknowns, errors], axis=-1), -1, 0), strict=True))
 
     def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
         """What the model predicts for every measurement, at several coordinates."""
@@ -131,7 +133,7 @@ class LogDensity(eqx.Module):
         drawn /= np.where(
             heavy, np.sqrt(random.chisquare(np.where(heavy, freedom, 1.0), predicted.shape) / freedom), 1.0
         )
-        errors = jax.vmap(lambda one: self._with_errors(one).error)(jnp.asarray(coordinates))
+        errors = jax.vmap(lambda point: self._with_errors(point).error)(jnp.asarray(coordinates))
         return predicted + np.asarray(errors) * drawn
 
     @status_line("simulating")
@@ -159,9 +161,9 @@ class LogDensity(eqx.Module):
     def _log_prior(self, coordinates: Float[Array, " unknowns"]) -> Float[Array, ""]:
         """The log density of the priors in the coordinates: that of a parameter, and how the coordinate stretches it."""
         total = jnp.zeros(())
-        for k, (name, one) in enumerate(self.problem.free):
+        for k, (name, unknown) in enumerate(self.problem.free):
             if (prior := self.priors.get(name)) is not None:
-                value, slope = jax.value_and_grad(one.value)(coordinates[k])
+                value, slope = jax.value_and_grad(unknown.value)(coordinates[k])
                 total += (prior(value) if callable(prior) else _normal(value, *prior)) + jnp.log(jnp.abs(slope))
         return total
 

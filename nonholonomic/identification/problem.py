@@ -32,7 +32,7 @@ class Problem(eqx.Module):
     def __init__(self, model: Callable[..., Any], free: tuple[tuple[str, Free], ...], step: float | None = None):
         self.model, self.step = model, step
         self.names = tuple(name for name, _ in free)
-        self.unknowns = tuple(Unknown.of(one) for _, one in free)
+        self.unknowns = tuple(Unknown.of(unknown) for _, unknown in free)
 
     @property
     def free(self) -> tuple[tuple[str, Unknown], ...]:
@@ -41,7 +41,7 @@ class Problem(eqx.Module):
 
     def values(self, coordinates: Float[Array, "... unknowns"]) -> Float[Array, "... unknowns"]:
         """The parameters at given coordinates."""
-        return jnp.stack([one.value(coordinates[..., k]) for k, one in enumerate(self.unknowns)], axis=-1)
+        return jnp.stack([unknown.value(coordinates[..., k]) for k, unknown in enumerate(self.unknowns)], axis=-1)
 
     def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
         """What the model predicts in every row."""
@@ -110,8 +110,8 @@ def _differences(problem: Problem, step: float, coordinates: Rows) -> tuple[np.n
     rows, unknowns = coordinates.shape
     moves = step * np.concatenate([np.zeros((1, unknowns)), np.eye(unknowns), -np.eye(unknowns)])
     predict = Problem.predict if getattr(problem.model, "on_host", False) else _predicted
-    found = np.asarray(predict(problem, jnp.asarray((coordinates[:, None] + moves).reshape(-1, unknowns))))
-    values, ahead, behind = np.split(found.reshape(rows, len(moves), -1), [1, 1 + unknowns], axis=1)
+    predictions = np.asarray(predict(problem, jnp.asarray((coordinates[:, None] + moves).reshape(-1, unknowns))))
+    values, ahead, behind = np.split(predictions.reshape(rows, len(moves), -1), [1, 1 + unknowns], axis=1)
     with np.errstate(invalid="ignore"):
         slopes = np.moveaxis(ahead - behind, 1, -1) / (2.0 * step)
     return values[:, 0], np.where(np.isfinite(slopes), slopes, 0.0)
@@ -169,7 +169,9 @@ def _priors(unknowns: tuple[Unknown, ...], coordinates: Float[Array, "rows unkno
     """Residuals of the priors, and their slopes by the coordinates."""
 
     def of(row: Float[Array, " unknowns"]) -> Float[Array, " priors"]:
-        given = [(one.value(row[k]), *one.prior) for k, one in enumerate(unknowns) if one.prior is not None]
-        return jnp.array([(value - mean) / deviation for value, mean, deviation in given])
+        priors = [
+            (unknown.value(row[k]), *unknown.prior) for k, unknown in enumerate(unknowns) if unknown.prior is not None
+        ]
+        return jnp.array([(value - mean) / deviation for value, mean, deviation in priors])
 
     return jax.vmap(of)(coordinates), jax.vmap(jax.jacfwd(of))(coordinates)

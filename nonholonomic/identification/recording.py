@@ -44,15 +44,15 @@ class Quantities:
         **Raises:** `ValueError` for an unknown one, or one that is named twice.
         """
         words = quantity if isinstance(quantity, tuple) else (quantity,)
-        found: list[str] = []
+        columns: list[str] = []
         for word in words:
             known = self.columns | {name: (name,) for name in self.units}
             if not isinstance(word, str) or word not in known:
                 raise ValueError(f"quantity = {word!r} must be one of {', '.join(map(repr, known))}")
-            found += known[word]
-        if not found or len(set(found)) < len(found):
+            columns += known[word]
+        if not columns or len(set(columns)) < len(columns):
             raise ValueError(f"quantity = {quantity!r} must name at least one column, and each once")
-        return tuple(found)
+        return tuple(columns)
 
 
 def as_quantity(words: Any) -> Any:
@@ -149,9 +149,9 @@ class AbstractRecording(eqx.Module):
         if self.error is None:
             error = np.broadcast_to(noise(value), value.shape)
         else:
-            given = np.asarray(self.error)
+            error = np.asarray(self.error)
             error = np.broadcast_to(
-                given.reshape(value.shape) if given.ndim == np.ndim(self.value) else given, value.shape
+                error.reshape(value.shape) if error.ndim == np.ndim(self.value) else error, value.shape
             )
         period = [2.0 * math.pi if name in self.quantities.angles else math.inf for name in self.columns]
 
@@ -173,10 +173,10 @@ def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " colu
     """A first guess of the errors: the scatter of the second differences, or of the values where there are too few of them."""
 
     def of(column: np.ndarray) -> float:
-        there = column[np.isfinite(column)]
-        second = np.diff(there, 2)
+        observed = column[np.isfinite(column)]
+        second = np.diff(observed, 2)
         guess = np.median(np.abs(second)) / 0.6745 / math.sqrt(6.0) if len(second) > 2 else 0.0
-        return guess or 0.1 * float(np.ptp(there)) or 1.0
+        return guess or 0.1 * float(np.ptp(observed)) or 1.0
 
     return np.array([of(column) for column in value.T])
 
@@ -218,14 +218,14 @@ def predicted(
 
     def one(lane: Values, times: Float[Array, " times"]) -> Float[Array, "times columns"]:
         rest = {name: value for name, value in lane.items() if name != "t0"}
-        found = run(rest, model_times(times, lane["t0"]))
-        return jnp.stack([column(found, name) for name in columns], axis=-1)
+        trajectory = run(rest, model_times(times, lane["t0"]))
+        return jnp.stack([column(trajectory, name) for name in columns], axis=-1)
 
-    found = jax.vmap(one)(given, jnp.tile(clock, (rows, 1))).reshape(rows, len(recordings), longest, len(columns))
+    predictions = jax.vmap(one)(given, jnp.tile(clock, (rows, 1))).reshape(rows, len(recordings), longest, len(columns))
     parts = []
     for k, (recording, _) in enumerate(recordings):
         places = np.array([columns.index(name) for name in recording.columns])
-        parts.append(found[:, k, : len(recording.times)][..., places].reshape(rows, -1))
+        parts.append(predictions[:, k, : len(recording.times)][..., places].reshape(rows, -1))
     return parts
 
 

@@ -176,9 +176,9 @@ class Identification:
         starts = np.tile(self.coordinates, (len(values), 1))
         starts[:, k] = np.asarray(free.coordinate(values))
         ends = minimise(self.problem, starts, self.measurements, held=k)
-        found = np.asarray(self.problem.values(jnp.asarray(ends.coordinates)))
+        optima = np.asarray(self.problem.values(jnp.asarray(ends.coordinates)))
         deviance = deviance_of(self.problem, ends.coordinates, self.measurements) - self.deviance
-        others = {other: found[:, i] for i, other in enumerate(self.problem.names) if i != k}
+        others = {other: optima[:, i] for i, other in enumerate(self.problem.names) if i != k}
         return Profile(values, deviance, others, ends.converged)
 
     @property
@@ -269,7 +269,9 @@ def identifiability(problem: Problem, estimates: Any, slopes: Any, jacobian: Any
     **Arguments:** `estimates`: (unknowns,); `slopes`: (unknowns,), of the parameters by their coordinates; `jacobian`: (n,
     unknowns), of the residuals by the coordinates.
     """
-    units = np.array([abs(x) if one.positive else one.unit for x, one in zip(estimates, problem.unknowns, strict=True)])
+    units = np.array(
+        [abs(x) if unknown.positive else unknown.unit for x, unknown in zip(estimates, problem.unknowns, strict=True)]
+    )
     scaled = np.asarray(jacobian) * units / np.where(slopes == 0.0, 1.0, slopes)
     values, directions = _singular(scaled)
     words = tuple(_in_words(problem, direction) for direction in directions)
@@ -299,13 +301,15 @@ def summarise(
     known = np.any(np.isfinite(at_ends.prediction), axis=1) & np.all(np.isfinite(ends), axis=1)
     deviances = np.where(known & np.isfinite(at_ends.deviance), at_ends.deviance, np.inf)
     statuses = tuple(
-        "failed" if np.isinf(deviance) else "converged" if there else "not_converged"
-        for deviance, there in zip(deviances, converged, strict=True)
+        "failed" if np.isinf(deviance) else "converged" if has_converged else "not_converged"
+        for deviance, has_converged in zip(deviances, converged, strict=True)
     )
     best = int(np.argmin(deviances))
-    here, names = ends[best], problem.names
+    optimum, names = ends[best], problem.names
     values = np.asarray(problem.values(jnp.asarray(ends)))
-    slopes = np.array([float(jax.grad(one.value)(at)) for at, one in zip(here, problem.unknowns, strict=True)])
+    slopes = np.array(
+        [float(jax.grad(unknown.value)(at)) for at, unknown in zip(optimum, problem.unknowns, strict=True)]
+    )
     covariance = coordinate_covariance(at_ends.whole_information[best])
     with np.errstate(invalid="ignore"):
         by_value = np.where(covariance == 0.0, 0.0, covariance * np.outer(slopes, slopes))
@@ -318,7 +322,7 @@ def summarise(
         measurements.upper,
     )
     table = zip(labels, *(np.asarray(part).tolist() for part in numbers), strict=True)
-    found = identifiability(problem, values[best], slopes, at_ends.information[best])
+    combinations = identifiability(problem, values[best], slopes, at_ends.information[best])
     priors, limits = at_ends.prior.shape[-1], int(np.sum(np.asarray(measurements.censored)))
     degrees = len(labels) + priors - len(names)
     return Identification(
@@ -327,7 +331,7 @@ def summarise(
         covariance=by_value,
         deviance=float(deviances[best]),
         degrees=degrees,
-        identifiability=found,
+        identifiability=combinations,
         residuals=tuple(ResidualRow(*row) for row in table),
         status=statuses[best],
         starts=dict(zip(names, begins.T, strict=True)),
@@ -340,10 +344,10 @@ def summarise(
             at_ends.residual[best],
             degrees - limits,
             agreement(ends, deviances, covariance, best),
-            found.unseen,
+            combinations.unseen,
             statuses[best],
         ),
-        coordinates=here,
+        coordinates=optimum,
         coordinate_covariance=covariance,
         problem=problem,
         measurements=measurements,

@@ -66,11 +66,11 @@ class Draws(NamedTuple):
         from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
 
         values = {name: np.asarray(value) for name, value in density.values(jnp.asarray(coordinates)).items()}
-        found = map(
+        draws = map(
             np.asarray, (measure(coordinates) for measure in (potential_scale_reduction, effective_sample_size))
         )
         # Of a single unknown they are numbers, not lists of one.
-        named = (dict(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in found)
+        named = (dict(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in draws)
         return cls(values, coordinates, *named, accepted=accepted, runs=runs, units=density.units)
 
     def __str__(self) -> str:
@@ -121,13 +121,13 @@ def sample(
     with Progress(warmup + draws, "step", shown=progress) as shown:
         surrogate, walk, runs = learn(Surrogate.around(density, centre, covariance), chains, random)
         surrogate = surrogate.to_power(PROPOSING)
-        at, here = _seen(surrogate, walk.points)
+        at, log_density = _seen(surrogate, walk.points)
         shown.begin()
         for step in range(warmup + draws):
             ahead = _walked(surrogate, _key(random), walk, jnp.asarray(False))
-            tried, there = _seen(surrogate, ahead.points)
-            taken = np.log(random.uniform(size=chains)) < there - here
-            at, here = np.where(taken[:, None], tried, at), np.where(taken, there, here)
+            tried, proposed_log_density = _seen(surrogate, ahead.points)
+            taken = np.log(random.uniform(size=chains)) < proposed_log_density - log_density
+            at, log_density = np.where(taken[:, None], tried, at), np.where(taken, proposed_log_density, log_density)
             walk = walk._replace(points=jnp.where(taken[:, None], ahead.points, walk.points))
             if step >= warmup:
                 accepted += float(np.mean(taken)) / draws
@@ -218,12 +218,12 @@ def _walked(surrogate: Surrogate, key: Array, walk: Walk, adapting: Bool[Array, 
         state = walk.adaptation
         length = jnp.exp(jnp.where(adapting, state.log_step_size, state.log_step_size_avg))
 
-        def one(key: Array, point: Float[Array, " unknowns"]) -> tuple[Array, Array]:
+        def step(key: Array, point: Float[Array, " unknowns"]) -> tuple[Array, Array]:
             begun = blackjax.nuts.init(point, surrogate)
             ended, info = kernel(key, begun, surrogate, length, round_mass, max_num_doublings=DOUBLINGS)
             return ended.position, info.acceptance_rate
 
-        points, accepted = jax.vmap(one)(jax.random.split(key, len(walk.points)), walk.points)
+        points, accepted = jax.vmap(step)(jax.random.split(key, len(walk.points)), walk.points)
         new = adapted(state, jnp.mean(accepted))
         return Walk(points, jax.tree.map(lambda new, old: jnp.where(adapting, new, old), new, state)), None
 

@@ -57,7 +57,7 @@ class Surrogate(eqx.Module):
         if np.shape(centre) != (numbers,):
             raise ValueError(f"centre = {centre!r} must be of shape {(numbers,)}")
         series, open_ = np.asarray(density.measurements.series), np.asarray(density.measurements.estimated)
-        sizes = [math.sqrt(0.5 / np.sum(open_ & (series == one))) for one in density.open_series]
+        sizes = [math.sqrt(0.5 / np.sum(open_ & (series == number))) for number in density.open_series]
         root = np.zeros((numbers + len(sizes),) * 2)
         root[:numbers, :numbers] = np.linalg.cholesky(covariance)
         root[numbers:, numbers:] = np.diag(sizes)
@@ -100,8 +100,8 @@ class Surrogate(eqx.Module):
         below = np.max(log_densities[known]) - log_densities[known]
         weights = 1.0 / np.sqrt(1.0 + below / len(self.centre))
         terms = np.asarray(self._terms(jnp.asarray(coordinates[known])))
-        found, *_ = np.linalg.lstsq(terms * weights[:, None], predictions[known] * weights[:, None])
-        return eqx.tree_at(lambda one: one.coefficients, self, jnp.asarray(found))
+        coefficients, *_ = np.linalg.lstsq(terms * weights[:, None], predictions[known] * weights[:, None])
+        return eqx.tree_at(lambda surrogate: surrogate.coefficients, self, jnp.asarray(coefficients))
 
     def among(
         self, coordinates: Float[np.ndarray, "draws unknowns"]
@@ -118,22 +118,24 @@ class Surrogate(eqx.Module):
         for k in range(unknowns):
             powers = np.concatenate([points[:, :k] ** (p + 1) for p in range(BENT)], axis=1)
             terms = np.concatenate([np.ones((count, 1)), powers], axis=1)
-            found, *_ = np.linalg.lstsq(terms, along[:, k])
-            rest = along[:, k] - terms @ found
-            bends[0, k, k], shift[k] = np.std(rest), found[0]
+            fitted, *_ = np.linalg.lstsq(terms, along[:, k])
+            rest = along[:, k] - terms @ fitted
+            bends[0, k, k], shift[k] = np.std(rest), fitted[0]
             points[:, k] = rest / bends[0, k, k]
-            bends[:, k, :k] = found[1:].reshape(BENT, k)
+            bends[:, k, :k] = fitted[1:].reshape(BENT, k)
         new = (centre + axes @ shift, axes @ bends)
-        return eqx.tree_at(lambda one: (one.centre, one.bends), self, tuple(map(jnp.asarray, new))), points
+        return eqx.tree_at(
+            lambda surrogate: (surrogate.centre, surrogate.bends), self, tuple(map(jnp.asarray, new))
+        ), points
 
     def to_power(self, power: float) -> "Surrogate":
         """The same, but another power of the density."""
-        return eqx.tree_at(lambda one: one.power, self, jnp.asarray(power))
+        return eqx.tree_at(lambda surrogate: surrogate.power, self, jnp.asarray(power))
 
     def _terms(self, coordinates: Float[Array, "... unknowns"]) -> Float[Array, "... terms"]:
         x = (coordinates[..., : len(self.origin)] - self.origin) @ self.scale.T
-        one = jnp.ones_like(x[..., :1])
-        return jnp.prod(jnp.concatenate([one, x], axis=-1)[..., _factors(len(self.origin))], axis=-1)
+        ones = jnp.ones_like(x[..., :1])
+        return jnp.prod(jnp.concatenate([ones, x], axis=-1)[..., _factors(len(self.origin))], axis=-1)
 
 
 def _factors(numbers: int) -> np.ndarray:

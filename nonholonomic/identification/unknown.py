@@ -120,22 +120,24 @@ def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]
     """
     if not isinstance(free, dict) or not free:
         raise ValueError(f"free = {free!r} must be a non-empty dictionary, name of a number -> where to start")
-    found = {}
-    for name, given in free.items():
-        one = given if isinstance(given, Free) else Free(given)
-        if one.lower == -math.inf and one.upper == math.inf:
-            one = one._replace(lower=(lower or {}).get(name, -math.inf))
-        require(one.start, f"start of {name}")
-        if np.ndim(one.start) != 0:
-            raise ValueError(f"start of {name} must be one number, not of shape {np.shape(one.start)}")
-        require(one.start, f"start of {name}", above=one.lower, below=one.upper, why="the bounds")
-        if one.prior is not None:
-            if np.shape(one.prior) != (2,):
-                raise ValueError(f"prior of {name} = {one.prior!r} must be a mean and a standard deviation")
-            require(one.prior[0], f"mean of the prior of {name}")
-            require(one.prior[1], f"standard deviation of the prior of {name}", above=0.0)
-        found[name] = one._replace(start=float(one.start), lower=float(one.lower), upper=float(one.upper))
-    return found
+    unknowns = {}
+    for name, start in free.items():
+        unknown = start if isinstance(start, Free) else Free(start)
+        if unknown.lower == -math.inf and unknown.upper == math.inf:
+            unknown = unknown._replace(lower=(lower or {}).get(name, -math.inf))
+        require(unknown.start, f"start of {name}")
+        if np.ndim(unknown.start) != 0:
+            raise ValueError(f"start of {name} must be one number, not of shape {np.shape(unknown.start)}")
+        require(unknown.start, f"start of {name}", above=unknown.lower, below=unknown.upper, why="the bounds")
+        if unknown.prior is not None:
+            if np.shape(unknown.prior) != (2,):
+                raise ValueError(f"prior of {name} = {unknown.prior!r} must be a mean and a standard deviation")
+            require(unknown.prior[0], f"mean of the prior of {name}")
+            require(unknown.prior[1], f"standard deviation of the prior of {name}", above=0.0)
+        unknowns[name] = unknown._replace(
+            start=float(unknown.start), lower=float(unknown.lower), upper=float(unknown.upper)
+        )
+    return unknowns
 
 
 def draw_starts(free: dict[str, Free], count: int, spread: float, seed: int) -> Float[np.ndarray, "count unknowns"]:
@@ -144,11 +146,11 @@ def draw_starts(free: dict[str, Free], count: int, spread: float, seed: int) -> 
     A parameter fitted in its logarithm is drawn uniformly in it, up to a factor `spread` either way; any other is drawn
     within the distance by which that factor would change its start.
     """
-    centre = np.array([float(one.coordinate(one.start)) for one in free.values()])
+    centre = np.array([float(unknown.coordinate(unknown.start)) for unknown in free.values()])
     reach = np.array(
         [
-            math.log(spread) if math.isfinite(one.lower) or math.isfinite(one.upper) else spread - 1.0
-            for one in free.values()
+            math.log(spread) if math.isfinite(unknown.lower) or math.isfinite(unknown.upper) else spread - 1.0
+            for unknown in free.values()
         ]
     )
     drawn = centre + reach * np.random.default_rng(seed).uniform(-1.0, 1.0, (count, len(free)))

@@ -78,7 +78,9 @@ class Verdict(NamedTuple):
             if math.isnan(self.p_value)
             else f"residuals this large have a probability of {self.p_value:.2g}"
         )
-        signs = ", ".join(f"{one.runs} runs of {one.count} signs (p = {one.p_value:.2g})" for one in self.series)
+        signs = ", ".join(
+            f"{series.runs} runs of {series.count} signs (p = {series.p_value:.2g})" for series in self.series
+        )
         lines = [f"  {scatter}", f"  {signs}" if signs else "", f"  {self.agree} of {self.starts} starts agree"]
         return "\n".join([*filter(None, lines), *(f"  BUT {concern}" for concern in self.concerns)])
 
@@ -108,8 +110,8 @@ def judge(
     estimated = bool(np.any(np.asarray(measurements.estimated)))
     p_value = math.nan if estimated or degrees < 1 else chi_squared_tail(float(np.sum(scores[exact] ** 2)), degrees)
     numbers = np.asarray(measurements.series)
-    parts = [scores[exact & (numbers == one)] for one in np.unique(numbers)]
-    seen = tuple(found for found in map(runs_of_signs, parts) if found.count > 1)
+    parts = [scores[exact & (numbers == number)] for number in np.unique(numbers)]
+    seen = tuple(runs for runs in map(runs_of_signs, parts) if runs.count > 1)
     noisy = [runs_of_signs(part).p_value for part in parts if np.any(np.abs(part) > NEGLIGIBLE)]
     agree, rivals, starts = agreement
     limits = np.abs(residual[~exact])

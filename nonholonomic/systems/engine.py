@@ -21,8 +21,8 @@ from .mode import State
 from .tracing import spelled_out
 
 #: A function counts as zero if changing every component of the state by this fraction of its size could make it so: at the end
-#: of a mode, which is located to a fraction of a step; and up to round-off.
-AT_END, ROUND_OFF = 1e-8, 1e-14
+#: of a mode, which is located to 1e-10 of a step, so that a long step leaves an error to be taken out; and up to round-off.
+AT_END, ROUND_OFF = 1e-6, 1e-14
 
 #: The magnitude by which errors of the time are measured [s]: it has none, and no share in step control.
 UNMEASURED = 1e9

@@ -82,6 +82,12 @@ def _plain(name: str) -> str:
     return name.replace("[", "_").replace("]", "").replace(".", "_")
 
 
+def has_checks(tree: Any) -> bool:
+    """Whether a module of a user checks its numbers, so that every value of an axis must be looked at."""
+    kinds = {kind for module in _modules(tree) for kind in type(module).__mro__ if "__check_init__" in vars(kind)}
+    return any(not kind.__module__.startswith("nonholonomic.") for kind in kinds)
+
+
 def check_again(tree: Any) -> None:
     """Have all modules of a tree check their numbers, as they do when they are made."""
     for module in _modules(tree):

@@ -31,7 +31,7 @@ from ..sweeps import sweep as computed
 from ..validation import as_number
 from .engine import Cells
 from .mode import Event, Hybrid
-from .numbers import Named, check_again, short_names
+from .numbers import Named, check_again, has_checks, short_names
 from .system import Run, System, check_run, run_of
 from .tracing import dependent_outputs
 
@@ -109,7 +109,7 @@ def sweep(
     by = [full_name("sensitivities", name, named.movable) for name in sensitivities]
     shorts = short_names([*full, *(name for name in by if name not in full)])
     grid = [axis(shorts[name], name, "1", values) for name, values in full.items()]
-    for one in grid:
+    for one in grid if has_checks(system) or has_checks(event) else ():
         for value in one.values:
             check_again(named.tree(named.replaced({one.number: jnp.asarray(value)})))
     job = SweepJob(named, float(t1), float(tolerance), solver, tuple(by))

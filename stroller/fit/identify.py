@@ -35,11 +35,13 @@ class SceneModel(eqx.Module):
         values = [of_data(parameters, k) for k in range(len(self.data))]
         parts: dict[int, Array] = {}
         rides: dict[Any, list[int]] = {}
-        for k, one in enumerate(self.data):
-            rides.setdefault((id(one.input), tuple(numbers("launch", one.launch)), tuple(values[k])), []).append(k)
+        for k, recording in enumerate(self.data):
+            rides.setdefault(
+                (id(recording.input), tuple(numbers("launch", recording.launch)), tuple(values[k])), []
+            ).append(k)
         for alike in rides.values():
-            found = self._predict([(self.data[k], values[k]) for k in alike], rows)
-            parts |= dict(zip(alike, found, strict=True))
+            predictions = self._predict([(self.data[k], values[k]) for k in alike], rows)
+            parts |= dict(zip(alike, predictions, strict=True))
         return jnp.concatenate([parts[k] for k in range(len(self.data))], axis=1)[:, self.seen]
 
     def _predict(self, recordings: list[tuple[Recording, Any]], rows: int) -> list[Float[Array, "rows samples"]]:
@@ -104,11 +106,11 @@ def identify(
     with status_line("fitting", progress):
         require_kind(scene, "scene", Scene)
         data = tuple(data) if isinstance(data, list | tuple) else (data,)
-        if not data or not all(isinstance(one, Recording) for one in data):
+        if not data or not all(isinstance(recording, Recording) for recording in data):
             raise ValueError(f"data = {data!r} must be a Recording, or a list of them")
         tolerance_bound(tolerance).require()
-        for one in data:
-            scene.check(one.launch)
+        for recording in data:
+            scene.check(recording.launch)
         unknowns = _unknowns_of(scene, data, free)
         measurements, labels, seen = generic.joined(data)
         return generic.identify(
@@ -127,7 +129,7 @@ def identify(
 def _unknowns_of(scene: Scene, data: tuple[Recording, ...], free: Any) -> dict[str, Free]:
     """The unknowns of a scene and its data by their full names, checked."""
     roots = {"scene": scene, "launch": data[0].launch}
-    own = [[*numbers("launch", one.launch), "t0"] for one in data]
+    own = [[*numbers("launch", recording.launch), "t0"] for recording in data]
 
     def check(values: dict[str, float]) -> None:
         with_numbers(roots, {name: value for name, value in values.items() if name != "t0"})

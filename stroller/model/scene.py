@@ -206,14 +206,14 @@ class Scene(Bounded):
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
         body, dynamics = self.body, self.dynamics
-        one = jnp.ones_like(self.state(launch, driven)[0])
+        ones = jnp.ones_like(self.state(launch, driven)[0])
         rate = jnp.sqrt(self.gravity / body.wheelbase) + jnp.abs(launch.steering_rate) + 1e-3
         rate = rate + jnp.abs(launch.speed) / body.wheelbase
         speed = rate * body.wheelbase
         places, headings = self.surface.axes, dynamics.heading.axes(self.surface)
-        motion = (one, jnp.sqrt(body.mass) * speed, rate, one, one)
+        motion = (ones, jnp.sqrt(body.mass) * speed, rate, ones, ones)
         works = (body.mass * speed**2,) * (2 * driven + self.friction.dissipates)
-        return stacked((*(body.wheelbase,) * places, *(one,) * headings, *motion, *works), one[None])
+        return stacked((*(body.wheelbase,) * places, *(ones,) * headings, *motion, *works), ones[None])
 
     def energy(self, state: State) -> Float[Array, "..."]:
         """Kinetic and potential energy [J] at a state."""

@@ -48,8 +48,8 @@ def watched(spec: RideSpec, states: States, name: str) -> Lanes:
 @eqx.filter_jit
 def _watched(spec: RideSpec, states: State) -> Float[Array, "watched lanes"]:
     dynamics = spec.ride.scene.dynamics
-    found = (dynamics.contact(states), dynamics.geometry(states).cosine, dynamics.rank(states))
-    return jnp.stack(jnp.broadcast_arrays(*found))
+    quantities = (dynamics.contact(states), dynamics.geometry(states).cosine, dynamics.rank(states))
+    return jnp.stack(jnp.broadcast_arrays(*quantities))
 
 
 def crossings(spec: RideSpec, steps: Steps, name: str, level: float) -> Float[np.ndarray, " times"]:
@@ -68,8 +68,8 @@ def crossings(spec: RideSpec, steps: Steps, name: str, level: float) -> Float[np
         new = _nearest(time, value)
         if new.size == 0:
             break
-    found = np.flatnonzero((value[:-1] > 0.0) != (value[1:] > 0.0))
-    return few_trials(quantity.at, time[found], time[found + 1], value[found], value[found + 1])
+    changes = np.flatnonzero((value[:-1] > 0.0) != (value[1:] > 0.0))
+    return few_trials(quantity.at, time[changes], time[changes + 1], value[changes], value[changes + 1])
 
 
 def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:

@@ -27,11 +27,11 @@ def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str],
     figure = Figure(figsize=(18.0, 4.2 * len(grounds)), layout="constrained")
     layout = figure.add_gridspec(len(grounds), 4, width_ratios=(1.5, 1.0, 1.0, 1.0))
     for row, (name, ground) in enumerate(grounds.items()):
-        here = {ride: run for (where, ride), run in rides.items() if where == name}
+        on_ground = {ride: run for (where, ride), run in rides.items() if where == name}
         space = figure.add_subplot(layout[row, 0], projection="3d")
-        _draw_ground(space, ground, here)
+        _draw_ground(space, ground, on_ground)
         panels = [figure.add_subplot(layout[row, column]) for column in (1, 2, 3)]
-        for colour, (ride, run) in zip(COLOURS, here.items(), strict=False):
+        for colour, (ride, run) in zip(COLOURS, on_ground.items(), strict=False):
             space.plot(*np.asarray(run.position).T, color=colour, linewidth=1.4, label=ride)
             panels[0].plot(run.t, run.speed, color=colour)
             panels[1].plot(run.t, run.energy, color=colour)

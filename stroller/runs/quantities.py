@@ -59,10 +59,10 @@ def table_of(runs: list[Any], names: list[str], request: dict[str, Any]) -> Tabl
     coords = {"ride": np.array(names)} if names else {}
     coords |= {"time": np.asarray(runs[0].t), "coordinate": np.array(places)}
     coords |= {"component": np.array(("x", "y", "z")), "axle": np.array(("rear", "front"))}
-    found = {name: [np.asarray(one.read(run)) for run in runs] for name, one in QUANTITIES.items()}
-    units = {"time": "s"} | {name: one.unit for name, one in QUANTITIES.items()}
+    values_by_name = {name: [np.asarray(quantity.read(run)) for run in runs] for name, quantity in QUANTITIES.items()}
+    units = {"time": "s"} | {name: quantity.unit for name, quantity in QUANTITIES.items()}
     units["place"] = unit
-    long_names = {"time": "time"} | {name: one.long_name for name, one in QUANTITIES.items()}
+    long_names = {"time": "time"} | {name: quantity.long_name for name, quantity in QUANTITIES.items()}
     attributes = {
         "request": json.dumps(request, default=repr),
         "axes": json.dumps([*(["ride"] if names else []), "time"]),
@@ -71,10 +71,12 @@ def table_of(runs: list[Any], names: list[str], request: dict[str, Any]) -> Tabl
     }
     return Table(
         coords,
-        {name: np.stack(values) if names else values[0] for name, values in found.items()},
+        {name: np.stack(values) if names else values[0] for name, values in values_by_name.items()},
         units,
         attributes,
-        inner={name: (one.components,) for name, one in QUANTITIES.items() if one.components is not None},
+        inner={
+            name: (quantity.components,) for name, quantity in QUANTITIES.items() if quantity.components is not None
+        },
     )
 
 

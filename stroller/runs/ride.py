@@ -59,10 +59,13 @@ class RideProblem(AbstractProblem):
         def spread(states):
             return jnp.broadcast_to(states.reshape(states.shape[0], -1), (states.shape[0], cells))
 
-        one = cls.single(scene, launch, controls)
-        guarded, watched = isinstance(one.dynamics.heading, Projected), watched and not isinstance(scene.surface, Plane)
-        columns = {"states": spread(one.states), "scales": spread(one.scales)}
-        return dataclasses.replace(one, **columns, watched=watched, guarded=guarded)
+        ride = cls.single(scene, launch, controls)
+        guarded, watched = (
+            isinstance(ride.dynamics.heading, Projected),
+            watched and not isinstance(scene.surface, Plane),
+        )
+        columns = {"states": spread(ride.states), "scales": spread(ride.scales)}
+        return dataclasses.replace(ride, **columns, watched=watched, guarded=guarded)
 
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
         return self.states, self.scales
@@ -138,15 +141,15 @@ def traced_ride(
     """The states of a ride at `times`, inside a transformation, and statistics."""
     modules = (ride.scene, ride.launch, ride.input)
     if adjoint is None:
-        found = sampled_run(ride_problem, modules, times, ride.t1, ride.settings, ride.grid)
+        sampled = sampled_run(ride_problem, modules, times, ride.t1, ride.settings, ride.grid)
     else:
-        given = (times, ride.t1, ride.settings, adjoint, ride.grid)
-        found = sampled_run_by_diffrax(ride_problem(modules, None), *given)
-    return found.states.T, stats_of(found)
+        arguments = (times, ride.t1, ride.settings, adjoint, ride.grid)
+        sampled = sampled_run_by_diffrax(ride_problem(modules, None), *arguments)
+    return sampled.states.T, stats_of(sampled)
 
 
-def stats_of(found: SampledRun) -> Stats:
+def stats_of(sampled: SampledRun) -> Stats:
     """The statistics of a run."""
-    counts = (jax.lax.stop_gradient(part) for part in (found.accepted, found.rejected, found.status))
+    counts = (jax.lax.stop_gradient(part) for part in (sampled.accepted, sampled.rejected, sampled.status))
     accepted, rejected, status = counts
     return Stats(accepted.astype(int), rejected.astype(int), status == REACHED_END)

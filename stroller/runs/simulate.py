@@ -124,7 +124,7 @@ def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.Ab
         begun = begun._replace(**nan_unless(may, {"scene": ride.scene, "launch": ride.launch, "input": ride.input}))
     run = read_off(RideSpec.of(ride), run_times, *traced_ride(begun, run_times, adjoint))
     stats = run.stats._replace(finished=run.stats.finished & may)
-    return eqx.tree_at(lambda one: (one.t, one.stats), nan_unless(may, run), (times, stats))
+    return eqx.tree_at(lambda trajectory: (trajectory.t, trajectory.stats), nan_unless(may, run), (times, stats))
 
 
 def _evenly_spaced(t1: Float[Array, ""]) -> Float[Array, " times"]:

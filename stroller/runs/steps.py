@@ -74,11 +74,11 @@ def _field(spec: RideSpec, times: Float[Array, " lanes"], states: State) -> Stat
 def in_blocks(function: Callable[..., Any], *columns: Any) -> Any:
     """A compiled function of any number of columns, `WIDTH` at a time; the last block is padded with its last column."""
     count = columns[0].shape[-1]
-    found = []
+    results = []
     for first in range(0, count, WIDTH):
         lanes = np.minimum(np.arange(first, first + WIDTH), count - 1)
-        found.append(np.asarray(function(*(column[..., lanes] for column in columns))))
-    return np.concatenate(found, axis=-1)[..., :count]
+        results.append(np.asarray(function(*(column[..., lanes] for column in columns))))
+    return np.concatenate(results, axis=-1)[..., :count]
 
 
 def followed(spec: RideSpec) -> tuple[Steps, Stats]:
@@ -88,11 +88,11 @@ def followed(spec: RideSpec) -> tuple[Steps, Stats]:
     if ride.grid is None:
         path = follow(problem, float(ride.t1), ride.settings, dense=False)
         return Steps(path.times, path.states), _counted(path.accepted, path.rejected, not path.failed)
-    found = _on_grid(problem, spec)
+    solution = _on_grid(problem, spec)
     ends = np.asarray(ride.grid)
-    good = ends <= float(found.end_time)
-    steps = Steps(ends[good], np.asarray(found.states)[:, good])
-    return steps, _counted(int(found.accepted), int(found.rejected), bool(good.all()))
+    good = ends <= float(solution.end_time)
+    steps = Steps(ends[good], np.asarray(solution.states)[:, good])
+    return steps, _counted(int(solution.accepted), int(solution.rejected), bool(good.all()))
 
 
 def _counted(accepted: int, rejected: int, finished: bool) -> Stats:

@@ -141,16 +141,18 @@ def sweep(
     request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
     request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
     request |= {"solver": type(solver).__name__, "input": "none" if input is None else described(input)}
-    request |= {one.number: "an axis" for one in grid}
+    request |= {grid_axis.number: "an axis" for grid_axis in grid}
     job = RideJob.of(roots, input, float(t1), float(tolerance), solver)
     return computed(job, grid, VARIABLES, request, path=path, progress=progress, executor=executor)
 
 
 def variable_numbers(roots: dict[str, Any]) -> list[str]:
     """The full names of what can be varied: single numbers, those that are left out for 0 among them."""
-    found = {name: value for root, tree in roots.items() for name, value in numbers(root, tree).items()}
+    values_by_name = {name: value for root, tree in roots.items() for name, value in numbers(root, tree).items()}
     level = isinstance(roots["scene"].surface, Plane)
-    return [name for name, value in found.items() if np.ndim(value) == 0 and (level or name != "scene.body.centre")]
+    return [
+        name for name, value in values_by_name.items() if np.ndim(value) == 0 and (level or name != "scene.body.centre")
+    ]
 
 
 class RideJob(NamedTuple):

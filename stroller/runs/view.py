@@ -54,12 +54,12 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     rides = [run.spec.ride for run in runs]
     starts = [f"ride of {float(run.t[-1]):.3g} s" for run in runs]
     names = distinguishing_labels(starts, [ride.scene for ride in rides], [ride.launch for ride in rides])
-    return grouped([list(enumerate(runs))] if overlaid else [[one] for one in enumerate(runs)], names)
+    return grouped([list(enumerate(runs))] if overlaid else [[numbered_run] for numbered_run in enumerate(runs)], names)
 
 
 def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage]:
     """A stage for each group of rides, which are numbered and have one ground; `names` are those of the rides."""
-    found = []
+    stages = []
     for group in groups:
         scene = group[0][1].spec.ride.scene
         length = float(scene.body.wheelbase)
@@ -67,15 +67,15 @@ def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage
         points = np.concatenate([np.asarray(run.position) for _, run in group])
         normal = normals(scene.surface, scene.side, np.asarray(group[0][1].position)[:1])[0]
         ground = arena(scene.surface, points, normal, 3.0 * length, length)
-        found.append(Stage("; ".join(one.name for one in shows), ground, shows))
-    return found
+        stages.append(Stage("; ".join(body.name for body in shows), ground, shows))
+    return stages
 
 
 def normals(surface: AbstractSurface, side: str | None, position: np.ndarray) -> np.ndarray:
     """Unit normals at positions (times, 3), towards the side on which the stroller is."""
-    found = surface.normal(surface.in_own_axes(tuple(position.T)))
+    components = surface.normal(surface.in_own_axes(tuple(position.T)))
     like = np.zeros(len(position))
-    full = tuple(like if part is None else np.asarray(part) + like for part in found)
+    full = tuple(like if part is None else np.asarray(part) + like for part in components)
     return surface.sign(side, DRIVES) * np.stack([np.asarray(part) for part in surface.in_fixed_frame(full)], axis=-1)
 
 
@@ -84,7 +84,7 @@ def show(run: Any, number: int, name: str) -> Show:
     scene = run.spec.ride.scene
     length, colour = float(scene.body.wheelbase), COLOURS[number % len(COLOURS)]
     radius, half = RADIUS * length, TRACK * length / 2.0
-    given = np.asarray(run.t)
+    times = np.asarray(run.t)
     times, read = refined(run, radius)
     position, direction = read(run.position), read(run.direction)
     normal = read(normals(scene.surface, scene.side, np.asarray(run.position)))
@@ -96,10 +96,10 @@ def show(run: Any, number: int, name: str) -> Show:
     forward, left = np.cos(steering) * x + np.sin(steering) * y, np.cos(steering) * y - np.sin(steering) * x
     axle, front = position + radius * z, position + length * x + radius * z
     rolled = {
-        side: read(_integral(given, (np.asarray(run.speed) - sign * half * np.asarray(run.yaw_rate)) / radius))
+        side: read(_integral(times, (np.asarray(run.speed) - sign * half * np.asarray(run.yaw_rate)) / radius))
         for side, sign in (("left", 1.0), ("right", -1.0))
     }
-    ahead = read(_integral(given, np.asarray(run.front_speed) / radius))
+    ahead = read(_integral(times, np.asarray(run.front_speed) / radius))
     rear = wheel(radius, WIDTH * length, (DARK, PALE))
     weight = float(scene.body.mass * scene.gravity)
     forces, scale = read(run.side_force), WEIGHT * length / weight

@@ -52,10 +52,10 @@ class Chart(AbstractSystem):
 
     def forms(self, q: Coordinates) -> Float[Array, "3 4"]:
         """The one-forms long, lat and yaw, a row each: what the rear axle rolls, slips to the left, and turns left."""
-        zero, one = jnp.zeros(()), jnp.ones(())
+        zero, unit = jnp.zeros(()), jnp.ones(())
         sine, cosine = jnp.sin(q[2]), jnp.cos(q[2])
         if self.quadric is None:
-            return jnp.array([[cosine, sine, zero, zero], [-sine, cosine, zero, zero], [zero, zero, one, zero]])
+            return jnp.array([[cosine, sine, zero, zero], [-sine, cosine, zero, zero], [zero, zero, unit, zero]])
         equatorial, _ = self.quadric.semi_axes
         if self.scene.heading == "projected":
             # The pull-back of cos(theta) dx + sin(theta) dy and its like by x = A cos(eta) cos(mu), y = ... sin(mu).
@@ -63,12 +63,12 @@ class Chart(AbstractSystem):
             sine, cosine = jnp.sin(q[2] - q[1]), jnp.cos(q[2] - q[1])
             long = [inwards * cosine, across * sine, zero, zero]
             lat = [-inwards * sine, across * cosine, zero, zero]
-            return jnp.array([long, lat, [zero, zero, one, zero]])
+            return jnp.array([long, lat, [zero, zero, unit, zero]])
         h_eta, h_mu = jnp.sqrt(self.ground_metric(q))
         connection = equatorial * jnp.sin(q[0]) / h_eta
         side = self.scene.dynamics.side
         lat = [side * h_eta * cosine, -side * h_mu * sine, zero, zero]
-        return jnp.array([[h_eta * sine, h_mu * cosine, zero, zero], lat, [zero, side * connection, side * one, zero]])
+        return jnp.array([[h_eta * sine, h_mu * cosine, zero, zero], lat, [zero, side * connection, side * unit, zero]])
 
     def metric(self, q: Coordinates) -> Float[Array, "4 4"]:
         body, absolute = self.scene.body, FORKS[self.scene.fork]

@@ -149,11 +149,11 @@ class ConvexBody(AbstractBody):
     def _samples(self) -> tuple[Float[Array, "samples ..."], ...]:
         """Height and the two radii of curvature over the inclinations [m]."""
 
-        def one(cosine: Float[Array, ""]) -> tuple[Float[Array, "..."], ...]:
+        def sample(cosine: Float[Array, ""]) -> tuple[Float[Array, "..."], ...]:
             lever = self.meridian.at(cosine)
             return self.support(cosine), lever.radius, lever.radius - (1.0 - cosine * cosine) * lever.growth
 
-        return jax.vmap(one)(jnp.cos(jnp.linspace(0.0, jnp.pi, SAMPLES)))
+        return jax.vmap(sample)(jnp.cos(jnp.linspace(0.0, jnp.pi, SAMPLES)))
 
     @property
     def meridian(self) -> "SupportMeridian":
@@ -172,11 +172,11 @@ class SupportMeridian(AbstractMeridian):
 
     def at(self, cosine: Float[Array, "..."]) -> ContactGeometry:
         cosine = as_number(cosine)
-        one = jnp.ones_like(cosine)
+        unit = jnp.ones_like(cosine)
 
         def slope(c: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-            height, along = jax.jvp(self.support, (c,), (one,))
+            height, along = jax.jvp(self.support, (c,), (unit,))
             return along, height
 
-        rise, bend, height = jax.jvp(slope, (cosine,), (one,), has_aux=True)
+        rise, bend, height = jax.jvp(slope, (cosine,), (unit,), has_aux=True)
         return ContactGeometry(-rise, height - cosine * rise, -self.per_inertia * rise, -bend)

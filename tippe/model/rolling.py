@@ -158,8 +158,8 @@ class RollingDynamics(eqx.Module):
         - `state`: (8 + the arena's place, ...); `axis`: 0 for t1, 1 for t2.
         """
         e = parts(state).axis
-        r, one = self._contact(e), jnp.ones_like(state[0])
-        v = (one, None, None) if axis == 0 else (None, one, None)
+        r, unit = self._contact(e), jnp.ones_like(state[0])
+        v = (unit, None, None) if axis == 0 else (None, unit, None)
         w = self._over_inertia(e, r, scale(self.mass, cross(r, v)))
         return scale(self.mass, sum_vectors(cross(r, w), v))
 

@@ -250,19 +250,19 @@ class Scene(Bounded):
 
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
-        one = jnp.ones_like(launch.theta)
+        ones = jnp.ones_like(launch.theta)
         rate = jnp.sqrt(self.gravity / self.body.size)
         velocity = rate * self.body.size
         momentum = jnp.maximum(self.body.I3 * jnp.abs(launch.spin), self.body.I1 * rate)
         if launch.angular_velocity is not None:
             turning = launch.angular_velocity
             momentum = jnp.maximum(momentum, self.body.I1 * jnp.sqrt(dot(turning, turning)))
-        place = scale(one, self.frame.place_scales)
+        place = scale(ones, self.frame.place_scales)
         tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
         # A top that stands exactly upright has no growth to resolve.
         tilt = jnp.where(tilt > 0.0, jnp.clip(tilt, 1e-280, 1.0), 1.0)
         velocities, momenta = (velocity * tilt, velocity * tilt), (momentum * tilt, momentum * tilt, momentum)
-        return joined(velocities, (tilt, tilt, one), momenta, place)
+        return joined(velocities, (tilt, tilt, ones), momenta, place)
 
     def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """Rate of change of the state: (m/s^2, 1/s, N m, 1/s) for (velocity, axis, angular momentum, place)."""

@@ -84,23 +84,23 @@ class Onset(eqx.Module):
 
     def falls_to(self, component: int, value: Float[Array, "..."], first: Float[Array, "..."]) -> Float[Array, "..."]:
         """The fraction of the step, after `first`, at which a component of the state has fallen to a value; 1 if nowhere."""
-        one = Onset(
+        onset = Onset(
             self.start[component : component + 1], self.length, self.rates[component : component + 1], self.found
         )
 
         def halved(_, bracket):
             low, high = bracket
             middle = 0.5 * (low + high)
-            above = one.at(middle)[0] > value
+            above = onset.at(middle)[0] > value
             return jnp.where(above, middle, low), jnp.where(above, high, middle)
 
-        found = jax.lax.stop_gradient(jax.lax.fori_loop(0, 52, halved, (first, jnp.ones_like(first)))[1])
+        fraction = jax.lax.stop_gradient(jax.lax.fori_loop(0, 52, halved, (first, jnp.ones_like(first)))[1])
         # Halving has no derivative: that is by the implicit function theorem.
-        height, rise = jax.jvp(lambda at: one.at(at)[0], (found,), (jnp.ones_like(found),))
+        height, rise = jax.jvp(lambda at: onset.at(at)[0], (fraction,), (jnp.ones_like(fraction),))
         missing = height - value
-        inside = (found < 1.0) & (rise != 0.0)
+        inside = (fraction < 1.0) & (rise != 0.0)
         shift = (missing - jax.lax.stop_gradient(missing)) / jax.lax.stop_gradient(jnp.where(inside, rise, 1.0))
-        return found - jnp.where(inside, shift, 0.0)
+        return fraction - jnp.where(inside, shift, 0.0)
 
     @property
     def end(self) -> Float[Array, "components ..."]:
@@ -154,8 +154,8 @@ def begin(
         v = contact.first_guess(times)
         return jax.lax.fori_loop(0, ITERATIONS, newton, (v, rolled, v, jnp.zeros_like(rolled)))
 
-    def again(carry):
-        trial, age, found, _ = carry
+    def shorten(carry):
+        trial, age, converged, _ = carry
         times = age * NODES.reshape((-1,) + (1,) * (state.ndim - 1))
         _, moved, change, rates = iterated(age, times)
         unsettled = jnp.max(length(*change), axis=0) / contact.speed
@@ -166,18 +166,18 @@ def begin(
         # The contact must persist, or the slip would pass by its loss.
         lost = jnp.min(slipping.contact_margin(moved[:size]), axis=0) <= 0.0
         error = jnp.where(jnp.isfinite(error) & ~lost, error, jnp.inf)
-        found = error <= jnp.maximum(tolerance, ROUNDING)
+        converged = error <= jnp.maximum(tolerance, ROUNDING)
         shorter = jnp.clip(0.8 * (tolerance / error) ** (1.0 / STAGES), 0.4, 0.8)
-        return trial + 1, jnp.where(found, age, shorter * age), found, rates
+        return trial + 1, jnp.where(converged, age, shorter * age), converged, rates
 
     def goes_on(carry):
-        trial, _, found, _ = carry
-        return (trial < TRIALS) & ~jnp.all(found)
+        trial, _, converged, _ = carry
+        return (trial < TRIALS) & ~jnp.all(converged)
 
     age = jnp.minimum(FIRST * tolerance ** (1.0 / STAGES) * contact.unit, most)
     rates = jnp.zeros((*state.shape[:1], STAGES, *state.shape[1:]))
-    _, age, found, rates = jax.lax.while_loop(goes_on, again, (0, age, jnp.zeros(age.shape, bool), rates))
-    return Onset(state, age, rates, found)
+    _, age, converged, rates = jax.lax.while_loop(goes_on, shorten, (0, age, jnp.zeros(age.shape, bool), rates))
+    return Onset(state, age, rates, converged)
 
 
 class _Contact(eqx.Module):

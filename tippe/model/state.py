@@ -33,9 +33,9 @@ def parts(state: Float[Array, "components ..."]) -> Parts:
     return Parts((u1, u2), (e1, e2, e3), (L1, L2, L3), tuple(place))
 
 
-def joined(*some: tuple[Component, ...]) -> Float[Array, "components ..."]:
+def joined(*vectors: tuple[Component, ...]) -> Float[Array, "components ..."]:
     """The state made of its parts, in order; a component is a scalar or one per lane."""
-    return jnp.stack(jnp.broadcast_arrays(*(component for part in some for component in part)))
+    return jnp.stack(jnp.broadcast_arrays(*(component for part in vectors for component in part)))
 
 
 def inclination(axis: Vector) -> Float[Array, "..."]:

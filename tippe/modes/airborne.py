@@ -280,8 +280,8 @@ class Fly(AbstractFlyingMode):
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         velocity, momentum = self.scales[0], self.scales[7]
-        one = jnp.ones_like(velocity)
-        rows = [one * self.scene.body.radius] * 3 + [velocity] * 3 + [one] * 3 + [momentum] * 3 + [one] * 2
+        ones = jnp.ones_like(velocity)
+        rows = [ones * self.scene.body.radius] * 3 + [velocity] * 3 + [ones] * 3 + [momentum] * 3 + [ones] * 2
         scales = jnp.concatenate([jnp.stack(rows), self.scales[OWN:]])
         falls = scale(-1.0 * self.scene.gravity, self.scene.surface.up)
         return Flight(self.scene, self.cos_angle, state, scales, falls, self.rides)
@@ -327,8 +327,8 @@ def modes(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The phases of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`."""
-    given = (scene, problem.scales, problem.cos_angle, rides)
-    return (Slide(*given), Fly(*given)), jnp.zeros(problem.states.shape[1:], int)
+    arguments = (scene, problem.scales, problem.cos_angle, rides)
+    return (Slide(*arguments), Fly(*arguments)), jnp.zeros(problem.states.shape[1:], int)
 
 
 def on_the_ground(

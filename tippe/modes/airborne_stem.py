@@ -228,7 +228,7 @@ def apply_impulse(scene: Scene, flying: FlightState, ground: Below, own: Ball, o
         velocity=from_frame(after.velocity, ground.axes), momentum=from_frame(after.momentum, ground.axes)
     )
     beside = landing_site(scene, flying, other)
-    before, now = (gap_rate(body, other, as_free_body(scene, one, beside, other)) for one in (flying, thrown))
+    before, now = (gap_rate(body, other, as_free_body(scene, motion, beside, other)) for motion in (flying, thrown))
     touches = beside.gap < TOUCHING * body.radius
     rests = touches & ~rebounds & (speed <= closing) & (jnp.abs(before) <= closing)
     return ContactImpulse(after, rebounds, touches & ~rests & (now < -closing), rests, fails)
@@ -248,9 +248,9 @@ def modes(
 
     A launch in which the stem would be in the arena starts on the stem: its place and its theta are those of the stem's foot.
     """
-    given, (main, stem) = (scene, problem.scales, problem.cos_angle, rides), balls(scene.body)
+    arguments, (main, stem) = (scene, problem.scales, problem.cos_angle, rides), balls(scene.body)
     started = flight_state(lift_off(scene, problem.states[:OWN], False, main))
     first = jnp.where(landing_site(scene, started, stem).gap < 0.0, ON_STEM, SLIDING)
-    slides = [SlideOnOne(*given, jnp.asarray(number)) for number in (0, 1)]
-    flies, strikes = (FlyBoth(*given, jnp.asarray(strikes)) for strikes in (False, True))
+    slides = [SlideOnOne(*arguments, jnp.asarray(number)) for number in (0, 1)]
+    flies, strikes = (FlyBoth(*arguments, jnp.asarray(strikes)) for strikes in (False, True))
     return (slides[0], flies, slides[1], strikes), first

@@ -45,17 +45,17 @@ class Touch(AbstractFlyingMode):
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Stick, slip, or fly where the contact is lost. It counts flights, and changes from slip to rolling."""
-        there = self.contact_state.reset_map(state, left)
-        whole = there.state
+        transition = self.contact_state.reset_map(state, left)
+        whole = transition.state
         if self.kind.rolls:
             whole = jnp.concatenate([self.kind.both.rolling.carried_along(whole[:OWN]), whole[OWN:]])
-        flies = (there.status == LEFT_DOMAIN) & (self.kind.loss(whole[:OWN]) == 0)
-        mode = jnp.where(there.mode == sticking.ROLLING, ROLLING, SLIPPING)
-        return there._replace(
+        flies = (transition.status == LEFT_DOMAIN) & (self.kind.loss(whole[:OWN]) == 0)
+        mode = jnp.where(transition.mode == sticking.ROLLING, ROLLING, SLIPPING)
+        return transition._replace(
             mode=jnp.where(flies, FLYING, mode),
-            state=jnp.where(flies, lift_off(self.scene, whole, self.rides), there.state),
-            status=jnp.where(flies, RUNNING, there.status),
-            counts=jnp.concatenate([flies.astype(int)[None], there.counts]),
+            state=jnp.where(flies, lift_off(self.scene, whole, self.rides), transition.state),
+            status=jnp.where(flies, RUNNING, transition.status),
+            counts=jnp.concatenate([flies.astype(int)[None], transition.counts]),
         )
 
 
@@ -64,23 +64,26 @@ class Land(Fly):
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Strike the arena; rebound, or slip or roll on."""
-        there, both = super().reset_map(state, left), self.scene.dynamics
+        transition, both = super().reset_map(state, left), self.scene.dynamics
         assert isinstance(both, StickSlip)
-        rests = both.slip_speed(there.state[:OWN]) <= AT_REST * both.speed
+        rests = both.slip_speed(transition.state[:OWN]) <= AT_REST * both.speed
         mode = jnp.where(rests, ROLLING, SLIPPING)
-        counts = jnp.concatenate([there.counts, jnp.zeros_like(there.counts)])
-        return there._replace(mode=jnp.where(there.mode == FLYING, FLYING, mode), counts=counts)
+        counts = jnp.concatenate([transition.counts, jnp.zeros_like(transition.counts)])
+        return transition._replace(mode=jnp.where(transition.mode == FLYING, FLYING, mode), counts=counts)
 
 
 def modes(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The phases of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`."""
-    both, given = problem.dynamics, (scene, problem.scales, problem.cos_angle, rides)
+    both, arguments = problem.dynamics, (scene, problem.scales, problem.cos_angle, rides)
     assert isinstance(both, StickSlip)
-    slips, rolls = (Touch(*given, ContactMode(both, jnp.asarray(tolerance, float), one), last) for one in (False, True))
+    slips, rolls = (
+        Touch(*arguments, ContactMode(both, jnp.asarray(tolerance, float), rolls_first), last)
+        for rolls_first in (False, True)
+    )
     rests = both.slip_speed(problem.states[:OWN]) <= AT_REST * both.speed
-    return (slips, Land(*given), rolls), jnp.where(rests, ROLLING, SLIPPING)
+    return (slips, Land(*arguments), rolls), jnp.where(rests, ROLLING, SLIPPING)
 
 
 def _at_no_distance(shown: Float[Array, "19 times"]) -> Float[Array, "21 times"]:

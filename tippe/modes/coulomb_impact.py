@@ -89,8 +89,8 @@ def resolve_coulomb_impact(
     step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
     state = jnp.where(stops, outcome.state, outcome.state + step * rates)
     blow = impact.blow(state[2], state[:2])
-    onward = _onward(impact, friction.mu, blow.force)
-    force = tuple(jnp.where(stops, a + b, a) for a, b in zip(blow.force, onward, strict=True))
+    remaining = _onward(impact, friction.mu, blow.force)
+    force = tuple(jnp.where(stops, a + b, a) for a, b in zip(blow.force, remaining, strict=True))
     return apply_impulse(body, meets, free, ContactImpulse(force, None)), outcome.status != LEFT_DOMAIN
 
 

@@ -202,7 +202,7 @@ def landing(descent: Descent, most: Cells) -> tuple[Cells, Bool[Array, " cells"]
         return jnp.where(straight, jnp.inf, time + jnp.minimum(*ahead) / jnp.where(straight, 1.0, rate))
 
     def search(carry):
-        low, high, found, over, count = carry
+        low, high, located, over, count = carry
         begin = jnp.where((low > high_from) & (low < high_to), high_to, low)
         stop = jnp.minimum(next_inflection(begin), end)
         falls = descent.value(stop) < 0.0
@@ -210,20 +210,20 @@ def landing(descent: Descent, most: Cells) -> tuple[Cells, Bool[Array, " cells"]
         bottom = halved(lambda t: descent.slope(t) < 0.0, begin, stop)[1]
         dips &= descent.value(bottom) < 0.0
         hit = falls | dips
-        here = ~found & ~over
-        low = jnp.where(here, jnp.where(hit, begin, stop), low)
-        high = jnp.where(here & hit, jnp.where(dips, bottom, stop), high)
-        return low, high, found | (here & hit), over | (here & ~hit & (stop >= end)), count + 1
+        active = ~located & ~over
+        low = jnp.where(active, jnp.where(hit, begin, stop), low)
+        high = jnp.where(active & hit, jnp.where(dips, bottom, stop), high)
+        return low, high, located | (active & hit), over | (active & ~hit & (stop >= end)), count + 1
 
     def searching(carry):
-        _, _, found, over, count = carry
-        return jnp.any(~found & ~over) & (count < MOST_STRETCHES)
+        _, _, located, over, count = carry
+        return jnp.any(~located & ~over) & (count < MOST_STRETCHES)
 
     zero, no = jnp.zeros_like(end), jnp.zeros(end.shape, bool)
-    low, high, found, over, _ = jax.lax.while_loop(searching, search, (zero, zero, no, no, 0))
+    low, high, located, over, _ = jax.lax.while_loop(searching, search, (zero, zero, no, no, 0))
     # At the very start the distance is zero: what counts is that it has been above since.
     time = halved(lambda t: descent.value(t) >= 0.0, low, high)[1]
-    return jnp.where(found, time, jnp.inf), ~found & ~over
+    return jnp.where(located, time, jnp.inf), ~located & ~over
 
 
 def landed_at(descent: Descent, time: Cells) -> Cells:

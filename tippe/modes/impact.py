@@ -164,13 +164,13 @@ def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
     )
     turning = angular_velocity(body, free.axis, free.momentum)
     velocity = sum_vectors(free.velocity, cross(turning, arm))
-    zero, one = jnp.zeros_like(arm[0]), jnp.ones_like(arm[0])
+    zero, unit = jnp.zeros_like(arm[0]), jnp.ones_like(arm[0])
 
     def gained(impulse: Vector) -> Vector:
         turned = angular_velocity(body, free.axis, cross(arm, impulse))
         return sum_vectors(scale(1.0 / body.mass, impulse), cross(turned, arm))
 
-    response = (gained((one, zero, zero)), gained((zero, one, zero)), gained((zero, zero, one)))
+    response = (gained((unit, zero, zero)), gained((zero, unit, zero)), gained((zero, zero, unit)))
     return Approach(arm, velocity, response, free.axis, turning)
 
 

@@ -155,8 +155,8 @@ class Slide(AbstractFlyingMode):
         state = contact_state(air.free)
         if air.riding is not None:
             state = jnp.concatenate([state, air.riding])
-        found = (air.ball, state, air.elapsed, status, air.crossing_time, air.flights[None])
-        return Transition(*found, record, air.log_rates)
+        fields = (air.ball, state, air.elapsed, status, air.crossing_time, air.flights[None])
+        return Transition(*fields, record, air.log_rates)
 
 
 class Lean(AbstractFlyingMode):
@@ -188,12 +188,12 @@ def modes(
     - `scene`: with `contact="hybrid"`; `problem`: of its launches, which stand on their lower sphere.
     - `tolerance`: no phase needs it; `last`: whether the last crossing counts; `rides`: as for `AbstractFlyingMode`.
     """
-    spheres, given = balls(scene.body), (scene, problem.scales, problem.cos_angle, rides)
-    found = tuple(Slide(*given, jnp.asarray(number), last) for number in range(len(spheres)))
+    spheres, arguments = balls(scene.body), (scene, problem.scales, problem.cos_angle, rides)
+    slides = tuple(Slide(*arguments, jnp.asarray(number), last) for number in range(len(spheres)))
     if len(spheres) == 1:
-        return found, jnp.zeros(problem.states.shape[1:], int)
+        return slides, jnp.zeros(problem.states.shape[1:], int)
     main, stem = spheres
-    return (*found, Lean(*given)), (height(main, stem, problem.states) < 0.0).astype(int)
+    return (*slides, Lean(*arguments)), (height(main, stem, problem.states) < 0.0).astype(int)
 
 
 def leaning(scene: Scene) -> LeaningDynamics:

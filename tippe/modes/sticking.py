@@ -112,8 +112,8 @@ def modes(
     both = problem.dynamics
     assert isinstance(both, StickSlip)
     kinds = (ContactMode(both, jnp.asarray(tolerance, float), rolls) for rolls in (False, True))
-    found = tuple(StickSlipMode(kind, problem.cos_angle, problem.scales, last, axial, size) for kind in kinds)
-    return found, _first_mode(both, problem.states)
+    both_modes = tuple(StickSlipMode(kind, problem.cos_angle, problem.scales, last, axial, size) for kind in kinds)
+    return both_modes, _first_mode(both, problem.states)
 
 
 @compiled_setup

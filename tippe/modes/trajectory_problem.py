@@ -78,8 +78,8 @@ def _problem(scene: Scene, launch: Launch, cells: int | None) -> TrajectoryProbl
     sine, cosine = jnp.sin(launch.theta), jnp.cos(launch.theta)
     across = (cosine * jnp.cos(launch.azimuth), cosine * jnp.sin(launch.azimuth), -sine)
     cyclic = (*scene.start(launch)[1], *across)
-    one = jnp.ones(())
-    extra = jnp.stack(jnp.broadcast_arrays(*[size] * (len(cyclic) - 3), one, one, one, one, weight * size))
+    unit = jnp.ones(())
+    extra = jnp.stack(jnp.broadcast_arrays(*[size] * (len(cyclic) - 3), unit, unit, unit, unit, weight * size))
     cyclic = jnp.stack(jnp.broadcast_arrays(*cyclic))
     rows = (scene.state(launch), cyclic, scene.scales(launch), extra)
     if cells is not None:

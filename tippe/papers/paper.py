@@ -68,9 +68,9 @@ def rotation_generators(place: Float[Array, " 3"]) -> Float[Array, "3 3"]:
     """
     r, eta, y = place
     s, c = jnp.sin(eta), jnp.cos(eta)
-    zero, one = jnp.zeros_like(s), jnp.ones_like(s)
+    zero, unit = jnp.zeros_like(s), jnp.ones_like(s)
     about_x = jnp.stack([y * c, -y / r * s, -r * c])
-    about_y = jnp.stack([zero, one, zero])
+    about_y = jnp.stack([zero, unit, zero])
     about_z = jnp.stack([-y * s, -y / r * c, r * s])
     return jnp.stack([about_x, about_y, about_z], axis=1)
 

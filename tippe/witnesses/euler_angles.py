@@ -233,7 +233,7 @@ def equations(scene: Scene, state: Float[Array, " 8"]) -> tuple[Float[Array, "6 
     turning = turns * eta_dot
     s, c, sp, cp = jnp.sin(theta), jnp.cos(theta), jnp.sin(phi), jnp.cos(phi)
     e1, e2, e = axes(theta, phi)
-    zero, one = jnp.zeros_like(s), jnp.ones_like(s)
+    zero, unit = jnp.zeros_like(s), jnp.ones_like(s)
 
     # e'' = turns eta'' (-e3, 0, e1) + theta'' e1 + phi'' sin(theta) e2 + bend: the frame turns at -eta' t2.
     seen = theta_dot * e1 + phi_dot * s * e2
@@ -243,8 +243,8 @@ def equations(scene: Scene, state: Float[Array, " 8"]) -> tuple[Float[Array, "6 
     swing = turns * jnp.stack([-e[2], zero, e[0]])
 
     f, torque = friction_per_normal_force(scene, slip_velocity(scene, q, q_dot), angular_velocity(scene, q, q_dot))
-    push = jnp.append(f, one)
-    moment = jnp.cross(body.offset * e - body.radius * jnp.stack([zero, zero, one]), push) + torque
+    push = jnp.append(f, unit)
+    moment = jnp.cross(body.offset * e - body.radius * jnp.stack([zero, zero, unit]), push) + torque
 
     p, q2 = -(phi_dot * s + turning * c * sp), theta_dot - turning * cp
     sigma = phi_dot * c - turning * s * sp
@@ -254,13 +254,13 @@ def equations(scene: Scene, state: Float[Array, " 8"]) -> tuple[Float[Array, "6 
     q_rest = turning * sp * phi_dot
     spin_rest = -phi_dot * theta_dot * s - turning * (c * sp * theta_dot + s * cp * phi_dot)
 
-    centripetal = metric * turns * eta_dot**2 * jnp.stack([zero, zero, one])
+    centripetal = metric * turns * eta_dot**2 * jnp.stack([zero, zero, unit])
     vertical = jnp.stack([turns * jnp.sin(eta), zero, jnp.cos(turns * eta)])
     m, a = body.mass, body.offset
     momentum = jnp.stack(
         [
-            m * (metric * jnp.stack([one, zero, zero]) - a * swing),
-            m * jnp.stack([zero, one, zero]),
+            m * (metric * jnp.stack([unit, zero, zero]) - a * swing),
+            m * jnp.stack([zero, unit, zero]),
             -m * a * e1,
             -m * a * s * e2,
             jnp.zeros(3, q.dtype),

@@ -164,13 +164,13 @@ class Swing(eqx.Module):
 
     - `middle`, `half`: middle and half width of the swing of z = cos(theta).
     - `cosines`: coefficients [s] of dt/dchi = c0 + c1 cos(chi) + ...
-    - `mode`: chi [rad] at t = 0.
+    - `phase`: chi [rad] at t = 0.
     """
 
     middle: Float[Array, ""]
     half: Float[Array, ""]
     cosines: Float[Array, " k"]
-    mode: Float[Array, ""]
+    phase: Float[Array, ""]
 
     @property
     def period(self) -> Float[Array, ""]:
@@ -193,7 +193,7 @@ class Swing(eqx.Module):
 
     def theta(self, t: Float[Array, "..."]) -> Float[Array, "..."]:
         """Angle [rad] from the normal to the axis at the times [s]."""
-        due = t + self.elapsed(self.mode)
+        due = t + self.elapsed(self.phase)
 
         def newton(_, chi):
             return chi - (self.elapsed(chi) - due) / self.pace(chi)
@@ -232,11 +232,11 @@ def swing(nutation: AbstractNutation, z: Float[Array, ""], z_dot: Float[Array, "
     angles = (jnp.arange(COSINES) + 0.5) * (math.pi / COSINES)
     waves = jnp.cos(jnp.arange(COSINES)[:, None] * angles)
     cosines = (2.0 / COSINES) * waves @ jax.lax.map(pace, angles)
-    made = Swing(middle, half, cosines.at[0].divide(2.0), jnp.zeros_like(z))
+    motion = Swing(middle, half, cosines.at[0].divide(2.0), jnp.zeros_like(z))
     # The rate fixes the phase near a turning point, where z does not.
     rough = jnp.arccos(jnp.clip((middle - z) / half, -1.0, 1.0))
-    mode = jnp.arctan2(z_dot * made.pace(rough), middle - z)
-    return eqx.tree_at(lambda s: s.mode, made, mode)
+    phase = jnp.arctan2(z_dot * motion.pace(rough), middle - z)
+    return eqx.tree_at(lambda s: s.phase, motion, phase)
 
 
 def turning_point(nutation: AbstractNutation, z: Float[Array, ""], direction: float) -> Float[Array, ""]:

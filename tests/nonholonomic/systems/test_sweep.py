@@ -91,3 +91,10 @@ def test_what_is_wrong_with_a_table_is_said_before_anything_compiles():
         sweep(system, [1.0], 1.0, axes={"drag": [1.0]})
     with pytest.raises(ValueError, match="sensitivities are those of the event's time"):
         sweep(system, [1.0], 1.0, axes={}, sensitivities=["rate"])
+
+
+def test_long_steps_leave_no_error_in_the_times_of_bounces():
+    """The ball's field is integrated exactly, so steps grow without limit; an end is located to a fraction of a step."""
+    heights = np.linspace(0.5, 2.0, 512)
+    table = sweep(BALL, [1.0, 0.0, 0.0], 20.0, axes={"start[0]": heights}, progress=False)
+    assert_close(table.time, bounce(heights, 0.8, GRAVITY, 3), rtol=1e-13)
