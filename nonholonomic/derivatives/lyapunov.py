@@ -52,6 +52,11 @@ class VariedProblem(AbstractProblem):
     ) -> Float[Array, " lanes"] | None:
         return self.problem.domain_margin(time, state[: len(self.magnitudes)])
 
+    def margins(
+        self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]
+    ) -> tuple[Float[Array, " lanes"], ...]:
+        return self.problem.margins(time, state[: len(self.magnitudes)])
+
 
 def probed(problem: AbstractProblem) -> VariedProblem:
     """A run and a generic tangent, for a derivative that does not take part in step-size control itself.

@@ -74,6 +74,9 @@ class VariationalProblem(AbstractProblem):
     def domain_margin(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
         return self.problem.domain_margin(time, self.parts(state)[0])
 
+    def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.problem.margins(time, self.parts(state)[0])
+
     def parts(self, state: Float[Array, "components ..."]) -> list[Float[Array, "components ..."]]:
         """The state and its variations."""
         return jnp.split(state, 1 + len(self.tangents)) if self.tangents else [state]
