@@ -83,7 +83,7 @@ def try_step(problem: AbstractProblem, control: Control, atol: States, lane_stat
     - `problem`: the problem with one number per lane (or a scalar) in every leaf.
     - `control`: the method and its tolerances.
     - `atol`: absolute tolerances, (components, lanes).
-    - `block`: the lanes; those that have ended stay as they are.
+    - `lane_state`: the lanes; those that have ended stay as they are.
 
     **Returns:** the block after the attempt.
     """
