@@ -4,10 +4,10 @@ The pair has the thirteen stages, and all simplifying assumptions, of Prince and
 embedded Runge-Kutta formulae, J. Comput. Appl. Math. 7, 1981), which is Diffrax's `Dopri8`. These leave ten
 coefficients free. Prince and Dormand chose them for a small error in ninth order, whatever the field. Here they
 minimise the error of a step along the motions of tops and strollers, for lengths at which the error is about the
-tolerance, and keep the weights small, because large weights magnify round-off; `python benchmarks/tune_pair.py --starts
-50 --seed 0` computed them. `docs/performance.md` has the gain. A rotation by 1 rad a step changes the amplitude by
-3e-10 and the phase by 7e-10, with `Dopri8` by 1e-8 and 3e-8; by 3 rad, which only the loosest tolerances allow, both by
-8e-4, `Dopri8` inwards and this pair outwards.
+tolerance, and keep the weights small, because large weights magnify round-off;
+`python benchmarks/tune_pair.py --starts 50 --seed 0` computed them. `docs/performance.md` has the gain. A
+rotation by 1 rad a step changes the amplitude by 3e-10 and the phase by 7e-10, with `Dopri8` by 1e-8 and 3e-8;
+by 3 rad, which only the loosest tolerances allow, both by 8e-4, `Dopri8` inwards and this pair outwards.
 """
 
 from typing import Any, ClassVar
