@@ -1,4 +1,4 @@
-"""First derivatives of event times by any number of parameters at once: the discrete adjoint of the march.
+"""First derivatives of event times by any number of parameters at once: the discrete adjoint of the ensemble solve.
 
 A run is cut into periods, each with its steps recorded. Once the last one is done, the derivatives of the
 event times by the states are carried back from the last period to the first. A period whose record is gone is computed again

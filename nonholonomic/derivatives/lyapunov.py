@@ -23,7 +23,7 @@ class VariedProblem(AbstractProblem):
 
     **Arguments:**
 
-    - `problem`: an autonomous problem; only its field and its guard are used.
+    - `problem`: an autonomous problem; only its field and its domain margin are used.
     - `states`: the problem's state, the direction and the growth of every cell.
     - `magnitudes`: of the problem's own components.
     """
@@ -94,7 +94,7 @@ def growth(
     **Arguments:**
 
     - `problem`: as for `ensemble_solve`.
-    - `directions`: to follow, in the problem's own units.
+    - `tangents`: to follow, in the problem's own units.
     - `t1`: horizon [s].
     - `stretches`: of time, in each of which the growth is counted by itself.
     - `settings`: with an explicit Runge-Kutta solver of Diffrax.

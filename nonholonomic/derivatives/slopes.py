@@ -49,7 +49,7 @@ def ensemble_solve_with_tangents(
 
     **Arguments:** as for `ensemble_solve`, and
 
-    - `directions`: tangents of the problem, as for `VariationalProblem`. Their variations, or a mixture of them, take part in
+    - `tangents`: tangents of the problem, as for `VariationalProblem`. Their variations, or a mixture of them, take part in
       step control.
     - `one_kernel`: as for `ensemble_solve`. Without it, so that the result can be differentiated again, runs are not taken
       back: variations run along, whatever the number of directions.
@@ -114,7 +114,7 @@ def _mixed(tangents: tuple[Any, ...]) -> Any:
 
 
 def _event_time(varied: VariationalProblem, lane_state: LaneState) -> Float[Array, " lanes"]:
-    """When the crossing function vanishes, for a block that has ended there (implicit function theorem).
+    """When the event function vanishes, for a block that has ended there (implicit function theorem).
 
     To first order, unlike `crossing_time`: the event is located to 1e-10 of a step, and its time is not differentiated again.
     """

@@ -86,9 +86,9 @@ def slopes_by_variations(
 
     **Arguments:**
 
-    - `problem`, `directions`: as for `VariationalProblem`.
+    - `problem`, `tangents`: as for `VariationalProblem`.
     - `ends_on_event`: whether runs end on the event, or at the horizon, which is then the event's time.
-    - `given`, `one_kernel`: horizon, number of cells and settings, as for `Queue.of`.
+    - `given`, `one_kernel`: horizon, number of cells and settings, as for `LaneScheduler.of`.
 
     **Returns:** the `Outcome`, with crossing times left out, and for each direction the derivative of the event's time.
     """
@@ -114,7 +114,7 @@ def in_groups(run: Callable[..., tuple[Any, list[Any]]], tangents: tuple[Any, ..
 
     - `run`: a tuple of `TOGETHER` directions, or of fewer if there are no more -> a result that does not depend on them, and
       a slope for each.
-    - `directions`: any number of them.
+    - `tangents`: any number of them.
 
     **Returns:** the result, and the slopes.
     """

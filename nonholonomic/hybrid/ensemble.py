@@ -1,9 +1,9 @@
-"""Motion in smooth phases with jumps between them, for many cells at once.
+"""Motion in smooth modes with jumps between them, for many cells at once.
 
-A phase has its own equations and ends where they cease to hold: a contact opens or closes, slipping ends. What follows
-is a function, the phase's `leave`: an impact, a flight in closed form, other equations. All phases share one layout
-of the state. The cells advance in rounds: in each, the cells that are now in a phase are gathered and marched together
-(`march.py`) to the event, to the horizon or to the end of the phase, and those at its end are passed on.
+A mode has its own equations and ends where they cease to hold: a contact opens or closes, slipping ends. What follows
+is a function, the mode's `reset_map`: an impact, a flight in closed form, other equations. All modes share one layout
+of the state. The cells advance in rounds: in each, the cells that are now in a mode are gathered and integrated together
+(`ensemble.py`) to the event, to the horizon or to the end of the mode, and those at its end are passed on.
 """
 
 import abc
@@ -23,15 +23,15 @@ from ..integration.settings import Settings
 from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 from ..xla_cpu import compiled_quickly
 
-#: Rounds, and so phases of a single run, after which what is still under way is given up.
+#: Rounds, and so modes of a single run, after which what is still under way is given up.
 MOST_ROUNDS = 2000
 
 
 class TransitionPath(NamedTuple):
-    """The way of a single run from one phase to the next, as stretches of motion of known form that follow one another.
+    """The way of a single run from one mode to the next, as stretches of motion of known form that follow one another.
 
-    - `ends`: when each stretch ends [s], counted from the end of the phase; infinite where there are no more.
-    - `motions`: what `AbstractPhase.between` needs of each, with the stretches on the first axis of every leaf.
+    - `ends`: when each stretch ends [s], counted from the end of the mode; infinite where there are no more.
+    - `motions`: what `AbstractBatchedMode.between` needs of each, with the stretches on the first axis of every leaf.
     - `shown`: at how many times each is to be shown by default.
     """
 
@@ -41,12 +41,12 @@ class TransitionPath(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """What follows the end of a phase, one number per cell.
+    """What follows the end of a mode, one number per cell.
 
-    `status` is `RUNNING` where the motion goes on in the phase numbered `mode`, else how it ended; `state` is the state
+    `status` is `RUNNING` where the motion goes on in the mode numbered `mode`, else how it ended; `state` is the state
     then, `elapsed` [s] the time that passed on the way, `crossing_time` [s] when on the way the event was passed (for the
     last time), infinite if it was not; `counts` how often each kind of thing happened, a row for each kind. `record` is for a
-    single run that keeps its path (`phased_run.py`); `None` where no time passes on the way, or where the path is not kept.
+    single run that keeps its path (`path.py`); `None` where no time passes on the way, or where the path is not kept.
     `log_rates` is the sum of the logarithms of the rates at which events on the way are met; `None` if there are none.
     """
 
@@ -61,15 +61,15 @@ class Transition(NamedTuple):
 
 
 class AbstractBatchedMode(eqx.Module):
-    """One phase of the motion. Its leaves are scalars, or hold one number per cell in their last axis."""
+    """One mode of the motion. Its leaves are scalars, or hold one number per cell in their last axis."""
 
     @abc.abstractmethod
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        """The motion in this phase from the given states on; the problem's guard ends the phase."""
+        """The motion in this mode from the given states on; the problem's domain margin ends the mode."""
 
     @abc.abstractmethod
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """What follows where the guard has ended the phase.
+        """What follows where the domain margin has ended the mode.
 
         **Arguments:**
 
@@ -80,16 +80,16 @@ class AbstractBatchedMode(eqx.Module):
         """
 
     def shown(self, state: Float[Array, "components times"]) -> Float[Array, "shown times"]:
-        """What a path shows of states in this phase: in all phases of a run as many components."""
+        """What a path shows of states in this mode: in all modes of a run as many components."""
         return state
 
     def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
-        """What a path shows of one of the stretches in `Passage.record`, some time [s] after it has begun."""
+        """What a path shows of one of the stretches in `Transition.record`, some time [s] after it has begun."""
         raise NotImplementedError(f"{type(self).__name__} records stretches but does not say what they show")
 
 
 class HybridOutcome(NamedTuple):
-    """How every cell ended, as in `march.Outcome`, in which phase, and how often each kind of thing happened on the way."""
+    """How every cell ended, as in `Outcome`, in which mode, and how often each kind of thing happened on the way."""
 
     status: Int[np.ndarray, " cells"]
     crossing_time: Float[np.ndarray, " cells"]
@@ -126,19 +126,19 @@ def solve_hybrid(
     parts: int = 1,
     most_rounds: int = MOST_ROUNDS,
 ) -> HybridOutcome:
-    """Run every cell through its phases to its event, to `t1`, or to where the model ends.
+    """Run every cell through its modes to its event, to `t1`, or to where the model ends.
 
     It runs on the host, round by round, and is called with concrete numbers. All calls with the same number of cells, padding
     included, share their compiled programs.
 
     **Arguments:**
 
-    - `modes`: the phases, of which `mode` and `Passage.phase` are numbers.
+    - `modes`: the modes, of which `mode` and `Transition.mode` are numbers.
     - `mode`, `state`: where every cell starts.
     - `t1`: horizon [s], one for all or one per cell.
     - `cells`: how many cells to run; the rest is padding. With 0, the programs are compiled and nothing is run.
     - `settings`: with an explicit Runge-Kutta solver of Diffrax.
-    - `kinds`: rows of `Passage.counts`.
+    - `kinds`: rows of `Transition.counts`.
     - `passes`, `parts`: as for `ensemble_solve`.
     - `most_rounds`: a cell that needs more ends as `UNRESOLVED`.
 
@@ -160,7 +160,7 @@ def solve_hybrid(
     if cells == 0:
         _compile(modes, found, t1, settings, options)
     for _ in range(most_rounds):
-        # Selected before the round: a cell that changes its phase during it waits for the next round.
+        # Selected before the round: a cell that changes its mode during it waits for the next round.
         here = [np.flatnonzero((found.status == RUNNING) & (found.mode == number)) for number in range(len(modes))]
         for one, some in zip(modes, here, strict=True):
             if some.size:
@@ -193,7 +193,7 @@ def _compile(
 def _gather(
     mode: AbstractBatchedMode, found: HybridOutcome, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
 ) -> tuple[Any, ...]:
-    """The phase, the states and the remaining times of some cells, padded to the size of the whole."""
+    """The mode, the states and the remaining times of some cells, padded to the size of the whole."""
     size = len(found.status)
     cell = np.concatenate([some, np.full(size - some.size, some[-1] if some.size else 0)])
     numbers, rest = eqx.partition(mode, eqx.is_array)
@@ -210,7 +210,7 @@ def _march(
     settings: Settings,
     options: dict[str, Any],
 ) -> None:
-    """March some cells to the end of their phase and note what was found."""
+    """Integrate some cells to the end of their mode and note what was found."""
     mode, state, left = _gather(mode, found, some, t1)
     problem = _problem(mode, state)
     count = jnp.asarray(some.size)
@@ -222,7 +222,7 @@ def _march(
 def _pass_on(
     mode: AbstractBatchedMode, found: HybridOutcome, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
 ) -> None:
-    """Pass some cells on to the phase that follows and note what happened on the way."""
+    """Pass some cells on to the mode that follows and note what happened on the way."""
     transition = _leave(*_gather(mode, found, some, t1))
     transition = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], transition)
     _store(found, some, after_reset(np, _some(found, some), transition, t1[some]))
@@ -238,9 +238,9 @@ def _store(found: HybridOutcome, some: Int[np.ndarray, " some"], new: HybridOutc
 
 
 def after_solve(xp: Any, found: HybridOutcome, outcome: Outcome, t1: Float[Array, " cells"]) -> HybridOutcome:
-    """What is known of cells after a march that ended as `outcome` says. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
+    """What is known of cells after a solve that ended as `outcome` says. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
     began = found.end_time
-    # A cell that enters a phase beyond the event passed it earlier, unless it started there.
+    # A cell that enters a mode beyond the event passed it earlier, unless it started there.
     passed = xp.isfinite(outcome.crossing_time) & ((outcome.crossing_time > 0.0) | xp.isinf(found.crossing_time))
     return HybridOutcome(
         status=outcome.status,
@@ -255,9 +255,9 @@ def after_solve(xp: Any, found: HybridOutcome, outcome: Outcome, t1: Float[Array
 
 
 def after_reset(xp: Any, found: HybridOutcome, transition: Transition, t1: Float[Array, " cells"]) -> HybridOutcome:
-    """What is known of cells after the passage from one phase to the next. **Arguments:** as for `after_solve`."""
+    """What is known of cells after the transition from one mode to the next. **Arguments:** as for `after_solve`."""
     passed = xp.isfinite(transition.crossing_time)
-    # Non-finite states would be marched forever.
+    # Non-finite states would be integrated forever.
     sound = xp.isfinite(transition.state).all(axis=0) & xp.isfinite(transition.elapsed)
     return HybridOutcome(
         status=xp.where(sound, transition.status, FAILED),

@@ -1,4 +1,4 @@
-"""One run through several phases with its path: the phases of `phases.py`, each followed by any solver of Diffrax."""
+"""One run through several modes with its path: the modes of `ensemble.py`, each followed by any solver of Diffrax."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -16,14 +16,14 @@ from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRE
 from ..xla_cpu import compiled_quickly
 from .ensemble import MOST_ROUNDS, AbstractBatchedMode, Transition
 
-#: The number of a piece on the way between two phases.
+#: The number of a piece on the way between two modes.
 BETWEEN = -1
 
 
 class Segment(NamedTuple):
-    """A part of a run: from `begin` to `end` [s], in the phase numbered `number`, or `BETWEEN` two phases.
+    """A part of a run: from `begin` to `end` [s], in the mode numbered `number`, or `BETWEEN` two modes.
 
-    `motion` is the `DenseSolution` in the phase, its times counted from `begin`, or one stretch of a `TransitionPath`;
+    `motion` is the `DenseSolution` in the mode, its times counted from `begin`, or one stretch of a `TransitionPath`;
     `shown` are the times [s] at which it is shown by default.
     """
 
@@ -43,7 +43,7 @@ class Segment(NamedTuple):
 
 
 class HybridPath(NamedTuple):
-    """A run through several phases: its pieces in order, how and when [s] it ended, in what state, and what it took.
+    """A run through several modes: its pieces in order, how and when [s] it ended, in what state, and what it took.
 
     `status` is one of the codes of a `HybridOutcome`; `counts` says how often each kind of thing happened on the way.
     """
@@ -68,7 +68,7 @@ class HybridPath(NamedTuple):
 
     @property
     def mode_segments(self) -> list[Segment]:
-        """The pieces in phases, without those that were over as soon as they began."""
+        """The pieces in modes, without those that were over as soon as they began."""
         return [segment for segment in self.segments if segment.number != BETWEEN and segment.end > segment.begin]
 
     @property
@@ -84,7 +84,7 @@ class HybridPath(NamedTuple):
         return self.at(self.times)
 
     def numbers(self, times: Float[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
-        """The numbers of the phases at given times, or `BETWEEN`."""
+        """The numbers of the modes at given times, or `BETWEEN`."""
         return np.array([segment.number for segment in self.segments])[self._where(times)]
 
     def at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "shown times"]:
@@ -108,7 +108,7 @@ class HybridPath(NamedTuple):
 
 @eqx.filter_jit
 def _problem(mode: AbstractBatchedMode, state: Float[Array, " components"]) -> AbstractProblem:
-    """The motion in a phase of one cell, as a problem without an axis of cells."""
+    """The motion in a mode of one cell, as a problem without an axis of cells."""
     lone = jax.tree.map(lambda leaf: leaf[..., 0] if eqx.is_array(leaf) and leaf.ndim else leaf, mode)
     return lone.problem(state)
 
@@ -137,15 +137,15 @@ def solve_hybrid_dense(
     *,
     kinds: int,
 ) -> HybridPath:
-    """Follow one run through its phases to `t1`, to an event on the way between two of them, or to where the model ends.
+    """Follow one run through its modes to `t1`, to an event on the way between two of them, or to where the model ends.
 
     **Arguments:**
 
     - `modes`: as for `solve_hybrid`, of one cell; where they record the way between them, that is part of the path.
-    - `number`, `state`: the phase and the state in which the run starts.
+    - `number`, `state`: the mode and the state in which the run starts.
     - `t1`: horizon [s].
     - `settings`: as for `follow`; the most steps are those of the whole run.
-    - `kinds`: rows of `Passage.counts`.
+    - `kinds`: rows of `Transition.counts`.
 
     **Returns:** a `HybridPath`.
     """
@@ -179,7 +179,7 @@ def _stay(mode: AbstractBatchedMode, number: int, path: DenseSolution, begin: fl
 
 
 def _way(mode: AbstractBatchedMode, transition: Transition, begin: float) -> list[Segment]:
-    """The pieces of a way between two phases that begins at a time [s]."""
+    """The pieces of a way between two modes that begins at a time [s]."""
     if transition.record is None:
         return []
     ends = np.asarray(transition.record.ends)[:, 0]

@@ -1,13 +1,13 @@
-"""First derivatives through runs of several phases: the variations of the state go through every change of phase.
+"""First derivatives through runs of several modes: the variations of the state go through every change of mode.
 
 A variation of a run at an event is that of the state there, dx, and that of the time, dt. With the event g(x) = 0, x' = f(x)
-and the phase entered at t + dt,
+and the mode entered at t + dt,
 
     dT = -dg / (Dg f),   dx <- dx + f dT,   dt <- dt + dT,
 
-by the implicit function theorem; then the phase's own `leave` is differentiated, an impact or a flight, which may take time
+by the implicit function theorem; then the mode's own `reset_map` is differentiated, an impact or a flight, which may take time
 itself. That is the saltation matrix (Leine and Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical Systems, 2004,
-ch. 7) in two halves: the next phase counts its time from its own beginning, so -f dt of it is never needed, and is added
+ch. 7) in two halves: the next mode counts its time from its own beginning, so -f dt of it is never needed, and is added
 where a time is held fixed.
 
 The rates at which events are met stand in the denominator of a derivative. Where one of them may be zero, within the
@@ -40,7 +40,7 @@ UNMEASURED = 1e9
 
 
 class Clocked(AbstractProblem):
-    """A problem with the time since its phase began behind its state; the clock's variation is that of the beginning."""
+    """A problem with the time since its mode began behind its state; the clock's variation is that of the beginning."""
 
     problem: AbstractProblem
     began: Float[Array, " cells"]
@@ -73,11 +73,11 @@ def with_row(state: Float[Array, "components cells"], row: Float[Array, " cells"
 
 
 class VariationalMode(AbstractBatchedMode):
-    """A phase, and first variations of its runs behind the state: of the state and, last, of the time at which it began.
+    """A mode, and first variations of its runs behind the state: of the state and, last, of the time at which it began.
 
-    The phase's equations must not depend on time.
+    The mode's equations must not depend on time.
 
-    - `directions`: tangents of the phase, as for `VariationalProblem`.
+    - `tangents`: tangents of the mode, as for `VariationalProblem`.
     - `ends_on_event`: as there; `tolerance`: relative, of the integration.
     """
 
@@ -98,15 +98,15 @@ class VariationalMode(AbstractBatchedMode):
         return VariationalProblem(clocked(*point), tangents_of(clocked, point, tangents), self.ends_on_event)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """What follows the phase itself, with variations. Counted in the last row are grazing events."""
+        """What follows the mode itself, with variations. Counted in the last row are grazing events."""
         return self.left_behind(state, left, lambda mode, record, left: ())[0]
 
     def left_behind(
         self, state: Float[Array, "components cells"], left: Float[Array, " cells"], seen: Callable[..., Any]
     ) -> tuple[Transition, Any, Any]:
-        """What follows the phase, as `leave` says it, and what is seen of the way to the next.
+        """What follows the mode, as `reset_map` says it, and what is seen of the way to the next.
 
-        **Arguments:** `seen`: takes the phase, the `TransitionPath` of the way and `left`, and gives a tree of numbers.
+        **Arguments:** `seen`: takes the mode, the `TransitionPath` of the way and `left`, and gives a tree of numbers.
 
         **Returns:** the `Transition`; the numbers; and their variations, with the directions first.
         """
@@ -124,7 +124,7 @@ class VariationalMode(AbstractBatchedMode):
         along = [(one[:-1], *moved) for one, moved in zip(variations, self._rates(), strict=True)]
         along += [(self._error(at, lasted, rates), *still), (rates, *still)]
         (_, rate), (domain_margins, changes) = _along(met, (at, *numbers), along)
-        # A phase that ended as it began has not met its event.
+        # A mode that ended as it began has not met its event.
         happened = (lasted > 0.0) & (rate != 0.0)
         safe = jnp.where(happened, rate, 1.0)
         later = jnp.where(happened, -domain_margins[:-1] / safe, 0.0)
@@ -168,12 +168,12 @@ class VariationalMode(AbstractBatchedMode):
         if not variations:
             return shown(at), jnp.zeros((0, *shown(at).shape))
         rates = self.mode.problem(at).field(lasted, at)
-        # A phase that begins later is less far at the same time.
+        # A mode that begins later is less far at the same time.
         along = [(one[:-1] - rates * one[-1], *moved) for one, moved in zip(variations, self._rates(), strict=True)]
         return _along(shown, (at, *numbers), along)
 
     def slopes(self, state: Float[Array, "components cells"]) -> Float[Array, "directions cells"]:
-        """The derivative of the time of the event at which runs have ended in this phase, or on the way to it."""
+        """The derivative of the time of the event at which runs have ended in this mode, or on the way to it."""
         at, *variations = self.parts(state)
         numbers, build = self._moving()
 
@@ -197,14 +197,14 @@ class VariationalMode(AbstractBatchedMode):
         lasted: Float[Array, " cells"],
         rates: Float[Array, "components cells"],
     ) -> Float[Array, "components cells"]:
-        """What the state at the end of the phase may err by, over the tolerance: of what has changed, and of the magnitudes."""
+        """What the state at the end of the mode may err by, over the tolerance: of what has changed, and of the magnitudes."""
         sizes = jnp.minimum(self.mode.problem(at).start()[1], jnp.abs(rates) * lasted)
         # Shares of both signs that are not likely to cancel.
         shares = [(-1.0) ** k * (0.5 + math.modf(0.618 * k)[0]) for k in range(len(sizes))]
         return jnp.asarray(shares)[:, None] * sizes
 
     def _moving(self) -> tuple[list[Array], Any]:
-        """The phase's numbers that are moved, and the phase as a function of them."""
+        """The mode's numbers that are moved, and the mode as a function of them."""
         if not self.tangents:
             return [], lambda: self.mode
         numbers, structure = jax.tree.flatten(where_active(self.mode, self.tangents[0]))
@@ -252,11 +252,11 @@ def solve_hybrid_with_tangents(
     kinds: int,
     ends_on_event: bool = True,
 ) -> tuple[HybridOutcome, Slopes]:
-    """Run every cell through its phases to its event, and differentiate the event's time in some directions.
+    """Run every cell through its modes to its event, and differentiate the event's time in some directions.
 
     **Arguments:** as for `solve_hybrid`, and
 
-    - `directions`: for each, the tangents of the phases and that of the states, `None` for what does not move.
+    - `tangents`: for each, the tangents of the modes and that of the states, `None` for what does not move.
     - `ends_on_event`: whether runs end on the event; else they end at `t1`, which is then the event's time.
 
     **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event, or it is there at the start.
@@ -288,7 +288,7 @@ def traced_solve_hybrid_with_tangents(
 
 
 def _own(ended: HybridOutcome, size: int) -> HybridOutcome:
-    """A journey without its variations."""
+    """A hybrid outcome without its variations."""
     return ended._replace(state=ended.state[:size], counts=ended.counts[:-1])
 
 
@@ -315,7 +315,7 @@ def variational_modes(
     tolerance: Float[Array, ""],
     ends_on_event: bool,
 ) -> tuple[VariationalMode, ...]:
-    """The phases with their variations. **Arguments:** as for `solve_hybrid_with_tangents`."""
+    """The modes with their variations. **Arguments:** as for `solve_hybrid_with_tangents`."""
     return tuple(
         VariationalMode(mode, tuple(direction[0][k] for direction in tangents), tolerance, ends_on_event)
         for k, mode in enumerate(modes)

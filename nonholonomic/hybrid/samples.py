@@ -1,4 +1,4 @@
-"""Single runs of several phases, sampled at given times inside other transformations, with their derivatives."""
+"""Single runs of several modes, sampled at given times inside other transformations, with their derivatives."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -18,15 +18,15 @@ from .path import BETWEEN
 from .saltation import VariationalMode, variational_modes, variational_start
 from .traced_ensemble import in_rounds
 
-#: From some modules (scene, launch, ...) and the tolerance to the phases of a single run, the number of the first, and the
+#: From some modules (scene, launch, ...) and the tolerance to the modes of a single run, the number of the first, and the
 #: state there.
 Build = Callable[[Any, Array], tuple[tuple[AbstractBatchedMode, ...], Array, Float[Array, "components 1"]]]
 
 
 class HybridSamples(NamedTuple):
-    """A run through several phases at given times, all floats.
+    """A run through several modes at given times, all floats.
 
-    - `shown`: what the phases show, NaN after the end of the run; `number`: of the phase at each time, or `BETWEEN`.
+    - `shown`: what the modes show, NaN after the end of the run; `number`: of the mode at each time, or `BETWEEN`.
     - `end_time`, `end_state`: when and where the run ended; `status`: the code of how.
     - `steps`, `rejected`; `counts`: what happened how often.
     """
@@ -49,7 +49,7 @@ def hybrid_samples(
     settings: Settings,
     kinds: int,
 ) -> HybridSamples:
-    """Run one cell through its phases inside a transformation and sample it, with derivatives that take part in step control.
+    """Run one cell through its modes inside a transformation and sample it, with derivatives that take part in step control.
 
     **Arguments:**
 
@@ -57,7 +57,7 @@ def hybrid_samples(
     - `modules`: the tree whose numbers can be differentiated by, once.
     - `times`: of the samples [s], growing; `t1`: horizon [s]. Neither can be differentiated by.
     - `settings`: with an explicit Runge-Kutta solver; the tolerance may be traced.
-    - `kinds`: rows of `Passage.counts`.
+    - `kinds`: rows of `Transition.counts`.
 
     **Returns:** `HybridSamples`; what is shown and the time of the end have derivatives, NaN behind a grazing event.
 
@@ -81,7 +81,7 @@ def _refused(primals: Any, tangents: Any) -> Any:
 
 
 class HybridSampling(AbstractSampling):
-    """Samples of a run through phases."""
+    """Samples of a run through modes."""
 
     in_blocks = False
 
@@ -127,7 +127,7 @@ def _follow(
 
 
 class Filled(NamedTuple):
-    """The samples so far: what is shown, its variations, the phases' numbers, NaN where there are none yet; and the time [s]
+    """The samples so far: what is shown, its variations, the modes' numbers, NaN where there are none yet; and the time [s]
     of the first grazing event, infinite if there was none."""
 
     shown: Float[Array, "shown times"]
@@ -153,7 +153,7 @@ def _followed(
     settings: Settings,
     kinds: int,
 ) -> tuple[HybridOutcome, Filled]:
-    """Round by round, as in `traced_solve_hybrid`, with samples of every phase and of the way to the next."""
+    """Round by round, as in `traced_solve_hybrid`, with samples of every mode and of the way to the next."""
     count, zero, none = len(modes[0].tangents), jnp.zeros(1), jnp.zeros(1, int)
     own = VariationalMode.parts(modes[0], state)[0][:-1]
     rows = len(jax.eval_shape(modes[0].mode.shown, own))
@@ -206,7 +206,7 @@ def _followed(
 def _on_the_way(
     mode: AbstractBatchedMode, record: TransitionPath, since: Float[Array, " times"]
 ) -> Float[Array, "shown times"]:
-    """What a path shows some times [s] after it has left a phase; nothing that means anything after the last stretch."""
+    """What a path shows some times [s] after it has left a mode; nothing that means anything after the last stretch."""
     ends = record.ends[:, 0]
     stretch = jnp.minimum(jnp.searchsorted(jax.lax.stop_gradient(ends), jax.lax.stop_gradient(since)), len(ends) - 1)
     began = jnp.where(stretch > 0, ends[jnp.maximum(stretch - 1, 0)], 0.0)

@@ -1,4 +1,4 @@
-"""Motion in phases inside other transformed functions: what `solve_hybrid` does on the host, as one traced loop."""
+"""Motion in modes inside other transformed functions: what `solve_hybrid` does on the host, as one traced loop."""
 
 from collections.abc import Callable
 from typing import Any
@@ -25,9 +25,9 @@ def traced_solve_hybrid(
     passes: bool = False,
     parts: int = 1,
 ) -> HybridOutcome:
-    """Run every cell through its phases to its event, to `t1`, or to where the model ends.
+    """Run every cell through its modes to its event, to `t1`, or to where the model ends.
 
-    Cells are not gathered: in each round every phase marches all cells, those that are in another one for no time.
+    Cells are not gathered: in each round every mode integrates all cells, those that are in another one for no time.
 
     **Arguments:** as for `solve_hybrid`.
 
@@ -60,7 +60,7 @@ def traced_solve_hybrid(
 
     def one_round(carry: tuple[HybridOutcome, Int[Array, ""]]) -> tuple[HybridOutcome, Int[Array, ""]]:
         found, rounds = carry
-        # Selected before the round: a cell that changes its phase during it waits for the next round.
+        # Selected before the round: a cell that changes its mode during it waits for the next round.
         here = [(found.status == RUNNING) & (found.mode == number) for number in range(len(modes))]
         for one, some in zip(modes, here, strict=True):
             found = through(one, found, some)
@@ -83,7 +83,7 @@ def in_rounds(one_round: Callable[[Any], Any], start: HybridOutcome, *more: Any)
 def passing(
     one: AbstractBatchedMode, found: HybridOutcome, lost: Bool[Array, " cells"], t1: Float[Array, " cells"]
 ) -> HybridOutcome:
-    """The cells that are at the end of a phase, passed on to the phase that follows."""
+    """The cells that are at the end of a mode, passed on to the mode that follows."""
 
     def passed() -> HybridOutcome:
         there, now = of_cells(one, lost), in_place_of(found, lost)
@@ -94,7 +94,7 @@ def passing(
 
 
 def of_cells(mode: AbstractBatchedMode, some: Bool[Array, " cells"]) -> AbstractBatchedMode:
-    """A phase of some cells; the numbers of the first of them stand in place of those of the others."""
+    """A mode of some cells; the numbers of the first of them stand in place of those of the others."""
     numbers, rest = eqx.partition(mode, eqx.is_array)
     return eqx.combine(jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[..., _cell(some)], numbers), rest)
 

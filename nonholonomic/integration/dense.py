@@ -18,7 +18,7 @@ from .zeros import halved
 #: Steps that are integrated and stored at once; a longer run is made of several such pieces.
 PIECE = 2048
 
-#: Places in every step at which the guard is looked at, besides its ends.
+#: Places in every step at which the domain margin is looked at, besides its ends.
 LOOKS = np.arange(1, 8) / 8.0
 
 
@@ -60,7 +60,7 @@ def saved(solution: diffrax.Solution) -> tuple[Any, Any]:
 
 
 def _guard(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array, " components"]) -> Float[Array, ""]:
-    """The guard of a problem that has one."""
+    """The domain margin of a problem that has one."""
     domain_margin = problem.domain_margin(time, state)
     assert domain_margin is not None
     return domain_margin
@@ -83,7 +83,7 @@ def _piece(
     settings: Settings,
     dense: bool,
 ) -> tuple[diffrax.Solution, Float[Array, " steps"]]:
-    """As many steps as the settings allow, and the least value of the guard seen in each."""
+    """As many steps as the settings allow, and the least value of the domain margin seen in each."""
     watched = problem.domain_margin(t0, state) is not None
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
@@ -130,9 +130,9 @@ def follow(
       failed.
     - `first`: length of the first step [s], by default selected as Diffrax does.
     - `t0`: when the run starts [s].
-    - `dense`: whether states within the steps will be asked for (`Followed.at`).
+    - `dense`: whether states within the steps will be asked for (`DenseSolution.at`).
 
-    **Returns:** a `DenseSolution` with the accepted steps; it ends where the guard reaches zero, found on the dense output.
+    **Returns:** a `DenseSolution` with the accepted steps; it ends where the domain margin reaches zero on the dense output.
     """
     state, scales = problem.start()
     state, scales = jnp.asarray(state), jnp.asarray(scales)
@@ -180,7 +180,7 @@ def follow(
 def _loss(
     problem: AbstractProblem, solution: diffrax.Solution, begin: Float[Array, ""], end: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """The last time in a step at which the guard has not been negative yet, on the dense output."""
+    """The last time in a step at which the domain margin has not been negative yet, on the dense output."""
 
     def holds(time):
         return ~(_guard(problem, time, solution.evaluate(time)) < 0.0)
@@ -202,7 +202,7 @@ class _GivenSteps(diffrax.StepTo):
 
 
 class SampledSolution(NamedTuple):
-    """A run at given times: its states, NaN after its end; when and where it ended, and whether the guard ended it."""
+    """A run at given times: its states, NaN after its end; when and where it ended, and whether the domain margin ended it."""
 
     states: Float[Array, "components times"]
     end_time: Float[Array, ""]
@@ -223,8 +223,8 @@ def sample(
 ) -> SampledSolution:
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 
-    The guard is checked at the ends of steps, and the run ends where it is zero on the dense output. Steps end on the times
-    asked for, where interpolation would lose a digit or two.
+    The domain margin is checked at the ends of steps, and the run ends where it is zero on the dense output. Steps end on
+    the times asked for, where interpolation would lose a digit or two.
 
     **Arguments:** as for `follow`; `times`: growing, in [0, t1], or `None` for those of the grid; `grid`: the ends of the steps
     [s], 0 the first and t1 the last, for a solver without an error estimate; `adjoint`: how Diffrax differentiates, by default
@@ -235,7 +235,7 @@ def sample(
     state, scales = problem.start()
     margin = problem.domain_margin(jnp.zeros_like(t1), state)
     watched = margin is not None
-    # Diffrax sees an event where the guard changes its sign: a run that starts beyond it has ended.
+    # Diffrax sees an event where the domain margin changes its sign: a run that starts beyond it has ended.
     at_once = jnp.zeros((), bool) if margin is None else margin <= 0.0
     t1 = jnp.where(at_once, 0.0, t1)
     event = diffrax.Event(

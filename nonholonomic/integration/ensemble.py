@@ -1,6 +1,6 @@
 """Many lanes at once: the driver for event times and end states of a whole grid.
 
-A block of lanes advances in lockstep, every lane with its own step length; cells wait in a queue for a lane (`queue.py`).
+A block of lanes advances in lockstep, every lane with its own step length; cells wait in a queue for a lane (`scheduler.py`).
 The state is one array (components, lanes); the parameters of the problem are scalars or one per cell.
 
 Derivatives (forward mode) flow through the states alone; step lengths are held fixed. `derivatives/slopes.py` has the
@@ -42,7 +42,7 @@ def ensemble_solve(
     - `passes`: whether a run goes on through the event, in either direction, rather than ending there.
     - `one_kernel`: whether to have the loop compiled into a single kernel on a CPU, which halves its cost; not for
       programs that are differentiated again.
-    - `parts`: of how many equal parts the state is made, as for `Queue.of`.
+    - `parts`: of how many equal parts the state is made, as for `LaneScheduler.of`.
 
     **Returns:** the `Outcome`, and the number of lockstep iterations, each of which advanced a block of lanes.
     """

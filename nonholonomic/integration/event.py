@@ -17,7 +17,7 @@ from .runge_kutta import Lanes, States, Step
 #: crossing.
 LOCATED = 1e-10
 
-#: A dip of the crossing function within a step is looked at if its estimate is below this fraction of the values at both ends.
+#: A dip of the event function within a step is looked at if its estimate is below this fraction of the values at both ends.
 #: With a tenth of it one first crossing of 1279 in a cylinder is missed at a tolerance of 1e-7 and none at 1e-9; with ten
 #: times as much none is found that was not, for a quarter more steps.
 DIP = 0.2
@@ -48,7 +48,7 @@ def refine(
 
     **Arguments:**
 
-    - `searching`: which lanes search already; any other opens its bracket with the step it just took.
+    - `bracketing`: which lanes search already; any other opens its bracket with the step it just took.
     - `was`: the bracket.
     - `before`, `margin`: the margin at the start of the attempt and at its end.
     - `length`: of the attempt [s].

@@ -12,22 +12,23 @@ from .runge_kutta import Lanes, States, lesser
 
 
 class AbstractProblem(eqx.Module):
-    """What is integrated: a field, a function whose zero is the event, and a guard that ends the run.
+    """What is integrated: a field, a function whose zero is the event, and a domain margin that ends the run.
 
     The leaves of a problem are scalars, or hold one number per cell in their last axis.
     """
 
     @property
     def leading(self) -> int | None:
-        """How many components, from the first, are all that field, crossing function and guard depend on, and have a field of
-        their own without the rest; `None` for all of them."""
+        """How many components, from the first, are all that field, event function and domain margin depend on, and have a
+        field of their own without the rest; `None` for all of them."""
         return None
 
     @property
     def direction_decides(self) -> bool:
-        """Whether the direction of motion decides on which side of a zero of the crossing function or the guard a run starts.
+        """Whether the direction of motion decides on which side of a zero of the event function or the domain margin a run
+        starts.
 
-        A run that starts beyond the event then waits for the next time the crossing function falls through zero; otherwise it
+        A run that starts beyond the event then waits for the next time the event function falls through zero; otherwise it
         ends at once.
         """
         return False
@@ -50,7 +51,7 @@ class AbstractProblem(eqx.Module):
         """A smooth function of order 1, positive before the event, negative after it; `None` if there is no event."""
 
     def crossing_along(self, state: States, rate: States) -> Lanes | None:
-        """The crossing function where the field is known too: what `crossing` is, for problems to which that saves work."""
+        """The event function where the field is known too: what `crossing` is, for problems to which that saves work."""
         return self.event_function(state)
 
     @abc.abstractmethod
@@ -92,13 +93,13 @@ class CoreProblem(AbstractProblem):
 
 
 def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: States, rate: States) -> Lanes:
-    """The least of the problem's crossing function, counted positive on the lane's side of the event, and its guard, where the
-    field is known."""
+    """The least of the problem's event function, counted positive on the lane's side of the event, and its domain margin,
+    where the field is known."""
     return lesser(problem.domain_margin(time, state), side_of(problem, side)(state, rate), side)
 
 
 def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States], Lanes | None]:
-    """The problem's crossing function by state and rate, counted positive on the lane's side of the event."""
+    """The problem's event function by state and rate, counted positive on the lane's side of the event."""
 
     def crossing(state: States, rate: States) -> Lanes | None:
         found = problem.crossing_along(state, rate)
@@ -108,7 +109,7 @@ def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States],
 
 
 def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes:
-    """When the crossing function vanishes, for a state close to that (`event_time`)."""
+    """When the event function vanishes, for a state close to that (`event_time`)."""
     return event_time(problem, problem.event_function, time, state)
 
 

@@ -59,8 +59,8 @@ def explicit_step(
     - `tableau`: the method.
     - `field`: (time [s], state) -> rate of the state.
     - `domain_margin`, `crossing`: (time, state) and (state, rate) -> a number per lane that should stay positive, or
-      `None`. They are looked at in the end and at three stages between: the guard, which may need all of the state, in a
-      branch of those stages; the crossing, which may need few components, after the stages. If one is negative for less
+      `None`. They are looked at in the end and at three stages between: the domain margin, which may need all of the state,
+      in a branch of those stages; the crossing, which may need few components, after the stages. If one is negative for less
       than two fifths of a step, that may go unnoticed.
     - `time`, `state`, `rate`: where the step starts, and the field there.
     - `length`: length of the step [s], one per lane.

@@ -24,7 +24,7 @@ from .step import LaneState, try_step
 PERIOD = 64
 
 #: By how much a step is stretched to end on a sample: its error stays below the tolerance, because steps are proposed with a
-#: margin of `attempt.SAFETY`.
+#: margin of `step.SAFETY`.
 STRETCH = 1.08
 
 Samples = Float[Array, "cells times components"]
@@ -38,7 +38,7 @@ class Reached(NamedTuple):
 
 
 class Sampling(NamedTuple):
-    """A march with samples on its way: `sample` is the number of the next one in every lane."""
+    """A solve with samples on its way: `sample` is the number of the next one in every lane."""
 
     progress: Progress
     sample: Int[Array, " lanes"]
@@ -58,7 +58,7 @@ def solve_with_samples(
 ) -> tuple[Outcome, Samples]:
     """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`, with samples on the way.
 
-    **Arguments:** as for `Queue.of`, and
+    **Arguments:** as for `LaneScheduler.of`, and
 
     - `times`: of the samples [s], increasing, from 0 or later; (times,) for all cells or (times, cells). Those after `t1` are
       not reached.

@@ -142,7 +142,7 @@ class LaneScheduler(eqx.Module):
     ) -> Bool[Array, ""]:
         """Whether a block goes on; while cells wait it stops to be refilled as soon as that is worth it.
 
-        **Arguments:** `idle`: steps that idle lanes have missed since it was filled; `queued`: how many cells have left the
+        **Arguments:** `idle`: steps that idle lanes have missed since it was filled; `scheduler`: how many cells have left its
         queue; `price`: what it costs to refill it, in steps of the whole block.
         """
         refill = (scheduler < self.cells) & (idle >= price * self.lanes)
@@ -208,7 +208,7 @@ def _fresh_lanes(
     rates: Float[Array, "components cells"],
     lengths: Float[Array, " cells"],
 ) -> LaneState:
-    """Every cell at its start; one that starts beyond the event or the guard has ended."""
+    """Every cell at its start; one that starts beyond the event or the domain margin has ended."""
     zero = jnp.zeros_like(lengths)
     no = jnp.zeros(lengths.shape, bool)
     if problem.direction_decides:

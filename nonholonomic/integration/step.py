@@ -44,9 +44,9 @@ class LaneState(NamedTuple):
     - `cell`: which cell of the problem a lane runs; `status`: a code of `status.py`.
     - `time` [s], `state`, `rate`: where the lane is, and the field there.
     - `length`: of the step to be tried [s], if the horizon is not nearer.
-    - `side`: 1 before the event, -1 beyond it; `margin`: the least of `side` times the crossing function and the guard.
+    - `side`: 1 before the event, -1 beyond it; `margin`: the least of `side` times the event function and the domain margin.
     - `first_crossing`, `crossing_time`: of the first and the last event that were passed [s], infinite if there was none.
-    - `searching`: whether the lane looks for an event, `search`: where.
+    - `bracketing`: whether the lane looks for an event, `bracket`: where.
     - `steps`: tried so far, `rejected`: by step control.
     """
 
@@ -80,9 +80,9 @@ def try_step(problem: AbstractProblem, control: Control, atol: States, lane_stat
     - `problem`: the problem with one number per lane (or a scalar) in every leaf.
     - `control`: the method and its tolerances.
     - `atol`: absolute tolerances, (components, lanes).
-    - `block`: the lanes; those that have ended stay as they are.
+    - `lane_state`: the lanes; those that have ended stay as they are.
 
-    **Returns:** the block after the attempt.
+    **Returns:** the lanes after the step.
     """
 
     tried_length = length_to_try(control, lane_state)

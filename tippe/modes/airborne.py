@@ -1,4 +1,4 @@
-"""Contact lost and found on any arena: phases of sliding and of flight, for a top without a stem (`airborne_stem.py` has one).
+"""Contact lost and found on any arena: modes of sliding and of flight, for a top without a stem (`airborne_stem.py` has one).
 
 In contact the state is that of `tippe/model/state.py` with a `CarriedFrame`, 14 components. In flight it is, in the surface's
 axes, the place of the centre of mass [m], its velocity [m/s], the axis, the angular momentum about it, and two zeros. A flight
@@ -42,7 +42,7 @@ from .free_body import Ball, FreeBody, axis_rate, balls, energy, gap_rate, stand
 from .impact import CLOSING_SPEED, resolve_impact
 from .inversion_problem import InversionProblem
 
-#: The numbers of the phases. The last two are those of a top with a stem: that slides; or a sphere is about to strike, and the
+#: The numbers of the modes. The last two are those of a top with a stem: that slides; or a sphere is about to strike, and the
 #: state is that of a flight.
 SLIDING, FLYING, ON_STEM, STRIKING = range(4)
 
@@ -150,7 +150,7 @@ def standing(scene: Scene, ball: Ball) -> Dynamics:
     return dataclasses.replace(standing_on(scene.dynamics, ball), frame=frame)
 
 
-# A single run asks before every phase, outside of its programs, whether it is over as it begins.
+# A single run asks before every mode, outside of its programs, whether it is over as it begins.
 @compiled_setup
 def gap_margin(scene: Scene, flying: FlightState, ball: Ball, rounding: float = 0.0) -> Float[Array, "..."]:
     """Distance of a sphere from the arena as a fraction of R, plus the round-off of a parting.
@@ -321,7 +321,7 @@ class Fly(AbstractFlyingMode):
 def modes(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
-    """The phases of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`."""
+    """The modes of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`."""
     arguments = (scene, problem.scales, problem.cos_angle, rides)
     return (Slide(*arguments), Fly(*arguments)), jnp.zeros(problem.states.shape[1:], int)
 

@@ -166,7 +166,7 @@ class FlyBoth(Fly):
         own, other = own_and_other(scene, number)
         ground = landing_site(scene, flying, own)
         astray = missed(scene, ground, own)
-        # Where the landing was located a little below the arena, the next phase would end where it begins.
+        # Where the landing was located a little below the arena, the next mode would end where it begins.
         flying = flying._replace(place=tuple(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
         ground = ground._replace(gap=zero)
         blow = apply_impulse(scene, flying, ground, own, other)
@@ -237,7 +237,7 @@ def own_and_other(scene: Scene, number: Int[Array, "..."]) -> tuple[Ball, Ball]:
 def modes(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
-    """The phases of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`.
+    """The modes of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`.
 
     A launch in which the stem would be in the arena starts on the stem: its place and its theta are those of the stem's foot.
     """

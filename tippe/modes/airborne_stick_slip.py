@@ -1,6 +1,6 @@
 """Slipping, rolling and flying over any arena, the level plane included, under Coulomb's law as it stands.
 
-What slips and rolls is as in `stick_slip_runs.py`, what flies as in `airborne.py`; the states and what rides along are those of
+What slips and rolls is as in `sticking.py`, what flies as in `airborne.py`; the states and what rides along are those of
 the latter.
 """
 
@@ -18,7 +18,7 @@ from .airborne import FLYING, OWN, SLIDING, Fly, lift_off
 from .flying_mode import AbstractFlyingMode
 from .inversion_problem import InversionProblem
 
-#: The numbers of the phases; flying has that of `airborne.py`.
+#: The numbers of the modes; flying has that of `airborne.py`.
 SLIPPING, ROLLING = SLIDING, 2
 
 
@@ -30,7 +30,7 @@ class Touch(AbstractFlyingMode):
 
     @property
     def contact_state(self) -> sticking.StickSlipMode:
-        """The phase of runs that end where the contact is lost."""
+        """The mode of runs that end where the contact is lost."""
         size = OWN if self.rides else None
         return sticking.StickSlipMode(self.kind, self.cos_angle, self.scales, self.last, self.axial, size)
 
@@ -75,7 +75,7 @@ class Land(Fly):
 def modes(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
-    """The phases of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`."""
+    """The modes of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`."""
     both, arguments = problem.dynamics, (scene, problem.scales, problem.cos_angle, rides)
     assert isinstance(both, StickSlip)
     slips, rolls = (

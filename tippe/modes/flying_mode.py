@@ -1,4 +1,4 @@
-"""What all phases of runs through flights have in common."""
+"""What all modes of runs through flights have in common."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -9,7 +9,7 @@ from ..model.scene import Scene
 
 
 class AbstractFlyingMode(AbstractBatchedMode):
-    """A phase of runs that go on through flights.
+    """A mode of runs that go on through flights.
 
     - `scene`: with `contact="hybrid"`; `scales`: magnitudes by which absolute errors of the state are measured.
     - `cos_angle`: cosine of the angle of theta that is the event.

@@ -1,4 +1,4 @@
-"""Sliding as a phase of the motion, on one sphere or on both, and what follows it: a flight, the other sphere, or the end.
+"""Sliding as a mode of the motion, on one sphere or on both, and what follows it: a flight, the other sphere, or the end.
 
 A single run whose path is kept carries seven more numbers behind its state, which ride along: the place (x, y) of the centre
 of mass [m], the vector c of `trajectory_problem.py`, the angle by which the top has turned about its axis [rad], and the work
@@ -157,7 +157,7 @@ class Slide(AbstractFlyingMode):
 
 
 class Lean(AbstractFlyingMode):
-    """Sliding on both spheres; the phase after those of the spheres."""
+    """Sliding on both spheres; the mode after those of the spheres."""
 
     def problem(self, state: Float[Array, "components cells"]) -> Sliding:
         return Sliding(leaning(self.scene), None, None, self.cos_angle, state, self.scales, self.axial)
@@ -178,12 +178,12 @@ class Lean(AbstractFlyingMode):
 def modes(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
-    """The phases of runs, sliding on each sphere and on both if there are two; and the number of that in which each starts.
+    """The modes of runs, sliding on each sphere and on both if there are two; and the number of that in which each starts.
 
     **Arguments:**
 
     - `scene`: with `contact="hybrid"`; `problem`: of its launches, which stand on their lower sphere.
-    - `tolerance`: no phase needs it; `last`: whether the last crossing counts; `rides`: as for `AbstractFlyingMode`.
+    - `tolerance`: no mode needs it; `last`: whether the last crossing counts; `rides`: as for `AbstractFlyingMode`.
     """
     spheres, arguments = balls(scene.body), (scene, problem.scales, problem.cos_angle, rides)
     slides = tuple(Slide(*arguments, jnp.asarray(number), last) for number in range(len(spheres)))
@@ -203,7 +203,7 @@ class Air(NamedTuple):
 
     - `free`, `elapsed` [s]: the body and the time since the contact was lost.
     - `ball`: the sphere that touched last; `rising`: whether it left with a speed; `falls`: whether, without a flight, it is
-      about to strike the plane, `None` for a top without stem. Once the contact is closed, the number of the phase.
+      about to strike the plane, `None` for a top without stem. Once the contact is closed, the number of the mode.
     - `status`: `RUNNING`, or how the run ended, `LEFT_DOMAIN` if it has jammed; `crossing_time` [s] of the event, infinite if
       there was none.
     - `flights`: so far; `open`: whether there is no contact and the run goes on.

@@ -19,7 +19,7 @@ from ..model.stick_slip import AT_REST, Change, ContactMode, StickSlip
 from .inversion_problem import InversionProblem
 from .trajectory_problem import TrajectoryProblem
 
-#: The numbers of the two phases.
+#: The numbers of the two modes.
 SLIPPING, ROLLING = range(2)
 
 
@@ -101,7 +101,7 @@ def modes(
     axial: Float[Array, ""] | None = None,
     size: int | None = None,
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]:
-    """The phases of runs, and the number of that in which each starts.
+    """The modes of runs, and the number of that in which each starts.
 
     **Arguments:**
 
@@ -118,14 +118,14 @@ def modes(
 
 @compiled_setup
 def _first_mode(both: StickSlip, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
-    """The number of the phase in which each cell starts."""
+    """The number of the mode in which each cell starts."""
     return jnp.where(both.slip_speed(states) <= AT_REST * both.speed, ROLLING, SLIPPING)
 
 
 def contact_modes(
     run: TrajectoryProblem, tolerance: Any
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]:
-    """The phases of one run whose path is kept, the number of the first, and the state there.
+    """The modes of one run whose path is kept, the number of the first, and the state there.
 
     **Arguments:** `run`: of a scene with `SetValuedCoulomb`; `tolerance`: relative, of the integration.
     """

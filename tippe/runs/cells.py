@@ -37,9 +37,9 @@ from .sensitivities import hybrid_sensitivities_of_cells, sensitivities_of_cells
 
 
 class RunKind(NamedTuple):
-    """How the runs of a kind of scene go: the words of their status, what is counted besides steps, and the phases.
+    """How the runs of a kind of scene go: the words of their status, what is counted besides steps, and the modes.
 
-    `modes` takes (scene, problem, tolerance, last) and gives the phases and the number of each cell's first; `None` for runs
+    `modes` takes (scene, problem, tolerance, last) and gives the modes and the number of each cell's first; `None` for runs
     of one smooth motion. `flight_state` is whether states may be those of flight, in a layout of their own.
     """
 
@@ -105,7 +105,7 @@ def too_many_steps(t1: float, most: int, end: float) -> str:
 
 
 def run_kind_of(scene: Scene) -> RunKind:
-    """The driver for a scene."""
+    """The kind of run of a scene."""
     hybrid = scene.contact == "hybrid"
     if scene.friction.set_valued:
         return STICK_SLIP_FLY if hybrid else STICK_SLIP
@@ -117,7 +117,7 @@ def run_kind_of(scene: Scene) -> RunKind:
 
 
 def check_differentiable(scene: Scene) -> None:
-    """Raise `ValueError` for a scene through whose phases no derivative goes."""
+    """Raise `ValueError` for a scene through whose modes no derivative goes."""
     if run_kind_of(scene) is STICK_SLIP_FLY:
         raise ValueError(
             "friction = SetValuedCoulomb with contact = 'hybrid' has no derivatives: they do not go through impacts in which a "
@@ -195,7 +195,7 @@ class InversionRuns(NamedTuple):
     def _hybrid_runs(
         self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, along: Callable[..., Any]
     ) -> dict[str, Any]:
-        """The variables of cells whose runs have phases; `along` takes (horizon, tolerance) and gives runs and slopes."""
+        """The variables of cells whose runs have several modes; `along`: (horizon, tolerance) -> runs and slopes."""
         if self.slopes_by and not self.last:
             found, slopes, grazing = along(self.t1, tolerance)
         else:
@@ -211,7 +211,7 @@ class InversionRuns(NamedTuple):
             found = found._replace(state=np.asarray(_on_the_ground(scene, found.state, found.mode)))
         named = self._named(scene, problem, found, loss) | dict(zip(self.run_kind.counts, found.counts, strict=True))
         if self.crossing == "both":
-            # Through phases the first crossing takes a journey of its own, which ends there.
+            # Through modes the first crossing takes a run of its own, which ends there.
             first = self._hybrid_outcome(scene, problem, tolerance, count, False)
             named["first_time"] = np.where(first.status == CROSSED, first.crossing_time, np.inf)
         if not self.slopes_by:
@@ -224,7 +224,7 @@ class InversionRuns(NamedTuple):
     def _hybrid_outcome(
         self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, last: bool
     ) -> HybridOutcome:
-        """The runs of cells through their phases."""
+        """The runs of cells through their modes."""
         assert self.run_kind.modes is not None
         modes, first = self.run_kind.modes(scene, problem, tolerance, last)
         start, settings = (np.asarray(first), np.asarray(problem.states)), Settings(tolerance, self.solver)

@@ -126,7 +126,7 @@ def event_bounds(angle: Any) -> Iterator[Bound]:
 
 
 def check_smooth(scene: Scene, caller: str) -> None:
-    """Raise `ValueError` for a scene whose runs have phases, which derivatives do not go through."""
+    """Raise `ValueError` for a scene whose runs have several modes, which derivatives do not go through."""
     if scene.contact == "hybrid":
         raise ValueError(f"contact = 'hybrid' must be 'stop' for {caller}; inversion_table goes through flights")
     if scene.friction.set_valued:

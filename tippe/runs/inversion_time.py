@@ -80,7 +80,7 @@ def inversion_time(
     not happen at all, the derivative is NaN; `inversion_table` says so in the variable `grazes`.
 
     **Raises:** `ValueError` for arguments outside these ranges, for a run that needs more than 2 000 000 steps, for second
-    derivatives through changes of phase, and for derivatives with both, whose impacts may stop a slip.
+    derivatives through changes of mode, and for derivatives with both, whose impacts may stop a slip.
 
     **Example:**
 
@@ -194,7 +194,7 @@ class InversionSolve(AbstractDifferentiableSolve):
 
 
 class HybridInversionSolve(InversionSolve):
-    """When cells invert whose runs have phases; the leaves are those of `InversionSolve`."""
+    """When cells invert whose runs have several modes; the leaves are those of `InversionSolve`."""
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
@@ -234,7 +234,7 @@ class HybridInversionSolve(InversionSolve):
         return time, [jnp.where(happened, jnp.where(digits, slope, jnp.nan), 0.0 * time) for slope in gather(slopes)]
 
     def hybrid(self, leaves: tuple[Array, ...], cells: int | None) -> Any:
-        """The phases of some cells, the number of each one's first, problem and scene; the last leaf is the tolerance."""
+        """The modes of some cells, the number of each one's first, problem and scene; the last leaf is the tolerance."""
         *own, tolerance = leaves
         scene, *_ = jax.tree.unflatten(self.structure, (*own, *(None,) * (self.structure.num_leaves - len(own))))
         problem, modes_of = self.problem(tuple(own), cells), run_kind_of(scene).modes
@@ -250,7 +250,7 @@ class HybridInversionSolve(InversionSolve):
         t1: Float[Array, "..."],
         tolerance: Float[Array, ""],
     ) -> HybridOutcome:
-        """The runs of cells through their phases."""
+        """The runs of cells through their modes."""
         settings, kinds = Settings(tolerance, self.solver), len(run_kind_of(scene).counts)
         return traced_solve_hybrid(modes, first, problem.states, t1, settings, kinds=kinds, passes=self.last)
 

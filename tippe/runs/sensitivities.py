@@ -121,16 +121,16 @@ def hybrid_sensitivities_of_cells(
     last: bool,
     kinds: int,
 ) -> tuple[HybridOutcome, dict[str, Any], Bool[np.ndarray, " size"]]:
-    """What `sensitivities_of_cells` gives, for runs of several phases.
+    """What `sensitivities_of_cells` gives, for runs of several modes.
 
     **Arguments:** as there, and
 
-    - `modes_of`: the phases, as `RunKind` has them.
+    - `modes_of`: the modes, as `RunKind` has them.
     - `t1`: horizon [s]; where the `last` crossing counts, its time in every cell, at which the runs end.
     - `kinds`: how many kinds of things are counted.
 
     **Returns:** the `HybridOutcome`; name of the variable -> derivatives (size,); and where these have no digits, because
-    an event on the way was grazing. Source: saltation at every change of phase (`nonholonomic/hybrid/saltation.py`).
+    an event on the way was grazing. Source: saltation at every change of mode (`nonholonomic/hybrid/saltation.py`).
     """
     numbers = (jnp.asarray(angle, float), jnp.asarray(tolerance, float))
     built = _modes_and_tangents(modes_of, roots, columns, names, *numbers, size, last)
@@ -154,7 +154,7 @@ def _modes_and_tangents(
     size: int,
     last: bool,
 ) -> tuple[Any, tuple[Any, ...], list[Float[Array, "..."]]]:
-    """The phases of the cells, the number of each one's first and its state there; tangents and sizes as above."""
+    """The modes of the cells, the number of each one's first and its state there; tangents and sizes as above."""
 
     def build(*moving: Any) -> Any:
         cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))
