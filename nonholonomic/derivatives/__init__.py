@@ -1,8 +1,8 @@
-"""Derivatives of the end of a run, forwards along it and backwards through it; and the rate at which neighbouring runs diverge.
+"""Forward and adjoint derivatives of the end of a run, and the rate at which neighbouring runs diverge.
 
-For one direction the variation is integrated along with the run; for several, every run is differentiated backwards
-once. Step lengths are held fixed in both. `sampled_run` gives a run at given times, with its derivatives. Runs of several
-modes are in `nonholonomic.hybrid`.
+With few tangents the variations are integrated along with the run; with more, each run is differentiated by one
+backward pass. Both hold step lengths fixed. `sampled_run` gives a run at given times, with its derivatives. Hybrid runs
+are in `nonholonomic.hybrid`.
 """
 
 from .differentiable import AbstractDifferentiableSolve as AbstractDifferentiableSolve

@@ -1,9 +1,9 @@
-"""First derivatives of event times by any number of parameters at once: the discrete adjoint of the ensemble solve.
+"""First derivatives of event times by any number of parameters at once: the discrete adjoint of an ensemble solve.
 
-A run is cut into periods, each with its steps recorded. Once the last one is done, the derivatives of the
-event times by the states are carried back from the last period to the first. A period whose record is gone is computed again
-from the latest progress kept before it. The cost does not depend on how many parameters are differentiated by, nor the memory
-on how long the runs are. Step lengths are held fixed, as in `variation.py`.
+A run is cut into periods, and the steps of each period are recorded. After the last period, a backward pass carries the
+derivatives of the event times by the states from the last period to the first. A period whose record is gone is
+computed again from the latest checkpoint before it. The cost does not depend on the number of parameters, nor the
+memory on the length of the runs. Step lengths are held fixed, as in `variation.py`.
 """
 
 import dataclasses
@@ -38,23 +38,23 @@ from ..xla_cpu import uncounted, written_by_component, written_in_place
 from ._shared_values import sharing_values
 from .variation import VariationalProblem
 
-#: Iterations of a period: as many as fit the caches with their record.
+#: Iterations per period: as many as fit the caches with their record.
 PERIOD = 128
 
-#: What it costs to refill a block here, in steps of the whole block: a period ends with it.
+#: Cost of refilling the lanes here, in steps of all lanes: a period ends with the refill.
 REFILL = 2.0
 
-#: Periods whose starts are kept; beyond that some are dropped, and computed again from further back. With the 64
-#: lanes of a CPU that takes 5 MB, with the 32768 of an accelerator 2 GB.
+#: Number of checkpoints. With more periods, some checkpoints are dropped and computed again from an earlier one. With
+#: the 64 lanes of a CPU the checkpoints take 5 MB, with the 32768 of an accelerator 2 GB.
 KEPT = 256
 
-#: What is measured at the end of a run: (problem, block) -> a number per lane, with its derivative by the problem's parameters
-#: and the block's state.
+#: The quantity measured at the end of a run: (problem, lane state) -> a number per lane, differentiable by the
+#: problem's parameters and the lanes' states.
 Measured = Callable[[Any, LaneState], Lanes]
 
 
 class StepRecord(NamedTuple):
-    """The steps of a period: where each began, and its length, 0 for a lane that did not move."""
+    """The steps of a period: where each step began, and its length, 0 for a lane that did not move."""
 
     time: Float[Array, "iterations lanes"]
     state: Float[Array, "iterations components lanes"]
@@ -62,9 +62,9 @@ class StepRecord(NamedTuple):
 
 
 class Checkpoints(NamedTuple):
-    """The starts of periods that are kept, the earliest first.
+    """The stored starts of periods, the earliest first.
 
-    There are `depth` of them; `index` says which period each one starts, `slot` where in `progress` it is stored.
+    There are `depth` of them; `index` holds the period that each one starts, `slot` its place in `progress`.
     """
 
     depth: Int[Array, ""]
@@ -79,16 +79,18 @@ class Checkpoints(NamedTuple):
         return cls(jnp.ones((), int), jnp.zeros(KEPT, int), jnp.arange(KEPT), room)
 
     def latest(self) -> tuple[Int[Array, ""], Progress]:
-        """The latest one, and which period it starts."""
+        """The period of the latest checkpoint, and the checkpoint itself."""
         last = self.depth - 1
         return self.index[last], jax.tree.map(functools.partial(_read, at=self.slot[last]), self.progress)
 
     def dropped(self, drop: Bool[Array, ""]) -> "Checkpoints":
-        """These without the latest one, if it is to be dropped."""
+        """The checkpoints without the latest one, if `drop` holds."""
         return self._replace(depth=self.depth - drop)
 
     def added(self, index: Int[Array, ""], progress: Progress, add: Bool[Array, ""]) -> "Checkpoints":
-        """These and another one, if it is to be added; if there is no room, the one whose neighbours are closest is dropped."""
+        """The checkpoints with another one, if `add` holds; if all slots are full, the one whose neighbours are closest
+        is dropped.
+        """
         position = jnp.arange(KEPT)
         full = self.depth == KEPT
         following = jnp.where(position == KEPT - 1, index, jnp.roll(self.index, -1))
@@ -99,16 +101,16 @@ class Checkpoints(NamedTuple):
         to = jnp.minimum(self.depth, KEPT - 1)
         indices = jnp.where(moves, jnp.roll(self.index, -1), self.index).at[to].set(index)
         slots = jnp.where(moves, jnp.roll(self.slot, -1), self.slot).at[to].set(free)
-        # Written in any case: if none is added, the place stays free.
+        # Always written: if no checkpoint is added, the slot stays free.
         room = jax.tree.map(functools.partial(written_in_place, at=free), self.progress, progress)
         return Checkpoints(jnp.minimum(self.depth + add, KEPT), indices, slots, room)
 
 
 class Backward(NamedTuple):
-    """A run being differentiated backwards: `needed` is the period after the one that comes next.
+    """State of a backward pass: `needed` is the period after the one that comes next.
 
-    `adjoint` holds, for the cell in each lane, the derivatives of what is measured: by the state in its first rows, then by
-    the parameters; `gradient` holds those of every cell by its start.
+    `adjoint` holds, for the cell in each lane, the derivatives of the measured quantity: by the state in its first
+    rows, then by the parameters; `gradient` holds those of every cell by its initial state.
     """
 
     kept: Checkpoints
@@ -129,18 +131,18 @@ def solve_with_adjoint(
     measured: Measured,
     one_kernel: bool = False,
 ) -> tuple[Outcome, Float[Array, "components cells"], Any]:
-    """Run every cell to its end, and differentiate what is measured there by the parameters of the problem.
+    """Run every cell to its end, and differentiate a quantity measured there by the parameters of the problem.
 
     **Arguments:** as for `ensemble_solve`, except `passes`, and
 
-    - `problem`: without directions.
+    - `problem`: without tangents.
     - `moving`: a tree of booleans like the problem: which of its leaves, scalars or (cells,), to differentiate by.
-    - `probe`: a direction of the inner problem. Its variation is integrated too and takes part in step control, so that the
-      steps suit tangents even where the state is at rest.
-    - `measured`: what is measured.
+    - `probe`: a tangent of the inner problem. Its variation is integrated too and takes part in step-size control, so
+      that the steps suit tangents even where the state is at rest.
+    - `measured`: the quantity to differentiate.
 
-    **Returns:** the `Outcome`, with crossing times left out; the derivatives of every cell by its state at the start; and
-    those by the parameters, one per cell, in a tree like the problem with `None` for the other leaves.
+    **Returns:** the `Outcome`, without crossing times; the derivatives for every cell by its initial state; and those
+    by the parameters, one per cell, in a tree like the problem with `None` for the other leaves.
 
     **Raises:** `ValueError` for a chosen leaf that has several components.
     """
@@ -152,7 +154,7 @@ def solve_with_adjoint(
             raise ValueError(f"moving: a number must be a scalar or ({size},), not of shape {jnp.shape(leaf)}")
     numbers = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (size,)), numbers)
     problem = eqx.combine(numbers, rest)
-    # The chosen parameters have one value for each cell by now, and so have their rates.
+    # The chosen parameters now have one value per cell, and so must their rates.
     probe = jax.tree.map(
         lambda rate, number: None if rate is None else jnp.broadcast_to(rate, jnp.shape(number)),
         probe,
@@ -160,7 +162,7 @@ def solve_with_adjoint(
         is_leaf=lambda rate: rate is None,
     )
     probed = dataclasses.replace(problem, tangents=(probe,))
-    # As many lanes as for the run alone: on the way back, which costs most, the probe is not there.
+    # As many lanes as without the probe: the backward pass, which costs most, does not use the probe.
     settings = dataclasses.replace(settings, lanes=settings.lanes_of(size))
     scheduler = LaneScheduler.of(probed, t1, cells, settings, one_kernel=one_kernel, parts=2)
     rows = components + len(jax.tree.leaves(numbers))
@@ -198,7 +200,7 @@ def solve_with_adjoint(
 
 
 def _recorded(scheduler: LaneScheduler, progress: Progress) -> tuple[Progress, StepRecord, Int[Array, ""]]:
-    """Advance the block by a period and record its steps; also returns the number of iterations."""
+    """Advance the lanes by a period and record their steps; also return the number of iterations."""
     here = scheduler.here(progress.lane_state)
 
     def going(carry: Any) -> Bool[Array, ""]:
@@ -227,7 +229,7 @@ def _recorded(scheduler: LaneScheduler, progress: Progress) -> tuple[Progress, S
 
 
 def _without_probe(lane_state: LaneState) -> LaneState:
-    """The block with the states alone, without the variations."""
+    """The lanes with the states alone, without the variations."""
     return lane_state._replace(state=lane_state.state[: lane_state.state.shape[0] // 2])
 
 
@@ -240,9 +242,11 @@ def _taken_back(
     count: Int[Array, ""],
     adjoint: Float[Array, "rows lanes"],
 ) -> Float[Array, "rows lanes"]:
-    """Carry the derivatives from the end of a period to its start; for lanes that have ended they begin there."""
+    """Carry the derivatives from the end of a period to its start; in lanes that have ended, the derivatives begin
+    there.
+    """
     weights = Weights.of(scheduler.control.tableau)
-    # Selected here: XLA 0.10.2 aborts on a kernel that gets all the cells' starts if these are constants.
+    # Selected here: XLA 0.10.2 aborts on a kernel that takes the initial states of all cells if they are constants.
     problem = dataclasses.replace(scheduler.here(lane_state)[0], tangents=())
     lane_state = _without_probe(lane_state)
 
@@ -265,7 +269,7 @@ def _taken_back(
 def _at_the_end(
     problem: AbstractProblem, moving: Any, measured: Measured, lane_state: LaneState
 ) -> Float[Array, "rows lanes"]:
-    """The derivatives of what is measured, by the state at the end and by the parameters."""
+    """The derivatives of the measured quantity by the final state and by the parameters."""
     numbers, rest = eqx.partition(problem, moving)
 
     def value(numbers: Any, state: States) -> Lanes:
@@ -278,8 +282,8 @@ def _at_the_end(
 class Weights(NamedTuple):
     """The coefficients of a Runge-Kutta method that its adjoint needs.
 
-    `fractions` of the step at which the stages lie, `rows` that lead to every stage but the first, and for every stage the
-    `shares` of its rate in the end of the step and in the later stages.
+    `fractions`: the position of each stage in the step; `rows`: the weights of each stage but the first; `shares`: for
+    each stage, the share of its rate in the end of the step and in the later stages.
     """
 
     fractions: Float[np.ndarray, " stages"]
@@ -288,7 +292,7 @@ class Weights(NamedTuple):
 
     @classmethod
     def of(cls, tableau: diffrax.ButcherTableau) -> "Weights":
-        """The weights of a method; a last stage that only serves the next step is left out."""
+        """The weights of a method, without a last stage that only serves the next step."""
         weights, fractions, rows = tableau.b_sol, np.array([0.0, *tableau.c]), tableau.a_lower
         if tableau.fsal:
             weights, fractions, rows = rows[-1], fractions[:-1], rows[:-1]
@@ -312,17 +316,17 @@ def step_taken_back(
 ) -> tuple[Float[Array, "rows lanes"], Stages]:
     """Carry derivatives from the end of a Runge-Kutta step to its start (Hager, Numer. Math. 87 (2000) 247).
 
-    The stages are done in loops, as in `explicit_step`.
+    The stages are computed in loops, as in `explicit_step`.
 
     **Arguments:**
 
     - `weights`: the method.
-    - `problem`, `moving`: its leaves scalars or one number per lane; which of them to differentiate by.
-    - `time`, `state`, `length`: where the step starts, and its length; 0 where none was made.
+    - `problem`, `moving`: the problem, its leaves scalars or one number per lane; which leaves to differentiate by.
+    - `time`, `state`, `length`: where the step starts, and its length; 0 where no step was made.
     - `adjoint`: derivatives at the end of the step, by the state and by the parameters.
     - `room`: working memory for the derivatives by the end and by the stages; finite.
 
-    **Returns:** those at the start; and the working memory, to be used again.
+    **Returns:** the derivatives at the start, and the working memory for reuse.
     """
     numbers, rest = eqx.partition(problem, moving)
     components, stages = state.shape[0], len(weights.fractions)
@@ -352,7 +356,7 @@ def step_taken_back(
         pulled = sharing_values(pull)(
             at, numbers, tuple(jnp.unstack(_read(along, at=stage))), tuple(jnp.unstack(by_rate))
         )
-        # Where no step was made, nothing can be assumed finite.
+        # Where no step was made, values may not be finite.
         pulled = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(pulled), 0.0))
         return written_in_place(by_stage, pulled[:components], at=stage + 1), total + pulled
 
@@ -362,5 +366,5 @@ def step_taken_back(
 
 
 def _read(whole: Array, at: Int[Array, ""]) -> Array:
-    """One of the arrays that are stacked in another."""
+    """One of the arrays stacked in another."""
     return jax.lax.dynamic_index_in_dim(whole, at, 0, keepdims=False)

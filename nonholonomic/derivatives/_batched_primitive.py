@@ -1,7 +1,8 @@
-"""What is found of the cells of a block, as one operation of JAX: `vmap` adds cells to it, `jit` has it find what is read only.
+"""A JAX primitive that solves for all members of a batch at once and, under `jit`, computes only the outputs that are
+used.
 
-`custom_vmap` does the first, but all of its results are found as soon as one is read. The rule for unread results is JAX's
-`partial_eval.dce_rules`, as its own `scan` has it.
+`custom_vmap` batches too, but computes all outputs as soon as one is used. The rule for unused outputs is JAX's
+`partial_eval.dce_rules`, as in its own `scan`.
 """
 
 import dataclasses
@@ -20,14 +21,14 @@ from jaxtyping import Array, Float
 from ..xla_cpu import compiled_alone, compiled_quickly
 
 
-# Compared by identity: JAX looks for its hash, and what it holds may have none.
+# Compared by identity: JAX hashes the request, and its fields may not be hashable.
 @dataclasses.dataclass(frozen=True, eq=False)
 class Request:
-    """What is asked of some cells.
+    """Which outputs of a differentiable solve to compute for a number of cells.
 
     - `question`: an `AbstractDifferentiableSolve`.
-    - `active`: the numbers of the leaves to differentiate by, as for `with_slopes`; `None` for the answer alone.
-    - `wanted`: the numbers of the parts of the tree that are to be found, all if `None`; parts that are `None` count.
+    - `active`: indices of the leaves to differentiate by, as for `with_slopes`; `None` for the primal alone.
+    - `wanted`: indices of the parts of the output tree to compute, all if `None`; parts that are `None` count.
     """
 
     question: Any
@@ -35,20 +36,20 @@ class Request:
     wanted: tuple[int, ...] | None = None
 
     def tree(self, cells: int, *leaves: Float[Array, "..."]) -> Any:
-        """The answer of some cells, with its slopes if there are active leaves; a tree of arrays, the cells first."""
+        """The primal of some cells, with its derivatives if there are active leaves; a tree of arrays, the cells first."""
         if self.active is None:
             return self.question.answer(cells, *leaves)
         return self.question.with_slopes(self.active, False, cells, *leaves)
 
     def parts(self, cells: int, *leaves: Float[Array, "..."]) -> list[Array]:
-        """The parts that are wanted and not `None`."""
+        """The wanted parts that are not `None`."""
         found = _flat(self.tree(cells, *leaves))[0]
         kept = found if self.wanted is None else [found[k] for k in self.wanted]
         return [part for part in kept if part is not None]
 
 
 def find(request: Request, *leaves: Float[Array, "..."]) -> Any:
-    """What is found of a single cell, without the axis of cells; under `vmap` the cells are those of one block.
+    """The outputs for a single cell, without the axis of cells; under `vmap` the batch is solved as one ensemble.
 
     **Arguments:** `request`: with all parts wanted; `leaves`: numbers of a single cell.
     """
@@ -64,21 +65,22 @@ def find(request: Request, *leaves: Float[Array, "..."]) -> Any:
 
 @eqx.filter_jit
 def _compiled_tree(question: Any, active: tuple[int, ...] | None, *leaves: Float[Array, "..."]) -> Any:
-    """What is found of a single cell; never run, but JAX remembers its shapes for questions that are equal."""
+    """The outputs for a single cell; never run, but JAX caches their shapes for solves that are equal."""
     return Request(question, active).tree(1, *leaves)
 
 
 def _parts(
     question: Any, active: tuple[int, ...] | None, wanted: tuple[int, ...], cells: int, leaves: list[Array]
 ) -> list[Array]:
-    """`Request.parts` as one program, which serves all questions that are equal, whatever the numbers of the leaves.
+    """`Request.parts` as one program, which serves all solves that are equal, whatever the values of the leaves.
 
-    Outside of `jit` each operation would else be a program of its own, and a loop would be compiled anew in every call.
+    Otherwise, outside of `jit`, each operation would be a program of its own, and every call would compile its loops
+    anew.
     """
     return Request(question, active, wanted).parts(cells, *leaves)
 
 
-#: For one run: that of a hybrid scene compiles in half the time, with a third of the memory and of the mappings (289 for 818),
+#: For one run: a hybrid scene compiles in half the time, with a third of the memory and of the mappings (289 for 818),
 #: and runs as fast; 256 runs at once would take 2.5 times as long.
 _parts_of_one = compiled_quickly(_parts)
 _parts_of_many = compiled_alone(_parts)
@@ -89,15 +91,15 @@ def _flat(tree: Any) -> tuple[list[Any], Any]:
     return jax.tree.flatten(tree, is_leaf=lambda part: part is None)
 
 
-#: The parts that a `Request` wants of a number of cells. `own` says which leaves have a value for each cell, and `kinds` what
-#: the parts of one cell are.
+#: The parts that a `Request` wants of a number of cells. `own` marks the leaves that have a value per cell; `kinds`
+#: holds the shapes and dtypes of the parts of one cell.
 _found = Primitive("found_in_block")
 _found.multiple_results = True
 
 
 @_found.def_impl
 def _run(*leaves: Array, request: Request, cells: int, own: Any, kinds: Any) -> list[Array]:
-    # Numbers of Python would be part of the program.
+    # Python numbers would become part of the program.
     arrays = [leaf if isinstance(leaf, jax.Array) else jax.device_put(np.asarray(leaf)) for leaf in leaves]
     compiled = _parts_of_one if cells == 1 else _parts_of_many
     return compiled(request.question, request.active, request.wanted, cells, arrays)
@@ -118,7 +120,7 @@ mlir.register_lowering(_found, mlir.lower_fun(_traced, multiple_results=True))
 def _batched(
     leaves: tuple[Array, ...], axes: Any, *, request: Request, cells: int, own: tuple[bool, ...], kinds: Any
 ) -> tuple[list[Array], list[int]]:
-    """A batch of blocks is one block."""
+    """Merge a batch of ensembles into one ensemble."""
     size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
     if size == 0:
         return [jnp.zeros((0, cells, *kind.shape), kind.dtype) for kind in kinds], [0] * len(kinds)
@@ -139,7 +141,7 @@ batching.primitive_batchers[_found] = _batched
 
 
 def _only_read(read: list[bool], *others: Any) -> tuple[list[bool], Any]:
-    """The operation with the parts that are read."""
+    """The operation restricted to the parts that are used."""
     # Since JAX 0.12 a list of inputs stands between the two.
     equation = others[-1]
     if not any(read):

@@ -1,8 +1,8 @@
-"""Functions rewritten so that a value that several others need is computed only once.
+"""Rewrite functions so that a value with several uses is computed only once.
 
-XLA fuses every result of a function over many lanes with everything that leads to it, and computes what several results
-share again for each. For the derivatives of a field, where nearly everything is shared, that multiplies the work. Here a
-function is split into its operations, and values that are needed again are stored: in levels, each joined into one array
+XLA fuses every result of a function over many lanes with all operations that lead to it, and recomputes shared values
+for each result. For the derivatives of a field, where nearly everything is shared, this multiplies the work. Here a
+function is split into its operations, and values with several uses are stored: in levels, each joined into one array
 followed by a barrier, as in `xla_cpu.stored`.
 """
 
@@ -16,7 +16,7 @@ from jax.extend.core import Literal
 
 from ..xla_cpu import stored
 
-#: A value is stored if computing it anew for every use would cost at least this many more operations.
+#: A value is stored if recomputing it for every use would cost at least this many more operations.
 WORTH_STORING = 2
 
 #: Operations that compute nothing.
@@ -27,7 +27,7 @@ CALLS = ("closed_call", "custom_jvp_call", "custom_vjp_call", "jit", "pjit")
 
 
 class Operation(NamedTuple):
-    """One operation, and the numbers of the values that go into it and come out."""
+    """One operation, and the indices of its input and output values."""
 
     equation: Any
     inputs: tuple[int, ...]
@@ -42,10 +42,10 @@ class Stack(NamedTuple):
 
 
 class Listing:
-    """The operations of a function: equal ones listed once; barriers, and stacks that are taken apart again, left out.
+    """The operations of a function: equal operations listed once; barriers, and stacks that are split again, left out.
 
     - `operations`: in an order in which they can be done.
-    - `given`: number of a value -> the array, for values that are not the result of an operation.
+    - `given`: index of a value -> the array, for values that are not the result of an operation.
     - `kinds`: shape and dtype of every value.
     """
 
@@ -56,7 +56,7 @@ class Listing:
         self._known: dict[Any, Any] = {}
 
     def enter(self, value: Any, key: Any = None) -> int:
-        """The number of a given value; values with the same key are the same."""
+        """The index of an input value; values with the same key are the same."""
         key = ("given", id(value)) if key is None else key
         if key not in self._known:
             self._known[key] = self._new(jnp.shape(value), jnp.result_type(value))
@@ -66,7 +66,7 @@ class Listing:
     def follow(self, jaxpr: Any, constants: list[Any], arguments: list[Any]) -> list[Any]:
         """List a function's operations.
 
-        **Returns:** for each of its results the number of a value, or a `Stack`.
+        **Returns:** for each result the index of a value, or a `Stack`.
         """
         seen = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
 
@@ -92,7 +92,7 @@ class Listing:
         return [read(variable) for variable in jaxpr.outvars]
 
     def joined(self, value: Any) -> int:
-        """The number of a value, a stack put together if it is one."""
+        """The index of a value; a stack is joined first."""
         if not isinstance(value, Stack):
             return value
         return self._listed(value.equation, [self.joined(part) for part in value.parts])[0]
@@ -113,7 +113,7 @@ class Listing:
 
 
 def sharing_values(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function, with the values that several others need computed once.
+    """Rewrite a function so that values with several uses are computed once.
 
     **Arguments:**
 
@@ -132,10 +132,10 @@ def sharing_values(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _evaluated(listing: Listing, results: list[int]) -> list[Any]:
-    """The values with the given numbers, computed level by level."""
+    """The values with the given indices, computed level by level."""
     operations = _needed(listing.operations, results)
     uses = Counter([*results, *(value for one in operations for value in set(one.inputs))])
-    #: Of every value: what computing it anew would cost, and after how many levels of stored values it can be.
+    #: For every value: the cost of recomputing it, and the number of levels of stored values that must precede it.
     costs: Counter[int] = Counter()
     depths: Counter[int] = Counter()
     levels: list[tuple[list[Operation], list[int]]] = [([], [])]
@@ -164,7 +164,7 @@ def _evaluated(listing: Listing, results: list[int]) -> list[Any]:
 
 
 def _needed(operations: list[Operation], results: list[int]) -> list[Operation]:
-    """The operations that lead to some values."""
+    """The operations that some values depend on."""
     needed, kept = set(results), []
     for operation in reversed(operations):
         if not needed.isdisjoint(operation.outputs):

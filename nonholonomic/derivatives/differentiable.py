@@ -1,8 +1,7 @@
-"""Answers with their own derivatives: functions of scalars for `jit`, `vmap`, `grad`, `jvp` and their compositions.
+"""Solves with their own derivative rules: functions of scalars for `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
-A run is not differentiated operation by operation. A question finds its answer together with the answer's
-slopes by some of the parameters (forwards or backwards), and JAX gets what it asks for from these.
-A batch of answers, as `vmap` asks for, is found as the cells of one block.
+A run is not differentiated operation by operation. A solve returns its primal together with the derivatives by some of
+the parameters (forward or adjoint), and JAX's rules combine these. A batch under `vmap` is solved as one ensemble.
 """
 
 import abc
@@ -21,51 +20,51 @@ from ._batched_primitive import Request, find
 from .slopes import tangents_of
 from .variation import tangent_scale
 
-#: An answer: arrays of floats, the cells along the first axis.
+#: The primal output of a solve: arrays of floats, the cells along the first axis.
 Answer = Any
 
 
 class AbstractDifferentiableSolve(eqx.Module):
-    """What is asked of a run, as a function of `leaves`, of which the first `movable` can be differentiated by."""
+    """A solve as a function of `leaves`; the first `movable` leaves are differentiable."""
 
-    #: Whether a batch is run as the cells of one block; otherwise each run is separate, with a single cell.
+    #: Whether a batch is run as one ensemble; otherwise each run is separate, with a single cell.
     in_blocks: ClassVar[bool] = True
 
     movable: eqx.AbstractVar[int]
 
     @abc.abstractmethod
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
-        """Where an entry of the answer means "none", such as an infinite time: its derivative is 0 there."""
+        """Where an entry of the primal means "none", such as an infinite time: its derivative is 0 there."""
 
     @abc.abstractmethod
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Answer:
-        """The answer in every cell; a number is a scalar or one per cell."""
+        """The primal in every cell; each leaf is a scalar or has one number per cell."""
 
     @abc.abstractmethod
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Answer, list[Answer]]:
-        """The answer, and its slope by each active leaf: shaped like the answer, with the leaf's own axes behind; a part of
-        the answer that is not to be differentiated has `None` for its slope.
+        """The primal and its derivative by each active leaf, shaped like the primal with the leaf's own axes last;
+        `None` for a part of the primal that is not differentiable.
 
-        **Arguments:** `active`: which leaves; `again`: whether what is found will be differentiated once more, forwards;
-        `cells`, `leaves`: as for `answer`.
+        **Arguments:** `active`: which leaves; `again`: whether the outputs will be differentiated once more, in forward
+        mode; `cells`, `leaves`: as for `answer`.
         """
 
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
-        """A question that may leave out (as `None`) all but some parts of what is found; by default it leaves out none.
+        """A solve that may omit (as `None`) all outputs but some; by default it omits none.
 
-        **Arguments:** `wanted`: numbers of parts of the answer, or of the answer and its slopes, one after the other.
+        **Arguments:** `wanted`: indices into the parts of the primal, or of the primal followed by its derivatives.
         """
         return self
 
 
 def differentiable_solve(question: AbstractDifferentiableSolve, *leaves: Float[Array, "..."]) -> Answer:
-    """The answer for one run. Where it is absent its derivative is 0, whatever is done with it afterwards.
+    """Solve for one member. Where there is no event the derivative is zero, whatever the cotangent.
 
-    **Arguments:** `leaves`: the numbers, as the question takes them for a single cell.
+    **Arguments:** `leaves`: the numbers of a single cell, in the order of the solve.
 
-    **Returns:** the answer, without the axis of cells.
+    **Returns:** the primal, without the axis of cells.
     """
 
     @jax.custom_jvp
@@ -81,14 +80,16 @@ def differentiable_solve(question: AbstractDifferentiableSolve, *leaves: Float[A
             return answer, jax.tree.map(jnp.zeros_like, answer)
         answer, slopes = _with_slopes(question, active)(*leaves)
         moved = [tangents[i] for i in active]
-        # Slopes have `None` where the answer has an array that is not differentiated.
+        # Derivatives are `None` where the primal has an array that is not differentiated.
         return answer, jax.tree.map(lambda value, *by: _change(question, value, by, moved), answer, *slopes)
 
     return found(*_canonical(leaves))
 
 
 def _canonical(leaves: tuple[Any, ...]) -> list[Any]:
-    """Leaves that a function with a rule of its own takes inside `jit`: JAX refuses the NumPy arrays that `vmap` hands on."""
+    """Convert the leaves for a function with its own rule inside `jit`: JAX rejects the NumPy arrays that `vmap` passes
+    on.
+    """
     return [jnp.array(leaf) if is_traced(leaf) else leaf for leaf in leaves]
 
 
@@ -98,10 +99,11 @@ def _change(question: AbstractDifferentiableSolve, value: Array, slopes: tuple[A
     none = question.absent(value)
 
     def share(slope: Array, tangent: Array) -> Array:
-        # Selected before and after, so that an infinite tangent or cotangent of an absent answer is dropped, not multiplied.
+        # Selected before and after, so that an infinite tangent or cotangent of an absent output is dropped, not
+        # multiplied.
         kept = jnp.where(jnp.all(none), 0.0, tangent)
         product = slope * kept
-        # Where the answer does not move, a cotangent that is not a number, such as that of theta at the pole, says nothing.
+        # Where the derivative is zero, a NaN cotangent, such as that of theta at the pole, has no effect.
         product = jnp.where(slope == 0.0, 0.0, product).sum(axis=tuple(range(jnp.ndim(value), jnp.ndim(product))))
         return jnp.where(none, 0.0, product)
 
@@ -111,7 +113,7 @@ def _change(question: AbstractDifferentiableSolve, value: Array, slopes: tuple[A
 def _with_slopes(
     question: AbstractDifferentiableSolve, active: tuple[int, ...]
 ) -> Callable[..., tuple[Answer, list[Answer]]]:
-    """Answer and slopes of one run, which can be differentiated once more."""
+    """Primal and derivatives of one run, which can be differentiated once more."""
 
     @jax.custom_jvp
     def found(*leaves):
@@ -119,7 +121,7 @@ def _with_slopes(
 
     @found.defjvp
     def second_variation(leaves, tangents):
-        # Differentiated operation by operation, which those of a block are not.
+        # Differentiated operation by operation; the ensemble solve does not allow this.
         return jax.jvp(functools.partial(_again, question, active), leaves, tangents)
 
     return found
@@ -128,12 +130,12 @@ def _with_slopes(
 # Compiled as a whole even outside of `jit`.
 @eqx.filter_jit
 def _again(question: AbstractDifferentiableSolve, active: tuple[int, ...], *leaves: Float[Array, "..."]) -> Any:
-    """Answer and slopes of one run as operations that can be differentiated."""
+    """Primal and derivatives of one run as differentiable operations."""
     return _only(question.with_slopes(active, True, 1, *leaves))
 
 
 def _of_one(request: Request, *leaves: Float[Array, "..."]) -> Any:
-    """What is found of one run."""
+    """The outputs for one run."""
     return find(request, *leaves) if request.question.in_blocks else _only(request.tree(1, *leaves))
 
 
@@ -147,16 +149,16 @@ def tangents_by(
     leaves: tuple[Array, ...],
     cells: int | None,
 ) -> tuple[Any, tuple[Any, ...], Callable[[list[Answer]], list[Answer]]]:
-    """A problem and its directions along leaves, each of which changes a leaf in proportion to its own size.
+    """Build a problem and its tangents along leaves, each scaled by the leaf's own size.
 
     **Arguments:**
 
     - `build`: (leaves, cells) -> problem.
-    - `active`, `leaves`: along which of the leaves. With `cells` they are scalars or one per cell; without, arrays of any
-      shape, each of whose entries has a direction of its own.
+    - `active`, `leaves`: the leaves, and which of them to move. With `cells` they are scalars or one per cell; without,
+      arrays of any shape, each entry of which has its own tangent.
 
-    **Returns:** the problem; its directions; and a function that turns slopes along the directions (trees of arrays)
-    into slopes by each leaf, the leaf's own axes behind (with `cells` there are none, and the cells come first).
+    **Returns:** the problem; its tangents; and a function that turns derivatives along the tangents (trees of arrays)
+    into derivatives by each leaf, the leaf's own axes last (with `cells` there are none, and the cells come first).
     """
 
     def moved(*moving: Array) -> Any:
@@ -197,10 +199,10 @@ def tangents_by(
 
 
 def _by_entries(size: Array, *parts: Array) -> Array:
-    """Slopes along the entries of a leaf, as slopes by the leaf, with its axes last."""
+    """Convert derivatives along the entries of a leaf to derivatives by the leaf, with its axes last."""
     return jnp.stack(parts, axis=-1).reshape(*parts[0].shape, *size.shape) / size
 
 
 def _by_cells(size: Array, part: Array) -> Array:
-    """Slopes along a leaf, as slopes by the leaf, which is one for all cells or one for each."""
+    """Convert derivatives along a leaf to derivatives by the leaf, which is one for all cells or one per cell."""
     return part / size.reshape((-1,) + (1,) * (part.ndim - 1))

@@ -1,9 +1,9 @@
 """The largest Lyapunov exponent of a problem: the mean rate at which nearby runs diverge, by the variational equation.
 
-A direction w is integrated along with the state y' = f(y). It is kept at unit length while it follows the linearised motion
-(Benettin et al., Meccanica 15 (1980) 9, with the renormalisation made continuous), and what the renormalisation removes
-is added up: w' = J w - g w, g = (w . J w) / (w . w), growth' = g, where J w is a Jacobian-vector product of f. Directions
-and lengths are those of the state in units of the problem's magnitudes.
+A tangent w is integrated along with the state y' = f(y). It is kept at unit length while it follows the linearised
+motion (Benettin et al., Meccanica 15 (1980) 9, with the renormalisation made continuous), and the logarithm removed by
+the renormalisation is added up: w' = J w - g w, g = (w . J w) / (w . w), growth' = g, where J w is a Jacobian-vector
+product of f. Tangents and lengths are those of the state in units of the problem's magnitudes.
 """
 
 import math
@@ -19,12 +19,12 @@ from ..progress import Progress
 
 
 class VariedProblem(AbstractProblem):
-    """A problem without its event, extended by a direction and the logarithm of its growth.
+    """A problem without its event, extended by a tangent and the logarithm of its growth.
 
     **Arguments:**
 
     - `problem`: an autonomous problem; only its field and its domain margin are used.
-    - `states`: the problem's state, the direction and the growth of every cell.
+    - `states`: the problem's state, the tangent and the growth of every cell.
     - `magnitudes`: of the problem's own components.
     """
 
@@ -52,11 +52,16 @@ class VariedProblem(AbstractProblem):
     ) -> Float[Array, " lanes"] | None:
         return self.problem.domain_margin(time, state[: len(self.magnitudes)])
 
+    def margins(
+        self, time: Float[Array, " lanes"], state: Float[Array, "all lanes"]
+    ) -> tuple[Float[Array, " lanes"], ...]:
+        return self.problem.margins(time, state[: len(self.magnitudes)])
+
 
 def probed(problem: AbstractProblem) -> VariedProblem:
-    """A run and a direction with nothing special about it, for a derivative that does not take part in step control itself.
+    """A run and a generic tangent, for a derivative that does not take part in step-size control itself.
 
-    The direction follows the linearised motion and takes part in step control, so that the steps suit tangents even
+    The tangent follows the linearised motion and takes part in step-size control, so that the steps suit tangents even
     where the state is at rest.
     """
     start, magnitudes = problem.start()
@@ -68,11 +73,11 @@ def probed(problem: AbstractProblem) -> VariedProblem:
 
 
 class Growth(NamedTuple):
-    """How a direction grew in every cell, in equal stretches of time.
+    """Growth of a tangent in every cell, in equal intervals of time.
 
-    - `logarithm`: of the growth in each stretch.
-    - `status`: code of `integration/status.py`: how the run ended; `end_time` [s] and `state`: when and where;
-      `steps`: accepted and rejected ones.
+    - `logarithm`: of the growth in each interval.
+    - `status`: code of `integration/status.py`: how the run ended; `end_time` [s] and `state`: when and where; `steps`:
+      accepted and rejected ones.
     """
 
     logarithm: Float[np.ndarray, "stretches cells"]
@@ -89,14 +94,14 @@ def growth(
     stretches: int,
     settings: Settings,
 ) -> Growth:
-    """Follow every cell of an autonomous problem and a direction in it.
+    """Integrate every cell of an autonomous problem together with a tangent.
 
     **Arguments:**
 
     - `problem`: as for `ensemble_solve`.
-    - `tangents`: to follow, in the problem's own units.
+    - `tangents`: in the problem's own units.
     - `t1`: horizon [s].
-    - `stretches`: of time, in each of which the growth is counted by itself.
+    - `stretches`: number of time intervals; the growth is returned for each.
     - `settings`: with an explicit Runge-Kutta solver of Diffrax.
 
     **Returns:** the `Growth`; nothing grows in a cell after its run has ended.
@@ -118,7 +123,7 @@ def growth(
             status = np.where(alive, outcome.status, status)
             start, direction = outcome.state[:size], outcome.state[size:-1]
             state = np.where(alive, start, state)
-            # The first one compiles.
+            # The first interval compiles.
             if number == 0:
                 shown.begin(1)
             else:
@@ -129,16 +134,16 @@ def growth(
 def exponent_of(
     logarithm: Float[np.ndarray, "stretches cells"], t1: float
 ) -> tuple[Float[np.ndarray, " cells"], Float[np.ndarray, " cells"]]:
-    """The exponent that a growth shows, and its error.
+    """Estimate the exponent and its error from the growth.
 
-    The first half of the run is left out: there the direction still turns to that of fastest growth. The error has two parts:
-    the scatter of the other half's stretches, in groups of 1, 2 and 4 and that of the last three quarters, the greatest
-    counting, because chaotic motion lingers near orderly motion (Flyvbjerg and Petersen, J. Chem. Phys. 91 (1989) 461); and
-    ln 2 over half the run, which is what the linear divergence of orderly motion adds. An exponent below twice its error is
-    no sign of chaos. Where motion lingers for long, the error is too small by a factor of up to four
-    (`tests/tippe/test_lyapunov.py`).
+    The first half of the run is left out: there the tangent still turns towards the direction of fastest growth. The
+    error has two parts: the scatter of the other half's intervals, in groups of 1, 2 and 4, and that of the last three
+    quarters, whichever is largest, because chaotic motion lingers near orderly motion (Flyvbjerg and Petersen, J. Chem.
+    Phys. 91 (1989) 461); and ln 2 over half the run, the share of the linear divergence of orderly motion. An exponent
+    below twice its error is no sign of chaos. Where motion lingers for long, the error is too small by a factor of up
+    to four (`tests/tippe/test_lyapunov.py`).
 
-    **Arguments:** `logarithm`: as in `Growth`, the stretches a multiple of 8; `t1`: time [s] that it spans.
+    **Arguments:** `logarithm`: as in `Growth`, the number of intervals a multiple of 8; `t1`: time [s] that it spans.
 
     **Returns:** exponent and error [1/s].
     """

@@ -27,16 +27,16 @@ from .lyapunov import probed
 from .sampling import AbstractSampling, ProblemSpec, solve_for_samples
 from .variation import VariationalProblem, in_groups
 
-#: From some modules (scene, launch, ...) and a number of cells, `None` for a single run, to the problem.
+#: Build a problem from some modules (scene, launch, ...) and a number of cells, `None` for a single run.
 Build = Callable[[Any, int | None], AbstractProblem]
 
 
 class SampledRun(NamedTuple):
-    """A run at given times, all floats: its states, NaN after its end; when and where it ended, the code of how
-    (`REACHED_END`, `LEFT_DOMAIN` or `FAILED`), and how many steps were accepted and rejected.
+    """A run at given times, all floats: its states, NaN after its end; when and where it ended, the status code
+    (`REACHED_END`, `LEFT_DOMAIN` or `FAILED`), and the numbers of accepted and rejected steps.
 
-    `states` and `end_state` are those components on which the problem's `leading` ones depend, `riding` the others, `None` if
-    there are none. If a program reads `riding` nowhere, its blocks run without.
+    `states` and `end_state` are the core components (the problem's `leading` ones), `riding` the passive quadratures,
+    `None` if there are none. If a program does not use `riding`, the ensemble runs without it.
     """
 
     states: Float[Array, "*cells times components"]
@@ -56,15 +56,15 @@ def sampled_run(
     settings: Settings,
     grid: Float[Array, " steps"] | None = None,
 ) -> SampledRun:
-    """Run a problem inside a transformation and sample it, with derivatives that take part in step control.
+    """Run a problem inside a transformation and sample it, with derivatives that take part in step-size control.
 
-    An explicit Runge-Kutta solver uses the block of lanes, one for each run of a batch, if every number of the modules is a
-    scalar; all else runs by Diffrax.
+    With an explicit Runge-Kutta solver and scalar modules, a batch is solved as one ensemble, one lane per run;
+    otherwise Diffrax integrates each run.
 
     **Arguments:**
 
-    - `build`: makes the problem from the modules; compared by identity, so it should not be made anew for each call.
-    - `modules`: the tree whose numbers can be differentiated by.
+    - `build`: makes the problem from the modules; compared by identity, so do not create a new function for each call.
+    - `modules`: the tree whose numbers are differentiable.
     - `times`: of the samples [s], growing; `t1`: horizon [s].
     - `settings`: the tolerance may be traced.
     - `grid`: the ends of the steps [s], concrete, for a solver without an error estimate.
@@ -74,7 +74,7 @@ def sampled_run(
     scalars = all(leaf.ndim == 0 for leaf in jax.tree.leaves(modules) if eqx.is_inexact_array(leaf))
     kind = BlockSampling if scalars and isinstance(settings.for_lanes, diffrax.AbstractERK) else SingleSampling
     found = solve_for_samples(kind, build, modules, jax.lax.stop_gradient(times), t1, settings, grid)
-    # One by one: what a custom derivative is given counts as read.
+    # Separate calls: all arguments of a custom derivative count as used.
     states = _at_times(found.states, None, times, modules, build)
     riding = None if found.riding is None else _at_times(found.riding, found.states, times, modules, build)
     return found._replace(states=states, riding=riding)
@@ -88,8 +88,9 @@ def _at_times(
     modules: Any,
     build: Build,
 ) -> Float[Array, "times rows"]:
-    """The samples themselves, which a small delay of their times moves along the field: those of the leading components, or,
-    where these are given too, of those that ride along."""
+    """The samples themselves, shifted along the field by a variation of their times: the core components, or, where
+    these are passed too, the passive quadratures.
+    """
     return samples
 
 
@@ -107,16 +108,16 @@ def _later(primals: Any, tangents: Any) -> Any:
 
 
 def core_problem(problem: AbstractProblem) -> AbstractProblem:
-    """A problem without what rides along."""
+    """A problem without its passive quadratures."""
     return problem if problem.leading is None else CoreProblem(problem, problem.leading)
 
 
-#: Samples of the leading components and of those that ride along, `None` without these.
+#: Samples of the core components and of the passive quadratures, `None` without these.
 Samples = tuple[Float[Array, "*cells times components"], Float[Array, "*cells times riders"] | None]
 
 
 def parted(problem: AbstractProblem, states: Float[Array, "*cells times components"]) -> Samples:
-    """The leading components, and those that ride along."""
+    """Split states into the core components and the passive quadratures."""
     if problem.leading is None:
         return states, None
     return states[..., : problem.leading], states[..., problem.leading :]
@@ -132,7 +133,7 @@ def sampled_run_by_diffrax(
 ) -> SampledRun:
     """Run a problem and let Diffrax differentiate its steps, which a probe keeps short enough for tangents.
 
-    Steps that are given need no probe.
+    Fixed steps (`grid`) need no probe.
 
     **Arguments:** as for `sampled_run`; `adjoint`: how Diffrax differentiates.
     """
@@ -146,12 +147,12 @@ def sampled_run_by_diffrax(
 
 
 def _status(path: SampledSolution, t1: Float[Array, ""]) -> Int[Array, ""]:
-    """The code of how a single run ended."""
+    """The status code of a single run."""
     return jnp.where(path.lost, LEFT_DOMAIN, jnp.where(path.end_time < t1, FAILED, REACHED_END))
 
 
 class BlockSampling(AbstractSampling):
-    """Samples by the block of lanes, with what rides along or `alone`."""
+    """Samples by an ensemble solve, with the passive quadratures or without (`alone`)."""
 
     movable: int
     spec: ProblemSpec
@@ -194,14 +195,14 @@ class BlockSampling(AbstractSampling):
 def _march(
     varied: VariationalProblem, given: tuple[Array, Array, Array], settings: Settings, one_kernel: bool = True
 ) -> tuple[SampledRun, list[SampledRun]]:
-    """What is found of the cells, and its slope along each of the directions."""
+    """The samples of the cells, and their derivative along each tangent."""
     times, t1, tolerance = given
     outcome, samples = solve_with_samples(
         varied,
         times if times.ndim == 1 else times.T,
         t1,
         jnp.asarray(varied.problem.start()[0].shape[1]),
-        # One tolerance serves a block: the smallest of a batch.
+        # One tolerance serves the whole ensemble: the smallest of the batch.
         settings.with_tolerance(jnp.min(tolerance)),
         parts=1 + len(varied.tangents),
         one_kernel=one_kernel,
@@ -216,7 +217,7 @@ def _found(
     ends: tuple[Float[Array, "*cells"], Float[Array, "components *cells"], Int[Array, "*cells"]],
     counts: tuple[Int[Array, "*cells"], Int[Array, "*cells"]],
 ) -> tuple[SampledRun, list[SampledRun]]:
-    """What is found, and its slope along each of the directions, given when, where and how the runs ended."""
+    """The samples and their derivative along each tangent, from when, where and how the runs ended."""
     states, *variations = jnp.split(samples, 1 + len(varied.tangents), axis=-1)
     time, end, status = ends
     end, *end_variations = varied.parts(end)
@@ -269,7 +270,7 @@ class SingleSampling(AbstractSampling):
 def _follow(
     varied: VariationalProblem, given: tuple[Array, Array, Array], spec: ProblemSpec
 ) -> tuple[SampledRun, list[SampledRun]]:
-    """What is found of a run, and its slope along each of the directions."""
+    """The samples of a run, and their derivative along each tangent."""
     times, t1, tolerance = given
     path = sample(varied, times, t1, spec.settings.with_tolerance(tolerance), grid=spec.grid)
     ends = (path.end_time, path.end_state, _status(path, t1))

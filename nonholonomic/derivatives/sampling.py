@@ -1,4 +1,4 @@
-"""Samples of a run as a question: what its leaves are, and how what is run is made of them."""
+"""Samples of a run as a differentiable solve: its leaves, and how they are assembled into a problem."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from .differentiable import AbstractDifferentiableSolve, differentiable_solve
 
 
 class ProblemSpec(eqx.Module):
-    """How what is run is made of numbers, and how it is integrated, all but the tolerance."""
+    """How to build a problem from numbers and how to integrate it, all but the tolerance."""
 
     build: Callable[[Any, Any], Any] = eqx.field(static=True)
     # JAX's PyTreeDef, which type checkers take for a variable.
@@ -24,14 +24,15 @@ class ProblemSpec(eqx.Module):
     grid: Float[Array, " steps"] | None
 
     def made(self, numbers: tuple[Array, ...], given: Any) -> Any:
-        """What is built from the modules with some numbers, and from what else `build` is given."""
+        """Build the problem from the modules with some numbers, and from the extra argument of `build`."""
         return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), self.rest), given)
 
 
 class AbstractSampling(AbstractDifferentiableSolve):
-    """Samples of a run; the leaves are the modules' numbers, the times, the horizon, the tolerance and the recipe's arrays.
+    """Samples of a run; the leaves are the modules' numbers, the times, the horizon, the tolerance and the spec's
+    arrays.
 
-    `spec` is without its arrays, and `places` says where they belong in it.
+    `spec` is without its arrays, and `places` holds their positions in it.
     """
 
     spec: eqx.AbstractVar[ProblemSpec]
@@ -41,7 +42,7 @@ class AbstractSampling(AbstractDifferentiableSolve):
         return jnp.isnan(value)
 
     def _sorted(self, leaves: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array, Array], ProblemSpec]:
-        """The modules' numbers; times, horizon and tolerance; and the whole recipe."""
+        """The modules' numbers; times, horizon and tolerance; and the whole spec."""
         numbers, (times, t1, tolerance, *held) = leaves[: self.movable], leaves[self.movable :]
         return numbers, (times, t1, tolerance), eqx.combine(self.spec, jax.tree.unflatten(self.places, held))
 
@@ -55,10 +56,10 @@ def solve_for_samples(
     settings: Settings,
     grid: Float[Array, " steps"] | None = None,
 ) -> Any:
-    """What a question about samples finds.
+    """Solve for the samples of a run.
 
-    **Arguments:** `question`: makes it of its first three fields; `build`: from modules and what the question adds to what is
-    run, compared by identity; the others as for `sampled_run`.
+    **Arguments:** `question`: builds the solve from its first three fields; `build`: builds the problem from the
+    modules and an extra argument of the solve, compared by identity; the others as for `sampled_run`.
     """
     numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(numbers)

@@ -1,7 +1,7 @@
-"""Derivatives of the event times of many cells along directions in which the numbers of a problem move.
+"""Derivatives of the event times of many cells along tangents of a problem.
 
-Up to `MOST_FORWARD` directions are integrated forward, as variations beside the run (`variation.py`); more of them take one
-backward pass of every run (`_adjoint.py`).
+Up to `MOST_FORWARD` tangents are integrated forward, as variations beside the run (`variation.py`); more of them take
+one backward pass of every run (`_adjoint.py`).
 """
 
 import math
@@ -29,9 +29,10 @@ from ..xla_cpu import compiled_alone
 from ._adjoint import solve_with_adjoint
 from .variation import VariationalProblem, in_groups, slopes_by_variations
 
-#: Up to this many directions are integrated forward, in pairs. Cost in tables of the same launches, at 1e-8, by 2, 3, 4 and 6
-#: numbers, forward and backward: on the plane 5.0, 7.3, 8.4, 15 and 7.8, 13, 7.4, 7.6 (jax 0.10) or 4.6, 6.9, 8.4, 14 and
-#: 8.5, 11, 10, 11 (jax 0.12); in a cylinder 5.2, 8.5, 9.5, 16 and 9.4, 12, 10, 12 (jax 0.10). By one number: 2.8.
+#: Up to this many tangents are integrated forward, in pairs. Cost in tables of the same launches, at 1e-8, by 2, 3, 4
+#: and 6 numbers, forward and backward: on the plane 5.0, 7.3, 8.4, 15 and 7.8, 13, 7.4, 7.6 (jax 0.10) or 4.6, 6.9,
+#: 8.4, 14 and 8.5, 11, 10, 11 (jax 0.12); in a cylinder 5.2, 8.5, 9.5, 16 and 9.4, 12, 10, 12 (jax 0.10). By one
+#: number: 2.8.
 MOST_FORWARD = 4
 
 
@@ -45,23 +46,23 @@ def ensemble_solve_with_tangents(
     passes: bool = False,
     one_kernel: bool = False,
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
-    """Run every cell, and differentiate the time of its event in some directions.
+    """Run every cell, and differentiate the time of its event along some tangents.
 
     **Arguments:** as for `ensemble_solve`, and
 
-    - `tangents`: tangents of the problem, as for `VariationalProblem`. Their variations, or a mixture of them, take part in
-      step control.
-    - `one_kernel`: as for `ensemble_solve`. Without it, so that the result can be differentiated again, runs are not taken
-      back: variations run along, whatever the number of directions.
+    - `tangents`: of the problem, as for `VariationalProblem`. Their variations, or a mixture of them, take part in
+      step-size control.
+    - `one_kernel`: as for `ensemble_solve`. Without it, so that the result can be differentiated again, there is no
+      backward pass: all tangents are integrated forward, whatever their number.
 
-    **Returns:** the `Outcome`, and for each direction the derivative of `crossing_time`, 0 where that is infinite. Source:
-    implicit function theorem at the event; step lengths are held fixed.
+    **Returns:** the `Outcome`, and for each tangent the derivative of `crossing_time`, 0 where that is infinite.
+    Source: implicit function theorem at the event; step lengths are held fixed.
     """
     horizon = t1
     if passes:
         whole = LaneScheduler.of(problem, t1, cells, settings, passes=True, one_kernel=one_kernel)
         outcome = whole.outcome()[0]
-        # The slopes need the run up to the event alone, whose time is known by now.
+        # The derivatives need the run only up to the event, whose time is now known.
         horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
     given = (not passes, horizon, cells, settings)
 
@@ -74,9 +75,9 @@ def ensemble_solve_with_tangents(
         there, slopes = in_groups(along, tangents)
     if not passes:
         outcome = with_crossing_times(problem, there)
-    # At the very start the event is there at once, whatever moves.
+    # An event at the start has a fixed time, whatever the tangent.
     happened = jnp.isfinite(outcome.crossing_time) & (there.end_time > 0.0)
-    # The run with its variations takes other steps: where it does not arrive, there is no slope.
+    # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
     arrived = there.status == (REACHED_END if passes else CROSSED)
     return outcome, [jnp.where(happened, jnp.where(arrived, slope, jnp.nan), 0.0) for slope in slopes]
 
@@ -84,9 +85,9 @@ def ensemble_solve_with_tangents(
 def _slopes_by_adjoint(
     problem: AbstractProblem, tangents: tuple[Any, ...], ends_on_event: bool, *given: Any
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
-    """What `slopes_by_variations` gives, at a cost that does not depend on the number of directions."""
+    """The result of `slopes_by_variations`, at a cost that does not depend on the number of tangents."""
     moving = _moving(problem, tangents[0])
-    # Without directions it is the problem itself, which can be told not to end on its event.
+    # Without tangents this is the problem itself, with the choice not to end on its event.
     there, by_start, by_number = solve_with_adjoint(
         VariationalProblem(problem, (), ends_on_event),
         VariationalProblem(moving, (), ends_on_event),
@@ -108,15 +109,16 @@ def _slopes_by_adjoint(
 
 
 def _mixed(tangents: tuple[Any, ...]) -> Any:
-    """A direction in which all of some directions have a share, by shares that are not likely to cancel."""
+    """A mixture of some tangents, with shares that are unlikely to cancel."""
     shares = [0.5 + math.modf(0.618 * k)[0] for k in range(len(tangents))]
     return jax.tree.map(lambda *rates: sum(c * rate for c, rate in zip(shares, rates, strict=True)), *tangents)
 
 
 def _event_time(varied: VariationalProblem, lane_state: LaneState) -> Float[Array, " lanes"]:
-    """When the event function vanishes, for a block that has ended there (implicit function theorem).
+    """Zero of the event function for lanes that have ended on the event (implicit function theorem).
 
-    To first order, unlike `crossing_time`: the event is located to 1e-10 of a step, and its time is not differentiated again.
+    First order, unlike `crossing_time`: the event is located to 1e-10 of a step, and its time is not differentiated
+    again.
     """
     crossing, rate = varied.problem.event_function, varied.problem.field(lane_state.time, lane_state.state)
     fall = stop_gradient(jax.jvp(crossing, (stop_gradient(lane_state.state),), (rate,))[1])
@@ -124,7 +126,7 @@ def _event_time(varied: VariationalProblem, lane_state: LaneState) -> Float[Arra
 
 
 def _moving(problem: AbstractProblem, direction: Any) -> Any:
-    """Which numbers of a problem a direction moves, of those on which the field or the event depends."""
+    """Which leaves a tangent moves, of those on which the field or the event function depends."""
     leaves, structure = jax.tree.flatten(problem)
     states = problem.start()[0]
 
@@ -156,10 +158,10 @@ def tangents_of(
     **Arguments:**
 
     - `build`: numbers -> problem.
-    - `numbers`: what it is built from, arrays.
-    - `tangents`: for each direction the rate at which each number moves.
+    - `numbers`: the arguments of `build`, arrays.
+    - `tangents`: each with the rates at which the numbers move.
 
-    **Returns:** for each direction the tangent of the problem, `None` for what depends on no number.
+    **Returns:** for each tangent that of the problem, `None` for leaves that depend on no number.
     """
 
     def built(*numbers: Any) -> Any:

@@ -1,7 +1,7 @@
-"""First derivatives of event times along a direction or two: the variations of the state run along with it.
+"""First derivatives of event times along one or two tangents: the variations of the state are integrated along with it.
 
-A problem and its variations are one problem with a longer state, so that they run through the same loop as the problem
-alone; differentiating the loop as a whole costs several times as much. For many directions see `_adjoint.py`.
+A problem and its variations are one problem with a longer state, and run through the same loop as the problem alone;
+differentiating the loop as a whole costs several times as much. For many tangents see `_adjoint.py`.
 """
 
 import operator
@@ -15,22 +15,22 @@ from jaxtyping import Array, Float
 
 from ..integration import AbstractProblem, LaneScheduler, Outcome, crossing_time
 
-#: Directions that run along together: two take 0.6 to 1.0 times as long as one after the other, and compile for an eighth
-#: longer; four take 1.1 times as long as two twice.
+#: Tangents integrated together: two take 0.6 to 1.0 times as long as one after the other, and compile for an eighth
+#: longer; four take 1.1 times as long as two pairs.
 TOGETHER = 2
 
 
 def tangent_scale(number: Float[Array, "..."]) -> Float[Array, "..."]:
-    """By how much to move a number: by its own size, or by 1 where it is zero."""
+    """The scale of a number's tangent: its own size, or 1 where it is zero."""
     return jax.lax.stop_gradient(jnp.where(number == 0.0, 1.0, jnp.abs(number)))
 
 
 class VariationalProblem(AbstractProblem):
-    """A problem and its first variation in each of some directions, the variations stacked behind the state.
+    """A problem and its first variation along each of some tangents, the variations stacked behind the state.
 
-    A direction is a tangent of the problem: the same tree, with the rate at which each number moves, `None` where none of
-    the directions moves it. A variation's absolute tolerance is that of the state, so a direction should move a number by
-    about its own size (`tangent_scale`).
+    A tangent of the problem is the same tree, with the rate at which each number moves, `None` where no tangent moves
+    it. A variation's absolute tolerance is that of the state, so a tangent should move a number by about its own size
+    (`tangent_scale`).
     """
 
     problem: AbstractProblem
@@ -64,7 +64,7 @@ class VariationalProblem(AbstractProblem):
         def rate(moving: Any, at: Float[Array, "components lanes"]) -> Float[Array, "components lanes"]:
             return eqx.combine(moving, self.problem).field(time, at)
 
-        # Linearised once: the rate is computed once, and the directions share what their changes have in common.
+        # Linearised once: the rate is computed once, and the tangents share common subexpressions.
         here, change = jax.linearize(rate, moving, at)
         return jnp.concatenate([here, *(change(*moved) for moved in zip(self.tangents, variations, strict=True))])
 
@@ -74,6 +74,9 @@ class VariationalProblem(AbstractProblem):
     def domain_margin(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
         return self.problem.domain_margin(time, self.parts(state)[0])
 
+    def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.problem.margins(time, self.parts(state)[0])
+
     def parts(self, state: Float[Array, "components ..."]) -> list[Float[Array, "components ..."]]:
         """The state and its variations."""
         return jnp.split(state, 1 + len(self.tangents)) if self.tangents else [state]
@@ -82,7 +85,7 @@ class VariationalProblem(AbstractProblem):
 def slopes_by_variations(
     problem: AbstractProblem, tangents: tuple[Any, ...], ends_on_event: bool, *given: Any, one_kernel: bool
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
-    """Run every cell with its variations, and let them move the event at its end.
+    """Run every cell with its variations, and differentiate the time of the event at its end.
 
     **Arguments:**
 
@@ -90,11 +93,11 @@ def slopes_by_variations(
     - `ends_on_event`: whether runs end on the event, or at the horizon, which is then the event's time.
     - `given`, `one_kernel`: horizon, number of cells and settings, as for `LaneScheduler.of`.
 
-    **Returns:** the `Outcome`, with crossing times left out, and for each direction the derivative of the event's time.
+    **Returns:** the `Outcome`, without crossing times, and for each tangent the derivative of the event's time.
     """
     varied = VariationalProblem(problem, tangents, ends_on_event)
-    # The variations take part in step control: the state alone may be at rest where its tangent is not, and steps would
-    # outgrow what the tangent can bear.
+    # The variations take part in step-size control: the state alone may be at rest where its tangent is not, and the
+    # steps would grow too long for the tangent.
     there, _ = LaneScheduler.of(varied, *given, parts=1 + len(tangents), one_kernel=one_kernel).outcome()
     state, *variations = varied.parts(there.state)
 
@@ -108,19 +111,18 @@ def slopes_by_variations(
 
 
 def in_groups(run: Callable[..., tuple[Any, list[Any]]], tangents: tuple[Any, ...]) -> tuple[Any, list[Any]]:
-    """What `run` finds along many directions, `TOGETHER` of them at a time by one program.
+    """Apply `run` to many tangents, `TOGETHER` at a time, with one program.
 
     **Arguments:**
 
-    - `run`: a tuple of `TOGETHER` directions, or of fewer if there are no more -> a result that does not depend on them, and
-      a slope for each.
+    - `run`: a tuple of at most `TOGETHER` tangents -> a result that does not depend on them, and a derivative for each.
     - `tangents`: any number of them.
 
-    **Returns:** the result, and the slopes.
+    **Returns:** the result, and the derivatives.
     """
     if len(tangents) <= TOGETHER:
         return run(tangents)
-    # The last group is filled with directions that lead nowhere.
+    # The last group is padded with zero tangents.
     empty = -len(tangents) % TOGETHER
     padded = [*tangents, *[jax.tree.map(jnp.zeros_like, tangents[0])] * empty]
     stacked = [jax.tree.map(lambda *rates: jnp.stack(rates), *padded[k::TOGETHER]) for k in range(TOGETHER)]
@@ -131,7 +133,7 @@ def in_groups(run: Callable[..., tuple[Any, list[Any]]], tangents: tuple[Any, ..
 
 
 def where_active(problem: Any, direction: Any) -> Any:
-    """The numbers of a problem that a direction moves, `None` for the others."""
+    """The numbers of a problem that a tangent moves, `None` for the others."""
 
     def moved(rate: Any, number: Any) -> Any:
         return None if rate is None else number

@@ -66,6 +66,9 @@ class Clocked(AbstractProblem):
     def domain_margin(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
         return self.problem.domain_margin(time, state[:-1])
 
+    def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
+        return self.problem.margins(time, state[:-1])
+
 
 def with_row(state: Float[Array, "components cells"], row: Float[Array, " cells"]) -> Float[Array, "more cells"]:
     """A state with one more component."""

@@ -28,7 +28,8 @@ from .runge_kutta import Step as Step
 from .runge_kutta import explicit_tableau as explicit_tableau
 from .runge_kutta import moved_state as moved_state
 from .runge_kutta import over_stages as over_stages
-from .runge_kutta import places_to_look as places_to_look
+from .runge_kutta import stages_to_look as stages_to_look
+from .runge_kutta import watched_places as watched_places
 from .samples import solve_with_samples as solve_with_samples
 from .scheduler import LaneScheduler as LaneScheduler
 from .scheduler import Outcome as Outcome

@@ -3,24 +3,17 @@
 So the event has the accuracy of the method, and not that of an interpolation.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from .runge_kutta import Lanes, States, Step
+from .runge_kutta import Lanes
 
 #: An event is located once the next trial would differ by less than this fraction of the step in which it lies. The end of
 #: contact errs by 2e-13 of its time from it, and by 2e-12 with ten times the value; `crossing_time` takes it out of a
 #: crossing.
 LOCATED = 1e-10
-
-#: A dip of the event function within a step is looked at if its estimate is below this fraction of the values at both ends.
-#: With a tenth of it one first crossing of 1279 in a cylinder is missed at a tolerance of 1e-7 and none at 1e-9; with ten
-#: times as much none is found that was not, for a quarter more steps.
-DIP = 0.2
 
 #: Trials after which the far end of what is left of the step is taken for the event. It is a safety net: ten times as many
 #: change no bit of a result, six would let the end of contact err by 1e-8.
@@ -85,31 +78,3 @@ def refine(
 def _fade(margin: Lanes, replaced: Lanes) -> Lanes:
     factor = 1.0 - margin / jnp.where(replaced == 0.0, 1.0, replaced)
     return jnp.where(factor > 0.0, factor, 0.5)
-
-
-def dip(
-    function: Callable[[States], Lanes | None], side: Lanes, before: tuple[States, States], tried: Step, length: Lanes
-) -> Lanes:
-    """Where in a step a function may dip below zero and come back, as a fraction of the step; 2 if nowhere.
-
-    It is where the cubic through its values and slopes at both ends is least, if that is low against both ends.
-
-    **Arguments:**
-
-    - `function`: of the state, counted positive where `side` is 1 and negative where it is -1.
-    - `before`: state and rate at the start of the step; `tried`: the step, of some `length` [s].
-    """
-    state, rate = before
-    if function(state) is None:
-        return jnp.full_like(length, 2.0)
-    low, fall = jax.jvp(function, (state,), (rate,))
-    high, rise = jax.jvp(function, (tried.state,), (tried.rate,))
-    low, high = side * low, side * high
-    fall, rise = side * fall * length, side * rise * length
-    cubic = 3.0 * (fall + rise - 2.0 * (high - low))
-    square = 3.0 * (high - low) - 2.0 * fall - rise
-    root = square + jnp.sqrt(jnp.maximum(square * square - cubic * fall, 0.0))
-    at = -fall / jnp.where(root == 0.0, 1.0, root)
-    least = low + at * (fall + at * (square + at * cubic / 3.0))
-    dips = (fall < 0.0) & (rise > 0.0) & (least < DIP * jnp.minimum(low, high)) & (at > 0.02) & (at < 0.98)
-    return jnp.where(dips, at, 2.0)

@@ -58,6 +58,11 @@ class AbstractProblem(eqx.Module):
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
         """A function of order 1 that is positive while the model holds; `None` if it always does."""
 
+    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
+        """The smooth functions of which `domain_margin` is the least; a step searches each of them for a missed double root."""
+        domain_margin = self.domain_margin(time, state)
+        return () if domain_margin is None else (domain_margin,)
+
 
 class CoreProblem(AbstractProblem):
     """A problem with the first components of its state alone, on which the others do not act."""
@@ -86,6 +91,9 @@ class CoreProblem(AbstractProblem):
 
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
         return self.whole.domain_margin(time, self._longer(state))
+
+    def margins(self, time: Lanes, state: States) -> tuple[Lanes, ...]:
+        return self.whole.margins(time, self._longer(state))
 
     def _longer(self, state: States) -> States:
         missing = len(self.whole.start()[0]) - self.size

@@ -19,13 +19,20 @@ Stages = Float[Array, "stages components lanes"]
 
 
 class Step(NamedTuple):
-    """A step that was tried: where it leads, the rate there, its error estimate and what was seen on the way."""
+    """A step that was tried.
+
+    - `state`, `rate`: where it leads, and the field there; `error`: its estimated error.
+    - `watched`: the least of the margins and the event function at its end.
+    - `first_negative`: the fraction of the step of the first stage at which one of these was negative, 2 if none was.
+    - `margins`: all margins at `watched_places` of the step; `None` if there are none.
+    """
 
     state: States
     rate: States
     error: States
     watched: Lanes
     first_negative: Lanes
+    margins: Float[Array, "places margins lanes"] | None
 
 
 def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
@@ -42,12 +49,13 @@ def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
 def explicit_step(
     tableau: diffrax.ButcherTableau,
     field: Callable[[Lanes, States], States],
-    domain_margin: Callable[[Lanes, States], Lanes | None],
+    margins: Callable[[Lanes, States], tuple[Lanes, ...]],
     crossing: Callable[[States, States], Lanes | None],
     time: Lanes,
     state: States,
     rate: States,
     length: Lanes,
+    margins_before: Float[Array, "margins lanes"] | None,
 ) -> Step:
     """Try one step in every lane.
 
@@ -58,60 +66,69 @@ def explicit_step(
 
     - `tableau`: the method.
     - `field`: (time [s], state) -> rate of the state.
-    - `domain_margin`, `crossing`: (time, state) and (state, rate) -> a number per lane that should stay positive, or
-      `None`. They are looked at in the end and at three stages between: the domain margin, which may need all of the state,
-      in a branch of those stages; the crossing, which may need few components, after the stages. If one is negative for less
-      than two fifths of a step, that may go unnoticed.
+    - `margins`, `crossing`: (time, state) -> any number of margins, and (state, rate) -> the event function or `None`: numbers
+      per lane that should stay positive. They are evaluated at the end and at three stages between: the margins, which may
+      need all of the state, in a branch of those stages; the event function, which may need few components, after the stages.
     - `time`, `state`, `rate`: where the step starts, and the field there.
     - `length`: length of the step [s], one per lane.
+    - `margins_before`: the margins at the start; `None` if there are none.
 
-    **Returns:** a `Step`. `watched` is the lesser number at the end; `first_negative` the fraction of the step of the first
-    stage at which one was negative, 2 if none was.
+    **Returns:** a `Step`.
     """
     # The last stage of a method whose steps end with a stage is the end of the step, below.
     inner = len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
-    looks = places_to_look(tableau.c)
-    places, looked = jnp.asarray(tableau.c[:inner]), jnp.asarray(np.isin(np.arange(inner), list(looks)))
+    looks = stages_to_look(tableau.c)
+    places, looked = jnp.asarray(tableau.c[:inner]), jnp.asarray(np.isin(np.arange(inner), looks))
+    rows = jnp.asarray(np.searchsorted(looks, np.arange(inner)) + 1)
 
-    def do(stage: Int[Array, ""], carry: tuple[Stages, Lanes]) -> tuple[Stages, Lanes]:
-        rates, first_negative = carry
+    def do(stage: Int[Array, ""], carry: tuple[Stages, Any]) -> tuple[Stages, Any]:
+        rates, seen = carry
         there = moved_state(stage, tableau.a_lower[:inner], state, length, rates)
         at = time + places[stage] * length
 
-        def look(first_negative: Lanes) -> Lanes:
-            return jnp.minimum(first_negative, _where_negative(domain_margin(at, there), places[stage], length))
+        def look(seen: Float[Array, "places margins lanes"]) -> Float[Array, "places margins lanes"]:
+            return written_in_place(seen, jnp.stack(margins(at, there)), at=rows[stage])
 
         # A branch, for the other stages not to pay for it: a tenth of a step of a top in a cylinder.
-        first_negative = jax.lax.cond(looked[stage], look, lambda first_negative: first_negative, first_negative)
-        return written_by_component(rates, field(at, there), at=stage + 1), first_negative
+        seen = None if seen is None else jax.lax.cond(looked[stage], look, lambda seen: seen, seen)
+        return written_by_component(rates, field(at, there), at=stage + 1), seen
 
-    none = jnp.zeros((1 + inner, *rate.shape), rate.dtype)
-    start = written_in_place(none, rate, at=jnp.zeros((), int)), jnp.full_like(length, 2.0)
-    rates, first_negative = over_stages(inner, do, start)
-    stages = list(jnp.unstack(rates))
-    for stage in looks:
+    none, first = jnp.zeros((1 + inner, *rate.shape), rate.dtype), jnp.zeros((), int)
+    seen = None
+    if margins_before is not None:
+        seen = jnp.zeros((2 + len(looks), *margins_before.shape), margins_before.dtype)
+        seen = written_in_place(seen, margins_before, at=first)
+    rates, seen = over_stages(inner, do, (written_in_place(none, rate, at=first), seen))
+    stages, first_negative = list(jnp.unstack(rates)), jnp.full_like(length, 2.0)
+    for row, stage in enumerate(looks, start=1):
         there = state + length * weighted_sum(tableau.a_lower[stage], stages[: stage + 1])
-        negative = _where_negative(crossing(there, stages[stage + 1]), tableau.c[stage], length)
+        margin = lesser(_least(None if seen is None else seen[row]), crossing(there, stages[stage + 1]), length)
+        negative = jnp.where(margin < 0.0, tableau.c[stage], 2.0)
         first_negative = jnp.minimum(first_negative, negative)
     # Stored, for the step, its error and the event all depend on it.
     end = jax.lax.optimization_barrier(state + length * weighted_sum(tableau.b_sol[: 1 + inner], stages))
     last_rate = jax.lax.optimization_barrier(field(time + length, end))
-    watched = jax.lax.optimization_barrier(lesser(domain_margin(time + length, end), crossing(end, last_rate), length))
+    last = None if seen is None else jax.lax.optimization_barrier(jnp.stack(margins(time + length, end)))
+    watched = jax.lax.optimization_barrier(lesser(_least(last), crossing(end, last_rate), length))
+    seen = None if seen is None else written_in_place(seen, last, at=jnp.asarray(1 + len(looks)))
     stages += [last_rate] if tableau.fsal else []
-    return Step(end, last_rate, length * weighted_sum(tableau.b_error, stages), watched, first_negative)
+    return Step(end, last_rate, length * weighted_sum(tableau.b_error, stages), watched, first_negative, seen)
 
 
-def lesser(domain_margin: Lanes | None, crossing: Lanes | None, like: Lanes) -> Lanes:
+def watched_places(tableau: diffrax.ButcherTableau) -> Float[np.ndarray, " places"]:
+    """The fractions of a step at which its margins are known: its start, some stages between, and its end."""
+    return np.array([0.0, *(tableau.c[stage] for stage in stages_to_look(tableau.c)), 1.0])
+
+
+def lesser(margin: Lanes | None, crossing: Lanes | None, like: Lanes) -> Lanes:
     """The lesser of two numbers per lane, of which each may be `None`; 1 if both are."""
-    if domain_margin is None:
+    if margin is None:
         return jnp.ones_like(like) if crossing is None else crossing
-    return domain_margin if crossing is None else jnp.minimum(crossing, domain_margin)
+    return margin if crossing is None else jnp.minimum(crossing, margin)
 
 
-def _where_negative(watched: Lanes | None, place: Any, like: Lanes) -> Lanes:
-    """A place in the step in the lanes in which the number there is negative, 2 in the others."""
-    never = jnp.full_like(like, 2.0)
-    return never if watched is None else jnp.where(watched < 0.0, place, never)
+def _least(margins: Float[Array, "margins lanes"] | None) -> Lanes | None:
+    return None if margins is None else jnp.min(margins, axis=0)
 
 
 def over_stages(stages: int, do: Callable[[Int[Array, ""], Any], Any], start: Any) -> Any:
@@ -120,10 +137,11 @@ def over_stages(stages: int, do: Callable[[Int[Array, ""], Any], Any], start: An
     return jax.lax.fori_loop(0, stages, do, start, unroll=jax.default_backend() != "cpu")
 
 
-def places_to_look(fractions: Float[np.ndarray, " stages"]) -> set[int]:
+def stages_to_look(fractions: Float[np.ndarray, " stages"]) -> list[int]:
     """The stages nearest to 1/4, 1/2 and 3/4 of the step: the places at which its inside is checked."""
     between = [stage for stage, fraction in enumerate(fractions) if 0.0 < fraction < 1.0]
-    return {min(between, key=lambda stage: abs(fractions[stage] - part)) for part in (0.25, 0.5, 0.75) if between}
+    nearest = {min(between, key=lambda stage: abs(fractions[stage] - part)) for part in (0.25, 0.5, 0.75) if between}
+    return sorted(nearest)
 
 
 def weighted_sum(weights: Float[np.ndarray, " stages"], rates: Sequence[States]) -> States:

@@ -250,6 +250,7 @@ def _lanes_at_start(
         length=lengths,
         side=side,
         margin=stop_gradient(least_margin(problem, side, zero, states, rates)),
+        margins=stop_gradient(jnp.stack(margins)) if (margins := problem.margins(zero, states)) else None,
         first_crossing=crossing_time,
         crossing_time=crossing_time,
         bracketing=jnp.zeros(lengths.shape, bool),

@@ -12,9 +12,10 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from ..xla_cpu import stored
-from .event import Bracket, dip, refine
+from .double_roots import missed_double_root, missed_loss
+from .event import Bracket, refine
 from .problem import AbstractProblem, crossing_time, side_of
-from .runge_kutta import Lanes, States, Step, explicit_step, inverse_root, scaled_error
+from .runge_kutta import Lanes, States, Step, explicit_step, inverse_root, scaled_error, watched_places
 from .status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING
 
 #: Step control as in Diffrax's I controller with its defaults.
@@ -44,7 +45,8 @@ class LaneState(NamedTuple):
     - `cell`: which cell of the problem a lane runs; `status`: a code of `status.py`.
     - `time` [s], `state`, `rate`: where the lane is, and the field there.
     - `length`: of the step to be tried [s], if the horizon is not nearer.
-    - `side`: 1 before the event, -1 beyond it; `margin`: the least of `side` times the event function and the domain margin.
+    - `side`: 1 before the event, -1 beyond it; `margin`: the least of `side` times the event function and the margins.
+    - `margins`: those of the problem, `None` if there are none.
     - `first_crossing`, `crossing_time`: of the first and the last event that were passed [s], infinite if there was none.
     - `bracketing`: whether the lane looks for an event, `bracket`: where.
     - `steps`: tried so far, `rejected`: by step control.
@@ -58,6 +60,7 @@ class LaneState(NamedTuple):
     length: Lanes
     side: Lanes
     margin: Lanes
+    margins: Float[Array, "margins lanes"] | None
     first_crossing: Lanes
     crossing_time: Lanes
     bracketing: Bool[Array, " lanes"]
@@ -88,7 +91,7 @@ def try_step(problem: AbstractProblem, control: Control, atol: States, lane_stat
     tried_length = length_to_try(control, lane_state)
     crossing = side_of(problem, lane_state.side)
     start = (lane_state.time, lane_state.state, lane_state.rate, tried_length)
-    tried = explicit_step(control.tableau, problem.field, problem.domain_margin, crossing, *start)
+    tried = explicit_step(control.tableau, problem.field, problem.margins, crossing, *start, lane_state.margins)
     return after_step(problem, control, atol, lane_state, tried_length, tried)
 
 
@@ -113,8 +116,11 @@ def after_step(
     error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
     good = error <= 1.0
     # Negative in between: end the step there and look again, so that the first event of several is found.
-    dips = dip(problem.event_function, lane_state.side, (lane_state.state, lane_state.rate), tried, tried_length)
-    negative = jnp.minimum(tried.first_negative, stop_gradient(dips))
+    event = missed_double_root(
+        problem.event_function, lane_state.side, (lane_state.state, lane_state.rate), tried, tried_length
+    )
+    loss = missed_loss(watched_places(control.tableau), stop_gradient(tried.margins), free & good)
+    negative = jnp.minimum(tried.first_negative, stop_gradient(jnp.minimum(event, loss)))
     between = good & (negative < 1.0)
     beyond = good & ~between & (margin <= 0.0)
     forward = free & good & ~between & ~beyond
@@ -147,6 +153,9 @@ def after_step(
         side=side,
         # Just past a crossing the margin is round-off of either sign.
         margin=jnp.where(hit, jnp.abs(margin), jnp.where(forward, margin, lane_state.margin)),
+        margins=None
+        if tried.margins is None
+        else jnp.where(moved, stop_gradient(tried.margins[-1]), lane_state.margins),
         first_crossing=first,
         crossing_time=latest,
         bracketing=bracketing,
@@ -171,13 +180,12 @@ def _classify(
     hit: Bool[Array, " lanes"],
 ) -> tuple[Int[Array, " lanes"], Lanes, Lanes, Lanes]:
     """Status, side, first and latest crossing time of the lanes, where `hit` says that an event was located."""
-    crossing, domain_margin = problem.event_function(tried.state), problem.domain_margin(time, tried.state)
+    crossing, margins = problem.event_function(tried.state), tried.margins
     # The lesser of the two is what was located; by its sign it may be round-off.
-    by_margin = (
-        hit
-        if crossing is None
-        else hit & (False if domain_margin is None else domain_margin <= lane_state.side * crossing)
-    )
+    by_margin = hit
+    if crossing is not None:
+        lost = False if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0) <= lane_state.side * crossing
+        by_margin = hit & lost
     crossed = hit & ~by_margin
     if not control.passes:
         status = jnp.where(hit, jnp.where(by_margin, LEFT_DOMAIN, CROSSED), lane_state.status)

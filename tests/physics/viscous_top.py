@@ -13,11 +13,23 @@ def rate(body: Body):
 
     def of(_, state):
         contact = Contact(body, state)
-        direction = contact.n - body.mu * contact.v
-        load = -contact.v @ contact.n_dot - contact.n @ contact.drift
-        return contact.rate(load / (contact.n @ contact.W @ direction) * direction)
+        return contact.rate(_load(contact) * _direction(contact))
 
     return of
+
+
+def normal_force(body: Body, state: np.ndarray) -> float:
+    """Normal force [N] at a state."""
+    return _load(Contact(body, state))
+
+
+def _direction(contact: Contact) -> np.ndarray:
+    return contact.n - contact.body.mu * contact.v
+
+
+def _load(contact: Contact) -> float:
+    load = -contact.v @ contact.n_dot - contact.n @ contact.drift
+    return load / (contact.n @ contact.W @ _direction(contact))
 
 
 def follow(body: Body, state: np.ndarray, times: np.ndarray, rtol: float = 1e-9) -> np.ndarray:

@@ -186,19 +186,16 @@ class Dynamics(eqx.Module):
         return stacked(self.motion(state).rate, state)
 
     def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Positive while the contact persists and Coulomb's law has an answer.
-
-        The least of what `_margins` says.
-        """
-        return least(*self._margins(state))
+        """Positive while the contact persists and Coulomb's law has an answer: the least of `margins`."""
+        return least(*self.margins(state))
 
     def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
         """How a contact has ended whose margin is zero: a code in `LOSSES`."""
-        lost, *others = self._margins(state)
+        lost, *others = self.margins(state)
         # At the located end a margin is round-off of either sign; where another has vanished N is many times the weight.
         return len(others) - jnp.argmin(jnp.stack([*others[::-1], jnp.maximum(lost, 0.0)]), axis=0)
 
-    def _margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
+    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
         """For each of `LOSSES` what is left: the normal force as a fraction of the weight, plus a round-off allowance for a
         start with N = 0; the excess of the stiffness over `JAMMED`; that of the room over `FITS`, if the room may end."""
         motion = self.motion(state)

@@ -96,11 +96,15 @@ class StickSlip(eqx.Module):
         return stacked(self.motion(state).rate, state)
 
     def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Normal force as a fraction of the weight, plus the round-off that a start with N = 0 exactly is allowed; or the
-        room that is left, if that is less."""
+        """The least of `margins`."""
+        return least(*self.margins(state))
+
+    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
+        """Normal force as a fraction of the weight, plus the round-off that a start with N = 0 exactly is allowed; and the
+        room that is left, if it may end."""
         motion = self.motion(state)
         margin = motion.normal_force / (self.slipping.mass * self.slipping.gravity) + 1e-12
-        return margin if motion.room is None else least(margin, motion.room - FITS)
+        return (margin,) if motion.room is None else (margin, motion.room - FITS)
 
     def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
         """How a contact has ended whose margin is zero: a code in `LOSSES`. Only one that slips can jam."""
@@ -181,10 +185,14 @@ class ContactMode(eqx.Module):
 
     def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Positive while this kind of motion lasts. Rolling leaves the friction cone before the normal force is zero."""
+        return least(*self.margins(state))
+
+    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
+        """The smooth functions of which the contact margin is the least."""
         if self.rolls:
             grip, room = self.both.grip_left(state), self.both.rolling.motion(state).room
-            return grip if room is None else least(grip, room - FITS)
-        return least(self.both.slipping.contact_margin(state), self.slip_left(state))
+            return (grip,) if room is None else (grip, room - FITS)
+        return (*self.both.slipping.margins(state), self.slip_left(state))
 
     def slip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Slip speed above that at which a slip is over, in units of sqrt(g R). A slip that grows is never over."""

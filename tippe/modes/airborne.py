@@ -192,6 +192,9 @@ class Contact(AbstractProblem):
     def domain_margin(self, time, state):
         return self.dynamics.contact_margin(state[:OWN])
 
+    def margins(self, time, state):
+        return self.dynamics.margins(state[:OWN])
+
 
 class Flight(AbstractProblem):
     """Flying until theta reaches an angle or a sphere is back at the arena; `falls` is the acceleration [m/s^2]."""
@@ -221,9 +224,11 @@ class Flight(AbstractProblem):
         return dot(flying.axis, below(self.scene, flying).axes[2]) - self.cos_angle
 
     def domain_margin(self, time, state):
+        return functools.reduce(jnp.minimum, self.margins(time, state))
+
+    def margins(self, time, state):
         flying = flight_state(state)
-        margins = (gap_margin(self.scene, flying, ball) for ball in balls(self.scene.body))
-        return functools.reduce(jnp.minimum, margins)
+        return tuple(gap_margin(self.scene, flying, ball) for ball in balls(self.scene.body))
 
 
 class Slide(AbstractFlyingMode):

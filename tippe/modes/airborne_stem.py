@@ -6,6 +6,7 @@ strikes the tangent plane at its own foot. A top that comes to rest on both ends
 leaning are those of the plane (`leaning.py`).
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -76,7 +77,10 @@ class OneOfTwo(AbstractProblem):
         return jnp.where(self.on_stem, apart, state[COS_THETA]) - self.contact.cos_angle
 
     def domain_margin(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
-        return jnp.minimum(self.contact.domain_margin(time, state), clearance(self.scene, self.own, self.other, state))
+        return functools.reduce(jnp.minimum, self.margins(time, state))
+
+    def margins(self, time: Any, state: Float[Array, "components cells"]) -> tuple[Float[Array, " cells"], ...]:
+        return (*self.contact.margins(time, state), clearance(self.scene, self.own, self.other, state))
 
 
 @compiled_setup
@@ -142,6 +146,9 @@ class FlightToBlow(AbstractProblem):
 
     def domain_margin(self, time: Any, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         return jnp.where(self.strikes, -1.0, self.flight.domain_margin(time, state))
+
+    def margins(self, time: Any, state: Float[Array, "components cells"]) -> tuple[Float[Array, " cells"], ...]:
+        return tuple(jnp.where(self.strikes, -1.0, margin) for margin in self.flight.margins(time, state))
 
 
 class FlyBoth(Fly):

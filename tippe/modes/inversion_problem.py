@@ -45,6 +45,9 @@ class InversionProblem(AbstractProblem):
     ) -> Float[Array, " lanes"]:
         return self.dynamics.contact_margin(state)
 
+    def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> tuple[Any, ...]:
+        return self.dynamics.margins(state)
+
 
 @compiled_setup
 def _problem(scene: Scene, launch: Launch, angle: Float[Array, "..."], cells: int) -> InversionProblem:

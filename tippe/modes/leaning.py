@@ -121,8 +121,13 @@ class LeaningDynamics(eqx.Module):
         return stacked(self.motion(state).rate, state)
 
     def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """The lesser of both normal forces as a fraction of the weight, plus `HOLDS`."""
-        return least(*self.motion(state).normal_forces) / (self.body.mass * self.gravity) + HOLDS
+        """The lesser of `margins`."""
+        return least(*self.margins(state))
+
+    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
+        """Both normal forces as fractions of the weight, plus `HOLDS`."""
+        weight = self.body.mass * self.gravity
+        return tuple(force / weight + HOLDS for force in self.motion(state).normal_forces)
 
     def heavier(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
         """The number of the sphere with the greater normal force: the one that stays when the other's vanishes."""

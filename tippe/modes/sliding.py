@@ -82,11 +82,14 @@ class Sliding(AbstractProblem):
         return state[COS_THETA] - self.cos_angle
 
     def domain_margin(self, time: Cells, state: Float[Array, "components cells"]) -> Cells:
-        margin = self.dynamics.contact_margin(state)
+        return least(*self.margins(time, state))
+
+    def margins(self, time: Cells, state: Float[Array, "components cells"]) -> tuple[Cells, ...]:
+        margins = self.dynamics.margins(state)
         if self.own is None or self.other is None:
-            return margin
+            return margins
         assert isinstance(self.dynamics, Dynamics)
-        return least(margin, clearance(self.dynamics, self.own, self.other, state))
+        return (*margins, clearance(self.dynamics, self.own, self.other, state))
 
 
 def clearance(dynamics: Dynamics, own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:

@@ -68,6 +68,9 @@ class TrajectoryProblem(AbstractProblem):
     def domain_margin(self, time: Float[Array, "..."], state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         return self.dynamics.contact_margin(state[: len(self.state)])
 
+    def margins(self, time: Float[Array, "..."], state: Float[Array, "components ..."]) -> tuple[Any, ...]:
+        return self.dynamics.margins(state[: len(self.state)])
+
 
 @compiled_setup
 def _problem(scene: Scene, launch: Launch, cells: int | None) -> TrajectoryProblem:

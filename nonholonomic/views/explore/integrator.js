@@ -8,8 +8,11 @@ function integrator(model) {
   const start = new Float64Array(model.constants + at.size);
   const rates = Array.from({ length: stages + 2 }, () => new Float64Array(n));
   const [there, time, length, number] = [new Float64Array(n), new Float64Array(1), new Float64Array(1), [1]];
-  // As a `Step` of Python: state, rate, error, the lesser of domain margin and event function at the end, and where one was negative before.
-  const tried = new Float64Array(3 * n + 2), [end, last, error] = [0, 1, 2].map((k) => tried.subarray(k * n, (k + 1) * n));
+  // As a `Step` of Python: state, rate, error, the least of margins and event function at the end, where one was negative before, and
+  // the margins at the start, at the stages that are looked at, and at the end.
+  const m = model.kinds, rows = model.looks.length + 2, tried = new Float64Array(3 * n + 2 + rows * m);
+  const [end, last, error] = [0, 1, 2].map((k) => tried.subarray(k * n, (k + 1) * n));
+  const margins = Array.from({ length: rows }, (_, k) => tried.subarray(3 * n + 2 + k * m, 3 * n + 2 + (k + 1) * m));
 
   // There = state + length * (weights . rates).
   function move(there, state, length, weights) {
@@ -22,6 +25,12 @@ function integrator(model) {
   const none = new Float64Array(n);
   const value = (function_, ...inputs) => (number.length = 0, function_(...inputs, number), number.length ? number[0] : Infinity);
 
+  // The least of the margins, which are written into a row, and of the event function.
+  function least(row, time, state, rate, side) {
+    model.margins(constants, time, state, margins[row]);
+    return Math.min(...margins[row], side * value(model.crossing, constants, state, rate));
+  }
+
   // One step from a state at a time, whose rate is known, written into `tried`; only its end where nobody watches for events.
   function step(from, state, rate, side, length, watches = true) {
     rates[0].set(rate);
@@ -30,9 +39,8 @@ function integrator(model) {
       move(there, state, length, model.stages[stage]);
       time[0] = from + model.places[stage] * length;
       model.field(constants, time, there, rates[stage + 1]);
-      if (!watches || !model.looks.includes(stage)) continue;
-      if (value(model.domain, constants, time, there) < 0 || side * value(model.crossing, constants, there, rates[stage + 1]) < 0)
-        negative = Math.min(negative, model.places[stage]);
+      const row = model.looks.indexOf(stage) + 1;
+      if (watches && row > 0 && least(row, time, there, rates[stage + 1], side) < 0) negative = Math.min(negative, model.places[stage]);
     }
     move(end, state, length, model.step);
     if (!watches) return;
@@ -40,7 +48,7 @@ function integrator(model) {
     model.field(constants, time, end, last);
     rates[stages + 1].set(last);
     move(error, none, length, model.error);
-    const margin = Math.min(value(model.domain, constants, time, end), side * value(model.crossing, constants, end, last));
+    const margin = least(rows - 1, time, end, last, side);
     tried[3 * n] = margin === Infinity ? 1 : margin;
     tried[3 * n + 1] = negative;
   }
@@ -53,6 +61,7 @@ function integrator(model) {
     const [state, rate] = [lane.subarray(at.state, at.state + n), lane.subarray(at.rate, at.rate + n)];
     while (lane[at.status] === model.running) {
       model.length(constants, lane, length);
+      margins[0].set(lane.subarray(at.margins, at.margins + m));
       const from = lane[at.time], before = record && { time: from, state: state.slice(), rate: rate.slice() };
       step(from, state, rate, lane[at.side], length[0]);
       model.after(constants, lane, length, tried, lane);

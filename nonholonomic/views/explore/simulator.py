@@ -25,7 +25,8 @@ from ...integration import (
     after_step,
     explicit_tableau,
     length_to_try,
-    places_to_look,
+    stages_to_look,
+    watched_places,
 )
 from .javascript import javascript
 
@@ -72,7 +73,12 @@ def written(simulator: Simulator, values: Numbers) -> str:
     (constants, lane), static = eqx.partition(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
     run = functools.partial(eqx.combine, static[0])
     time, state = lane.time, lane.state
-    tried = Step(state, state, state, time, time)
+    tableau = explicit_tableau(simulator.settings.for_lanes)
+    kinds = 0 if lane.margins is None else len(lane.margins)
+    margins = (
+        jax.ShapeDtypeStruct((len(watched_places(tableau)), *lane.margins.shape), lane.margins.dtype) if kinds else None
+    )
+    tried = Step(state, state, state, time, time, margins)
 
     def after(constants: Any, lane: LaneState, length: Any, tried: Step) -> LaneState:
         problem, control, atols = run(constants)
@@ -82,10 +88,7 @@ def written(simulator: Simulator, values: Numbers) -> str:
         "begin": (lambda values: eqx.filter(begin(values), eqx.is_array), (values,)),
         "length": (lambda constants, lane: length_to_try(run(constants)[1], lane), (constants, lane)),
         "field": (lambda constants, time, state: run(constants)[0].field(time, state), (constants, time, state)),
-        "domain": (
-            lambda constants, time, state: run(constants)[0].domain_margin(time, state),
-            (constants, time, state),
-        ),
+        "margins": (lambda constants, time, state: run(constants)[0].margins(time, state), (constants, time, state)),
         "crossing": (
             lambda constants, state, rate: run(constants)[0].crossing_along(state, rate),
             (constants, state, state),
@@ -97,7 +100,6 @@ def written(simulator: Simulator, values: Numbers) -> str:
             lambda values, constants, lane, read=read: read(values, run(constants)[0], lane),
             (values, constants, lane),
         )
-    tableau = explicit_tableau(simulator.settings.for_lanes)
     inner = len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
     facts = {
         "constants": _size(constants),
@@ -106,7 +108,8 @@ def written(simulator: Simulator, values: Numbers) -> str:
         "running": RUNNING,
         "stages": [row.tolist() for row in tableau.a_lower[:inner]],
         "places": np.asarray(tableau.c[:inner]).tolist(),
-        "looks": sorted(int(stage) for stage in places_to_look(tableau.c)),
+        "looks": stages_to_look(tableau.c),
+        "kinds": kinds,
         "step": np.asarray(tableau.b_sol[: 1 + inner]).tolist(),
         "error": np.asarray(tableau.b_error).tolist(),
     }

@@ -134,6 +134,26 @@ def test_a_dip_between_the_stages_of_a_step_is_found():
     assert_close(outcome.crossing_time, [math.acos(level)], atol=1e-3)
 
 
+@pytest.mark.parametrize("solver", [Oscillatory8(), diffrax.Dopri8(), diffrax.Dopri5(), diffrax.Bosh3()])
+@pytest.mark.parametrize("depth", [1e-2, 1e-4, 1e-7])
+def test_a_short_loss_between_the_stages_of_a_step_is_found(solver, depth):
+    """The margin 1 - depth - sin(w t) is negative for sqrt(8 depth) / w; it ends the run at asin(1 - depth) / w."""
+    frequency = np.geomspace(0.3, 4.0, 8)
+    outcome, _ = run(frequency, level=-2.0, floor=1.0 - depth, tolerance=1e-8, solver=solver, t1=4.0 * math.pi / 0.3)
+    assert (np.asarray(outcome.status) == LEFT_DOMAIN).all()
+    assert_close(outcome.end_time, math.asin(1.0 - depth) / frequency, rtol=1e-3)
+
+
+def test_what_comes_close_to_a_loss_goes_on_and_costs_little():
+    """The margin 1 + height - sin(w t) has a least value of `height` in every period."""
+    frequency = np.geomspace(0.3, 4.0, 8)
+    far, _ = run(frequency, level=-2.0, floor=2.0, tolerance=1e-8, t1=40.0)
+    for height in (1e-2, 1e-4, 1e-6):
+        close, _ = run(frequency, level=-2.0, floor=1.0 + height, tolerance=1e-8, t1=40.0)
+        assert (np.asarray(close.status) == REACHED_END).all()
+        assert int(close.steps.sum()) < 1.6 * int(far.steps.sum())
+
+
 def test_too_many_steps_and_nonsense_are_failures():
     outcome, _ = run([1.0], level=-2.0, t1=1e3, max_steps=20)
     assert outcome.status[0] == FAILED

@@ -8,7 +8,7 @@ import pytest
 from close import assert_close
 
 from nonholonomic.integration import Oscillatory8
-from nonholonomic.integration.runge_kutta import explicit_step, explicit_tableau, inverse_root
+from nonholonomic.integration.runge_kutta import explicit_step, explicit_tableau, inverse_root, watched_places
 
 
 def field(time, state):
@@ -28,12 +28,13 @@ def test_a_step_is_that_of_diffrax(solver):
     step = explicit_step(
         explicit_tableau(solver),
         field,
-        lambda time, at: 10.0 + at[1],
+        lambda time, at: (10.0 + at[1], 20.0 + at[0]),
         lambda at, rate: at[0],
         jnp.asarray(time),
         state,
         field(time, state),
         jnp.asarray(length),
+        jnp.stack([10.0 + state[1], 20.0 + state[0]]),
     )
     term = diffrax.ODETerm(lambda t, y, _: field(t, y))
     for lane in range(3):
@@ -44,6 +45,13 @@ def test_a_step_is_that_of_diffrax(solver):
         np.testing.assert_allclose(np.abs(step.error[:, lane]), np.abs(error), rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose(step.rate[:, lane], field(t1, y1), rtol=1e-12, atol=1e-14)
         assert step.watched[lane] == step.state[0, lane]
+        assert step.margins[-1, :, lane].tolist() == [10.0 + step.state[1, lane], 20.0 + step.state[0, lane]]
+    # As far from the start as the state moves in the part of the step that the places say.
+    places = watched_places(explicit_tableau(solver))
+    assert len(places) == len(step.margins)
+    moved = step.margins[:, 0, 0] - 10.0 - state[1, 0]
+    # The second component falls at the rate 1 + t at first; the first stages of Bosh3 are of first order.
+    np.testing.assert_allclose(moved, -(0.1 * places) - 0.5 * (0.1 * places) ** 2, atol=1.5e-3)
     # The first lane stays on its side; the last one is beyond it all along, where there are stages between start and end.
     assert step.first_negative[0] == 2.0
     between = [fraction for fraction in explicit_tableau(solver).c if fraction < 1.0]
@@ -57,9 +65,8 @@ def test_an_accelerator_gets_the_stages_written_out(monkeypatch):
 
     def compiled():
         def step(state):
-            return explicit_step(
-                tableau, field, lambda time, at: at[0], lambda at, rate: None, time, state, field(time, state), length
-            )
+            start = (time, state, field(time, state), length, state[:1])
+            return explicit_step(tableau, field, lambda time, at: (at[0],), lambda at, rate: None, *start)
 
         return jax.jit(step)
 
