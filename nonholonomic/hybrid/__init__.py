@@ -1,8 +1,10 @@
-"""Hybrid systems: smooth motion in modes with resets between them, for ensembles and single runs, with their derivatives.
+"""Hybrid systems: smooth motion in modes with resets between them, for ensembles and single runs, with their
+derivatives.
 
-`solve_hybrid` takes an ensemble of runs through the modes of an `AbstractBatchedMode` each (`traced_solve_hybrid` inside
-other transformed functions); `solve_hybrid_dense` is a single run with its path. `solve_hybrid_with_tangents` carries
-tangents through every reset by the saltation matrix, and `hybrid_samples` gives states at times, with their derivatives.
+`solve_hybrid` integrates an ensemble of runs, each through the modes of a system (`traced_solve_hybrid` inside other
+transformed functions); `solve_hybrid_dense` integrates a single run with its path. `solve_hybrid_with_tangents` carries
+tangents through every reset by the saltation matrix, and `hybrid_samples` returns states at times, with their
+derivatives.
 """
 
 from .ensemble import AbstractBatchedMode as AbstractBatchedMode

@@ -1,9 +1,10 @@
-"""Motion in smooth modes with jumps between them, for many cells at once.
+"""Hybrid motion of many cells at once: smooth modes with resets between them.
 
-A mode has its own equations and ends where they cease to hold: a contact opens or closes, slipping ends. What follows
-is a function, the mode's `reset_map`: an impact, a flight in closed form, other equations. All modes share one layout
-of the state. The cells advance in rounds: in each, the cells that are now in a mode are gathered and integrated together
-(`ensemble.py`) to the event, to the horizon or to the end of the mode, and those at its end are passed on.
+A mode has its own equations of motion and ends where they cease to hold: a contact opens or closes, slipping ends. The
+mode's `reset_map` gives the transition to the next mode: an impact, a flight in closed form, other equations. All modes
+share one layout of the state. The cells advance in rounds: each round gathers the cells of each mode, solves them as
+one ensemble (`integration/ensemble.py`) to the event, the horizon or the end of the mode, and applies the reset map to
+those at its end.
 """
 
 import abc
@@ -23,16 +24,17 @@ from ..integration.settings import Settings
 from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 from ..xla_cpu import compiled_quickly
 
-#: Rounds, and so modes of a single run, after which what is still under way is given up.
+#: Most rounds, and so most modes of a single run, before unfinished cells end as `UNRESOLVED`.
 MOST_ROUNDS = 2000
 
 
 class TransitionPath(NamedTuple):
-    """The way of a single run from one mode to the next, as stretches of motion of known form that follow one another.
+    """Path of a single run from one mode to the next, as successive stretches of motion in closed form.
 
-    - `ends`: when each stretch ends [s], counted from the end of the mode; infinite where there are no more.
-    - `motions`: what `AbstractBatchedMode.between` needs of each, with the stretches on the first axis of every leaf.
-    - `shown`: at how many times each is to be shown by default.
+    - `ends`: when each stretch ends [s], counted from the end of the mode; infinite for unused entries.
+    - `motions`: the argument of `AbstractBatchedMode.between` for each, with the stretches on the first axis of every
+      leaf.
+    - `shown`: number of default output times of each stretch.
     """
 
     ends: Float[Array, " stretches 1"]
@@ -41,13 +43,13 @@ class TransitionPath(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """What follows the end of a mode, one number per cell.
+    """The result of a reset map, one number per cell.
 
-    `status` is `RUNNING` where the motion goes on in the mode numbered `mode`, else how it ended; `state` is the state
-    then, `elapsed` [s] the time that passed on the way, `crossing_time` [s] when on the way the event was passed (for the
-    last time), infinite if it was not; `counts` how often each kind of thing happened, a row for each kind. `record` is for a
-    single run that keeps its path (`path.py`); `None` where no time passes on the way, or where the path is not kept.
-    `log_rates` is the sum of the logarithms of the rates at which events on the way are met; `None` if there are none.
+    `status` is `RUNNING` where the motion continues in the mode numbered `mode`, else how it ended; `state` is the new
+    state, `elapsed` [s] the duration of the transition, `crossing_time` [s] the (last) time of the event during the
+    transition, infinite if there was none; `counts` holds the counters, one per row. `record` is the path of a single
+    run (`path.py`); `None` for instantaneous transitions, or where no path is kept. `log_rates` is the sum of the
+    logarithms of the rates at which events on the way are met; `None` if there are none.
     """
 
     mode: Int[Array, " cells"]
@@ -61,35 +63,35 @@ class Transition(NamedTuple):
 
 
 class AbstractBatchedMode(eqx.Module):
-    """One mode of the motion. Its leaves are scalars, or hold one number per cell in their last axis."""
+    """One mode of a hybrid system. Its leaves are scalars, or hold one number per cell in their last axis."""
 
     @abc.abstractmethod
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        """The motion in this mode from the given states on; the problem's domain margin ends the mode."""
+        """The motion in this mode from the given states; the mode ends where the problem's domain margin vanishes."""
 
     @abc.abstractmethod
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """What follows where the domain margin has ended the mode.
+        """Map the states at the end of the mode, where the domain margin vanishes, to the start of the next mode.
 
         **Arguments:**
 
-        - `state`: the states there.
+        - `state`: the states at the end of the mode.
         - `left`: time [s] to the horizon.
 
         **Returns:** a `Transition`, which ends with `REACHED_END` where it would take longer than `left`.
         """
 
     def shown(self, state: Float[Array, "components times"]) -> Float[Array, "shown times"]:
-        """What a path shows of states in this mode: in all modes of a run as many components."""
+        """Map mode states to output rows; every mode must return the same number of rows."""
         return state
 
     def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
-        """What a path shows of one of the stretches in `Transition.record`, some time [s] after it has begun."""
+        """The output rows of one stretch in `Transition.record`, at times [s] counted from its start."""
         raise NotImplementedError(f"{type(self).__name__} records stretches but does not say what they show")
 
 
 class HybridOutcome(NamedTuple):
-    """How every cell ended, as in `Outcome`, in which mode, and how often each kind of thing happened on the way."""
+    """How every cell ended, as in `integration.Outcome`, in which mode, and the counters."""
 
     status: Int[np.ndarray, " cells"]
     crossing_time: Float[np.ndarray, " cells"]
@@ -128,17 +130,17 @@ def solve_hybrid(
 ) -> HybridOutcome:
     """Run every cell through its modes to its event, to `t1`, or to where the model ends.
 
-    It runs on the host, round by round, and is called with concrete numbers. All calls with the same number of cells, padding
+    The loop runs on the host, round by round, with concrete numbers. All calls with the same number of cells, padding
     included, share their compiled programs.
 
     **Arguments:**
 
-    - `modes`: the modes, of which `mode` and `Transition.mode` are numbers.
-    - `mode`, `state`: where every cell starts.
+    - `modes`: the modes; `mode` and `Transition.mode` are indices into them.
+    - `mode`, `state`: initial mode and state of every cell.
     - `t1`: horizon [s], one for all or one per cell.
     - `cells`: how many cells to run; the rest is padding. With 0, the programs are compiled and nothing is run.
     - `settings`: with an explicit Runge-Kutta solver of Diffrax.
-    - `kinds`: rows of `Transition.counts`.
+    - `kinds`: number of counters, the rows of `Transition.counts`.
     - `passes`, `parts`: as for `ensemble_solve`.
     - `most_rounds`: a cell that needs more ends as `UNRESOLVED`.
 
@@ -160,7 +162,7 @@ def solve_hybrid(
     if cells == 0:
         _compile(modes, found, t1, settings, options)
     for _ in range(most_rounds):
-        # Selected before the round: a cell that changes its mode during it waits for the next round.
+        # Selected before the round: a cell that changes its mode during the round waits for the next round.
         here = [np.flatnonzero((found.status == RUNNING) & (found.mode == number)) for number in range(len(modes))]
         for one, some in zip(modes, here, strict=True):
             if some.size:
@@ -181,7 +183,7 @@ def _compile(
     settings: Settings,
     options: dict[str, Any],
 ) -> None:
-    """Compile all programs by running none of the cells: two at once, for the compiler uses little more than one core."""
+    """Compile all programs by running no cells: two at once, because the compiler uses little more than one core."""
     none = np.arange(0)
     with ThreadPoolExecutor(2) as threads:
         marches = [threads.submit(_march, one, found, none, t1, settings, options) for one in modes]
@@ -193,7 +195,7 @@ def _compile(
 def _gather(
     mode: AbstractBatchedMode, found: HybridOutcome, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
 ) -> tuple[Any, ...]:
-    """The mode, the states and the remaining times of some cells, padded to the size of the whole."""
+    """The mode, the states and the remaining times of some cells, padded to the full number of cells."""
     size = len(found.status)
     cell = np.concatenate([some, np.full(size - some.size, some[-1] if some.size else 0)])
     numbers, rest = eqx.partition(mode, eqx.is_array)
@@ -210,7 +212,7 @@ def _march(
     settings: Settings,
     options: dict[str, Any],
 ) -> None:
-    """Integrate some cells to the end of their mode and note what was found."""
+    """Solve some cells to the end of their mode and store the outcome."""
     mode, state, left = _gather(mode, found, some, t1)
     problem = _problem(mode, state)
     count = jnp.asarray(some.size)
@@ -222,7 +224,7 @@ def _march(
 def _pass_on(
     mode: AbstractBatchedMode, found: HybridOutcome, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
 ) -> None:
-    """Pass some cells on to the mode that follows and note what happened on the way."""
+    """Apply the reset map to some cells and store the transition."""
     transition = _leave(*_gather(mode, found, some, t1))
     transition = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], transition)
     _store(found, some, after_reset(np, _some(found, some), transition, t1[some]))
@@ -238,9 +240,9 @@ def _store(found: HybridOutcome, some: Int[np.ndarray, " some"], new: HybridOutc
 
 
 def after_solve(xp: Any, found: HybridOutcome, outcome: Outcome, t1: Float[Array, " cells"]) -> HybridOutcome:
-    """What is known of cells after a solve that ended as `outcome` says. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
+    """Update the cells after an ensemble solve that ended as in `outcome`. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
     began = found.end_time
-    # A cell that enters a mode beyond the event passed it earlier, unless it started there.
+    # A cell that enters a mode beyond the event passed the event earlier, unless it started there.
     passed = xp.isfinite(outcome.crossing_time) & ((outcome.crossing_time > 0.0) | xp.isinf(found.crossing_time))
     return HybridOutcome(
         status=outcome.status,
@@ -255,9 +257,9 @@ def after_solve(xp: Any, found: HybridOutcome, outcome: Outcome, t1: Float[Array
 
 
 def after_reset(xp: Any, found: HybridOutcome, transition: Transition, t1: Float[Array, " cells"]) -> HybridOutcome:
-    """What is known of cells after the transition from one mode to the next. **Arguments:** as for `after_solve`."""
+    """Update the cells after the transition to the next mode. **Arguments:** as for `after_solve`."""
     passed = xp.isfinite(transition.crossing_time)
-    # Non-finite states would be integrated forever.
+    # Non-finite states would never finish.
     sound = xp.isfinite(transition.state).all(axis=0) & xp.isfinite(transition.elapsed)
     return HybridOutcome(
         status=xp.where(sound, transition.status, FAILED),

@@ -1,4 +1,4 @@
-"""One run through several modes with its path: the modes of `ensemble.py`, each followed by any solver of Diffrax."""
+"""One hybrid run with its path: the modes of `ensemble.py`, each integrated by any solver of Diffrax."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -16,15 +16,15 @@ from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRE
 from ..xla_cpu import compiled_quickly
 from .ensemble import MOST_ROUNDS, AbstractBatchedMode, Transition
 
-#: The number of a piece on the way between two modes.
+#: The number of a segment between two modes.
 BETWEEN = -1
 
 
 class Segment(NamedTuple):
-    """A part of a run: from `begin` to `end` [s], in the mode numbered `number`, or `BETWEEN` two modes.
+    """A segment of a run: from `begin` to `end` [s], in the mode numbered `number`, or `BETWEEN` two modes.
 
     `motion` is the `DenseSolution` in the mode, its times counted from `begin`, or one stretch of a `TransitionPath`;
-    `shown` are the times [s] at which it is shown by default.
+    `shown` holds the default output times [s].
     """
 
     begin: float
@@ -35,7 +35,7 @@ class Segment(NamedTuple):
     shown: Float[np.ndarray, " times"]
 
     def at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "shown times"]:
-        """What is shown at times within the piece."""
+        """The output rows at times within the segment."""
         passed = np.maximum(times - self.begin, 0.0)
         if self.number == BETWEEN:
             return np.asarray(_between(self.mode, self.motion, jnp.asarray(np.minimum(passed, self.end - self.begin))))
@@ -43,9 +43,9 @@ class Segment(NamedTuple):
 
 
 class HybridPath(NamedTuple):
-    """A run through several modes: its pieces in order, how and when [s] it ended, in what state, and what it took.
+    """A hybrid run: its segments in order, how and when [s] it ended, its final state, and its cost.
 
-    `status` is one of the codes of a `HybridOutcome`; `counts` says how often each kind of thing happened on the way.
+    `status` is one of the codes of a `HybridOutcome`; `counts` holds the counters.
     """
 
     segments: list[Segment]
@@ -68,33 +68,33 @@ class HybridPath(NamedTuple):
 
     @property
     def mode_segments(self) -> list[Segment]:
-        """The pieces in modes, without those that were over as soon as they began."""
+        """The segments in modes, without those of zero length."""
         return [segment for segment in self.segments if segment.number != BETWEEN and segment.end > segment.begin]
 
     @property
     def times(self) -> Float[np.ndarray, " times"]:
-        """The times [s] at which the run is shown by default: those of all its steps."""
+        """The default output times [s]: those of all steps."""
         return np.unique(
             np.minimum(np.concatenate([np.zeros(1), *(one.shown for one in self.segments)]), self.end_time)
         )
 
     @property
     def states(self) -> Float[np.ndarray, "shown times"]:
-        """What is shown at these times."""
+        """The output rows at these times."""
         return self.at(self.times)
 
     def numbers(self, times: Float[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
-        """The numbers of the modes at given times, or `BETWEEN`."""
+        """The mode numbers at given times, or `BETWEEN`."""
         return np.array([segment.number for segment in self.segments])[self._where(times)]
 
     def at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "shown times"]:
-        """What is shown at the given times, which must lie within the run; where a piece ends, before what happens there."""
+        """The output rows at the given times, which must lie within the run; at the end of a segment, before the reset."""
         if not len(times):
             return self.segments[0].at(np.zeros(1))[:, :0]
         where, found = self._where(times), []
         for index in np.unique(where):
             here = np.flatnonzero(where == index)
-            # To one length, so that one program serves all pieces.
+            # Padded to one length, so that one program serves all segments.
             found.append((here, self.segments[index].at(padded(times[here], len(times)))[:, : here.size]))
         shown = np.empty((len(found[0][1]), len(times)))
         for here, values in found:
@@ -137,15 +137,15 @@ def solve_hybrid_dense(
     *,
     kinds: int,
 ) -> HybridPath:
-    """Follow one run through its modes to `t1`, to an event on the way between two of them, or to where the model ends.
+    """Integrate one run through its modes to `t1`, to an event during a transition, or to where the model ends.
 
     **Arguments:**
 
-    - `modes`: as for `solve_hybrid`, of one cell; where they record the way between them, that is part of the path.
-    - `number`, `state`: the mode and the state in which the run starts.
+    - `modes`: as for `solve_hybrid`, of one cell; the path includes the transitions that the modes record.
+    - `number`, `state`: initial mode and state.
     - `t1`: horizon [s].
     - `settings`: as for `follow`; the most steps are those of the whole run.
-    - `kinds`: rows of `Transition.counts`.
+    - `kinds`: number of counters, the rows of `Transition.counts`.
 
     **Returns:** a `HybridPath`.
     """
@@ -179,7 +179,7 @@ def _stay(mode: AbstractBatchedMode, number: int, path: DenseSolution, begin: fl
 
 
 def _way(mode: AbstractBatchedMode, transition: Transition, begin: float) -> list[Segment]:
-    """The pieces of a way between two modes that begins at a time [s]."""
+    """The segments of a transition that begins at a time [s]."""
     if transition.record is None:
         return []
     ends = np.asarray(transition.record.ends)[:, 0]

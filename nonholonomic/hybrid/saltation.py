@@ -1,17 +1,17 @@
-"""First derivatives through runs of several modes: the variations of the state go through every change of mode.
+"""First derivatives of hybrid runs: the variations of the state pass through every change of mode.
 
-A variation of a run at an event is that of the state there, dx, and that of the time, dt. With the event g(x) = 0, x' = f(x)
-and the mode entered at t + dt,
+A variation of a run at an event is that of the state there, dx, and that of the time, dt. With the event g(x) = 0,
+x' = f(x) and the mode entered at t + dt,
 
     dT = -dg / (Dg f),   dx <- dx + f dT,   dt <- dt + dT,
 
-by the implicit function theorem; then the mode's own `reset_map` is differentiated, an impact or a flight, which may take time
-itself. That is the saltation matrix (Leine and Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical Systems, 2004,
-ch. 7) in two halves: the next mode counts its time from its own beginning, so -f dt of it is never needed, and is added
-where a time is held fixed.
+by the implicit function theorem; then the mode's own `reset_map` is differentiated, an impact or a flight, which may
+take time itself. That is the saltation matrix (Leine and Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical
+Systems, 2004, ch. 7) in two halves: the next mode counts its time from its own beginning, so -f dt of it is not needed
+there, and is added where a time is held fixed.
 
-The rates at which events are met stand in the denominator of a derivative. Where one of them may be zero, within the
-tolerance, the event is grazing and the derivative has no digits: such events are counted (`GRAZING`).
+The rates at which events are met stand in the denominator of a derivative. Where such a rate may be zero, within the
+tolerance, the event is grazing and the derivative has no correct digits: such events are counted (`GRAZING`).
 """
 
 import math
@@ -31,11 +31,11 @@ from ..integration import AbstractProblem, Settings
 from .ensemble import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid
 from .traced_ensemble import traced_solve_hybrid
 
-#: An event is grazing if numbers that change by the tolerance, as a part of their own size, or an error of the state that the
-#: tolerance allows, change its rate by more than this part. The derivative then errs by about as much.
+#: An event is grazing if a relative change of the numbers by the tolerance, or an error of the state that the tolerance
+#: allows, changes its rate by more than this fraction. The derivative then errs by about as much.
 GRAZING = 1e-2
 
-#: The magnitude by which errors of the clock are measured [s]: it has none, and no share in step control.
+#: Magnitude that scales the error of the clock [s]: the clock has no error, and no share in step-size control.
 UNMEASURED = 1e9
 
 
@@ -80,7 +80,7 @@ class VariationalMode(AbstractBatchedMode):
 
     The mode's equations must not depend on time.
 
-    - `tangents`: tangents of the mode, as for `VariationalProblem`.
+    - `tangents`: of the mode, as for `VariationalProblem`.
     - `ends_on_event`: as there; `tolerance`: relative, of the integration.
     """
 
@@ -101,17 +101,17 @@ class VariationalMode(AbstractBatchedMode):
         return VariationalProblem(clocked(*point), tangents_of(clocked, point, tangents), self.ends_on_event)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """What follows the mode itself, with variations. Counted in the last row are grazing events."""
+        """The reset map of the mode itself, with variations. The last row of the counters counts grazing events."""
         return self.left_behind(state, left, lambda mode, record, left: ())[0]
 
     def left_behind(
         self, state: Float[Array, "components cells"], left: Float[Array, " cells"], seen: Callable[..., Any]
     ) -> tuple[Transition, Any, Any]:
-        """What follows the mode, as `reset_map` says it, and what is seen of the way to the next.
+        """The transition by the mode's `reset_map`, and a function of its path.
 
-        **Arguments:** `seen`: takes the mode, the `TransitionPath` of the way and `left`, and gives a tree of numbers.
+        **Arguments:** `seen`: (mode, the `TransitionPath`, `left`) -> a tree of numbers.
 
-        **Returns:** the `Transition`; the numbers; and their variations, with the directions first.
+        **Returns:** the `Transition`; the numbers; and their variations, with the tangents first.
         """
         at, *variations = self.parts(state)
         at, lasted, count = at[:-1], at[-1], len(variations)
@@ -123,7 +123,7 @@ class VariationalMode(AbstractBatchedMode):
             problem = build(*numbers).problem(at)
             return jax.jvp(lambda at: problem.domain_margin(lasted, at), (at,), (problem.field(lasted, at),))
 
-        # Behind the variations stand an error of the state, and the way on in time.
+        # Behind the variations stand an error of the state, and a tangent along time.
         along = [(one[:-1], *moved) for one, moved in zip(variations, self._rates(), strict=True)]
         along += [(self._error(at, lasted, rates), *still), (rates, *still)]
         (_, rate), (domain_margins, changes) = _along(met, (at, *numbers), along)
@@ -151,7 +151,7 @@ class VariationalMode(AbstractBatchedMode):
         log_rates = jnp.max(jnp.abs(log_rates + inside), axis=0)
         finite = jnp.isfinite(found).all(axis=(0, 1)) & jnp.isfinite(log_rates)
         grazes = ~finite | (self.tolerance * log_rates > GRAZING)
-        # The run itself is sound: without digits its variations must not end it.
+        # The run itself is valid: variations without correct digits must not end it.
         found = jnp.where(finite, found, 0.0)
         whole = jnp.concatenate([onward.state, jnp.zeros_like(lasted)[None], *found])
         onward = onward._replace(state=whole, counts=jnp.concatenate([onward.counts, grazes.astype(int)[None]]))
@@ -159,8 +159,8 @@ class VariationalMode(AbstractBatchedMode):
 
     def seen(
         self, state: Float[Array, "components times"]
-    ) -> tuple[Float[Array, "shown times"], Float[Array, "directions shown times"]]:
-        """What is shown of states of a single run, and how it varies at times that stay as they are."""
+    ) -> tuple[Float[Array, "shown times"], Float[Array, "tangents shown times"]]:
+        """The output rows of a single run's states, and their variation at fixed times."""
         at, *variations = self.parts(state)
         at, lasted = at[:-1], at[-1]
         numbers, build = self._moving()
@@ -171,12 +171,12 @@ class VariationalMode(AbstractBatchedMode):
         if not variations:
             return shown(at), jnp.zeros((0, *shown(at).shape))
         rates = self.mode.problem(at).field(lasted, at)
-        # A mode that begins later is less far at the same time.
+        # A mode that begins later has advanced less at the same time.
         along = [(one[:-1] - rates * one[-1], *moved) for one, moved in zip(variations, self._rates(), strict=True)]
         return _along(shown, (at, *numbers), along)
 
-    def slopes(self, state: Float[Array, "components cells"]) -> Float[Array, "directions cells"]:
-        """The derivative of the time of the event at which runs have ended in this mode, or on the way to it."""
+    def slopes(self, state: Float[Array, "components cells"]) -> Float[Array, "tangents cells"]:
+        """The derivative of the time of the event at which runs have ended in this mode, or in the transition to it."""
         at, *variations = self.parts(state)
         numbers, build = self._moving()
 
@@ -200,21 +200,23 @@ class VariationalMode(AbstractBatchedMode):
         lasted: Float[Array, " cells"],
         rates: Float[Array, "components cells"],
     ) -> Float[Array, "components cells"]:
-        """What the state at the end of the mode may err by, over the tolerance: of what has changed, and of the magnitudes."""
+        """The error of the state at the end of the mode, over the tolerance: from the change of the state, and from the
+        magnitudes.
+        """
         sizes = jnp.minimum(self.mode.problem(at).start()[1], jnp.abs(rates) * lasted)
-        # Shares of both signs that are not likely to cancel.
+        # Shares of both signs that are unlikely to cancel.
         shares = [(-1.0) ** k * (0.5 + math.modf(0.618 * k)[0]) for k in range(len(sizes))]
         return jnp.asarray(shares)[:, None] * sizes
 
     def _moving(self) -> tuple[list[Array], Any]:
-        """The mode's numbers that are moved, and the mode as a function of them."""
+        """The mode's active numbers, and the mode as a function of them."""
         if not self.tangents:
             return [], lambda: self.mode
         numbers, structure = jax.tree.flatten(where_active(self.mode, self.tangents[0]))
         return numbers, lambda *numbers: eqx.combine(jax.tree.unflatten(structure, numbers), self.mode)
 
     def _rates(self) -> list[list[Array]]:
-        """For each direction the rates at which these numbers move."""
+        """For each tangent the rates at which these numbers move."""
         return [jax.tree.leaves(direction) for direction in self.tangents]
 
 
@@ -225,7 +227,7 @@ def delay(function: Any, state: Float[Array, "components cells"], rates: Float[A
 
 
 def _along(function: Any, point: tuple[Array, ...], tangents: list[tuple[Array, ...]], has_aux: bool = False) -> Any:
-    """A function's value, its variations along tangents with these on the first axis, and what it gives besides if any."""
+    """A function's value, its variations along tangents with these on the first axis, and its auxiliary output if any."""
 
     def along(tangent: tuple[Array, ...]) -> Any:
         return jax.jvp(function, point, tangent, has_aux=has_aux)
@@ -236,10 +238,11 @@ def _along(function: Any, point: tuple[Array, ...], tangents: list[tuple[Array, 
 
 
 class Slopes(NamedTuple):
-    """Derivatives of the times of the events at which runs ended, (directions, cells); and where they have no digits, because
-    an event on the way was `grazing`."""
+    """Derivatives of the times of the events at which runs ended, (tangents, cells); and where they have no correct
+    digits, because an event on the way was `grazing`.
+    """
 
-    slopes: Float[Array, "directions cells"]
+    slopes: Float[Array, "tangents cells"]
     grazing: Bool[Array, " cells"]
 
 
@@ -255,14 +258,14 @@ def solve_hybrid_with_tangents(
     kinds: int,
     ends_on_event: bool = True,
 ) -> tuple[HybridOutcome, Slopes]:
-    """Run every cell through its modes to its event, and differentiate the event's time in some directions.
+    """Run every cell through its modes to its event, and differentiate the event's time along some tangents.
 
     **Arguments:** as for `solve_hybrid`, and
 
     - `tangents`: for each, the tangents of the modes and that of the states, `None` for what does not move.
     - `ends_on_event`: whether runs end on the event; else they end at `t1`, which is then the event's time.
 
-    **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event, or it is there at the start.
+    **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event, or it is at the start.
     """
     varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
     start, parts = np.asarray(variational_start(jnp.asarray(state), tangents)), 1 + len(tangents)
@@ -295,11 +298,11 @@ def _own(ended: HybridOutcome, size: int) -> HybridOutcome:
     return ended._replace(state=ended.state[:size], counts=ended.counts[:-1])
 
 
-def _of_mode(xp: Any, ended: HybridOutcome, slopes: list[Float[Array, "directions cells"]]) -> Any:
-    """Of the slopes in every mode those of the mode in which each cell is.
+def _of_mode(xp: Any, ended: HybridOutcome, slopes: list[Float[Array, "tangents cells"]]) -> Any:
+    """Select, for each cell, the derivatives of its mode.
 
-    A run that has ended between two modes is in none of them: its event is the end of the mode before, whose variation is the
-    last row.
+    A run that has ended between two modes is in none of them: its event is the end of the previous mode, whose
+    variation is the last row.
     """
     found = xp.reshape(ended.state, (1 + len(slopes[0]), -1, len(ended.mode)))[1:, -1]
     for number, some in enumerate(slopes):
@@ -308,7 +311,7 @@ def _of_mode(xp: Any, ended: HybridOutcome, slopes: list[Float[Array, "direction
 
 
 @eqx.filter_jit
-def _slopes(varied: VariationalMode, state: Float[Array, "components cells"]) -> Float[Array, "directions cells"]:
+def _slopes(varied: VariationalMode, state: Float[Array, "components cells"]) -> Float[Array, "tangents cells"]:
     return varied.slopes(state)
 
 
@@ -328,7 +331,7 @@ def variational_modes(
 def variational_start(
     state: Float[Array, "components cells"], tangents: tuple[tuple[tuple[Any, ...], Any], ...]
 ) -> Float[Array, "more cells"]:
-    """States at the start with their clocks, and the variations of both behind them."""
+    """Initial states with their clocks, and the variations of both behind them."""
     zero = jnp.zeros_like(state[0])
     moved = [jnp.zeros_like(state) if direction[1] is None else direction[1] for direction in tangents]
     return jnp.concatenate([with_row(one, zero) for one in (state, *moved)])

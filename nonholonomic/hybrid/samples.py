@@ -1,4 +1,4 @@
-"""Single runs of several modes, sampled at given times inside other transformations, with their derivatives."""
+"""Single hybrid runs, sampled at given times inside other transformations, with their derivatives."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -18,17 +18,17 @@ from .path import BETWEEN
 from .saltation import VariationalMode, variational_modes, variational_start
 from .traced_ensemble import in_rounds
 
-#: From some modules (scene, launch, ...) and the tolerance to the modes of a single run, the number of the first, and the
-#: state there.
+#: From some modules (scene, launch, ...) and the tolerance to the modes of a single run, the number of the first mode,
+#: and the initial state.
 Build = Callable[[Any, Array], tuple[tuple[AbstractBatchedMode, ...], Array, Float[Array, "components 1"]]]
 
 
 class HybridSamples(NamedTuple):
-    """A run through several modes at given times, all floats.
+    """A hybrid run at given times, all floats.
 
-    - `shown`: what the modes show, NaN after the end of the run; `number`: of the mode at each time, or `BETWEEN`.
+    - `shown`: the output rows, NaN after the end of the run; `number`: of the mode at each time, or `BETWEEN`.
     - `end_time`, `end_state`: when and where the run ended; `status`: the code of how.
-    - `steps`, `rejected`; `counts`: what happened how often.
+    - `steps`, `rejected`; `counts`: the counters.
     """
 
     shown: Float[Array, "shown times"]
@@ -49,17 +49,18 @@ def hybrid_samples(
     settings: Settings,
     kinds: int,
 ) -> HybridSamples:
-    """Run one cell through its modes inside a transformation and sample it, with derivatives that take part in step control.
+    """Run one cell through its modes inside a transformation and sample it, with derivatives that take part in
+    step-size control.
 
     **Arguments:**
 
-    - `build`: compared by identity, so it should not be made anew for each call.
-    - `modules`: the tree whose numbers can be differentiated by, once.
-    - `times`: of the samples [s], growing; `t1`: horizon [s]. Neither can be differentiated by.
+    - `build`: compared by identity, so do not create a new function for each call.
+    - `modules`: the tree whose numbers are differentiable, once.
+    - `times`: of the samples [s], growing; `t1`: horizon [s]. Neither is differentiable.
     - `settings`: with an explicit Runge-Kutta solver; the tolerance may be traced.
-    - `kinds`: rows of `Transition.counts`.
+    - `kinds`: number of counters, the rows of `Transition.counts`.
 
-    **Returns:** `HybridSamples`; what is shown and the time of the end have derivatives, NaN behind a grazing event.
+    **Returns:** `HybridSamples`; the output rows and the end time have derivatives, NaN after a grazing event.
 
     **Raises:** `ValueError` for derivatives by the times, and for second derivatives.
     """
@@ -69,7 +70,7 @@ def hybrid_samples(
 
 @eqx.filter_custom_jvp
 def _fixed(times: Float[Array, " times"]) -> Float[Array, " times"]:
-    """The times themselves, by which nothing is differentiated."""
+    """The times themselves, marked as not differentiable."""
     return times
 
 
@@ -81,7 +82,7 @@ def _refused(primals: Any, tangents: Any) -> Any:
 
 
 class HybridSampling(AbstractSampling):
-    """Samples of a run through modes."""
+    """Samples of a hybrid run."""
 
     in_blocks = False
 
@@ -119,7 +120,7 @@ class HybridSampling(AbstractSampling):
 def _follow(
     built: Any, tangents: tuple[Any, ...], given: Sequence[Array], settings: Settings, kinds: int
 ) -> tuple[HybridSamples, list[HybridSamples]]:
-    """The run, and its slope along each of the directions."""
+    """The run, and its derivative along each tangent."""
     (modes, first, state), (times, t1) = built, given
     varied, start = variational_modes(modes, tangents, settings.tolerance, False), variational_start(state, tangents)
     ended, filled = _followed(varied, first, start, times, t1, settings, kinds)
@@ -127,16 +128,17 @@ def _follow(
 
 
 class Filled(NamedTuple):
-    """The samples so far: what is shown, its variations, the modes' numbers, NaN where there are none yet; and the time [s]
-    of the first grazing event, infinite if there was none."""
+    """The samples so far: output rows, their variations, mode numbers, NaN where still missing; and the time [s] of the
+    first grazing event, infinite if there was none.
+    """
 
     shown: Float[Array, "shown times"]
-    variations: Float[Array, "directions shown times"]
+    variations: Float[Array, "tangents shown times"]
     number: Float[Array, " times"]
     grazed: Float[Array, ""]
 
     def with_samples(self, here: Bool[Array, " times"], seen: tuple[Array, Array], number: int) -> "Filled":
-        """With the samples of some times that have none yet."""
+        """Fill in the samples at some times that have none yet."""
         here = here & jnp.isnan(self.number)
         shown, variations = (
             jnp.where(here, new, old) for new, old in zip(seen, (self.shown, self.variations), strict=True)
@@ -153,7 +155,7 @@ def _followed(
     settings: Settings,
     kinds: int,
 ) -> tuple[HybridOutcome, Filled]:
-    """Round by round, as in `traced_solve_hybrid`, with samples of every mode and of the way to the next."""
+    """Run round by round, as in `traced_solve_hybrid`, with samples of every mode and of the transition to the next."""
     count, zero, none = len(modes[0].tangents), jnp.zeros(1), jnp.zeros(1, int)
     own = VariationalMode.parts(modes[0], state)[0][:-1]
     rows = len(jax.eval_shape(modes[0].mode.shown, own))
@@ -173,7 +175,7 @@ def _followed(
 
     def change(one: VariationalMode, found: HybridOutcome, filled: Filled) -> tuple[HybridOutcome, Filled]:
         def seen(mode: AbstractBatchedMode, record: TransitionPath | None, left: Float[Array, " 1"]) -> Any:
-            # A time that stays as it is comes sooner after an event that is later, as the horizon does.
+            # Relative to an event that is later, a fixed time comes sooner, as the horizon does.
             return None if record is None else _on_the_way(mode, record, times - t1 + left)
 
         left = jnp.maximum(t1 - found.end_time, 0.0)
@@ -206,7 +208,7 @@ def _followed(
 def _on_the_way(
     mode: AbstractBatchedMode, record: TransitionPath, since: Float[Array, " times"]
 ) -> Float[Array, "shown times"]:
-    """What a path shows some times [s] after it has left a mode; nothing that means anything after the last stretch."""
+    """The output rows some times [s] after the end of a mode; meaningless after the last stretch."""
     ends = record.ends[:, 0]
     stretch = jnp.minimum(jnp.searchsorted(jax.lax.stop_gradient(ends), jax.lax.stop_gradient(since)), len(ends) - 1)
     began = jnp.where(stretch > 0, ends[jnp.maximum(stretch - 1, 0)], 0.0)
@@ -217,7 +219,7 @@ def _on_the_way(
 def _found(
     ended: HybridOutcome, filled: Filled, times: Float[Array, " times"], size: int, count: int
 ) -> tuple[HybridSamples, list[HybridSamples]]:
-    """What is found, and its slope along each of the directions."""
+    """The samples, and their derivative along each tangent."""
     end_time, status, grazed = ended.end_time[0], ended.status[0], ended.counts[-1, 0] > 0
     late = jnp.where(times > filled.grazed, jnp.nan, 0.0)
     # The variation of a time stands behind that of the state; a horizon does not move.

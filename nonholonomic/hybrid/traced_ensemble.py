@@ -1,4 +1,4 @@
-"""Motion in modes inside other transformed functions: what `solve_hybrid` does on the host, as one traced loop."""
+"""Hybrid runs inside other transformed functions: `solve_hybrid` as one traced loop."""
 
 from collections.abc import Callable
 from typing import Any
@@ -27,7 +27,7 @@ def traced_solve_hybrid(
 ) -> HybridOutcome:
     """Run every cell through its modes to its event, to `t1`, or to where the model ends.
 
-    Cells are not gathered: in each round every mode integrates all cells, those that are in another one for no time.
+    Cells are not gathered: in each round every mode runs all cells, those in another mode for no time.
 
     **Arguments:** as for `solve_hybrid`.
 
@@ -60,7 +60,7 @@ def traced_solve_hybrid(
 
     def one_round(carry: tuple[HybridOutcome, Int[Array, ""]]) -> tuple[HybridOutcome, Int[Array, ""]]:
         found, rounds = carry
-        # Selected before the round: a cell that changes its mode during it waits for the next round.
+        # Selected before the round: a cell that changes its mode during the round waits for the next round.
         here = [(found.status == RUNNING) & (found.mode == number) for number in range(len(modes))]
         for one, some in zip(modes, here, strict=True):
             found = through(one, found, some)
@@ -70,7 +70,7 @@ def traced_solve_hybrid(
 
 
 def in_rounds(one_round: Callable[[Any], Any], start: HybridOutcome, *more: Any) -> Any:
-    """Go on round by round while a cell is under way. The carry is the `HybridOutcome`, what else there is, and the round."""
+    """Loop over rounds while a cell is running. The carry is the `HybridOutcome`, any further values, and the round."""
 
     def under_way(carry: Any) -> Bool[Array, ""]:
         return jnp.any(carry[0].status == RUNNING) & (carry[-1] < MOST_ROUNDS)
@@ -83,7 +83,7 @@ def in_rounds(one_round: Callable[[Any], Any], start: HybridOutcome, *more: Any)
 def passing(
     one: AbstractBatchedMode, found: HybridOutcome, lost: Bool[Array, " cells"], t1: Float[Array, " cells"]
 ) -> HybridOutcome:
-    """The cells that are at the end of a mode, passed on to the mode that follows."""
+    """Apply the reset map to the cells at the end of a mode."""
 
     def passed() -> HybridOutcome:
         there, now = of_cells(one, lost), in_place_of(found, lost)
@@ -94,13 +94,13 @@ def passing(
 
 
 def of_cells(mode: AbstractBatchedMode, some: Bool[Array, " cells"]) -> AbstractBatchedMode:
-    """A mode of some cells; the numbers of the first of them stand in place of those of the others."""
+    """A mode of some cells; the numbers of the first of them replace those of the others."""
     numbers, rest = eqx.partition(mode, eqx.is_array)
     return eqx.combine(jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[..., _cell(some)], numbers), rest)
 
 
 def in_place_of(found: HybridOutcome, some: Bool[Array, " cells"]) -> HybridOutcome:
-    """What is known of some cells, with the first of them in place of the others, whose states have another meaning."""
+    """The state of some cells, with the first of them in place of the others, whose states have another meaning."""
     return jax.tree.map(lambda values: values[..., _cell(some)], found)
 
 
@@ -109,5 +109,5 @@ def _cell(some: Bool[Array, " cells"]) -> Int[Array, " cells"]:
 
 
 def chosen(some: Bool[Array, " cells"], new: HybridOutcome, old: HybridOutcome) -> HybridOutcome:
-    """The new of some cells and the old of the others."""
+    """The new outcome of some cells and the old one of the others."""
     return jax.tree.map(lambda a, b: jnp.where(some, a, b), new, old)

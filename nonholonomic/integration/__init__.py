@@ -1,9 +1,9 @@
 """Runs in time: from a start along a field to an event, to the end of the model's validity, or to a horizon.
 
-`solve_ensemble` runs many cells of a problem in lanes that keep step with one another; `follow` and `sample` are single runs
-with any solver of Diffrax. `solve_by_diffrax` is the independent second road. Runs of several modes are in
-`nonholonomic.hybrid`. `Settings` says how, and the codes of a run's status are `RUNNING`, `REACHED_END`, `CROSSED`,
-`LEFT_DOMAIN`, `FAILED` and `UNRESOLVED`.
+`solve_ensemble` runs many cells of a problem in lanes that step together; `follow` and `sample` integrate single runs
+with any solver of Diffrax. `solve_by_diffrax` is an independent reference. Hybrid runs are in `nonholonomic.hybrid`.
+`Settings` holds the options, and the status codes of a run are `RUNNING`, `REACHED_END`, `CROSSED`, `LEFT_DOMAIN`,
+`FAILED` and `UNRESOLVED`.
 """
 
 from .dense import DenseSolution as DenseSolution

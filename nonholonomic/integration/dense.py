@@ -15,15 +15,15 @@ from .problem import AbstractProblem
 from .settings import Settings
 from .zeros import halved
 
-#: Steps that are integrated and stored at once; a longer run is made of several such pieces.
+#: Steps that are integrated and stored at once; a longer run consists of several such segments.
 PIECE = 2048
 
-#: Places in every step at which the domain margin is looked at, besides its ends.
+#: Places in every step at which the domain margin is checked, besides the ends of the step.
 LOOKS = np.arange(1, 8) / 8.0
 
 
 class DenseSolution(NamedTuple):
-    """A run: its times and states, the pieces of its dense output, how it ended and how many steps it took."""
+    """A run: its times and states, the segments of its dense output, how it ended and how many steps it took."""
 
     times: Float[np.ndarray, " times"]
     states: Float[np.ndarray, "components times"]
@@ -44,7 +44,9 @@ class DenseSolution(NamedTuple):
 
 
 def padded(values: Float[np.ndarray, "... times"], least: int) -> Float[np.ndarray, "... more"]:
-    """Values with those of the last time repeated, up to a power of two of at least `least`: a program serves many numbers."""
+    """Values with those of the last time repeated, up to a power of two of at least `least`: one program serves many
+    sizes.
+    """
     more = (1 << (least - 1).bit_length()) - values.shape[-1]
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)], mode="edge")
 
@@ -55,7 +57,7 @@ def _evaluate(segment: diffrax.Solution, times: Float[Array, " times"]) -> Float
 
 
 def saved(solution: diffrax.Solution) -> tuple[Any, Any]:
-    """Times and states that a solution holds; Diffrax's types say that there may be none."""
+    """Times and states of a solution; Diffrax's types say that there may be none."""
     return solution.ts, solution.ys
 
 
@@ -67,7 +69,7 @@ def _guard(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array,
 
 
 def _control(settings: Settings, scales: Float[Array, " components"]) -> diffrax.PIDController:
-    # The greatest error counts, not the mean: cyclic coordinates that ride along must not dilute the others' errors.
+    # The largest error counts, not the mean: passive cyclic coordinates must not dilute the errors of the others.
     atol = settings.absolute * settings.tolerance * jax.lax.stop_gradient(scales)
     return diffrax.PIDController(settings.tolerance, atol, norm=optimistix.max_norm)
 
@@ -83,7 +85,7 @@ def _piece(
     settings: Settings,
     dense: bool,
 ) -> tuple[diffrax.Solution, Float[Array, " steps"]]:
-    """As many steps as the settings allow, and the least value of the domain margin seen in each."""
+    """Integrate as many steps as the settings allow; also return the least domain margin in each step."""
     watched = problem.domain_margin(t0, state) is not None
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: args.field(t, y)),
@@ -126,13 +128,14 @@ def follow(
 
     - `problem`: with a `start()` of shape (components,).
     - `t1`: horizon [s].
-    - `settings`: with any solver of Diffrax; a run that is still under way after `max_steps` steps, rejected ones included, has
-      failed.
+    - `settings`: with any solver of Diffrax; a run that has not ended after `max_steps` steps, rejected ones included,
+      has failed.
     - `first`: length of the first step [s], by default selected as Diffrax does.
     - `t0`: when the run starts [s].
-    - `dense`: whether states within the steps will be asked for (`DenseSolution.at`).
+    - `dense`: whether to keep dense output for states within the steps (`DenseSolution.at`).
 
-    **Returns:** a `DenseSolution` with the accepted steps; it ends where the domain margin reaches zero on the dense output.
+    **Returns:** a `DenseSolution` with the accepted steps; it ends where the domain margin reaches zero, located on the
+    dense output.
     """
     state, scales = problem.start()
     state, scales = jnp.asarray(state), jnp.asarray(scales)
@@ -141,7 +144,7 @@ def follow(
     accepted = rejected = 0
     end, lost, failed = jnp.asarray(t1, state.dtype), False, False
     length = None if first is None else jnp.asarray(first, state.dtype)
-    # Compiled for the number of steps, so that it must not change with what is left of them.
+    # The program is compiled for this number of steps, so it must not change with the number that is left.
     each = dataclasses.replace(settings, max_steps=min(PIECE, settings.max_steps))
     margin = problem.domain_margin(time, state)
     if margin is not None and float(margin) <= 0.0:
@@ -180,7 +183,7 @@ def follow(
 def _loss(
     problem: AbstractProblem, solution: diffrax.Solution, begin: Float[Array, ""], end: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """The last time in a step at which the domain margin has not been negative yet, on the dense output."""
+    """The last time in a step before the domain margin becomes negative, on the dense output."""
 
     def holds(time):
         return ~(_guard(problem, time, solution.evaluate(time)) < 0.0)
@@ -191,8 +194,9 @@ def _loss(
 
 
 class _GivenSteps(diffrax.StepTo):
-    """Steps that end at given times, growing, without Diffrax's checks: these call Python back, and a program that does so is
-    not kept on disk."""
+    """Steps that end at given times, growing, without Diffrax's checks: these call back into Python, and such programs
+    are not cached on disk.
+    """
 
     def wrap(self, direction: Any) -> "_GivenSteps":
         return self
@@ -202,7 +206,9 @@ class _GivenSteps(diffrax.StepTo):
 
 
 class SampledSolution(NamedTuple):
-    """A run at given times: its states, NaN after its end; when and where it ended, and whether the domain margin ended it."""
+    """A run at given times: its states, NaN after its end; when and where it ended, and whether it left the model's
+    domain.
+    """
 
     states: Float[Array, "components times"]
     end_time: Float[Array, ""]
@@ -223,19 +229,19 @@ def sample(
 ) -> SampledSolution:
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 
-    The domain margin is checked at the ends of steps, and the run ends where it is zero on the dense output. Steps end on
-    the times asked for, where interpolation would lose a digit or two.
+    The domain margin is checked at the ends of steps, and the run ends where the margin is zero on the dense output.
+    Steps end on the requested times, where interpolation would lose a digit or two.
 
-    **Arguments:** as for `follow`; `times`: growing, in [0, t1], or `None` for those of the grid; `grid`: the ends of the steps
-    [s], 0 the first and t1 the last, for a solver without an error estimate; `adjoint`: how Diffrax differentiates, by default
-    forwards.
+    **Arguments:** as for `follow`; `times`: growing, in [0, t1], or `None` for those of the grid; `grid`: the ends of
+    the steps [s], 0 the first and t1 the last, for a solver without an error estimate; `adjoint`: how Diffrax
+    differentiates, by default in forward mode.
 
     **Returns:** a `SampledSolution`.
     """
     state, scales = problem.start()
     margin = problem.domain_margin(jnp.zeros_like(t1), state)
     watched = margin is not None
-    # Diffrax sees an event where the domain margin changes its sign: a run that starts beyond it has ended.
+    # Diffrax detects an event where the margin changes its sign: a run that starts outside the domain has ended.
     at_once = jnp.zeros((), bool) if margin is None else margin <= 0.0
     t1 = jnp.where(at_once, 0.0, t1)
     event = diffrax.Event(

@@ -1,10 +1,10 @@
-"""Many lanes at once: the driver for event times and end states of a whole grid.
+"""Solve an ensemble in lanes: event times and end states of a whole grid.
 
-A block of lanes advances in lockstep, every lane with its own step length; cells wait in a queue for a lane (`scheduler.py`).
-The state is one array (components, lanes); the parameters of the problem are scalars or one per cell.
+All lanes step together, every lane with its own step length; cells wait in a queue for a lane (`scheduler.py`). The
+state is one array (components, lanes); the parameters of the problem are scalars or one per cell.
 
-Derivatives (forward mode) flow through the states alone; step lengths are held fixed. `derivatives/slopes.py` has the
-fast ways to first derivatives.
+Forward-mode derivatives flow through the states alone; step lengths are held fixed. `derivatives/slopes.py` computes
+first derivatives faster.
 """
 
 import functools
@@ -39,12 +39,12 @@ def ensemble_solve(
     - `cells`: how many of the problem's cells to run; the rest is padding, so that one compiled program serves grids of
       different sizes.
     - `settings`: with an explicit Runge-Kutta solver of Diffrax.
-    - `passes`: whether a run goes on through the event, in either direction, rather than ending there.
-    - `one_kernel`: whether to have the loop compiled into a single kernel on a CPU, which halves its cost; not for
-      programs that are differentiated again.
-    - `parts`: of how many equal parts the state is made, as for `LaneScheduler.of`.
+    - `passes`: whether the event is nonterminal: a run continues through it, in either direction.
+    - `one_kernel`: whether to compile the loop into a single kernel on a CPU, which halves its cost; not for programs
+      that are differentiated again.
+    - `parts`: number of equal blocks of the state, as for `LaneScheduler.of`.
 
-    **Returns:** the `Outcome`, and the number of lockstep iterations, each of which advanced a block of lanes.
+    **Returns:** the `Outcome`, and the number of iterations, each of which advanced all lanes.
     """
     options = {"passes": passes, "one_kernel": one_kernel, "parts": parts}
     outcome, iterations = LaneScheduler.of(problem, t1, cells, settings, **options).outcome()
@@ -52,11 +52,11 @@ def ensemble_solve(
 
 
 def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
-    """The outcome with the time of the event in the cells that ended on it, infinite in the others."""
+    """The outcome with the event time of the cells that ended on the event, infinite in the others."""
     if problem.event_function(outcome.state) is None:
         return outcome
     time = crossing_time(problem, outcome.end_time, outcome.state)
-    # A cell that starts beyond the event is there at once.
+    # A cell that starts beyond the event has its event at 0.
     time = jnp.where(outcome.end_time > 0.0, time, 0.0)
     time = jnp.where(outcome.status == CROSSED, time, jnp.inf)
     return outcome._replace(first_crossing=time, crossing_time=time)

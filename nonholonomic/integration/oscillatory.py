@@ -1,12 +1,13 @@
-"""An explicit Runge-Kutta pair of orders 8 and 7 for motions that oscillate or turn, the default of blocks of lanes.
+"""An explicit Runge-Kutta pair of orders 8 and 7 for motions that oscillate or rotate, the default of ensemble solves.
 
-It has the thirteen stages, and all simplifying assumptions, of Prince and Dormand's pair RK8(7)13M (High order embedded
-Runge-Kutta formulae, J. Comput. Appl. Math. 7, 1981), which is Diffrax's `Dopri8`. These leave ten coefficients free. Prince
-and Dormand chose them for a small error in ninth order, whatever the field. Here they are those of the smallest error of a
-step along the motions of tops and strollers, for lengths at which the error is about the tolerance, and with small weights, for
-these magnify round-off; `python benchmarks/tune_pair.py --starts 50 --seed 0` found them. What they gain is in
-`docs/performance.md`. A rotation by 1 rad a step changes the amplitude by 3e-10 and the phase by 7e-10, with `Dopri8` by 1e-8
-and 3e-8; by 3 rad, which only the loosest tolerances allow, both by 8e-4, `Dopri8` inwards and this pair outwards.
+The pair has the thirteen stages, and all simplifying assumptions, of Prince and Dormand's pair RK8(7)13M (High order
+embedded Runge-Kutta formulae, J. Comput. Appl. Math. 7, 1981), which is Diffrax's `Dopri8`. These leave ten
+coefficients free. Prince and Dormand chose them for a small error in ninth order, whatever the field. Here they
+minimise the error of a step along the motions of tops and strollers, for lengths at which the error is about the
+tolerance, and keep the weights small, because large weights magnify round-off; `python benchmarks/tune_pair.py --starts
+50 --seed 0` computed them. `docs/performance.md` has the gain. A rotation by 1 rad a step changes the amplitude by
+3e-10 and the phase by 7e-10, with `Dopri8` by 1e-8 and 3e-8; by 3 rad, which only the loosest tolerances allow, both by
+8e-4, `Dopri8` inwards and this pair outwards.
 """
 
 from typing import Any, ClassVar
@@ -125,11 +126,11 @@ SEVENTH = (
     0.0,
 )
 
-#: The error of a step is estimated by this times the difference of the two. With 2, smooth motions take about as many steps as
-#: with Prince and Dormand's pair at the same tolerance, and err less.
+#: The error of a step is estimated by this factor times the difference of the two. With 2, smooth motions take about as
+#: many steps as with Prince and Dormand's pair at the same tolerance, and err less.
 CAUTION = 2.0
 
-#: Where the stages lie in the step, but for the first one, and with its end, at which the next step begins.
+#: Positions of the stages after the first in the step, and of the step's end, where the next step begins.
 PLACES = np.array([*(sum(row) for row in STAGES), 1.0])
 
 

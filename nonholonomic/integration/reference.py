@@ -1,4 +1,4 @@
-"""The outcome of every cell by vmapped `diffrax.diffeqsolve`: slow, and independent of the lockstep driver."""
+"""The outcome of every cell by vmapped `diffrax.diffeqsolve`: slow, and independent of the ensemble solver."""
 
 import functools
 
@@ -26,7 +26,7 @@ def solve_by_diffrax(
 
     The domain margin is checked at the ends of steps; events are located on Diffrax's dense output.
 
-    **Arguments:** as for `ensemble_solve`, but any solver of Diffrax will do.
+    **Arguments:** as for `ensemble_solve`, but any solver of Diffrax works.
 
     **Returns:** the `Outcome`.
     """
@@ -43,7 +43,7 @@ def solve_by_diffrax(
             else (lambda t, y, args, **_: args.domain_margin(t, y)),
         }
         conditions = {code: condition for code, condition in conditions.items() if condition is not None}
-        # Diffrax sees an event where a condition changes its sign: a cell that starts beyond one has ended.
+        # Diffrax detects an event where a condition changes its sign: a cell that starts beyond one has ended.
         at_once = [condition(jnp.zeros(()), state, here) <= 0.0 for condition in conditions.values()]
         ends_at_once = functools.reduce(jnp.logical_or, at_once, jnp.asarray(False))
         event = diffrax.Event(list(conditions.values()), root_finder=optimistix.Newton(1e-13, 1e-13))

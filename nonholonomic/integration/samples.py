@@ -1,7 +1,7 @@
-"""Many runs sampled at given times, by the same block of lanes that finds event times.
+"""Sample many runs at given times, with the lanes that also locate event times.
 
-Steps end on the times that are asked for, so a sample has the accuracy of the method; between two samples the steps are
-of even length. The loop works in periods: a period records what each iteration reached, and then its samples are stored
+Steps end on the requested times, so a sample has the accuracy of the method; between two samples the steps have even
+lengths. The loop works in periods: a period records the state after each iteration, and then stores its samples
 together.
 """
 
@@ -20,25 +20,25 @@ from .settings import Settings
 from .status import REACHED_END, RUNNING
 from .step import LaneState, try_step
 
-#: Iterations of a period: as many as fit the caches with their record.
+#: Iterations per period: as many as fit the caches with their record.
 PERIOD = 64
 
-#: By how much a step is stretched to end on a sample: its error stays below the tolerance, because steps are proposed with a
-#: margin of `step.SAFETY`.
+#: Largest factor by which a step is stretched to end on a sample: its error stays below the tolerance, because steps
+#: are proposed with a margin of `step.SAFETY`.
 STRETCH = 1.08
 
 Samples = Float[Array, "cells times components"]
 
 
 class Reached(NamedTuple):
-    """What the iterations of a period reached: the state, and the number of the sample there, if it is one."""
+    """Record of a period: the state after each iteration, and the number of the sample there, if any."""
 
     state: Float[Array, "iterations components lanes"]
     sample: Int[Array, "iterations lanes"]
 
 
 class Sampling(NamedTuple):
-    """A solve with samples on its way: `sample` is the number of the next one in every lane."""
+    """Progress of an ensemble solve with samples: `sample` is the number of the next sample in every lane."""
 
     progress: Progress
     sample: Int[Array, " lanes"]
@@ -56,15 +56,15 @@ def solve_with_samples(
     parts: int = 1,
     one_kernel: bool = False,
 ) -> tuple[Outcome, Samples]:
-    """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`, with samples on the way.
+    """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`, and sample it.
 
     **Arguments:** as for `LaneScheduler.of`, and
 
-    - `times`: of the samples [s], increasing, from 0 or later; (times,) for all cells or (times, cells). Those after `t1` are
-      not reached.
+    - `times`: of the samples [s], increasing, from 0 or later; (times,) for all cells or (times, cells). Those after
+      `t1` are not reached.
 
-    **Returns:** the `Outcome`, without crossing times; and the states at the times, (cells, times, components), NaN after the
-    end of a run.
+    **Returns:** the `Outcome`, without crossing times; and the states at the times, (cells, times, components), NaN
+    after the end of a run.
     """
     scheduler = LaneScheduler.of(problem, t1, cells, settings, parts=parts, one_kernel=one_kernel)
     count, starts = times.shape[0], scheduler.fresh.state
@@ -96,7 +96,7 @@ def solve_with_samples(
 def _recorded(
     scheduler: LaneScheduler, times: Float[Array, "times ..."], progress: Progress, sample: Int[Array, " lanes"]
 ) -> tuple[Progress, Int[Array, " lanes"], Reached]:
-    """Advance the block by a period and record its samples."""
+    """Advance the lanes by a period and record their samples."""
     here, control, atol = scheduler.here(progress.lane_state)
     count = times.shape[0]
     horizon = jnp.broadcast_to(control.t1, progress.lane_state.time.shape)

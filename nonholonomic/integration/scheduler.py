@@ -1,7 +1,7 @@
-"""The cells of a problem and the block of lanes that works through them.
+"""The cells of a problem, and the lanes that run them.
 
-A lane whose run has ended takes the next cell of the queue, so cheap and expensive cells share a block without waiting for
-one another.
+A lane whose run has ended takes the next cell of the queue, so cheap and expensive cells share the lanes without
+waiting for one another.
 """
 
 from collections.abc import Callable
@@ -21,21 +21,21 @@ from .settings import Settings
 from .status import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
 from .step import Control, LaneState, try_step
 
-#: What it costs to refill a block, in steps of the whole block, measured on a CPU. It is refilled when idle lanes have missed
-#: as many, so what is lost is at most twice what the best moment would have cost.
+#: Cost of refilling the lanes, in steps of all lanes, measured on a CPU. The lanes are refilled when idle lanes have
+#: missed as many steps, so the loss is at most twice that of the best moment.
 REFILL = 0.25
 
-#: How far ahead the direction of motion is looked at, in first steps; and below which fraction of the change until then a start
-#: counts as one at a zero.
+#: How far ahead the direction of motion is evaluated, in first steps; and the fraction of the change until then below
+#: which a start counts as a zero.
 SOON, AT_ZERO = 1e-2, 1e-6
 
 
 class Outcome(NamedTuple):
     """How every cell ended.
 
-    `status` is one of the codes of `status.py`; `first_crossing` and `crossing_time` [s] are the times of the first and the
-    last event, the same where runs end on it, infinite if there was none; `end_time` [s] and `state` are those at which
-    the run ended; `steps` counts accepted and rejected steps, `rejected` the latter.
+    `status` is one of the codes of `status.py`; `first_crossing` and `crossing_time` [s] are the times of the first and
+    the last event, the same where runs end on it, infinite if there was none; `end_time` [s] and `state` are those at
+    which the run ended; `steps` counts accepted and rejected steps, `rejected` the latter.
     """
 
     status: Int[Array, " cells"]
@@ -48,7 +48,7 @@ class Outcome(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """The block of lanes, how many cells have left the queue, and how many iterations the block has made."""
+    """The lanes, the number of cells that have left the queue, and the number of iterations made."""
 
     lane_state: LaneState
     scheduler: Int[Array, ""]
@@ -81,9 +81,9 @@ class LaneScheduler(eqx.Module):
         one_kernel: bool = False,
         parts: int = 1,
     ) -> "LaneScheduler":
-        """The queue of a problem.
+        """The scheduler of a problem.
 
-        **Arguments:** as for `ensemble_solve`, and `parts`: the number of equal parts of the state, as for `Control`.
+        **Arguments:** as for `ensemble_solve`, and `parts`: the number of equal blocks of the state, as for `Control`.
         """
         solver, rtol = settings.for_lanes, settings.tolerance
         control = Control(explicit_tableau(solver), solver.order(None), rtol, t1, settings.max_steps, passes, parts)
@@ -96,7 +96,7 @@ class LaneScheduler(eqx.Module):
 
     @property
     def capacity(self) -> int:
-        """How many cells the problem has, padding included."""
+        """Number of cells of the problem, padding included."""
         return self.fresh.cell.shape[0]
 
     def pick(self, tree: Any, cell: Int[Array, " lanes"]) -> Any:
@@ -105,14 +105,14 @@ class LaneScheduler(eqx.Module):
         return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., inside], tree)
 
     def here(self, lane_state: LaneState) -> tuple[AbstractProblem, Control, Float[Array, "components lanes"]]:
-        """Problem, control and absolute tolerances of the cells in a block."""
+        """Problem, control and absolute tolerances of the cells in the lanes."""
         control = self.control._replace(t1=self.pick(self.control.t1, lane_state.cell))
         return self.pick(self.problem, lane_state.cell), control, self.pick(self.atols, lane_state.cell)
 
     def outcome(self) -> tuple[Outcome, Int[Array, ""]]:
         """Run every cell.
 
-        **Returns:** the `Outcome`, whose crossing times are those of events that were passed, and the number of iterations.
+        **Returns:** the `Outcome`, whose crossing times are those of nonterminal events, and the number of iterations.
         """
 
         def period(carry: tuple[Progress, Outcome]) -> tuple[Progress, Outcome]:
@@ -134,22 +134,22 @@ class LaneScheduler(eqx.Module):
         return jnp.any(progress.lane_state.status == RUNNING) | (progress.scheduler < self.cells)
 
     def idle(self, lane_state: LaneState) -> Int[Array, ""]:
-        """How many lanes have nothing to do."""
+        """Number of idle lanes."""
         return jnp.sum(lane_state.status != RUNNING)
 
     def goes_on(
         self, lane_state: LaneState, idle: Int[Array, ""], scheduler: Int[Array, ""], price: float = REFILL
     ) -> Bool[Array, ""]:
-        """Whether a block goes on; while cells wait it stops to be refilled as soon as that is worth it.
+        """Whether the loop continues; while cells wait it stops for a refill as soon as the refill pays off.
 
-        **Arguments:** `idle`: steps that idle lanes have missed since it was filled; `scheduler`: how many cells have left its
-        queue; `price`: what it costs to refill it, in steps of the whole block.
+        **Arguments:** `idle`: steps that idle lanes have missed since the last refill; `scheduler`: how many cells have
+        left the queue; `price`: cost of a refill, in steps of all lanes.
         """
         refill = (scheduler < self.cells) & (idle >= price * self.lanes)
         return jnp.any(lane_state.status == RUNNING) & ~refill
 
     def run(self, progress: Progress) -> Progress:
-        """Let the block go on until it should be refilled, or ends."""
+        """Advance the lanes until they should be refilled, or all have ended."""
         here = self.here(progress.lane_state)
 
         def goes_on(carry: tuple[LaneState, Int[Array, ""], Int[Array, ""]]) -> Bool[Array, ""]:
@@ -167,11 +167,11 @@ class LaneScheduler(eqx.Module):
         return Progress(lane_state, progress.scheduler, iterations)
 
     def in_kernel(self, loop: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        """A loop over steps, compiled into a single kernel if the queue's are."""
+        """A loop over steps, compiled into a single kernel if `one_kernel` is set."""
         return in_one_kernel(loop) if self.one_kernel and self.problem.fits_one_kernel else loop
 
     def refill(self, progress: Progress) -> Progress:
-        """Give every idle lane the next cell that waits."""
+        """Give every idle lane the next waiting cell."""
         lane_state, scheduler, iterations = progress
         idle = lane_state.status != RUNNING
         loaded = self._load(
@@ -181,18 +181,18 @@ class LaneScheduler(eqx.Module):
         return Progress(lane_state, jnp.minimum(scheduler + jnp.sum(idle), self.cells), iterations)
 
     def empty(self) -> Outcome:
-        """An outcome of the right shapes, to be filled."""
+        """An empty outcome of the right shapes."""
         return _outcome_of(self.fresh)
 
     def store(self, outcome: Outcome, lane_state: LaneState) -> Outcome:
-        """The outcome with the cells of a block that have ended."""
+        """Store the cells whose lanes have ended in the outcome."""
         found = _outcome_of(lane_state)
         to = jnp.where((lane_state.status != RUNNING) & (lane_state.cell < self.cells), lane_state.cell, self.capacity)
         return jax.tree.map(lambda all, some: all.at[..., to].set(some, mode="drop"), outcome, found)
 
     def _load(self, cell: Int[Array, " lanes"]) -> LaneState:
         lane_state = self.pick(self.fresh, cell)
-        # There may be fewer cells than lanes: the other lanes have nothing to do.
+        # There may be fewer cells than lanes: the other lanes stay idle.
         return lane_state._replace(cell=cell, status=jnp.where(cell < self.cells, lane_state.status, REACHED_END))
 
 
@@ -208,7 +208,7 @@ def _fresh_lanes(
     rates: Float[Array, "components cells"],
     lengths: Float[Array, " cells"],
 ) -> LaneState:
-    """Every cell at its start; one that starts beyond the event or the domain margin has ended."""
+    """Every cell at its start; a cell that starts beyond the event or outside the domain has ended."""
     zero = jnp.zeros_like(lengths)
     no = jnp.zeros(lengths.shape, bool)
     if problem.direction_decides:
@@ -267,7 +267,9 @@ def _holds(
     rates: Float[Array, "components cells"],
     lengths: Float[Array, " cells"],
 ) -> Bool[Array, " cells"] | None:
-    """Where a function of the state is positive at the start; at a zero, up to round-off, whether it is about to be."""
+    """Where a function of the state is positive at the start; at a zero, up to round-off, whether it is about to become
+    positive.
+    """
     value, zero = function(states), jnp.zeros_like(lengths)
     if value is None:
         return None

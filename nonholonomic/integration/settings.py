@@ -14,24 +14,25 @@ from .oscillatory import Oscillatory8
 #: The absolute tolerance as a fraction of the relative one, in units of a problem's own magnitudes.
 ABSOLUTE = 0.1
 
-#: The least and the greatest relative tolerance: below, steps are decided by round-off; above, steps are hardly controlled.
+#: The least and the greatest relative tolerance: below, round-off decides on steps; above, steps are hardly controlled.
 TIGHTEST, LOOSEST = 1e-14, 1e-2
 
-#: Steps after which a run has failed that should be short: an impact, parameters tried by a fit, a run of the slow reference.
+#: Most steps of runs that should be short: an impact, parameters tried by a fit, a run of the slow reference. A run
+#: that needs more has failed.
 MOST_STEPS = 100_000
 
 
 class Settings(eqx.Module):
-    """How runs are integrated, whatever is asked of them.
+    """How runs are integrated, for every kind of result.
 
     **Arguments:**
 
     - `tolerance`: relative tolerance.
-    - `solver`: a solver of Diffrax, an explicit Runge-Kutta one for blocks of lanes; `None` for `Oscillatory8` in blocks and
-      `Dopri8` in single runs, which need its dense output.
+    - `solver`: a solver of Diffrax, an explicit Runge-Kutta one for ensembles; `None` for `Oscillatory8` in ensembles
+      and `Dopri8` in single runs, which need its dense output.
     - `absolute`: absolute tolerance as a fraction of the relative one, in units of the problem's magnitudes.
     - `max_steps`: a run that needs more has failed.
-    - `lanes`: how many cells of a block advance together; by default as many as suit the machine (`lanes_for`).
+    - `lanes`: how many cells advance together; by default as many as suit the machine (`lanes_for`).
     """
 
     tolerance: Float[Array, ""] = eqx.field(converter=as_number)
@@ -42,12 +43,12 @@ class Settings(eqx.Module):
 
     @property
     def for_lanes(self) -> diffrax.AbstractSolver:
-        """The solver of blocks of lanes."""
+        """The solver of ensembles."""
         return Oscillatory8() if self.solver is None else self.solver
 
     @property
     def for_single_runs(self) -> diffrax.AbstractSolver:
-        """The solver where Diffrax integrates, and finds events and some of the states within steps.
+        """The solver for integration by Diffrax that locates events, and interpolates states, within steps.
 
         **Raises:** `ValueError` for one whose dense output is less accurate than its steps.
         """
@@ -59,15 +60,15 @@ class Settings(eqx.Module):
 
     @property
     def for_steps_alone(self) -> diffrax.AbstractSolver:
-        """The solver where Diffrax integrates and steps end wherever a state is asked for."""
+        """The solver for integration by Diffrax with steps that end on all requested times."""
         return diffrax.Dopri8() if self.solver is None else self.solver
 
     def with_tolerance(self, tolerance: Float[Array, ""] | None) -> Self:
-        """The same with another tolerance, or without one, which is then kept elsewhere."""
+        """The same with another tolerance, or without one, where the caller keeps it."""
         return eqx.tree_at(lambda one: one.tolerance, self, tolerance, is_leaf=lambda leaf: leaf is None)
 
     def lanes_of(self, cells: int, parts: int = 1) -> int:
-        """How many of the cells of a problem advance together, given the number of parts in its state."""
+        """How many of the cells of a problem advance together, given the number of blocks in its state."""
         return lanes_for(cells, parts) if self.lanes is None else self.lanes
 
 
@@ -90,7 +91,7 @@ def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
 def require_adaptive(solver: Any, others: str = "") -> None:
     """Raise `ValueError` unless this is `None` or a solver of Diffrax that estimates its errors and takes one field.
 
-    Those with two take a stiff part or noise beside it. **Arguments:** `others`: what else the message should allow.
+    Solvers with two fields add a stiff part or noise. **Arguments:** `others`: what else the message should allow.
     """
     structure = getattr(solver, "term_structure", None)
     adaptive = isinstance(solver, diffrax.AbstractAdaptiveSolver) and isinstance(structure, type)
@@ -102,15 +103,15 @@ def require_adaptive(solver: Any, others: str = "") -> None:
 
 
 def require_adjoint(adjoint: Any) -> None:
-    """Raise `ValueError` unless this is `None` or a way of Diffrax to differentiate."""
+    """Raise `ValueError` unless this is `None` or an adjoint method of Diffrax."""
     if not isinstance(adjoint, diffrax.AbstractAdjoint | None):
         raise ValueError(f"adjoint = {adjoint!r} must be one of Diffrax, such as RecursiveCheckpointAdjoint(), or None")
 
 
 def lanes_for(cells: int, parts: int = 1) -> int:
-    """How many cells should advance together, given their number and the number of equal parts in the state.
+    """How many cells should advance together, given their number and the number of equal blocks in the state.
 
-    On a CPU a block and its stages should fit the first caches; an accelerator is idle below tens of thousands.
+    On a CPU the lanes and their stages should fit the first caches; an accelerator is idle below tens of thousands.
     """
     most = 64 if jax.default_backend() == "cpu" else 32768
     alone = min(most, 1 << (cells - 1).bit_length())

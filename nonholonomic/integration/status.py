@@ -1,13 +1,13 @@
-"""How a run stands or has ended: the codes that the integration uses, and what users are told."""
+"""How a run stands or has ended: the codes of the integration, and the words for users."""
 
 import enum
 from typing import Self
 
-#: Still under way; at the horizon; on its event; where the model ceases to hold; given up by step control; given up
+#: Still running; at the horizon; on its event; where the model ceases to hold; stopped by step-size control; stopped
 #: because it changed its mode too often, or because the forces are not determined.
 RUNNING, REACHED_END, CROSSED, LEFT_DOMAIN, FAILED, UNRESOLVED = range(6)
 
-#: Words of earlier versions, which files and scripts hold.
+#: Words of earlier versions that may be in files and scripts.
 FORMER_WORDS = {"reached t1": "completed", "reached_end": "completed"}
 
 
@@ -52,14 +52,14 @@ class Status(enum.IntEnum):
 
     @property
     def word(self) -> str:
-        """The word for it in results and files."""
+        """The word for the status in results and files."""
         return self.name.lower()
 
     @classmethod
     def of(cls, word: str) -> Self:
-        """The status that a word, of this version or an earlier one, stands for.
+        """The status for a word of this version or an earlier one.
 
-        **Raises:** `ValueError` for a word that stands for none.
+        **Raises:** `ValueError` for an unknown word.
         """
         known = {status.word: status for status in cls}
         current = FORMER_WORDS.get(word, word)

@@ -1,4 +1,4 @@
-"""Zeros of functions of one number, many at once. (The search for an event within a step is a part of `event.py`.)"""
+"""Zeros of functions of one number, many at once. (Events within a step are located in `event.py`.)"""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 Brackets = Float[np.ndarray, " zeros"]
 
-#: Halvings that take any bracket to round-off.
+#: Halvings that reduce any bracket to round-off.
 HALVINGS = 60
 
 #: `few_trials` stops once a bracket, or the change from one trial to the next, is shorter than this fraction of the value.
@@ -73,7 +73,7 @@ def few_trials(
         last, rise = guess, at_high - at_low
         with np.errstate(all="ignore"):
             guess = low - at_low * (high - low) / rise
-        # Where the function is not a number, and now and then to be sure, the bracket is halved.
+        # Where the function is NaN, and in every fourth trial as a safeguard, the bracket is halved.
         halve = ~np.isfinite(guess) | (trial % 4 == 3)
         guess = np.where(halve, 0.5 * (low + high), np.clip(guess, low, high))
         if np.all(np.minimum(high - low, np.abs(guess - last)) <= LOCATED * np.maximum(high, 1.0)):
@@ -83,7 +83,7 @@ def few_trials(
         with np.errstate(all="ignore"):
             fade_low, fade_high = 1.0 - value / at_high, 1.0 - value / at_low
         fade_low, fade_high = (np.where(fade > 0.0, fade, 0.5) for fade in (fade_low, fade_high))
-        # The end that stays is given less weight, so that it moves too in the next trial.
+        # The retained end is given less weight, so that it moves too in the next trial.
         at_low, at_high = np.where(beyond, at_low * fade_low, value), np.where(beyond, value, at_high * fade_high)
         low, high = np.where(beyond, low, guess), np.where(beyond, guess, high)
     return guess
