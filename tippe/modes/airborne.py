@@ -345,7 +345,7 @@ def on_the_ground(
 
 
 def loss(scene: Scene, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-    """How a contact has ended that was not merely lost: a code in `tippe.dynamics.LOSSES`."""
+    """How a contact has ended that was not merely lost: a code in `LOSSES` in `tippe/model/dynamics.py`."""
     own, state = scene.dynamics, state[:OWN]
     if scene.body.stem is None:
         return own.loss(state)
