@@ -1,7 +1,7 @@
-"""Functions that fall below zero and come back within a step: two zeros that the ends of the step do not show.
+"""Functions that fall below zero and come back within a step: two zeros that do not show at the ends of the step.
 
-Where a double root may have been missed, the step is tried again with an end near the minimum. Either the function is negative
-there, and its zero is located as any other; or the step is accepted, and the next one looks at what is left.
+Where a double root may have been missed, the step is tried again with an end near the minimum. Either the function is
+negative there, and its zero is located as any other; or the step is accepted, and the next one checks the rest.
 """
 
 from collections.abc import Callable
@@ -13,9 +13,9 @@ from jaxtyping import Array, Bool, Float
 
 from .runge_kutta import Lanes, States, Step
 
-#: A minimum of the event function within a step is looked at if its estimate is below this fraction of the values at both ends.
-#: With a tenth of it one first crossing of 1279 in a cylinder is missed at a tolerance of 1e-7 and none at 1e-9; with ten
-#: times as much none is found that was not, for a quarter more steps.
+#: A minimum of the event function within a step is checked if its estimate is below this fraction of the values at both
+#: ends. With a tenth of it one first crossing of 1279 in a cylinder is missed at a tolerance of 1e-7 and none at 1e-9;
+#: ten times as much takes a quarter more steps and locates no further crossing.
 DIP = 0.2
 
 #: Only a margin whose least known value is below this fraction of its range in the step can have a minimum below zero between
@@ -36,9 +36,9 @@ CELLS = 4
 def missed_double_root(
     function: Callable[[States], Lanes | None], side: Lanes, before: tuple[States, States], tried: Step, length: Lanes
 ) -> Lanes:
-    """Where in a step a function may fall below zero and come back, as a fraction of the step; 2 if nowhere.
+    """Fraction of a step at which a function may fall below zero and come back; 2 if nowhere.
 
-    It is where the cubic through its values and slopes at both ends is least, if that is low against both ends.
+    This is the minimum of the cubic through values and derivatives at both ends, if it is low against both ends.
 
     **Arguments:**
 
@@ -61,13 +61,14 @@ def missed_loss(
     margins: Float[Array, "places margins lanes"] | None,
     free: Bool[Array, " lanes"],
 ) -> Lanes:
-    """Where in a step one of its margins may first fall below zero and come back, as a fraction of the step; 2 if nowhere.
+    """Fraction of a step at which one of its margins may first fall below zero and come back; 2 if nowhere.
 
-    It is where the polynomial through the known values is least, if its error may hide a zero.
+    This is the minimum of the polynomial through the known values, if its error may hide a zero.
 
     **Arguments:**
 
-    - `places`: the fractions of the step, from 0 to 1, at which the `margins` are known; these are `None` if there are none.
+    - `places`: the fractions of the step, from 0 to 1, at which the `margins` are known; these are `None` if there are
+      none.
     - `free`: the lanes that matter.
     """
     if margins is None or len(places) < 3:
@@ -86,16 +87,17 @@ def missed_loss(
         error = SCATTER * spread * 4.0 * place * (1.0 - place)
         return jnp.min(jnp.where(suspect & (at < 1.0) & (least < error), place, 2.0), axis=(0, 1))
 
-    # A branch, for few steps come near to a zero.
+    # A branch, because few steps come near a zero.
     return jax.lax.cond(jnp.any(suspect), first_minimum, lambda: jnp.full(free.shape, 2.0))
 
 
 def _minimum(
     low: Float[Array, "..."], fall: Float[Array, "..."], high: Float[Array, "..."], rise: Float[Array, "..."]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Where between 0 and 1 the cubic with given values and slopes at both ends is least, and its value there.
+    """Position between 0 and 1 of the minimum of the cubic with given values and derivatives at both ends, and its
+    value there.
 
-    The place is 2 where the cubic does not fall at 0 and rise at 1.
+    The position is 2 where the cubic does not fall at 0 and rise at 1.
     """
     cubic = 3.0 * (fall + rise - 2.0 * (high - low))
     square = 3.0 * (high - low) - 2.0 * fall - rise
@@ -108,7 +110,7 @@ def _minimum(
 def _interpolated(
     places: Float[np.ndarray, " places"], edges: Float[np.ndarray, " edges"], values: Float[Array, "places ..."]
 ) -> tuple[Float[Array, "edges ..."], Float[Array, "edges ..."]]:
-    """Values and slopes at the edges of the polynomial through values at some places."""
+    """Values and derivatives at the edges of the polynomial through values at some places."""
     powers = np.arange(len(places))
     per_power = np.linalg.inv(places[:, None] ** powers)
     slopes = powers * edges[:, None] ** np.maximum(powers - 1, 0)

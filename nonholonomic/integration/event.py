@@ -1,6 +1,6 @@
-"""The search for an event within a step: by trying the step again, from its start, with other lengths.
+"""Locate an event within a step: retry the step from its start with other lengths.
 
-So the event has the accuracy of the method, and not that of an interpolation.
+So the event has the accuracy of the method, not that of an interpolant.
 """
 
 from typing import NamedTuple
@@ -10,20 +10,20 @@ from jaxtyping import Array, Bool, Int
 
 from .runge_kutta import Lanes
 
-#: An event is located once the next trial would differ by less than this fraction of the step in which it lies. The end of
-#: contact errs by 2e-13 of its time from it, and by 2e-12 with ten times the value; `crossing_time` takes it out of a
-#: crossing.
+#: An event is located once the next trial would differ by less than this fraction of the step that contains it. The
+#: time of the end of contact then errs by a relative 2e-13, and by 2e-12 with ten times the value; `crossing_time`
+#: removes this error from the times of events.
 LOCATED = 1e-10
 
-#: Trials after which the far end of what is left of the step is taken for the event. It is a safety net: ten times as many
-#: change no bit of a result, six would let the end of contact err by 1e-8.
+#: Trials after which the far end of the bracket is taken for the event. A safety net: ten times as many change no bit
+#: of a result, six would let the end of contact err by 1e-8.
 MOST_TRIALS = 64
 
 
 class Bracket(NamedTuple):
-    """Where a lane looks for its event: between the step lengths `low` and `high` [s], with the margins found there.
+    """Bracket of the event in each lane: the step lengths `low` and `high` [s], with the margins there.
 
-    `stride` is the length of the step in which the search began, `trials` counts the steps tried since.
+    `stride` is the length of the step that opened the bracket, `trials` counts the steps tried since.
     """
 
     low: Lanes
@@ -37,22 +37,22 @@ class Bracket(NamedTuple):
 def refine(
     bracketing: Bool[Array, " lanes"], was: Bracket, before: Lanes, margin: Lanes, length: Lanes
 ) -> tuple[Bracket, Lanes, Bool[Array, " lanes"]]:
-    """Narrow the bracket by what an attempt found (Anderson and Bjorck, BIT 13 (1973) 253).
+    """Narrow the bracket with the result of a trial step (Anderson and Bjorck, BIT 13 (1973) 253).
 
     **Arguments:**
 
-    - `searching`: which lanes search already; any other opens its bracket with the step it just took.
+    - `bracketing`: which lanes have a bracket; any other lane opens its bracket with the step it just took.
     - `was`: the bracket.
-    - `before`, `margin`: the margin at the start of the attempt and at its end.
-    - `length`: of the attempt [s].
+    - `before`, `margin`: the margin at the start of the trial step and at its end.
+    - `length`: of the trial step [s].
 
-    **Returns:** the bracket, the length to try next, and whether the attempt ended on the event.
+    **Returns:** the bracket, the length to try next, and whether the trial step ended on the event.
     """
     opens = ~bracketing
     replaces_high = margin <= 0.0
-    # Just past a crossing the margin is round-off, or 0, and would send the search back to that crossing.
+    # Just past an event the margin is round-off, or 0, and would lead back to that event.
     start = jnp.maximum(before, -1e-3 * margin)
-    # The end that stays is given less weight, so that it moves too in the next trial.
+    # The retained end is given less weight, so that it moves too in the next trial.
     weighted_low = was.margin_low * _fade(margin, was.margin_high)
     weighted_high = was.margin_high * _fade(margin, was.margin_low)
     bracket = Bracket(
@@ -69,7 +69,7 @@ def refine(
     located = max(LOCATED, 8.0 * float(jnp.finfo(margin.dtype).eps)) * bracket.stride
     tired = bracket.trials >= MOST_TRIALS
     close = bracketing & ((jnp.abs(guess - length) <= 2.0 * located) | tired)
-    # A run that goes on must start beyond the event, or it would find the same one again.
+    # A run through a nonterminal event must restart beyond the event, or it would locate the same event again.
     found = close & replaces_high
     beyond = jnp.where(tired, bracket.high, jnp.minimum(length + located, bracket.high))
     return bracket, jnp.where(close & ~found, beyond, guess), found

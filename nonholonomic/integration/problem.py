@@ -1,4 +1,4 @@
-"""What is integrated."""
+"""The interface of an initial value problem with an event and a domain."""
 
 import abc
 from collections.abc import Callable
@@ -12,22 +12,24 @@ from .runge_kutta import Lanes, States, lesser
 
 
 class AbstractProblem(eqx.Module):
-    """What is integrated: a field, a function whose zero is the event, and a guard that ends the run.
+    """An initial value problem: a field, an event function, and a domain margin that ends the run where it vanishes.
 
     The leaves of a problem are scalars, or hold one number per cell in their last axis.
     """
 
     @property
     def leading(self) -> int | None:
-        """How many components, from the first, are all that field, crossing function and guard depend on, and have a field of
-        their own without the rest; `None` for all of them."""
+        """Number of leading components (the core state) that evolve independently of the rest, and on which event
+        function and domain margin depend alone; `None` if all are coupled.
+        """
         return None
 
     @property
     def direction_decides(self) -> bool:
-        """Whether the direction of motion decides on which side of a zero of the crossing function or the guard a run starts.
+        """Whether the direction of motion decides on which side of a zero of the event function or domain margin a run
+        starts.
 
-        A run that starts beyond the event then waits for the next time the crossing function falls through zero; otherwise it
+        A run that starts beyond the event then waits until the event function next falls through zero; otherwise it
         ends at once.
         """
         return False
@@ -39,7 +41,7 @@ class AbstractProblem(eqx.Module):
 
     @abc.abstractmethod
     def start(self) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
-        """State at the start of every cell, and the magnitudes by which its absolute errors are measured."""
+        """The initial state of every cell, and the magnitudes that scale its absolute errors."""
 
     @abc.abstractmethod
     def field(self, time: Lanes, state: States) -> States:
@@ -50,7 +52,9 @@ class AbstractProblem(eqx.Module):
         """A smooth function of order 1, positive before the event, negative after it; `None` if there is no event."""
 
     def crossing_along(self, state: States, rate: States) -> Lanes | None:
-        """The crossing function where the field is known too: what `crossing` is, for problems to which that saves work."""
+        """The event function where the field is known too: equal to `event_function`, for problems where this saves
+        work.
+        """
         return self.event_function(state)
 
     @abc.abstractmethod
@@ -64,7 +68,7 @@ class AbstractProblem(eqx.Module):
 
 
 class CoreProblem(AbstractProblem):
-    """A problem with the first components of its state alone, on which the others do not act."""
+    """The core state of a problem: the leading components, on which the others do not act."""
 
     whole: AbstractProblem
     size: int = eqx.field(static=True)
@@ -82,7 +86,7 @@ class CoreProblem(AbstractProblem):
         return state[: self.size], scales[: self.size]
 
     def field(self, time: Lanes, state: States) -> States:
-        # What the rates do not depend on, and those that are left out, the compiler drops.
+        # The compiler drops the omitted components and everything that only they depend on.
         return self.whole.field(time, self._longer(state))[: self.size]
 
     def event_function(self, state: States) -> Lanes | None:
@@ -100,13 +104,14 @@ class CoreProblem(AbstractProblem):
 
 
 def least_margin(problem: AbstractProblem, side: Lanes, time: Lanes, state: States, rate: States) -> Lanes:
-    """The least of the problem's crossing function, counted positive on the lane's side of the event, and its guard, where the
-    field is known."""
+    """The least of the problem's event function, counted positive on the lane's side of the event, and its domain
+    margin, where the field is known.
+    """
     return lesser(problem.domain_margin(time, state), side_of(problem, side)(state, rate), side)
 
 
 def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States], Lanes | None]:
-    """The problem's crossing function by state and rate, counted positive on the lane's side of the event."""
+    """The problem's event function by state and rate, counted positive on the lane's side of the event."""
 
     def crossing(state: States, rate: States) -> Lanes | None:
         found = problem.crossing_along(state, rate)
@@ -116,15 +121,16 @@ def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States],
 
 
 def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes:
-    """When the crossing function vanishes, for a state close to that (`event_time`)."""
+    """Time at which the event function vanishes, for a state close to the event (`event_time`)."""
     return event_time(problem, problem.event_function, time, state)
 
 
 def event_time(problem: AbstractProblem, function: Callable[[States], Lanes], time: Lanes, state: States) -> Lanes:
-    """When a function of the state vanishes along a motion, for a state close to that, to third order in the distance.
+    """Time at which a function of the state vanishes along a motion, for a state close to the zero, to third order in
+    the distance.
 
-    It gives the time of a located event its derivatives: `time` is held fixed, the state varies with the parameters, and
-    the series t - g/g' - g'' g^2 / (2 g'^3) turns its variation into that of the time (implicit function theorem).
+    This gives the time of a located event its derivatives: `time` is held fixed, the state varies with the parameters,
+    and the series t - g/g' - g'' g^2 / (2 g'^3) turns its variation into that of the time (implicit function theorem).
     """
 
     def slope(at: States) -> Lanes:

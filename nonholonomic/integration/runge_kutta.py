@@ -59,23 +59,24 @@ def explicit_step(
 ) -> Step:
     """Try one step in every lane.
 
-    The stages are done in a loop, so that the field is compiled twice and not once a stage. In one kernel that runs as fast as
-    stages that are written out, and compiles in half the time.
+    The stages are computed in a loop, so that the field is compiled twice and not once per stage. In one kernel the
+    loop runs as fast as unrolled stages, and compiles in half the time.
 
     **Arguments:**
 
     - `tableau`: the method.
     - `field`: (time [s], state) -> rate of the state.
-    - `margins`, `crossing`: (time, state) -> any number of margins, and (state, rate) -> the event function or `None`: numbers
-      per lane that should stay positive. They are evaluated at the end and at three stages between: the margins, which may
-      need all of the state, in a branch of those stages; the event function, which may need few components, after the stages.
+    - `margins`, `crossing`: (time, state) -> any number of margins, and (state, rate) -> the event function or `None`:
+      numbers per lane that should stay positive. They are evaluated at the end and at three stages between: the
+      margins, which may need all of the state, in a branch of those stages; the event function, which may need few
+      components, after the stages.
     - `time`, `state`, `rate`: where the step starts, and the field there.
     - `length`: length of the step [s], one per lane.
     - `margins_before`: the margins at the start; `None` if there are none.
 
     **Returns:** a `Step`.
     """
-    # The last stage of a method whose steps end with a stage is the end of the step, below.
+    # In a method whose steps end with a stage, the last stage is the end of the step, below.
     inner = len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
     looks = stages_to_look(tableau.c)
     places, looked = jnp.asarray(tableau.c[:inner]), jnp.asarray(np.isin(np.arange(inner), looks))
@@ -89,7 +90,7 @@ def explicit_step(
         def look(seen: Float[Array, "places margins lanes"]) -> Float[Array, "places margins lanes"]:
             return written_in_place(seen, jnp.stack(margins(at, there)), at=rows[stage])
 
-        # A branch, for the other stages not to pay for it: a tenth of a step of a top in a cylinder.
+        # A branch, so that the other stages do not pay for it: a tenth of a step of a top in a cylinder.
         seen = None if seen is None else jax.lax.cond(looked[stage], look, lambda seen: seen, seen)
         return written_by_component(rates, field(at, there), at=stage + 1), seen
 
@@ -105,7 +106,7 @@ def explicit_step(
         margin = lesser(_least(None if seen is None else seen[row]), crossing(there, stages[stage + 1]), length)
         negative = jnp.where(margin < 0.0, tableau.c[stage], 2.0)
         first_negative = jnp.minimum(first_negative, negative)
-    # Stored, for the step, its error and the event all depend on it.
+    # Stored, because the step, its error and the event all depend on it.
     end = jax.lax.optimization_barrier(state + length * weighted_sum(tableau.b_sol[: 1 + inner], stages))
     last_rate = jax.lax.optimization_barrier(field(time + length, end))
     last = None if seen is None else jax.lax.optimization_barrier(jnp.stack(margins(time + length, end)))
@@ -121,7 +122,7 @@ def watched_places(tableau: diffrax.ButcherTableau) -> Float[np.ndarray, " place
 
 
 def lesser(margin: Lanes | None, crossing: Lanes | None, like: Lanes) -> Lanes:
-    """The lesser of two numbers per lane, of which each may be `None`; 1 if both are."""
+    """The lesser of two numbers per lane, either of which may be `None`; 1 if both are."""
     if margin is None:
         return jnp.ones_like(like) if crossing is None else crossing
     return margin if crossing is None else jnp.minimum(crossing, margin)
@@ -132,20 +133,21 @@ def _least(margins: Float[Array, "margins lanes"] | None) -> Lanes | None:
 
 
 def over_stages(stages: int, do: Callable[[Int[Array, ""], Any], Any], start: Any) -> Any:
-    """What is carried on when something is done in every stage, in a loop; on an accelerator, which would wait for the host at
-    every branch, one after the other."""
+    """Loop over the stages and return the carry; on an accelerator, which would wait for the host at every branch, the
+    loop is unrolled.
+    """
     return jax.lax.fori_loop(0, stages, do, start, unroll=jax.default_backend() != "cpu")
 
 
 def stages_to_look(fractions: Float[np.ndarray, " stages"]) -> list[int]:
-    """The stages nearest to 1/4, 1/2 and 3/4 of the step: the places at which its inside is checked."""
+    """The stages nearest to 1/4, 1/2 and 3/4 of the step, where the inside of the step is checked."""
     between = [stage for stage, fraction in enumerate(fractions) if 0.0 < fraction < 1.0]
     nearest = {min(between, key=lambda stage: abs(fractions[stage] - part)) for part in (0.25, 0.5, 0.75) if between}
     return sorted(nearest)
 
 
 def weighted_sum(weights: Float[np.ndarray, " stages"], rates: Sequence[States]) -> States:
-    """Sum of the rates with the given weights, leaving out those of weight 0."""
+    """Weighted sum of the rates, without those of weight 0."""
     total = None
     for weight, rate in zip(weights, rates, strict=True):
         if weight != 0.0:
@@ -169,10 +171,11 @@ def moved_state(
 
 
 def scaled_error(error: States, before: States, after: States, rtol: float, atol: States, parts: int) -> Lanes:
-    """Error in units of the tolerance: of the parts of the state, the greatest root mean square (Diffrax's norm and scale).
+    """Error in units of the tolerance: the greatest root mean square among the blocks of the state (Diffrax's norm and
+    scale).
 
-    The squares are added one by one: XLA compiles a sum over an axis of more than eight components lane by lane, which took
-    half of the time of a run with twelve.
+    The squares are added one by one: XLA compiles a sum over an axis of more than eight components lane by lane, which
+    took half of the time of a run with twelve.
     """
     ratio = error / (atol + rtol * jnp.maximum(jnp.abs(before), jnp.abs(after)))
     squares, size = [one * one for one in ratio], ratio.shape[0] // parts
@@ -181,7 +184,7 @@ def scaled_error(error: States, before: States, after: States, rtol: float, atol
 
 
 def inverse_root(value: Lanes, order: int) -> Lanes:
-    """`value**(-1/order)`; square roots alone where the order is a power of 2, because `pow` costs twenty of them."""
+    """`value**(-1/order)`; by square roots alone where the order is a power of 2, because `pow` costs twenty of them."""
     if order & (order - 1) == 0:
         while order > 1:
             value, order = jnp.sqrt(value), order // 2
@@ -199,10 +202,12 @@ def first_length(
     atol: States,
     parts: int,
 ) -> Lanes:
-    """Length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section II.4), in the motion's own unit.
+    """Length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section II.4), in the motion's own
+    unit.
 
-    Their formula compares |y'| with |y''|, which depends on the unit of time; Diffrax uses seconds. Here the unit is |y|/|y'|,
-    so that motions that differ only in scale are integrated alike. If the state has several `parts`, the first one counts.
+    Their formula compares |y'| with |y''|, which depends on the unit of time; Diffrax uses seconds. Here the unit is
+    |y|/|y'|, so that motions that differ only in scale are integrated alike. If the state has several blocks (`parts`),
+    the first one counts.
     """
     scale = atol + jnp.abs(state) * rtol
     size = state.shape[0] // parts

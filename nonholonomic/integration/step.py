@@ -1,7 +1,7 @@
-"""One attempted step of a block of lanes: step control, events, and what becomes of each lane.
+"""Try one step in every lane: step-size control, events, and the new status of each lane.
 
-A lane is free until an accepted step ends beyond an event; then it searches for the event by trying that step again with
-other lengths, its start kept, until the step ends on the event. So the event has the accuracy of the method.
+A lane is free until an accepted step ends beyond an event; then the lane locates the event by trying that step again
+from the same start with other lengths, until the step ends on the event. So the event has the accuracy of the method.
 """
 
 from typing import NamedTuple
@@ -18,16 +18,17 @@ from .problem import AbstractProblem, crossing_time, side_of
 from .runge_kutta import Lanes, States, Step, explicit_step, inverse_root, scaled_error, watched_places
 from .status import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING
 
-#: Step control as in Diffrax's I controller with its defaults.
+#: Step-size control as in Diffrax's I controller with its defaults.
 SAFETY, SHRINK, GROW = 0.9, 0.2, 10.0
 
 
 class Control(NamedTuple):
-    """How steps are taken.
+    """Options of the steps.
 
-    `tableau` and `order` are the method's; `rtol` the relative tolerance; `t1` the horizon [s], one for all or one per lane;
-    a lane that needs more than `max_steps` has failed; `passes` says whether a run goes on through its event; `parts` is the
-    number of equal parts in the state, such as a state and its variations: a step is judged by the part with the largest error.
+    `tableau` and `order` are the method's; `rtol` is the relative tolerance; `t1` the horizon [s], one for all or one
+    per lane; a lane that needs more than `max_steps` has failed; `passes` is true for a nonterminal event; `parts` is
+    the number of equal blocks of the state, such as a state and its variations: the block with the largest error
+    controls the step.
     """
 
     tableau: diffrax.ButcherTableau
@@ -40,16 +41,16 @@ class Control(NamedTuple):
 
 
 class LaneState(NamedTuple):
-    """The lanes of a block.
+    """The state of the lanes.
 
     - `cell`: which cell of the problem a lane runs; `status`: a code of `status.py`.
     - `time` [s], `state`, `rate`: where the lane is, and the field there.
     - `length`: of the step to be tried [s], if the horizon is not nearer.
-    - `side`: 1 before the event, -1 beyond it; `margin`: the least of `side` times the crossing function and the margins.
+    - `side`: 1 before the event, -1 beyond it; `margin`: the least of `side` times the event function and the margins.
     - `margins`: those of the problem, `None` if there are none.
-    - `first_crossing`, `crossing_time`: of the first and the last event that were passed [s], infinite if there was none.
-    - `searching`: whether the lane looks for an event, `search`: where.
-    - `steps`: tried so far, `rejected`: by step control.
+    - `first_crossing`, `crossing_time`: of the first and the last event passed [s], infinite if there was none.
+    - `bracketing`: whether the lane is locating an event; `bracket`: the current bracket.
+    - `steps`: number of tried steps; `rejected`: of those rejected by step-size control.
     """
 
     cell: Int[Array, " lanes"]
@@ -70,22 +71,24 @@ class LaneState(NamedTuple):
 
 
 def length_to_try(control: Control, lane_state: LaneState) -> Lanes:
-    """Length of each lane's next step [s]: the last one ends on the horizon exactly, also where round-off would miss it."""
+    """Length of each lane's next step [s]: the last one ends exactly on the horizon, even where round-off would miss
+    it.
+    """
     left = control.t1 - lane_state.time
     return jnp.where(~lane_state.bracketing & (lane_state.length >= left * (1.0 - 1e-12)), left, lane_state.length)
 
 
 def try_step(problem: AbstractProblem, control: Control, atol: States, lane_state: LaneState) -> LaneState:
-    """Try a step in every lane of a block and decide what becomes of it.
+    """Try a step in every lane and update the lanes.
 
     **Arguments:**
 
     - `problem`: the problem with one number per lane (or a scalar) in every leaf.
     - `control`: the method and its tolerances.
     - `atol`: absolute tolerances, (components, lanes).
-    - `lane_state`: the lanes; those that have ended stay as they are.
+    - `lane_state`: the lanes; those that have ended do not change.
 
-    **Returns:** the block after the attempt.
+    **Returns:** the lanes after the step.
     """
 
     tried_length = length_to_try(control, lane_state)
@@ -98,7 +101,7 @@ def try_step(problem: AbstractProblem, control: Control, atol: States, lane_stat
 def after_step(
     problem: AbstractProblem, control: Control, atol: States, lane_state: LaneState, tried_length: Lanes, tried: Step
 ) -> LaneState:
-    """Decide what becomes of each lane after a step was tried.
+    """Update each lane after a step was tried.
 
     **Arguments:** as for `try_step`; `tried_length` is the length of the steps [s], `tried` their results.
 
@@ -109,13 +112,14 @@ def after_step(
     error = scaled_error(
         *stop_gradient((tried.error, lane_state.state, tried.state)), control.rtol, atol, control.parts
     )
-    # An event is located where the margin is round-off. Joined, with a barrier behind it, it is computed once; the compiler
-    # would else fuse it into several kernels of different round-off, in one of which the event is found and in another not.
+    # An event is located where the margin is round-off. Stored jointly, behind a barrier, the margin is computed once;
+    # otherwise the compiler would fuse it into several kernels with different round-off, and only some of them would
+    # detect the event.
     error, margin = stored(error, stop_gradient(tried.watched))
-    # A step into nonsense counts as one with a huge error.
+    # A step to a state that is not finite counts as one with a huge error.
     error = jnp.where(jnp.isfinite(error) & ~jnp.isnan(margin), error, jnp.inf)
     good = error <= 1.0
-    # Negative in between: end the step there and look again, so that the first event of several is found.
+    # Negative inside the step: end the step there and check again, so that the first of several events is located.
     event = missed_double_root(
         problem.event_function, lane_state.side, (lane_state.state, lane_state.rate), tried, tried_length
     )
@@ -137,7 +141,7 @@ def after_step(
     status, side, first, latest = _classify(problem, control, lane_state, tried, time, hit)
     ended = running & (status == RUNNING) & moved & (time >= control.t1)
     steps = lane_state.steps + running
-    # Written so that a length that is not a number counts as stuck.
+    # Written so that a NaN length counts as stuck.
     tiny = 8.0 * jnp.finfo(time.dtype).eps * jnp.maximum(time, 1e-3)
     stuck = free & ~forward & ~bracketing & ~(length > tiny)
     stuck |= forward & (time == lane_state.time) & (tried_length > 0.0)
@@ -166,7 +170,7 @@ def after_step(
 
 
 def _factor(error: Lanes, good: Bool[Array, " lanes"], order: int) -> Lanes:
-    """By how much the next step is longer, as Diffrax's I controller has it."""
+    """Growth factor of the next step, as in Diffrax's I controller."""
     factor = SAFETY * inverse_root(jnp.maximum(error, 1e-30), order)
     return jnp.where(good, jnp.clip(factor, 1.0, GROW), jnp.clip(factor, SHRINK, SAFETY))
 
@@ -181,7 +185,7 @@ def _classify(
 ) -> tuple[Int[Array, " lanes"], Lanes, Lanes, Lanes]:
     """Status, side, first and latest crossing time of the lanes, where `hit` says that an event was located."""
     crossing, margins = problem.event_function(tried.state), tried.margins
-    # The lesser of the two is what was located; by its sign it may be round-off.
+    # The located event is the lesser of the two; its sign may be round-off.
     by_margin = hit
     if crossing is not None:
         lost = False if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0) <= lane_state.side * crossing
@@ -195,7 +199,7 @@ def _classify(
         returns = crossed & (lane_state.side < 0.0)
         status, side = jnp.where(returns, lane_state.status, status), jnp.where(returns, 1.0, lane_state.side)
         return status, side, lane_state.first_crossing, lane_state.crossing_time
-    # Only the way from positive to negative is the event; the way back does not count.
+    # Only a crossing from positive to negative is the event; the return does not count.
     counts = crossed & (lane_state.side > 0.0)
     here = crossing_time(problem, time, tried.state)
     first = jnp.where(counts & jnp.isinf(lane_state.first_crossing), here, lane_state.first_crossing)

@@ -1,4 +1,6 @@
-"""What a top does between two events, as problems and modes for the integrator: slide, roll, fly, strike, lean on its stem.
+"""The modes of a top between events, as problems for the integrator: sliding, rolling, flight, impact, leaning on its
+stem.
 
-Each mode has its equations of motion, a margin that is positive while the mode lasts, and a map to the mode that follows.
+Each mode has its equations of motion, a domain margin that is positive while the mode lasts, and a reset map to the
+next mode.
 """

@@ -1,12 +1,15 @@
-"""Contact lost and found on any arena: phases of sliding and of flight, for a top without a stem (`airborne_stem.py` has one).
+"""Contact lost and regained on any arena: the modes of sliding and of flight, for a top without a stem (see
+`airborne_stem.py` for one with a stem).
 
-In contact the state is that of `tippe/model/state.py` with a `CarriedFrame`, 14 components. In flight it is, in the surface's
-axes, the place of the centre of mass [m], its velocity [m/s], the axis, the angular momentum about it, and two zeros. A flight
-ends where the distance of the centre of a sphere from the arena has come back to its radius; then that sphere strikes the
-tangent plane there (`impact.py`). theta counts from the normal below the top's own sphere, whichever touches.
+In contact the state is that of `tippe/model/state.py` with a `CarriedFrame`, 14 components. In flight it is, in the
+surface's axes, the position of the centre of mass [m], its velocity [m/s], the axis, the angular momentum about it, and
+two zeros. A flight ends where the distance of the centre of a sphere from the arena equals its radius again; then that
+sphere strikes the tangent plane there (`impact.py`). theta counts from the normal below the top's own sphere, whichever
+touches.
 
-A single run whose path is kept carries five more: the vector c of `trajectory_problem.py`, in the frame in contact, in the
-surface's axes in flight; the angle by which the top has turned about its axis [rad]; and the work of friction and impacts [J].
+A single run whose path is kept has five more components: the vector c of `trajectory_problem.py`, in the frame in
+contact, in the surface's axes in flight; the rotation angle of the top about its axis [rad]; and the work of friction
+and impacts [J].
 """
 
 import dataclasses
@@ -42,20 +45,20 @@ from .free_body import Ball, FreeBody, axis_rate, balls, energy, gap_rate, stand
 from .impact import CLOSING_SPEED, resolve_impact
 from .inversion_problem import InversionProblem
 
-#: The numbers of the phases. The last two are those of a top with a stem: that slides; or a sphere is about to strike, and the
-#: state is that of a flight.
+#: The mode numbers. The last two are those of a top with a stem: the stem slides; or a sphere is about to strike, and
+#: the state is that of a flight.
 SLIDING, FLYING, ON_STEM, STRIKING = range(4)
 
-#: Components of a state, behind which others may ride along.
+#: Components of a state, behind which passive quadratures may follow.
 OWN = 14
 
-#: How far a sphere may be from the arena where its flight ends, as a fraction of its radius, and by how much the normal there
-#: may differ from that of the contact. Located landings are within 1e-9.
+#: Largest distance of a sphere from the arena at the end of its flight, as a fraction of its radius, and largest
+#: difference of the normal there from that of the contact. Located landings are within 1e-9.
 LANDED = 1e-6
 
 
 class FlightState(NamedTuple):
-    """A state of flight, taken apart, in the surface's axes."""
+    """The parts of a flight state, in the surface's axes."""
 
     place: Vector
     velocity: Vector
@@ -64,7 +67,7 @@ class FlightState(NamedTuple):
 
 
 def flight_state(state: Float[Array, "components ..."]) -> FlightState:
-    """The parts of a state of flight."""
+    """Split a flight state into its parts."""
     rows = tuple(state[k] for k in range(12))
     return FlightState(rows[:3], rows[3:6], rows[6:9], rows[9:12])
 
@@ -88,7 +91,9 @@ def below(scene: Scene, flying: FlightState, ball: Ball | None = None) -> Below:
 
 
 def landing_site(scene: Scene, flying: FlightState, ball: Ball) -> Below:
-    """Where a sphere is about to touch the arena: the nearest point as it lands. Before that only the gap's sign is known."""
+    """The point where a sphere lands: the nearest point of the arena at that time. Earlier, only the sign of the gap is
+    valid.
+    """
     centre = centre_of(flying, ball)
     site, zero = scene.surface.ball_gap(centre, ball.radius, carried_frame(scene).side), jnp.zeros_like(flying.place[0])
     n = tuple(zero if part is None else part + zero for part in site.normal)
@@ -102,15 +107,17 @@ def centre_of(flying: FlightState, ball: Ball) -> Vector:
 
 
 def missed(scene: Scene, site: Below, ball: Ball) -> Bool[Array, "..."]:
-    """Whether a flight has not ended where a sphere touches the arena, so that no motion may go on from there."""
+    """Whether a flight has ended away from a contact of the sphere with the arena, so that no motion may continue from
+    there.
+    """
     n = carried_frame(scene).normal(site.foot)
     turned = tuple(subtract(a, b) for a, b in zip(n, site.axes[2], strict=True))
-    # Written so that what is not a number is a miss.
+    # Written so that NaN is a miss.
     return ~((jnp.abs(site.gap) < LANDED * ball.radius) & (dot(turned, turned) < LANDED**2))
 
 
 def carried_frame(scene: Scene) -> CarriedFrame:
-    """The frame of a scene whose contact may be lost and found."""
+    """The frame of a scene whose contact may be lost and regained."""
     assert isinstance(scene.frame, CarriedFrame)
     return scene.frame
 
@@ -134,12 +141,12 @@ def as_free_body(scene: Scene, flying: FlightState, ground: Below, ball: Ball | 
 
 
 def in_contact(ground: Below, free: FreeBody) -> Float[Array, "14 ..."]:
-    """The state of a top in contact at the foot below it; in flight what it would be but for the distance."""
+    """The state of a top in contact at the foot below it; in flight, the state that it would have without the gap."""
     return joined(free.velocity[:2], free.axis, free.momentum, ground.foot, ground.axes[0])
 
 
 def in_flight(place: Vector, axes: tuple[Vector, Vector, Vector], free: FreeBody) -> Float[Array, "14 ..."]:
-    """The state of flight of a body whose velocity, axis and momentum are given in a frame."""
+    """The flight state of a body whose velocity, axis and momentum are expressed in a frame."""
     zero = jnp.zeros_like(place[0])
     return joined(place, *(from_frame(part, axes) for part in (free.velocity, free.axis, free.momentum)), (zero, zero))
 
@@ -150,12 +157,12 @@ def standing(scene: Scene, ball: Ball) -> Dynamics:
     return dataclasses.replace(standing_on(scene.dynamics, ball), frame=frame)
 
 
-# A single run asks before every phase, outside of its programs, whether it is over as it begins.
+# Before every mode, a single run checks outside of its programs whether the mode is over as it begins.
 @compiled_setup
 def gap_margin(scene: Scene, flying: FlightState, ball: Ball, rounding: float = 0.0) -> Float[Array, "..."]:
-    """Distance of a sphere from the arena as a fraction of R, plus the round-off of a parting.
+    """Distance of a sphere from the arena as a fraction of R, plus the round-off allowed at lift-off.
 
-    **Arguments:** `rounding`: what is allowed besides that.
+    **Arguments:** `rounding`: an additional allowance.
     """
     body, ground = scene.body, landing_site(scene, flying, ball)
     rate = gap_rate(body, ball, as_free_body(scene, flying, ground, ball))
@@ -165,7 +172,7 @@ def gap_margin(scene: Scene, flying: FlightState, ball: Ball, rounding: float = 
 
 
 class Contact(AbstractProblem):
-    """Sliding until theta reaches an angle or the contact ends; `axial` [kg m^2] is `None` where nothing rides along."""
+    """Sliding until theta reaches an angle or the contact ends; `axial` [kg m^2] is `None` without passive quadratures."""
 
     dynamics: Dynamics
     cos_angle: Float[Array, "..."]
@@ -241,7 +248,7 @@ class Slide(AbstractFlyingMode):
         return jnp.concatenate([state, jnp.zeros_like(state[:2])])
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """Fly where the contact is lost, end where it jams or the ball does not fit. It counts the flights."""
+        """Fly where the contact is lost, end where it jams or the ball does not fit. Counts the flights."""
         ends, zero = self.scene.dynamics.loss(state[:OWN]) > 0, jnp.zeros_like(state[0])
         return Transition(
             mode=jnp.where(ends, SLIDING, FLYING),
@@ -256,13 +263,13 @@ class Slide(AbstractFlyingMode):
 def lift_off(
     scene: Scene, state: Float[Array, "components ..."], rides: bool, ball: Ball | None = None
 ) -> Float[Array, "components ..."]:
-    """The state of flight of a top that has lost the contact in which its state is given, with what rides along if any.
+    """The flight state of a top that has lost contact, from its state in contact, with its passive quadratures if any.
 
     **Arguments:** `ball`: the sphere that touched, by default the top's own.
     """
     body, frame, (u, e, L, place) = scene.body, carried_frame(scene), parts(state[:OWN])
     ball = balls(body)[0] if ball is None else ball
-    # Errors of the steps take the foot off the arena: a flight that began below it would end where it begins.
+    # Step errors move the foot off the arena: a flight that began below it would end where it begins.
     place = (*scene.surface.onto(place[:3]), *place[3:])
     axes = frame.own_axes(place)
     velocity = (*u, -ball.offset * axis_rate(body, e, L)[2])
@@ -296,7 +303,7 @@ class Fly(AbstractFlyingMode):
         return jnp.concatenate([in_contact(ground, free), *rows])
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """Strike the arena; rebound, or slide on where the rebound would be slow. It counts the flights that begin."""
+        """Strike the arena; rebound, or slide on where the rebound would be slow. Counts the flights that begin."""
         scene, flying, ball = self.scene, flight_state(state), balls(self.scene.body)[0]
         ground = landing_site(scene, flying, ball)
         free, zero = as_free_body(scene, flying, ground), jnp.zeros_like(state[0])
@@ -305,7 +312,7 @@ class Fly(AbstractFlyingMode):
         rebounds = bounce * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
         blow = resolve_coulomb_impact if scene.friction.set_valued else resolve_impact
         struck, fails = blow(scene.body, scene.friction, ball, free, jnp.where(rebounds, bounce, 0.0))
-        # Where the landing was located a little below the arena, the next flight would end where it begins.
+        # Where the landing was located slightly below the arena, the next flight would end where it begins.
         lifted = tuple(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
         after = jnp.where(rebounds, in_flight(lifted, ground.axes, struck), in_contact(ground, struck))
         if self.rides:
@@ -326,7 +333,7 @@ class Fly(AbstractFlyingMode):
 def modes(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
-    """The phases of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`."""
+    """The modes of runs, and the number of the mode in which each starts. **Arguments:** as for those of `sliding.py`."""
     arguments = (scene, problem.scales, problem.cos_angle, rides)
     return (Slide(*arguments), Fly(*arguments)), jnp.zeros(problem.states.shape[1:], int)
 
@@ -334,7 +341,9 @@ def modes(
 def on_the_ground(
     scene: Scene, state: Float[Array, "components cells"], mode: Int[Array, " cells"]
 ) -> Float[Array, "14 cells"]:
-    """States of runs in the layout of a contact of the top's own sphere; others as they are seen from the foot below that."""
+    """States of runs in the layout of a contact of the top's own sphere; for other modes, relative to the foot below
+    that sphere.
+    """
     flies, flown = mode == FLYING, state[:OWN]
     if scene.body.stem is not None:
         on_stem = mode == ON_STEM
@@ -345,11 +354,11 @@ def on_the_ground(
 
 
 def loss(scene: Scene, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-    """How a contact has ended that was not merely lost: a code in `LOSSES` in `tippe/model/dynamics.py`."""
+    """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/dynamics.py`)."""
     own, state = scene.dynamics, state[:OWN]
     if scene.body.stem is None:
         return own.loss(state)
-    # It is the sphere that touched whose margin has vanished.
+    # The domain margin of the touching sphere has vanished.
     stem = standing(scene, balls(scene.body)[1])
     on_stem = jnp.abs(stem.contact_margin(state)) < jnp.abs(own.contact_margin(state))
     return jnp.where(on_stem, stem.loss(state), own.loss(state))

@@ -1,9 +1,10 @@
-"""Contact lost and found on any arena by a top with a stem: sliding on either sphere, flights, and the blows of both.
+"""Contact lost and regained on any arena by a top with a stem: sliding on either sphere, flights, and the impacts of
+both.
 
-States are those of `airborne.py`. A top that slides on its stem has a frame of its own, carried along by the stem's sphere: its
-place is the foot below that. On a curved arena the feet of both spheres are apart and so are the normals there: each sphere
-strikes the tangent plane at its own foot. A top that comes to rest on both ends there as `UNRESOLVED`, because the equations of
-leaning are those of the plane (`leaning.py`).
+States are those of `airborne.py`. A top that slides on its stem has a frame of its own, carried along by the stem's
+sphere: its origin is the foot below that sphere. On a curved arena the feet of the two spheres differ and so do the
+normals there: each sphere strikes the tangent plane at its own foot. A top that comes to rest on both ends there as
+`UNRESOLVED`, because the equations of leaning are those of the plane (`leaning.py`).
 """
 
 import functools
@@ -48,14 +49,16 @@ from .free_body import Ball, FreeBody, balls, energy, gap_rate
 from .impact import CLOSING_SPEED, TOUCHING, resolve_impact
 from .inversion_problem import InversionProblem
 
-#: How far the other sphere may be in the arena while it parts, as a fraction of R: where its landing was located a little late.
+#: Largest overlap of the other sphere with the arena while it lifts off, as a fraction of R: its landing may be located
+#: slightly late.
 OVERLAP = 1e-11
 
 
 class OneOfTwo(AbstractProblem):
-    """Sliding on one of two spheres until theta reaches an angle, the contact ends, or the other sphere is at the arena.
+    """Sliding on one of two spheres until theta reaches an angle, the contact ends, or the other sphere is at the
+    arena.
 
-    `contact` is the sliding; `own` and `other` are the spheres; `on_stem` says whether the stem is the one that slides.
+    `contact` is the sliding mode; `own` and `other` are the spheres; `on_stem` is true if the stem slides.
     """
 
     scene: Scene
@@ -85,7 +88,7 @@ class OneOfTwo(AbstractProblem):
 
 @compiled_setup
 def clearance(scene: Scene, own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-    """Distance of the other sphere from the arena as a fraction of R, plus the round-off of a parting."""
+    """Distance of the other sphere from the arena as a fraction of R, plus the round-off allowed at lift-off."""
     return gap_margin(scene, flight_state(lift_off(scene, state[:OWN], False, own)), other, OVERLAP)
 
 
@@ -113,8 +116,9 @@ class SlideOnOne(AbstractFlyingMode):
         return jnp.where(self.number == 1, beside, jnp.concatenate([state, jnp.zeros_like(state[:2])]))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """Fly where the contact is lost, strike with the other sphere where that is at the arena, end where the contact jams or
-        the sphere does not fit. It counts the flights."""
+        """Fly where the contact is lost, strike with the other sphere where that is at the arena, end where the contact
+        jams or the sphere does not fit. Counts the flights.
+        """
         own, other = self.spheres
         dynamics, zero = standing(self.scene, own), jnp.zeros_like(state[0])
         lands = clearance(self.scene, own, other, state) <= dynamics.contact_margin(state[:OWN])
@@ -130,7 +134,7 @@ class SlideOnOne(AbstractFlyingMode):
 
 
 class FlightToBlow(AbstractProblem):
-    """A flight that is over as it begins where a sphere is at the arena already (`strikes`)."""
+    """A flight that is over as it begins where a sphere is already at the arena (`strikes`)."""
 
     flight: Flight
     strikes: Bool[Array, ""]
@@ -152,9 +156,9 @@ class FlightToBlow(AbstractProblem):
 
 
 class FlyBoth(Fly):
-    """Flying over the arena, with two spheres that can land; or the instant before a blow, if it `strikes`.
+    """Flying over the arena, with two spheres that can land; or the instant before an impact, if it `strikes`.
 
-    That is an array, so that one program serves both.
+    `strikes` is an array, so that one program serves both.
     """
 
     strikes: Bool[Array, ""]
@@ -165,7 +169,7 @@ class FlyBoth(Fly):
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Strike the arena with the sphere that is there; rebound, or slide on it where the rebound would be slow.
 
-        If the blow throws the other sphere into the arena, that strikes next. It counts the flights that begin.
+        If the impact throws the other sphere into the arena, that strikes next. Counts the flights that begin.
         """
         scene, flying, zero = self.scene, flight_state(state), jnp.zeros_like(state[0])
         main, stem = (gap_margin(scene, flying, ball) for ball in balls(scene.body))
@@ -173,7 +177,7 @@ class FlyBoth(Fly):
         own, other = own_and_other(scene, number)
         ground = landing_site(scene, flying, own)
         astray = missed(scene, ground, own)
-        # Where the landing was located a little below the arena, the next phase would end where it begins.
+        # Where the landing was located slightly below the arena, the next mode would end where it begins.
         flying = flying._replace(place=tuple(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
         ground = ground._replace(gap=zero)
         blow = apply_impulse(scene, flying, ground, own, other)
@@ -199,11 +203,11 @@ class FlyBoth(Fly):
 
 
 class ContactImpulse(NamedTuple):
-    """What a blow does.
+    """The result of an impact.
 
     - `free`: the top after it, above the tangent plane.
-    - `rebounds`: whether it flies off; `throws`: whether the other sphere is thrown into the arena; `rests`: whether the top is
-      at rest on both; `fails`: whether the blow could not be computed.
+    - `rebounds`: whether the top flies off; `throws`: whether the other sphere is thrown into the arena; `rests`:
+      whether the top is at rest on both; `fails`: whether the impact could not be computed.
     """
 
     free: FreeBody
@@ -214,9 +218,10 @@ class ContactImpulse(NamedTuple):
 
 
 def apply_impulse(scene: Scene, flying: FlightState, ground: Below, own: Ball, other: Ball) -> ContactImpulse:
-    """The blow of one sphere, on the tangent plane at its foot; slow rebounds are none.
+    """The impact of one sphere on the tangent plane at its foot; a slow rebound closes the contact.
 
-    **Arguments:** `flying`: the top, its sphere `own` at the arena; `ground`: below that sphere; `other`: the other one.
+    **Arguments:** `flying`: the top, its sphere `own` at the arena; `ground`: below that sphere; `other`: the other
+    one.
     """
     body, closing = scene.body, CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
     free = as_free_body(scene, flying, ground, own)
@@ -244,9 +249,10 @@ def own_and_other(scene: Scene, number: Int[Array, "..."]) -> tuple[Ball, Ball]:
 def modes(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
-    """The phases of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`.
+    """The modes of runs, and the number of the mode in which each starts. **Arguments:** as for those of `sliding.py`.
 
-    A launch in which the stem would be in the arena starts on the stem: its place and its theta are those of the stem's foot.
+    A launch in which the stem would be in the arena starts on the stem: its place and its theta are those of the stem's
+    foot.
     """
     arguments, (main, stem) = (scene, problem.scales, problem.cos_angle, rides), balls(scene.body)
     started = flight_state(lift_off(scene, problem.states[:OWN], False, main))

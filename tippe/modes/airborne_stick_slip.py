@@ -1,7 +1,7 @@
-"""Slipping, rolling and flying over any arena, the level plane included, under Coulomb's law as it stands.
+"""Slipping, rolling and flying over any arena, the level plane included, under set-valued Coulomb friction.
 
-What slips and rolls is as in `stick_slip_runs.py`, what flies as in `airborne.py`; the states and what rides along are those of
-the latter.
+Slipping and rolling are as in `sticking.py`, flight as in `airborne.py`, with the states and passive quadratures of the
+latter.
 """
 
 import equinox as eqx
@@ -18,7 +18,7 @@ from .airborne import FLYING, OWN, SLIDING, Fly, lift_off
 from .flying_mode import AbstractFlyingMode
 from .inversion_problem import InversionProblem
 
-#: The numbers of the phases; flying has that of `airborne.py`.
+#: The mode numbers; flying has that of `airborne.py`.
 SLIPPING, ROLLING = SLIDING, 2
 
 
@@ -30,7 +30,7 @@ class Touch(AbstractFlyingMode):
 
     @property
     def contact_state(self) -> sticking.StickSlipMode:
-        """The phase of runs that end where the contact is lost."""
+        """The mode of runs that end where the contact is lost."""
         size = OWN if self.rides else None
         return sticking.StickSlipMode(self.kind, self.cos_angle, self.scales, self.last, self.axial, size)
 
@@ -44,7 +44,7 @@ class Touch(AbstractFlyingMode):
         return _at_no_distance(self.contact_state.between(motion, passed))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """Stick, slip, or fly where the contact is lost. It counts flights, and changes from slip to rolling."""
+        """Stick, slip, or fly where the contact is lost. Counts flights, and changes from slip to rolling."""
         transition = self.contact_state.reset_map(state, left)
         whole = transition.state
         if self.kind.rolls:
@@ -75,7 +75,7 @@ class Land(Fly):
 def modes(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
-    """The phases of runs, and the number of that in which each starts. **Arguments:** as for those of `sliding.py`."""
+    """The modes of runs, and the number of the mode in which each starts. **Arguments:** as for those of `sliding.py`."""
     both, arguments = problem.dynamics, (scene, problem.scales, problem.cos_angle, rides)
     assert isinstance(both, StickSlip)
     slips, rolls = (
@@ -87,5 +87,5 @@ def modes(
 
 
 def _at_no_distance(shown: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
-    """What a path shows of states in contact."""
+    """The output rows of states in contact."""
     return jnp.concatenate([shown, jnp.zeros_like(shown[:2])])

@@ -1,12 +1,14 @@
-"""Impact under Coulomb's law as it stands: the slip may stop, and the contact then sticks or slips on.
+"""Impact under set-valued Coulomb friction: the slip may stop, and the contact then sticks or slips again.
 
-As in `impact.py` the normal impulse p is the clock, and the contact's velocity changes by the constant matrix W. While it slips
-the tangential impulse grows by -mu v / |v|, whose direction has no limit where a slip stops. With the way of the slip as the
-clock, ds = dp / |v|, nothing is singular, v' = |v| W_n - mu W_t v, and a slip that stops does so exponentially in s.
+As in `impact.py` the normal impulse p replaces time, and the contact's velocity changes by the constant matrix W. While
+the contact slips, the tangential impulse grows by -mu v / |v|, whose direction has no limit where a slip stops. With
+the slip distance s as the independent variable, ds = dp / |v|, nothing is singular, v' = |v| W_n - mu W_t v, and a slip
+that stops does so exponentially in s.
 
-From a stop on the tangential impulse per p is, of all f with |f| <= mu, that with the least f.W_tt f / 2 + f.W_tn: v then
-grows along -f if |f| = mu, and stays zero if |f| < mu. W_tt being positive definite, there is one such f, (W_tt + k) f = -W_tn
-with k >= 0: the way on is unique, straight, and lasts to the end. The normal velocity grows on it.
+After a stop the tangential impulse per p is, of all f with |f| <= mu, the one with the least f.W_tt f / 2 + f.W_tn: v
+then grows along -f if |f| = mu, and stays zero if |f| < mu. W_tt being positive definite, there is one such f, (W_tt +
+k) f = -W_tn with k >= 0: the solution after the stop is unique, straight, and lasts to the end. The normal velocity
+grows along it.
 """
 
 import diffrax
@@ -25,16 +27,16 @@ from .impact import LARGEST, TOLERANCE, ContactImpulse, Impact, apply_impulse, a
 
 Cells = Float[Array, " cells"]
 
-#: A slip has stopped where its speed is this part of that with which the sphere arrives. The impulse errs by as much at most.
-#: Errors of the integration, a tenth of its tolerance, must be less.
+#: A slip has stopped where its speed is this fraction of the sphere's speed of arrival. The impulse errs by as much at
+#: most. Integration errors, a tenth of the tolerance, must be smaller.
 STOPS = 1e-11
 
-#: Newton's iterations for the force after a stop. They converge from one side, in six or so.
+#: Newton iterations for the force after a stop. They converge from one side, in about six.
 ITERATIONS = 30
 
 
 class Skid(AbstractProblem):
-    """The slipping part of impacts: tangential and normal impulse as the state, the way of the slip as the time.
+    """The slipping part of impacts: tangential and normal impulse as the state, the slip distance as the time.
 
     - `impact`: the impacts, in whose units the impulses are; `pace`: the speed with which the sphere arrives [m/s].
     """
@@ -64,14 +66,15 @@ class Skid(AbstractProblem):
         return least(self.impact.domain_margin(state[2], state[:2]), self.slip_left(state))
 
     def slip_left(self, state: Float[Array, "3 cells"]) -> Cells:
-        """Slip speed above that at which a slip has stopped, as a part of the speed of arrival."""
+        """Slip speed above the threshold at which a slip has stopped, as a fraction of the speed of arrival."""
         return length(*self.velocity(state)[:2]) / self.pace - STOPS
 
 
 def resolve_coulomb_impact(
     body: Top, friction: SetValuedCoulomb, ball: Ball, free: FreeBody, restitution: Cells
 ) -> tuple[FreeBody, Bool[Array, " cells"]]:
-    """The body after a sphere of it has struck the plane; where the contact sticks, its slip is zero but for round-off.
+    """The body after one of its spheres has struck the plane; where the contact sticks, its slip is zero up to
+    round-off.
 
     **Arguments, returns:** as for `resolve_impact`, of which it is the limit for a slip speed of 0.
     """
@@ -83,7 +86,7 @@ def resolve_coulomb_impact(
     outcome, _ = traced_solve_ensemble(skid, jnp.asarray(LARGEST), jnp.asarray(pace.shape[0]), settings)
     stops = skid.slip_left(outcome.state) <= STOPS
     rates = skid.field(outcome.end_time, outcome.state)
-    # An impact that ends while it slips is put right by one step of Newton's method, as in `Impact.ended`.
+    # An impact that ends while it slips is corrected by one step of Newton's method, as in `Impact.ended`.
     left, slope = jax.jvp(lambda at: impact.domain_margin(at[2], at[:2]), (outcome.state,), (rates,))
     step = -left / jnp.where(slope == 0.0, 1.0, slope)
     step = jnp.where(jnp.abs(step) < 1e-6, step, 0.0)
@@ -104,7 +107,7 @@ def _onward(impact: Impact, mu: Float[Array, "..."], blow: Vector) -> Vector:
     def change(force: Vector) -> Vector:
         return tuple(dot(column, force) for column in W)
 
-    # Where it sticks, a blow first takes the slip that was left.
+    # Where the contact sticks, the impulse first removes the remaining slip.
     v1, v2, _ = sum_vectors(meets.velocity, change(blow))
     sticks, determinant = f1 * f1 + f2 * f2 < mu * mu, a * c - b * b
     rest = (
@@ -113,7 +116,7 @@ def _onward(impact: Impact, mu: Float[Array, "..."], blow: Vector) -> Vector:
     )
     blow = sum_vectors(blow, (*rest, None))
     velocity, along = sum_vectors(meets.velocity, change(blow)), (f1, f2, jnp.ones_like(f1))
-    # It ends as `Impact.guard` says: the normal velocity grows in proportion, the energy as a parabola.
+    # The impact ends as in `Impact.domain_margin`: the normal velocity grows in proportion, the energy as a parabola.
     gains = change(along)
     wanted = jnp.maximum((meets.velocity[2] + impact.gained - velocity[2]) / gains[2], 0.0)
     compressed = jnp.maximum(-velocity[2], 0.0) / gains[2]

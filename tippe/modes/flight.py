@@ -1,8 +1,9 @@
 """Flight in closed form: the centre of mass on a parabola, the axis on a cone about the angular momentum.
 
-Between two contacts L is constant and e turns about it at the rate |L| / I1 (`tippe.md`, section 3). So the distance of a
-sphere from the plane is a parabola plus a cosine. Between inflections, which are known, its slope is monotone: there it has
-one minimum at most, and one root or none between points of different sign. That makes the search for the landing complete.
+Between two contacts L is constant and e turns about it at the rate |L| / I1 (`tippe.md`, section 3). So the distance of
+a sphere from the plane is a parabola plus a cosine. Between inflections, which are known, its slope is monotone: each
+interval has at most one minimum, and one root or none between points of different sign. That makes the search for the
+landing complete.
 """
 
 from typing import NamedTuple
@@ -20,12 +21,12 @@ from .free_body import Ball, FreeBody, gap, gap_rate
 
 Cells = Float[Array, " cells"]
 
-#: Stretches between inflections that are searched for a landing; the search leaves out those where the top is too high.
+#: Most intervals between inflections that are searched for a landing; the search skips those where the top is too high.
 MOST_STRETCHES = 20_000
 
 
 class Cone(NamedTuple):
-    """How the axis turns: e(t) = `along` + `across` cos(W t) + `ahead` sin(W t), W being `rate` [rad/s]."""
+    """Motion of the axis: e(t) = `along` + `across` cos(W t) + `ahead` sin(W t), W being `rate` [rad/s]."""
 
     rate: Float[Array, "..."]
     along: Vector
@@ -60,7 +61,7 @@ class Descent(NamedTuple):
 class Flight(NamedTuple):
     """How a flight ended: its length [s], whether a sphere landed and which.
 
-    `lost` says where the search for the landing gave up; `log_rate` is the logarithm of the speed of landing.
+    `lost` is true where the search for the landing failed; `log_rate` is the logarithm of the speed of landing.
     """
 
     duration: Cells
@@ -80,7 +81,7 @@ def angle_less_sine(angle: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def cone(body: Top, free: FreeBody) -> Cone:
-    """How the axis of a free body turns."""
+    """Motion of the axis of a free body."""
     size = jnp.sqrt(dot(free.momentum, free.momentum))
     still = size == 0.0
     direction = scale(1.0 / jnp.where(still, 1.0, size), free.momentum)
@@ -100,7 +101,7 @@ def flown(body: Top, gravity: Float[Array, "..."], free: FreeBody, time: Float[A
 
 
 def c_in_flight(body: Top, free: FreeBody, across: Vector, time: Float[Array, "..."]) -> Vector:
-    """A vector across the axis that turns with it and not about it, some time [s] later.
+    """A vector across the axis, carried with the axis without rotation about it, some time [s] later.
 
     It turns at the rate L / I1 - (e.L / I1) e: about L, and less about e.
     """
@@ -133,16 +134,16 @@ def fly(
     - `spheres`: those that can land.
     - `free`: the body at the start.
     - `parted`: the number of the sphere that has just left the plane.
-    - `rising`: where that sphere leaves with a speed, as after an impact; elsewhere it is at rest and its normal force has
-      vanished, so that its distance grows with the third power of time.
-    - `most`: the flight is cut off there [s].
+    - `rising`: where that sphere leaves with a speed, as after an impact; elsewhere it is at rest and its normal force
+      has vanished, so that its distance grows with the third power of time.
+    - `most`: time [s] at which the flight is cut off.
 
     **Returns:** a `Flight`.
     """
     times, speeds, lost = [], [], jnp.zeros(most.shape, bool)
     for number, ball in enumerate(spheres):
         descent = _descent(body, gravity, ball, free, (parted == number) & ~rising, parted == number)
-        # The search is by halving, which has no derivative.
+        # The search is by bisection, which has no derivative.
         time, given_up = landing(*stop_gradient((descent, most)))
         times.append(landed_at(descent, time))
         speeds.append(-descent.slope(jnp.where(jnp.isfinite(time), times[-1], 0.0)))
@@ -164,13 +165,13 @@ def _descent(
     at_rest: Bool[Array, " cells"],
     touching: Bool[Array, " cells"],
 ) -> Descent:
-    """The distance of a sphere from the plane, as it flies."""
+    """The distance of a sphere from the plane in flight."""
     turning = cone(body, free)
     start = jnp.where(touching, 0.0, jnp.maximum(gap(ball, free), 0.0))
     speed = gap_rate(body, ball, free)
     speed = jnp.where(at_rest, 0.0, jnp.where(touching, jnp.maximum(speed, 0.0), speed))
     cosine, sine = ball.offset * turning.across[2], ball.offset * turning.ahead[2]
-    # Where the normal force vanishes the distance is not bent: of what is left there, round-off, it may rise only.
+    # Where the normal force vanishes the distance has no curvature: the remainder, round-off, may only rise.
     unbent = -gravity / jnp.maximum(turning.rate**2, jnp.finfo(cosine.dtype).tiny)
     cosine = jnp.where(at_rest, jnp.minimum(cosine, unbent), cosine)
     gravity = jnp.broadcast_to(gravity, start.shape)
@@ -178,18 +179,18 @@ def _descent(
 
 
 def landing(descent: Descent, most: Cells) -> tuple[Cells, Bool[Array, " cells"]]:
-    """When the distance first falls below zero, after a start at zero or above.
+    """Time at which the distance first falls below zero, after a start at zero or above.
 
-    **Arguments:** `most`: time [s] that is looked at.
+    **Arguments:** `most`: time [s] to search.
 
-    **Returns:** the time [s], infinite where it is more than `most`; and where the search gave up.
+    **Returns:** the time [s], infinite where it is more than `most`; and where the search failed.
     """
     g, rate, amplitude = descent.gravity, descent.rate, jnp.hypot(descent.cosine, descent.sine)
     # The distance lies between two parabolas, mean +- amplitude.
     mean, drift = descent.start - descent.cosine, descent.speed - descent.sine * rate
     end = jnp.minimum(most, _last_root(mean + amplitude, drift, g) * (1.0 + 1e-9))
     high_from, high_to = _roots(mean - amplitude, drift, g)
-    # It is bent upwards where rate^2 amplitude cos(rate t - phase) < -g, for angles between bend and 2 pi - bend.
+    # The distance is convex where rate^2 amplitude cos(rate t - phase) < -g, for angles between bend and 2 pi - bend.
     mode = jnp.arctan2(descent.sine, descent.cosine)
     ratio = g / jnp.maximum(rate**2 * amplitude, jnp.finfo(g.dtype).tiny)
     bend = jnp.arccos(-jnp.minimum(ratio, 1.0))
@@ -197,7 +198,7 @@ def landing(descent: Descent, most: Cells) -> tuple[Cells, Bool[Array, " cells"]
 
     def next_inflection(time: Cells) -> Cells:
         ahead = [jnp.mod(mode + side * bend - rate * time, 2.0 * jnp.pi) for side in (1.0, -1.0)]
-        # The one that has been reached is left behind.
+        # Skip the inflection just reached.
         ahead = [jnp.where(angle < 1e-9, 2.0 * jnp.pi, angle) for angle in ahead]
         return jnp.where(straight, jnp.inf, time + jnp.minimum(*ahead) / jnp.where(straight, 1.0, rate))
 
@@ -221,7 +222,7 @@ def landing(descent: Descent, most: Cells) -> tuple[Cells, Bool[Array, " cells"]
 
     zero, no = jnp.zeros_like(end), jnp.zeros(end.shape, bool)
     low, high, located, over, _ = jax.lax.while_loop(searching, search, (zero, zero, no, no, 0))
-    # At the very start the distance is zero: what counts is that it has been above since.
+    # At the very start the distance is zero: it must have been positive since.
     time = halved(lambda t: descent.value(t) >= 0.0, low, high)[1]
     return jnp.where(located, time, jnp.inf), ~located & ~over
 
@@ -234,7 +235,7 @@ def landed_at(descent: Descent, time: Cells) -> Cells:
 
 
 def _roots(height: Cells, speed: Cells, gravity: Cells) -> tuple[Cells, Cells]:
-    """Between which times a body thrown from a height is above zero; infinite, and so never, if it is not."""
+    """Times between which a body thrown from a height is above zero; infinite, and so never, if it is not."""
     square = speed**2 + 2.0 * gravity * height
     root = jnp.sqrt(jnp.maximum(square, 0.0))
     never = square <= 0.0
@@ -245,12 +246,13 @@ def _roots(height: Cells, speed: Cells, gravity: Cells) -> tuple[Cells, Cells]:
 
 
 def _last_root(height: Cells, speed: Cells, gravity: Cells) -> Cells:
-    """When a body thrown from a height, which is not negative but for round-off, is at zero again."""
+    """Time at which a body thrown from a height, nonnegative up to round-off, is at zero again."""
     return (speed + jnp.sqrt(jnp.maximum(speed**2 + 2.0 * gravity * height, 0.0))) / gravity
 
 
 def angle_reached(body: Top, free: FreeBody, cos_angle: Float[Array, "..."], until: Cells, last: bool) -> Cells:
-    """When in flight theta rises through an angle, for the first or for the last time; infinite if not by `until`.
+    """Time in flight at which theta rises through an angle, for the first or for the last time; infinite if not by
+    `until`.
 
     Along the normal the axis is a constant plus a cosine, so the times are known in closed form.
     """

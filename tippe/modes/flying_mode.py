@@ -1,4 +1,4 @@
-"""What all phases of runs through flights have in common."""
+"""Common base of all modes of runs with flights."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -9,11 +9,11 @@ from ..model.scene import Scene
 
 
 class AbstractFlyingMode(AbstractBatchedMode):
-    """A phase of runs that go on through flights.
+    """A mode of runs that continue through flights.
 
-    - `scene`: with `contact="hybrid"`; `scales`: magnitudes by which absolute errors of the state are measured.
+    - `scene`: with `contact="hybrid"`; `scales`: magnitudes that scale absolute errors of the state.
     - `cos_angle`: cosine of the angle of theta that is the event.
-    - `rides`: whether it is a single run whose path is kept, so that more rides along behind its state.
+    - `rides`: whether this is a single run whose path is kept, with passive quadratures behind its state.
     """
 
     scene: Scene
@@ -23,5 +23,5 @@ class AbstractFlyingMode(AbstractBatchedMode):
 
     @property
     def axial(self) -> Float[Array, "..."] | None:
-        """The moment of inertia about the axis [kg m^2], `None` where nothing rides along."""
+        """The moment of inertia about the axis [kg m^2], `None` without passive quadratures."""
         return self.scene.body.I3 if self.rides else None

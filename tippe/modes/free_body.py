@@ -1,6 +1,7 @@
-"""The top free of the plane, and the spheres with which it can touch it.
+"""The top as a free body, and the spheres with which it can touch the plane.
 
-In contact the velocity and the height of the centre of mass follow from the axis; a free body carries them on its own.
+In contact the velocity and the height of the centre of mass follow from the axis; for a free body they are part of the
+state.
 """
 
 import dataclasses
@@ -16,16 +17,17 @@ from ..model.dynamics import Dynamics
 from ..model.state import joined, parts
 from ..model.top import Top
 
-#: The round-off that a sphere that has just left the arena is allowed, as a fraction of R. As it is allowed to none that comes
-#: back, ten times the value and a tenth of it move no landing.
+#: Round-off allowed to a sphere that has just left the arena, as a fraction of R. None is allowed to a sphere that
+#: comes back, so ten times the value and a tenth of it move no landing.
 ROUNDING = 1e-12
 
-#: A sphere comes back if it does so faster than this fraction of sqrt(g R). Until then it sinks by half the square, in R.
+#: A sphere comes back if its speed is more than this fraction of sqrt(g R). Until then it sinks by half the square, in
+#: R.
 COMES_BACK = 1e-8
 
 
 class Ball(NamedTuple):
-    """A sphere of the body: how far its centre is from the centre of mass along e [m], and its radius [m]."""
+    """A sphere of the body: the distance of its centre from the centre of mass along e [m], and its radius [m]."""
 
     offset: Float[Array, "..."]
     radius: Float[Array, "..."]
@@ -50,7 +52,9 @@ def balls(body: Top) -> tuple[Ball, ...]:
 
 
 def standing_on(dynamics: Dynamics, ball: Ball) -> Dynamics:
-    """The equations of motion of a top that stands on another of its spheres: of the same form with its numbers."""
+    """The equations of motion of a top that stands on another of its spheres: of the same form with the sphere's
+    parameters.
+    """
     coupling = dynamics.mass * ball.offset * dynamics.per_transverse
     return dataclasses.replace(dynamics, meridian=Round(ball.offset, ball.radius, coupling))
 
@@ -66,18 +70,18 @@ def as_free_body(body: Top, ball: Ball, state: Float[Array, "components ..."]) -
 
 
 def contact_state(free: FreeBody) -> Float[Array, "components ..."]:
-    """The state (8, ...) of a top in contact; what is left out follows from the contact."""
+    """The state (8, ...) of a top in contact; the omitted components follow from the contact."""
     return joined(free.velocity[:2], free.axis, free.momentum)
 
 
 def shown(body: Top, free: FreeBody, riding: Float[Array, "7 ..."]) -> Float[Array, "17 ..."]:
-    """What a path shows of a body that may fly.
+    """The output rows of a body that may fly.
 
-    **Arguments:** `riding`: place (x, y) of the centre of mass [m], the vector c of `trajectory_problem.py`, spin angle [rad],
-    work [J].
+    **Arguments:** `riding`: position (x, y) of the centre of mass [m], the vector c of `trajectory_problem.py`, spin
+    angle [rad], work [J].
 
-    **Returns:** the state as in contact; place (x, y) of the sphere's centre, c, spin angle, work; and the distance of the
-    top's own sphere from the plane [m] with its rate [m/s].
+    **Returns:** the state as in contact; position (x, y) of the sphere's centre, c, spin angle, work; and the distance
+    of the top's own sphere from the plane [m] with its rate [m/s].
     """
     main = balls(body)[0]
     place = [x + main.offset * e for x, e in zip(riding[:2], free.axis[:2], strict=True)]
@@ -104,11 +108,11 @@ def gap_rate(body: Top, ball: Ball, free: FreeBody) -> Float[Array, "..."]:
 def still_parting(
     rate: Float[Array, "..."], gravity: Float[Array, "..."], radius: Float[Array, "..."], rounding: Any = 0.0
 ) -> Float[Array, "..."]:
-    """The round-off that the distance of a sphere is allowed, as a fraction of R.
+    """The round-off allowed to the distance of a sphere, as a fraction of R.
 
-    It is all allowed while the sphere parts, and none when it comes back, for then it would put the landing too late.
+    The full allowance holds while the sphere lifts off, and none when it comes back: that would delay the landing.
 
-    **Arguments:** `rate`: of the distance [m/s]; `rounding`: what is allowed besides `ROUNDING`.
+    **Arguments:** `rate`: of the distance [m/s]; `rounding`: an allowance in addition to `ROUNDING`.
     """
     return (ROUNDING + rounding) * jnp.clip(1.0 + rate / (COMES_BACK * jnp.sqrt(gravity * radius)), 0.0, 1.0)
 

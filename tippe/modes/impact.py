@@ -1,18 +1,20 @@
-"""Impact of a sphere of the top on the plane, with the scene's own friction, torque included (Routh's incremental method).
+"""Impact of a sphere of the top on the plane, with the scene's own friction, torque included (Routh's incremental
+method).
 
-During an impact the configuration stands still and the contact load acts as in contact, f and tau being the scene's
+During an impact the configuration is fixed and the contact load acts as in contact, f and tau being the scene's
 friction force and torque per unit normal force: with the normal impulse p in place of time, d(tangential impulse)/dp =
 f and d(impulse of the torque)/dp = tau, slip and angular velocity changing with the impulses (Routh, Dynamics of a
-System of Rigid Bodies, 1905, art. 198; Stronge, Impact Mechanics, ch. 4). It is the limit of a stiff contact with the
-same law, and so needs no law of its own: a stop of the slip, a reversal, and friction that depends on the speed come
-out by themselves. Newton's restitution e_N says when it ends: once the velocity along the normal is e_N times the speed
-of approach. With friction Newton's rule may ask for more energy than there was (Stronge, section 3.3); the impact then
-ends earlier, where the kinetic energy is what it was before.
+System of Rigid Bodies, 1905, art. 198; Stronge, Impact Mechanics, ch. 4). This is the limit of a stiff contact with the
+same law, and so needs no law of its own: a stop of the slip, a reversal, and friction that depends on the speed all
+follow from it. Newton's restitution e_N determines the end: the velocity along the normal is e_N times the speed of
+approach. With friction Newton's rule may require more energy than there was (Stronge, section 3.3); the impact then
+ends earlier, where the kinetic energy equals that before the impact.
 
-There is always an end. Strong friction can pull the sphere into the plane faster than the impulse pushes it out (a jam), so
-the velocity along the normal is no clock. But friction only takes energy, the slip comes to an end, and a contact that does
-not slip is pushed out, because the response to an impulse is positive definite. So it is with a torque, which only takes
-energy too: velocity and angular velocity of the contact respond to force and torque by a positive definite matrix.
+There is always an end. Strong friction can pull the sphere into the plane faster than the impulse pushes it out (a
+jam), so the velocity along the normal is not monotone. But friction only takes energy, the slip comes to an end, and a
+contact that does not slip is pushed out, because the response to an impulse is positive definite. The same holds with a
+torque, which only takes energy too: velocity and angular velocity of the contact respond to force and torque by a
+positive definite matrix.
 """
 
 from typing import NamedTuple
@@ -33,31 +35,31 @@ from .free_body import Ball, FreeBody
 
 Cells = Float[Array, " cells"]
 
-#: Relative tolerance of an impact's integration: impacts are rare, so they may cost. Ten times the value moves inversion times
-#: after hundreds of them by 1e-14.
+#: Relative tolerance of an impact's integration: impacts are rare, so this cost is small. Ten times the value moves
+#: inversion times after hundreds of impacts by 1e-14.
 TOLERANCE = 1e-12
 
 #: An impact has failed if it takes this many times the normal impulse that would stop the sphere without friction.
 LARGEST = 1e9
 
-#: A rebound slower than this fraction of sqrt(g R) is none: the contact closes. In the time T that the bounces to come would
-#: take, the sliding top gets the impulse that they would give it, so the error is as small as its square. On the plane ten
-#: times the value moves inversion times by 3e-12 of themselves where a top bounces, and by 4e-11 where it rocks from sphere to
-#: sphere, ever less, until it leans on both (`LeaningDynamics.stopped`); the value itself errs by 3e-13. On other arenas ten
-#: times the value moves places and axes after the last bounce by 5e-13, inversion times after 270 flights in a bowl by 3e-13
-#: of themselves. Contact begins too early by T.
+#: A rebound slower than this fraction of sqrt(g R) closes the contact. In the time T that the remaining bounces would
+#: take, the sliding top gets the impulse that they would give it, so the error is of the order of the square. On the
+#: plane ten times the value moves inversion times by a relative 3e-12 where a top bounces, and by 4e-11 where it rocks
+#: from sphere to sphere, ever less, until it leans on both (`LeaningDynamics.stopped`); the value itself errs by 3e-13.
+#: On other arenas ten times the value moves positions and axes after the last bounce by 5e-13, inversion times after
+#: 270 flights in a bowl by a relative 3e-13. Contact begins too early by T.
 CLOSING_SPEED = 1e-5
 
-#: Two spheres touch the arena together if neither is farther from it than this fraction of R. On the plane ten times the value
-#: and a tenth of it change no bit of a time.
+#: Two spheres touch the arena together if neither is farther from it than this fraction of R. On the plane ten times
+#: the value and a tenth of it change no bit of a time.
 TOUCHING = 1e-9
 
 
 class Approach(NamedTuple):
     """A sphere about to strike: from the centre of mass to the contact point [m], velocity of that point [m/s].
 
-    `response` is the symmetric matrix W with (change of that velocity) = W (impulse) [1/kg], as three columns. `axis` is that
-    of the body; `turning` its angular velocity [rad/s].
+    `response` is the symmetric matrix W with (change of that velocity) = W (impulse) [1/kg], as three columns. `axis`
+    is that of the body; `turning` its angular velocity [rad/s].
     """
 
     arm: Vector
@@ -75,11 +77,11 @@ class ContactImpulse(NamedTuple):
 
 
 class Impact(AbstractProblem):
-    """Impacts, with the normal impulse as the time; the state is the tangential impulse and, where there is one, that of the
-    torque.
+    """Impacts, with the normal impulse as the time; the state is the tangential impulse and, where there is one, that
+    of the torque.
 
-    Both are in units of the impulse that would stop the sphere if there were no friction, and of that times the sphere's
-    radius. `gained` is the velocity along the normal [m/s] by which the impact is over.
+    Both are in units of the impulse that would stop the sphere without friction, and of that times the sphere's radius.
+    `gained` is the velocity along the normal [m/s] at which the impact ends.
     """
 
     body: Top
@@ -90,7 +92,9 @@ class Impact(AbstractProblem):
 
     @property
     def speed(self) -> Cells:
-        """Speed along the normal before the impact [m/s]; positive, because a sphere at rest has none to be measured by."""
+        """Speed along the normal before the impact [m/s]; positive, because the impulse of a sphere at rest has no
+        unit.
+        """
         return jnp.maximum(jnp.abs(self.approach.velocity[2]), 1e-12)
 
     def blow(self, normal: Cells, state: Float[Array, "rows cells"]) -> ContactImpulse:
@@ -100,7 +104,7 @@ class Impact(AbstractProblem):
         return ContactImpulse(force, tuple(row * unit * self.radius for row in state[2:]) or None)
 
     def changes(self, blow: ContactImpulse) -> tuple[Vector, Vector]:
-        """How the velocity of the contact point [m/s] and the angular velocity [rad/s] change by a blow."""
+        """Changes of the velocity of the contact point [m/s] and of the angular velocity [rad/s] by an impulse."""
         meets, torque = self.approach, cross(self.approach.arm, blow.force)
         velocity = tuple(dot(column, blow.force) for column in meets.response)
         if blow.torque is not None:
@@ -110,7 +114,7 @@ class Impact(AbstractProblem):
         return velocity, angular_velocity(self.body, meets.axis, torque)
 
     def load(self, velocity: Vector, turning: Vector) -> ContactLoad:
-        """What friction does per unit normal impulse."""
+        """Friction force and torque per unit normal impulse."""
         drilling = turning[2] if self.friction.uses_spin else None
         return self.friction.per_normal_force(Slip(velocity[0], velocity[1], (turning[0], turning[1], drilling)))
 
@@ -133,7 +137,8 @@ class Impact(AbstractProblem):
         blow, response = self.blow(time, state), self.approach.response
         change, turned = self.changes(blow)
         missing = (self.gained - change[2]) / self.speed
-        # In compression the sphere still approaches; in restitution the energy that was lost is not to come back in full.
+        # In compression the sphere still approaches; in restitution the margin is the lost energy that is not to be
+        # returned.
         approaches = -(self.approach.velocity[2] + change[2]) / self.speed
         gain = dot(blow.force, self.approach.velocity) + 0.5 * dot(blow.force, change)
         if blow.torque is not None:
@@ -142,9 +147,9 @@ class Impact(AbstractProblem):
         return least(missing, jnp.where(approaches > short, approaches, short))
 
     def ended(self, time: Cells, state: Float[Array, "rows cells"]) -> ContactImpulse:
-        """The impulses of an impact whose end has been located: put right by one step of Newton's method.
+        """The impulses of an impact whose end has been located, corrected by one step of Newton's method.
 
-        The search leaves an error of 1e-10, its square is round-off.
+        The search leaves an error of 1e-10; its square is round-off.
         """
         left, slope = jax.jvp(self.domain_margin, (time, state), (jnp.ones_like(time), self.field(time, state)))
         step = -left / jnp.where(slope == 0.0, 1.0, slope)
@@ -153,7 +158,7 @@ class Impact(AbstractProblem):
 
 
 def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
-    """How a sphere of a free body meets the plane.
+    """Velocity, lever arm and response of a sphere of a free body at the plane.
 
     W = 1/m - [r]x J^-1 [r]x, r = a e - R n (`tippe.md`, section 3).
     """
@@ -177,17 +182,18 @@ def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
 def resolve_impact(
     body: Top, friction: AbstractFriction, ball: Ball, free: FreeBody, restitution: Cells
 ) -> tuple[FreeBody, Bool[Array, " cells"]]:
-    """The body after a sphere of it has struck the plane; unchanged where the sphere does not approach the plane.
+    """The body after one of its spheres has struck the plane; unchanged where the sphere does not approach the plane.
 
-    An impulse at the contact point leaves Jellett's quantity of that sphere as it is; that of a torque changes it.
+    An impulse at the contact point leaves Jellett's quantity of that sphere unchanged; an impulse of a torque changes
+    it.
 
     **Arguments:**
 
     - `friction`: the scene's law.
     - `free`: the body before the impact.
-    - `restitution`: Newton's coefficient e_N [1]; the rebound is slower where it would take energy from nowhere.
+    - `restitution`: Newton's coefficient e_N [1]; the rebound is slower where it would create energy.
 
-    **Returns:** the body after it; and where the impact could not be computed (`MOST_STEPS`, `LARGEST`).
+    **Returns:** the body after the impact; and where the impact could not be computed (`MOST_STEPS`, `LARGEST`).
     """
     meets = approach(body, ball, free)
     gained = (1.0 + restitution) * jnp.maximum(-meets.velocity[2], 0.0)
@@ -205,7 +211,7 @@ def resolve_impact(
 
 
 def apply_impulse(body: Top, meets: Approach, free: FreeBody, blow: ContactImpulse) -> FreeBody:
-    """A free body after a blow at its contact."""
+    """A free body after an impulse at its contact."""
     velocity = sum_vectors(free.velocity, scale(1.0 / body.mass, blow.force))
     momentum = sum_vectors(free.momentum, cross(meets.arm, blow.force))
     if blow.torque is not None:

@@ -1,18 +1,18 @@
 """The top that slides on its sphere and on its stem at once: it leans.
 
-Both spheres touch the plane at one angle theta only, so the axis turns about the normal at some rate W, e' = W n x e, and
-the centre of mass stays at its height h = R_j - a_j c, c = cos theta. With L = A e + I1 W n and the momenta p = L.n and
-b = L.e,
+Both spheres touch the plane at one angle theta only, so the axis turns about the normal at some rate W, e' = W n x e,
+and the centre of mass stays at its height h = R_j - a_j c, c = cos theta. With L = A e + I1 W n and the momenta p = L.n
+and b = L.e,
 
     A = (b - c p) / (1 - c^2),   I1 W = p - c A,   w = s e + W n,   s = A / I1 + (1 / I3 - 1 / I1) b,
 
-and the slip of sphere j is v_j = u + (s R_j + W a_j) n x e. With the friction f_j per unit normal force, each from its own
-slip, nothing lifts the centre of mass and nothing raises the axis if
+and the slip of sphere j is v_j = u + (s R_j + W a_j) n x e. With the friction f_j per unit normal force, each from its
+own slip, the vertical force on the centre of mass and the torque that raises the axis vanish if
 
     N_0 + N_1 = m g,   N_0 m_0 + N_1 m_1 = -A W (1 - c^2),   m_j = a_j (1 - c^2) + h f_j.e - tau_j.(n x e),
 
-with tau_j the torque per unit normal force of a law that has one. Then m u' = N_0 f_0 + N_1 f_1, and with t_j = f_j.(n x e)
-the momenta change by p' = sum N_j (a_j t_j + tau_j.n) and b' = sum N_j (R_j t_j + tau_j.e).
+with tau_j the torque per unit normal force of a law that has one. Then m u' = N_0 f_0 + N_1 f_1, and with
+t_j = f_j.(n x e) the momenta change by p' = sum N_j (a_j t_j + tau_j.n) and b' = sum N_j (R_j t_j + tau_j.e).
 
 The slips differ across the direction of leaning only. So m_1 - m_0 is (a_1 - a_0) (1 - c^2) without friction and with
 viscous friction; Coulomb's law can make it vanish if mu h is more than (a_1 - a_0) sin theta. The first of two normal
@@ -34,25 +34,26 @@ from ..model.top import Top
 from .free_body import FreeBody, axis_rate, balls, contact_state, gap_rate
 from .impact import approach
 
-#: The number of this kind of contact, next to those of the spheres, 0 and 1.
+#: The number of this contact mode, next to those of the spheres, 0 and 1.
 BOTH = 2
 
-#: A contact ends where it would pull by this fraction of the weight. A top that comes to roll on its sphere presses its stem
-#: ever less, and never lifts it; the steps would go by the errors of a force that is next to zero. To let go so late changes
-#: velocities by the square of this: ten times the value and a tenth of it move an inversion time by 4e-16.
+#: A contact ends where its normal force is below minus this fraction of the weight. A top that begins to roll on its
+#: sphere presses its stem ever less, and never lifts it; step lengths would follow the errors of a nearly zero force.
+#: Ending the contact so late changes velocities by the square of this: ten times the value and a tenth of it move an
+#: inversion time by 4e-16.
 HOLDS = 1e-8
 
-#: Where m_1 - m_0 is less than this fraction of what it is without friction, rigid bodies do not say what follows. It decides
-#: on a status alone.
+#: Where m_1 - m_0 is less than this fraction of its value without friction, rigid-body mechanics does not determine the
+#: motion. Used for a status only.
 INDEFINITE = 1e-6
 
 
 class LeaningMotion(NamedTuple):
-    """What the equations of motion give for one state: the rate of the state of `tippe/model/dynamics.py`, and both normal
-    forces [N].
+    """The equations of motion evaluated at one state: the rate of the state of `tippe/model/dynamics.py`, and both
+    normal forces [N].
 
-    `friction_power` [W] is that of both contacts, `None` without friction; `definiteness` is m_1 - m_0 as a fraction of what
-    it is without friction.
+    `friction_power` [W] is that of both contacts, `None` without friction; `definiteness` is m_1 - m_0 as a fraction of
+    its value without friction.
     """
 
     rate: tuple[Component, ...]
@@ -65,8 +66,8 @@ class LeaningMotion(NamedTuple):
 class LeaningDynamics(eqx.Module):
     """The equations of motion of a top with a stem while both of its spheres touch the plane.
 
-    The state has the layout of `tippe/model/dynamics.py`. Its cos theta is constant to the bit, and the part of L along n x
-    e, which would change theta and is round-off, is carried along but not used.
+    The state has the layout of `tippe/model/dynamics.py`. Its cos theta is constant to the bit; the part of L along
+    n x e, which would change theta and is round-off, is integrated but not used.
     """
 
     body: Top
@@ -108,7 +109,7 @@ class LeaningDynamics(eqx.Module):
         each = list(zip(spheres, pulls, loads, strict=True))
         p_dot = dot(normal, tuple(add(multiply(ball.offset, t), load.torque[2]) for ball, t, load in each))
         b_dot = dot(normal, tuple(add(multiply(ball.radius, t), dot(load.torque, e)) for ball, t, load in each))
-        # L turns with the axis, whatever part of it is across; so b changes by its rate and by no more.
+        # L turns with the axis, including its part across; so b changes by its own rate alone.
         growth = multiply(1.0 / sine2, subtract(b_dot, multiply(c, p_dot)))
         L_dot = sum_vectors(scale(growth, e[:2]), (-precession * L[1], precession * L[0]))
         rate = (*u_dot, *scale(precession, across), None, *L_dot, p_dot)
@@ -130,21 +131,21 @@ class LeaningDynamics(eqx.Module):
         return tuple(force / weight + HOLDS for force in self.motion(state).normal_forces)
 
     def heavier(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-        """The number of the sphere with the greater normal force: the one that stays when the other's vanishes."""
+        """The number of the sphere with the greater normal force: contact remains there when the other force vanishes."""
         N_0, N_1 = self.motion(state).normal_forces
         return (N_1 > N_0).astype(int)
 
     def stopped(self, free: FreeBody) -> tuple[FreeBody, Bool[Array, "..."]]:
-        """The end of rocking: what all blows to come do together to a top whose spheres are both at the plane.
+        """The end of rocking: the total effect of all remaining impacts on a top whose spheres are both at the plane.
 
-        The top rocks from sphere to sphere, ever less, and infinitely many blows take a finite time T. Sphere j gets the
-        impulse P_j (f_j, 1), and P_j tau_j where the law has a torque, more than while it leans for T, and the sum stops both
-        speeds along the normal, g + G P = 0. In T both slips change by as little as the speeds g, so that this errs by their
-        square.
+        The top rocks from sphere to sphere, ever less, and infinitely many impacts take a finite time T. Sphere j gets
+        the impulse P_j (f_j, 1), and P_j tau_j where the law has a torque, more than while it leans for T, and the sum
+        stops both speeds along the normal, g + G P = 0. In T both slips change by as little as the speeds g, so that
+        this errs by their square.
 
-        **Returns:** the body after these impulses, but for `at_rest`; and whether their friction takes energy. One P_j is
-        negative, what that sphere carries less in T; if it gives energy now, it takes some if the blow of the other sphere is
-        waited for (det G > 0).
+        **Returns:** the body after these impulses, before `at_rest`; and whether their friction takes energy. One P_j
+        is negative, the reduction of that sphere's load in T; if its friction adds energy now, it takes some after the
+        impact of the other sphere (det G > 0).
         """
         spheres, zero = balls(self.body), jnp.zeros_like(free.height)
         w1, w2, w3 = angular_velocity(self.body, free.axis, free.momentum)
@@ -168,13 +169,14 @@ class LeaningDynamics(eqx.Module):
         return FreeBody(velocity, free.height, free.axis, momentum), dot(impulses, tuple(gains)) <= 0.0
 
     def settled(self, free: FreeBody) -> tuple[FreeBody, Int[Array, "..."], Bool[Array, "..."]]:
-        """What holds a top at rest along the normal whose spheres are both at the plane.
+        """Contacts that keep a top at rest along the normal whose spheres are both at the plane.
 
-        Of all ways to have both normal forces at least zero, and each zero where its sphere leaves the plane, there is one
-        if m_1 - m_0 is positive: on both spheres if that takes two positive forces, else on the one with the positive force.
+        Of all solutions with both normal forces at least zero, and each zero where its sphere leaves the plane, there
+        is one if m_1 - m_0 is positive: on both spheres if that takes two positive forces, else on the one with the
+        positive force.
 
-        **Returns:** the body, at rest along the normal to the bit (`at_rest`); `BOTH`, or the number of the sphere that it
-        stands on; and whether that is the only answer.
+        **Returns:** the body, at rest along the normal to the bit (`at_rest`); `BOTH`, or the number of the sphere that
+        it stands on; and whether that is the only solution.
         """
         free = at_rest(self.body, free)
         state = contact_state(free)
@@ -183,17 +185,17 @@ class LeaningDynamics(eqx.Module):
 
 
 def at_rest(body: Top, free: FreeBody) -> FreeBody:
-    """A body whose spheres are both at the plane, without the speeds along the normal that are left.
+    """A body whose spheres are both at the plane, without its remaining speeds along the normal.
 
-    theta becomes the angle of both contacts, and L loses its component along n x e, the one that changes theta: as by an
-    impulse along the normal at each sphere that ends its motion. L.n, L.e, and so Jellett's quantity of either sphere, and
-    the slip keep their values; the energy falls by that of the motion which ends.
+    theta becomes the angle of both contacts, and L loses its component along n x e, the one that changes theta: as by
+    an impulse along the normal at each sphere that ends its motion. L.n, L.e, and so Jellett's quantity of either
+    sphere, and the slip keep their values; the energy falls by that of the motion which ends.
     """
     main, stem = balls(body)
     e, L = free.axis, free.momentum
     c = jnp.broadcast_to((stem.radius - main.radius) / (stem.offset - main.offset), e[2].shape)
     square = e[0] ** 2 + e[1] ** 2
-    # The length of e stays what it was.
+    # The length of e is unchanged.
     factor = jnp.sqrt((square + e[2] ** 2 - c**2) / square)
     across = (-e[1], e[0])
     L = (*sum_vectors(L[:2], scale(-dot(across, L[:2]) / square, across)), L[2])

@@ -1,8 +1,9 @@
-"""Sliding as a phase of the motion, on one sphere or on both, and what follows it: a flight, the other sphere, or the end.
+"""Sliding as a mode of the motion, on one sphere or on both, and its transitions: to a flight, to the other sphere, or
+to the end.
 
-A single run whose path is kept carries seven more numbers behind its state, which ride along: the place (x, y) of the centre
-of mass [m], the vector c of `trajectory_problem.py`, the angle by which the top has turned about its axis [rad], and the work
-of friction and impacts [J].
+A single run whose path is kept has seven passive quadratures behind its state: the position (x, y) of the centre of
+mass [m], the vector c of `trajectory_problem.py`, the rotation angle of the top about its axis [rad], and the work of
+friction and impacts [J].
 """
 
 from typing import Any, NamedTuple
@@ -41,21 +42,21 @@ from .leaning import LeaningDynamics, at_rest
 
 Cells = Float[Array, " cells"]
 
-#: Bounces in a row after which a run is given up.
+#: Most bounces in a row before a run fails.
 MOST_BOUNCES = 10_000
 
-#: Components of a state, behind which others may ride along.
+#: Components of a state, behind which passive quadratures may follow.
 OWN = 8
 
-#: Angle by which the axis turns between the times at which a flight is shown by default [rad].
+#: Angle by which the axis turns between the default output times of a flight [rad].
 SHOWN = 0.4
 
 
 class Sliding(AbstractProblem):
-    """Sliding until theta reaches an angle, a contact is lost or jams, or a sphere that does not touch the plane does.
+    """Sliding until theta reaches an angle, a contact is lost or jams, or a sphere that does not touch the plane lands.
 
-    `own` is the sphere that slides and `other` the one that does not; `None` if there is none. `axial` is the moment of inertia
-    about the axis [kg m^2], `None` where nothing rides along.
+    `own` is the sphere that slides and `other` the one that does not; `None` if there is none. `axial` is the moment of
+    inertia about the axis [kg m^2], `None` without passive quadratures.
     """
 
     dynamics: Dynamics | LeaningDynamics
@@ -93,7 +94,9 @@ class Sliding(AbstractProblem):
 
 
 def clearance(dynamics: Dynamics, own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-    """Distance of the other sphere from the plane as a fraction of the own radius, plus the round-off of a parting."""
+    """Distance of the other sphere from the plane as a fraction of the own radius, plus the round-off allowed at
+    lift-off.
+    """
     _, e, L, _ = parts(state[:OWN])
     rate = (other.offset - own.offset) * dynamics.per_transverse * (L[0] * e[1] - L[1] * e[0])
     return height(own, other, state) / own.radius + still_parting(rate, dynamics.gravity, own.radius)
@@ -107,7 +110,7 @@ def height(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Flo
 class Slide(AbstractFlyingMode):
     """Sliding on the sphere numbered `number`, in the order of `free_body.balls`, up to an angle of theta.
 
-    The number is an array, so that one program serves both spheres; `last` says whether the run goes on through the angle. A
+    The number is an array, so that one program serves both spheres; with `last` a run continues through the angle. A
     single run whose path is kept records its flights.
     """
 
@@ -129,9 +132,9 @@ class Slide(AbstractFlyingMode):
         return shown(self.scene.body, later, _carried(self.scene.body, free, riding, passed))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Cells) -> Transition:
-        """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land where it is that which touches.
+        """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land where that one touches.
 
-        It counts the flights.
+        Counts the flights.
         """
 
         def hop(carry: tuple[Air, Array, TransitionPath | None]) -> tuple[Air, Array, TransitionPath | None]:
@@ -160,7 +163,7 @@ class Slide(AbstractFlyingMode):
 
 
 class Lean(AbstractFlyingMode):
-    """Sliding on both spheres; the phase after those of the spheres."""
+    """Sliding on both spheres; numbered after the modes of the single spheres."""
 
     def problem(self, state: Float[Array, "components cells"]) -> Sliding:
         return Sliding(leaning(self.scene), None, None, self.cos_angle, state, self.scales, self.axial)
@@ -181,12 +184,14 @@ class Lean(AbstractFlyingMode):
 def modes(
     scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
-    """The phases of runs, sliding on each sphere and on both if there are two; and the number of that in which each starts.
+    """The modes of runs, sliding on each sphere and on both if there are two; and the number of the mode in which each
+    starts.
 
     **Arguments:**
 
     - `scene`: with `contact="hybrid"`; `problem`: of its launches, which stand on their lower sphere.
-    - `tolerance`: no phase needs it; `last`: whether the last crossing counts; `rides`: as for `AbstractFlyingMode`.
+    - `tolerance`: unused by these modes; `last`: whether the last crossing counts; `rides`: as for
+      `AbstractFlyingMode`.
     """
     spheres, arguments = balls(scene.body), (scene, problem.scales, problem.cos_angle, rides)
     slides = tuple(Slide(*arguments, jnp.asarray(number), last) for number in range(len(spheres)))
@@ -205,13 +210,14 @@ class Air(NamedTuple):
     """A top that may be in the air.
 
     - `free`, `elapsed` [s]: the body and the time since the contact was lost.
-    - `ball`: the sphere that touched last; `rising`: whether it left with a speed; `falls`: whether, without a flight, it is
-      about to strike the plane, `None` for a top without stem. Once the contact is closed, the number of the phase.
-    - `status`: `RUNNING`, or how the run ended, `LEFT_DOMAIN` if it has jammed; `crossing_time` [s] of the event, infinite if
-      there was none.
-    - `flights`: so far; `open`: whether there is no contact and the run goes on.
+    - `ball`: the sphere that touched last; `rising`: whether it left with a speed; `falls`: whether, without a flight,
+      it is about to strike the plane, `None` for a top without stem. Once the contact is closed, `ball` is the number
+      of the mode.
+    - `status`: `RUNNING`, or how the run ended, `LEFT_DOMAIN` if it has jammed; `crossing_time` [s] of the event,
+      infinite if there was none.
+    - `flights`: so far; `open`: whether there is no contact and the run continues.
     - `log_rates`: of the landings, as in `Transition`.
-    - `riding`: what rides along with a single run.
+    - `riding`: the passive quadratures of a single run.
     """
 
     free: FreeBody
@@ -228,7 +234,9 @@ class Air(NamedTuple):
 
 
 def lost_contact(scene: Scene, number: Int[Array, ""], state: Float[Array, "components cells"]) -> Air:
-    """The top at the end of sliding on the sphere with a number: its contact is lost or jams, or the other is at the plane."""
+    """The top at the end of sliding on the numbered sphere: its contact is lost or jams, or the other sphere is at the
+    plane.
+    """
     own, other = _own_and_other(balls(scene.body), number)
     zero = jnp.zeros_like(state[0])
     dynamics = standing_on(scene.dynamics, own)
@@ -281,7 +289,7 @@ def take_flight(
 
 
 def land(scene: Scene, air: Air) -> Air:
-    """The impact of the sphere that has reached the plane; slow rebounds are none, and the contact closes."""
+    """The impact of the sphere that has reached the plane; a slow rebound closes the contact."""
     body, spheres = scene.body, balls(scene.body)
     own, other = _own_and_other(spheres, air.ball)
     speed = jnp.maximum(-gap_rate(body, own, air.free), 0.0)
@@ -301,7 +309,8 @@ def land(scene: Scene, air: Air) -> Air:
 
 
 def _with_other(scene: Scene, air: Air, struck: Air, other: Ball, slow: Bool[Array, " cells"], closing: Cells) -> Air:
-    """What an impact means to the other sphere if that is at the plane: it strikes too, or the top comes to rest on both.
+    """Effect of an impact on the other sphere if that is at the plane: it strikes too, or the top comes to rest on
+    both.
 
     **Arguments:** `air`: before the impact; `struck`: after it; `slow`: where it is so slow that it may be the last.
     """
@@ -323,7 +332,7 @@ def _with_other(scene: Scene, air: Air, struck: Air, other: Ball, slow: Bool[Arr
 def _carried(
     body: Top, free: FreeBody, riding: Float[Array, "7 ..."], time: Float[Array, "..."]
 ) -> Float[Array, "7 ..."]:
-    """What rides along after some time [s] in flight."""
+    """The passive quadratures after some time [s] in flight."""
     x, y, *across, angle, work = riding
     u1, u2, _ = free.velocity
     spin_rate = dot(free.axis, free.momentum) / body.I3
@@ -332,7 +341,7 @@ def _carried(
 
 
 def _no_flights(start: Air) -> TransitionPath:
-    """Room for the flights of a single run."""
+    """An empty record for the flights of a single run."""
 
     def room(leaf: Array) -> Array:
         return jnp.zeros((MOST_BOUNCES, *leaf.shape), leaf.dtype)
@@ -342,7 +351,7 @@ def _no_flights(start: Air) -> TransitionPath:
 
 
 def _with_flight(body: Top, record: TransitionPath | None, before: Air, after: Air) -> TransitionPath | None:
-    """A record, if one is kept, with the flight that leads from one state of a single run to another, if it flew."""
+    """The record, if one is kept, with the flight between two states of a single run, if it flew."""
     if record is None:
         return None
     place, flew = before.flights[0], after.flights > before.flights
@@ -359,7 +368,7 @@ def _where(condition: Bool[Array, " cells"], this: Any, that: Any) -> Any:
 
 
 def _own_and_other(spheres: tuple[Ball, ...], number: Int[Array, "..."]) -> tuple[Ball, Ball | None]:
-    """The sphere with a number, and the other if there is one."""
+    """The numbered sphere, and the other if there is one."""
     if len(spheres) == 1:
         return spheres[0], None
     main, stem = spheres

@@ -1,4 +1,4 @@
-"""Runs through stick and slip: the cells of a table, and a single run with its path."""
+"""Runs with stick and slip: the cells of a table, and a single run with its path."""
 
 from typing import Any
 
@@ -19,15 +19,15 @@ from ..model.stick_slip import AT_REST, Change, ContactMode, StickSlip
 from .inversion_problem import InversionProblem
 from .trajectory_problem import TrajectoryProblem
 
-#: The numbers of the two phases.
+#: The numbers of the two modes.
 SLIPPING, ROLLING = range(2)
 
 
 class StickSlipMode(AbstractBatchedMode):
-    """Slipping or rolling up to an angle of theta; `last` is whether the last crossing of it counts.
+    """Slipping or rolling up to an angle of theta; with `last` the last crossing of it counts.
 
-    With a single run whose path is kept, what a `TrajectoryProblem` carries rides along behind the first `size` components:
-    `axial` is then the moment of inertia about the axis [kg m^2]. For the cells of a table both are `None`.
+    For a single run whose path is kept, the passive quadratures of a `TrajectoryProblem` follow the first `size`
+    components: `axial` is then the moment of inertia about the axis [kg m^2]. For the cells of a table both are `None`.
     """
 
     kind: ContactMode
@@ -52,7 +52,7 @@ class StickSlipMode(AbstractBatchedMode):
         return onset.at((passed - wait) / jnp.where(onset.length > 0.0, onset.length, 1.0))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """Stick, slip, or end where the contact is lost. It counts how often a slip has turned into rolling."""
+        """Stick, slip, or end where the contact is lost. Counts the changes from slip to rolling."""
         slipping = self._under(self.kind.both.slipping, state)
         change = self.kind.ended(state, self._size(state), lambda at: slipping.field(left, at), self.scales, left)
         onset, length = change.onset, change.onset.length
@@ -75,11 +75,11 @@ class StickSlipMode(AbstractBatchedMode):
         )
 
     def _size(self, state: Float[Array, "components ..."]) -> int:
-        """How many components the equations of motion know."""
+        """Number of components in the equations of motion."""
         return len(state) if self.size is None else self.size
 
     def _under(self, equations: Dynamics | ContactMode, state: Float[Array, "components cells"]) -> AbstractProblem:
-        """The motion from some states on under given equations."""
+        """The motion from some states under given equations."""
         if self.axial is None:
             return InversionProblem(equations, self.cos_angle, state, self.scales)
         own, path, rest = jnp.split(state, (self._size(state), len(state) - 2))
@@ -101,11 +101,11 @@ def modes(
     axial: Float[Array, ""] | None = None,
     size: int | None = None,
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]:
-    """The phases of runs, and the number of that in which each starts.
+    """The modes of runs, and the number of the mode in which each starts.
 
     **Arguments:**
 
-    - `problem`: of a scene with `SetValuedCoulomb` and its launches; it says all that is needed of the scene.
+    - `problem`: of a scene with `SetValuedCoulomb` and its launches; it holds all that is needed of the scene.
     - `tolerance`: relative, of the integration; `last`: whether the last crossing counts.
     - `axial`, `size`: as for `StickSlipMode`.
     """
@@ -118,14 +118,14 @@ def modes(
 
 @compiled_setup
 def _first_mode(both: StickSlip, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
-    """The number of the phase in which each cell starts."""
+    """The number of the mode in which each cell starts."""
     return jnp.where(both.slip_speed(states) <= AT_REST * both.speed, ROLLING, SLIPPING)
 
 
 def contact_modes(
     run: TrajectoryProblem, tolerance: Any
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]:
-    """The phases of one run whose path is kept, the number of the first, and the state there.
+    """The modes of one run whose path is kept, the number of the first mode, and the initial state.
 
     **Arguments:** `run`: of a scene with `SetValuedCoulomb`; `tolerance`: relative, of the integration.
     """

@@ -19,9 +19,9 @@ from ..model.stick_slip import ContactMode, StickSlip
 class TrajectoryProblem(AbstractProblem):
     """Launches with their cyclic coordinates: the state, the arena's path, the spin angle and the work of friction.
 
-    Behind the coordinates of the arena's frame stand the three components of a unit vector c across the axis that turns with
-    it and not about it, c' = (e x e') x c. The body's first axis is c turned about e by the spin angle: like this all that is
-    integrated changes as slowly as the axis does.
+    Behind the coordinates of the arena's frame stand the three components of a unit vector c across the axis, carried
+    with the axis without rotation about it, c' = (e x e') x c. The body's first axis is c turned about e by the spin
+    angle: so every integrated component changes as slowly as the axis does.
 
     `rest` are spin angle and work at the start, `None` where both are 0.
     """
@@ -44,7 +44,7 @@ class TrajectoryProblem(AbstractProblem):
 
     @property
     def up_to_path(self) -> int:
-        """How many components, from the first, state and path have; what is behind them is for rotation and work."""
+        """Number of components of state and path, counted from the first; those behind them are for rotation and work."""
         return len(self.state) + len(self.cyclic) - 3
 
     def start(self) -> tuple[Float[Array, "components ..."], Float[Array, "components ..."]]:

@@ -1,4 +1,4 @@
-"""How the cells of a table are run: the kinds of scene, and the variables of each."""
+"""How to run the cells of a table: the kinds of scene, and the variables of each."""
 
 import functools
 from collections.abc import Callable
@@ -37,10 +37,10 @@ from .sensitivities import hybrid_sensitivities_of_cells, sensitivities_of_cells
 
 
 class RunKind(NamedTuple):
-    """How the runs of a kind of scene go: the words of their status, what is counted besides steps, and the phases.
+    """How to run a kind of scene: its status words, its counters besides steps, and its modes.
 
-    `modes` takes (scene, problem, tolerance, last) and gives the phases and the number of each cell's first; `None` for runs
-    of one smooth motion. `flight_state` is whether states may be those of flight, in a layout of their own.
+    `modes` takes (scene, problem, tolerance, last) and returns the modes and the number of each cell's first; `None`
+    for runs of one smooth motion. `flight_state` is whether states may be those of flight, in a layout of their own.
     """
 
     words: tuple[str, ...]
@@ -63,13 +63,13 @@ class RunKind(NamedTuple):
         return found | {name: Variable("1", np.int64, long_name=COUNTED[name]) for name in counts}
 
 
-#: What is counted in a run, and the times that are found, in words.
+#: Descriptions of the counters of a run.
 COUNTED = {"steps": "steps", "rejected": "rejected steps", "hops": "flights", "sticks": "changes from slip to rolling"}
 TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_time": "last inversion time"}
 
 NAMES = TIMES | {"end_time": "end of the run", "end_theta": "θ at the end of the run"}
 
-# Compiled once for all blocks.
+# Compiled once for all chunks.
 _on_the_ground = eqx.filter_jit(airborne.on_the_ground)
 _loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
 _flight_loss = eqx.filter_jit(airborne.loss)
@@ -97,7 +97,7 @@ WORD_OF_STATUS = {LEFT_DOMAIN: WORDS.index("contact_lost"), FAILED: WORDS.index(
 
 
 def too_many_steps(t1: float, most: int, end: float) -> str:
-    """What a message says of a run that needed more steps than it may take."""
+    """Message for a run that needs more than the most steps."""
     return (
         f"t1 = {t1:g} s is too long: the run needs more than {most:_} steps, with which it came to {end:.4g} s; "
         "take a shorter t1 or a larger tolerance"
@@ -105,7 +105,7 @@ def too_many_steps(t1: float, most: int, end: float) -> str:
 
 
 def run_kind_of(scene: Scene) -> RunKind:
-    """The driver for a scene."""
+    """The run kind of a scene."""
     hybrid = scene.contact == "hybrid"
     if scene.friction.set_valued:
         return STICK_SLIP_FLY if hybrid else STICK_SLIP
@@ -117,7 +117,7 @@ def run_kind_of(scene: Scene) -> RunKind:
 
 
 def check_differentiable(scene: Scene) -> None:
-    """Raise `ValueError` for a scene through whose phases no derivative goes."""
+    """Raise `ValueError` for a scene whose modes do not support derivatives."""
     if run_kind_of(scene) is STICK_SLIP_FLY:
         raise ValueError(
             "friction = SetValuedCoulomb with contact = 'hybrid' has no derivatives: they do not go through impacts in which a "
@@ -126,7 +126,7 @@ def check_differentiable(scene: Scene) -> None:
 
 
 class InversionRuns(NamedTuple):
-    """What is asked of every cell of a table; see `inversion_table`."""
+    """The requested variables of every cell of a table; see `inversion_table`."""
 
     run_kind: RunKind
     t1: float
@@ -143,12 +143,12 @@ class InversionRuns(NamedTuple):
 
     @property
     def last(self) -> bool:
-        """Whether a run goes on through the angle: where it ends above it, the last crossing counts."""
+        """Whether a run continues through the angle: where it ends above it, the last crossing counts."""
         return self.crossing != "first"
 
     @property
     def variables(self) -> dict[str, Variable]:
-        """The table's variables, but errors and derivatives."""
+        """The table's variables, without errors and derivatives."""
         times = {name: Variable("s", np.float64, long_name=TIMES[name]) for name in self.times}
         grazes = Variable("1", np.int8, long_name="whether an event on the way was grazing")
         return (
@@ -159,7 +159,7 @@ class InversionRuns(NamedTuple):
 
     @property
     def error_variables(self) -> dict[str, Variable]:
-        """The table's variables that say how far others can be trusted (`time_error.py`)."""
+        """The table's variables that describe the accuracy of others (`time_error.py`)."""
         bounds = dict.fromkeys((*self.times, "end_time"), "s") | {"end_theta": "rad"}
         found = {
             name: Variable(unit, np.float64, long_name=f"error of the {NAMES[name]}") for name, unit in bounds.items()
@@ -195,13 +195,13 @@ class InversionRuns(NamedTuple):
     def _hybrid_runs(
         self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, along: Callable[..., Any]
     ) -> dict[str, Any]:
-        """The variables of cells whose runs have phases; `along` takes (horizon, tolerance) and gives runs and slopes."""
+        """The variables of cells with hybrid runs; `along` takes (horizon, tolerance) and returns runs and derivatives."""
         if self.slopes_by and not self.last:
             found, slopes, grazing = along(self.t1, tolerance)
         else:
             found = self._hybrid_outcome(scene, problem, tolerance, count, self.last)
         if self.slopes_by and self.last:
-            # The slopes need the run up to the event alone, whose time is known by now.
+            # The derivatives need the run only up to the event, whose time is now known.
             there, slopes, grazing = along(
                 np.where(np.isfinite(found.crossing_time), found.crossing_time, 0.0), tolerance
             )
@@ -211,12 +211,12 @@ class InversionRuns(NamedTuple):
             found = found._replace(state=np.asarray(_on_the_ground(scene, found.state, found.mode)))
         named = self._named(scene, problem, found, loss) | dict(zip(self.run_kind.counts, found.counts, strict=True))
         if self.crossing == "both":
-            # Through phases the first crossing takes a journey of its own, which ends there.
+            # With several modes the first crossing takes a hybrid solve of its own, which ends there.
             first = self._hybrid_outcome(scene, problem, tolerance, count, False)
             named["first_time"] = np.where(first.status == CROSSED, first.crossing_time, np.inf)
         if not self.slopes_by:
             return named
-        # At the very start the event is there at once, whatever moves.
+        # An event at the start has a fixed time, whatever the tangent.
         moves = (named["status"] == 0) & (named[self.times[-1]] > 0.0)
         slopes = {name: np.where(moves, np.where(grazing, np.nan, slope), 0.0) for name, slope in slopes.items()}
         return named | slopes | {"grazes": (moves & grazing).astype(np.int8)}
@@ -224,7 +224,7 @@ class InversionRuns(NamedTuple):
     def _hybrid_outcome(
         self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, last: bool
     ) -> HybridOutcome:
-        """The runs of cells through their phases."""
+        """The hybrid runs of cells."""
         assert self.run_kind.modes is not None
         modes, first = self.run_kind.modes(scene, problem, tolerance, last)
         start, settings = (np.asarray(first), np.asarray(problem.states)), Settings(tolerance, self.solver)
@@ -241,9 +241,9 @@ class InversionRuns(NamedTuple):
         return self._named(scene, problem, outcome, functools.partial(self._loss, scene, outcome.state))
 
     def _loss(self, scene: Scene, state: Any) -> Any:
-        """How the contacts ended with which runs ended: codes in `LOSSES`."""
+        """Why contact ended in each cell, as a code in `LOSSES`."""
         if self.run_kind is HYBRID:
-            # It flies on where contact is lost, and fits everywhere.
+            # A run with flights continues where contact is lost, and its ball fits everywhere.
             return LOSSES.index(Status.JAMMED)
         state = jnp.asarray(state)
         return np.asarray(_flight_loss(scene, state) if self.run_kind.flight_state else _loss(scene.dynamics, state))

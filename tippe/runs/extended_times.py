@@ -1,4 +1,4 @@
-"""Inversion times that a loss can follow beyond the horizon: finite, and with a slope, where the top does not invert."""
+"""Inversion time extended smoothly past the horizon, for use in a loss function."""
 
 import math
 from typing import Any
@@ -73,16 +73,16 @@ def extended_inversion_time(
 
 
 class ExtendedSolve(AbstractDifferentiableSolve):
-    """When cells invert, beyond the horizon too; the leaves are those of `InversionSolve`."""
+    """Extended inversion times of cells; the leaves are those of `InversionSolve`."""
 
     movable: int
     # JAX's PyTreeDef, which type checkers take for a variable.
     structure: Any = eqx.field(static=True)
-    # Whether some numbers were traced, so that the checks could not see them.
+    # Whether some numbers were traced, so that they could not be checked.
     unchecked: bool = eqx.field(static=True)
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
-        # Every run has one. A select on NaN would make the derivative of a run that failed zero.
+        # Every run has a time. A select on NaN would make the derivative of a failed run zero.
         return jnp.zeros(jnp.shape(value), bool)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
@@ -113,7 +113,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         cells: int,
         again: bool = False,
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-        """The extended times of every cell, and their derivatives along directions (as of `VariationalProblem`)."""
+        """The extended times of every cell, and their derivatives along tangents (as of `VariationalProblem`)."""
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         varied = VariationalProblem(problem, tangents, True)
         # Parameters tried by a fit may be far off.
@@ -126,7 +126,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         crossed = outcome.status == CROSSED
 
         def extended(problem: InversionProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
-            # A cell that starts beyond the angle has reached it at once.
+            # A cell that starts beyond the angle has reached it at time 0.
             time = jnp.where(outcome.end_time > 0.0, crossing_time(problem, outcome.end_time, state), 0.0)
             angle = jnp.arccos(problem.cos_angle)
             missing = _e_folds(state, angle)
@@ -143,6 +143,6 @@ class ExtendedSolve(AbstractDifferentiableSolve):
 
 
 def _e_folds(state: Float[Array, "components cells"], angle: Float[Array, "..."]) -> Float[Array, " cells"]:
-    """How many times theta must still grow e-fold to reach an angle."""
+    """Number of e-folds by which theta must still grow to reach an angle."""
     theta = inclination(parts(state).axis)
     return jnp.log(angle / jnp.clip(theta, LEAST_ANGLE, angle))

@@ -1,4 +1,4 @@
-"""Inversion: launches that end when the axis reaches an angle, and the checks of what is asked about them."""
+"""Inversion: launches that end when the axis reaches an angle, and the checks of their arguments."""
 
 import math
 import warnings
@@ -36,12 +36,12 @@ from ..modes.inversion_problem import InversionProblem
 def permitted(
     structure: Any, unchecked: bool, leaves: tuple[Float[Array, "..."], ...]
 ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, ""]]:
-    """Which cells have legal numbers; the horizons, 0 for the others; and the tolerance of the block.
+    """Which cells have legal numbers; the horizons, 0 for the others; and the tolerance of the ensemble.
 
-    One tolerance serves a block: the smallest of a batch.
+    One tolerance serves the whole ensemble: the smallest of a batch.
 
-    **Arguments:** `structure`, `leaves`: of scene, launch, angle, horizon and tolerance; `unchecked`: whether some of them
-    were traced when they were checked.
+    **Arguments:** `structure`, `leaves`: of scene, launch, angle, horizon and tolerance; `unchecked`: whether some of
+    them were traced when they were checked.
     """
     scene, launch, angle, t1, tolerance = jax.tree.unflatten(structure, leaves)
     may = jnp.asarray(True)
@@ -58,10 +58,10 @@ def permitted(
     return may, t1, jnp.min(tolerance)
 
 
-# One program where it is called on its own, not one for every comparison.
+# One program where the function is called on its own, not one for every comparison.
 @compiled_setup
 def nan_if_illegal(found: Float[Array, ""], structure: Any, unchecked: bool, leaves: list[Any]) -> Float[Array, ""]:
-    """What was found, or NaN, and so every derivative of it, where numbers are not legal. **Arguments:** as for `permitted`."""
+    """The result, or NaN with NaN derivatives where numbers are not legal. **Arguments:** as for `permitted`."""
     return nan_unless(permitted(structure, unchecked, leaves)[0], found) if unchecked else found
 
 
@@ -73,7 +73,7 @@ def is_inverted(outcome: Outcome | HybridOutcome, problem: InversionProblem, las
     return (outcome.status == REACHED_END) & above & jnp.isfinite(outcome.crossing_time)
 
 
-#: What the message about a list adds where a table is the better choice.
+#: Advice in messages about lists, where a table is the better choice.
 LISTS = "inversion_table takes lists, and jax.vmap maps over them"
 
 
@@ -87,10 +87,11 @@ def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LIS
 
 
 def check_numbers(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LISTS) -> None:
-    """Raise `ValueError` unless these are a scene, a launch, a positive horizon and a tolerance in range, each by itself.
+    """Raise `ValueError` unless these are a scene, a launch, a positive horizon and a tolerance in range, each by
+    itself.
 
-    **Arguments:** as for `inversion_time`; `lists`: what takes lists instead of single numbers. What a function holds, such as
-    that of a `Graph`, may be lists.
+    **Arguments:** as for `inversion_time`; `lists`: which functions accept lists instead of single numbers. The
+    parameters of a function, such as that of a `Graph`, may be lists.
     """
     require_kind(scene, "scene", Scene)
     require_kind(launch, "launch", Launch)
@@ -102,7 +103,7 @@ def check_numbers(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str =
 def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any) -> None:
     """Warn of a scene without friction, and of a top that stands exactly upright on a level plane.
 
-    **Arguments:** `launch`: but for its theta; `theta`: one angle or several [rad].
+    **Arguments:** `launch`: its theta is ignored; `theta`: one angle or several [rad].
     """
     if isinstance(scene.friction, Frictionless):
         warnings.warn(
@@ -126,7 +127,7 @@ def event_bounds(angle: Any) -> Iterator[Bound]:
 
 
 def check_smooth(scene: Scene, caller: str) -> None:
-    """Raise `ValueError` for a scene whose runs have phases, which derivatives do not go through."""
+    """Raise `ValueError` for a scene with hybrid runs, which do not support derivatives here."""
     if scene.contact == "hybrid":
         raise ValueError(f"contact = 'hybrid' must be 'stop' for {caller}; inversion_table goes through flights")
     if scene.friction.set_valued:

@@ -118,7 +118,8 @@ def explain_failure(
     crossing: str,
     solver: diffrax.AbstractERK,
 ) -> None:
-    """Raise `ValueError` for a run that needed too many steps; warn of any other failure. The run is made once more.
+    """Raise `ValueError` for a run that needed too many steps; warn of any other failure. The run is repeated to find
+    out.
 
     **Arguments:** as for `inversion_time`.
     """
@@ -138,14 +139,14 @@ def explain_failure(
 
 
 class InversionSolve(AbstractDifferentiableSolve):
-    """When cells invert; the leaves are those of scene and launch, the angle, the horizon, the tolerance."""
+    """Inversion times of cells; the leaves are those of scene and launch, the angle, the horizon, the tolerance."""
 
     movable: int
     # JAX's PyTreeDef, which type checkers take for a variable.
     structure: Any = eqx.field(static=True)
     solver: diffrax.AbstractERK
     last: bool = eqx.field(static=True)
-    # Whether some numbers were traced, so that the checks could not see them.
+    # Whether some numbers were traced, so that they could not be checked.
     unchecked: bool = eqx.field(static=True)
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
@@ -176,7 +177,7 @@ class InversionSolve(AbstractDifferentiableSolve):
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-        # Cells do not influence one another, so varying a parameter in all of them at once gives each its own derivative.
+        # Cells are independent, so varying a parameter in all of them at once gives each its own derivative.
         problem, tangents, gather = tangents_by(self.problem, active, leaves[: self.movable], cells)
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         outcome, slopes = traced_solve_ensemble_with_tangents(
@@ -194,7 +195,7 @@ class InversionSolve(AbstractDifferentiableSolve):
 
 
 class HybridInversionSolve(InversionSolve):
-    """When cells invert whose runs have phases; the leaves are those of `InversionSolve`."""
+    """Inversion times of cells with hybrid runs; the leaves are those of `InversionSolve`."""
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
@@ -213,7 +214,7 @@ class HybridInversionSolve(InversionSolve):
         (modes, first, problem, scene), tangents, gather = built
         check_differentiable(scene)
         if self.last:
-            # The slopes need the run up to the event alone, whose time is known then.
+            # The derivatives need the run only up to the event, whose time is then known.
             whole = self.hybrid_outcome(modes, first, problem, scene, t1, tolerance)
             t1 = jnp.where(jnp.isfinite(whole.crossing_time), whole.crossing_time, 0.0)
         settings = Settings(tolerance, self.solver)
@@ -229,12 +230,12 @@ class HybridInversionSolve(InversionSolve):
         time = self.named(may, whole if self.last else hybrid_outcome, problem, scene)
         ended = hybrid_outcome.status == (REACHED_END if self.last else CROSSED)
         digits = ended & ~grazing
-        # At the very start the event is there at once, whatever moves.
+        # An event at the start has a fixed time, whatever the tangent.
         happened = jnp.isfinite(time) & (time > 0.0)
         return time, [jnp.where(happened, jnp.where(digits, slope, jnp.nan), 0.0 * time) for slope in gather(slopes)]
 
     def hybrid(self, leaves: tuple[Array, ...], cells: int | None) -> Any:
-        """The phases of some cells, the number of each one's first, problem and scene; the last leaf is the tolerance."""
+        """The modes of some cells, the number of each one's first, problem and scene; the last leaf is the tolerance."""
         *own, tolerance = leaves
         scene, *_ = jax.tree.unflatten(self.structure, (*own, *(None,) * (self.structure.num_leaves - len(own))))
         problem, modes_of = self.problem(tuple(own), cells), run_kind_of(scene).modes
@@ -250,7 +251,7 @@ class HybridInversionSolve(InversionSolve):
         t1: Float[Array, "..."],
         tolerance: Float[Array, ""],
     ) -> HybridOutcome:
-        """The runs of cells through their phases."""
+        """The hybrid runs of cells."""
         settings, kinds = Settings(tolerance, self.solver), len(run_kind_of(scene).counts)
         return traced_solve_hybrid(modes, first, problem.states, t1, settings, kinds=kinds, passes=self.last)
 

@@ -24,7 +24,7 @@ def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
 
     **Arguments:** `roots`: the table's scene and launch; `names`: full names, or the ends of them that fit one only.
 
-    **Raises:** `ValueError` for something else than a list of such names.
+    **Raises:** `ValueError` unless `names` is a list of such names.
     """
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"sensitivities = {names!r} must be a list of names, such as ['scene.friction.mu']")
@@ -77,7 +77,8 @@ def sensitivities_of_cells(
     - `columns`: full name of a parameter -> its value in every cell; `count` of the `size` cells are to be run.
     - `names`: full names of the numbers to differentiate by.
 
-    **Returns:** the `Outcome`, and name of the variable -> derivatives (size,). Source: implicit function theorem at the event.
+    **Returns:** the `Outcome`, and name of the variable -> derivatives (size,). Source: implicit function theorem at
+    the event.
     """
     problem, tangents, sizes = _problem_and_tangents(roots, columns, names, jnp.asarray(angle, float), size)
     outcome, slopes = solve_ensemble_with_tangents(
@@ -97,7 +98,7 @@ def sensitivities_of_cells(
 def _problem_and_tangents(
     roots: dict[str, Any], columns: dict[str, Any], names: list[str], angle: Float[Array, ""], size: int
 ) -> tuple[InversionProblem, tuple[Any, ...], list[Float[Array, "..."]]]:
-    """The problem of the cells, its tangents along the numbers to differentiate by, and by how much these move each."""
+    """The problem of the cells, its tangents along the numbers to differentiate by, and the scale of each tangent."""
 
     def build(*moving: Any) -> InversionProblem:
         cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))
@@ -121,16 +122,17 @@ def hybrid_sensitivities_of_cells(
     last: bool,
     kinds: int,
 ) -> tuple[HybridOutcome, dict[str, Any], Bool[np.ndarray, " size"]]:
-    """What `sensitivities_of_cells` gives, for runs of several phases.
+    """`sensitivities_of_cells` for hybrid runs.
 
     **Arguments:** as there, and
 
-    - `modes_of`: the phases, as `RunKind` has them.
+    - `modes_of`: returns the modes, as in `RunKind`.
     - `t1`: horizon [s]; where the `last` crossing counts, its time in every cell, at which the runs end.
-    - `kinds`: how many kinds of things are counted.
+    - `kinds`: number of counters.
 
-    **Returns:** the `HybridOutcome`; name of the variable -> derivatives (size,); and where these have no digits, because
-    an event on the way was grazing. Source: saltation at every change of phase (`nonholonomic/hybrid/saltation.py`).
+    **Returns:** the `HybridOutcome`; name of the variable -> derivatives (size,); and where these have no correct
+    digits, because an event on the way was grazing. Source: saltation at every change of mode
+    (`nonholonomic/hybrid/saltation.py`).
     """
     numbers = (jnp.asarray(angle, float), jnp.asarray(tolerance, float))
     built = _modes_and_tangents(modes_of, roots, columns, names, *numbers, size, last)
@@ -154,7 +156,7 @@ def _modes_and_tangents(
     size: int,
     last: bool,
 ) -> tuple[Any, tuple[Any, ...], list[Float[Array, "..."]]]:
-    """The phases of the cells, the number of each one's first and its state there; tangents and sizes as above."""
+    """The modes of the cells, the number of each one's first and its state there; tangents and scales as above."""
 
     def build(*moving: Any) -> Any:
         cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))
@@ -167,7 +169,7 @@ def _modes_and_tangents(
 def _with_tangents(
     build: Callable[..., Any], roots: dict[str, Any], columns: dict[str, Any], names: list[str]
 ) -> tuple[Any, tuple[Any, ...], list[Float[Array, "..."]]]:
-    """What is built from the numbers to differentiate by, its tangents along them, and by how much these move each."""
+    """Build an object from the numbers to differentiate by; also return its tangents along them and the scale of each."""
     cells = with_numbers(roots, columns)
     values = {name: value for root, tree in cells.items() for name, value in numbers(root, tree).items()}
     point = tuple(jnp.asarray(values[name], float) for name in names)
