@@ -43,7 +43,7 @@ def missing(path: Path) -> list[str]:
 
 def test_what_is_not_there_is_found(tmp_path):
     program = tmp_path / "program.py"
-    program.write_text('"""As in `march.py` and `marsh.py`."""\nx = "no.py"  # in `rooms/` and `sweeps/`\n')
+    program.write_text('"""As in `step.py` and `marsh.py`."""\nx = "no.py"  # in `rooms/` and `sweeps/`\n')
     assert missing(program) == ["marsh.py", "rooms/"]
 
 

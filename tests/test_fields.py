@@ -70,7 +70,7 @@ def slow_in_problem(problem):
 
 
 def table_problems(scene, launch):
-    """The problems that a table of the scene integrates: one, or that of every phase."""
+    """The problems that a table of the scene integrates: one, or that of every mode."""
     problem, driver = InversionProblem.of(scene, launch, 3.0, 1), run_kind_of(scene)
     if driver.smooth:
         return (problem,)
@@ -79,7 +79,7 @@ def table_problems(scene, launch):
 
 
 def trajectory_problems(scene, launch):
-    """The problems that `simulate` integrates, with all that rides along: one, or that of every phase."""
+    """The problems that `simulate` integrates, with all that rides along: one, or that of every mode."""
     if scene.contact == "hybrid":
         modes_of = level_modes if scene.flies_in_closed_form else arena_modes
         modes, _, state = modes_of((scene, launch), 1e-9)

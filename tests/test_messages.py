@@ -306,6 +306,15 @@ def test_a_table_says_which_horizon_was_too_long():
         warn_of_long_runs(table_of_times([1.0, np.inf, 2.0], [10, 2_000_000, 30]), 1e5, 2_000_000)
 
 
+@pytest.fixture
+def programs_of_its_own():
+    """No compiled program from before, and none for later: a limit that a test sets is compiled into the programs."""
+    jax.clear_caches()
+    yield
+    jax.clear_caches()
+
+
+@pytest.mark.usefixtures("programs_of_its_own")
 def test_a_time_that_takes_too_many_steps_is_an_error_that_says_how_many(monkeypatch):
     for module in ("tippe.runs.inversion_time", "tippe.runs.cells"):
         monkeypatch.setattr(importlib.import_module(module), "Settings", functools.partial(Settings, max_steps=40))

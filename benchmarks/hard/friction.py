@@ -16,7 +16,8 @@ from hard.lagrange import theta_by_lagrange
 from hard.limits import rutstam_top
 from hard.row import Row, of_runs
 from nonholonomic.integration import DenseSolution, Settings, follow
-from tippe.runs.trajectory import TrajectoryProblem
+from tippe.model.friction import Slip
+from tippe.modes.trajectory_problem import TrajectoryProblem
 
 GRAVITY = 9.81
 
@@ -54,9 +55,7 @@ def disc_by_quadrature() -> Row:
     def departure() -> float:
         worst = 0.0
         for ratio in np.geomspace(1e-2, 1e2, 25):
-            load = law.per_normal_force(
-                tippe.friction.Slip(jnp.asarray(ratio * radius), jnp.zeros(()), (0.0, 0.0, 1.0))
-            )
+            load = law.per_normal_force(Slip(jnp.asarray(ratio * radius), jnp.zeros(()), (0.0, 0.0, 1.0)))
             force, torque = hertz_disc(ratio)
             worst = max(worst, abs(float(load.force[0]) + force), abs(float(load.torque[2]) / radius + torque))
         return worst

@@ -164,7 +164,8 @@ class AbstractLevel(AbstractSurface):
 
     def nearest(self, position: Vector) -> Vector:
         surface, place = _held(self), jax.lax.stop_gradient(position)
-        first = surface.onto(place)
+        # A start that is off the surface on the position's side would be nearer than every point of the surface.
+        first = surface.onto(surface.onto(place))
         within = jnp.sqrt(_square(place, first))
         starts = jnp.asarray(self.starts)
 
@@ -178,6 +179,7 @@ class AbstractLevel(AbstractSurface):
                 return nearer(nearest, surface.onto(about))
 
             begin = vector_of(jax.lax.fori_loop(0, self.starts.shape[1], start, _stacked(first)))
+            begin = surface.onto(surface.onto(begin))
             searched = (step, surface.onto, lambda foot: _square(place, foot), begin, within, 0.25 * within)
             return nearer(nearest, descended(*searched))
 

@@ -21,7 +21,7 @@ def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], most: int
 
     After an exception, Ctrl-C included, no further block starts.
 
-    **Arguments:** `submit`: hands out a block; `blocks`: their numbers; `most`: how many may be handed out at once.
+    **Arguments:** `submit`: hands out a block; `chunks`: their numbers; `most`: how many may be handed out at once.
 
     **Returns:** the number and the results of each as it finishes; `None` for one that `MAX_CRASHES` workers died of.
 

@@ -144,7 +144,7 @@ def layout_of(
 
 
 class Held:
-    """The blocks of a table that is not to be stored: the same as `Blocks`, in memory."""
+    """The blocks of a table that is not to be stored: the same as `ChunkStore`, in memory."""
 
     def __init__(self, layout: Layout):
         """State what the table is made of.

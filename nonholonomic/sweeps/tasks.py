@@ -24,7 +24,7 @@ MUST_AGREE = ("nonholonomic", "jax", "jaxlib", "diffrax", "float")
 
 
 class ChunkTask(NamedTuple):
-    """A job and the grid it is for; `block`: how many cells the job is given at once, so that one compiled program serves."""
+    """A job and the grid it is for; `chunk`: how many cells the job is given at once, so that one compiled program serves."""
 
     job: Job
     axes: list[Axis]
@@ -62,7 +62,7 @@ def packed(work: ChunkTask) -> bytes:
 def remote_results(sent: bytes, needed: dict[str, str], first: int, count: int, mark: str) -> dict[str, Values]:
     """The results of some cells, in the process that this is called in.
 
-    **Arguments:** `sent`: from `packed`; `needed`: the `stamp` of who sent it; `first`, `count`: as for `Work.results`;
+    **Arguments:** `sent`: from `packed`; `needed`: the `stamp` of who sent it; `first`, `count`: as for `ChunkTask.results`;
     `mark`: different in every call, because Dask takes calls with the same arguments for one.
 
     **Raises:** `RuntimeError` that names the worker if it has another version of a package whose numbers may differ.

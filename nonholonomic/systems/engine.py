@@ -1,4 +1,4 @@
-"""A user's hybrid system as problems and phases of the engine.
+"""A user's hybrid system as problems and batched modes of the engine.
 
 A user writes functions of one state. Here they are mapped over lanes component by component, so that what they compute is laid
 out as in equations written for the engine: components along the first axis, lanes last. Time is one more component of the
@@ -62,7 +62,7 @@ class ModeProblem(AbstractProblem):
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
         if self.form.traits.ends[self.mode]:
             return self._over_lanes(self.form.function("margin", self.mode), state)
-        # What changes between modes asks for a guard in each.
+        # What changes between modes asks for a domain margin in each.
         return None if self.form.traits.smooth else jnp.ones_like(state[0])
 
     def _over_lanes(self, function: OfRun, state: States) -> Any:
@@ -86,7 +86,7 @@ def time_and_state(form: Form, parts: tuple[Array, ...]) -> tuple[Array, State]:
 
 
 class BatchedMode(AbstractBatchedMode):
-    """A mode as a phase of the engine, of cells with `numbers` and `scales` as in `ModeProblem`."""
+    """A user's mode as a mode of the engine, of cells with `numbers` and `scales` as in `ModeProblem`."""
 
     numbers: tuple[Float[Array, "..."], ...]
     scales: Float[Array, "components cells"]
@@ -209,7 +209,7 @@ class Cells(eqx.Module):
     def modes(
         self, cells: int
     ) -> tuple[tuple[BatchedMode, ...], Int[Array, " cells"], Float[Array, "components cells"]]:
-        """The phases of a system with resets, the number of the first, and the states there."""
+        """The modes of a system with resets, the number of the first, and the states there."""
         states, scales = self.states(cells)
         phases = tuple(BatchedMode(self.numbers, scales, self.form, mode) for mode in range(self.form.modes))
         return phases, jnp.full(cells, self.form.first), states

@@ -50,7 +50,7 @@ def event_time(
     all runs are lanes of one batch.
 
     Derivatives by the start, by every number of the system and of the event are exact: by the implicit function theorem at the
-    event and the saltation matrix at every reset (`nonholonomic/hybrid/varied_phases.py`). They are 0 where the time is
+    event and the saltation matrix at every reset (`nonholonomic/hybrid/saltation.py`). They are 0 where the time is
     infinite.
 
     **Arguments:**

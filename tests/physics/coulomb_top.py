@@ -119,7 +119,7 @@ def slip_to(body: Body, state: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def rate_of(body: Body, kind: str):
-    """The field of a phase."""
+    """The field of a mode."""
 
     def rate(_, state):
         contact = Contact(body, state)
@@ -144,7 +144,7 @@ def follow(
     rtol: float = 1e-11,
     stiff: float = 2e-3,
 ) -> list[Mode]:
-    """Run to `t1` [s], phase by phase; a slip ends where its speed has fallen to `floor` and begins with `onset` [m/s]. For
+    """Run to `t1` [s], mode by mode; a slip ends where its speed has fallen to `floor` and begins with `onset` [m/s]. For
     the time `stiff` [s] after that the method is implicit."""
     atol = 0.1 * rtol * np.repeat([1.0, np.sqrt(body.gravity * body.radius), 100.0, body.radius], 3)
 

@@ -68,7 +68,7 @@ def scene_of(arena: float | None, mu: float = MU, restitution: float = 0.0) -> t
 
 
 def check_against_reference(run: tippe.HybridTrajectory, arena: float | None) -> list[int]:
-    """Phase by phase, and at the end; returns the numbers of the phases."""
+    """Mode by mode, and at the end; returns the numbers of the modes."""
     scene, curved = run.scene, (0.0, 0.0, 0.0) if arena is None else (1.0, 1.0, 1.0)
     body = Body(*NUMBERS, float(scene.friction.mu), 9.81, arena, curved)
     restitution = 0.0 if scene.restitution is None else float(scene.restitution)

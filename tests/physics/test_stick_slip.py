@@ -28,12 +28,12 @@ def scene_of(body: tippe.Top, mu: float) -> tippe.Scene:
 
 
 def kinds(path: HybridPath) -> list[bool]:
-    """Whether each phase of a run rolls."""
+    """Whether each mode of a run rolls."""
     return [piece.number == ROLLING for piece in path.mode_segments]
 
 
 def reference(body: tippe.Top, mu: float, theta: float, spin: float, t1: float) -> list[coulomb_top.Mode]:
-    """The phases of the same run in plain NumPy and SciPy."""
+    """The modes of the same run in plain NumPy and SciPy."""
     numbers = [float(x) for x in (body.mass, body.radius, body.offset, body.I1, body.I3)]
     plain = coulomb_top.Body(*numbers, mu)
     return coulomb_top.follow(plain, coulomb_top.start(plain, theta, spin), t1)
@@ -192,7 +192,7 @@ def test_the_error_of_many_slips_falls_with_the_tolerance_and_is_known():
         assert error < float(table.time_error)
     assert errors[2] < 0.1 * errors[1] < 1e-8
     run = tippe.simulate(scene, tippe.Launch(0.35, 100.0), time, tolerance=1e-11)
-    # A single run finds the ends of its phases on the dense output.
+    # A single run finds the ends of its modes on the dense output.
     assert_close(run.theta[-1], angle, atol=3e-8)
     assert run.stats["sticks"] == 9
 

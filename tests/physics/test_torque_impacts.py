@@ -75,7 +75,7 @@ TORQUES = {"contact_radius": 1e-3, "resistance": 1e-4, "turning_speed": 5.0}
 @pytest.mark.slow
 @pytest.mark.parametrize("surface", [tippe.Plane(), tippe.Graph(lambda x, y: 0.0 * x)], ids=["plane", "graph"])
 def test_inversion_times_through_flights_with_torques(surface):
-    """A disc of contact and rolling resistance, after 3 flights and 2 impacts; a graph has the phases of every arena."""
+    """A disc of contact and rolling resistance, after 3 flights and 2 impacts; a graph has the modes of every arena."""
     cases = [dataclasses.replace(HOPS, spin=spin, **TORQUES) for spin in (300.0, 350.0)]
     scene = dataclasses.replace(scene_of(cases[0]), surface=surface)
     table = tippe.inversion_table(scene, theta=1.5, spin=[300.0, 350.0], t1=0.4, tolerance=1e-11)

@@ -106,7 +106,7 @@ CALLS = {
     ),
 }
 
-#: What has no meaning through phases, and is refused there.
+#: What has no meaning through modes, and is refused there.
 SMOOTH_ONLY = ("time, hessian", "extended", "table of paths", "exponent")
 
 COMPILED = "/jax/core/compile/backend_compile_duration"

@@ -1,4 +1,4 @@
-"""Predictions for fits of runs with phases, by whose differences they are fitted: outside of transformations."""
+"""Predictions for fits of runs with several modes, by whose differences they are fitted: outside of transformations."""
 
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ class HybridModel(NamedTuple):
     seen: Float[np.ndarray, " n"]
     tolerance: float
 
-    #: It runs phase by phase, and cannot be traced.
+    #: It runs mode by mode, and cannot be traced.
     on_host = True
 
     def __call__(self, parameters: dict[str, Any]) -> Float[np.ndarray, "rows n"]:

@@ -81,7 +81,7 @@ def identify(
 
     **Returns:** an `Identification`, with its `verdict`; of which it warns (`FitWarning`) if it is not good.
 
-    **Raises:** `ValueError` for arguments out of range, an unknown name, and for exact slopes through phases: the time of a top
+    **Raises:** `ValueError` for arguments out of range, an unknown name, and for exact slopes through modes: the time of a top
     that hops has a slope, but with steps of every flight it may point the other way than the trend.
 
     **Example:**

@@ -26,7 +26,7 @@ def log_density(
     **Returns:** a `LogDensity`: a function of coordinates (unknowns,) for any sampler, with `value_and_gradient` for those that
     do not know JAX, `values` for the way back to parameters, `names` and `start`.
 
-    **Raises:** `ValueError` for arguments out of range, an unknown name, and scenes through whose phases no derivative goes.
+    **Raises:** `ValueError` for arguments out of range, an unknown name, and scenes through whose modes no derivative goes.
 
     **Example:** friction from one time, known to 10 % beforehand.
 

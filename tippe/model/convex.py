@@ -125,7 +125,7 @@ class ConvexBody(AbstractBody):
     >>> def support(c):
     ...     return jnp.sqrt(4e-4 + 3.84e-4 * c * c) - 1e-3 * c * (1.0 + c * c)
     >>> egg = tippe.ConvexBody(mass=0.05, support=support, I1=1.2e-5, I3=8e-6)
-    >>> print(f"{egg.outline.at(0.0).radius:.3f} m")
+    >>> print(f"{egg.meridian.at(0.0).radius:.3f} m")
     0.020 m
 
     ```

@@ -321,10 +321,10 @@ class SetValuedCoulomb(AbstractFriction):
     """Exact Coulomb friction, without a slip speed: F = -mu N v_s / |v_s| while the contact slips, and any force
     along the arena up to mu N while it does not (`tippe.md`, section 3).
 
-    The run is made of phases. In a slip the force has its full size; a slip that stops turns into rolling, with the
-    equations of `phases/rolling.py`, if the force needed for that is within the friction cone; the top slips again as soon
+    The run is made of modes. In a slip the force has its full size; a slip that stops turns into rolling, with the
+    equations of `tippe/model/rolling.py`, if the force needed for that is within the friction cone; the top slips again as soon
     as it is not. While it rolls the energy is constant. With `contact="hybrid"` a top without a stem flies on where contact is
-    lost, and slips, rolls or rebounds behind an impact (`phases/airborne_stick_slip.py`).
+    lost, and slips, rolls or rebounds behind an impact (`tippe/modes/airborne_stick_slip.py`).
 
     **Arguments:**
 

@@ -56,7 +56,8 @@ class Scene(Bounded):
 
     **Arguments:**
 
-    - `body`: a `Top`; or a `SpheroidBody` or `ConvexBody`, on a plane, with `contact="stop"` and friction without phases.
+    - `body`: a `Top`; or a `SpheroidBody` or `ConvexBody`, on a plane, with `contact="stop"` and a friction law with a
+      single mode.
     - `surface`: the arena: `Plane(tilt)`, `Cylinder(radius)`, `Sphere(radius)`, `Spheroid(equatorial, polar)`, `Torus(ring,
       tube)`, `Paraboloid(p)`, `Graph(height)` or `Implicit(function)`.
     - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
@@ -168,7 +169,7 @@ class Scene(Bounded):
 
     @property
     def flies_in_closed_form(self) -> bool:
-        """Whether flights of a hybrid scene need no integration: over a level plane, under a law without phases of its own."""
+        """Whether flights of a hybrid scene need no integration: over a level plane, under a law with a single mode."""
         return self.level and not self.friction.set_valued
 
     @property

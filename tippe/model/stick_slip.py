@@ -4,7 +4,7 @@ Within the friction cone rolling is the only motion near zero slip, and a slip r
 a slip has no limit there, and steps shrink with its speed; so the slip is stopped by a blow where the way that is left to
 slide, v^2 / (2 |v'|), is `LEFT` times the tolerance in units of R. Friction would have taken the same momentum in the time
 that was left, so the state errs by that way, in proportion to the tolerance. Rolling ends where mu N = |F_t|; from there the
-slip is begun by a step of its own (`onset.py`), whose estimated error is within the tolerance
+slip is begun by a step of its own (`slip_onset.py`), whose estimated error is within the tolerance
 (`tests/physics/test_stick_slip.py` has the figures).
 """
 
@@ -139,10 +139,10 @@ class StickSlip(eqx.Module):
 
 
 class Change(NamedTuple):
-    """What follows the end of a phase.
+    """What follows the end of a mode.
 
     - `state`: from which the motion goes on, and whether it `rolls` then; `lost`: whether the contact is lost instead.
-    - `onset`: the beginning of the slip where it does not roll; it starts `wait` [s] after the phase has ended.
+    - `onset`: the beginning of the slip where it does not roll; it starts `wait` [s] after the mode has ended.
     - `elapsed`: until the motion goes on [s].
     """
 

@@ -354,7 +354,7 @@ def on_the_ground(
 
 
 def loss(scene: Scene, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-    """Why a contact ended, if it was not merely lost: a code in `tippe.dynamics.LOSSES`."""
+    """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/dynamics.py`)."""
     own, state = scene.dynamics, state[:OWN]
     if scene.body.stem is None:
         return own.loss(state)

@@ -110,7 +110,7 @@ class StickSlipArenaTrajectory(ArenaTrajectory):
 
     @staticmethod
     def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
-        # Between two phases a slip begins.
+        # Between two modes a slip begins.
         return -1 * (numbers == FLYING)
 
     @staticmethod
@@ -121,7 +121,7 @@ class StickSlipArenaTrajectory(ArenaTrajectory):
 
 
 def arena_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "19 1"]]:
-    """The phases of one launch of a hybrid scene on any arena, the number of the first, and the state there.
+    """The modes of one launch of a hybrid scene on any arena, the number of the first, and the state there.
 
     **Arguments:** `modules`: scene and launch; `tolerance`: relative, of the integration.
     """

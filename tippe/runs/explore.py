@@ -75,7 +75,8 @@ def explore(
 
     **Arguments:**
 
-    - `scene`, `launch`: the run at the start, every number a scalar; `contact` must be "stop", the friction without modes.
+    - `scene`, `launch`: the run at the start, every number a scalar; `contact` must be "stop", and the friction law
+      must have a single mode.
     - `path`: file to write the page to, or `None`.
     - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name will do where only one parameter fits, such
       as "theta", "spin", "mu", "friction.mu" or "offset". By default theta, spin, the coefficient of friction and the offset.
@@ -139,7 +140,7 @@ def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float) -> Liv
 
 
 def check_smooth(scene: Scene) -> None:
-    """Raise `ValueError` for a scene whose runs have modes, which the page does not know."""
+    """Raise `ValueError` for a scene whose runs have several modes, which the page does not know."""
     if scene.contact == "hybrid":
         raise ValueError(
             "contact = 'hybrid' must be 'stop' for explore, whose page ends a run where contact is lost; leave the stem "

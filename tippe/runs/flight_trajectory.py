@@ -136,7 +136,7 @@ class HybridTrajectory(AbstractTrajectory):
 
     @staticmethod
     def parts_of(shown: Float[np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
-        """State, cyclic coordinates, spin angle, work, and the distance with its rate, from what the phases show."""
+        """State, cyclic coordinates, spin angle, work, and the distance with its rate, from what the modes show."""
         return shown[:8], shown[8:13], shown[13], shown[14], shown[15:]
 
     @staticmethod
@@ -146,7 +146,7 @@ class HybridTrajectory(AbstractTrajectory):
 
     @staticmethod
     def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
-        """Which sphere touches, for the numbers of the phases."""
+        """Which sphere touches, for the numbers of the modes."""
         return numbers
 
     def __str__(self) -> str:
@@ -154,9 +154,9 @@ class HybridTrajectory(AbstractTrajectory):
 
 
 def level_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "15 1"]]:
-    """The phases of one launch of a hybrid scene on a level plane, the number of the first, and the state there.
+    """The modes of one launch of a hybrid scene on a level plane, the number of the first, and the state there.
 
-    **Arguments:** `modules`: scene and launch; `tolerance`: no phase needs it.
+    **Arguments:** `modules`: scene and launch; `tolerance`: no mode needs it.
     """
     scene = modules[0]
     state, scales = TrajectoryProblem.of(*modules).start()
@@ -185,7 +185,7 @@ def sampled_hybrid(scene: Scene, launch: Launch, times: Any, t1: Any, settings: 
 def sampled_flights(
     kind: type[HybridTrajectory], scene: Scene, times: Any, found: HybridSamples, lost: Int[Array, ""]
 ) -> Any:
-    """A trajectory of some kind from samples; `lost` is the code of how a run has ended that its guard has ended."""
+    """A trajectory of some kind from samples; `lost` is the code of how a run ended that left its domain."""
     states, place, spin_angle, work, distance = kind.parts_of(found.shown)
     # After the end no sphere touches.
     number = jnp.where(jnp.isnan(found.number), BETWEEN, found.number).astype(int)

@@ -80,7 +80,7 @@ def inversion_time(
     not happen at all, the derivative is NaN; `inversion_table` says so in the variable `grazes`.
 
     **Raises:** `ValueError` for arguments outside these ranges, for a run that needs more than 2 000 000 steps, for second
-    derivatives through changes of phase, and for derivatives with both, whose impacts may stop a slip.
+    derivatives through changes of mode, and for derivatives with both, whose impacts may stop a slip.
 
     **Example:**
 

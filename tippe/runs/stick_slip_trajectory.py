@@ -8,7 +8,7 @@ from ..modes.trajectory_problem import TrajectoryProblem
 
 
 def solve_stick_slip_dense(run: TrajectoryProblem, t1: float, settings: Settings) -> HybridPath:
-    """One run, phase by phase, until `t1` or until contact is lost.
+    """One run, mode by mode, until `t1` or until contact is lost.
 
     **Arguments:**
 

@@ -147,9 +147,9 @@ def simulate(
 
     **Returns:** a `Trajectory`, for a hybrid scene a `HybridTrajectory`.
 
-    **Raises:** `ValueError` for arguments out of range; inside a transformation for a law with phases (`SetValuedCoulomb`),
-    and for a hybrid scene with `adjoint`, with a solver that is not an explicit Runge-Kutta one, and where derivatives by
-    `times` or second derivatives are asked for.
+    **Raises:** `ValueError` for arguments out of range; inside a transformation for a law with several modes
+    (`SetValuedCoulomb`), and for a hybrid scene with `adjoint`, with a solver that is not an explicit Runge-Kutta one, and
+    where derivatives by `times` or second derivatives are asked for.
 
     **Example:**
 

@@ -1,4 +1,4 @@
-"""Derivatives through changes of phase, on problems with closed forms: a bouncing ball, and a ball that grazes a slope."""
+"""Derivatives through changes of mode, on problems with closed forms: a bouncing ball, and a ball that grazes a slope."""
 
 import diffrax
 import equinox as eqx
@@ -86,7 +86,7 @@ HEIGHTS, RESTITUTIONS = np.linspace(0.5, 2.0, CELLS), np.linspace(0.9, 0.6, CELL
 
 @pytest.fixture(scope="module")
 def balls():
-    """Phases, directions, first phases and states of balls, and their slopes: by height, gravity, restitution and level."""
+    """Modes, directions, first modes and states of balls, and their slopes: by height, gravity, restitution and level."""
     numbers, bounces = (jnp.asarray(HEIGHTS), jnp.asarray(9.81), jnp.asarray(RESTITUTIONS), jnp.asarray(0.01)), 5
 
     def build(height, gravity, restitution, level):

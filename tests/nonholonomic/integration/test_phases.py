@@ -1,4 +1,4 @@
-"""Runs of several phases against a closed form: balls that fall, rebound and come to rest."""
+"""Runs of several modes against a closed form: balls that fall, rebound and come to rest."""
 
 from typing import NamedTuple
 
@@ -163,7 +163,7 @@ def test_the_times_of_bounces_of_many_balls():
 
 @pytest.mark.parametrize("t1", [0.2, 0.9, 1.7, 30.0])
 def test_the_states_of_many_balls_at_a_horizon(t1):
-    """Falling, rising or at rest after up to 80 bounces, each cell in a phase of its own."""
+    """Falling, rising or at rest after up to 80 bounces, each cell in a mode of its own."""
     found = table(t1, np.full(CELLS, np.inf))
     expected = np.array([ball.state(t1) for ball in BALLS]).T
     assert (found.status == REACHED_END).all()

@@ -145,8 +145,8 @@ def test_the_main_job_of_the_top_says_what_is_saved(tmp_path):
     wait_for(lambda: (folder / "table.h5").exists(), process)
     # It compiles for some seconds from here on.
     time.sleep(0.5)
-    status, out, error, passed = interrupted(process)
-    assert (status, out) == (INTERRUPTED, [])
+    status, _, error, passed = interrupted(process)
+    assert status == INTERRUPTED
     # On a busy machine the process may end before the main thread knows what is saved.
     saved = "python -m tippe: saved 0 of 2 cells to out/cylinder.h5; run the same call again to resume"
     assert error in ([saved], ["python -m tippe: interrupted; run the same command again to resume"])
