@@ -204,7 +204,7 @@ def runs_of(kind, count, tolerances):
     scene, launch, columns = batch(kind, count)
     runs = InversionRuns(run_kind_of(scene), 8.0, 0.95 * np.pi, "first", None, "ensemble", [])
     roots = {"scene": scene, "launch": launch}
-    return {tolerance: runs.results(roots, columns, tolerance, count) for tolerance in tolerances}, runs.driver.counts
+    return {tolerance: runs.results(roots, columns, tolerance, count) for tolerance in tolerances}, runs.run_kind.counts
 
 
 def judged(first, second, true, counts):

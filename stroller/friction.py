@@ -1,0 +1,7 @@
+"""The friction laws, and what a law of your own is made of."""
+
+from .model.friction import AbstractFriction as AbstractFriction
+from .model.friction import Damping as Damping
+from .model.friction import Drag as Drag
+from .model.friction import Frictionless as Frictionless
+from .model.friction import RollingResistance as RollingResistance
