@@ -77,6 +77,9 @@ def missed_loss(
     lowest = jnp.minimum(inside, at_end)
     spread = jnp.max(margins, axis=0) - lowest
     suspect = (lowest < jnp.where(inside < at_end, SUSPECT_INSIDE, SUSPECT_AT_END) * spread) & (spread > FLAT) & free
+    # A mode that begins on its margin has no zero before it: where the margin rises from there without a slope, the
+    # polynomial may fall at first.
+    suspect &= margins[0] > FLAT
 
     def first_minimum() -> Lanes:
         edges = np.linspace(0.0, 1.0, CELLS + 1)

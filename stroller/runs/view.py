@@ -84,7 +84,7 @@ def show(run: Any, number: int, name: str) -> Show:
     scene = run.spec.ride.scene
     length, colour = float(scene.body.wheelbase), COLOURS[number % len(COLOURS)]
     radius, half = RADIUS * length, TRACK * length / 2.0
-    times = np.asarray(run.t)
+    step_times = np.asarray(run.t)
     times, read = refined(run, radius)
     position, direction = read(run.position), read(run.direction)
     normal = read(normals(scene.surface, scene.side, np.asarray(run.position)))
@@ -96,10 +96,10 @@ def show(run: Any, number: int, name: str) -> Show:
     forward, left = np.cos(steering) * x + np.sin(steering) * y, np.cos(steering) * y - np.sin(steering) * x
     axle, front = position + radius * z, position + length * x + radius * z
     rolled = {
-        side: read(_integral(times, (np.asarray(run.speed) - sign * half * np.asarray(run.yaw_rate)) / radius))
+        side: read(_integral(step_times, (np.asarray(run.speed) - sign * half * np.asarray(run.yaw_rate)) / radius))
         for side, sign in (("left", 1.0), ("right", -1.0))
     }
-    ahead = read(_integral(times, np.asarray(run.front_speed) / radius))
+    ahead = read(_integral(step_times, np.asarray(run.front_speed) / radius))
     rear = wheel(radius, WIDTH * length, (DARK, PALE))
     weight = float(scene.body.mass * scene.gravity)
     forces, scale = read(run.side_force), WEIGHT * length / weight
