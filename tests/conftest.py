@@ -35,7 +35,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
     `pytest --cache-clear` forgets it; a folder that `JAX_COMPILATION_CACHE_DIR` names is used instead.
 
-    The ordinary run compiles without LLVM's optimisations, as JAX's own tests do: compiling is most of its work. The slow tests and those with the newest libraries
+    The ordinary run compiles without LLVM's optimisations, as JAX's own tests do: compiling is most of its work. The slow
+    tests and those with the newest libraries
     run what users run; so do all with `XLA_FLAGS=`.
     """
     if config.option.markexpr == ORDINARY:
