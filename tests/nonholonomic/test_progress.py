@@ -1,6 +1,5 @@
 """A long call says what it is doing, to whoever watches."""
 
-import importlib.util
 import io
 import subprocess
 import sys
@@ -9,6 +8,7 @@ import time
 import types
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from importlib.machinery import ModuleSpec
 
 import jax
 import jax.numpy as jnp
@@ -197,7 +197,7 @@ def test_nobody_watches_a_stream_that_is_closed(closed, monkeypatch):
 @pytest.mark.parametrize("widgets", [True, False])
 def test_a_notebook_without_widgets_has_a_line_of_text_and_no_warning(widgets, monkeypatch):
     monkeypatch.setattr(progress, "is_notebook", lambda: True)
-    monkeypatch.setattr(progress, "find_spec", lambda name: importlib.util.find_spec(name) if widgets else None)
+    monkeypatch.setattr(progress, "find_spec", lambda name: ModuleSpec(name, None) if widgets else None)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = progress.bar_class()
