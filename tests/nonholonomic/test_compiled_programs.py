@@ -58,14 +58,31 @@ def test_much_memory_or_many_mappings_forget_all_programs_with_one_line(why, pro
     assert "\n" not in said
 
 
-def test_memory_that_programs_do_not_take_forgets_nothing(program):
+def test_memory_that_programs_do_not_take_forgets_nothing(program, monkeypatch):
     """Such as a large table: forgetting programs would not help, in any call."""
+    monkeypatch.setattr(compiled_programs, "MANY_MAPPINGS", 10**9)
     double, traced = program
     kept = jnp.zeros(1_000_000)
-    assert not forget_programs_if_many(1000) or count_mappings() > compiled_programs.MANY_MAPPINGS
+    assert not forget_programs_if_many(1000)
     assert double(3.0) == 6.0
     assert len(traced) == 1
     assert kept.nbytes
+
+
+def test_looking_at_the_memory_compiles_nothing(program, monkeypatch):
+    monkeypatch.setattr(compiled_programs, "MANY_MAPPINGS", 10**9)
+    compiled = []
+    jax.clear_caches()
+
+    def record(event, duration, **_):
+        compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(record)
+    try:
+        assert not forget_programs_if_many(1000)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(record)
+    assert compiled == []
 
 
 def test_nothing_is_forgotten_while_a_program_is_traced(monkeypatch):

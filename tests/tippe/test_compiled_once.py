@@ -144,6 +144,7 @@ def compiles_once(kind, call):
 CHEAP = [("smooth", "time, grad"), ("hybrid", "time, vmap"), ("set-valued", "path"), ("arena", "path")]
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize(("kind", "call"), CHEAP)
 def test_a_second_call_with_other_numbers_compiles_nothing(kind, call):
     compiles_once(kind, call)

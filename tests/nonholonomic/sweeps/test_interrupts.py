@@ -125,6 +125,7 @@ def test_a_table_says_what_is_saved_and_goes_on_from_there(way, tmp_path):
 def test_a_table_is_heard_while_it_compiles(tmp_path):
     process = run(tmp_path, COMPILING, "table.h5")
     assert process.stdout.readline() == "begun\n"
+    time.sleep(0.5)
     status, out, _, passed = interrupted(process)
     assert (status, out) == (7, ["saved 0 of 50 cells to table.h5; run the same call again to resume"])
     assert passed < PROMPT
@@ -133,6 +134,8 @@ def test_a_table_is_heard_while_it_compiles(tmp_path):
 def test_a_command_line_ends_while_it_compiles(tmp_path):
     process = run(tmp_path, COMMAND)
     assert process.stdout.readline() == "begun\n"
+    # Until it no longer hears signals.
+    time.sleep(0.5)
     status, out, error, passed = interrupted(process)
     assert (status, out) == (INTERRUPTED, [])
     assert error == ["python -m something: interrupted; run the same command again to resume"]
