@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from ..derivatives.differentiable import tangents_by
 from ..derivatives.sampling import AbstractSampling, ProblemSpec, solve_for_samples
 from ..derivatives.variation import in_groups
+from ..extremes import greatest
 from ..integration import LEFT_DOMAIN, REACHED_END, RUNNING, Settings, solve_with_samples
 from .ensemble import AbstractBatchedMode, HybridOutcome, TransitionPath, after_reset, after_solve
 from .path import BETWEEN
@@ -166,7 +167,7 @@ def _followed(
     empty = Filled(missing, jnp.zeros((count, *missing.shape)), missing[0], jnp.full((), jnp.inf))
 
     def stay(one: VariationalMode, number: int, found: HybridOutcome, filled: Filled) -> tuple[HybridOutcome, Filled]:
-        since, left = times - found.end_time, jnp.maximum(t1 - found.end_time, 0.0)
+        since, left = times - found.end_time, greatest(t1 - found.end_time, 0.0)
         outcome, samples = solve_with_samples(
             one.problem(found.state), since, left, jnp.asarray(1), settings, parts=1 + count
         )
@@ -178,7 +179,7 @@ def _followed(
             # Relative to an event that is later, a fixed time comes sooner, as the horizon does.
             return None if record is None else _on_the_way(mode, record, times - t1 + left)
 
-        left = jnp.maximum(t1 - found.end_time, 0.0)
+        left = greatest(t1 - found.end_time, 0.0)
         transition, shown, variations = one.left_behind(found.state, left, seen)
         after = after_reset(jnp, found, transition, t1)
         if shown is not None:

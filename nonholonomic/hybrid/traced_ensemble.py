@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..extremes import greatest
 from ..integration.ensemble import traced_solve_ensemble
 from ..integration.settings import Settings
 from ..integration.status import LEFT_DOMAIN, RUNNING, UNRESOLVED
@@ -50,7 +51,7 @@ def traced_solve_hybrid(
     def through(one: AbstractBatchedMode, found: HybridOutcome, here: Bool[Array, " cells"]) -> HybridOutcome:
         def ensemble_solve() -> HybridOutcome:
             there, now = of_cells(one, here), in_place_of(found, here)
-            left = jnp.where(here, jnp.maximum(t1 - found.end_time, 0.0), 0.0)
+            left = jnp.where(here, greatest(t1 - found.end_time, 0.0), 0.0)
             problem = there.problem(now.state)
             outcome, _ = traced_solve_ensemble(problem, left, jnp.asarray(size), settings, passes=passes, parts=parts)
             return chosen(here, after_solve(jnp, found, outcome, t1), found)
@@ -87,7 +88,7 @@ def passing(
 
     def passed() -> HybridOutcome:
         there, now = of_cells(one, lost), in_place_of(found, lost)
-        transition = there.reset_map(now.state, jnp.maximum(t1 - now.end_time, 0.0))
+        transition = there.reset_map(now.state, greatest(t1 - now.end_time, 0.0))
         return chosen(lost, after_reset(jnp, found, transition, t1), found)
 
     return jax.lax.cond(jnp.any(lost), passed, lambda: found)

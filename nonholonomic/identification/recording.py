@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..extremes import greatest
 from ..parameters import numbers, one_line
 from ..validation import as_number, as_number_or_none, require
 from .likelihood import Measurements
@@ -183,7 +184,7 @@ def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " colu
 
 def model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Array, " times"]:
     """The times of the samples since the launch [s]; those before it are moved to it."""
-    return jnp.maximum(times - t0, INSTANT * jnp.arange(times.shape[0]))
+    return greatest(times - t0, INSTANT * jnp.arange(times.shape[0]))
 
 
 def predicted(

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nonholonomic.extremes import greatest
 from nonholonomic.geometry import Component
 from nonholonomic.validation import Bound, Bounded, as_number
 
@@ -167,4 +168,4 @@ class RollingResistance(AbstractFriction):
 
     def resistance(self, load: Component, speed: Float[Array, "..."]) -> Component:
         """Force [N] along a wheel with the given load [N] that rolls at the given speed [m/s]."""
-        return None if load is None else -self.coefficient * jnp.maximum(load, 0.0) * jnp.tanh(speed / self.speed)
+        return None if load is None else -self.coefficient * greatest(load, 0.0) * jnp.tanh(speed / self.speed)

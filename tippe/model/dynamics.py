@@ -6,13 +6,13 @@ part of it.
 """
 
 import dataclasses
-import functools
 from typing import NamedTuple, Self
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from nonholonomic.extremes import least
 from nonholonomic.geometry import (
     AbstractFrame,
     Component,
@@ -201,15 +201,6 @@ class Dynamics(eqx.Module):
         motion = self.motion(state)
         lost, jammed = motion.normal_force / (self.mass * self.gravity) + 1e-12, motion.painleve_factor - JAMMED
         return (lost, jammed) if motion.room is None else (lost, jammed, motion.room - FITS)
-
-
-def least(*margins: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The least of some margins, with a slope that is that of one of them.
-
-    JAX differentiates `min` and `minimum` by looking which number equals the least. Where the compiler computes a margin again
-    with another rounding none does, and the slope is 0 or not a number. What is not a number stays so.
-    """
-    return functools.reduce(lambda one, other: jnp.where((one < other) | jnp.isnan(one), one, other), margins)
 
 
 def turned(vector: Vector, rate: Float[Array, "..."]) -> Vector:

@@ -25,6 +25,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.polynomial import Polynomial, legendre
 
+from nonholonomic.extremes import greatest
+
 from .dynamics import Dynamics
 from .friction import Slip, length
 from .rolling import RollingDynamics
@@ -217,7 +219,7 @@ class _Contact(eqx.Module):
         determinant = a * c - b * b
         lifted = jnp.stack([b * h - c * f, b * f - a * h]) / determinant
         yields = d[0] * (a * d[0] + b * d[1] + mu * f) + d[1] * (b * d[0] + c * d[1] + mu * h)
-        rise = (jnp.maximum(-grip, 0.0) * weight / yields, jnp.maximum(-falls, 0.0) * weight / (2.0 * yields))
+        rise = (greatest(-grip, 0.0) * weight / yields, greatest(-falls, 0.0) * weight / (2.0 * yields))
         speed = jnp.sqrt(rolling.gravity * rolling.radius)
         spin = jnp.sqrt(sum(x * x for x in rolling.angular_velocity(state)))
         unit = 1.0 / jnp.maximum(spin, speed / rolling.radius)
@@ -253,7 +255,7 @@ class _Contact(eqx.Module):
         # The force asks for a slip's direction alone, and where a slip begins v is far less than what a small turn of the force
         # makes of it. So the direction turns by what the equations say, and not to where v points; v is not turned round.
         turned = along + turn * across
-        longer = jnp.maximum(size + change[0] * along[0] + change[1] * along[1], 0.2 * size)
+        longer = greatest(size + change[0] * along[0] + change[1] * along[1], 0.2 * size)
         return longer / length(turned[0], turned[1]) * turned - v
 
 

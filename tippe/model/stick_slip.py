@@ -17,9 +17,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.extremes import greatest, least
 from nonholonomic.geometry import AbstractFrame
 
-from .dynamics import FITS, Dynamics, Motion, least, stacked
+from .dynamics import FITS, Dynamics, Motion, stacked
 from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, Slip, length
 from .rolling import RollingDynamics
 from .slip_onset import Onset, begin
@@ -198,7 +199,7 @@ class ContactMode(eqx.Module):
         """Slip speed above that at which a slip is over, in units of sqrt(g R). A slip that grows is never over."""
         speed, change = self._slowing(state)
         way = LEFT * self.tolerance * self.both.rolling.radius
-        return (speed - jnp.sqrt(2.0 * way * jnp.maximum(-change, 0.0))) / self.both.speed
+        return (speed - jnp.sqrt(2.0 * way * greatest(-change, 0.0))) / self.both.speed
 
     def _slowing(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """The slip's speed [m/s] and its rate."""

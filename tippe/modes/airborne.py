@@ -20,6 +20,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.extremes import greatest
 from nonholonomic.geometry import (
     CarriedFrame,
     Component,
@@ -307,7 +308,7 @@ class Fly(AbstractFlyingMode):
         scene, flying, ball = self.scene, flight_state(state), balls(self.scene.body)[0]
         ground = landing_site(scene, flying, ball)
         free, zero = as_free_body(scene, flying, ground), jnp.zeros_like(state[0])
-        speed = jnp.maximum(-gap_rate(scene.body, ball, free), 0.0)
+        speed = greatest(-gap_rate(scene.body, ball, free), 0.0)
         bounce = zero if scene.restitution is None else scene.restitution + zero
         rebounds = bounce * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
         blow = resolve_coulomb_impact if scene.friction.set_valued else resolve_impact

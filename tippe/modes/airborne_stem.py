@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.extremes import greatest
 from nonholonomic.geometry import dot, scale, sum_vectors
 from nonholonomic.hybrid import Transition
 from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractProblem
@@ -225,7 +226,7 @@ def apply_impulse(scene: Scene, flying: FlightState, ground: Below, own: Ball, o
     """
     body, closing = scene.body, CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
     free = as_free_body(scene, flying, ground, own)
-    speed = jnp.maximum(-gap_rate(body, own, free), 0.0)
+    speed = greatest(-gap_rate(body, own, free), 0.0)
     bounce = jnp.zeros_like(speed) if scene.restitution is None else scene.restitution
     rebounds = bounce * speed > closing
     after, fails = resolve_impact(body, scene.friction, own, free, jnp.where(rebounds, bounce, 0.0))

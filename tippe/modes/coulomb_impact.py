@@ -16,10 +16,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from nonholonomic.extremes import greatest, least
 from nonholonomic.geometry import Vector, dot, scale, sum_vectors
 from nonholonomic.integration import LEFT_DOMAIN, MOST_STEPS, AbstractProblem, Settings, traced_solve_ensemble
 
-from ..model.dynamics import least
 from ..model.friction import SetValuedCoulomb, length
 from ..model.top import Top
 from .free_body import Ball, FreeBody
@@ -79,8 +79,8 @@ def resolve_coulomb_impact(
     **Arguments, returns:** as for `resolve_impact`, of which it is the limit for a slip speed of 0.
     """
     meets = approach(body, ball, free)
-    impact = Impact(body, friction, meets, ball.radius, (1.0 + restitution) * jnp.maximum(-meets.velocity[2], 0.0))
-    pace = jnp.maximum(length(*meets.velocity[:2]), impact.speed)
+    impact = Impact(body, friction, meets, ball.radius, (1.0 + restitution) * greatest(-meets.velocity[2], 0.0))
+    pace = greatest(length(*meets.velocity[:2]), impact.speed)
     skid = Skid(impact, friction.mu, pace)
     settings = Settings(TOLERANCE, diffrax.Dopri5(), absolute=0.1, max_steps=MOST_STEPS)
     outcome, _ = traced_solve_ensemble(skid, jnp.asarray(LARGEST), jnp.asarray(pace.shape[0]), settings)
@@ -118,12 +118,12 @@ def _onward(impact: Impact, mu: Float[Array, "..."], blow: Vector) -> Vector:
     velocity, along = sum_vectors(meets.velocity, change(blow)), (f1, f2, jnp.ones_like(f1))
     # The impact ends as in `Impact.domain_margin`: the normal velocity grows in proportion, the energy as a parabola.
     gains = change(along)
-    wanted = jnp.maximum((meets.velocity[2] + impact.gained - velocity[2]) / gains[2], 0.0)
-    compressed = jnp.maximum(-velocity[2], 0.0) / gains[2]
+    wanted = greatest((meets.velocity[2] + impact.gained - velocity[2]) / gains[2], 0.0)
+    compressed = greatest(-velocity[2], 0.0) / gains[2]
     power, stiff = dot(along, velocity), dot(along, gains)
-    gain = jnp.minimum(dot(blow, meets.velocity) + 0.5 * dot(blow, change(blow)), 0.0)
+    gain = least(dot(blow, meets.velocity) + 0.5 * dot(blow, change(blow)), 0.0)
     restored = (-power + jnp.sqrt(power * power - 2.0 * gain * stiff)) / stiff
-    return sum_vectors(scale(jnp.minimum(wanted, jnp.maximum(compressed, restored)), along), (*rest, None))
+    return sum_vectors(scale(least(wanted, greatest(compressed, restored)), along), (*rest, None))
 
 
 def sticking_force(

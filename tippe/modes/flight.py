@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.extremes import greatest
 from nonholonomic.geometry import Vector, cross, dot, scale, subtract, sum_vectors
 from nonholonomic.integration import halved
 
@@ -167,9 +168,9 @@ def _descent(
 ) -> Descent:
     """The distance of a sphere from the plane in flight."""
     turning = cone(body, free)
-    start = jnp.where(touching, 0.0, jnp.maximum(gap(ball, free), 0.0))
+    start = jnp.where(touching, 0.0, greatest(gap(ball, free), 0.0))
     speed = gap_rate(body, ball, free)
-    speed = jnp.where(at_rest, 0.0, jnp.where(touching, jnp.maximum(speed, 0.0), speed))
+    speed = jnp.where(at_rest, 0.0, jnp.where(touching, greatest(speed, 0.0), speed))
     cosine, sine = ball.offset * turning.across[2], ball.offset * turning.ahead[2]
     # Where the normal force vanishes the distance has no curvature: the remainder, round-off, may only rise.
     unbent = -gravity / jnp.maximum(turning.rate**2, jnp.finfo(cosine.dtype).tiny)
@@ -237,7 +238,7 @@ def landed_at(descent: Descent, time: Cells) -> Cells:
 def _roots(height: Cells, speed: Cells, gravity: Cells) -> tuple[Cells, Cells]:
     """Times between which a body thrown from a height is above zero; infinite, and so never, if it is not."""
     square = speed**2 + 2.0 * gravity * height
-    root = jnp.sqrt(jnp.maximum(square, 0.0))
+    root = jnp.sqrt(greatest(square, 0.0))
     never = square <= 0.0
     return (
         jnp.where(never, jnp.inf, (speed - root) / gravity),
@@ -247,7 +248,7 @@ def _roots(height: Cells, speed: Cells, gravity: Cells) -> tuple[Cells, Cells]:
 
 def _last_root(height: Cells, speed: Cells, gravity: Cells) -> Cells:
     """Time at which a body thrown from a height, nonnegative up to round-off, is at zero again."""
-    return (speed + jnp.sqrt(jnp.maximum(speed**2 + 2.0 * gravity * height, 0.0))) / gravity
+    return (speed + jnp.sqrt(greatest(speed**2 + 2.0 * gravity * height, 0.0))) / gravity
 
 
 def angle_reached(body: Top, free: FreeBody, cos_angle: Float[Array, "..."], until: Cells, last: bool) -> Cells:

@@ -24,10 +24,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from nonholonomic.extremes import greatest, least
 from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
 from nonholonomic.integration import LEFT_DOMAIN, MOST_STEPS, AbstractProblem, Settings, traced_solve_ensemble
 
-from ..model.dynamics import least
 from ..model.friction import AbstractFriction, ContactLoad, Slip
 from ..model.state import angular_velocity
 from ..model.top import Top
@@ -95,7 +95,7 @@ class Impact(AbstractProblem):
         """Speed along the normal before the impact [m/s]; positive, because the impulse of a sphere at rest has no
         unit.
         """
-        return jnp.maximum(jnp.abs(self.approach.velocity[2]), 1e-12)
+        return greatest(jnp.abs(self.approach.velocity[2]), 1e-12)
 
     def blow(self, normal: Cells, state: Float[Array, "rows cells"]) -> ContactImpulse:
         """The impulses at a stage of the impact."""
@@ -196,7 +196,7 @@ def resolve_impact(
     **Returns:** the body after the impact; and where the impact could not be computed (`MOST_STEPS`, `LARGEST`).
     """
     meets = approach(body, ball, free)
-    gained = (1.0 + restitution) * jnp.maximum(-meets.velocity[2], 0.0)
+    gained = (1.0 + restitution) * greatest(-meets.velocity[2], 0.0)
     problem = Impact(body, friction, meets, ball.radius, gained)
     cells = gained.shape[0]
     outcome, _ = traced_solve_ensemble(

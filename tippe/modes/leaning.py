@@ -25,9 +25,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.extremes import least
 from nonholonomic.geometry import Component, add, cross, dot, multiply, scale, subtract, sum_vectors
 
-from ..model.dynamics import least, stacked
+from ..model.dynamics import stacked
 from ..model.friction import AbstractFriction, Slip
 from ..model.state import angular_velocity, parts
 from ..model.top import Top

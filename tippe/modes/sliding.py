@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.extremes import greatest, least
 from nonholonomic.geometry import dot, multiply, scale
 from nonholonomic.hybrid import Transition, TransitionPath
 from nonholonomic.integration import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED, AbstractProblem
 
-from ..model.dynamics import Dynamics, least, stacked
+from ..model.dynamics import Dynamics, stacked
 from ..model.scene import Scene
 from ..model.state import COS_THETA, parts
 from ..model.top import Top
@@ -266,7 +267,7 @@ def take_flight(
     **Returns:** the top at its end; and where a sphere has reached the plane.
     """
     body, gravity = scene.body, scene.gravity
-    flight = fly(body, gravity, balls(body), air.free, air.ball, air.rising, jnp.maximum(left - air.elapsed, 0.0))
+    flight = fly(body, gravity, balls(body), air.free, air.ball, air.rising, greatest(left - air.elapsed, 0.0))
     reached = angle_reached(body, air.free, cos_angle, flight.duration, last)
     crosses = jnp.isfinite(reached) & (not last)
     duration = jnp.where(crosses, reached, flight.duration)
@@ -292,7 +293,7 @@ def land(scene: Scene, air: Air) -> Air:
     """The impact of the sphere that has reached the plane; a slow rebound closes the contact."""
     body, spheres = scene.body, balls(scene.body)
     own, other = _own_and_other(spheres, air.ball)
-    speed = jnp.maximum(-gap_rate(body, own, air.free), 0.0)
+    speed = greatest(-gap_rate(body, own, air.free), 0.0)
     restitution = (
         jnp.zeros_like(speed) if scene.restitution is None else jnp.broadcast_to(scene.restitution, speed.shape)
     )

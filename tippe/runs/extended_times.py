@@ -15,6 +15,7 @@ from nonholonomic.derivatives import (
     in_groups,
     tangents_by,
 )
+from nonholonomic.extremes import greatest, least
 from nonholonomic.integration import CROSSED, FAILED, MOST_STEPS, LaneScheduler, Settings, crossing_time
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, is_traced
@@ -130,7 +131,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
             time = jnp.where(outcome.end_time > 0.0, crossing_time(problem, outcome.end_time, state), 0.0)
             angle = jnp.arccos(problem.cos_angle)
             missing = _e_folds(state, angle)
-            whole = jnp.maximum(_e_folds(problem.states, angle), 1.0)
+            whole = greatest(_e_folds(problem.states, angle), 1.0)
             return jnp.where(crossed, time, t1 * (1.0 + missing / whole))
 
         good = may & (outcome.status != FAILED)
@@ -145,4 +146,4 @@ class ExtendedSolve(AbstractDifferentiableSolve):
 def _e_folds(state: Float[Array, "components cells"], angle: Float[Array, "..."]) -> Float[Array, " cells"]:
     """Number of e-folds by which theta must still grow to reach an angle."""
     theta = inclination(parts(state).axis)
-    return jnp.log(angle / jnp.clip(theta, LEAST_ANGLE, angle))
+    return jnp.log(angle / least(greatest(theta, LEAST_ANGLE), angle))

@@ -1,0 +1,37 @@
+"""The least and the greatest of some numbers, and their derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nonholonomic.extremes import greatest, least
+
+
+@pytest.mark.parametrize("function", [least, greatest])
+def test_the_derivative_survives_what_the_compiler_rounds_differently(function):
+    """The derivative of x - 0.37 exp(c), where it is the one chosen of two numbers, is -0.37 exp(c).
+
+    XLA may round the difference in one kernel and not in another; by `jnp.maximum` and `jnp.minimum` some of these are 0 then.
+    """
+    sign = 1.0 if function is greatest else -1.0
+    times = 1.0 + 0.01 * np.arange(24)
+
+    @jax.jit
+    def value_and_slope(c):
+        return jax.jvp(lambda c: function(sign * (times - 0.37 * jnp.exp(c)), jnp.zeros(24)), (c,), (1.0,))
+
+    for c in np.random.default_rng(0).uniform(-3.0, -2.0, 100):
+        np.testing.assert_allclose(value_and_slope(c)[1], -sign * 0.37 * np.exp(c), rtol=1e-12)
+
+
+def test_what_is_not_a_number_stays_so():
+    for function in (least, greatest):
+        assert jnp.isnan(function(jnp.nan, 1.0))
+        assert jnp.isnan(function(1.0, jnp.nan))
+
+
+def test_of_several_numbers():
+    numbers = jnp.array([[3.0, 1.0], [2.0, 5.0], [4.0, 0.0]])
+    np.testing.assert_array_equal(least(*numbers), [2.0, 0.0])
+    np.testing.assert_array_equal(greatest(*numbers), [4.0, 5.0])
