@@ -4,6 +4,7 @@ Measured on jaxlib 0.10.2 and a core with AVX-512 unless another version is name
 `benchmarks/work_precision.py` time the whole.
 """
 
+import functools
 import os
 import warnings
 from collections.abc import Callable
@@ -87,6 +88,33 @@ def uncounted(going: Bool[Array, ""], carried: Int[Array, ""]) -> Bool[Array, ""
     how the value is changed before it copies.
     """
     return going & (carried >= 0)
+
+
+def least(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
+    """The least of some numbers, with the derivative of that one; what is not a number stays so.
+
+    JAX differentiates `minimum`, `maximum` and `clip` by asking which number equals the result. Where XLA computes that number
+    again and rounds it differently, none does, and the derivative is 0. It can go when JAX asks which number is less.
+
+    **Example:**
+
+    >>> import jax
+    >>> jax.grad(lambda x: least(2.0 * x, 1.0))(0.3).item()
+    2.0
+    """
+    return functools.reduce(lambda one, other: jnp.where((one < other) | jnp.isnan(one), one, other), numbers)
+
+
+def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
+    """The greatest of some numbers, with the derivative of that one, as `least`.
+
+    **Example:**
+
+    >>> import jax
+    >>> jax.grad(lambda x: greatest(2.0 * x, 0.0))(0.3).item()
+    2.0
+    """
+    return functools.reduce(lambda one, other: jnp.where((one > other) | jnp.isnan(one), one, other), numbers)
 
 
 def on_device(*arrays: Float[ArrayLike, "..."]) -> tuple[Float[Array, "..."], ...]:

@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float
 from ..derivatives.differentiable import tangents_by
 from ..derivatives.sampling import AbstractSampling, ProblemSpec, solve_for_samples
 from ..derivatives.variation import in_groups
-from ..extremes import greatest
 from ..integration import LEFT_DOMAIN, REACHED_END, RUNNING, Settings, solve_with_samples
+from ..xla_cpu import greatest
 from .ensemble import AbstractBatchedMode, HybridOutcome, TransitionPath, after_reset, after_solve
 from .path import BETWEEN
 from .saltation import VariationalMode, variational_modes, variational_start

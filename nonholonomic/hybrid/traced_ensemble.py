@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..extremes import greatest
 from ..integration.ensemble import traced_solve_ensemble
 from ..integration.settings import Settings
 from ..integration.status import LEFT_DOMAIN, RUNNING, UNRESOLVED
+from ..xla_cpu import greatest
 from .ensemble import MOST_ROUNDS, AbstractBatchedMode, HybridOutcome, after_reset, after_solve
 
 

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..extremes import greatest
 from ..parameters import numbers, one_line
 from ..validation import as_number, as_number_or_none, require
+from ..xla_cpu import greatest
 from .likelihood import Measurements
 
 #: Model times of samples before the launch: so close to it, and to one another [s], that nothing moves.

@@ -8,9 +8,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from nonholonomic.extremes import greatest
 from nonholonomic.geometry import Component
 from nonholonomic.validation import Bound, Bounded, as_number
+from nonholonomic.xla_cpu import greatest
 
 
 class WheelMotion(NamedTuple):

@@ -12,7 +12,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from nonholonomic.extremes import least
 from nonholonomic.geometry import (
     AbstractFrame,
     Component,
@@ -28,7 +27,7 @@ from nonholonomic.geometry import (
     sum_vectors,
 )
 from nonholonomic.integration import Status
-from nonholonomic.xla_cpu import stored
+from nonholonomic.xla_cpu import least, stored
 
 from .body import AbstractBody, AbstractMeridian
 from .friction import AbstractFriction, ContactLoad, Slip

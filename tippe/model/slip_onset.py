@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.polynomial import Polynomial, legendre
 
-from nonholonomic.extremes import greatest
+from nonholonomic.xla_cpu import greatest
 
 from .dynamics import Dynamics
 from .friction import Slip, length

@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.extremes import greatest, least
 from nonholonomic.geometry import AbstractFrame
+from nonholonomic.xla_cpu import greatest, least
 
 from .dynamics import FITS, Dynamics, Motion, stacked
 from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, Slip, length

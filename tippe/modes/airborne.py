@@ -20,7 +20,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.extremes import greatest
 from nonholonomic.geometry import (
     CarriedFrame,
     Component,
@@ -35,7 +34,7 @@ from nonholonomic.geometry import (
 )
 from nonholonomic.hybrid import Transition
 from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractProblem
-from nonholonomic.xla_cpu import compiled_setup
+from nonholonomic.xla_cpu import compiled_setup, greatest
 
 from ..model.dynamics import Dynamics, stacked
 from ..model.scene import Scene

@@ -13,11 +13,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.extremes import greatest
 from nonholonomic.geometry import dot, scale, sum_vectors
 from nonholonomic.hybrid import Transition
 from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractProblem
-from nonholonomic.xla_cpu import compiled_setup
+from nonholonomic.xla_cpu import compiled_setup, greatest
 
 from ..model.scene import Scene
 from ..model.state import COS_THETA

@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.extremes import greatest, least
 from nonholonomic.geometry import Vector, dot, scale, sum_vectors
 from nonholonomic.integration import LEFT_DOMAIN, MOST_STEPS, AbstractProblem, Settings, traced_solve_ensemble
+from nonholonomic.xla_cpu import greatest, least
 
 from ..model.friction import SetValuedCoulomb, length
 from ..model.top import Top

@@ -24,9 +24,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.extremes import greatest, least
 from nonholonomic.geometry import Vector, cross, dot, scale, sum_vectors
 from nonholonomic.integration import LEFT_DOMAIN, MOST_STEPS, AbstractProblem, Settings, traced_solve_ensemble
+from nonholonomic.xla_cpu import greatest, least
 
 from ..model.friction import AbstractFriction, ContactLoad, Slip
 from ..model.state import angular_velocity

@@ -25,8 +25,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.extremes import least
 from nonholonomic.geometry import Component, add, cross, dot, multiply, scale, subtract, sum_vectors
+from nonholonomic.xla_cpu import least
 
 from ..model.dynamics import stacked
 from ..model.friction import AbstractFriction, Slip

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.extremes import greatest, least
 from nonholonomic.geometry import dot, multiply, scale
 from nonholonomic.hybrid import Transition, TransitionPath
 from nonholonomic.integration import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED, AbstractProblem
+from nonholonomic.xla_cpu import greatest, least
 
 from ..model.dynamics import Dynamics, stacked
 from ..model.scene import Scene

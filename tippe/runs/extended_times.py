@@ -15,10 +15,10 @@ from nonholonomic.derivatives import (
     in_groups,
     tangents_by,
 )
-from nonholonomic.extremes import greatest, least
 from nonholonomic.integration import CROSSED, FAILED, MOST_STEPS, LaneScheduler, Settings, crossing_time
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, is_traced
+from nonholonomic.xla_cpu import greatest, least
 
 from ..model.launch import Launch
 from ..model.scene import Scene
