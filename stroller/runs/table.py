@@ -129,8 +129,8 @@ def sweep(
     check_run(scene, launch, t1, input, tolerance)
     if not isinstance(axes, dict) or not all(isinstance(number, str) for number in axes):
         raise ValueError(f"axes = {axes!r} must be a dictionary, full name of a parameter -> values")
-    solver = Settings(tolerance, solver).for_lanes
-    explicit_tableau(solver)
+    method = Settings(tolerance, solver).for_lanes
+    explicit_tableau(method)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
     grid = named_axes(full_axes(axes, variable_numbers(roots)), scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.
@@ -140,9 +140,9 @@ def sweep(
 
     request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
     request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
-    request |= {"solver": type(solver).__name__, "input": "none" if input is None else described(input)}
+    request |= {"solver": type(method).__name__, "input": "none" if input is None else described(input)}
     request |= {grid_axis.number: "an axis" for grid_axis in grid}
-    job = RideJob.of(roots, input, float(t1), float(tolerance), solver)
+    job = RideJob.of(roots, input, float(t1), float(tolerance), method)
     return computed(job, grid, VARIABLES, request, path=path, progress=progress, executor=executor)
 
 
@@ -165,13 +165,15 @@ class RideJob(NamedTuple):
     input: Input | None
     t1: float
     tolerance: float
-    solver: diffrax.AbstractERK
-    controls: eqx.Module | None
+    solver: diffrax.AbstractSolver
+    controls: Input | None
 
     @classmethod
-    def of(cls, roots: dict[str, Any], input: Input | None, *rest: Any) -> "RideJob":
+    def of(
+        cls, roots: dict[str, Any], input: Any, t1: float, tolerance: float, solver: diffrax.AbstractSolver
+    ) -> "RideJob":
         """The job, in this process."""
-        return cls(roots, input, *rest, as_module(input, roots["scene"], roots["launch"]))
+        return cls(roots, input, t1, tolerance, solver, as_module(input, roots["scene"], roots["launch"]))
 
     def __reduce__(self) -> Any:
         return RideJob.of, tuple(self[:-1])
