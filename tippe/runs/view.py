@@ -72,19 +72,19 @@ class Motion(NamedTuple, Generic[Numbers]):
     angular_velocity: Float[Numbers, "times 3"]
     angular_momentum: Float[Numbers, "times 3"]
 
-    @classmethod
-    def of(cls, run: Any) -> "Motion[Array]":
+    @staticmethod
+    def of(run: Any) -> "Motion[Array]":
         """The motion of one run, inside or outside of transformations."""
         body, slip = run.scene.body, run.slip
         zero = jnp.zeros_like(run.t)
         position, axis, normal = run.position, run.axis, run._fixed((zero, zero, zero + 1.0))
-        contact = run.contact if not isinstance(body, Top) else position - body.radius * normal
+        contact: Array = run.contact if not isinstance(body, Top) else position - body.radius * normal
         if isinstance(body, Top) and body.stem is not None:
             stem = position + (body.stem.offset - body.offset) * axis - body.stem.radius * normal
             contact = jnp.where((run.contact == 1)[:, None], stem, contact)
         turning = run.angular_velocity
         along = jnp.sum(turning * axis, axis=-1, keepdims=True)
-        return cls(
+        return Motion(
             run.t,
             position,
             axis,
@@ -195,7 +195,7 @@ def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
     return found
 
 
-def aside(normal: Float[Array, "times 3"]) -> Float[Array, "times 3"]:
+def aside(normal: Float[Array | np.ndarray, "times 3"]) -> Float[Array, "times 3"]:
     """Unit vectors across the normal, towards x, or towards y where the normal is along x."""
     x, y = jnp.array([[1.0, 0.0, 0.0]]), jnp.array([[0.0, 1.0, 0.0]])
     towards = jnp.where(jnp.abs(normal[:, :1]) < 0.9, x, y)
