@@ -152,9 +152,7 @@ def jellett_thresholds(scene: Scene[Top]) -> tuple[Float[Array, "..."], Float[Ar
     return upright, inverted
 
 
-def standing_state(
-    scene: Scene[Top], spin: Float[ArrayLike, ""], inverted: bool = False
-) -> Float[Array, " components"]:
+def standing_state(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = False) -> Float[Array, " components"]:
     """State of the vector form of a standing top at the arena's lowest point.
 
     **Arguments:**
@@ -174,7 +172,7 @@ def standing_state(
 
 
 @eqx.filter_jit
-def standing_matrix(scene: Scene[Top], spin: Float[ArrayLike, ""], inverted: bool = False) -> Float[Array, "k k"]:
+def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = False) -> Float[Array, "k k"]:
     """Matrix [1/s] of the linear motion near a standing top, on any arena.
 
     Components along n change at second order only and are left out, as are the frame's own direction and the places that a
@@ -198,7 +196,7 @@ def standing_matrix(scene: Scene[Top], spin: Float[ArrayLike, ""], inverted: boo
     return jacobian[np.ix_(across, across)]
 
 
-def _places_across(scene: Scene[Top]) -> range:
+def _places_across(scene: Scene) -> range:
     """Which components of a state are places that differ near the arena's lowest point."""
     count = max(len(scene.frame.place_scales) - 1, 0)
     if isinstance(scene.frame, CarriedFrame):
@@ -396,6 +394,6 @@ def growth_rate(matrix: Float[Array, "k k"]) -> Float[Array, ""]:
     return jnp.max(jnp.linalg.eigvals(matrix).real)
 
 
-def _on_a_plane(scene: Scene[Top]) -> None:
+def _on_a_plane(scene: Scene) -> None:
     if not isinstance(scene.surface, Plane):
         raise ValueError(f"surface = {scene.surface!r} must be a Plane: elsewhere no top tumbles steadily")
