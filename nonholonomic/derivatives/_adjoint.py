@@ -133,7 +133,7 @@ def solve_with_adjoint(
 ) -> tuple[Outcome, Float[Array, "components cells"], Any]:
     """Run every cell to its end, and differentiate a quantity measured there by the parameters of the problem.
 
-    **Arguments:** as for `ensemble_solve`, except `passes`, and
+    **Arguments:** as for `ensemble_solve`, except `nonterminal`, and
 
     - `problem`: without tangents.
     - `moving`: a tree of booleans like the problem: which of its leaves, scalars or (cells,), to differentiate by.
@@ -164,15 +164,15 @@ def solve_with_adjoint(
     probed = dataclasses.replace(problem, tangents=(probe,))
     # As many lanes as without the probe: the backward pass, which costs most, does not use the probe.
     settings = dataclasses.replace(settings, lanes=settings.lanes_of(size))
-    scheduler = LaneScheduler.of(probed, t1, cells, settings, one_kernel=one_kernel, parts=2)
+    scheduler = LaneScheduler.of(probed, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
     rows = components + len(jax.tree.leaves(numbers))
 
     def period(run: Backward) -> Backward:
         index, before = run.kept.latest()
         after, record, count = _recorded(scheduler, before)
         outcome = scheduler.store(run.outcome, after.lane_state)
-        onward = scheduler.refill(after)
-        back = ~scheduler.unfinished(onward) | (index + 1 == run.needed)
+        refilled = scheduler.refill(after)
+        back = ~scheduler.unfinished(refilled) | (index + 1 == run.needed)
         adjoint = _taken_back(
             scheduler, moving, measured, after.lane_state, record, jnp.where(back, count, 0), run.adjoint
         )
@@ -180,7 +180,7 @@ def solve_with_adjoint(
         began = back & (before.lane_state.steps == 0) & (before.lane_state.cell < cells)
         to = jnp.where(began, before.lane_state.cell, size)
         return Backward(
-            kept=run.kept.dropped(back).added(index + 1, onward, ~back),
+            kept=run.kept.dropped(back).added(index + 1, refilled, ~back),
             needed=jnp.where(back, index, run.needed),
             outcome=outcome,
             adjoint=jnp.where(back, adjoint, run.adjoint),
@@ -201,16 +201,16 @@ def solve_with_adjoint(
 
 def _recorded(scheduler: LaneScheduler, progress: Progress) -> tuple[Progress, StepRecord, Int[Array, ""]]:
     """Advance the lanes by a period and record their steps; also return the number of iterations."""
-    here = scheduler.here(progress.lane_state)
+    in_lanes = scheduler.in_lanes(progress.lane_state)
 
     def going(carry: Any) -> Bool[Array, ""]:
         lane_state, _, idle, count = carry
-        return scheduler.goes_on(lane_state, idle, progress.scheduler, REFILL) & (count < PERIOD)
+        return scheduler.goes_on(lane_state, idle, progress.loaded, REFILL) & (count < PERIOD)
 
     def step(carry: Any) -> Any:
         lane_state, record, idle, count = carry
-        after = try_step(*here, lane_state)
-        length = jnp.where(after.time > lane_state.time, length_to_try(here[1], lane_state), 0.0)
+        after = try_step(*in_lanes, lane_state)
+        length = jnp.where(after.time > lane_state.time, length_to_try(in_lanes[1], lane_state), 0.0)
         made = StepRecord(lane_state.time, _without_probe(lane_state).state, length)
         record = jax.tree.map(functools.partial(written_in_place, at=count), record, made)
         return after, record, idle + scheduler.idle(lane_state), count + 1
@@ -225,7 +225,7 @@ def _recorded(scheduler: LaneScheduler, progress: Progress) -> tuple[Progress, S
         return jax.lax.while_loop(going, step, (start, empty, jnp.zeros((), int), jnp.zeros((), int)))
 
     lane_state, record, _, count = scheduler.in_kernel(loop)(progress.lane_state)
-    return Progress(lane_state, progress.scheduler, progress.iterations + count), record, count
+    return Progress(lane_state, progress.loaded, progress.iterations + count), record, count
 
 
 def _without_probe(lane_state: LaneState) -> LaneState:
@@ -247,7 +247,7 @@ def _taken_back(
     """
     weights = Weights.of(scheduler.control.tableau)
     # Selected here: XLA 0.10.2 aborts on a kernel that takes the initial states of all cells if they are constants.
-    problem = dataclasses.replace(scheduler.here(lane_state)[0], tangents=())
+    problem = dataclasses.replace(scheduler.in_lanes(lane_state)[0], tangents=())
     lane_state = _without_probe(lane_state)
 
     def loop(carry: Any) -> Any:

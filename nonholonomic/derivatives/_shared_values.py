@@ -79,7 +79,7 @@ class Listing:
             inputs, name = [read(variable) for variable in equation.invars], equation.primitive.name
             if name in CALLS:
                 inner = equation.params["jaxpr" if "jaxpr" in equation.params else "call_jaxpr"]
-                outputs = self.follow(inner.jaxpr, [self.enter(one) for one in inner.consts], inputs)
+                outputs = self.follow(inner.jaxpr, [self.enter(atom) for atom in inner.consts], inputs)
             elif name == "optimization_barrier":
                 outputs = inputs
             elif name == "stack" and equation.params["axis"] == 0:
@@ -87,7 +87,7 @@ class Listing:
             elif name == "unstack" and equation.params["axis"] == 0 and isinstance(inputs[0], Stack):
                 outputs = inputs[0].parts
             else:
-                outputs = self._listed(equation, [self.joined(one) for one in inputs])
+                outputs = self._listed(equation, [self.joined(atom) for atom in inputs])
             seen.update(zip(equation.outvars, outputs, strict=True))
         return [read(variable) for variable in jaxpr.outvars]
 
@@ -102,7 +102,7 @@ class Listing:
         commutes = name in ("add", "add_any", "mul")
         key = (name, *(sorted(inputs) if commutes else inputs), str(equation.params))
         if key not in self._known:
-            outputs = tuple(self._new(one.aval.shape, one.aval.dtype) for one in equation.outvars)
+            outputs = tuple(self._new(variable.aval.shape, variable.aval.dtype) for variable in equation.outvars)
             self.operations.append(Operation(equation, tuple(inputs), outputs))
             self._known[key] = outputs
         return list(self._known[key])
@@ -123,9 +123,9 @@ def sharing_values(function: Callable[..., Any]) -> Callable[..., Any]:
     def evaluated(*arguments: Any) -> Any:
         closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
         listing = Listing()
-        constants = [listing.enter(one) for one in closed.consts]
-        results = listing.follow(closed.jaxpr, constants, [listing.enter(one) for one in jax.tree.leaves(arguments)])
-        values = _evaluated(listing, [listing.joined(one) for one in results])
+        constants = [listing.enter(atom) for atom in closed.consts]
+        results = listing.follow(closed.jaxpr, constants, [listing.enter(atom) for atom in jax.tree.leaves(arguments)])
+        values = _evaluated(listing, [listing.joined(atom) for atom in results])
         return jax.tree.unflatten(jax.tree.structure(shape), values)
 
     return evaluated
@@ -134,7 +134,7 @@ def sharing_values(function: Callable[..., Any]) -> Callable[..., Any]:
 def _evaluated(listing: Listing, results: list[int]) -> list[Any]:
     """The values with the given indices, computed level by level."""
     operations = _needed(listing.operations, results)
-    uses = Counter([*results, *(value for one in operations for value in set(one.inputs))])
+    uses = Counter([*results, *(value for operation in operations for value in set(operation.inputs))])
     #: For every value: the cost of recomputing it, and the number of levels of stored values that must precede it.
     costs: Counter[int] = Counter()
     depths: Counter[int] = Counter()
@@ -154,8 +154,8 @@ def _evaluated(listing: Listing, results: list[int]) -> list[Any]:
     for done, kept in levels:
         for operation in done:
             primitive = operation.equation.primitive
-            found = primitive.bind(*(values[value] for value in operation.inputs), **operation.equation.params)
-            values.update(zip(operation.outputs, found if primitive.multiple_results else [found], strict=True))
+            result = primitive.bind(*(values[value] for value in operation.inputs), **operation.equation.params)
+            values.update(zip(operation.outputs, result if primitive.multiple_results else [result], strict=True))
         # Only arrays of the same kind can be joined.
         for kind in dict.fromkeys(listing.kinds[value] for value in kept):
             alike = [value for value in kept if listing.kinds[value] == kind]

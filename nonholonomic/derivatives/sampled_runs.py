@@ -39,12 +39,12 @@ class SampledRun(NamedTuple):
     """A run at given times, all floats: its states, NaN after its end; when and where it ended, the status code
     (`REACHED_END`, `LEFT_DOMAIN` or `FAILED`), and the numbers of accepted and rejected steps.
 
-    `states` and `end_state` are the core components (the problem's `leading` ones), `riding` the passive quadratures,
-    `None` if there are none. If a program does not use `riding`, the ensemble runs without it.
+    `states` and `end_state` are the core components (the problem's `leading` ones), `quadratures` the passive quadratures,
+    `None` if there are none. If a program does not use `quadratures`, the ensemble runs without it.
     """
 
     states: Float[Array, "*cells times components"]
-    riding: Float[Array, "*cells times riders"] | None
+    quadratures: Float[Array, "*cells times quadratures"] | None
     end_time: Float[Array, "*cells"]
     end_state: Float[Array, "*cells components"]
     status: Float[Array, "*cells"]
@@ -77,11 +77,13 @@ def sampled_run(
     """
     scalars = all(leaf.ndim == 0 for leaf in jax.tree.leaves(modules) if eqx.is_inexact_array(leaf))
     kind = BlockSampling if scalars and isinstance(settings.for_lanes, diffrax.AbstractERK) else SingleSampling
-    found = solve_for_samples(kind, build, modules, jax.lax.stop_gradient(times), t1, settings, grid)
+    samples = solve_for_samples(kind, build, modules, jax.lax.stop_gradient(times), t1, settings, grid)
     # Separate calls: all arguments of a custom derivative count as used.
-    states = _at_times(found.states, None, times, modules, build)
-    riding = None if found.riding is None else _at_times(found.riding, found.states, times, modules, build)
-    return found._replace(states=states, riding=riding)
+    states = _at_times(samples.states, None, times, modules, build)
+    quadratures = (
+        None if samples.quadratures is None else _at_times(samples.quadratures, samples.states, times, modules, build)
+    )
+    return samples._replace(states=states, quadratures=quadratures)
 
 
 @eqx.filter_custom_jvp
@@ -117,7 +119,7 @@ def core_problem(problem: AbstractProblem) -> AbstractProblem:
 
 
 #: Samples of the core components and of the passive quadratures, `None` without these.
-Samples = tuple[Float[Array, "*cells times components"], Float[Array, "*cells times riders"] | None]
+Samples = tuple[Float[Array, "*cells times components"], Float[Array, "*cells times quadratures"] | None]
 
 
 def parted(problem: AbstractProblem, states: Float[Array, "*cells times components"]) -> Samples:
@@ -164,43 +166,43 @@ class BlockSampling(AbstractSampling):
     alone: bool = eqx.field(static=True, default=False)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
-        build, numbers, given, settings = self._builder(leaves)
-        return _march(VariationalProblem(build(numbers, cells), (), False), given, settings)[0]
+        build, numbers, arguments, settings = self._builder(leaves)
+        return _march(VariationalProblem(build(numbers, cells), (), False), arguments, settings)[0]
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[SampledRun, list[SampledRun]]:
-        build, numbers, given, settings = self._builder(leaves)
+        build, numbers, arguments, settings = self._builder(leaves)
         problem, tangents, gather = tangents_by(build, active, numbers, cells)
 
-        def run(some: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
-            return _march(VariationalProblem(problem, some, False), given, settings, not again)
+        def run(group: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
+            return _march(VariationalProblem(problem, group, False), arguments, settings, not again)
 
-        found, slopes = in_groups(run, tangents)
-        return found, gather(slopes)
+        samples, slopes = in_groups(run, tangents)
+        return samples, gather(slopes)
 
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
         fields = SampledRun._fields
-        riding = any(fields[part % len(fields)] == "riding" for part in wanted)
-        return self if riding else dataclasses.replace(self, alone=True)
+        quadratures = any(fields[part % len(fields)] == "quadratures" for part in wanted)
+        return self if quadratures else dataclasses.replace(self, alone=True)
 
     def _builder(self, leaves: tuple[Array, ...]) -> tuple[Callable[..., AbstractProblem], Any, Any, Settings]:
         """(the modules' numbers, cells) -> the problem; these numbers; times, horizon and tolerance; and the settings."""
-        numbers, given, spec = self._sorted(leaves)
+        numbers, arguments, spec = self._sorted(leaves)
 
         def build(numbers: tuple[Array, ...], cells: int | None) -> AbstractProblem:
             problem = spec.made(numbers, cells)
             return core_problem(problem) if self.alone else problem
 
-        return build, numbers, given, spec.settings
+        return build, numbers, arguments, spec.settings
 
 
 @eqx.filter_jit
 def _march(
-    varied: VariationalProblem, given: tuple[Array, Array, Array], settings: Settings, one_kernel: bool = True
+    varied: VariationalProblem, arguments: tuple[Array, Array, Array], settings: Settings, one_kernel: bool = True
 ) -> tuple[SampledRun, list[SampledRun]]:
     """The samples of the cells, and their derivative along each tangent."""
-    times, t1, tolerance = given
+    times, t1, tolerance = arguments
     outcome, samples = solve_with_samples(
         varied,
         times if times.ndim == 1 else times.T,
@@ -208,7 +210,7 @@ def _march(
         jnp.asarray(varied.problem.start()[0].shape[1]),
         # One tolerance serves the whole ensemble: the smallest of the batch.
         settings.with_tolerance(jnp.min(tolerance)),
-        parts=1 + len(varied.tangents),
+        n_blocks=1 + len(varied.tangents),
         one_kernel=one_kernel,
     )
     counts = (outcome.steps - outcome.rejected, outcome.rejected)
@@ -238,7 +240,7 @@ def _found(
         changes = parted(varied.problem, jnp.where(jnp.isnan(states), 0.0, variation))
         return SampledRun(*changes, later, *NOT_DIFFERENTIATED)
 
-    slopes = [slope(*one) for one in zip(varied.tangents, variations, end_variations, strict=True)]
+    slopes = [slope(*parts) for parts in zip(varied.tangents, variations, end_variations, strict=True)]
     numbers = (part.astype(float) for part in (status, *counts))
     end, _ = parted(varied.problem, jnp.moveaxis(end, 0, -1))
     return SampledRun(*parted(varied.problem, states), time, end, *numbers), slopes
@@ -254,28 +256,28 @@ class SingleSampling(AbstractSampling):
     places: Any = eqx.field(static=True)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
-        numbers, given, spec = self._sorted(leaves)
-        found, _ = _follow(VariationalProblem(spec.made(numbers, None), (), False), given, spec)
-        return jax.tree.map(lambda part: part[None], found)
+        numbers, arguments, spec = self._sorted(leaves)
+        samples, _ = _follow(VariationalProblem(spec.made(numbers, None), (), False), arguments, spec)
+        return jax.tree.map(lambda part: part[None], samples)
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[SampledRun, list[SampledRun]]:
-        numbers, given, spec = self._sorted(leaves)
+        numbers, arguments, spec = self._sorted(leaves)
         problem, tangents, gather = tangents_by(spec.made, active, numbers, None)
 
-        def run(some: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
-            return _follow(VariationalProblem(problem, some, False), given, spec)
+        def run(group: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
+            return _follow(VariationalProblem(problem, group, False), arguments, spec)
 
-        found, slopes = in_groups(run, tangents)
-        return jax.tree.map(lambda part: part[None], (found, gather(slopes)))
+        samples, slopes = in_groups(run, tangents)
+        return jax.tree.map(lambda part: part[None], (samples, gather(slopes)))
 
 
 def _follow(
-    varied: VariationalProblem, given: tuple[Array, Array, Array], spec: ProblemSpec
+    varied: VariationalProblem, arguments: tuple[Array, Array, Array], spec: ProblemSpec
 ) -> tuple[SampledRun, list[SampledRun]]:
     """The samples of a run, and their derivative along each tangent."""
-    times, t1, tolerance = given
+    times, t1, tolerance = arguments
     path = sample(varied, times, t1, spec.settings.with_tolerance(tolerance), grid=spec.grid)
     ends = (path.end_time, path.end_state, _status(path, t1))
     return _found(varied, path.states.T, ends, (path.accepted, path.rejected))

@@ -43,7 +43,7 @@ def ensemble_solve_with_tangents(
     cells: Int[Array, ""],
     settings: Settings,
     *,
-    passes: bool = False,
+    nonterminal: bool = False,
     one_kernel: bool = False,
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """Run every cell, and differentiate the time of its event along some tangents.
@@ -59,40 +59,40 @@ def ensemble_solve_with_tangents(
     Source: implicit function theorem at the event; step lengths are held fixed.
     """
     horizon = t1
-    if passes:
-        whole = LaneScheduler.of(problem, t1, cells, settings, passes=True, one_kernel=one_kernel)
+    if nonterminal:
+        whole = LaneScheduler.of(problem, t1, cells, settings, nonterminal=True, one_kernel=one_kernel)
         outcome = whole.outcome()[0]
         # The derivatives need the run only up to the event, whose time is now known.
         horizon = jnp.where(jnp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
-    given = (not passes, horizon, cells, settings)
+    options = (not nonterminal, horizon, cells, settings)
 
-    def along(some: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
-        return slopes_by_variations(problem, some, *given, one_kernel=one_kernel)
+    def along(group: tuple[Any, ...]) -> tuple[Outcome, list[Float[Array, " cells"]]]:
+        return slopes_by_variations(problem, group, *options, one_kernel=one_kernel)
 
     if one_kernel and problem.fits_one_kernel and len(tangents) > MOST_FORWARD:
-        there, slopes = _slopes_by_adjoint(problem, tangents, *given)
+        ended, slopes = _slopes_by_adjoint(problem, tangents, *options)
     else:
-        there, slopes = in_groups(along, tangents)
-    if not passes:
-        outcome = with_crossing_times(problem, there)
+        ended, slopes = in_groups(along, tangents)
+    if not nonterminal:
+        outcome = with_crossing_times(problem, ended)
     # An event at the start has a fixed time, whatever the tangent.
-    happened = jnp.isfinite(outcome.crossing_time) & (there.end_time > 0.0)
+    happened = jnp.isfinite(outcome.crossing_time) & (ended.end_time > 0.0)
     # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
-    arrived = there.status == (REACHED_END if passes else CROSSED)
+    arrived = ended.status == (REACHED_END if nonterminal else CROSSED)
     return outcome, [jnp.where(happened, jnp.where(arrived, slope, jnp.nan), 0.0) for slope in slopes]
 
 
 def _slopes_by_adjoint(
-    problem: AbstractProblem, tangents: tuple[Any, ...], ends_on_event: bool, *given: Any
+    problem: AbstractProblem, tangents: tuple[Any, ...], ends_on_event: bool, *options: Any
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """The result of `slopes_by_variations`, at a cost that does not depend on the number of tangents."""
     moving = _moving(problem, tangents[0])
     # Without tangents this is the problem itself, with the choice not to end on its event.
-    there, by_start, by_number = solve_with_adjoint(
+    ended, by_start, by_number = solve_with_adjoint(
         VariationalProblem(problem, (), ends_on_event),
         VariationalProblem(moving, (), ends_on_event),
         _mixed(tangents),
-        *given,
+        *options,
         measured=_event_time,
         one_kernel=True,
     )
@@ -105,7 +105,7 @@ def _slopes_by_adjoint(
         ]
         return sum(shares, jnp.zeros(by_start.shape[1]) if start is None else jnp.sum(by_start * start, axis=0))
 
-    return there, [slope(direction) for direction in tangents]
+    return ended, [slope(direction) for direction in tangents]
 
 
 def _mixed(tangents: tuple[Any, ...]) -> Any:
@@ -133,8 +133,8 @@ def _moving(problem: AbstractProblem, direction: Any) -> Any:
     states = problem.start()[0]
 
     def seen(*leaves: Any) -> Any:
-        one = jax.tree.unflatten(structure, leaves)
-        return one.field(jnp.zeros_like(states[0]), states), one.event_function(states)
+        rebuilt = jax.tree.unflatten(structure, leaves)
+        return rebuilt.field(jnp.zeros_like(states[0]), states), rebuilt.event_function(states)
 
     closed = jax.make_jaxpr(seen)(*leaves)
     needed = set(closed.jaxpr.outvars)
@@ -142,7 +142,9 @@ def _moving(problem: AbstractProblem, direction: Any) -> Any:
         if not needed.isdisjoint(equation.outvars):
             needed |= {variable for variable in equation.invars if not isinstance(variable, Literal)}
     used = jax.tree.unflatten(structure, [variable in needed for variable in closed.jaxpr.invars])
-    return jax.tree.map(lambda rate, one: one and rate is not None, direction, used, is_leaf=lambda rate: rate is None)
+    return jax.tree.map(
+        lambda rate, is_used: is_used and rate is not None, direction, used, is_leaf=lambda rate: rate is None
+    )
 
 
 #: `ensemble_solve_with_tangents`, compiled on its own, for use outside of other transformed functions.
@@ -173,8 +175,8 @@ def tangents_of(
     reached = _reached(jax.make_jaxpr(built)(*numbers))
     structure = jax.tree.structure(jax.eval_shape(built, *numbers))
     moving = jax.tree.unflatten(structure, reached)
-    found = [jax.jvp(built, numbers, tangent)[1] for tangent in tangents]
-    return tuple(eqx.filter(one, moving) for one in found)
+    changes = [jax.jvp(built, numbers, tangent)[1] for tangent in tangents]
+    return tuple(eqx.filter(change, moving) for change in changes)
 
 
 def _reached(closed: Any) -> list[bool]:

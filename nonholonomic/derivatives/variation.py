@@ -98,7 +98,7 @@ def slopes_by_variations(
     varied = VariationalProblem(problem, tangents, ends_on_event)
     # The variations take part in step-size control: the state alone may be at rest where its tangent is not, and the
     # steps would grow too long for the tangent.
-    there, _ = LaneScheduler.of(varied, *given, parts=1 + len(tangents), one_kernel=one_kernel).outcome()
+    there, _ = LaneScheduler.of(varied, *given, n_blocks=1 + len(tangents), one_kernel=one_kernel).outcome()
     state, *variations = varied.parts(there.state)
 
     def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:

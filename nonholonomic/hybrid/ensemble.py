@@ -57,7 +57,7 @@ class Transition(NamedTuple, Generic[Numbers]):
     elapsed: Float[Numbers, " cells"]
     status: Int[Numbers, " cells"]
     crossing_time: Float[Numbers, " cells"]
-    counts: Int[Numbers, "kinds cells"]
+    counts: Int[Numbers, "counters cells"]
     record: TransitionPath | None = None
     log_rates: Float[Numbers, " cells"] | None = None
 
@@ -100,7 +100,7 @@ class HybridOutcome(NamedTuple, Generic[Numbers]):
     steps: Int[Numbers, " cells"]
     rejected: Int[Numbers, " cells"]
     mode: Int[Numbers, " cells"]
-    counts: Int[Numbers, "kinds cells"]
+    counts: Int[Numbers, "counters cells"]
 
 
 @eqx.filter_jit
@@ -109,7 +109,7 @@ def _problem(mode: AbstractBatchedMode, state: Float[Array, "components cells"])
 
 
 @compiled_quickly
-def _leave(
+def _reset_map(
     mode: AbstractBatchedMode, state: Float[Array, "components cells"], left: Float[Array, " cells"]
 ) -> Transition:
     return mode.reset_map(state, left)
@@ -123,9 +123,9 @@ def solve_hybrid(
     cells: int,
     settings: Settings,
     *,
-    kinds: int,
-    passes: bool = False,
-    parts: int = 1,
+    counters: int,
+    nonterminal: bool = False,
+    n_blocks: int = 1,
     most_rounds: int = MOST_ROUNDS,
 ) -> HybridOutcome[np.ndarray]:
     """Run every cell through its modes to its event, to `t1`, or to where the model ends.
@@ -140,15 +140,15 @@ def solve_hybrid(
     - `t1`: horizon [s], one for all or one per cell.
     - `cells`: how many cells to run; the rest is padding. With 0, the programs are compiled and nothing is run.
     - `settings`: with an explicit Runge-Kutta solver of Diffrax.
-    - `kinds`: number of counters, the rows of `Transition.counts`.
-    - `passes`, `parts`: as for `ensemble_solve`.
+    - `counters`: number of counters, the rows of `Transition.counts`.
+    - `nonterminal`, `n_blocks`: as for `ensemble_solve`.
     - `most_rounds`: a cell that needs more ends as `UNRESOLVED`.
 
     **Returns:** a `HybridOutcome`.
     """
-    size, options = len(mode), {"passes": passes, "parts": parts}
+    size, options = len(mode), {"nonterminal": nonterminal, "n_blocks": n_blocks}
     t1 = np.broadcast_to(np.asarray(t1, float), size)
-    found = HybridOutcome(
+    runs = HybridOutcome(
         status=np.full(size, RUNNING),
         crossing_time=np.full(size, np.inf),
         end_time=np.zeros(size),
@@ -156,116 +156,118 @@ def solve_hybrid(
         steps=np.zeros(size, int),
         rejected=np.zeros(size, int),
         mode=np.array(mode),
-        counts=np.zeros((kinds, size), int),
+        counts=np.zeros((counters, size), int),
     )
-    found.status[cells:] = REACHED_END
+    runs.status[cells:] = REACHED_END
     if cells == 0:
-        _compile(modes, found, t1, settings, options)
+        _compile(modes, runs, t1, settings, options)
     for _ in range(most_rounds):
         # Selected before the round: a cell that changes its mode during the round waits for the next round.
-        here = [np.flatnonzero((found.status == RUNNING) & (found.mode == number)) for number in range(len(modes))]
-        for one, some in zip(modes, here, strict=True):
-            if some.size:
-                _march(one, found, some, t1, settings, options)
-                lost = some[found.status[some] == LEFT_DOMAIN]
+        by_mode = [np.flatnonzero((runs.status == RUNNING) & (runs.mode == number)) for number in range(len(modes))]
+        for batched_mode, selected in zip(modes, by_mode, strict=True):
+            if selected.size:
+                _solve_mode(batched_mode, runs, selected, t1, settings, options)
+                lost = selected[runs.status[selected] == LEFT_DOMAIN]
                 if lost.size:
-                    _pass_on(one, found, lost, t1)
-        if not (found.status == RUNNING).any():
+                    _apply_reset(batched_mode, runs, lost, t1)
+        if not (runs.status == RUNNING).any():
             break
-    found.status[found.status == RUNNING] = UNRESOLVED
-    return found
+    runs.status[runs.status == RUNNING] = UNRESOLVED
+    return runs
 
 
 def _compile(
     modes: tuple[AbstractBatchedMode, ...],
-    found: HybridOutcome[np.ndarray],
+    runs: HybridOutcome[np.ndarray],
     t1: Float[np.ndarray, " cells"],
     settings: Settings,
     options: dict[str, Any],
 ) -> None:
     """Compile all programs by running no cells: two at once, because the compiler uses little more than one core."""
-    none = np.arange(0)
+    no_cells = np.arange(0)
     with ThreadPoolExecutor(2) as threads:
-        marches = [threads.submit(_march, one, found, none, t1, settings, options) for one in modes]
-        leaving = [threads.submit(_pass_on, one, found, none, t1) for one in modes]
-        for program in (*marches, *leaving):
+        solves = [
+            threads.submit(_solve_mode, batched_mode, runs, no_cells, t1, settings, options) for batched_mode in modes
+        ]
+        resets = [threads.submit(_apply_reset, batched_mode, runs, no_cells, t1) for batched_mode in modes]
+        for program in (*solves, *resets):
             program.result()
 
 
 def _gather(
     mode: AbstractBatchedMode,
-    found: HybridOutcome[np.ndarray],
-    some: Int[np.ndarray, " some"],
+    runs: HybridOutcome[np.ndarray],
+    selected: Int[np.ndarray, " some"],
     t1: Float[np.ndarray, " cells"],
 ) -> tuple[Any, ...]:
     """The mode, the states and the remaining times of some cells, padded to the full number of cells."""
-    size = len(found.status)
-    cell = np.concatenate([some, np.full(size - some.size, some[-1] if some.size else 0)])
-    numbers, rest = eqx.partition(mode, eqx.is_array)
+    size = len(runs.status)
+    cell = np.concatenate([selected, np.full(size - selected.size, selected[-1] if selected.size else 0)])
+    numbers, static = eqx.partition(mode, eqx.is_array)
     numbers = jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., cell], numbers)
-    left = jnp.asarray(np.maximum(t1[cell] - found.end_time[cell], 0.0))
-    return eqx.combine(numbers, rest), jnp.asarray(found.state[:, cell]), left
+    left = jnp.asarray(np.maximum(t1[cell] - runs.end_time[cell], 0.0))
+    return eqx.combine(numbers, static), jnp.asarray(runs.state[:, cell]), left
 
 
-def _march(
+def _solve_mode(
     mode: AbstractBatchedMode,
-    found: HybridOutcome[np.ndarray],
-    some: Int[np.ndarray, " some"],
+    runs: HybridOutcome[np.ndarray],
+    selected: Int[np.ndarray, " some"],
     t1: Float[np.ndarray, " cells"],
     settings: Settings,
     options: dict[str, Any],
 ) -> None:
     """Solve some cells to the end of their mode and store the outcome."""
-    mode, state, left = _gather(mode, found, some, t1)
+    mode, state, left = _gather(mode, runs, selected, t1)
     problem = _problem(mode, state)
-    count = jnp.asarray(some.size)
+    count = jnp.asarray(selected.size)
     outcome, _ = solve_ensemble(problem, left, count, settings, **options)
-    outcome = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], outcome)
-    _store(found, some, after_solve(np, _some(found, some), outcome, t1[some]))
+    outcome = jax.tree.map(lambda values: np.asarray(values)[..., : selected.size], outcome)
+    _store(runs, selected, after_solve(np, _of_cells(runs, selected), outcome, t1[selected]))
 
 
-def _pass_on(
+def _apply_reset(
     mode: AbstractBatchedMode,
-    found: HybridOutcome[np.ndarray],
-    some: Int[np.ndarray, " some"],
+    runs: HybridOutcome[np.ndarray],
+    selected: Int[np.ndarray, " some"],
     t1: Float[np.ndarray, " cells"],
 ) -> None:
     """Apply the reset map to some cells and store the transition."""
-    transition = _leave(*_gather(mode, found, some, t1))
-    transition = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], transition)
-    _store(found, some, after_reset(np, _some(found, some), transition, t1[some]))
+    transition = _reset_map(*_gather(mode, runs, selected, t1))
+    transition = jax.tree.map(lambda values: np.asarray(values)[..., : selected.size], transition)
+    _store(runs, selected, after_reset(np, _of_cells(runs, selected), transition, t1[selected]))
 
 
-def _some(found: HybridOutcome[np.ndarray], some: Int[np.ndarray, " some"]) -> HybridOutcome[np.ndarray]:
-    return HybridOutcome(*(values[..., some] for values in found))
+def _of_cells(runs: HybridOutcome[np.ndarray], selected: Int[np.ndarray, " some"]) -> HybridOutcome[np.ndarray]:
+    return HybridOutcome(*(values[..., selected] for values in runs))
 
 
-def _store(found: HybridOutcome[np.ndarray], some: Int[np.ndarray, " some"], new: HybridOutcome[np.ndarray]) -> None:
-    for values, of_some in zip(found, new, strict=True):
-        values[..., some] = of_some
+def _store(runs: HybridOutcome[np.ndarray], selected: Int[np.ndarray, " some"], new: HybridOutcome[np.ndarray]) -> None:
+    for values, of_selected in zip(runs, new, strict=True):
+        values[..., selected] = of_selected
 
 
 def after_solve(
-    xp: Any, found: HybridOutcome[Numbers], outcome: Outcome[Numbers], t1: Float[Numbers, " cells"]
+    xp: Any, runs: HybridOutcome[Numbers], outcome: Outcome[Numbers], t1: Float[Numbers, " cells"]
 ) -> HybridOutcome[Numbers]:
     """Update the cells after an ensemble solve that ended as in `outcome`. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
-    began = found.end_time
+    began = runs.end_time
     # A cell that enters a mode beyond the event passed the event earlier, unless it started there.
-    passed = xp.isfinite(outcome.crossing_time) & ((outcome.crossing_time > 0.0) | xp.isinf(found.crossing_time))
+    passed = xp.isfinite(outcome.crossing_time) & ((outcome.crossing_time > 0.0) | xp.isinf(runs.crossing_time))
     return HybridOutcome(
         status=outcome.status,
-        crossing_time=xp.where(passed, began + outcome.crossing_time, found.crossing_time),
+        crossing_time=xp.where(passed, began + outcome.crossing_time, runs.crossing_time),
         end_time=xp.where(outcome.status == REACHED_END, t1, began + outcome.end_time),
         state=outcome.state,
-        steps=found.steps + outcome.steps,
-        rejected=found.rejected + outcome.rejected,
-        mode=found.mode,
-        counts=found.counts,
+        steps=runs.steps + outcome.steps,
+        rejected=runs.rejected + outcome.rejected,
+        mode=runs.mode,
+        counts=runs.counts,
     )
 
 
 def after_reset(
-    xp: Any, found: HybridOutcome[Numbers], transition: Transition[Numbers], t1: Float[Numbers, " cells"]
+    xp: Any, runs: HybridOutcome[Numbers], transition: Transition[Numbers], t1: Float[Numbers, " cells"]
 ) -> HybridOutcome[Numbers]:
     """Update the cells after the transition to the next mode. **Arguments:** as for `after_solve`."""
     passed = xp.isfinite(transition.crossing_time)
@@ -273,11 +275,11 @@ def after_reset(
     sound = xp.isfinite(transition.state).all(axis=0) & xp.isfinite(transition.elapsed)
     return HybridOutcome(
         status=xp.where(sound, transition.status, FAILED),
-        crossing_time=xp.where(passed, found.end_time + transition.crossing_time, found.crossing_time),
-        end_time=xp.where(transition.status == REACHED_END, t1, found.end_time + transition.elapsed),
+        crossing_time=xp.where(passed, runs.end_time + transition.crossing_time, runs.crossing_time),
+        end_time=xp.where(transition.status == REACHED_END, t1, runs.end_time + transition.elapsed),
         state=transition.state,
-        steps=found.steps,
-        rejected=found.rejected,
+        steps=runs.steps,
+        rejected=runs.rejected,
         mode=transition.mode,
-        counts=found.counts + transition.counts,
+        counts=runs.counts + transition.counts,
     )

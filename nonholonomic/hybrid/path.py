@@ -52,7 +52,7 @@ class HybridPath(NamedTuple):
     status: int
     end_time: float
     state: Float[np.ndarray, " components"]
-    counts: Int[np.ndarray, " kinds"]
+    counts: Int[np.ndarray, " counters"]
     accepted: int
     rejected: int
 
@@ -135,7 +135,7 @@ def solve_hybrid_dense(
     t1: float,
     settings: Settings,
     *,
-    kinds: int,
+    counters: int,
 ) -> HybridPath:
     """Integrate one run through its modes to `t1`, to an event during a transition, or to where the model ends.
 
@@ -145,11 +145,11 @@ def solve_hybrid_dense(
     - `number`, `state`: initial mode and state.
     - `t1`: horizon [s].
     - `settings`: as for `follow`; the most steps are those of the whole run.
-    - `kinds`: number of counters, the rows of `Transition.counts`.
+    - `counters`: number of counters, the rows of `Transition.counts`.
 
     **Returns:** a `HybridPath`.
     """
-    segments, counts, time, accepted, rejected = [], np.zeros(kinds, int), 0.0, 0, 0
+    segments, counts, time, accepted, rejected = [], np.zeros(counters, int), 0.0, 0, 0
     status, state = RUNNING, jnp.asarray(state)
     for _ in range(MOST_ROUNDS):
         mode = modes[number]

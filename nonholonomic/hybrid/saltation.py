@@ -98,7 +98,7 @@ class VariationalMode(AbstractBatchedMode):
             return Clocked(build(*numbers).problem(state[:-1]), state[-1])
 
         point = (with_row(at[:-1], jnp.zeros_like(at[-1])), *numbers)
-        tangents = [(one, *rates) for one, rates in zip(variations, self._rates(), strict=True)]
+        tangents = [(variation, *rates) for variation, rates in zip(variations, self._rates(), strict=True)]
         return VariationalProblem(clocked(*point), tangents_of(clocked, point, tangents), self.ends_on_event)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
@@ -125,7 +125,7 @@ class VariationalMode(AbstractBatchedMode):
             return jax.jvp(lambda at: problem.domain_margin(lasted, at), (at,), (problem.field(lasted, at),))
 
         # Behind the variations stand an error of the state, and a tangent along time.
-        along = [(one[:-1], *moved) for one, moved in zip(variations, self._rates(), strict=True)]
+        along = [(variation[:-1], *moved) for variation, moved in zip(variations, self._rates(), strict=True)]
         along += [(self._error(at, lasted, rates), *still), (rates, *still)]
         (_, rate), (domain_margins, changes) = _along(met, (at, *numbers), along)
         # A mode that ended as it began has not met its event.
@@ -136,27 +136,33 @@ class VariationalMode(AbstractBatchedMode):
 
         def passed(at: Float[Array, "components cells"], left: Float[Array, " cells"], *numbers: Array) -> Any:
             mode = build(*numbers)
-            onward = mode.reset_map(at, left)
-            inside = jnp.zeros_like(left) if onward.log_rates is None else onward.log_rates
-            path = seen(mode, onward.record, left)
-            return (onward.state, onward.elapsed, inside, path), onward._replace(record=None, log_rates=None)
+            transition = mode.reset_map(at, left)
+            inside = jnp.zeros_like(left) if transition.log_rates is None else transition.log_rates
+            path = seen(mode, transition.record, left)
+            return (transition.state, transition.elapsed, inside, path), transition._replace(
+                record=None, log_rates=None
+            )
 
-        begins = jnp.concatenate([*[one[None, -1] for one in variations], jnp.zeros_like(lasted)[None]]) + later
-        onwards = [
+        begins = (
+            jnp.concatenate([*[variation[None, -1] for variation in variations], jnp.zeros_like(lasted)[None]]) + later
+        )
+        after_event = [
             (moved[0] + shift * rates, -begin, *moved[1:])
             for moved, shift, begin in zip(along[:-1], later, begins, strict=True)
         ]
-        there, moved, onward = _along(passed, (at, left, *numbers), onwards, has_aux=True)
+        values, moved, transition = _along(passed, (at, left, *numbers), after_event, has_aux=True)
         states, elapsed, inside, changes = moved
-        found = jnp.concatenate([states, (begins + elapsed)[:, None]], axis=1)[:count]
+        new_variations = jnp.concatenate([states, (begins + elapsed)[:, None]], axis=1)[:count]
         log_rates = jnp.max(jnp.abs(log_rates + inside), axis=0)
-        finite = jnp.isfinite(found).all(axis=(0, 1)) & jnp.isfinite(log_rates)
+        finite = jnp.isfinite(new_variations).all(axis=(0, 1)) & jnp.isfinite(log_rates)
         grazes = ~finite | (self.tolerance * log_rates > GRAZING)
         # The run itself is valid: variations without correct digits must not end it.
-        found = jnp.where(finite, found, 0.0)
-        whole = jnp.concatenate([onward.state, jnp.zeros_like(lasted)[None], *found])
-        onward = onward._replace(state=whole, counts=jnp.concatenate([onward.counts, grazes.astype(int)[None]]))
-        return onward, there[-1], jax.tree.map(lambda change: change[:count], changes)
+        new_variations = jnp.where(finite, new_variations, 0.0)
+        whole = jnp.concatenate([transition.state, jnp.zeros_like(lasted)[None], *new_variations])
+        transition = transition._replace(
+            state=whole, counts=jnp.concatenate([transition.counts, grazes.astype(int)[None]])
+        )
+        return transition, values[-1], jax.tree.map(lambda change: change[:count], changes)
 
     def seen(
         self, state: Float[Array, "components times"]
@@ -173,7 +179,10 @@ class VariationalMode(AbstractBatchedMode):
             return shown(at), jnp.zeros((0, *shown(at).shape))
         rates = self.mode.problem(at).field(lasted, at)
         # A mode that begins later has advanced less at the same time.
-        along = [(one[:-1] - rates * one[-1], *moved) for one, moved in zip(variations, self._rates(), strict=True)]
+        along = [
+            (variation[:-1] - rates * variation[-1], *moved)
+            for variation, moved in zip(variations, self._rates(), strict=True)
+        ]
         return _along(shown, (at, *numbers), along)
 
     def slopes(self, state: Float[Array, "components cells"]) -> Float[Array, "tangents cells"]:
@@ -188,7 +197,9 @@ class VariationalMode(AbstractBatchedMode):
             return began + delay(problem.event_function, at, problem.field(began, at))
 
         point = (at[:-1], jnp.zeros_like(at[-1]), *numbers)
-        tangents = [(one[:-1], one[-1], *rates) for one, rates in zip(variations, self._rates(), strict=True)]
+        tangents = [
+            (variation[:-1], variation[-1], *rates) for variation, rates in zip(variations, self._rates(), strict=True)
+        ]
         return jnp.stack([jax.jvp(time, point, tangent)[1] for tangent in tangents])
 
     def parts(self, state: Float[Array, "components cells"]) -> list[Float[Array, "components cells"]]:
@@ -256,7 +267,7 @@ def solve_hybrid_with_tangents(
     cells: int,
     settings: Settings,
     *,
-    kinds: int,
+    counters: int,
     ends_on_event: bool = True,
 ) -> tuple[HybridOutcome[np.ndarray], Slopes[np.ndarray]]:
     """Run every cell through its modes to its event, and differentiate the event's time along some tangents.
@@ -269,9 +280,9 @@ def solve_hybrid_with_tangents(
     **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event, or it is at the start.
     """
     varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
-    start, parts = np.asarray(variational_start(jnp.asarray(state), tangents)), 1 + len(tangents)
-    ended = solve_hybrid(varied, mode, start, t1, cells, settings, kinds=kinds + 1, parts=parts)
-    slopes = [np.asarray(_slopes(one, jnp.asarray(ended.state))) for one in varied]
+    start, n_blocks = np.asarray(variational_start(jnp.asarray(state), tangents)), 1 + len(tangents)
+    ended = solve_hybrid(varied, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks)
+    slopes = [np.asarray(_slopes(varied_mode, jnp.asarray(ended.state))) for varied_mode in varied]
     return _own(ended, len(state)), Slopes(_of_mode(np, ended, slopes), ended.counts[-1] > 0)
 
 
@@ -283,14 +294,14 @@ def traced_solve_hybrid_with_tangents(
     t1: Float[Array, "..."],
     settings: Settings,
     *,
-    kinds: int,
+    counters: int,
     ends_on_event: bool = True,
 ) -> tuple[HybridOutcome[Array], Slopes[Array]]:
     """`solve_hybrid_with_tangents` inside other transformed functions, for all cells; arguments and results are traced."""
     varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
-    start, parts = variational_start(state, tangents), 1 + len(tangents)
-    ended = traced_solve_hybrid(varied, mode, start, t1, settings, kinds=kinds + 1, parts=parts)
-    slopes = _of_mode(jnp, ended, [one.slopes(ended.state) for one in varied])
+    start, n_blocks = variational_start(state, tangents), 1 + len(tangents)
+    ended = traced_solve_hybrid(varied, mode, start, t1, settings, counters=counters + 1, n_blocks=n_blocks)
+    slopes = _of_mode(jnp, ended, [varied_mode.slopes(ended.state) for varied_mode in varied])
     return _own(ended, len(state)), Slopes(slopes, ended.counts[-1] > 0)
 
 
@@ -305,10 +316,10 @@ def _of_mode(xp: Any, ended: HybridOutcome[Numbers], slopes: list[Float[Numbers,
     A run that has ended between two modes is in none of them: its event is the end of the previous mode, whose
     variation is the last row.
     """
-    found = xp.reshape(ended.state, (1 + len(slopes[0]), -1, len(ended.mode)))[1:, -1]
-    for number, some in enumerate(slopes):
-        found = xp.where(ended.mode == number, some, found)
-    return found
+    of_cells = xp.reshape(ended.state, (1 + len(slopes[0]), -1, len(ended.mode)))[1:, -1]
+    for number, of_mode in enumerate(slopes):
+        of_cells = xp.where(ended.mode == number, of_mode, of_cells)
+    return of_cells
 
 
 @eqx.filter_jit
@@ -335,4 +346,4 @@ def variational_start(
     """Initial states with their clocks, and the variations of both behind them."""
     zero = jnp.zeros_like(state[0])
     moved = [jnp.zeros_like(state) if direction[1] is None else direction[1] for direction in tangents]
-    return jnp.concatenate([with_row(one, zero) for one in (state, *moved)])
+    return jnp.concatenate([with_row(part, zero) for part in (state, *moved)])

@@ -43,7 +43,7 @@ class HybridSamples(NamedTuple):
     status: Float[Array, ""]
     steps: Float[Array, ""]
     rejected: Float[Array, ""]
-    counts: Float[Array, " kinds"]
+    counts: Float[Array, " counters"]
 
 
 def hybrid_samples(
@@ -52,7 +52,7 @@ def hybrid_samples(
     times: Float[Array, " times"],
     t1: Float[Array, ""],
     settings: Settings,
-    kinds: int,
+    counters: int,
 ) -> HybridSamples:
     """Run one cell through its modes inside a transformation and sample it, with derivatives that take part in
     step-size control.
@@ -63,14 +63,14 @@ def hybrid_samples(
     - `modules`: the tree whose numbers are differentiable, once.
     - `times`: of the samples [s], growing; `t1`: horizon [s]. Neither is differentiable.
     - `settings`: with an explicit Runge-Kutta solver; the tolerance may be traced.
-    - `kinds`: number of counters, the rows of `Transition.counts`.
+    - `counters`: number of counters, the rows of `Transition.counts`.
 
     **Returns:** `HybridSamples`; the output rows and the end time have derivatives, NaN after a grazing event.
 
     **Raises:** `ValueError` for derivatives by the times, and for second derivatives.
     """
-    question = functools.partial(HybridSampling, kinds=kinds)
-    return solve_for_samples(question, build, modules, _fixed(times), t1, settings)
+    sampling = functools.partial(HybridSampling, counters=counters)
+    return solve_for_samples(sampling, build, modules, _fixed(times), t1, settings)
 
 
 @eqx.filter_custom_jvp
@@ -94,20 +94,20 @@ class HybridSampling(AbstractSampling):
     movable: int
     spec: ProblemSpec
     places: Any = eqx.field(static=True)
-    kinds: int = eqx.field(static=True)
+    counters: int = eqx.field(static=True)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> HybridSamples:
-        numbers, (*given, tolerance), spec = self._sorted(leaves)
+        numbers, (*arguments, tolerance), spec = self._sorted(leaves)
         settings = spec.settings.with_tolerance(tolerance)
-        found, _ = _follow(spec.made(numbers, tolerance), (), given, settings, self.kinds)
-        return jax.tree.map(lambda part: part[None], found)
+        samples, _ = _follow(spec.made(numbers, tolerance), (), arguments, settings, self.counters)
+        return jax.tree.map(lambda part: part[None], samples)
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[HybridSamples, list[HybridSamples]]:
         if again:
             raise ValueError("second derivatives do not go through changes of phase: contact = 'hybrid'")
-        numbers, (*given, tolerance), spec = self._sorted(leaves)
+        numbers, (*arguments, tolerance), spec = self._sorted(leaves)
         settings = spec.settings.with_tolerance(tolerance)
 
         def build(numbers: tuple[Array, ...], cells: int | None) -> Any:
@@ -115,21 +115,23 @@ class HybridSampling(AbstractSampling):
 
         built, tangents, gather = tangents_by(build, active, numbers, None)
 
-        def run(some: tuple[Any, ...]) -> tuple[HybridSamples, list[HybridSamples]]:
-            return _follow(built, tuple((one[0], one[2]) for one in some), given, settings, self.kinds)
+        def run(group: tuple[Any, ...]) -> tuple[HybridSamples, list[HybridSamples]]:
+            return _follow(
+                built, tuple((tangent[0], tangent[2]) for tangent in group), arguments, settings, self.counters
+            )
 
-        found, slopes = in_groups(run, tangents)
-        return jax.tree.map(lambda part: part[None], (found, gather(slopes)))
+        samples, slopes = in_groups(run, tangents)
+        return jax.tree.map(lambda part: part[None], (samples, gather(slopes)))
 
 
 def _follow(
-    built: Any, tangents: tuple[Any, ...], given: Sequence[Array], settings: Settings, kinds: int
+    built: Any, tangents: tuple[Any, ...], arguments: Sequence[Array], settings: Settings, counters: int
 ) -> tuple[HybridSamples, list[HybridSamples]]:
     """The run, and its derivative along each tangent."""
-    (modes, first, state), (times, t1) = built, given
+    (modes, first, state), (times, t1) = built, arguments
     varied, start = variational_modes(modes, tangents, settings.tolerance, False), variational_start(state, tangents)
-    ended, filled = _followed(varied, first, start, times, t1, settings, kinds)
-    return _found(ended, filled, times, len(state), len(tangents))
+    ended, filled = _followed(varied, first, start, times, t1, settings, counters)
+    return _assembled(ended, filled, times, len(state), len(tangents))
 
 
 class Filled(NamedTuple):
@@ -142,13 +144,13 @@ class Filled(NamedTuple):
     number: Float[Array, " times"]
     grazed: Float[Array, ""]
 
-    def with_samples(self, here: Bool[Array, " times"], seen: tuple[Array, Array], number: int) -> "Filled":
+    def with_samples(self, selected: Bool[Array, " times"], seen: tuple[Array, Array], number: int) -> "Filled":
         """Fill in the samples at some times that have none yet."""
-        here = here & jnp.isnan(self.number)
+        selected = selected & jnp.isnan(self.number)
         shown, variations = (
-            jnp.where(here, new, old) for new, old in zip(seen, (self.shown, self.variations), strict=True)
+            jnp.where(selected, new, old) for new, old in zip(seen, (self.shown, self.variations), strict=True)
         )
-        return self._replace(shown=shown, variations=variations, number=jnp.where(here, number, self.number))
+        return self._replace(shown=shown, variations=variations, number=jnp.where(selected, number, self.number))
 
 
 def _followed(
@@ -158,58 +160,64 @@ def _followed(
     times: Float[Array, " times"],
     t1: Float[Array, ""],
     settings: Settings,
-    kinds: int,
+    counters: int,
 ) -> tuple[HybridOutcome[Array], Filled]:
     """Run round by round, as in `traced_solve_hybrid`, with samples of every mode and of the transition to the next."""
     count, zero, none = len(modes[0].tangents), jnp.zeros(1), jnp.zeros(1, int)
     own = VariationalMode.parts(modes[0], state)[0][:-1]
     rows = len(jax.eval_shape(modes[0].mode.shown, own))
     start = HybridOutcome(
-        none + RUNNING, zero + jnp.inf, zero, state, none, none, first, jnp.zeros((kinds + 1, 1), int)
+        none + RUNNING, zero + jnp.inf, zero, state, none, none, first, jnp.zeros((counters + 1, 1), int)
     )
     missing = jnp.full((rows, len(times)), jnp.nan)
     empty = Filled(missing, jnp.zeros((count, *missing.shape)), missing[0], jnp.full((), jnp.inf))
 
     def stay(
-        one: VariationalMode, number: int, found: HybridOutcome[Array], filled: Filled
+        varied_mode: VariationalMode, number: int, runs: HybridOutcome[Array], filled: Filled
     ) -> tuple[HybridOutcome[Array], Filled]:
-        since, left = times - found.end_time, greatest(t1 - found.end_time, 0.0)
+        since, left = times - runs.end_time, greatest(t1 - runs.end_time, 0.0)
         outcome, samples = solve_with_samples(
-            one.problem(found.state), since, left, jnp.asarray(1), settings, parts=1 + count
+            varied_mode.problem(runs.state), since, left, jnp.asarray(1), settings, n_blocks=1 + count
         )
-        after = after_solve(jnp, found, outcome, t1)
-        return after, filled.with_samples((since >= 0.0) & (times <= after.end_time), one.seen(samples[0].T), number)
+        after = after_solve(jnp, runs, outcome, t1)
+        return after, filled.with_samples(
+            (since >= 0.0) & (times <= after.end_time), varied_mode.seen(samples[0].T), number
+        )
 
     def change(
-        one: VariationalMode, found: HybridOutcome[Array], filled: Filled
+        varied_mode: VariationalMode, runs: HybridOutcome[Array], filled: Filled
     ) -> tuple[HybridOutcome[Array], Filled]:
         def seen(mode: AbstractBatchedMode, record: TransitionPath | None, left: Float[Array, " 1"]) -> Any:
             # Relative to an event that is later, a fixed time comes sooner, as the horizon does.
             return None if record is None else _on_the_way(mode, record, times - t1 + left)
 
-        left = greatest(t1 - found.end_time, 0.0)
-        transition, shown, variations = one.left_behind(found.state, left, seen)
-        after = after_reset(jnp, found, transition, t1)
+        left = greatest(t1 - runs.end_time, 0.0)
+        transition, shown, variations = varied_mode.left_behind(runs.state, left, seen)
+        after = after_reset(jnp, runs, transition, t1)
         if shown is not None:
-            inside = (times > found.end_time) & (times <= after.end_time)
+            inside = (times > runs.end_time) & (times <= after.end_time)
             filled = filled.with_samples(inside, (shown, variations), BETWEEN)
-        grazes = after.counts[-1, 0] > found.counts[-1, 0]
+        grazes = after.counts[-1, 0] > runs.counts[-1, 0]
         return after, filled._replace(
-            grazed=jnp.where(grazes, jnp.minimum(filled.grazed, found.end_time[0]), filled.grazed)
+            grazed=jnp.where(grazes, jnp.minimum(filled.grazed, runs.end_time[0]), filled.grazed)
         )
 
     def one_round(carry: Any) -> Any:
-        found, filled, rounds = carry
-        at = found.mode[0]
-        for number, one in enumerate(modes):
-            under_way = (found.status[0] == RUNNING) & (at == number)
+        runs, filled, rounds = carry
+        at = runs.mode[0]
+        for number, varied_mode in enumerate(modes):
+            under_way = (runs.status[0] == RUNNING) & (at == number)
 
-            def here(one: VariationalMode = one, number: int = number, found: Any = found, filled: Any = filled) -> Any:
-                stayed = stay(one, number, found, filled)
-                return jax.lax.cond(stayed[0].status[0] == LEFT_DOMAIN, lambda: change(one, *stayed), lambda: stayed)
+            def solve_mode(
+                varied_mode: VariationalMode = varied_mode, number: int = number, runs: Any = runs, filled: Any = filled
+            ) -> Any:
+                stayed = stay(varied_mode, number, runs, filled)
+                return jax.lax.cond(
+                    stayed[0].status[0] == LEFT_DOMAIN, lambda: change(varied_mode, *stayed), lambda: stayed
+                )
 
-            found, filled = jax.lax.cond(under_way, here, lambda found=found, filled=filled: (found, filled))
-        return found, filled, rounds + 1
+            runs, filled = jax.lax.cond(under_way, solve_mode, lambda runs=runs, filled=filled: (runs, filled))
+        return runs, filled, rounds + 1
 
     return in_rounds(one_round, start, empty)
 
@@ -225,7 +233,7 @@ def _on_the_way(
     return mode.between(motions, jnp.where(jnp.isfinite(began), since - began, 0.0))
 
 
-def _found(
+def _assembled(
     ended: HybridOutcome[Array], filled: Filled, times: Float[Array, " times"], size: int, count: int
 ) -> tuple[HybridSamples, list[HybridSamples]]:
     """The samples, and their derivative along each tangent."""
@@ -233,9 +241,9 @@ def _found(
     late = jnp.where(times > filled.grazed, jnp.nan, 0.0)
     # The variation of a time stands behind that of the state; a horizon does not move.
     later = [ended.state[k * (size + 1) + size, 0] for k in range(1, count + 1)]
-    later = [jnp.where(status == REACHED_END, 0.0, jnp.where(grazed, jnp.nan, one)) for one in later]
+    later = [jnp.where(status == REACHED_END, 0.0, jnp.where(grazed, jnp.nan, variation)) for variation in later]
     numbers = (status, ended.steps[0], ended.rejected[0], ended.counts[:-1, 0])
     others = (part.astype(float) for part in numbers)
-    found = HybridSamples(filled.shown, filled.number, end_time, ended.state[:size, 0], *others)
+    samples = HybridSamples(filled.shown, filled.number, end_time, ended.state[:size, 0], *others)
     slopes = [HybridSamples(filled.variations[k] + late, UNCHANGED, later[k], *(UNCHANGED,) * 5) for k in range(count)]
-    return found, slopes
+    return samples, slopes

@@ -22,9 +22,9 @@ def traced_solve_hybrid(
     t1: Float[Array, "..."],
     settings: Settings,
     *,
-    kinds: int,
-    passes: bool = False,
-    parts: int = 1,
+    counters: int,
+    nonterminal: bool = False,
+    n_blocks: int = 1,
 ) -> HybridOutcome[Array]:
     """Run every cell through its modes to its event, to `t1`, or to where the model ends.
 
@@ -45,29 +45,31 @@ def traced_solve_hybrid(
         steps=none,
         rejected=none,
         mode=mode,
-        counts=jnp.zeros((kinds, size), int),
+        counts=jnp.zeros((counters, size), int),
     )
 
-    def through(
-        one: AbstractBatchedMode, found: HybridOutcome[Array], here: Bool[Array, " cells"]
+    def solve_mode(
+        batched_mode: AbstractBatchedMode, runs: HybridOutcome[Array], active: Bool[Array, " cells"]
     ) -> HybridOutcome[Array]:
         def ensemble_solve() -> HybridOutcome[Array]:
-            there, now = of_cells(one, here), in_place_of(found, here)
-            left = jnp.where(here, greatest(t1 - found.end_time, 0.0), 0.0)
-            problem = there.problem(now.state)
-            outcome, _ = traced_solve_ensemble(problem, left, jnp.asarray(size), settings, passes=passes, parts=parts)
-            return chosen(here, after_solve(jnp, found, outcome, t1), found)
+            padded_mode, padded_runs = of_cells(batched_mode, active), in_place_of(runs, active)
+            left = jnp.where(active, greatest(t1 - runs.end_time, 0.0), 0.0)
+            problem = padded_mode.problem(padded_runs.state)
+            outcome, _ = traced_solve_ensemble(
+                problem, left, jnp.asarray(size), settings, nonterminal=nonterminal, n_blocks=n_blocks
+            )
+            return chosen(active, after_solve(jnp, runs, outcome, t1), runs)
 
-        found = jax.lax.cond(jnp.any(here), ensemble_solve, lambda: found)
-        return passing(one, found, here & (found.status == LEFT_DOMAIN), t1)
+        runs = jax.lax.cond(jnp.any(active), ensemble_solve, lambda: runs)
+        return apply_reset(batched_mode, runs, active & (runs.status == LEFT_DOMAIN), t1)
 
     def one_round(carry: tuple[HybridOutcome[Array], Int[Array, ""]]) -> tuple[HybridOutcome[Array], Int[Array, ""]]:
-        found, rounds = carry
+        runs, rounds = carry
         # Selected before the round: a cell that changes its mode during the round waits for the next round.
-        here = [(found.status == RUNNING) & (found.mode == number) for number in range(len(modes))]
-        for one, some in zip(modes, here, strict=True):
-            found = through(one, found, some)
-        return found, rounds + 1
+        by_mode = [(runs.status == RUNNING) & (runs.mode == number) for number in range(len(modes))]
+        for batched_mode, active in zip(modes, by_mode, strict=True):
+            runs = solve_mode(batched_mode, runs, active)
+        return runs, rounds + 1
 
     return in_rounds(one_round, start)
 
@@ -83,34 +85,41 @@ def in_rounds(one_round: Callable[[Any], Any], start: HybridOutcome[Array], *mor
     return (outcome, *values) if values else outcome
 
 
-def passing(
-    one: AbstractBatchedMode, found: HybridOutcome[Array], lost: Bool[Array, " cells"], t1: Float[Array, " cells"]
+def apply_reset(
+    batched_mode: AbstractBatchedMode,
+    runs: HybridOutcome[Array],
+    lost: Bool[Array, " cells"],
+    t1: Float[Array, " cells"],
 ) -> HybridOutcome[Array]:
     """Apply the reset map to the cells at the end of a mode."""
 
     def passed() -> HybridOutcome[Array]:
-        there, now = of_cells(one, lost), in_place_of(found, lost)
-        transition = there.reset_map(now.state, greatest(t1 - now.end_time, 0.0))
-        return chosen(lost, after_reset(jnp, found, transition, t1), found)
+        padded_mode, padded_runs = of_cells(batched_mode, lost), in_place_of(runs, lost)
+        transition = padded_mode.reset_map(padded_runs.state, greatest(t1 - padded_runs.end_time, 0.0))
+        return chosen(lost, after_reset(jnp, runs, transition, t1), runs)
 
-    return jax.lax.cond(jnp.any(lost), passed, lambda: found)
+    return jax.lax.cond(jnp.any(lost), passed, lambda: runs)
 
 
-def of_cells(mode: AbstractBatchedMode, some: Bool[Array, " cells"]) -> AbstractBatchedMode:
+def of_cells(mode: AbstractBatchedMode, selected: Bool[Array, " cells"]) -> AbstractBatchedMode:
     """A mode of some cells; the numbers of the first of them replace those of the others."""
-    numbers, rest = eqx.partition(mode, eqx.is_array)
-    return eqx.combine(jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[..., _cell(some)], numbers), rest)
+    numbers, static = eqx.partition(mode, eqx.is_array)
+    return eqx.combine(
+        jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[..., _cell(selected)], numbers), static
+    )
 
 
-def in_place_of(found: HybridOutcome[Array], some: Bool[Array, " cells"]) -> HybridOutcome[Array]:
+def in_place_of(runs: HybridOutcome[Array], selected: Bool[Array, " cells"]) -> HybridOutcome[Array]:
     """The state of some cells, with the first of them in place of the others, whose states have another meaning."""
-    return jax.tree.map(lambda values: values[..., _cell(some)], found)
+    return jax.tree.map(lambda values: values[..., _cell(selected)], runs)
 
 
-def _cell(some: Bool[Array, " cells"]) -> Int[Array, " cells"]:
-    return jnp.where(some, jnp.arange(some.size), jnp.argmax(some))
+def _cell(selected: Bool[Array, " cells"]) -> Int[Array, " cells"]:
+    return jnp.where(selected, jnp.arange(selected.size), jnp.argmax(selected))
 
 
-def chosen(some: Bool[Array, " cells"], new: HybridOutcome[Array], old: HybridOutcome[Array]) -> HybridOutcome[Array]:
+def chosen(
+    selected: Bool[Array, " cells"], new: HybridOutcome[Array], old: HybridOutcome[Array]
+) -> HybridOutcome[Array]:
     """The new outcome of some cells and the old one of the others."""
-    return jax.tree.map(lambda a, b: jnp.where(some, a, b), new, old)
+    return jax.tree.map(lambda a, b: jnp.where(selected, a, b), new, old)

@@ -156,8 +156,8 @@ class AbstractRecording(eqx.Module):
             )
         period = [2.0 * math.pi if name in self.quantities.angles else math.inf for name in self.columns]
 
-        def each(one: Any) -> np.ndarray:
-            return np.broadcast_to(one, value.shape).reshape(-1)[self.seen]
+        def each(numbers_of: Any) -> np.ndarray:
+            return np.broadcast_to(numbers_of, value.shape).reshape(-1)[self.seen]
 
         return Measurements(
             each(value),
@@ -203,26 +203,29 @@ def predicted(
 
     **Returns:** for each recording its samples, a time after the other, missing ones included; NaN after the end of a run.
     """
-    longest = max(len(one.times) for one, _ in recordings)
-    columns = tuple(dict.fromkeys(name for one, _ in recordings for name in one.columns))
+    longest = max(len(recording.times) for recording, _ in recordings)
+    columns = tuple(dict.fromkeys(name for recording, _ in recordings for name in recording.columns))
 
     def lanes(of_each: list[Array]) -> Array:
         """The numbers of all runs, one row after the other; each is a scalar or has one number a row."""
-        return jnp.stack([jnp.broadcast_to(one, (rows,)) for one in of_each], axis=1).reshape(-1)
+        return jnp.stack([jnp.broadcast_to(number, (rows,)) for number in of_each], axis=1).reshape(-1)
 
-    known = [numbers("launch", one.launch) for one, _ in recordings]
-    given = {name: lanes([one[name] for one in known]) for name, value in known[0].items() if value is not None}
-    given |= {"t0": lanes([one.t0 for one, _ in recordings])}
-    given |= {name: lanes([values[name] for _, values in recordings]) for name in recordings[0][1]}
+    launches = [numbers("launch", recording.launch) for recording, _ in recordings]
+    names = [name for name, value in launches[0].items() if value is not None]
+    lane_numbers = {name: lanes([launch[name] for launch in launches]) for name in names}
+    lane_numbers |= {"t0": lanes([recording.t0 for recording, _ in recordings])}
+    lane_numbers |= {name: lanes([values[name] for _, values in recordings]) for name in recordings[0][1]}
     # Shorter recordings go on for an instant, so that all have as many times.
-    clock = jnp.stack([_lengthened(one.times, longest) for one, _ in recordings])
+    clock = jnp.stack([_lengthened(recording.times, longest) for recording, _ in recordings])
 
-    def one(lane: Values, times: Float[Array, " times"]) -> Float[Array, "times columns"]:
-        rest = {name: value for name, value in lane.items() if name != "t0"}
-        trajectory = run(rest, model_times(times, lane["t0"]))
+    def samples_of_lane(lane: Values, times: Float[Array, " times"]) -> Float[Array, "times columns"]:
+        values = {name: value for name, value in lane.items() if name != "t0"}
+        trajectory = run(values, model_times(times, lane["t0"]))
         return jnp.stack([column(trajectory, name) for name in columns], axis=-1)
 
-    predictions = jax.vmap(one)(given, jnp.tile(clock, (rows, 1))).reshape(rows, len(recordings), longest, len(columns))
+    predictions = jax.vmap(samples_of_lane)(lane_numbers, jnp.tile(clock, (rows, 1))).reshape(
+        rows, len(recordings), longest, len(columns)
+    )
     parts = []
     for k, (recording, _) in enumerate(recordings):
         places = np.array([columns.index(name) for name in recording.columns])

@@ -26,9 +26,9 @@ def ensemble_solve(
     cells: Int[Array, ""],
     settings: Settings,
     *,
-    passes: bool = False,
+    nonterminal: bool = False,
     one_kernel: bool = False,
-    parts: int = 1,
+    n_blocks: int = 1,
 ) -> tuple[Outcome, Int[Array, ""]]:
     """Run every cell of a problem from t = 0 to its event, to the end of the model's validity, or to `t1`.
 
@@ -39,16 +39,16 @@ def ensemble_solve(
     - `cells`: how many of the problem's cells to run; the rest is padding, so that one compiled program serves grids of
       different sizes.
     - `settings`: with an explicit Runge-Kutta solver of Diffrax.
-    - `passes`: whether the event is nonterminal: a run continues through it, in either direction.
+    - `nonterminal`: whether the event is nonterminal: a run continues through it, in either direction.
     - `one_kernel`: whether to compile the loop into a single kernel on a CPU, which halves its cost; not for programs
       that are differentiated again.
-    - `parts`: number of equal blocks of the state, as for `LaneScheduler.of`.
+    - `n_blocks`: number of equal blocks of the state, as for `LaneScheduler.of`.
 
     **Returns:** the `Outcome`, and the number of iterations, each of which advanced all lanes.
     """
-    options = {"passes": passes, "one_kernel": one_kernel, "parts": parts}
+    options = {"nonterminal": nonterminal, "one_kernel": one_kernel, "n_blocks": n_blocks}
     outcome, iterations = LaneScheduler.of(problem, t1, cells, settings, **options).outcome()
-    return (outcome if passes else with_crossing_times(problem, outcome)), iterations
+    return (outcome if nonterminal else with_crossing_times(problem, outcome)), iterations
 
 
 def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:

@@ -182,7 +182,7 @@ def moved_state(
 
 
 def scaled_error(
-    error: States, before: States, after: States, rtol: Float[Array, ""], atol: States, parts: int
+    error: States, before: States, after: States, rtol: Float[Array, ""], atol: States, n_blocks: int
 ) -> Lanes:
     """Error in units of the tolerance: the greatest root mean square among the blocks of the state (Diffrax's norm and
     scale).
@@ -191,8 +191,8 @@ def scaled_error(
     took half of the time of a run with twelve.
     """
     ratio = error / (atol + rtol * jnp.maximum(jnp.abs(before), jnp.abs(after)))
-    squares, size = [one * one for one in ratio], ratio.shape[0] // parts
-    means = [functools.reduce(operator.add, squares[k * size : (k + 1) * size]) / size for k in range(parts)]
+    squares, size = [one * one for one in ratio], ratio.shape[0] // n_blocks
+    means = [functools.reduce(operator.add, squares[k * size : (k + 1) * size]) / size for k in range(n_blocks)]
     return jnp.sqrt(functools.reduce(jnp.maximum, means))
 
 
@@ -213,17 +213,17 @@ def first_length(
     order: int,
     rtol: Float[Array, ""],
     atol: States,
-    parts: int,
+    n_blocks: int,
 ) -> Lanes:
     """Length of the first step [s] (Hairer, Norsett and Wanner, Solving ODEs I, section II.4), in the motion's own
     unit.
 
     Their formula compares |y'| with |y''|, which depends on the unit of time; Diffrax uses seconds. Here the unit is
-    |y|/|y'|, so that motions that differ only in scale are integrated alike. If the state has several blocks (`parts`),
+    |y|/|y'|, so that motions that differ only in scale are integrated alike. If the state has several blocks (`n_blocks`),
     the first one counts.
     """
     scale = atol + jnp.abs(state) * rtol
-    size = state.shape[0] // parts
+    size = state.shape[0] // n_blocks
 
     def measure(vector: States) -> Lanes:
         return jnp.sqrt(jnp.mean((vector / scale)[:size] ** 2, axis=0))

@@ -53,7 +53,7 @@ def solve_with_samples(
     cells: Int[Array, ""],
     settings: Settings,
     *,
-    parts: int = 1,
+    n_blocks: int = 1,
     one_kernel: bool = False,
 ) -> tuple[Outcome, Samples]:
     """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`, and sample it.
@@ -66,7 +66,7 @@ def solve_with_samples(
     **Returns:** the `Outcome`, without crossing times; and the states at the times, (cells, times, components), NaN
     after the end of a run.
     """
-    scheduler = LaneScheduler.of(problem, t1, cells, settings, parts=parts, one_kernel=one_kernel)
+    scheduler = LaneScheduler.of(problem, t1, cells, settings, n_blocks=n_blocks, one_kernel=one_kernel)
     count, starts = times.shape[0], scheduler.fresh.state
     of_cell = jnp.broadcast_to(times.reshape(count, -1), (count, scheduler.capacity)).T
     first = jnp.sum(of_cell <= 0.0, axis=1)
@@ -74,15 +74,15 @@ def solve_with_samples(
 
     def period(run: Sampling) -> Sampling:
         cell = jnp.minimum(run.progress.lane_state.cell, scheduler.capacity - 1)
-        here = of_cell[cell].T if own_times else times
-        progress, sample, record = _recorded(scheduler, here, run.progress, run.sample)
+        lane_times = of_cell[cell].T if own_times else times
+        progress, sample, record = _recorded(scheduler, lane_times, run.progress, run.sample)
         outcome = scheduler.store(run.outcome, progress.lane_state)
-        onward = scheduler.refill(progress)
-        fresh = onward.lane_state.cell != progress.lane_state.cell
-        begin = first[jnp.minimum(onward.lane_state.cell, scheduler.capacity - 1)]
+        refilled = scheduler.refill(progress)
+        fresh = refilled.lane_state.cell != progress.lane_state.cell
+        begin = first[jnp.minimum(refilled.lane_state.cell, scheduler.capacity - 1)]
         rows = jnp.moveaxis(record.state, 1, -1)
         samples = run.samples.at[cell[None], record.sample].set(rows, mode="drop", unique_indices=True)
-        return Sampling(onward, jnp.where(fresh, begin, sample), outcome, samples)
+        return Sampling(refilled, jnp.where(fresh, begin, sample), outcome, samples)
 
     progress = scheduler.start()
     at_start = jnp.where(of_cell[..., None] <= 0.0, starts.T[:, None], jnp.nan)
@@ -97,13 +97,13 @@ def _recorded(
     scheduler: LaneScheduler, times: Float[Array, "times ..."], progress: Progress, sample: Int[Array, " lanes"]
 ) -> tuple[Progress, Int[Array, " lanes"], Reached]:
     """Advance the lanes by a period and record their samples."""
-    here, control, atol = scheduler.here(progress.lane_state)
+    problem, control, atol = scheduler.in_lanes(progress.lane_state)
     count = times.shape[0]
     horizon = jnp.broadcast_to(control.t1, progress.lane_state.time.shape)
 
     def going(carry: Any) -> Any:
         lane_state, _, _, _, idle, iteration = carry
-        return scheduler.goes_on(lane_state, idle, progress.scheduler) & (iteration < PERIOD)
+        return scheduler.goes_on(lane_state, idle, progress.loaded) & (iteration < PERIOD)
 
     def step(carry: Any) -> Any:
         lane_state, accepted, sample, record, idle, iteration = carry
@@ -114,12 +114,12 @@ def _recorded(
         # After a step that was not accepted the next one is shorter on purpose: it may have to end on a minimum of a margin.
         length = jnp.where(accepted, even, jnp.minimum(even, lane_state.length))
         lane_state = lane_state._replace(length=length)
-        after = try_step(here, control._replace(t1=stop), atol, lane_state)
+        after = try_step(problem, control._replace(t1=stop), atol, lane_state)
         reached = (lane_state.status == RUNNING) & (after.status == REACHED_END)
         is_sample = reached & (sample < count) & (after.time >= next_time)
         goes_on = reached & (after.time < horizon)
-        onward = jnp.where(after.steps < control.max_steps, RUNNING, FAILED)
-        after = after._replace(status=jnp.where(goes_on, onward, after.status))
+        status = jnp.where(after.steps < control.max_steps, RUNNING, FAILED)
+        after = after._replace(status=jnp.where(goes_on, status, after.status))
         made = Reached(after.state, jnp.where(is_sample, sample, count))
         record = jax.tree.map(functools.partial(written_in_place, at=iteration), record, made)
         return after, after.time > lane_state.time, sample + is_sample, record, idle, iteration + 1
@@ -136,7 +136,7 @@ def _recorded(
         )
 
     lane_state, _, sample, record, _, iterations = scheduler.in_kernel(loop)((progress.lane_state, sample))
-    return Progress(lane_state, progress.scheduler, progress.iterations + iterations), sample, record
+    return Progress(lane_state, progress.loaded, progress.iterations + iterations), sample, record
 
 
 def _next_time(times: Float[Array, "times ..."], sample: Int[Array, " lanes"]) -> Lanes:

@@ -55,7 +55,7 @@ class Progress(NamedTuple):
     """The lanes, the number of cells that have left the queue, and the number of iterations made."""
 
     lane_state: LaneState
-    scheduler: Int[Array, ""]
+    loaded: Int[Array, ""]
     iterations: Int[Array, ""]
 
 
@@ -81,22 +81,24 @@ class LaneScheduler(eqx.Module):
         cells: Int[Array, ""],
         settings: Settings,
         *,
-        passes: bool = False,
+        nonterminal: bool = False,
         one_kernel: bool = False,
-        parts: int = 1,
+        n_blocks: int = 1,
     ) -> "LaneScheduler":
         """The scheduler of a problem.
 
-        **Arguments:** as for `ensemble_solve`, and `parts`: the number of equal blocks of the state, as for `Control`.
+        **Arguments:** as for `ensemble_solve`, and `n_blocks`: the number of equal blocks of the state, as for `Control`.
         """
         solver, rtol = settings.for_lanes, settings.tolerance
-        control = Control(explicit_tableau(solver), explicit_order(solver), rtol, t1, settings.max_steps, passes, parts)
+        control = Control(
+            explicit_tableau(solver), explicit_order(solver), rtol, t1, settings.max_steps, nonterminal, n_blocks
+        )
         starts, scales = problem.start()
         zero = jnp.zeros_like(starts[0])
         rates, atols = problem.field(zero, starts), settings.absolute * rtol * scales
-        lengths = first_length(problem.field, zero, starts, rates, control.order, rtol, atols, parts)
+        lengths = first_length(problem.field, zero, starts, rates, control.order, rtol, atols, n_blocks)
         fresh = _fresh_lanes(problem, control, starts, rates, jnp.minimum(stop_gradient(lengths), t1))
-        return cls(problem, control, atols, fresh, cells, settings.lanes_of(starts.shape[1], parts), one_kernel)
+        return cls(problem, control, atols, fresh, cells, settings.lanes_of(starts.shape[1], n_blocks), one_kernel)
 
     @property
     def capacity(self) -> int:
@@ -108,7 +110,7 @@ class LaneScheduler(eqx.Module):
         inside = jnp.minimum(cell, self.capacity - 1)
         return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., inside], tree)
 
-    def here(self, lane_state: LaneState) -> tuple[AbstractProblem, Control, Float[Array, "components lanes"]]:
+    def in_lanes(self, lane_state: LaneState) -> tuple[AbstractProblem, Control, Float[Array, "components lanes"]]:
         """Problem, control and absolute tolerances of the cells in the lanes."""
         control = self.control._replace(t1=self.pick(self.control.t1, lane_state.cell))
         return self.pick(self.problem, lane_state.cell), control, self.pick(self.atols, lane_state.cell)
@@ -135,40 +137,40 @@ class LaneScheduler(eqx.Module):
 
     def unfinished(self, progress: Progress) -> Bool[Array, ""]:
         """Whether a lane is running or a cell waiting."""
-        return jnp.any(progress.lane_state.status == RUNNING) | (progress.scheduler < self.cells)
+        return jnp.any(progress.lane_state.status == RUNNING) | (progress.loaded < self.cells)
 
     def idle(self, lane_state: LaneState) -> Int[Array, ""]:
         """Number of idle lanes."""
         return jnp.sum(lane_state.status != RUNNING)
 
     def goes_on(
-        self, lane_state: LaneState, idle: Int[Array, ""], scheduler: Int[Array, ""], price: float = REFILL
+        self, lane_state: LaneState, idle: Int[Array, ""], loaded: Int[Array, ""], price: float = REFILL
     ) -> Bool[Array, ""]:
         """Whether the loop continues; while cells wait it stops for a refill as soon as the refill pays off.
 
-        **Arguments:** `idle`: steps that idle lanes have missed since the last refill; `scheduler`: how many cells have
+        **Arguments:** `idle`: steps that idle lanes have missed since the last refill; `loaded`: how many cells have
         left the queue; `price`: cost of a refill, in steps of all lanes.
         """
-        refill = (scheduler < self.cells) & (idle >= price * self.lanes)
+        refill = (loaded < self.cells) & (idle >= price * self.lanes)
         return jnp.any(lane_state.status == RUNNING) & ~refill
 
     def run(self, progress: Progress) -> Progress:
         """Advance the lanes until they should be refilled, or all have ended."""
-        here = self.here(progress.lane_state)
+        in_lanes = self.in_lanes(progress.lane_state)
 
         def goes_on(carry: tuple[LaneState, Int[Array, ""], Int[Array, ""]]) -> Bool[Array, ""]:
             lane_state, idle, _ = carry
-            return self.goes_on(lane_state, idle, progress.scheduler)
+            return self.goes_on(lane_state, idle, progress.loaded)
 
         def step(
             carry: tuple[LaneState, Int[Array, ""], Int[Array, ""]],
         ) -> tuple[LaneState, Int[Array, ""], Int[Array, ""]]:
             lane_state, idle, iterations = carry
-            return try_step(*here, lane_state), idle + self.idle(lane_state), iterations + 1
+            return try_step(*in_lanes, lane_state), idle + self.idle(lane_state), iterations + 1
 
         start = (progress.lane_state, jnp.zeros((), int), progress.iterations)
         lane_state, _, iterations = self.in_kernel(lambda carry: jax.lax.while_loop(goes_on, step, carry))(start)
-        return Progress(lane_state, progress.scheduler, iterations)
+        return Progress(lane_state, progress.loaded, iterations)
 
     def in_kernel(self, loop: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """A loop over steps, compiled into a single kernel if `one_kernel` is set."""
@@ -176,13 +178,11 @@ class LaneScheduler(eqx.Module):
 
     def refill(self, progress: Progress) -> Progress:
         """Give every idle lane the next waiting cell."""
-        lane_state, scheduler, iterations = progress
+        lane_state, loaded, iterations = progress
         idle = lane_state.status != RUNNING
-        loaded = self._load(
-            jnp.where(idle, jnp.minimum(scheduler + jnp.cumsum(idle) - 1, self.capacity), lane_state.cell)
-        )
-        lane_state = jax.tree.map(lambda new, old: jnp.where(idle, new, old), loaded, lane_state)
-        return Progress(lane_state, jnp.minimum(scheduler + jnp.sum(idle), self.cells), iterations)
+        fresh = self._load(jnp.where(idle, jnp.minimum(loaded + jnp.cumsum(idle) - 1, self.capacity), lane_state.cell))
+        lane_state = jax.tree.map(lambda new, old: jnp.where(idle, new, old), fresh, lane_state)
+        return Progress(lane_state, jnp.minimum(loaded + jnp.sum(idle), self.cells), iterations)
 
     def empty(self) -> Outcome:
         """An empty outcome of the right shapes."""
@@ -190,9 +190,9 @@ class LaneScheduler(eqx.Module):
 
     def store(self, outcome: Outcome, lane_state: LaneState) -> Outcome:
         """Store the cells whose lanes have ended in the outcome."""
-        found = _outcome_of(lane_state)
+        in_lanes = _outcome_of(lane_state)
         to = jnp.where((lane_state.status != RUNNING) & (lane_state.cell < self.cells), lane_state.cell, self.capacity)
-        return jax.tree.map(lambda all, some: all.at[..., to].set(some, mode="drop"), outcome, found)
+        return jax.tree.map(lambda cells, lanes: cells.at[..., to].set(lanes, mode="drop"), outcome, in_lanes)
 
     def _load(self, cell: Int[Array, " lanes"]) -> LaneState:
         lane_state = self.pick(self.fresh, cell)
@@ -226,9 +226,9 @@ def _fresh_lanes(
     if crossing is not None:
         # Exactly on the event, the direction of the motion decides.
         falls = jax.jvp(problem.event_function, (states,), (rates,))[1] <= 0.0
-        beyond = (crossing < 0.0) | ((crossing == 0.0) & (falls | (not control.passes)))
-    side = jnp.where(beyond & control.passes, -1.0, 1.0).astype(lengths.dtype)
-    status = jnp.where(beyond & (not control.passes), CROSSED, RUNNING)
+        beyond = (crossing < 0.0) | ((crossing == 0.0) & (falls | (not control.nonterminal)))
+    side = jnp.where(beyond & control.nonterminal, -1.0, 1.0).astype(lengths.dtype)
+    status = jnp.where(beyond & (not control.nonterminal), CROSSED, RUNNING)
     if domain_margin is not None:
         status = jnp.where(domain_margin <= 0.0, LEFT_DOMAIN, status)
     return _lanes_at_start(problem, states, rates, lengths, side, status, jnp.where(beyond, zero, jnp.inf))

@@ -70,9 +70,9 @@ class Settings(eqx.Module):
         """The same with another tolerance, or without one, where the caller keeps it."""
         return eqx.tree_at(lambda one: one.tolerance, self, tolerance, is_leaf=lambda leaf: leaf is None)
 
-    def lanes_of(self, cells: int, parts: int = 1) -> int:
+    def lanes_of(self, cells: int, n_blocks: int = 1) -> int:
         """How many of the cells of a problem advance together, given the number of blocks in its state."""
-        return lanes_for(cells, parts) if self.lanes is None else self.lanes
+        return lanes_for(cells, n_blocks) if self.lanes is None else self.lanes
 
 
 def tolerance_bound(tolerance: Any) -> Bound:
@@ -111,11 +111,11 @@ def require_adjoint(adjoint: Any) -> None:
         raise ValueError(f"adjoint = {adjoint!r} must be one of Diffrax, such as RecursiveCheckpointAdjoint(), or None")
 
 
-def lanes_for(cells: int, parts: int = 1) -> int:
+def lanes_for(cells: int, n_blocks: int = 1) -> int:
     """How many cells should advance together, given their number and the number of equal blocks in the state.
 
     On a CPU the lanes and their stages should fit the first caches; an accelerator is idle below tens of thousands.
     """
     most = 64 if jax.default_backend() == "cpu" else 32768
     alone = min(most, 1 << (cells - 1).bit_length())
-    return alone if parts == 1 else max(8, 3 * alone // (2 * parts))
+    return alone if n_blocks == 1 else max(8, 3 * alone // (2 * n_blocks))

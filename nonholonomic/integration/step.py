@@ -26,7 +26,7 @@ class Control(NamedTuple):
     """Options of the steps.
 
     `tableau` and `order` are the method's; `rtol` is the relative tolerance; `t1` the horizon [s], one for all or one
-    per lane; a lane that needs more than `max_steps` has failed; `passes` is true for a nonterminal event; `parts` is
+    per lane; a lane that needs more than `max_steps` has failed; `nonterminal` is true for a nonterminal event; `n_blocks` is
     the number of equal blocks of the state, such as a state and its variations: the block with the largest error
     controls the step.
     """
@@ -36,8 +36,8 @@ class Control(NamedTuple):
     rtol: Float[Array, ""]
     t1: Float[Array, "..."]
     max_steps: int
-    passes: bool
-    parts: int
+    nonterminal: bool
+    n_blocks: int
 
 
 class LaneState(NamedTuple):
@@ -110,7 +110,7 @@ def after_step(
     running = lane_state.status == RUNNING
     free = running & ~lane_state.bracketing
     error = scaled_error(
-        *stop_gradient((tried.error, lane_state.state, tried.state)), control.rtol, atol, control.parts
+        *stop_gradient((tried.error, lane_state.state, tried.state)), control.rtol, atol, control.n_blocks
     )
     # An event is located where the margin is round-off. Stored jointly, behind a barrier, the margin is computed once;
     # otherwise the compiler would fuse it into several kernels with different round-off, and only some of them would
@@ -191,7 +191,7 @@ def _classify(
         lost = False if margins is None else jnp.min(stop_gradient(margins[-1]), axis=0) <= lane_state.side * crossing
         by_margin = hit & lost
     crossed = hit & ~by_margin
-    if not control.passes:
+    if not control.nonterminal:
         status = jnp.where(hit, jnp.where(by_margin, LEFT_DOMAIN, CROSSED), lane_state.status)
         if not problem.direction_decides:
             return status, lane_state.side, lane_state.first_crossing, lane_state.crossing_time

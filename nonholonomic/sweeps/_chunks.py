@@ -215,20 +215,20 @@ def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
     if path.exists() or not (folder / "table.h5").exists():
         return None
     layout = Stored(folder / "table.h5").layout
-    found, damaged = layout.empty(layout.cells), 0
+    variables, damaged = layout.empty(layout.cells), 0
     for file in folder.glob("*.npz"):
         first, end = layout.ends(int(file.stem))
         values = read_chunk(folder, layout, int(file.stem))
         damaged += values is None
-        for name, some in (values or {}).items():
-            found[name][first:end] = some
+        for name, cells in (values or {}).items():
+            variables[name][first:end] = cells
     if path.exists():
         # It was finished meanwhile.
         return None
     if damaged:
         reason = f"{damaged} of its {layout.chunks} blocks do not match their checksums"
         raise OSError(f"cannot read {path}: it is damaged: {reason}")
-    return layout, found
+    return layout, variables
 
 
 def read_chunk(folder: Path, layout: Layout, chunk: int) -> dict[str, Values] | None:
@@ -236,18 +236,18 @@ def read_chunk(folder: Path, layout: Layout, chunk: int) -> dict[str, Values] | 
     try:
         # NumPy does not close a file that it cannot read.
         with (folder / f"{chunk}.npz").open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            found = {name: archive[name] for name in layout.kinds}
+            variables = {name: archive[name] for name in layout.kinds}
     except (OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile):
         return None
     first, end = layout.ends(chunk)
     right = {name: (kind, (end - first, *layout.inner_shape(name))) for name, kind in layout.kinds.items()}
-    return found if {name: (values.dtype, values.shape) for name, values in found.items()} == right else None
+    return variables if {name: (values.dtype, values.shape) for name, values in variables.items()} == right else None
 
 
 def same_request(left: str, right: str) -> str | None:
     """The first difference between two requests (JSON), in words; `None` if they are the same."""
-    one, other = json.loads(left), json.loads(right)
-    for name in [*one, *(name for name in other if name not in one)]:
-        if one.get(name) != other.get(name):
+    first, second = json.loads(left), json.loads(right)
+    for name in [*first, *(name for name in second if name not in first)]:
+        if first.get(name) != second.get(name):
             return f"{name} is {one.get(name)!r} there and {other.get(name)!r} here"
     return None

@@ -50,7 +50,7 @@ def axis(name: str, number: str, unit: str, values: Any, long_name: str = "") ->
 
 def size_of(axes: list[Axis]) -> int:
     """How many cells a grid has."""
-    return int(np.prod([len(one.values) for one in axes], dtype=int))
+    return int(np.prod([len(axis.values) for axis in axes], dtype=int))
 
 
 def columns(axes: list[Axis], first: int, count: int) -> dict[str, Values]:
@@ -61,8 +61,8 @@ def columns(axes: list[Axis], first: int, count: int) -> dict[str, Values]:
     **Returns:** full name of a parameter -> its value in every cell.
     """
     cell = np.minimum(np.arange(first, first + count), size_of(axes) - 1)
-    places = np.unravel_index(cell, [len(one.values) for one in axes]) if axes else ()
-    return {one.number: one.values[place] for one, place in zip(axes, places, strict=True)}
+    places = np.unravel_index(cell, [len(axis.values) for axis in axes]) if axes else ()
+    return {axis.number: axis.values[place] for axis, place in zip(axes, places, strict=True)}
 
 
 def cells_to_check(axes: list[Axis]) -> Iterator[dict[str, Values]]:
@@ -75,8 +75,8 @@ def cells_to_check(axes: list[Axis]) -> Iterator[dict[str, Values]]:
     if size_of(axes) <= CHECKED_WHOLE:
         yield columns(axes, 0, size_of(axes))
         return
-    for one in axes:
-        fixed = {other.number: np.repeat(other.values[:1], len(one.values)) for other in axes}
-        yield fixed | {one.number: one.values}
-    corners = np.array(list(itertools.product(*((one.values.min(), one.values.max()) for one in axes))))
-    yield {one.number: corner for one, corner in zip(axes, corners.T, strict=True)}
+    for axis in axes:
+        fixed = {other.number: np.repeat(other.values[:1], len(axis.values)) for other in axes}
+        yield fixed | {axis.number: axis.values}
+    corners = np.array(list(itertools.product(*((axis.values.min(), axis.values.max()) for axis in axes))))
+    yield {axis.number: corner for axis, corner in zip(axes, corners.T, strict=True)}

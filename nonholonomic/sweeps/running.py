@@ -73,16 +73,16 @@ def sweep(
     if executor is not None and not isinstance(executor, Executor):
         raise ValueError(f"executor = {executor!r} must be a concurrent.futures.Executor, or None")
     cells = size_of(axes)
-    given = chunk_for(cells) if chunk is None else chunk
-    given = given if most is None else min(given, most)
-    layout = layout_of(axes, inner, variables, request, given)
-    layout = layout._replace(chunk=given * chunks_together(layout, given))
+    chunk_size = chunk_for(cells) if chunk is None else chunk
+    chunk_size = chunk_size if most is None else min(chunk_size, most)
+    layout = layout_of(axes, inner, variables, request, chunk_size)
+    layout = layout._replace(chunk=chunk_size * chunks_together(layout, chunk_size))
     forget_programs_if_many()
-    work = ChunkTask(job, axes, given)
+    work = ChunkTask(job, axes, chunk_size)
     store = Held(layout) if path is None else ChunkStore(path, layout)
     try:
-        found = store.filled(computed(work, layout, store.finished, executor, progress))
-        return Table.of(found) if isinstance(found, Stored) else Table.laid_out(layout, found)
+        result = store.filled(computed(work, layout, store.finished, executor, progress))
+        return Table.of(result) if isinstance(result, Stored) else Table.laid_out(layout, result)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(store.interrupted()) from None
     except ExecutorBroken as error:
@@ -124,22 +124,22 @@ def layout_of(
     axes: list[Axis], inner: Sequence[Axis], variables: dict[str, Variable], request: dict[str, Any], chunk: int
 ) -> Layout:
     """What a sweep's table is made of; see `sweep`."""
-    coords = {one.name: one.values for one in (*axes, *inner)}
-    units = {one.name: one.unit for one in (*axes, *inner) if one.values.dtype.kind != "U"}
-    units |= {name: one.unit for name, one in variables.items() if one.words is None}
+    coords = {variable.name: variable.values for variable in (*axes, *inner)}
+    units = {variable.name: variable.unit for variable in (*axes, *inner) if variable.values.dtype.kind != "U"}
+    units |= {name: variable.unit for name, variable in variables.items() if variable.words is None}
     attributes = {
         "request": json.dumps(request | {"float": str(np.dtype(jnp.result_type(float)))}),
-        "axes": json.dumps([one.name for one in axes]),
+        "axes": json.dumps([variable.name for variable in axes]),
         "versions": json.dumps(versions()),
     }
-    long_names = {one.name: one.long_name for one in (*axes, *inner)}
-    long_names |= {name: one.long_name for name, one in variables.items()}
+    long_names = {variable.name: variable.long_name for variable in (*axes, *inner)}
+    long_names |= {name: variable.long_name for name, variable in variables.items()}
     if any(long_names.values()):
         named = {name: long_name for name, long_name in long_names.items() if long_name}
         attributes[LONG_NAMES] = json.dumps(named, sort_keys=True)
-    kinds = {name: np.dtype(one.kind) for name, one in variables.items()}
-    words = {name: one.words for name, one in variables.items() if one.words is not None}
-    dims = {name: one.inner for name, one in variables.items() if one.inner}
+    kinds = {name: np.dtype(variable.kind) for name, variable in variables.items()}
+    words = {name: variable.words for name, variable in variables.items() if variable.words is not None}
+    dims = {name: variable.inner for name, variable in variables.items() if variable.inner}
     return Layout(coords, kinds, units, attributes, words, dims, chunk)
 
 
@@ -164,8 +164,8 @@ class Held:
         """Keep the blocks that are computed; the variables, with all cells along the first axis."""
         for chunk, values in computed:
             first, end = self._layout.ends(chunk)
-            for name, some in values.items():
-                self._found[name][first:end] = some
+            for name, values_of_chunk in values.items():
+                self._found[name][first:end] = values_of_chunk
         return self._found
 
     def interrupted(self) -> str:

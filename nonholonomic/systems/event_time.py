@@ -179,7 +179,7 @@ class HybridEvent(SmoothEvent):
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, settings = self.permitted(leaves)
         phases, first, states = self.of_leaves(leaves).modes(cells)
-        return _named(may, traced_solve_hybrid(phases, first, states, t1, settings, kinds=1))
+        return _named(may, traced_solve_hybrid(phases, first, states, t1, settings, counters=1))
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
@@ -196,7 +196,7 @@ class HybridEvent(SmoothEvent):
 
         def run(some: tuple[Any, ...]) -> tuple[tuple[HybridOutcome, Array], list[Float[Array, " cells"]]]:
             moved = tuple((one[0], one[2]) for one in some)
-            journey, found = traced_solve_hybrid_with_tangents(phases, moved, first, states, t1, settings, kinds=1)
+            journey, found = traced_solve_hybrid_with_tangents(phases, moved, first, states, t1, settings, counters=1)
             return (journey, found.grazing), list(found.slopes)
 
         (journey, grazing), slopes = in_groups(run, directions)

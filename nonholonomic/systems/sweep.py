@@ -189,10 +189,10 @@ class SweepJob(NamedTuple):
             modes, first, states = cells.modes(size)
             begin = (np.asarray(first), np.asarray(states), np.asarray(self.t1), count, settings)
             if self.by:
-                outcome, found = solve_hybrid_with_tangents(modes, tangents, *begin, kinds=1)
+                outcome, found = solve_hybrid_with_tangents(modes, tangents, *begin, counters=1)
                 slopes, grazing = found.slopes, np.asarray(found.grazing)
             else:
-                outcome = solve_hybrid(modes, *begin, kinds=1)
+                outcome = solve_hybrid(modes, *begin, counters=1)
         crossed = np.asarray(outcome.status) == CROSSED
         shorts = short_names([*columns, *(name for name in self.by if name not in columns)])
         found = {

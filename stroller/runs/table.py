@@ -198,7 +198,7 @@ class RideJob(NamedTuple):
         problem = RideProblem.of(cells["scene"], cells["launch"], controls, size, watched=True)
         horizon, settings = as_number(self.t1), Settings(self.tolerance, self.solver, max_steps=self.max_steps)
         # A ride goes on where contact is lost, as if the ground could pull.
-        outcome, _ = solve_ensemble(problem, horizon, jnp.asarray(count), settings, passes=problem.watched)
+        outcome, _ = solve_ensemble(problem, horizon, jnp.asarray(count), settings, nonterminal=problem.watched)
         contact_time = np.asarray(outcome.first_crossing)
         lost = np.isfinite(contact_time)
         words = np.select([outcome.status == FAILED, outcome.status == LEFT_DOMAIN, lost], [3, 2, 1], 0)

@@ -72,11 +72,11 @@ def test_bounces_in_a_bowl():
 def test_a_ball_comes_to_rest():
     """Dropped at the lowest point of a bowl: all bounces together take sqrt(2 h / g) (1 + e) / (1 - e), to 1e-11 s."""
     scene, h, e = hop_scene(CASES[0], tippe.Paraboloid(CASES[0].p1)), 0.01, RESTITUTION
-    kinds, *_ = arena_modes((scene, tippe.Launch(0.0, 0.0)), 1e-12)
+    batched_modes, *_ = arena_modes((scene, tippe.Launch(0.0, 0.0)), 1e-12)
     upright = (0.0, 0.0, 1.0)
     centre = (0.0, 0.0, h + CASES[0].radius - CASES[0].offset)
     dropped = jnp.array([*centre, *np.zeros(3), *upright, *np.zeros(5), 1.0, *np.zeros(4)])
-    path = solve_hybrid_dense(kinds, FLYING, dropped, 0.16, Settings(1e-12, diffrax.Dopri8()), kinds=1)
+    path = solve_hybrid_dense(batched_modes, FLYING, dropped, 0.16, Settings(1e-12, diffrax.Dopri8()), counters=1)
     *_, last, rests = path.mode_segments
     assert (last.number, rests.number) == (FLYING, SLIDING)
     rest = last.end + (last.end - last.begin) * e / (1.0 - e)

@@ -193,8 +193,11 @@ class Contact(AbstractProblem):
         _, e, L, _ = parts(state[:OWN])
         across = tuple(state[OWN + k] for k in range(3))
         falls = -dot(cross(L, e), across) * self.dynamics.per_transverse
-        riding = (*sum_vectors(scale(falls, e), carried(across, motion.turning)), motion.spin_momentum / self.axial)
-        return stacked((*motion.rate, *riding, motion.friction_power), state)
+        quadratures = (
+            *sum_vectors(scale(falls, e), carried(across, motion.turning)),
+            motion.spin_momentum / self.axial,
+        )
+        return stacked((*motion.rate, *quadratures, motion.friction_power), state)
 
     def event_function(self, state):
         return state[COS_THETA] - self.cos_angle
@@ -214,7 +217,7 @@ class Flight(AbstractProblem):
     states: Float[Array, "components cells"]
     scales: Float[Array, "components cells"]
     falls: Vector
-    rides: bool = eqx.field(static=True)
+    with_quadratures: bool = eqx.field(static=True)
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
@@ -223,7 +226,7 @@ class Flight(AbstractProblem):
         flying, body = flight_state(state), self.scene.body
         turning = axis_rate(body, flying.axis, flying.momentum)
         rates = (*flying.velocity, *self.falls, *turning, None, None, None, None, None)
-        if self.rides:
+        if self.with_quadratures:
             across = tuple(state[OWN + k] for k in range(3))
             carry = scale(-1.0 * dot(turning, across), flying.axis)
             rates = (*rates, *carry, dot(flying.momentum, flying.axis) / body.I3, None)
@@ -257,7 +260,7 @@ class Slide(AbstractFlyingMode):
         ends, zero = self.scene.dynamics.loss(state[:OWN]) > 0, jnp.zeros_like(state[0])
         return Transition(
             mode=jnp.where(ends, SLIDING, FLYING),
-            state=jnp.where(ends, state, lift_off(self.scene, state, self.rides)),
+            state=jnp.where(ends, state, lift_off(self.scene, state, self.with_quadratures)),
             elapsed=zero,
             status=jnp.where(ends, LEFT_DOMAIN, RUNNING),
             crossing_time=jnp.full_like(zero, jnp.inf),
@@ -266,7 +269,7 @@ class Slide(AbstractFlyingMode):
 
 
 def lift_off(
-    scene: Scene[Top], state: Float[Array, "components ..."], rides: bool, ball: Ball | None = None
+    scene: Scene[Top], state: Float[Array, "components ..."], with_quadratures: bool, ball: Ball | None = None
 ) -> Float[Array, "components ..."]:
     """The flight state of a top that has lost contact, from its state in contact, with its passive quadratures if any.
 
@@ -281,7 +284,7 @@ def lift_off(
     centre = sum_vectors(place[:3], scale(ball.radius, axes[2]))
     s = sum_vectors(centre, scale(-ball.offset, from_frame(e, axes)))
     flies = in_flight(s, axes, FreeBody(velocity, jnp.zeros_like(state[0]), e, L))
-    if not rides:
+    if not with_quadratures:
         return flies
     across = from_frame(vector_of(state[OWN + k] for k in range(3)), axes)
     return jnp.concatenate([flies, jnp.stack(across), state[OWN + 3 :]])
@@ -300,7 +303,7 @@ class Fly(AbstractFlyingMode):
         rows = [ones * self.scene.body.radius] * 3 + [velocity] * 3 + [ones] * 3 + [momentum] * 3 + [ones] * 2
         scales = jnp.concatenate([jnp.stack(rows), self.scales[OWN:]])
         falls = scale(-1.0 * self.scene.gravity, self.scene.surface.up)
-        return Flight(self.scene, self.cos_angle, state, scales, falls, self.rides)
+        return Flight(self.scene, self.cos_angle, state, scales, falls, self.with_quadratures)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         flying = flight_state(state)
@@ -327,7 +330,7 @@ class Fly(AbstractFlyingMode):
         # Where the landing was located slightly below the arena, the next flight would end where it begins.
         lifted = vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
         after = jnp.where(rebounds, in_flight(lifted, ground.axes, struck), in_contact(ground, struck))
-        if self.rides:
+        if self.with_quadratures:
             across = vector_of(state[OWN + k] for k in range(3))
             across = jnp.where(rebounds, jnp.stack(across), jnp.stack(to_frame(across, ground.axes)))
             gained = energy(scene.body, 0.0, struck) - energy(scene.body, 0.0, free)
@@ -343,10 +346,10 @@ class Fly(AbstractFlyingMode):
 
 
 def modes(
-    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
+    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the number of the mode in which each starts. **Arguments:** as for those of `sliding.py`."""
-    arguments = (scene, problem.scales, problem.cos_angle, rides)
+    arguments = (scene, problem.scales, problem.cos_angle, with_quadratures)
     return (Slide(*arguments), Fly(*arguments)), jnp.zeros(problem.states.shape[1:], int)
 
 

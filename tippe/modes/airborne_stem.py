@@ -112,7 +112,7 @@ class SlideOnOne(AbstractFlyingMode):
         return OneOfTwo(self.scene, contact, own, other, self.number == 1)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
-        flight = Fly(self.scene, self.scales, self.cos_angle, self.rides)
+        flight = Fly(self.scene, self.scales, self.cos_angle, self.with_quadratures)
         beside = flight.shown(lift_off(self.scene, state, True, self.spheres[0]))
         return jnp.where(self.number == 1, beside, jnp.concatenate([state, jnp.zeros_like(state[:2])]))
 
@@ -126,7 +126,7 @@ class SlideOnOne(AbstractFlyingMode):
         ends = (dynamics.loss(state[:OWN]) > 0) & ~lands
         return Transition(
             mode=jnp.where(ends, jnp.where(self.number == 0, SLIDING, ON_STEM), jnp.where(lands, STRIKING, FLYING)),
-            state=jnp.where(ends, state, lift_off(self.scene, state, self.rides, own)),
+            state=jnp.where(ends, state, lift_off(self.scene, state, self.with_quadratures, own)),
             elapsed=zero,
             status=jnp.where(ends, LEFT_DOMAIN, RUNNING),
             crossing_time=jnp.full_like(zero, jnp.inf),
@@ -181,29 +181,29 @@ class FlyBoth(Fly):
         # Where the landing was located slightly below the arena, the next mode would end where it begins.
         flying = flying._replace(place=vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
         ground = ground._replace(gap=zero)
-        blow = apply_impulse(scene, flying, ground, own, other)
-        flies = blow.rebounds | blow.throws
-        after = in_flight(flying.place, ground.axes, blow.free)
-        after = jnp.where(flies, after, in_contact(ground, blow.free))
-        if self.rides:
+        impact = resolve_arena_impact(scene, flying, ground, own, other)
+        flies = impact.rebounds | impact.throws
+        after = in_flight(flying.place, ground.axes, impact.free)
+        after = jnp.where(flies, after, in_contact(ground, impact.free))
+        if self.with_quadratures:
             across = vector_of(state[OWN + k] for k in range(3))
             across = jnp.where(flies, jnp.stack(across), jnp.stack(to_frame(across, ground.axes)))
-            gained = energy(scene.body, 0.0, blow.free) - energy(
+            gained = energy(scene.body, 0.0, impact.free) - energy(
                 scene.body, 0.0, as_free_body(scene, flying, ground, own)
             )
             after = jnp.concatenate([after, across, state[OWN + 3 :].at[1].add(gained)])
         slides = jnp.where(number == 0, SLIDING, ON_STEM)
         return Transition(
-            mode=jnp.where(blow.throws, STRIKING, jnp.where(blow.rebounds, FLYING, slides)),
+            mode=jnp.where(impact.throws, STRIKING, jnp.where(impact.rebounds, FLYING, slides)),
             state=after,
             elapsed=zero,
-            status=jnp.where(astray | blow.rests, UNRESOLVED, jnp.where(blow.fails, FAILED, RUNNING)),
+            status=jnp.where(astray | impact.rests, UNRESOLVED, jnp.where(impact.fails, FAILED, RUNNING)),
             crossing_time=jnp.full_like(zero, jnp.inf),
-            counts=(blow.rebounds & ~blow.throws).astype(int)[None],
+            counts=(impact.rebounds & ~impact.throws).astype(int)[None],
         )
 
 
-class ContactImpulse(NamedTuple):
+class ArenaImpact(NamedTuple):
     """The result of an impact.
 
     - `free`: the top after it, above the tangent plane.
@@ -218,7 +218,7 @@ class ContactImpulse(NamedTuple):
     fails: Bool[Array, " cells"]
 
 
-def apply_impulse(scene: Scene[Top], flying: FlightState, ground: Below, own: Ball, other: Ball) -> ContactImpulse:
+def resolve_arena_impact(scene: Scene[Top], flying: FlightState, ground: Below, own: Ball, other: Ball) -> ArenaImpact:
     """The impact of one sphere on the tangent plane at its foot; a slow rebound closes the contact.
 
     **Arguments:** `flying`: the top, its sphere `own` at the arena; `ground`: below that sphere; `other`: the other
@@ -237,7 +237,7 @@ def apply_impulse(scene: Scene[Top], flying: FlightState, ground: Below, own: Ba
     before, now = (gap_rate(body, other, as_free_body(scene, motion, beside, other)) for motion in (flying, thrown))
     touches = beside.gap < TOUCHING * body.radius
     rests = touches & ~rebounds & (speed <= closing) & (jnp.abs(before) <= closing)
-    return ContactImpulse(after, rebounds, touches & ~rests & (now < -closing), rests, fails)
+    return ArenaImpact(after, rebounds, touches & ~rests & (now < -closing), rests, fails)
 
 
 def own_and_other(scene: Scene[Top], number: Int[Array, "..."]) -> tuple[Ball, Ball]:
@@ -248,14 +248,14 @@ def own_and_other(scene: Scene[Top], number: Int[Array, "..."]) -> tuple[Ball, B
 
 
 def modes(
-    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
+    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the number of the mode in which each starts. **Arguments:** as for those of `sliding.py`.
 
     A launch in which the stem would be in the arena starts on the stem: its place and its theta are those of the stem's
     foot.
     """
-    arguments, (main, stem) = (scene, problem.scales, problem.cos_angle, rides), balls(scene.body)
+    arguments, (main, stem) = (scene, problem.scales, problem.cos_angle, with_quadratures), balls(scene.body)
     started = flight_state(lift_off(scene, problem.states[:OWN], False, main))
     first = jnp.where(landing_site(scene, started, stem).gap < 0.0, ON_STEM, SLIDING)
     slides = [SlideOnOne(*arguments, jnp.asarray(number)) for number in (0, 1)]

@@ -34,7 +34,7 @@ class Touch(AbstractFlyingMode):
     @property
     def contact_state(self) -> sticking.StickSlipMode:
         """The mode of runs that end where the contact is lost."""
-        size = OWN if self.rides else None
+        size = OWN if self.with_quadratures else None
         return sticking.StickSlipMode(self.kind, self.cos_angle, self.scales, self.last, self.axial, size)
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
@@ -56,7 +56,7 @@ class Touch(AbstractFlyingMode):
         mode = jnp.where(transition.mode == sticking.ROLLING, ROLLING, SLIPPING)
         return transition._replace(
             mode=jnp.where(flies, FLYING, mode),
-            state=jnp.where(flies, lift_off(self.scene, whole, self.rides), transition.state),
+            state=jnp.where(flies, lift_off(self.scene, whole, self.with_quadratures), transition.state),
             status=jnp.where(flies, RUNNING, transition.status),
             counts=jnp.concatenate([flies.astype(int)[None], transition.counts]),
         )
@@ -76,10 +76,10 @@ class Land(Fly):
 
 
 def modes(
-    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
+    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the number of the mode in which each starts. **Arguments:** as for those of `sliding.py`."""
-    both, arguments = problem.dynamics, (scene, problem.scales, problem.cos_angle, rides)
+    both, arguments = problem.dynamics, (scene, problem.scales, problem.cos_angle, with_quadratures)
     assert isinstance(both, StickSlip)
     slips, rolls = (
         Touch(*arguments, ContactMode(both, jnp.asarray(tolerance, float), rolls_first), last)

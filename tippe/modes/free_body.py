@@ -76,19 +76,19 @@ def contact_state(free: FreeBody) -> Float[Array, "components ..."]:
     return joined(free.velocity[:2], free.axis, free.momentum)
 
 
-def shown(body: Top, free: FreeBody, riding: Float[Array, "7 ..."]) -> Float[Array, "17 ..."]:
+def shown(body: Top, free: FreeBody, quadratures: Float[Array, "7 ..."]) -> Float[Array, "17 ..."]:
     """The output rows of a body that may fly.
 
-    **Arguments:** `riding`: position (x, y) of the centre of mass [m], the vector c of `trajectory_problem.py`, spin
+    **Arguments:** `quadratures`: position (x, y) of the centre of mass [m], the vector c of `trajectory_problem.py`, spin
     angle [rad], work [J].
 
     **Returns:** the state as in contact; position (x, y) of the sphere's centre, c, spin angle, work; and the distance
     of the top's own sphere from the plane [m] with its rate [m/s].
     """
     main = balls(body)[0]
-    place = [x + main.offset * e for x, e in zip(riding[:2], free.axis[:2], strict=True)]
+    place = [x + main.offset * e for x, e in zip(quadratures[:2], free.axis[:2], strict=True)]
     distance = (gap(main, free), gap_rate(body, main, free))
-    rows = (*free.velocity[:2], *free.axis, *free.momentum, *place, *riding[2:], *distance)
+    rows = (*free.velocity[:2], *free.axis, *free.momentum, *place, *quadratures[2:], *distance)
     return jnp.stack(jnp.broadcast_arrays(*rows))
 
 

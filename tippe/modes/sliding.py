@@ -77,8 +77,8 @@ class Sliding(AbstractProblem):
         motion = self.dynamics.motion(state)
         across, turning = tuple(state[OWN + 2 : OWN + 5]), motion.rate[2:5]
         across_rate = scale(multiply(-1.0, dot(turning, across)), tuple(state[2:5]))
-        riding = (state[0], state[1], *across_rate, motion.spin_momentum / self.axial, motion.friction_power)
-        return stacked((*motion.rate, *riding), state)
+        quadratures = (state[0], state[1], *across_rate, motion.spin_momentum / self.axial, motion.friction_power)
+        return stacked((*motion.rate, *quadratures), state)
 
     def event_function(self, state: Float[Array, "components cells"]) -> Cells:
         return state[COS_THETA] - self.cos_angle
@@ -128,9 +128,9 @@ class Slide(AbstractFlyingMode):
         return shown(self.scene.body, as_free_body(self.scene.body, own, state), state[OWN:])
 
     def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "17 times"]:
-        free, riding = motion
+        free, quadratures = motion
         later = flown(self.scene.body, self.scene.gravity, free, passed)
-        return shown(self.scene.body, later, _carried(self.scene.body, free, riding, passed))
+        return shown(self.scene.body, later, _carried(self.scene.body, free, quadratures, passed))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Cells) -> Transition:
         """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land where that one touches.
@@ -151,14 +151,14 @@ class Slide(AbstractFlyingMode):
             return jnp.any(carry[0].open) & (carry[1] < MOST_BOUNCES)
 
         start = lost_contact(self.scene, self.number, state)
-        if self.rides:
-            start = start._replace(riding=state[OWN:])
-        record = _no_flights(start) if self.rides else None
+        if self.with_quadratures:
+            start = start._replace(quadratures=state[OWN:])
+        record = _no_flights(start) if self.with_quadratures else None
         air, _, record = jax.lax.while_loop(under_way, hop, (start, jnp.zeros((), int), record))
         status = jnp.where(air.open, UNRESOLVED, air.status)
         state = contact_state(air.free)
-        if air.riding is not None:
-            state = jnp.concatenate([state, air.riding])
+        if air.quadratures is not None:
+            state = jnp.concatenate([state, air.quadratures])
         fields = (air.ball, state, air.elapsed, status, air.crossing_time, air.flights[None])
         return Transition(*fields, record, air.log_rates)
 
@@ -183,7 +183,7 @@ class Lean(AbstractFlyingMode):
 
 
 def modes(
-    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
+    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, sliding on each sphere and on both if there are two; and the number of the mode in which each
     starts.
@@ -191,10 +191,10 @@ def modes(
     **Arguments:**
 
     - `scene`: with `contact="hybrid"`; `problem`: of its launches, which stand on their lower sphere.
-    - `tolerance`: unused by these modes; `last`: whether the last crossing counts; `rides`: as for
+    - `tolerance`: unused by these modes; `last`: whether the last crossing counts; `with_quadratures`: as for
       `AbstractFlyingMode`.
     """
-    spheres, arguments = balls(scene.body), (scene, problem.scales, problem.cos_angle, rides)
+    spheres, arguments = balls(scene.body), (scene, problem.scales, problem.cos_angle, with_quadratures)
     slides = tuple(Slide(*arguments, jnp.asarray(number), last) for number in range(len(spheres)))
     if len(spheres) == 1:
         return slides, jnp.zeros(problem.states.shape[1:], int)
@@ -218,7 +218,7 @@ class Air(NamedTuple):
       infinite if there was none.
     - `flights`: so far; `open`: whether there is no contact and the run continues.
     - `log_rates`: of the landings, as in `Transition`.
-    - `riding`: the passive quadratures of a single run.
+    - `quadratures`: the passive quadratures of a single run.
     """
 
     free: FreeBody
@@ -231,7 +231,7 @@ class Air(NamedTuple):
     flights: Int[Array, " cells"]
     open: Bool[Array, " cells"]
     log_rates: Cells
-    riding: Float[Array, "7 cells"] | None = None
+    quadratures: Float[Array, "7 cells"] | None = None
 
 
 def lost_contact(scene: Scene[Top], number: Int[Array, ""], state: Float[Array, "components cells"]) -> Air:
@@ -284,7 +284,7 @@ def take_flight(
         flights=air.flights + 1,
         open=landed,
         log_rates=air.log_rates + jnp.where(landed, flight.log_rate, 0.0),
-        riding=None if air.riding is None else _carried(body, air.free, air.riding, duration),
+        quadratures=None if air.quadratures is None else _carried(body, air.free, air.quadratures, duration),
     )
     return after, landed
 
@@ -303,9 +303,9 @@ def land(scene: Scene[Top], air: Air) -> Air:
     struck = air._replace(free=free, rising=rebounds, open=rebounds, status=jnp.where(fails, FAILED, air.status))
     if other is not None:
         struck = _with_other(scene, air, struck, other, (speed <= closing) & ~rebounds, closing)
-    if air.riding is not None:
+    if air.quadratures is not None:
         gained = energy(body, scene.gravity, struck.free) - energy(body, scene.gravity, air.free)
-        struck = struck._replace(riding=air.riding.at[-1].add(gained))
+        struck = struck._replace(quadratures=air.quadratures.at[-1].add(gained))
     return struck._replace(open=struck.open & ~fails)
 
 
@@ -333,10 +333,10 @@ def _with_other(
 
 
 def _carried(
-    body: Top, free: FreeBody, riding: Float[Array, "7 ..."], time: Float[Array, "..."]
+    body: Top, free: FreeBody, quadratures: Float[Array, "7 ..."], time: Float[Array, "..."]
 ) -> Float[Array, "7 ..."]:
     """The passive quadratures after some time [s] in flight."""
-    x, y, *across, angle, work = riding
+    x, y, *across, angle, work = quadratures
     u1, u2, _ = free.velocity
     spin_rate = dot(free.axis, free.momentum) / body.I3
     across = c_in_flight(body, free, tuple(across), time)
@@ -349,7 +349,7 @@ def _no_flights(start: Air) -> TransitionPath:
     def room(leaf: Array) -> Array:
         return jnp.zeros((MOST_BOUNCES, *leaf.shape), leaf.dtype)
 
-    motions = jax.tree.map(room, (start.free, start.riding))
+    motions = jax.tree.map(room, (start.free, start.quadratures))
     return TransitionPath(jnp.inf + room(start.elapsed), motions, room(start.flights))
 
 
@@ -360,7 +360,7 @@ def _with_flight(body: Top, record: TransitionPath | None, before: Air, after: A
     place, flew = before.flights[0], after.flights > before.flights
     turned = cone(body, before.free).rate * (after.elapsed - before.elapsed)
     new = TransitionPath(
-        jnp.where(flew, after.elapsed, jnp.inf), (before.free, before.riding), 1 + (turned / SHOWN).astype(int)
+        jnp.where(flew, after.elapsed, jnp.inf), (before.free, before.quadratures), 1 + (turned / SHOWN).astype(int)
     )
     return jax.tree.map(lambda kept, leaf: kept.at[place].set(leaf), record, new)
 

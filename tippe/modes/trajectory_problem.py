@@ -60,8 +60,8 @@ class TrajectoryProblem(AbstractProblem):
         path_rate = self.dynamics.frame.cyclic_rate(path, motion.velocity, motion.turning)
         falls = -dot(cross(L, e), across) * self.dynamics.per_transverse
         across_rate = sum_vectors(scale(falls, e), carried(across, motion.turning))
-        riding = (*path_rate, *across_rate, motion.spin_momentum / self.axial, motion.friction_power)
-        return stacked((*motion.rate, *riding), state)
+        quadratures = (*path_rate, *across_rate, motion.spin_momentum / self.axial, motion.friction_power)
+        return stacked((*motion.rate, *quadratures), state)
 
     def event_function(self, state: Float[Array, "components ..."]) -> None:
         return None

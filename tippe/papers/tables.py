@@ -130,10 +130,10 @@ def surface_of(words: list[str]) -> AbstractSurface:
     for known, kind in SURFACES.items():
         if known.split()[0] == name and len(numbers) == len(known.split()) - 1:
             try:
-                given = [float(number) for number in numbers]
+                arguments = [float(number) for number in numbers]
             except ValueError:
                 break
-            return kind(*given)
+            return kind(*arguments)
     raise ValueError(f"--surface {' '.join(words)} must be one of: {', '.join(SURFACES)}")
 
 
@@ -154,10 +154,10 @@ def spin_of(options: argparse.Namespace, scene: Scene[Top]) -> float:
 
 def tables(options: argparse.Namespace) -> dict[str, Table]:
     """The table of each arena, first and last crossing of the angle, written to its file."""
-    arenas, found = scenes(options), {}
+    arenas, by_arena = scenes(options), {}
     require_folder(options.out, "--out")
     for name, scene in arenas.items():
-        found[name] = inversion_table(
+        by_arena[name] = inversion_table(
             scene,
             theta=options.theta,
             eta=options.eta if counts_eta(scene) else 0.0,
@@ -168,7 +168,7 @@ def tables(options: argparse.Namespace) -> dict[str, Table]:
             crossing="both",
             path=options.out / f"{name}.h5",
         )
-    return found
+    return by_arena
 
 
 def printed_times(options: argparse.Namespace, eta: float) -> list[str] | None:
@@ -179,7 +179,7 @@ def printed_times(options: argparse.Namespace, eta: float) -> list[str] | None:
     return None
 
 
-def columns(options: argparse.Namespace, found: dict[str, Table]) -> list[tuple[str, list[str]]]:
+def columns(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[tuple[str, list[str]]]:
     """The columns of the report: a heading of two words or more, and an entry for every theta(0)."""
     shown = [("theta(0)|[rad]", [f"{theta:.4g}" for theta in options.theta])]
     places = []
@@ -187,7 +187,7 @@ def columns(options: argparse.Namespace, found: dict[str, Table]) -> list[tuple[
         etas = [(f"eta={eta:.4g}", (slice(None), i)) for i, eta in enumerate(options.eta)]
         places += [(arena, *place) for place in (etas if counts_eta(scene) else [("", (slice(None),))])]
     for arena, place, cells in places:
-        table = found[arena]
+        table = by_arena[arena]
         for crossing, times in (("first", table.first_time), ("last", table.last_time)):
             entries = [_entry(t, word) for t, word in zip(times[cells], table.status[cells], strict=True)]
             shown.append((f"{shown_name(options, arena)} {place}|{crossing} [s]", entries))
@@ -204,9 +204,9 @@ def _entry(seconds: float, word: str) -> str:
     return words.get(word, word)
 
 
-def report(options: argparse.Namespace, found: dict[str, Table]) -> str:
+def report(options: argparse.Namespace, by_arena: dict[str, Table]) -> str:
     """The tables side by side, as text."""
-    shown = columns(options, found)
+    shown = columns(options, by_arena)
     heads = [heading.split("|") for heading, _ in shown]
     widths = [max(len(text) for text in (*head, *entries)) for head, (_, entries) in zip(heads, shown, strict=True)]
     rows = [list(row) for row in zip(*heads, strict=True)]
@@ -253,8 +253,8 @@ def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, Motion
     arenas, times = scenes(options), np.linspace(0.0, t1, SAMPLES)
     tolerance = np.asarray(options.tolerance)
     with Progress(len(arenas), "arena", "compiling what is drawn"), ThreadPoolExecutor(2) as threads:
-        found = threads.map(lambda scene: moving(scene, starts(options, scene)[1], times, tolerance), arenas.values())
-        return times, dict(zip(arenas, found, strict=True))
+        runs = threads.map(lambda scene: moving(scene, starts(options, scene)[1], times, tolerance), arenas.values())
+        return times, dict(zip(arenas, runs, strict=True))
 
 
 def starts(options: argparse.Namespace, scene: Scene[Top]) -> tuple[list[float], Launch]:
@@ -264,14 +264,14 @@ def starts(options: argparse.Namespace, scene: Scene[Top]) -> tuple[list[float],
     return etas, Launch(theta, np.full_like(theta, spin_of(options, scene)), eta, np.zeros_like(theta))
 
 
-def picture(options: argparse.Namespace, found: dict[str, Table]) -> Any:
+def picture(options: argparse.Namespace, by_arena: dict[str, Table]) -> Any:
     """theta(t) of every launch."""
     times, runs = drawn(options, options.t1)
     panels, thetas = [], np.asarray(options.theta)
     for arena, scene in scenes(options).items():
         etas, _ = starts(options, scene)
         shown = np.asarray(runs[arena].theta).reshape(len(etas), len(thetas), -1)
-        ends = found[arena].last_time.reshape(len(thetas), len(etas))
+        ends = by_arena[arena].last_time.reshape(len(thetas), len(etas))
         for i, eta in enumerate(etas):
             name = shown_name(options, arena)
             title = f"{name}, η(0) = {eta:.4g}" if counts_eta(scene) else name
@@ -279,9 +279,9 @@ def picture(options: argparse.Namespace, found: dict[str, Table]) -> Any:
     return draw_launches(panels, options.angle)
 
 
-def motions(options: argparse.Namespace, found: dict[str, Table]) -> list[Stage]:
+def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[Stage]:
     """The most upright launch that turns over while it can be followed, or else the first to turn over, in both arenas."""
-    ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in found.values()]).max(axis=0)
+    ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in by_arena.values()]).max(axis=0)
     # No longer than the spin can be followed from one sample to the next.
     longest = SAMPLES / max(abs(spin_of(options, scene)) for scene in scenes(options).values())
     tilt = np.where(ends + 0.5 <= longest, options.theta, np.inf)
@@ -294,19 +294,19 @@ def motions(options: argparse.Namespace, found: dict[str, Table]) -> list[Stage]
     return stages(groups)
 
 
-def write_page(options: argparse.Namespace, found: dict[str, Table], drawing: Path | None) -> Path:
+def write_page(options: argparse.Namespace, by_arena: dict[str, Table], drawing: Path | None) -> Path:
     """The page of the main job: two tops in motion where three.js is installed, the tables, and the picture if there is one."""
     intro, rows = (
         described(options),
-        [list(row) for row in zip(*(heading.split("|") for heading, _ in columns(options, found)), strict=True)],
+        [list(row) for row in zip(*(heading.split("|") for heading, _ in columns(options, by_arena)), strict=True)],
     )
-    rows += [list(row) for row in zip(*(entries for _, entries in columns(options, found)), strict=True)]
+    rows += [list(row) for row in zip(*(entries for _, entries in columns(options, by_arena)), strict=True)]
     below = "<h2>Inversion times</h2>" + table_as_html(rows, 2)
     below += "".join(f'<p class="note">{escape(line)}</p>' for line in intro)
     below += "" if drawing is None else "<h2>θ(t) of every launch</h2>" + picture_as_html(drawing)
     above = "" if can_view() else f'<p class="note">{NO_VIEW}</p>'
     path = options.out / "index.html"
-    page(motions(options, found) if can_view() else [], "A tippe top turns over", 0.5, above, below).save(path)
+    page(motions(options, by_arena) if can_view() else [], "A tippe top turns over", 0.5, above, below).save(path)
     return path
 
 
@@ -321,21 +321,21 @@ def main(arguments: list[str] | None = None) -> int:
     enable_compilation_cache()
     started = time.perf_counter()
     try:
-        found = tables(options)
-        print(report(options, found))
+        by_arena = tables(options)
+        print(report(options, by_arena))
         with status_line("drawing"):
-            written, drawing = [options.out / f"{arena}.h5" for arena in found], None
+            written, drawing = [options.out / f"{arena}.h5" for arena in by_arena], None
             if find_spec("matplotlib") is None:
                 print("No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr)
             else:
                 drawing = options.out / "theta.png"
-                picture(options, found).savefig(drawing, dpi=130)
+                picture(options, by_arena).savefig(drawing, dpi=130)
                 written.append(drawing)
-            shown = write_page(options, found, drawing)
+            shown = write_page(options, by_arena, drawing)
     except (ValueError, OSError) as error:
         print(f"python -m tippe --paper: {error}", file=sys.stderr)
         return 2
-    cells = sum(table.status.size for table in found.values())
+    cells = sum(table.status.size for table in by_arena.values())
     print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
     print(f"Wrote {', '.join(map(str, written))}.")
     print(f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}")

@@ -132,7 +132,7 @@ def arena_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int
     modes = airborne.modes if modules[0].body.stem is None else airborne_stem.modes
     if modules[0].friction.set_valued:
         modes = stick_slip_modes
-    return (*modes(modules[0], problem, tolerance, last=False, rides=True), state[:, None])
+    return (*modes(modules[0], problem, tolerance, last=False, with_quadratures=True), state[:, None])
 
 
 def simulate_airborne(
@@ -144,9 +144,11 @@ def simulate_airborne(
     solver: diffrax.AbstractSolver | None,
 ) -> ArenaTrajectory:
     """Run one launch of a hybrid scene whose flights are integrated. **Arguments:** as for `simulate`, checked."""
-    kinds, first, state = arena_modes((scene, launch), tolerance)
+    batched_modes, first, state = arena_modes((scene, launch), tolerance)
     exact = scene.friction.set_valued
-    path = solve_hybrid_dense(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1 + exact)
+    path = solve_hybrid_dense(
+        batched_modes, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), counters=1 + exact
+    )
     status = STATUS[path.status]
     if status == Status.JAMMED:
         status = LOSSES[int(loss(scene, jnp.asarray(path.state)))]
@@ -161,6 +163,6 @@ def simulate_airborne(
 
 def sampled_airborne(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:
     """Run one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, checked."""
-    found = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, kinds=1)
+    found = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, counters=1)
     codes = jnp.array([int(status) for status in LOSSES])
     return sampled_flights(ArenaTrajectory, scene, times, found, codes[loss(scene, found.end_state)])

@@ -190,7 +190,7 @@ class InversionRuns(NamedTuple):
         options = {"count": count, "size": size, "last": self.last}
         numbers = (roots, columns, self.slopes_by, self.angle)
         if self.run_kind.modes is not None:
-            options |= {"kinds": len(self.run_kind.counts)}
+            options |= {"counters": len(self.run_kind.counts)}
             along = functools.partial(hybrid_sensitivities_of_cells, self.run_kind.modes, *numbers, **options)
             return self._hybrid_runs(scene, problem, tolerance, count, along)
         if not self.slopes_by:
@@ -234,13 +234,15 @@ class InversionRuns(NamedTuple):
         assert self.run_kind.modes is not None
         modes, first = self.run_kind.modes(scene, problem, tolerance, last)
         start, settings = (np.asarray(first), np.asarray(problem.states)), self.settings(tolerance)
-        return solve_hybrid(modes, *start, self.t1, count, settings, kinds=len(self.run_kind.counts), passes=last)
+        return solve_hybrid(
+            modes, *start, self.t1, count, settings, counters=len(self.run_kind.counts), nonterminal=last
+        )
 
     def _outcome(self, problem: InversionProblem, tolerance: float, count: int) -> Outcome:
         horizon, settings = jnp.asarray(self.t1), self.settings(tolerance)
         if self.method == "diffrax":
             return solve_by_diffrax(problem, horizon, settings)
-        return solve_ensemble(problem, horizon, jnp.asarray(count), settings, passes=self.last)[0]
+        return solve_ensemble(problem, horizon, jnp.asarray(count), settings, nonterminal=self.last)[0]
 
     def _ended(self, scene: Scene, problem: InversionProblem, outcome: Outcome) -> dict[str, Any]:
         """The variables of cells whose runs are one smooth motion."""

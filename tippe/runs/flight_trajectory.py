@@ -132,11 +132,11 @@ class HybridTrajectory(AbstractTrajectory):
 
     def resampled(self, times: Float[np.ndarray, " times"]) -> "HybridTrajectory":
         """The same run at other times, which are not checked."""
-        found = (times, *self.parts_of(self.dense.at(times)), self.touching(self.dense.numbers(times)))
+        arrays = (times, *self.parts_of(self.dense.at(times)), self.touching(self.dense.numbers(times)))
         return eqx.tree_at(
-            lambda one: (one.t, one.states, one.cyclic, one.spin_angle, one.work, one.distance, one.contact),
+            lambda run: (run.t, run.states, run.cyclic, run.spin_angle, run.work, run.distance, run.contact),
             self,
-            found,
+            arrays,
         )
 
     @staticmethod
@@ -169,7 +169,7 @@ def level_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int
     # The place is that of the centre of mass.
     state = state.at[8:10].add(-scene.body.offset * state[2:4])
     problem = InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
-    return (*modes(scene, problem, tolerance, last=False, rides=True), state[:, None])
+    return (*modes(scene, problem, tolerance, last=False, with_quadratures=True), state[:, None])
 
 
 def simulate_hybrid(
@@ -181,30 +181,31 @@ def simulate_hybrid(
     solver: diffrax.AbstractSolver | None,
 ) -> HybridTrajectory:
     """Run one launch of a hybrid scene until `t1`. **Arguments:** as for `simulate`, checked."""
-    kinds, first, state = level_modes((scene, launch), tolerance)
-    path = solve_hybrid_dense(kinds, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), kinds=1)
-    hops = np.array([(one.begin, one.end) for one in path.segments if one.number == BETWEEN]).reshape(-1, 2)
+    batched_modes, first, state = level_modes((scene, launch), tolerance)
+    path = solve_hybrid_dense(batched_modes, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), counters=1)
+    flights = [(segment.begin, segment.end) for segment in path.segments if segment.number == BETWEEN]
+    hops = np.array(flights).reshape(-1, 2)
     return flights_of(HybridTrajectory, scene, path, STATUS[path.status].word, hops, times, tolerance)
 
 
 def sampled_hybrid(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
     """Run one launch of a hybrid scene inside a transformation. **Arguments:** as for `simulate`, checked."""
-    found = hybrid_samples(level_modes, (scene, launch), times, t1, settings, kinds=1)
-    return sampled_flights(HybridTrajectory, scene, times, found, jnp.asarray(int(Status.JAMMED)))
+    samples = hybrid_samples(level_modes, (scene, launch), times, t1, settings, counters=1)
+    return sampled_flights(HybridTrajectory, scene, times, samples, jnp.asarray(int(Status.JAMMED)))
 
 
 def sampled_flights(
-    kind: type[HybridTrajectory], scene: Scene[Top], times: Any, found: HybridSamples, lost: Int[Array, ""]
+    kind: type[HybridTrajectory], scene: Scene[Top], times: Any, samples: HybridSamples, lost: Int[Array, ""]
 ) -> Any:
     """A trajectory of some kind from samples; `lost` is the code of how a run ended that left its domain."""
-    states, place, spin_angle, work, distance = kind.parts_of(found.shown)
+    states, place, spin_angle, work, distance = kind.parts_of(samples.shown)
     # After the end no sphere touches.
-    number = jnp.where(jnp.isnan(found.number), BETWEEN, found.number).astype(int)
+    number = jnp.where(jnp.isnan(samples.number), BETWEEN, samples.number).astype(int)
     ended = {code: jnp.asarray(int(status)) for code, status in STATUS.items()} | {LEFT_DOMAIN: lost}
-    status = sum(jnp.where(found.status == code, index, 0) for code, index in ended.items())
-    stats = {"accepted": found.steps - found.rejected, "rejected": found.rejected, "hops": found.counts[0]}
+    status = sum(jnp.where(samples.status == code, index, 0) for code, index in ended.items())
+    stats = {"accepted": samples.steps - samples.rejected, "rejected": samples.rejected, "hops": samples.counts[0]}
     stats = {name: count.astype(int) for name, count in stats.items()}
-    ends = (status, found.end_time, stats, None, distance, kind.touching(number), None)
+    ends = (status, samples.end_time, stats, None, distance, kind.touching(number), None)
     return kind(times, scene, states, place, spin_angle, work, *ends)
 
 
@@ -225,7 +226,7 @@ def flights_of(
     states, place, spin_angle, work, distance = kind.parts_of(path.at(shown))
     ends = (status, path.end_time, {}, path, distance, kind.touching(path.numbers(shown)), hops)
     run = kind(shown, scene, states, place, spin_angle, work, *ends)
-    in_contact = sum(kind.work_in(one) for one in path.segments)
+    in_contact = sum(kind.work_in(segment) for segment in path.segments)
     # What is left of the work is that of the impacts.
     run = run.with_stats(path, impact_loss=float(in_contact - path.state[-1]))
     size = float(np.max(np.abs(run.energy))) + float(scene.body.mass * scene.gravity * scene.body.radius)

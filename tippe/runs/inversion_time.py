@@ -168,7 +168,7 @@ class InversionSolve(AbstractDifferentiableSolve):
             t1,
             jnp.asarray(cells),
             Settings(tolerance, self.solver),
-            passes=self.last,
+            nonterminal=self.last,
             one_kernel=True,
         )
         time = jnp.where(is_inverted(outcome, problem, self.last), outcome.crossing_time, jnp.inf)
@@ -186,7 +186,7 @@ class InversionSolve(AbstractDifferentiableSolve):
             t1,
             jnp.asarray(cells),
             Settings(tolerance, self.solver),
-            passes=self.last,
+            nonterminal=self.last,
             one_kernel=not again,
         )
         inverted, good = is_inverted(outcome, problem, self.last), may & (outcome.status != FAILED)
@@ -222,8 +222,10 @@ class HybridInversionSolve(InversionSolve):
         def run(some: tuple[Any, ...]) -> tuple[tuple[HybridOutcome, Array], list[Float[Array, " cells"]]]:
             moved = tuple((one[0], one[2].states) for one in some)
             given = (modes, moved, first, problem.states, t1, settings)
-            kinds = len(run_kind_of(scene).counts)
-            hybrid_outcome, found = traced_solve_hybrid_with_tangents(*given, kinds=kinds, ends_on_event=not self.last)
+            counters = len(run_kind_of(scene).counts)
+            hybrid_outcome, found = traced_solve_hybrid_with_tangents(
+                *given, counters=counters, ends_on_event=not self.last
+            )
             return (hybrid_outcome, found.grazing), list(found.slopes)
 
         (hybrid_outcome, grazing), slopes = in_groups(run, tangents)
@@ -252,8 +254,8 @@ class HybridInversionSolve(InversionSolve):
         tolerance: Float[Array, ""],
     ) -> HybridOutcome:
         """The hybrid runs of cells."""
-        settings, kinds = Settings(tolerance, self.solver), len(run_kind_of(scene).counts)
-        return traced_solve_hybrid(modes, first, problem.states, t1, settings, kinds=kinds, passes=self.last)
+        settings, counters = Settings(tolerance, self.solver), len(run_kind_of(scene).counts)
+        return traced_solve_hybrid(modes, first, problem.states, t1, settings, counters=counters, nonterminal=self.last)
 
     def named(
         self, may: Bool[Array, "..."], ended: HybridOutcome, problem: InversionProblem, scene: Scene

@@ -27,11 +27,11 @@ def ended(
 
 
 class Found(NamedTuple):
-    """What is found of a run: `states`, and as `riding` what else a `TrajectoryProblem` carries, are NaN after the end;
+    """What is found of a run: `states`, and as `quadratures` what else a `TrajectoryProblem` carries, are NaN after the end;
     `status` is a `Status`, a float."""
 
     states: Float[Array, "components times"]
-    riding: Float[Array, "riders times"]
+    quadratures: Float[Array, "quadratures times"]
     end_time: Float[Array, ""]
     status: Float[Array, ""]
     accepted: Float[Array, ""]
@@ -56,5 +56,5 @@ def sampled(
     else:
         found = sampled_run_by_diffrax(run, times, t1, settings, adjoint)
     status = ended(run, found.end_state, found.status == LEFT_DOMAIN, found.status == FAILED)
-    assert found.riding is not None
-    return Found(found.states.T, found.riding.T, found.end_time, status, found.accepted, found.rejected)
+    assert found.quadratures is not None
+    return Found(found.states.T, found.quadratures.T, found.end_time, status, found.accepted, found.rejected)

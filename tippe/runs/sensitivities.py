@@ -85,7 +85,7 @@ def sensitivities_of_cells(
         jnp.asarray(t1, float),
         jnp.asarray(count),
         settings,
-        passes=last,
+        nonterminal=last,
     )
     inverted = is_inverted(outcome, problem, last)
     found = [np.where(inverted, slope / moved, 0.0) for slope, moved in zip(slopes, sizes, strict=True)]
@@ -117,7 +117,7 @@ def hybrid_sensitivities_of_cells(
     count: int,
     size: int,
     last: bool,
-    kinds: int,
+    counters: int,
 ) -> tuple[HybridOutcome, dict[str, Any], Bool[np.ndarray, " size"]]:
     """`sensitivities_of_cells` for hybrid runs.
 
@@ -125,7 +125,7 @@ def hybrid_sensitivities_of_cells(
 
     - `modes_of`: returns the modes, as in `RunKind`.
     - `t1`: horizon [s]; where the `last` crossing counts, its time in every cell, at which the runs end.
-    - `kinds`: number of counters.
+    - `counters`: number of counters.
 
     **Returns:** the `HybridOutcome`; name of the variable -> derivatives (size,); and where these have no correct
     digits, because an event on the way was grazing. Source: saltation at every change of mode
@@ -136,7 +136,7 @@ def hybrid_sensitivities_of_cells(
     (modes, first, states), tangents, sizes = built
     tangents = tuple((one[0], one[2]) for one in tangents)
     given = (tangents, np.asarray(first), np.asarray(states), t1, count, settings)
-    hybrid_outcome, found = solve_hybrid_with_tangents(modes, *given, kinds=kinds, ends_on_event=not last)
+    hybrid_outcome, found = solve_hybrid_with_tangents(modes, *given, counters=counters, ends_on_event=not last)
     slopes = [slope / np.asarray(moved) for slope, moved in zip(found.slopes, sizes, strict=True)]
     return hybrid_outcome, dict(zip(sensitivity_columns(names), slopes, strict=True)), found.grazing
 

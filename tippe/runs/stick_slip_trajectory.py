@@ -18,4 +18,4 @@ def solve_stick_slip_dense(run: TrajectoryProblem, t1: float, settings: Settings
     **Returns:** a `HybridPath`, whose counts tell how often slipping has turned into rolling.
     """
     both, first, state = contact_modes(run, settings.tolerance)
-    return solve_hybrid_dense(both, int(first[0]), state[:, 0], t1, settings, kinds=1)
+    return solve_hybrid_dense(both, int(first[0]), state[:, 0], t1, settings, counters=1)

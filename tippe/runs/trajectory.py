@@ -112,8 +112,8 @@ class Trajectory(AbstractTrajectory):
 
     def resampled(self, times: Float[np.ndarray, " times"]) -> "Trajectory":
         """The same run at other times, which are not checked."""
-        found = on_device(times, *_parts(len(self.states), self.dense.at(times)))
-        return eqx.tree_at(lambda one: (one.t, one.states, one.cyclic, one.spin_angle, one.work), self, found)
+        arrays = on_device(times, *_parts(len(self.states), self.dense.at(times)))
+        return eqx.tree_at(lambda run: (run.t, run.states, run.cyclic, run.spin_angle, run.work), self, arrays)
 
 
 @status_line("simulating")
@@ -212,9 +212,9 @@ def _legal_or_nan(
     if adjoint is not None:
         # Diffrax would differentiate the run of no length.
         scene, launch = nan_unless(may, (scene, launch))
-    found = _traced(scene, launch, times, t1, tolerance, solver, adjoint)
-    status = jnp.where(may, found.status, int(Status.ILLEGAL))
-    return eqx.tree_at(lambda one: (one.t, one.status), nan_unless(may, found), (times, status))
+    trajectory = _traced(scene, launch, times, t1, tolerance, solver, adjoint)
+    status = jnp.where(may, trajectory.status, int(Status.ILLEGAL))
+    return eqx.tree_at(lambda run: (run.t, run.status), nan_unless(may, trajectory), (times, status))
 
 
 def _traced(
@@ -238,11 +238,11 @@ def _traced(
             raise ValueError(f"adjoint = {adjoint!r} must be left out for contact = 'hybrid'")
         explicit_tableau(settings.for_lanes)
         return (sampled_hybrid if scene.flies_in_closed_form else sampled_airborne)(scene, launch, times, t1, settings)
-    found = sampled(scene, launch, times, t1, settings, adjoint)
-    status = found.status.astype(int)
-    stats = {"accepted": found.accepted.astype(int), "rejected": found.rejected.astype(int)}
-    riding = (found.riding[:-2], found.riding[-2], found.riding[-1])
-    return Trajectory(times, scene, found.states, *riding, status, found.end_time, stats, None)
+    samples = sampled(scene, launch, times, t1, settings, adjoint)
+    status = samples.status.astype(int)
+    stats = {"accepted": samples.accepted.astype(int), "rejected": samples.rejected.astype(int)}
+    quadratures = (samples.quadratures[:-2], samples.quadratures[-2], samples.quadratures[-1])
+    return Trajectory(times, scene, samples.states, *quadratures, status, samples.end_time, stats, None)
 
 
 def _parts(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:

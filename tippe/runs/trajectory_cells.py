@@ -47,11 +47,11 @@ def _read(
     name: str,
 ) -> Float[Array, "cells times ..."]:
     """A quantity at every sample, not a number after the end of a run."""
-    riders = len(run.state) + len(run.cyclic) - samples.shape[-1]
+    quadratures = len(run.state) + len(run.cyclic) - samples.shape[-1]
 
     def one(scene: Scene, states: Float[Array, "times components"]) -> Float[Array, "times ..."]:
         nothing = jnp.zeros(len(times))
-        state, cyclic = jnp.split(jnp.pad(states.T, ((0, riders), (0, 0))), [len(run.state)])
+        state, cyclic = jnp.split(jnp.pad(states.T, ((0, quadratures), (0, 0))), [len(run.state)])
         values = getattr(Trajectory(times, scene, state, cyclic, nothing, nothing, None, times[-1], {}, None), name)
         # What does not depend on the state would be a number after the end too.
         there = jnp.isfinite(states[:, 0]).reshape(-1, *[1] * (values.ndim - 1))

@@ -51,7 +51,7 @@ class Simulator(NamedTuple):
     def begin(self, values: Numbers) -> LaneScheduler:
         """The run that the sliders' numbers say, at its start."""
         t1, cells = jnp.asarray(self.t1), jnp.asarray(1)
-        return LaneScheduler.of(self.problem(values), t1, cells, self.settings, passes=self.passes)
+        return LaneScheduler.of(self.problem(values), t1, cells, self.settings, nonterminal=self.passes)
 
     def read(self, name: str, values: Numbers) -> Any:
         """A reading at the start of a run."""

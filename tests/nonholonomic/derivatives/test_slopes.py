@@ -82,9 +82,9 @@ def found_and_expected(names=MANY, patience=1e3, heights=HEIGHTS, cells=100, **o
         (("growth",), True, diffrax.Tsit5()),
     ],
 )
-def test_the_slopes_are_those_of_the_closed_form(names, passes, solver):
+def test_the_slopes_are_those_of_the_closed_form(names, nonterminal, solver):
     """For a field that depends on time, more cells than lanes, methods whose last stage is and is not their end."""
-    outcome, found, expected = found_and_expected(names, solver=solver, passes=passes)
+    outcome, found, expected = found_and_expected(names, solver=solver, nonterminal=nonterminal)
     assert_close(outcome.crossing_time, time_of_decay(RATES, HEIGHTS, 0.7), rtol=1e-9)
     for one, other in zip(found, expected, strict=True):
         assert_close(one, other, rtol=1e-7)

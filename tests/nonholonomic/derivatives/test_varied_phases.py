@@ -104,7 +104,7 @@ def balls():
 def test_a_bouncing_ball(balls):
     """By the height, gravity, the restitution and the level, through five impacts and what follows each."""
     given, times, expected = balls
-    hybrid_outcome, found = solve_hybrid_with_tangents(*given, 50.0, CELLS, settings_of(1e-10), kinds=1)
+    hybrid_outcome, found = solve_hybrid_with_tangents(*given, 50.0, CELLS, settings_of(1e-10), counters=1)
     assert (hybrid_outcome.status == CROSSED).all()
     assert (hybrid_outcome.counts == 5).all()
     assert not found.grazing.any()
@@ -121,7 +121,7 @@ def test_a_bouncing_ball_inside_a_transformation(balls):
         settings = settings_of(1e-10)
         first = jnp.asarray(first)
         return traced_solve_hybrid_with_tangents(
-            modes, directions, first, states, times, settings, kinds=1, ends_on_event=False
+            modes, directions, first, states, times, settings, counters=1, ends_on_event=False
         )
 
     hybrid_outcome, found = run(*given, times)
@@ -180,7 +180,7 @@ def test_a_grazing_event_is_seen():
     @eqx.filter_jit
     def run(modes, directions, first, states):
         return traced_solve_hybrid_with_tangents(
-            modes, directions, first, states, jnp.asarray(9.0), settings_of(tolerance), kinds=1
+            modes, directions, first, states, jnp.asarray(9.0), settings_of(tolerance), counters=1
         )
 
     hybrid_outcome, found = jax.tree.map(np.asarray, run(modes, directions, first, states))

@@ -100,7 +100,7 @@ def test_the_horizon_is_met_exactly():
 def test_the_last_crossing_of_many():
     """Passing through: x falls below 1/2 at (2 pi k + pi/3)/w; the last time before t1 counts."""
     frequency = np.array([0.7, 1.3, 5.0])
-    outcome, _ = run(frequency, passes=True, t1=20.0)
+    outcome, _ = run(frequency, nonterminal=True, t1=20.0)
     turns = np.floor((20.0 * frequency - math.pi / 3.0) / (2.0 * math.pi))
     assert_close(outcome.crossing_time, (2.0 * math.pi * turns + math.pi / 3.0) / frequency, rtol=1e-9)
     assert_close(outcome.state[0], np.cos(20.0 * frequency), atol=1e-7)
@@ -213,7 +213,7 @@ def test_locating_an_event_adds_no_error_of_its_own(solver):
     for tolerance in (1e-6, 1e-8, 1e-10):
         settings = Settings(tolerance, solver, absolute=1.0, lanes=1)
         located, _ = solve_ensemble(Growing(), jnp.asarray(20.0), jnp.asarray(1), settings)
-        reached, _ = solve_ensemble(Growing(), jnp.asarray(exact), jnp.asarray(1), settings, passes=True)
+        reached, _ = solve_ensemble(Growing(), jnp.asarray(exact), jnp.asarray(1), settings, nonterminal=True)
         error, state_error = float(located.crossing_time[0]) - exact, float(reached.state[0, 0]) + 2.0
         assert_close(error, -state_error / slope, rtol=0.2, atol=1e-11)
 

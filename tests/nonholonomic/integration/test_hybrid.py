@@ -139,12 +139,12 @@ def table(t1, bounces, most_rounds=200):
     modes = (Fall(jnp.asarray(padded(RESTITUTIONS)), jnp.asarray(padded(bounces), float)), Rest())
     state = np.stack([heights, 0.0 * heights, 0.0 * heights])
     start = np.full(CELLS + PADDING, FALLING)
-    return solve_hybrid(modes, start, state, t1, CELLS, SETTINGS, kinds=1, most_rounds=most_rounds)
+    return solve_hybrid(modes, start, state, t1, CELLS, SETTINGS, counters=1, most_rounds=most_rounds)
 
 
 def single(ball, t1, bounces=np.inf):
     modes = (Fall(jnp.array([ball.restitution]), jnp.array([float(bounces)])), Rest())
-    return solve_hybrid_dense(modes, FALLING, jnp.array([ball.height, 0.0, 0.0]), t1, SETTINGS, kinds=1)
+    return solve_hybrid_dense(modes, FALLING, jnp.array([ball.height, 0.0, 0.0]), t1, SETTINGS, counters=1)
 
 
 def test_the_times_of_bounces_of_many_balls():
