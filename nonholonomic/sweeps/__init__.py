@@ -1,7 +1,7 @@
-"""Grids of named axes, cut into blocks that run wherever there is room, and the labelled tables and files they end in.
+"""Grids of named axes, cut into chunks that run wherever there is room, and the labelled tables and files they end in.
 
-`sweep` computes a grid and returns a `Table`; with a file it writes every block as it finishes, and an
-interrupted sweep goes on from there. Any executor may compute the blocks; `local_processes` is one.
+`sweep` computes a grid and returns a `Table`; with a file it writes every chunk as it finishes, and an
+interrupted sweep goes on from there. Any executor may compute the chunks; `local_processes` is one.
 """
 
 from .grid import Axis as Axis

@@ -1,4 +1,4 @@
-"""The blocks of a table that is being computed: a file each, in a folder beside its own; a sweep that was killed goes on."""
+"""The chunks of a table that is being computed: a file each, in a folder beside its own; a sweep that was killed goes on."""
 
 import contextlib
 import json
@@ -22,21 +22,21 @@ from .layout import Layout, Values
 
 
 def folder_of(path: Path) -> Path:
-    """Where the blocks of a table's file are while it is computed."""
+    """Where the chunks of a table's file are while it is computed."""
     return path.with_name(path.name + ".blocks")
 
 
 class ChunkStore:
-    """The finished blocks of a table's file.
+    """The finished chunks of a table's file.
 
     Each is complete and on the disk before it is counted, whenever the process dies, and whenever the machine does, as far as
     its disk keeps what it confirms.
 
-    `finished`: the numbers of the blocks that were found when the sweep began.
+    `finished`: the numbers of the chunks that were found when the sweep began.
     """
 
     def __init__(self, path: Any, layout: Layout):
-        """Find the blocks of an earlier run of the same request, or make room for new ones.
+        """Find the chunks of an earlier run of the same request, or make room for new ones.
 
         **Raises:** `OSError` that names the path if it cannot be read or written; `ValueError` that names the first
         difference if it holds the result of another request or of another version of this package.
@@ -89,7 +89,7 @@ class ChunkStore:
 
     def _begin(self, header: Path) -> None:
         """Make the folder, and say in it what it is for."""
-        # The blocks are there until the table's file is, too.
+        # The chunks are there until the table's file is, too.
         need = 2 * self.layout.bytes_of_cells(self.layout.cells)
         try:
             room = shutil.disk_usage(self.path.parent).free
@@ -128,11 +128,11 @@ class ChunkStore:
             warnings.warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning, stacklevel=7)
 
     def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Stored:
-        """Store the blocks that are computed, each as it comes, and make the table's file of these and those there were.
+        """Store the chunks that are computed, each as it comes, and make the table's file of these and those there were.
 
-        What goes into the file while blocks are computed need not be read again at the end.
+        What goes into the file while chunks are computed need not be read again at the end.
 
-        **Raises:** `OSError` that names the path if it cannot be written, or a block that is damaged; no block is lost.
+        **Raises:** `OSError` that names the path if it cannot be written, or a chunk that is damaged; no chunk is lost.
         """
         if not self._whole:
             write_file(self.path, self.layout, self._all(computed), self.folder)
@@ -150,9 +150,9 @@ class ChunkStore:
             yield chunk, kept
 
     def write(self, chunk: int, values: dict[str, Values]) -> None:
-        """Store a block.
+        """Store a chunk.
 
-        **Raises:** `OSError` that names the path if that fails; no block is then finished but those that were.
+        **Raises:** `OSError` that names the path if that fails; no chunk is then finished but those that were.
         """
         kinds = self.layout.kinds
         with replacing(self.folder / f"{chunk}.npz") as scratch, scratch.open("wb") as stream:
@@ -209,7 +209,7 @@ def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
 
     **Returns:** its layout, and its variables with all cells along the first axis.
 
-    **Raises:** `OSError` that names the path if a block is damaged.
+    **Raises:** `OSError` that names the path if a chunk is damaged.
     """
     folder = folder_of(path)
     if path.exists() or not (folder / "table.h5").exists():
@@ -232,7 +232,7 @@ def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
 
 
 def read_chunk(folder: Path, layout: Layout, chunk: int) -> dict[str, Values] | None:
-    """The variables of a block; `None` if they are not those that were written, by the checksums of the archive."""
+    """The variables of a chunk; `None` if they are not those that were written, by the checksums of the archive."""
     try:
         # NumPy does not close a file that it cannot read.
         with (folder / f"{chunk}.npz").open("rb") as file, np.load(file, allow_pickle=False) as archive:

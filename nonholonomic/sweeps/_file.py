@@ -2,7 +2,7 @@
 
 Words, such as a cell's status, are stored as bytes with the attributes `flag_values` and `flag_meanings` (CF conventions).
 Every number is under a checksum: HDF5 has one for all that describes the arrays, and the group `checksums`, which xarray does
-not show, one for each block of each variable. A file appears when it is complete, or not at all.
+not show, one for each chunk of each variable. A file appears when it is complete, or not at all.
 """
 
 import contextlib
@@ -56,7 +56,7 @@ def replacing(path: Path, beside: Path | None = None) -> Iterator[Path]:
     except BaseException as error:
         with contextlib.suppress(OSError):
             scratch.unlink()
-        # Errors that were raised while reading the blocks keep their own message.
+        # Errors that were raised while reading the chunks keep their own message.
         if isinstance(error, OSError) and error.strerror:
             raise OSError(f"cannot write {path}: {error.strerror}") from None
         raise
@@ -77,7 +77,7 @@ def write_file(
 ) -> None:
     """Write a table, all at once or not at all; a file that exists is replaced.
 
-    **Arguments:** `blocks`: the number of a block and its cells by variable, in any order; with none of them the file says what
+    **Arguments:** `chunks`: the number of a chunk and its cells by variable, in any order; with none of them the file says what
     there will be. `beside`: as for `replacing`.
 
     **Raises:** `OSError` that names the path if it cannot be written.
@@ -250,7 +250,7 @@ class Stored:
         return values
 
     def chunk(self, chunk: int) -> dict[str, Values] | None:
-        """The variables of one block; `None` if its numbers are not those that were written."""
+        """The variables of one chunk; `None` if its numbers are not those that were written."""
         first, end = self.layout.ends(chunk)
         found = {}
         with self._opened() as file:

@@ -1,4 +1,4 @@
-"""Blocks are handed to an executor as its workers become free, and again where a worker died."""
+"""Chunks are handed to an executor as its workers become free, and again where a worker died."""
 
 import itertools
 import sys
@@ -8,7 +8,7 @@ from concurrent.futures import BrokenExecutor, CancelledError, Future
 from queue import SimpleQueue
 from typing import Any
 
-#: A block is given up once it has killed this many workers, the last of them when it was the only block handed out.
+#: A chunk is given up once it has killed this many workers, the last of them when it was the only chunk handed out.
 MAX_CRASHES = 3
 
 
@@ -17,15 +17,15 @@ class ExecutorBroken(Exception):
 
 
 def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], most: int) -> Iterator[tuple[int, Any]]:
-    """Have blocks computed, each as soon as there is room.
+    """Have chunks computed, each as soon as there is room.
 
-    After an exception, Ctrl-C included, no further block starts.
+    After an exception, Ctrl-C included, no further chunk starts.
 
-    **Arguments:** `submit`: hands out a block; `chunks`: their numbers; `most`: how many may be handed out at once.
+    **Arguments:** `submit`: hands out a chunk; `chunks`: their numbers; `most`: how many may be handed out at once.
 
     **Returns:** the number and the results of each as it finishes; `None` for one that `MAX_CRASHES` workers died of.
 
-    **Raises:** `ExecutorBroken` if the executor is gone; what a block itself raised.
+    **Raises:** `ExecutorBroken` if the executor is gone; what a chunk itself raised.
     """
     finished: SimpleQueue[tuple[int, Future]] = SimpleQueue()
     out: set[Future] = set()
@@ -66,7 +66,7 @@ def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], most: int
             if died and crashes[chunk] < MAX_CRASHES - 1:
                 hand_out(chunk)
             elif died and not was_last_try:
-                # Where an executor cannot tell of which block a worker died, all that were with it are accused. So the last
+                # Where an executor cannot tell of which chunk a worker died, all that were with it are accused. So the last
                 # try is made at the end, with each alone.
                 suspects.append(chunk)
             hand_out_more()
@@ -78,10 +78,10 @@ def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], most: int
 
 
 def crashes_reported_by(error: Any) -> int:
-    """How many workers have died of a block, according to what its future raised."""
+    """How many workers have died of a chunk, according to what its future raised."""
     if isinstance(error, BrokenExecutor):
         return 1
-    # Dask has handed the block to others before it says so.
+    # Dask has handed the chunk to others before it says so.
     distributed = sys.modules.get("distributed")
     if distributed is not None and isinstance(error, distributed.KilledWorker):
         return 1 + error.allowed_failures

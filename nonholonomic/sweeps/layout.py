@@ -1,4 +1,4 @@
-"""What a table is made of besides its numbers, and how its cells are cut into blocks."""
+"""What a table is made of besides its numbers, and how its cells are cut into chunks."""
 
 import math
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ PENDING, UNREACHED = -1, "pending"
 class Layout(NamedTuple):
     """A table without its numbers.
 
-    `kinds`: variable -> dtype; `block`: how many cells a block has, all but the last; the rest is as in `Table`.
+    `kinds`: variable -> dtype; `chunk`: how many cells a chunk has, all but the last; the rest is as in `Table`.
     """
 
     coords: dict[str, Values]
@@ -44,15 +44,15 @@ class Layout(NamedTuple):
 
     @property
     def chunks(self) -> int:
-        """How many blocks it is cut into."""
+        """How many chunks it is cut into."""
         return -(-self.cells // self.chunk)
 
     def ends(self, chunk: int) -> tuple[int, int]:
-        """The first cell of a block, and the one after its last."""
+        """The first cell of a chunk, and the one after its last."""
         return chunk * self.chunk, min((chunk + 1) * self.chunk, self.cells)
 
     def size(self, chunk: int) -> int:
-        """How many cells a block has."""
+        """How many cells a chunk has."""
         first, end = self.ends(chunk)
         return end - first
 

@@ -1,4 +1,4 @@
-"""Processes on this machine, each with its own cores, to compute the blocks of a sweep."""
+"""Processes on this machine, each with its own cores, to compute the chunks of a sweep."""
 
 import contextlib
 import multiprocessing
@@ -21,7 +21,7 @@ def local_processes(n: int, threads: int = 1) -> Iterator[Executor]:
     """Processes for `executor=`, which compute on this machine's processor.
 
     Each has its own cores, and the parent's store of compiled programs if there is one, before it imports JAX. They start as
-    blocks come. One that dies is replaced, and its block is tried in another; they end with the context, or with the
+    chunks come. One that dies is replaced, and its chunk is tried in another; they end with the context, or with the
     parent, however that ends. As for any process started by Python's `multiprocessing`, a script that makes them must have its
     own calls under `if __name__ == "__main__":`.
 

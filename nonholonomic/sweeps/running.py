@@ -1,4 +1,4 @@
-"""A grid is cut into blocks, which are computed wherever there is room, stored as they finish, and end up in a table."""
+"""A grid is cut into chunks, which are computed wherever there is room, stored as they finish, and end up in a table."""
 
 import contextlib
 import functools
@@ -25,10 +25,10 @@ from .layout import Layout, Values
 from .table import Table
 from .tasks import ChunkTask, Job, packed, remote_results, stamp, versions
 
-#: The most blocks that are handed out at once: their results are held in memory until they are stored.
+#: The most chunks that are handed out at once: their results are held in memory until they are stored.
 HANDED_OUT = 512
 
-#: About how many blocks a large grid is cut into, and what the results of one may take [bytes].
+#: About how many chunks a large grid is cut into, and what the results of one may take [bytes].
 CHUNKS, MOST_BYTES = 1024, 1 << 21
 
 
@@ -55,7 +55,7 @@ def sweep(
     - `axes`: the grid, the last axis varying fastest.
     - `variables`: what `job` returns.
     - `request`: plain data that says what is computed; it is stored in the table and guards the file.
-    - `path`: file to write, block by block; if it holds part of the same request, only the rest is computed.
+    - `path`: file to write, chunk by chunk; if it holds part of the same request, only the rest is computed.
     - `chunk`: how many cells `job` is given at once, by default `chunk_for` the number of cells; `most`: an upper limit
       to it, where results are large.
     - `inner`: the coordinates of the dimensions that results have besides the grid's, numbers or words.
@@ -97,7 +97,7 @@ def sweep(
 def computed(
     work: ChunkTask, layout: Layout, finished: set[int], executor: Executor | None, progress: bool
 ) -> Iterator[tuple[int, dict[str, Values]]]:
-    """The blocks that are not finished, each as it is computed; see `sweep`."""
+    """The chunks that are not finished, each as it is computed; see `sweep`."""
     todo = [chunk for chunk in range(layout.chunks) if chunk not in finished]
     done = layout.cells - sum(map(layout.size, todo))
     with Progress(layout.cells, "cell", shown=progress) as shown, workforce(work, executor) as submit:
@@ -144,7 +144,7 @@ def layout_of(
 
 
 class Held:
-    """The blocks of a table that is not to be stored: the same as `ChunkStore`, in memory."""
+    """The chunks of a table that is not to be stored: the same as `ChunkStore`, in memory."""
 
     def __init__(self, layout: Layout):
         """State what the table is made of.
@@ -161,7 +161,7 @@ class Held:
         self._layout, self._found = layout, layout.empty(layout.cells)
 
     def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> dict[str, Values]:
-        """Keep the blocks that are computed; the variables, with all cells along the first axis."""
+        """Keep the chunks that are computed; the variables, with all cells along the first axis."""
         for chunk, values in computed:
             first, end = self._layout.ends(chunk)
             for name, values_of_chunk in values.items():
@@ -205,7 +205,7 @@ def workforce(work: ChunkTask, executor: Executor | None) -> Iterator[Callable[[
 
 
 def failed_chunk(axes: list[Axis], layout: Layout, chunk: int) -> dict[str, Values]:
-    """The results of a block that is given up: `failed`, and no numbers; a warning names its cells."""
+    """The results of a chunk that is given up: `failed`, and no numbers; a warning names its cells."""
     first, end = layout.ends(chunk)
     ends = [columns(axes, cell, 1) for cell in (first, end - 1)]
     named = ", ".join(f"{name} {ends[0][name].item():.6g} to {ends[1][name].item():.6g}" for name in ends[0])
@@ -219,18 +219,18 @@ def failed_chunk(axes: list[Axis], layout: Layout, chunk: int) -> dict[str, Valu
 
 
 def chunk_for(cells: int) -> int:
-    """Cells in a block: few different sizes, so that few programs are compiled, but many blocks, to be shared among cores.
+    """Cells in a chunk: few different sizes, so that few programs are compiled, but many chunks, to be shared among cores.
 
     It does not depend on the number of cores, so that a file can be resumed on another machine.
     """
     if jax.default_backend() != "cpu":
         return 65536 if cells > 4096 else 4096
-    # A block of 64 lanes takes no longer for two cells than one of two lanes does: starting its loops is what takes the time.
+    # An ensemble of 64 lanes takes no longer for two cells than one of two lanes: most of the time is spent starting loops.
     return 64 if cells <= 64 else 128 if cells <= 4096 else 512
 
 
 def chunks_together(layout: Layout, chunk: int) -> int:
-    """How many blocks are handed out and stored as one, a power of two: more than one where the grid is large."""
+    """How many chunks are handed out and stored as one, a power of two: more than one where the grid is large."""
     wanted = min(layout.cells // (CHUNKS * chunk), MOST_BYTES // layout.bytes_of_cells(chunk))
     return 1 << max(wanted, 1).bit_length() - 1
 
@@ -244,7 +244,7 @@ def memory() -> float:
 
 
 def workers() -> int:
-    """How many blocks run at once in this process: one for each core it may use; an accelerator takes one at a time."""
+    """How many chunks run at once in this process: one for each core it may use; an accelerator takes one at a time."""
     if jax.default_backend() != "cpu":
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

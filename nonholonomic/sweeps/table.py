@@ -17,7 +17,7 @@ from .digits import concise_strings
 from .layout import UNREACHED, Layout, Values, axes_of
 
 #: Cells under one checksum in the file of a table that is saved.
-BLOCK = 1 << 15
+CHUNK = 1 << 15
 
 
 class Table(eqx.Module):
@@ -184,7 +184,7 @@ class Table(eqx.Module):
             if stored[name].dtype.kind == "U":
                 stored[name], words[name] = coded(stored[name], self.words.get(name, ()))
         kinds = {name: values.dtype for name, values in stored.items()}
-        layout = Layout(self.coords, kinds, self.units, self.attributes, words, self.inner, BLOCK)
+        layout = Layout(self.coords, kinds, self.units, self.attributes, words, self.inner, CHUNK)
         flat = {name: values.reshape(-1, *layout.inner_shape(name)) for name, values in stored.items()}
         ends = enumerate(map(layout.ends, range(layout.chunks)))
         cut = ((chunk, {name: some[first:end] for name, some in flat.items()}) for chunk, (first, end) in ends)
