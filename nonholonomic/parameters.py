@@ -56,7 +56,7 @@ def with_numbers(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any
     known = {name: number for root, tree in roots.items() for name, number in numbers(root, tree).items()}
     for name in values:
         if name not in known:
-            raise _unknown_axis(name, [one for one, number in known.items() if number is not None])
+            raise _unknown_axis(name, [known_name for known_name, number in known.items() if number is not None])
     return {root: _replaced(root, tree, values) for root, tree in roots.items()}
 
 
@@ -82,24 +82,24 @@ def full_axes(axes: dict[str, Any], known: list[str]) -> dict[str, Any]:
 
     **Raises:** `ValueError` for a name that means none of them, or several, and for a number that is named twice.
     """
-    found: dict[str, Any] = {}
+    by_full_name: dict[str, Any] = {}
     for name, values in axes.items():
         if not _meant(name, known):
             raise _unknown_axis(name, known)
         whole = full_name("axes", name, known)
-        if whole in found:
+        if whole in by_full_name:
             raise ValueError(f"axes: {whole!r} is named twice")
-        found[whole] = values
-    return found
+        by_full_name[whole] = values
+    return by_full_name
 
 
 def _meant(name: Any, known: list[str]) -> list[str]:
     """The full names that a name may mean."""
-    return [name] if name in known else [one for one in known if one.endswith("." + str(name))]
+    return [name] if name in known else [known_name for known_name in known if known_name.endswith("." + str(name))]
 
 
 def _unknown_axis(name: str, known: list[str]) -> ValueError:
-    short = {one.rsplit(".", 1)[-1]: one for one in known}
+    short = {full.rsplit(".", 1)[-1]: full for full in known}
     return ValueError(
         f"unknown axis {name!r}: the numbers that can be varied are {', '.join(known)}"
         f"{likely(name.rsplit('.', 1)[-1], short)}"

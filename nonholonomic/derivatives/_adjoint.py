@@ -211,8 +211,8 @@ def _recorded(scheduler: LaneScheduler, progress: Progress) -> tuple[Progress, S
         lane_state, record, idle, count = carry
         after = try_step(*in_lanes, lane_state)
         length = jnp.where(after.time > lane_state.time, length_to_try(in_lanes[1], lane_state), 0.0)
-        made = StepRecord(lane_state.time, _without_probe(lane_state).state, length)
-        record = jax.tree.map(functools.partial(written_in_place, at=count), record, made)
+        step_record = StepRecord(lane_state.time, _without_probe(lane_state).state, length)
+        record = jax.tree.map(functools.partial(written_in_place, at=count), record, step_record)
         return after, record, idle + scheduler.idle(lane_state), count + 1
 
     def loop(start: LaneState) -> Any:
@@ -257,8 +257,8 @@ def _taken_back(
 
         def step(carry: Any) -> Any:
             index, *along = carry
-            made = jax.tree.map(functools.partial(_read, at=index - 1), record)
-            return index - 1, *step_taken_back(weights, problem, moving, *made, *along)
+            step_record = jax.tree.map(functools.partial(_read, at=index - 1), record)
+            return index - 1, *step_taken_back(weights, problem, moving, *step_record, *along)
 
         room = jnp.zeros((1 + len(weights.fractions), *lane_state.state.shape), adjoint.dtype)
         return jax.lax.while_loop(lambda carry: carry[0] > 0, step, (count, adjoint, room))[1]
@@ -276,7 +276,7 @@ def _at_the_end(
         return measured(eqx.combine(numbers, rest), lane_state._replace(state=state))
 
     by_number, by_state = jax.vjp(value, numbers, lane_state.state)[1](jnp.ones_like(lane_state.time))
-    return jnp.concatenate([by_state, *(one[None] for one in jax.tree.leaves(by_number))])
+    return jnp.concatenate([by_state, *(row[None] for row in jax.tree.leaves(by_number))])
 
 
 class Weights(NamedTuple):

@@ -65,8 +65,8 @@ class VariationalProblem(AbstractProblem):
             return eqx.combine(moving, self.problem).field(time, at)
 
         # Linearised once: the rate is computed once, and the tangents share common subexpressions.
-        here, change = jax.linearize(rate, moving, at)
-        return jnp.concatenate([here, *(change(*moved) for moved in zip(self.tangents, variations, strict=True))])
+        rates, change = jax.linearize(rate, moving, at)
+        return jnp.concatenate([rates, *(change(*moved) for moved in zip(self.tangents, variations, strict=True))])
 
     def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"] | None:
         return self.problem.event_function(self.parts(state)[0]) if self.ends_on_event else None
@@ -83,7 +83,7 @@ class VariationalProblem(AbstractProblem):
 
 
 def slopes_by_variations(
-    problem: AbstractProblem, tangents: tuple[Any, ...], ends_on_event: bool, *given: Any, one_kernel: bool
+    problem: AbstractProblem, tangents: tuple[Any, ...], ends_on_event: bool, *options: Any, one_kernel: bool
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """Run every cell with its variations, and differentiate the time of the event at its end.
 
@@ -91,23 +91,23 @@ def slopes_by_variations(
 
     - `problem`, `tangents`: as for `VariationalProblem`.
     - `ends_on_event`: whether runs end on the event, or at the horizon, which is then the event's time.
-    - `given`, `one_kernel`: horizon, number of cells and settings, as for `LaneScheduler.of`.
+    - `options`, `one_kernel`: horizon, number of cells and settings, as for `LaneScheduler.of`.
 
     **Returns:** the `Outcome`, without crossing times, and for each tangent the derivative of the event's time.
     """
     varied = VariationalProblem(problem, tangents, ends_on_event)
     # The variations take part in step-size control: the state alone may be at rest where its tangent is not, and the
     # steps would grow too long for the tangent.
-    there, _ = LaneScheduler.of(varied, *given, n_blocks=1 + len(tangents), one_kernel=one_kernel).outcome()
-    state, *variations = varied.parts(there.state)
+    ended, _ = LaneScheduler.of(varied, *options, n_blocks=1 + len(tangents), one_kernel=one_kernel).outcome()
+    state, *variations = varied.parts(ended.state)
 
     def event_time(problem: AbstractProblem, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
-        return crossing_time(problem, there.end_time, state)
+        return crossing_time(problem, ended.end_time, state)
 
     slopes = [
         eqx.filter_jvp(event_time, (problem, state), moved)[1] for moved in zip(tangents, variations, strict=True)
     ]
-    return there._replace(state=state), slopes
+    return ended._replace(state=state), slopes
 
 
 def in_groups(run: Callable[..., tuple[Any, list[Any]]], tangents: tuple[Any, ...]) -> tuple[Any, list[Any]]:

@@ -85,25 +85,25 @@ def descended(
     """
 
     def going_on(carry: tuple[Descent, Any]) -> Bool[Array, ""]:
-        there, count = carry
-        return ~jnp.all(there.ended) & (count < MOST_STEPS)
+        descent, count = carry
+        return ~jnp.all(descent.ended) & (count < MOST_STEPS)
 
-    def once(carry: tuple[Descent, Any]) -> tuple[Descent, Any]:
-        there, count = carry
-        at = vector_of(there.at)
+    def descend(carry: tuple[Descent, Any]) -> tuple[Descent, Any]:
+        descent, count = carry
+        at = vector_of(descent.at)
         s1, s2, t1, t2 = step(at)
         length = jnp.sqrt(s1 * s1 + s2 * s2)
-        cut = jnp.minimum(1.0, there.reach / jnp.where(length > 0.0, length, 1.0))
+        cut = jnp.minimum(1.0, descent.reach / jnp.where(length > 0.0, length, 1.0))
         moved = onto(vector_of(sum_vectors(at, scale(cut * s1, t1), scale(cut * s2, t2))))
         after = value(moved)
-        better = (after <= there.value) | (length <= UNSEEN * size)
-        taken = better & ~there.ended
+        better = (after <= descent.value) | (length <= UNSEEN * size)
+        taken = better & ~descent.ended
         # What is not a number ends the search too.
-        ended = there.ended | ~(length > SETTLED * size)
+        ended = descent.ended | ~(length > SETTLED * size)
         new = Descent(
-            at=jnp.where(taken, _stacked(moved), there.at),
-            value=jnp.where(taken, after, there.value),
-            reach=jnp.where(better, 2.0, 0.25) * there.reach,
+            at=jnp.where(taken, _stacked(moved), descent.at),
+            value=jnp.where(taken, after, descent.value),
+            reach=jnp.where(better, 2.0, 0.25) * descent.reach,
             ended=ended,
         )
         return new, count + 1
@@ -111,8 +111,8 @@ def descended(
     first = _stacked(start)
     zero = jnp.zeros_like(first[0])
     begin = Descent(first, value(start) + zero, reach + zero, zero > 0.0)
-    found, _ = jax.lax.while_loop(going_on, once, (begin, jnp.zeros((), int)))
-    return vector_of(found.at)
+    lowest, _ = jax.lax.while_loop(going_on, descend, (begin, jnp.zeros((), int)))
+    return vector_of(lowest.at)
 
 
 class AbstractLevel(AbstractSurface):

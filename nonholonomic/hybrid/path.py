@@ -75,7 +75,7 @@ class HybridPath(NamedTuple):
     def times(self) -> Float[np.ndarray, " times"]:
         """The default output times [s]: those of all steps."""
         return np.unique(
-            np.minimum(np.concatenate([np.zeros(1), *(one.shown for one in self.segments)]), self.end_time)
+            np.minimum(np.concatenate([np.zeros(1), *(segment.shown for segment in self.segments)]), self.end_time)
         )
 
     @property
@@ -91,14 +91,14 @@ class HybridPath(NamedTuple):
         """The output rows at the given times, which must lie within the run; at the end of a segment, before the reset."""
         if not len(times):
             return self.segments[0].at(np.zeros(1))[:, :0]
-        where, found = self._where(times), []
+        where, by_segment = self._where(times), []
         for index in np.unique(where):
-            here = np.flatnonzero(where == index)
+            indices = np.flatnonzero(where == index)
             # Padded to one length, so that one program serves all segments.
-            found.append((here, self.segments[index].at(padded(times[here], len(times)))[:, : here.size]))
-        shown = np.empty((len(found[0][1]), len(times)))
-        for here, values in found:
-            shown[:, here] = values
+            by_segment.append((indices, self.segments[index].at(padded(times[indices], len(times)))[:, : indices.size]))
+        shown = np.empty((len(by_segment[0][1]), len(times)))
+        for indices, values in by_segment:
+            shown[:, indices] = values
         return shown
 
     def _where(self, times: Float[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:

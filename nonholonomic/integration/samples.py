@@ -120,8 +120,8 @@ def _recorded(
         goes_on = reached & (after.time < horizon)
         status = jnp.where(after.steps < control.max_steps, RUNNING, FAILED)
         after = after._replace(status=jnp.where(goes_on, status, after.status))
-        made = Reached(after.state, jnp.where(is_sample, sample, count))
-        record = jax.tree.map(functools.partial(written_in_place, at=iteration), record, made)
+        sampled = Reached(after.state, jnp.where(is_sample, sample, count))
+        record = jax.tree.map(functools.partial(written_in_place, at=iteration), record, sampled)
         return after, after.time > lane_state.time, sample + is_sample, record, idle, iteration + 1
 
     def loop(start: tuple[LaneState, Int[Array, " lanes"]]) -> Any:

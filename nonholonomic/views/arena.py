@@ -87,7 +87,7 @@ class _Chart:
     def ranges(self, margin: float, spacing: float) -> tuple[list[tuple[float, float]], list[float], str]:
         """The ranges of both numbers, the steps between lines, and what they are in words."""
         lengths = [self._length(number) for number in (0, 1)]
-        found, steps, words = [], [], []
+        intervals, steps, words = [], [], []
         for number, angle in enumerate(self.angles):
             low, high = self.places[number].min(), self.places[number].max()
             extra = margin / max(lengths[number], 1e-300)
@@ -97,10 +97,10 @@ class _Chart:
                 low, high = low - extra, high + extra
             low, high = self._legal(number, low, high)
             step = nice(max(spacing / max(lengths[number], 1e-300), (high - low) / MOST_LINES), angle)
-            found.append((low, high))
+            intervals.append((low, high))
             steps.append(step)
             words.append(f"{np.degrees(step):.3g}°" if angle else in_words(step))
-        return found, steps, "grid " + " x ".join(dict.fromkeys(words))
+        return intervals, steps, "grid " + " x ".join(dict.fromkeys(words))
 
     def _length(self, number: int) -> float:
         """Least length [m] along the surface for each unit of a number, at the run's places."""
@@ -157,9 +157,11 @@ def fixed(surface: AbstractSurface, vector: tuple) -> np.ndarray:
 def nice(step: float, angle: bool) -> float:
     """The next round number."""
     if angle:
-        return float(np.radians(next((one for one in DEGREES if one >= 0.999 * np.degrees(step)), DEGREES[-1])))
+        return float(
+            np.radians(next((candidate for candidate in DEGREES if candidate >= 0.999 * np.degrees(step)), DEGREES[-1]))
+        )
     unit = 10.0 ** np.floor(np.log10(step))
-    return float(unit * next(one for one in LENGTHS if one * unit >= 0.999 * step))
+    return float(unit * next(candidate for candidate in LENGTHS if candidate * unit >= 0.999 * step))
 
 
 def in_words(length: float) -> str:

@@ -36,7 +36,7 @@ def draw_fit(fit: "Identification") -> Any:
 def _series(fit: "Identification") -> list[np.ndarray]:
     """The places of the measurements of each series."""
     numbers = np.asarray(fit.measurements.series)
-    return [np.flatnonzero(numbers == one) for one in np.unique(numbers)]
+    return [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
 
 
 def _abscissa(fit: "Identification") -> tuple[np.ndarray, str]:
@@ -53,12 +53,12 @@ def _draw_data(fit: "Identification", axes: Any) -> None:
     censored = np.array([row.censored for row in rows])
     # An angle is drawn on the turn on which the prediction is.
     value = value + np.asarray(fit.measurements.whole_periods(predicted - value))
-    for k, here in enumerate(_series(fit)):
-        colour, exact, limits = f"C{k}", here[~censored[here]], here[censored[here]]
-        name = rows[here[0]].label.split("(")[0]
+    for k, indices in enumerate(_series(fit)):
+        colour, exact, limits = f"C{k}", indices[~censored[indices]], indices[censored[indices]]
+        name = rows[indices[0]].label.split("(")[0]
         axes.errorbar(places[exact], value[exact], errors[exact], fmt=".", color=colour, alpha=0.5, label=name)
         axes.plot(places[limits], value[limits], "^", color=colour, alpha=0.5)
-        axes.plot(places[here], predicted[here], "-" if label.startswith("time") else "x", color=colour)
+        axes.plot(places[indices], predicted[indices], "-" if label.startswith("time") else "x", color=colour)
     axes.set_xlabel(label)
     axes.set_ylabel("measured, predicted (lines, crosses)")
     axes.legend(fontsize=8)
@@ -67,8 +67,8 @@ def _draw_data(fit: "Identification", axes: Any) -> None:
 def _draw_residuals(fit: "Identification", axes: Any) -> None:
     places, label = _abscissa(fit)
     residual = np.array([row.residual for row in fit.residuals])
-    for k, here in enumerate(_series(fit)):
-        axes.plot(places[here], residual[here], ".", color=f"C{k}")
+    for k, indices in enumerate(_series(fit)):
+        axes.plot(places[indices], residual[indices], ".", color=f"C{k}")
     axes.axhspan(-1.96, 1.96, color="0.9", zorder=0)
     axes.set_xlabel(label)
     axes.set_ylabel("residual / error")

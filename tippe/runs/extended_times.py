@@ -69,8 +69,8 @@ def extended_inversion_time(
     check_smooth(scene, "extended_inversion_time")
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
     unchecked = any(is_traced(leaf) for leaf in leaves)
-    found = differentiable_solve(ExtendedSolve(len(leaves) - 2, structure, unchecked), *leaves)
-    return nan_if_illegal(found, structure, unchecked, leaves)
+    time = differentiable_solve(ExtendedSolve(len(leaves) - 2, structure, unchecked), *leaves)
+    return nan_if_illegal(time, structure, unchecked, leaves)
 
 
 class ExtendedSolve(AbstractDifferentiableSolve):
@@ -94,8 +94,8 @@ class ExtendedSolve(AbstractDifferentiableSolve):
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         problem, tangents, gather = tangents_by(self._problem, active, leaves[: self.movable], cells)
 
-        def run(some: tuple[Any, ...]) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-            return self._found(some, problem, leaves, cells, again)
+        def run(group: tuple[Any, ...]) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
+            return self._found(group, problem, leaves, cells, again)
 
         times, slopes = in_groups(run, tangents)
         return times, gather(slopes)
@@ -120,7 +120,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         # Parameters tried by a fit may be far off.
         settings = Settings(tolerance, max_steps=MOST_STEPS)
         queue = LaneScheduler.of(
-            varied, t1, jnp.asarray(cells), settings, one_kernel=not again, parts=1 + len(tangents)
+            varied, t1, jnp.asarray(cells), settings, one_kernel=not again, n_blocks=1 + len(tangents)
         )
         outcome, _ = queue.outcome()
         state, *variations = varied.parts(outcome.state)

@@ -113,21 +113,21 @@ def lyapunov_exponent(
     problem = InversionProblem.of(scene, launch, jnp.pi, cells)
     # A turning frame turns by another angle for each launch, and that difference would count as divergence.
     problem = dataclasses.replace(problem, dynamics=scene.dynamics, cos_angle=jnp.asarray(NO_COSINE))
-    found = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, settings)
-    exponent, error = exponent_of(found.logarithm, float(t1))
-    whole = found.status == REACHED_END
-    lost = np.array([status.word for status in LOSSES])[np.asarray(problem.dynamics.loss(jnp.asarray(found.state)))]
-    words = np.select([whole, found.status == LEFT_DOMAIN], ["completed", lost], "failed")
+    growths = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, settings)
+    exponent, error = exponent_of(growths.logarithm, float(t1))
+    whole = growths.status == REACHED_END
+    lost = np.array([status.word for status in LOSSES])[np.asarray(problem.dynamics.loss(jnp.asarray(growths.state)))]
+    words = np.select([whole, growths.status == LEFT_DOMAIN], ["completed", lost], "failed")
     times = t1 * np.arange(1, STRETCHES + 1) / STRETCHES
-    passed = np.minimum(times[:, None], found.end_time)
+    passed = np.minimum(times[:, None], growths.end_time)
     # A run that ends where it starts has not diverged from anything.
-    running = np.cumsum(found.logarithm, axis=0) / np.where(passed > 0.0, passed, 1.0)
+    running = np.cumsum(growths.logarithm, axis=0) / np.where(passed > 0.0, passed, 1.0)
     return LyapunovExponent(
         exponent=np.where(whole, exponent, np.nan).reshape(shape),
         error=np.where(whole, error, np.nan).reshape(shape),
         status=words.reshape(shape),
-        end_time=found.end_time.reshape(shape),
-        steps=found.steps.reshape(shape),
+        end_time=growths.end_time.reshape(shape),
+        steps=growths.steps.reshape(shape),
         times=times,
         running=running.reshape(STRETCHES, *shape),
     )

@@ -53,7 +53,7 @@ def table_of(run: Any) -> Table:
     """
     require_one_run(run, "to_table", "; trajectory_table makes a table of many")
     known = QUANTITIES | OF_ONE_RUN
-    dims = [one.components for one in known.values() if one.components is not None]
+    dims = [quantity.components for quantity in known.values() if quantity.components is not None]
     coords = {"time": np.asarray(run.t)} | {dim: np.array(COMPONENTS[dim]) for dim in dict.fromkeys(dims)}
     request = description("scene", run.scene) | {"status": str(run.status), "end_time": float(run.end_time)}
     attributes = {
@@ -61,13 +61,13 @@ def table_of(run: Any) -> Table:
         "axes": json.dumps(["time"]),
         "versions": json.dumps(versions()),
         "long_names": json.dumps(
-            {"time": "time"} | {name: one.long_name for name, one in known.items()}, sort_keys=True
+            {"time": "time"} | {name: quantity.long_name for name, quantity in known.items()}, sort_keys=True
         ),
     }
     return Table(
         coords,
         {name: np.asarray(getattr(run, name)) for name in known},
-        {"time": "s"} | {name: one.unit for name, one in known.items()},
+        {"time": "s"} | {name: quantity.unit for name, quantity in known.items()},
         attributes,
-        inner={name: (one.components,) for name, one in known.items() if one.components is not None},
+        inner={name: (quantity.components,) for name, quantity in known.items() if quantity.components is not None},
     )

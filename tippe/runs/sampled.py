@@ -52,9 +52,9 @@ def sampled(
     """
     run = TrajectoryProblem.of(scene, launch)
     if adjoint is None:
-        found = sampled_run(trajectory_problem, (scene, launch), times, t1, settings)
+        samples = sampled_run(trajectory_problem, (scene, launch), times, t1, settings)
     else:
-        found = sampled_run_by_diffrax(run, times, t1, settings, adjoint)
-    status = ended(run, found.end_state, found.status == LEFT_DOMAIN, found.status == FAILED)
-    assert found.quadratures is not None
-    return Found(found.states.T, found.quadratures.T, found.end_time, status, found.accepted, found.rejected)
+        samples = sampled_run_by_diffrax(run, times, t1, settings, adjoint)
+    status = ended(run, samples.end_state, samples.status == LEFT_DOMAIN, samples.status == FAILED)
+    assert samples.quadratures is not None
+    return Found(samples.states.T, samples.quadratures.T, samples.end_time, status, samples.accepted, samples.rejected)

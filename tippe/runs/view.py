@@ -112,7 +112,7 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     starts = [f"θ(0) = {float(run.theta[0]):.3g} rad, {float(run.spin[0]):.4g} rad/s" for run in runs]
     names = distinguishing_labels(starts, [run.scene for run in runs])
     named = [(name, run.scene, motion(run)) for name, run in zip(names, runs, strict=True)]
-    return stages([named] if overlaid else [[one] for one in named])
+    return stages([named] if overlaid else [[run] for run in named])
 
 
 def motion(run: Any) -> Motion[np.ndarray]:
@@ -164,7 +164,7 @@ def arrows(motion: Motion[np.ndarray], offset: float, radius: float, weight: flo
     common = max(float(np.quantile(speed, COMMON_SLIP)), 1e-12)
     down = np.broadcast_to([0.0, 0.0, -weight], centre.shape)
     push, width = motion.normal_force[:, None] * motion.normal, 0.05 * radius
-    found = [
+    drawn = [
         Arrow("normal force", beside, push, "N", WEIGHT * radius / weight, VIOLET, width),
         Arrow("slip", lifted, motion.slip, "m/s", SLIP * radius / common, GOLD, width, SLIP * radius),
         Arrow(
@@ -176,23 +176,23 @@ def arrows(motion: Motion[np.ndarray], offset: float, radius: float, weight: flo
         ("angular momentum", motion.angular_momentum, "kg m²/s", PINK),
     ):
         scale = SPIN * radius / max(float(np.linalg.norm(vector, axis=-1).max()), 1e-300)
-        found.append(Arrow(name, centre, vector, unit, scale, colour, width, None, True, False))
-    return tuple(found)
+        drawn.append(Arrow(name, centre, vector, unit, scale, colour, width, None, True, False))
+    return tuple(drawn)
 
 
 def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
     """A stage for each group of runs, which have one arena, with their names; colours tell all runs apart."""
-    found, number = [], 0
+    all_stages, number = [], 0
     for group in groups:
         (_, scene, first), radius = group[0], float(group[0][1].body.size)
         points = np.concatenate([motion.contact for _, _, motion in group])
         ground = arena(scene.surface, points, first.normal[0], 4.0 * radius, 2.5 * radius)
         shows = distinguished_by_colour(
-            tuple(show(one, motion, number + k, name) for k, (name, one, motion) in enumerate(group))
+            tuple(show(of_run, motion, number + k, name) for k, (name, of_run, motion) in enumerate(group))
         )
-        found.append(Stage("; ".join(name for name, _, _ in group), ground, shows))
+        all_stages.append(Stage("; ".join(name for name, _, _ in group), ground, shows))
         number += len(group)
-    return found
+    return all_stages
 
 
 def aside(normal: Float[Array | np.ndarray, "times 3"]) -> Float[Array, "times 3"]:
