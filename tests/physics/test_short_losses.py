@@ -30,6 +30,27 @@ def test_a_loss_shorter_than_a_step_ends_the_run(tolerance):
         assert_close(table.end_time, lost, atol=3e-5 if tolerance == 1e-6 else 1e-6)
 
 
+def test_a_batch_of_runs_ends_at_these_losses_wherever_its_samples_are():
+    """A sample just before a loss, and one where a step that should end on the least normal force could be stretched to it."""
+    mu, theta, spin, lost = (jnp.asarray(column) for column in zip(*SHORT, strict=True))
+
+    @jax.jit
+    @jax.vmap
+    def ends(mu, theta, spin, times):
+        scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(mu))
+        run = tippe.simulate(scene, tippe.Launch(theta, spin), 6.0, times)
+        return run.end_time, run.status, run.stats["accepted"] + run.stats["rejected"]
+
+    # The force is least about 0.3 ms after it vanishes.
+    least = lost + 3e-4
+    for before, after in ((2.0, 0.0), (0.004, 4e-5), (0.002, 6e-5)):
+        times = jnp.stack([least - before, least + after], axis=1)
+        end, status, steps = ends(mu, theta, spin, times)
+        assert (status == int(tippe.Status.CONTACT_LOST)).all()
+        assert_close(end, lost, atol=1e-6)
+        assert (steps < 3000).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("mu", "theta", "spin", "lost"), SHORT)
 def test_an_independent_program_finds_these_losses(mu, theta, spin, lost):
