@@ -100,6 +100,40 @@ PAGES = {
 }
 
 
+RUN = "to_table to_xarray save view animate plot portrait"
+TOP = (
+    "theta theta_rate eta azimuth spin position velocity normal axis angular_velocity angular_momentum slip normal_force "
+    "energy jellett inversion_time"
+)
+
+#: The members that a user needs; classes that are not here have none.
+MEMBERS = {
+    "tippe.Scene": "state field energy jellett theta spin normal_force slip_velocity friction_power",
+    "tippe.Launch": "degrees",
+    "tippe.Top": "turned",
+    "nonholonomic.Spheroid": "from_oblate",
+    "nonholonomic.Torus": "from_middle",
+    "nonholonomic.AbstractSurface": "axes sides coordinates up normal normal_rate elevation gaussian_curvature nearest "
+    "distance place_at charted in_fixed_frame in_own_axes",
+    "tippe.AbstractFriction": "set_valued uses_spin isotropic per_normal_force",
+    "stroller.AbstractFriction": "dissipates drag",
+    "tippe.Trajectory": f"at {RUN} {TOP} contact",
+    "tippe.HybridTrajectory": f"at {RUN} {TOP}",
+    "stroller.Scene": "state energy work contact",
+    "stroller.Trajectory": f"{RUN} status energy_residual wheelbase_error grip grip_margin contact_lost_at rank_lost_at "
+    "jackknifed_at",
+    "stroller.Motion": "position heading steering speed front_speed yaw_rate steering_rate",
+    "tippe.Status": "word of",
+    "tippe.Table": "shape dims long_names load save to_xarray to_dataframe plot digits",
+    "tippe.LyapunovExponent": "exponent error status end_time steps times running",
+    "tippe.InversionTimes": "measurements predict",
+    "tippe.Free": "start lower upper prior unit",
+    "nonholonomic.AbstractMode": "field margin reset",
+    "nonholonomic.AbstractSystem": "dimension metric potential constraints frame force lagrangian energy",
+    "nonholonomic.Trajectory": "status to_table to_xarray save portrait plot",
+}
+
+
 def public(package: str) -> list[str]:
     """The names that the `__init__.py` of a package imports as themselves."""
     text = inspect.getsource(importlib.import_module(package))
@@ -130,7 +164,8 @@ def text(page: Page) -> str:
             heading = f"``{name}``"
             lines += [heading, "-" * len(heading), "", f".. automodule:: {name}", "   :members:", ""]
         elif inspect.isclass(value):
-            lines += [f".. autoclass:: {name}", "   :members:", ""]
+            members = [f"   :members: {', '.join(MEMBERS[name].split())}"] if name in MEMBERS else []
+            lines += [f".. autoclass:: {name}", *members, ""]
         else:
             lines += [f".. autofunction:: {name}", ""]
     return "\n".join(lines)

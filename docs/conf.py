@@ -29,7 +29,8 @@ html_theme = "sphinx_book_theme"
 html_title = "nonholonomic"
 html_static_path = ["_static", str(mathjax / mathjax_path)]
 html_css_files = ["manual.css"]
-html_theme_options = {"show_toc_level": 2, "home_page_in_toc": True}
+# The sidebar has the search box.
+html_theme_options = {"show_toc_level": 2, "home_page_in_toc": True, "navbar_persistent": []}
 
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3
