@@ -1,7 +1,7 @@
 """Check a simulator against the reference scenes: `python reference/check.py with_nonholonomic [PART OF A NAME ...]`.
 
 The module defines `simulate(scene) -> {"events": [times], "states": {name: values}}` for a scene as in `scenes`. A simulator
-may leave out events or quantities, and returns `None` for a scene that it cannot run. A line of the report has the error of every
+may leave out events or quantities, and returns `None` for a scene that it cannot run. A report line has the error of every
 event time [s] and the largest error of each quantity, relative to its largest value, and in brackets the file's error bounds.
 """
 
