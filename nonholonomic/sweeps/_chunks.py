@@ -249,5 +249,5 @@ def same_request(left: str, right: str) -> str | None:
     first, second = json.loads(left), json.loads(right)
     for name in [*first, *(name for name in second if name not in first)]:
         if first.get(name) != second.get(name):
-            return f"{name} is {one.get(name)!r} there and {other.get(name)!r} here"
+            return f"{name} is {first.get(name)!r} there and {second.get(name)!r} here"
     return None
