@@ -71,7 +71,7 @@ def found_and_expected(names=MANY, patience=1e3, heights=HEIGHTS, cells=100, **o
 
 
 @pytest.mark.parametrize(
-    ("names", "passes", "solver"),
+    ("names", "nonterminal", "solver"),
     [
         (MANY, False, diffrax.Dopri8()),
         pytest.param(MANY, True, diffrax.Tsit5(), marks=pytest.mark.slow),
