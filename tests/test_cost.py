@@ -10,6 +10,9 @@ from operations import operations, operations_per_step
 from scenes import scenes
 
 FIELDS, RECORD = dict(cost.fields()), cost.record()
+#: JAX's rules of differentiation differ from version to version; the record is of 0.10.
+NAMES = [name for name in FIELDS if "derivatives" not in name or jax.__version_info__[:2] == (0, 10)]
+
 all_scenes = functools.cache(lambda: scenes(cost.LAUNCHES))
 
 #: Scenes whose programs the tests of tables compile too.
@@ -22,7 +25,7 @@ def test_the_record_has_every_field_and_scene():
     assert set(RECORD["steps"]) == set(all_scenes())
 
 
-@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("name", NAMES)
 def test_fields_have_no_more_operations_than_recorded(name):
     counted = cost.counts_of_field(FIELDS[name])
     assert not cost.has_grown(RECORD["field"][name], counted), counted
@@ -35,7 +38,7 @@ def test_a_step_has_no_more_operations_than_recorded(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("name", NAMES)
 def test_steps_of_all_fields_have_no_more_operations_than_recorded(name):
     test_a_step_has_no_more_operations_than_recorded(name)
 
