@@ -35,6 +35,7 @@ from .scheduler import LaneScheduler as LaneScheduler
 from .scheduler import Outcome as Outcome
 from .scheduler import Progress as Progress
 from .settings import ABSOLUTE as ABSOLUTE
+from .settings import DEFAULT_MAX_STEPS as DEFAULT_MAX_STEPS
 from .settings import LOOSEST as LOOSEST
 from .settings import MOST_STEPS as MOST_STEPS
 from .settings import TIGHTEST as TIGHTEST

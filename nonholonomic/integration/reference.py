@@ -24,7 +24,8 @@ def solve_by_diffrax(
 ) -> Outcome:
     """Run every cell from t = 0 to its event, to the end of the model's validity, or to `t1`.
 
-    The domain margin is checked at the ends of steps; events are located on Diffrax's dense output.
+    The domain margin is checked at the ends of steps, so a short loss can be missed; events are located on Diffrax's
+    dense output.
 
     **Arguments:** as for `ensemble_solve`, but any solver of Diffrax works.
 

@@ -17,7 +17,7 @@ from .problem import AbstractProblem
 from .runge_kutta import Lanes
 from .scheduler import LaneScheduler, Outcome, Progress
 from .settings import Settings
-from .status import REACHED_END, RUNNING
+from .status import FAILED, REACHED_END, RUNNING
 from .step import LaneState, try_step
 
 #: Iterations per period: as many as fit the caches with their record.
@@ -102,23 +102,27 @@ def _recorded(
     horizon = jnp.broadcast_to(control.t1, progress.lane_state.time.shape)
 
     def going(carry: Any) -> Any:
-        lane_state, _, _, idle, iteration = carry
+        lane_state, _, _, _, idle, iteration = carry
         return scheduler.goes_on(lane_state, idle, progress.scheduler) & (iteration < PERIOD)
 
     def step(carry: Any) -> Any:
-        lane_state, sample, record, idle, iteration = carry
+        lane_state, accepted, sample, record, idle, iteration = carry
         idle = idle + scheduler.idle(lane_state)
         next_time = _next_time(times, sample)
         stop = jnp.where(sample < count, jnp.minimum(next_time, horizon), horizon)
-        lane_state = lane_state._replace(length=_even(lane_state.length, stop - lane_state.time, lane_state.bracketing))
+        even = _even(lane_state.length, stop - lane_state.time, lane_state.bracketing)
+        # After a step that was not accepted the next one is shorter on purpose: it may have to end on a minimum of a margin.
+        length = jnp.where(accepted, even, jnp.minimum(even, lane_state.length))
+        lane_state = lane_state._replace(length=length)
         after = try_step(here, control._replace(t1=stop), atol, lane_state)
         reached = (lane_state.status == RUNNING) & (after.status == REACHED_END)
         is_sample = reached & (sample < count) & (after.time >= next_time)
         goes_on = reached & (after.time < horizon)
-        after = after._replace(status=jnp.where(goes_on, RUNNING, after.status))
+        onward = jnp.where(after.steps < control.max_steps, RUNNING, FAILED)
+        after = after._replace(status=jnp.where(goes_on, onward, after.status))
         made = Reached(after.state, jnp.where(is_sample, sample, count))
         record = jax.tree.map(functools.partial(written_in_place, at=iteration), record, made)
-        return after, sample + is_sample, record, idle, iteration + 1
+        return after, after.time > lane_state.time, sample + is_sample, record, idle, iteration + 1
 
     def loop(start: tuple[LaneState, Int[Array, " lanes"]]) -> Any:
         lane_state, sample = start
@@ -126,9 +130,12 @@ def _recorded(
             jnp.zeros((PERIOD, *lane_state.state.shape), lane_state.state.dtype),
             jnp.full((PERIOD, *sample.shape), count),
         )
-        return jax.lax.while_loop(going, step, (lane_state, sample, empty, jnp.zeros((), int), jnp.zeros((), int)))
+        accepted = jnp.ones(sample.shape, bool)
+        return jax.lax.while_loop(
+            going, step, (lane_state, accepted, sample, empty, jnp.zeros((), int), jnp.zeros((), int))
+        )
 
-    lane_state, sample, record, _, iterations = scheduler.in_kernel(loop)((progress.lane_state, sample))
+    lane_state, _, sample, record, _, iterations = scheduler.in_kernel(loop)((progress.lane_state, sample))
     return Progress(lane_state, progress.scheduler, progress.iterations + iterations), sample, record
 
 

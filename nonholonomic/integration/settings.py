@@ -17,6 +17,9 @@ ABSOLUTE = 0.1
 #: The least and the greatest relative tolerance: below, round-off decides on steps; above, steps are hardly controlled.
 TIGHTEST, LOOSEST = 1e-14, 1e-2
 
+#: Most steps of a run for which no other limit is set.
+DEFAULT_MAX_STEPS = 2_000_000
+
 #: Most steps of runs that should be short: an impact, parameters tried by a fit, a run of the slow reference. A run
 #: that needs more has failed.
 MOST_STEPS = 100_000
@@ -38,7 +41,7 @@ class Settings(eqx.Module):
     tolerance: Float[Array, ""] = eqx.field(converter=as_number)
     solver: diffrax.AbstractSolver | None = None
     absolute: float = eqx.field(static=True, default=ABSOLUTE)
-    max_steps: int = eqx.field(static=True, default=2_000_000)
+    max_steps: int = eqx.field(static=True, default=DEFAULT_MAX_STEPS)
     lanes: int | None = eqx.field(static=True, default=None)
 
     @property

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import AbstractSurface, Plane
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, Settings, explicit_tableau, solve_ensemble
+from nonholonomic.integration import DEFAULT_MAX_STEPS, FAILED, LEFT_DOMAIN, Settings, explicit_tableau, solve_ensemble
 from nonholonomic.parameters import description, full_axes, numbers, with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, cells_to_check
 from nonholonomic.sweeps import sweep as computed
-from nonholonomic.validation import as_number, require_outside
+from nonholonomic.validation import as_number, require_outside, require_whole
 
 from ..model.dynamics import State
 from ..model.friction import Damping, RollingResistance
@@ -82,6 +82,7 @@ def sweep(
     path: Any = None,
     progress: bool = True,
     executor: Executor | None = None,
+    max_steps: int = DEFAULT_MAX_STEPS,
 ) -> Table:
     """The ends of all rides over a grid of parameters, in one batched call on all cores.
 
@@ -101,6 +102,7 @@ def sweep(
     - `executor`: who computes: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a
       Dask client, to which blocks are handed as its workers become free; by default a thread for each core. The numbers
       are the same, to the bit on the same kind of processor.
+    - `max_steps`: a ride that needs more steps, rejected ones included, has failed; at least 1.
 
     **Returns:** a `Table` of the rides' ends: position `x`, `y`, `z` [m] in the fixed frame, `heading`, `end_steering`
     [rad], `end_speed` [m/s], `energy` [J], `residual` [J] of energy against work, `contact_time` [s] at which the ground
@@ -129,6 +131,7 @@ def sweep(
     check_run(scene, launch, t1, input, tolerance)
     if not isinstance(axes, dict) or not all(isinstance(number, str) for number in axes):
         raise ValueError(f"axes = {axes!r} must be a dictionary, full name of a parameter -> values")
+    require_whole(max_steps, "max_steps", 1)
     solver = Settings(tolerance, solver).for_lanes
     explicit_tableau(solver)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
@@ -142,7 +145,9 @@ def sweep(
     request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
     request |= {"solver": type(solver).__name__, "input": "none" if input is None else described(input)}
     request |= {grid_axis.number: "an axis" for grid_axis in grid}
-    job = RideJob.of(roots, input, float(t1), float(tolerance), solver)
+    if max_steps != DEFAULT_MAX_STEPS:
+        request |= {"max_steps": int(max_steps)}
+    job = RideJob.of(roots, input, float(t1), float(tolerance), solver, int(max_steps))
     return computed(job, grid, VARIABLES, request, path=path, progress=progress, executor=executor)
 
 
@@ -166,6 +171,7 @@ class RideJob(NamedTuple):
     t1: float
     tolerance: float
     solver: diffrax.AbstractERK
+    max_steps: int
     controls: eqx.Module | None
 
     @classmethod
@@ -182,7 +188,7 @@ class RideJob(NamedTuple):
         size = next((len(values) for values in columns.values()), 1)
         controls = cells.get("input", self.controls)
         problem = RideProblem.of(cells["scene"], cells["launch"], controls, size, watched=True)
-        horizon, settings = as_number(self.t1), Settings(self.tolerance, self.solver)
+        horizon, settings = as_number(self.t1), Settings(self.tolerance, self.solver, max_steps=self.max_steps)
         # A ride goes on where contact is lost, as if the ground could pull.
         outcome, _ = solve_ensemble(problem, horizon, jnp.asarray(count), settings, passes=problem.watched)
         contact_time = np.asarray(outcome.first_crossing)

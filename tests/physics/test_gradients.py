@@ -10,7 +10,7 @@ from make_gradient_reference import ANGLE, MOVED, columns_of, extrapolated, root
 from tops import rutstam_top
 
 import tippe
-from nonholonomic.integration import Oscillatory8
+from nonholonomic.integration import Oscillatory8, Settings
 from tippe.runs.sensitivities import sensitivities_of_cells
 
 ROWS = list(csv.DictReader(Path(__file__).with_name("gradient_reference.csv").read_text().splitlines()))
@@ -20,8 +20,9 @@ def relative_errors(family: str, tolerance: float) -> np.ndarray:
     """Of the derivatives by mu, theta, spin and offset in every scene of a family."""
     rows = [row for row in ROWS if row["family"] == family]
     names = list(MOVED.values())
-    options = {"count": len(rows), "size": len(rows), "solver": Oscillatory8(), "last": False}
-    _, found = sensitivities_of_cells(roots_of(rows[0]), columns_of(rows), names, ANGLE, 8.0, tolerance, **options)
+    options = {"count": len(rows), "size": len(rows), "last": False}
+    settings = Settings(tolerance, Oscillatory8())
+    _, found = sensitivities_of_cells(roots_of(rows[0]), columns_of(rows), names, ANGLE, 8.0, settings, **options)
     expected = np.array([[float(row[f"by_{name}"]) for row in rows] for name in MOVED])
     return np.abs(np.stack(list(found.values())) / expected - 1.0)
 

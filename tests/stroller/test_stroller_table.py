@@ -1,6 +1,7 @@
 """Sweeps and the main job."""
 
 import dataclasses
+import json
 
 import jax.numpy as jnp
 import numpy as np
@@ -77,6 +78,14 @@ def test_a_sweep_without_axes_is_a_single_ride():
 
 
 @pytest.mark.newest
+def test_a_ride_that_needs_more_than_the_most_steps_has_failed(bowl):
+    """The file of the default limit says nothing of it, so that older files can be resumed."""
+    table = stroller.sweep(Scene(BODY), LAUNCH, 3.0, axes={}, max_steps=3)
+    assert (str(table.status), int(table["steps"])) == ("failed", 3)
+    assert json.loads(table.attributes["request"])["max_steps"] == 3
+    assert "max_steps" not in json.loads(bowl[0].attributes["request"])
+
+
 def test_lost_contact_is_marked_with_its_time():
     """Outside a sphere from its top: contact ends at cos = 2/3 (1 + v0^2 / (2 g R)), the time is that of `simulate`."""
     scene, launch = Scene(BODY, Sphere(1.4)), Launch((0.0, np.pi / 2), 0.0, 0.5)
@@ -131,6 +140,7 @@ def test_axes_of_one_name_are_told_apart():
         (dict(axes={"scene.body.mass": [1.0, -1.0]}), r"mass = .* must be greater than 0\.0"),
         (dict(axes={"launch.place[1]": [0.0, 2.0]}), r"place\[1\] = .* must be at most 1\.57"),
         (dict(axes={}, tolerance=1.0), r"tolerance = 1\.0 must be at most"),
+        (dict(axes={}, max_steps=0), r"max_steps = 0 must be a whole number of at least 1"),
         (dict(axes=None), r"axes = None must be a dictionary"),
         (dict(axes={3: [1.0]}), r"axes = \{3: \[1\.0\]\} must be a dictionary, full name of a parameter -> values"),
         (dict(axes={}, t1=[1.0, 2.0]), r"t1 must be one number, not of shape \(2,\); axes of sweep take lists"),

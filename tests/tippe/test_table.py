@@ -1,5 +1,6 @@
 """Inversion tables: their axes, cells, scenes and faults; `test_table_files.py` has their files."""
 
+import json
 import math
 
 import diffrax
@@ -34,6 +35,19 @@ def test_axes_come_in_their_order_and_scalars_are_none(rutstam_scene_module):
     single = tippe.inversion_table(rutstam_scene_module, theta=0.1, spin=100.0, t1=0.1)
     assert single.shape == ()
     assert single.status == "not_inverted"
+
+
+def test_a_run_that_needs_more_than_the_most_steps_has_failed(table, rutstam_scene_module, tmp_path):
+    """A file of another limit is another request; the default limit is not in the request, so that older files resume."""
+    arguments = {"theta": THETA, "spin": SPIN, "t1": 12.0, "path": tmp_path / "table.h5"}
+    with pytest.warns(UserWarning, match=r"6 of 6 runs have failed: t1 = 12 s is too long: .* more than 40 steps"):
+        short = tippe.inversion_table(rutstam_scene_module, max_steps=40, **arguments)
+    assert (short.status == "failed").all()
+    assert (short["steps"] == 40).all()
+    assert json.loads(short.attributes["request"])["max_steps"] == 40
+    assert "max_steps" not in json.loads(table.attributes["request"])
+    with pytest.raises(ValueError, match="max_steps is 40 there"):
+        tippe.inversion_table(rutstam_scene_module, **arguments)
 
 
 def test_every_cell_is_inversion_time(table, rutstam_scene_module):
@@ -216,6 +230,7 @@ def test_every_scene_compiles(arena, law, asked):
         ({"crossing": "last", "method": "diffrax"}, "crossing = 'last' must be 'first'"),
         ({"t1": 0.0}, "t1 = 0.0 must be greater than 0.0"),
         ({"t1": "8"}, "t1 = '8' is not a number"),
+        ({"max_steps": 0.5}, "max_steps = 0.5 must be a whole number of at least 1"),
         ({"errors": "no"}, "errors = 'no' must be True or False"),
     ],
 )

@@ -1,5 +1,6 @@
 """Tables of trajectories: single runs and batches, axes, ends, files, and what is refused."""
 
+import json
 import re
 
 import h5py
@@ -55,6 +56,18 @@ def test_every_cell_is_a_single_run(table, scene):
         assert_close(table.end_time[i, 1, 1], run.end_time, atol=1e-7)
         assert table.status[i, 1, 1].replace("_end", " t1") == run.status
     assert_close(table.theta[1, 0, 0], single(scene, 0.2, 100.0, mu=0.2).theta, atol=1e-7)
+
+
+def test_a_run_that_needs_more_than_the_most_steps_has_failed(table, scene):
+    """What it reached is there. The default limit is not in the request, so that older files resume."""
+    short = tippe.trajectory_table(scene, theta=THETA, spin=SPIN, mu=MU, times=TIMES, max_steps=20)
+    assert (short.status == "failed").all()
+    assert (short["steps"] == 20).all()
+    reached = np.isfinite(short.theta)
+    assert 0 < reached.sum() < reached.size
+    np.testing.assert_array_equal(short.theta[reached], table[0].theta[reached])
+    assert json.loads(short.attributes["request"])["max_steps"] == 20
+    assert "max_steps" not in json.loads(table[0].attributes["request"])
 
 
 def test_a_batch_by_vmap_is_the_same(table, scene):
@@ -200,6 +213,7 @@ def test_it_is_drawn_over_time(table):
         ({"theta": None}, "theta"),
         ({"spin": [[1.0]]}, "launch.spin must be a number or a non-empty list"),
         ({"mu": [0.1, -0.1]}, "mu = -0.1 must be at least 0.0"),
+        ({"max_steps": 0}, "max_steps = 0 must be a whole number of at least 1"),
         ({"tolerance": 0.5}, "tolerance = 0.5 must be at most 0.01"),
         ({"quantities": "theta"}, "quantities = 'theta' must be a list of names"),
         ({"quantities": ()}, "quantities = () must be a list of names"),

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.hybrid import AbstractBatchedMode, HybridOutcome, solve_hybrid
 from nonholonomic.integration import (
     CROSSED,
+    DEFAULT_MAX_STEPS,
     FAILED,
     LEFT_DOMAIN,
     REACHED_END,
@@ -135,6 +136,11 @@ class InversionRuns(NamedTuple):
     solver: diffrax.AbstractERK | None
     method: str
     slopes_by: list[str]
+    max_steps: int = DEFAULT_MAX_STEPS
+
+    def settings(self, tolerance: float) -> Settings:
+        """How the runs are integrated at a tolerance."""
+        return Settings(tolerance, self.solver, max_steps=self.max_steps)
 
     @property
     def times(self) -> tuple[str, ...]:
@@ -181,7 +187,7 @@ class InversionRuns(NamedTuple):
         scene, launch = cells["scene"], cells["launch"]
         size = next((len(values) for values in columns.values()), 1)
         problem = InversionProblem.of(scene, launch, self.angle, size)
-        options = {"count": count, "size": size, "solver": self.solver, "last": self.last}
+        options = {"count": count, "size": size, "last": self.last}
         numbers = (roots, columns, self.slopes_by, self.angle)
         if self.run_kind.modes is not None:
             options |= {"kinds": len(self.run_kind.counts)}
@@ -189,21 +195,21 @@ class InversionRuns(NamedTuple):
             return self._hybrid_runs(scene, problem, tolerance, count, along)
         if not self.slopes_by:
             return self._ended(scene, problem, self._outcome(problem, tolerance, count))
-        outcome, slopes = sensitivities_of_cells(*numbers, self.t1, tolerance, **options)
+        outcome, slopes = sensitivities_of_cells(*numbers, self.t1, self.settings(tolerance), **options)
         return self._ended(scene, problem, outcome) | slopes
 
     def _hybrid_runs(
         self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, along: Callable[..., Any]
     ) -> dict[str, Any]:
-        """The variables of cells with hybrid runs; `along` takes (horizon, tolerance) and returns runs and derivatives."""
+        """The variables of cells with hybrid runs; `along` takes (horizon, settings) and returns runs and derivatives."""
         if self.slopes_by and not self.last:
-            found, slopes, grazing = along(self.t1, tolerance)
+            found, slopes, grazing = along(self.t1, self.settings(tolerance))
         else:
             found = self._hybrid_outcome(scene, problem, tolerance, count, self.last)
         if self.slopes_by and self.last:
             # The derivatives need the run only up to the event, whose time is now known.
             there, slopes, grazing = along(
-                np.where(np.isfinite(found.crossing_time), found.crossing_time, 0.0), tolerance
+                np.where(np.isfinite(found.crossing_time), found.crossing_time, 0.0), self.settings(tolerance)
             )
             grazing |= there.status != REACHED_END
         loss = functools.partial(self._loss, scene, found.state)
@@ -227,11 +233,11 @@ class InversionRuns(NamedTuple):
         """The hybrid runs of cells."""
         assert self.run_kind.modes is not None
         modes, first = self.run_kind.modes(scene, problem, tolerance, last)
-        start, settings = (np.asarray(first), np.asarray(problem.states)), Settings(tolerance, self.solver)
+        start, settings = (np.asarray(first), np.asarray(problem.states)), self.settings(tolerance)
         return solve_hybrid(modes, *start, self.t1, count, settings, kinds=len(self.run_kind.counts), passes=last)
 
     def _outcome(self, problem: InversionProblem, tolerance: float, count: int) -> Outcome:
-        horizon, settings = jnp.asarray(self.t1), Settings(tolerance, self.solver)
+        horizon, settings = jnp.asarray(self.t1), self.settings(tolerance)
         if self.method == "diffrax":
             return solve_by_diffrax(problem, horizon, settings)
         return solve_ensemble(problem, horizon, jnp.asarray(count), settings, passes=self.last)[0]

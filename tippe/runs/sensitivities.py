@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -63,11 +62,10 @@ def sensitivities_of_cells(
     names: list[str],
     angle: float,
     t1: float,
-    tolerance: float,
+    settings: Settings,
     *,
     count: int,
     size: int,
-    solver: diffrax.AbstractERK | None,
     last: bool,
 ) -> tuple[Outcome, dict[str, Any]]:
     """How every cell ended, and the derivative of its inversion time by every number, 0 where the top did not invert.
@@ -86,7 +84,7 @@ def sensitivities_of_cells(
         tangents,
         jnp.asarray(t1, float),
         jnp.asarray(count),
-        Settings(tolerance, solver),
+        settings,
         passes=last,
     )
     inverted = is_inverted(outcome, problem, last)
@@ -114,11 +112,10 @@ def hybrid_sensitivities_of_cells(
     names: list[str],
     angle: float,
     t1: float | Float[np.ndarray, " cells"],
-    tolerance: float,
+    settings: Settings,
     *,
     count: int,
     size: int,
-    solver: diffrax.AbstractERK | None,
     last: bool,
     kinds: int,
 ) -> tuple[HybridOutcome, dict[str, Any], Bool[np.ndarray, " size"]]:
@@ -134,11 +131,10 @@ def hybrid_sensitivities_of_cells(
     digits, because an event on the way was grazing. Source: saltation at every change of mode
     (`nonholonomic/hybrid/saltation.py`).
     """
-    numbers = (jnp.asarray(angle, float), jnp.asarray(tolerance, float))
+    numbers = (jnp.asarray(angle, float), settings.tolerance)
     built = _modes_and_tangents(modes_of, roots, columns, names, *numbers, size, last)
     (modes, first, states), tangents, sizes = built
     tangents = tuple((one[0], one[2]) for one in tangents)
-    settings = Settings(tolerance, solver)
     given = (tangents, np.asarray(first), np.asarray(states), t1, count, settings)
     hybrid_outcome, found = solve_hybrid_with_tangents(modes, *given, kinds=kinds, ends_on_event=not last)
     slopes = [slope / np.asarray(moved) for slope, moved in zip(found.slopes, sizes, strict=True)]

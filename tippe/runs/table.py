@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import diffrax
 import numpy as np
 
-from nonholonomic.integration import Settings, explicit_tableau
+from nonholonomic.integration import DEFAULT_MAX_STEPS, Settings, explicit_tableau
 from nonholonomic.sweeps import Axis, Table, Variable, sweep
-from nonholonomic.validation import require_flag, require_outside
+from nonholonomic.validation import require_flag, require_outside, require_whole
 
 from ..model.scene import Scene
 from .cells import InversionRuns, check_differentiable, run_kind_of, too_many_steps
@@ -43,6 +43,7 @@ def inversion_table(
     sensitivities: Sequence[str] = (),
     progress: bool = True,
     executor: Executor | None = None,
+    max_steps: int = DEFAULT_MAX_STEPS,
 ) -> Table:
     """Inversion times over a grid of launches and scenes, in one batched call on all cores.
 
@@ -64,7 +65,7 @@ def inversion_table(
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`, or `Dopri8()` for method "diffrax".
     - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which supports first
-      crossings only.
+      crossings only and can miss a loss of contact that is shorter than a step.
     - `scattered`: whether the lists are no axes of a grid but columns of one length: the k-th cell has the k-th number of each.
       The table then has the only axis "cell", and the columns are among its variables.
     - `errors`: whether to run every cell again at a hundredth of the tolerance, for bounds of its errors; a table then costs
@@ -76,6 +77,9 @@ def inversion_table(
     - `executor`: who computes: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a
       Dask client, to which blocks are handed as its workers become free; by default a thread for each core. The numbers
       are the same, to the bit on the same kind of processor.
+    - `max_steps`: a run that needs more steps, rejected ones included, has failed; at least 1. With several modes the limit
+      holds for each stay in a mode; `method="diffrax"` allows
+      100 000 steps at most.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
     "contact_lost", "failed", "jammed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was
@@ -126,6 +130,7 @@ def inversion_table(
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     given = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
     roots, grid, units = launches(scene, given, axes, t1, tolerance, scattered=scattered)
+    require_whole(max_steps, "max_steps", 1)
     settings = Settings(tolerance, solver)
     solver = settings.for_single_runs if method == "diffrax" else settings.for_lanes
     explicit_tableau(solver)
@@ -137,12 +142,14 @@ def inversion_table(
         raise ValueError("method = 'diffrax' is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
     looked_at = {one.number: one.values for one in grid}
     warn_if_it_cannot_invert(scene, roots["launch"], looked_at.get("launch.theta", roots["launch"].theta))
-    runs = InversionRuns(run_kind, float(t1), float(angle), crossing, solver, method, paths)
+    runs = InversionRuns(run_kind, float(t1), float(angle), crossing, solver, method, paths, int(max_steps))
     job = InversionJob(runs, roots, float(tolerance), errors)
 
     request = {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
     request = described(roots, grid) | request | {"solver": type(solver).__name__, "method": method}
     variables = runs.variables
+    if max_steps != DEFAULT_MAX_STEPS:
+        request |= {"max_steps": int(max_steps)}
     if errors:
         request |= {"errors": True}
         variables = variables | runs.error_variables
@@ -156,7 +163,7 @@ def inversion_table(
         job = ScatteredJob(job, columns, {one.number: one.name for one in grid})
         grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
     table = sweep(job, grid, variables, request, path=path, progress=progress, executor=executor)
-    warn_of_long_runs(table, float(t1), settings.max_steps)
+    warn_of_long_runs(table, float(t1), max_steps)
     return table
 
 

@@ -143,7 +143,7 @@ def simulate(
       transformations and without `adjoint` `nonholonomic.integration.Oscillatory8()`.
     - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
       parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax integrates a traced run, which pays if a
-      loss is differentiated by many parameters.
+      loss is differentiated by many parameters; it can miss a loss of contact that is shorter than a step.
 
     **Returns:** a `Trajectory`, for a hybrid scene a `HybridTrajectory`.
 

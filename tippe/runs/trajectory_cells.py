@@ -81,17 +81,17 @@ def _followed(
 
 
 def solve_cells(
-    scene: Scene, launch: Launch, cells: int, times: Any, tolerance: float, names: tuple[str, ...], count: int
+    scene: Scene, launch: Launch, cells: int, times: Any, settings: Settings, names: tuple[str, ...], count: int
 ) -> dict[str, Array]:
     """The variables of some cells.
 
     **Arguments:** `scene`, `launch`: numbers that are scalars or one per cell; `cells`: how many there are, of which the first
-    `count` are to be run; `times`: of the samples [s], the last the horizon; `tolerance`: relative tolerance; `names`: the
+    `count` are to be run; `times`: of the samples [s], the last the horizon; `settings`: how they are integrated; `names`: the
     quantities to be read.
 
     **Returns:** name -> values, the cells first.
     """
-    numbers = (jnp.asarray(times, float), jnp.asarray(count), Settings(tolerance))
+    numbers = (jnp.asarray(times, float), jnp.asarray(count), settings)
     problem = launches_with(scene, launch, cells, names)
     outcome, status, values = _followed(problem, scene, *numbers, names)
     ending = {"status": status, "end_time": outcome.end_time, "steps": outcome.steps, "rejected": outcome.rejected}

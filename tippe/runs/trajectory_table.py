@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from nonholonomic.integration import Settings, Status, times_bounds
+from nonholonomic.integration import DEFAULT_MAX_STEPS, Settings, Status, times_bounds
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
-from nonholonomic.validation import as_number, require, require_all, require_increasing, require_outside
+from nonholonomic.validation import as_number, require, require_all, require_increasing, require_outside, require_whole
 
 from ..model.scene import Scene
 from .cells import COUNTED
@@ -39,6 +39,7 @@ def trajectory_table(
     path: Any = None,
     progress: bool = True,
     executor: Executor | None = None,
+    max_steps: int = DEFAULT_MAX_STEPS,
 ) -> Table:
     """Trajectories over a grid of launches and scenes, sampled at given times, in one batched call on all cores.
 
@@ -60,6 +61,7 @@ def trajectory_table(
     - `tolerance`: relative tolerance of the integration.
     - `path`: HDF5 file to write, block by block. A call that was interrupted resumes from it.
     - `progress`, `executor`: as for `inversion_table`.
+    - `max_steps`: a run that needs more steps, rejected ones included, has failed; at least 1.
 
     **Returns:** a `Table` with a variable for each quantity, which has the axes' dimensions and a last dimension "time"; a
     vector has one more behind it, "component" (x, y, z), for "slip" "tangent" (t1, t2). They are not a number after the end of
@@ -87,6 +89,7 @@ def trajectory_table(
     """
     require_outside((scene, theta, spin, eta, mu, times, axes), "trajectory_table", "simulate with times=")
     names = _names(quantities)
+    require_whole(max_steps, "max_steps", 1)
     require_all(times_bounds(as_number(times), None))
     require_increasing(times, "times")
     times = np.asarray(times, dtype=float)
@@ -112,9 +115,11 @@ def trajectory_table(
     variables |= {name: Variable("1", np.int64, long_name=COUNTED[name]) for name in ("steps", "rejected")}
     request = described(roots, grid) | {"quantities": list(names), "tolerance": float(tolerance)}
     request |= {"solver": type(Settings(tolerance).for_lanes).__name__}
+    if max_steps != DEFAULT_MAX_STEPS:
+        request |= {"max_steps": int(max_steps)}
     # A run has a dozen components or so.
     most = max(16, 1 << (MOST_SAMPLED // (12 * len(times))).bit_length() - 1)
-    job = SamplingJob(roots, times, float(tolerance), names)
+    job = SamplingJob(roots, times, float(tolerance), int(max_steps), names)
     options = {"path": path, "most": most, "inner": inner, "progress": progress, "executor": executor}
     return sweep(job, grid, variables, request, **options)
 
@@ -125,13 +130,15 @@ class SamplingJob(NamedTuple):
     roots: dict[str, Any]
     times: Float[np.ndarray, " times"]
     tolerance: float
+    max_steps: int
     names: tuple[str, ...]
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which the first `count` are to be run."""
         cells = with_numbers(self.roots, columns)
         size = next((len(values) for values in columns.values()), 1)
-        found = solve_cells(cells["scene"], cells["launch"], size, self.times, self.tolerance, self.names, count)
+        settings = Settings(self.tolerance, max_steps=self.max_steps)
+        found = solve_cells(cells["scene"], cells["launch"], size, self.times, settings, self.names, count)
         return {name: np.asarray(values, np.int8 if name == "status" else None) for name, values in found.items()}
 
 
