@@ -267,11 +267,11 @@ class _Block:
     def indexed(self, equation: Any, inputs: Values, indices: Sequence[int]) -> Values:
         """Numbers taken from places that may be known only in JavaScript: there all possible ones are told apart."""
         pool = _flat([value for k, value in enumerate(inputs) if k not in indices])
-        unknown = [(k, place) for k in indices for place, one in np.ndenumerate(inputs[k]) if isinstance(one, str)]
+        unknown = [(k, place) for k in indices for place, x in np.ndenumerate(inputs[k]) if isinstance(x, str)]
         labels, values = itertools.count(), []
         labelled = [value if k in indices else _map(lambda _: next(labels), value) for k, value in enumerate(inputs)]
         # A gather beyond the end fills with a number that is none of the labels.
-        found = functools.partial(_map, lambda k: pool[k] if 0 <= k < len(pool) else math.nan)
+        picked = functools.partial(_map, lambda k: pool[k] if 0 <= k < len(pool) else math.nan)
         # One more than there are: an index beyond the end has a meaning of its own.
         options = range(max(inputs[0].shape, default=0) + 1)
         for option in itertools.product(options, repeat=len(unknown)):
@@ -280,7 +280,7 @@ class _Block:
                 operands[k][index] = choice
                 same.append(self.each("eq", np.asarray(inputs[k][index], object), _value(choice)))
             moved = equation.primitive.bind(*(operand.astype(int) for operand in operands), **equation.params)
-            results = [found(np.asarray(part)) for part in jax.tree.leaves(moved)]
+            results = [picked(np.asarray(part)) for part in jax.tree.leaves(moved)]
             if values:
                 chosen = functools.reduce(functools.partial(self.each, "and"), same)
                 results = [self.each(CHOICE, chosen, *pair) for pair in zip(values, results, strict=True)]
