@@ -7,6 +7,7 @@ tangents through every reset by the saltation matrix, and `hybrid_samples` retur
 derivatives.
 """
 
+from .ensemble import MOST_ROUNDS as MOST_ROUNDS
 from .ensemble import AbstractBatchedMode as AbstractBatchedMode
 from .ensemble import HybridOutcome as HybridOutcome
 from .ensemble import Transition as Transition

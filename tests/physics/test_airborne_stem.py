@@ -87,6 +87,7 @@ def test_a_top_that_leans_ends_as_unresolved():
     )
     run = tippe.simulate(scene, launch, 2.0 * leans, tolerance=1e-12, solver=diffrax.Tsit5())
     assert run.status == "unresolved"
+    assert "unresolved: sphere and stem came to rest on the arena together" in str(run)
     assert_close(run.end_time, leans, atol=1e-4)
     assert_close(run.theta[-1], np.arccos((STEM.radius - TOP.radius) / (STEM.offset - TOP.offset)), atol=1e-4)
 

@@ -164,5 +164,7 @@ class Mistaken(tippe.Paraboloid):
 def test_a_run_whose_energy_does_not_balance_is_unresolved():
     """The same run in a bowl that states its heights is whole."""
     launch = tippe.Launch(0.4, 100.0, place=(0.1, 0.0), velocity=(0.0, 0.2))
-    ends = [thrown(kind(0.3), launch, 0.05, 1e-9).status for kind in (tippe.Paraboloid, Mistaken)]
-    assert ends == ["completed", "unresolved"]
+    whole, mistaken = (thrown(kind(0.3), launch, 0.05, 1e-9) for kind in (tippe.Paraboloid, Mistaken))
+    assert [whole.status, mistaken.status] == ["completed", "unresolved"]
+    assert "unresolved" not in str(whole)
+    assert "unresolved: the energy residual of" in str(mistaken)

@@ -39,6 +39,9 @@ from ..modes.trajectory_problem import TrajectoryProblem
 from .flight_trajectory import STATUS, HybridTrajectory, flights_of, sampled_flights
 from .observables import of_each_run
 
+#: A sphere is at the arena if its distance is below this fraction of its radius, at the end of a run.
+NEAR = 1e-6
+
 
 class ArenaTrajectory(HybridTrajectory):
     """A `HybridTrajectory` over any arena: `theta` and `azimuth` refer to the frame at the foot, the point of the arena nearest
@@ -94,6 +97,17 @@ class ArenaTrajectory(HybridTrajectory):
         ground = below(scene, flying, stem)
         ground = ground._replace(axes=frame.own_axes((*ground.foot, *place[3:])))
         return standing(scene, stem).motion(in_contact(ground, as_free_body(scene, flying, ground, stem)))
+
+    @property
+    def where_the_model_ends(self) -> str:
+        body = self.scene.body
+        height = self.parts_of(self.dense.at(np.array([self.end_time])))[-1][0, 0]
+        if body.stem is not None and abs(height) < NEAR * body.radius:
+            return (
+                "sphere and stem came to rest on the arena together; the equations of sliding on both at once are those of "
+                "the level plane, Plane() without tilt"
+            )
+        return "a flight does not end at the arena"
 
     @staticmethod
     def parts_of(shown: Float[Array | np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:

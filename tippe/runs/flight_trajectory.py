@@ -9,7 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from nonholonomic.hybrid import BETWEEN, HybridPath, HybridSamples, Segment, hybrid_samples, solve_hybrid_dense
+from nonholonomic.hybrid import (
+    BETWEEN,
+    MOST_ROUNDS,
+    HybridPath,
+    HybridSamples,
+    Segment,
+    hybrid_samples,
+    solve_hybrid_dense,
+)
 from nonholonomic.integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Settings, Status
 
 from ..model.dynamics import NO_COSINE
@@ -20,7 +28,7 @@ from ..modes.free_body import Ball, FreeBody, as_free_body, balls, energy, stand
 from ..modes.impact import approach
 from ..modes.inversion_problem import InversionProblem
 from ..modes.leaning import BOTH
-from ..modes.sliding import modes
+from ..modes.sliding import MOST_BOUNCES, modes
 from ..modes.trajectory_problem import TrajectoryProblem
 from .observables import AbstractTrajectory, of_each_run
 
@@ -44,14 +52,14 @@ class HybridTrajectory(AbstractTrajectory):
     2000 contacts; sphere and stem on the plane together with so much friction that the forces are not determined; sphere and
     stem at rest together on another arena, where the equations of both contacts at once are not implemented; a flight that
     does not end at the arena; an energy residual beyond 1e4 times the tolerance, relative to the energy); the run ends at
-    `end_time`. `contact` says at each time which sphere touches: 0 the top's, 1 its stem's, 2 both, -1 none. At the time of an
-    impact the values are those before it. `distance` is that of the top's own sphere from the plane [m] with its rate [m/s].
-    `hops` has a row for each flight until `end_time`, its begin
-    and its end [s]; a table counts those before the inversion. Bounces that shrink by the restitution e are followed down to
-    1e-5 sqrt(g R); from there on the top counts as in contact, though all that are left would take e / (1 - e) of the last
-    one's time. `work` is that of friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest
-    drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J]. `rotation` and
-    `angular_velocity` are those of `Trajectory`.
+    `end_time`, and `print(run)` says why it is unresolved. `contact` says at each time which sphere touches: 0 the top's, 1
+    its stem's, 2 both, -1 none. At the time of an impact the values are those before it. `distance` is that of the top's own
+    sphere from the plane [m] with its rate [m/s]. `hops` has a row for each flight until `end_time`, its begin and its end
+    [s]; a table counts those before the inversion. Bounces that shrink by the restitution e are followed down to 1e-5 sqrt(g
+    R); from there on the top counts as in contact, though all that are left would take e / (1 - e) of the last one's time.
+    `work` is that of friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest drift of |e|,
+    the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J]. `rotation` and `angular_velocity` are
+    those of `Trajectory`.
 
     Inside a transformation `status` is the integer of the `Status`; `hops` is `None`, `stats["hops"]`
     counts the flights. First derivatives by the scene and the launch go through flights and impacts; they are NaN behind an
@@ -154,9 +162,27 @@ class HybridTrajectory(AbstractTrajectory):
         """Which sphere touches, for the numbers of the modes."""
         return numbers
 
+    @property
+    def _flights(self) -> int:
+        return 0 if self.hops is None else len(self.hops)
+
+    @property
+    def where_the_model_ends(self) -> str:
+        """Why no motion is determined from the end of the run on."""
+        return "sphere and stem touch the plane together, and friction is so strong that the forces are not determined"
+
+    def _reason(self) -> str:
+        """Why the status is "unresolved"."""
+        contacts = sum(segment.number != BETWEEN for segment in self.dense.segments)
+        if self.dense.status != UNRESOLVED:
+            return f"the energy residual of {self.stats['energy_residual']:.1e} J is beyond what the tolerance allows"
+        if self._flights >= MOST_BOUNCES or contacts >= MOST_ROUNDS:
+            return "there were too many flights or changes of contact"
+        return self.where_the_model_ends
+
     def __str__(self) -> str:
-        flights = 0 if self.hops is None else len(self.hops)
-        return f"{super().__str__()}\n  {flights} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
+        text = f"{super().__str__()}\n  {self._flights} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
+        return f"{text}\n  unresolved: {self._reason()}" if self.status == Status.UNRESOLVED.word else text
 
 
 def level_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "15 1"]]:

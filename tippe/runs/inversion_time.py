@@ -123,11 +123,11 @@ def explain_failure(
 
     **Arguments:** as for `inversion_time`.
     """
-    runs = InversionRuns(run_kind_of(scene), t1, angle, crossing, solver, "ensemble", [])
+    most = Settings(tolerance, solver).max_steps
+    runs = InversionRuns(run_kind_of(scene), t1, angle, crossing, solver, "ensemble", [], most)
     cell = {
         name: values[0] for name, values in runs.results({"scene": scene, "launch": launch}, {}, tolerance, 1).items()
     }
-    most = Settings(tolerance, solver).max_steps
     word = runs.run_kind.words[cell["status"]]
     if word == "failed" and cell["steps"] >= most:
         raise ValueError(too_many_steps(t1, most, cell["end_time"]))
