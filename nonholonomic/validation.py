@@ -35,7 +35,8 @@ def as_number(value: Any) -> Float[Array, "..."]:
             raise TypeError
         return jnp.asarray(value, dtype=float)
     except (TypeError, ValueError):
-        return value
+        # The types leave out what `require` will refuse.
+        return value  # pyright: ignore[reportReturnType]
 
 
 def as_number_or_none(value: Any) -> Float[Array, "..."] | None:

@@ -151,7 +151,7 @@ def rows_of(options: argparse.Namespace, table: Table) -> list[list[str]]:
     """The entries of a table, a number or a word each, under its two headings."""
     rows = [["theta(0)", *(f"mu = {mu:g}" for mu in options.mu)]]
     for theta, times, words in zip(options.theta, table.time, table.status, strict=True):
-        entries = [f"{t:.2f}" if math.isfinite(t) else WORDS.get(w, w) for t, w in zip(times, words, strict=True)]
+        entries = [f"{t:.2f}" if math.isfinite(t) else str(WORDS.get(w, w)) for t, w in zip(times, words, strict=True)]
         rows.append([f"{theta:g} deg", *entries])
     return rows
 

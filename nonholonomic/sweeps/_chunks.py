@@ -74,7 +74,9 @@ class ChunkStore:
         if stored is not None:
             damaged |= set(range(self.layout.chunks)) - good - self.finished
             for chunk in sorted(good - self.finished):
-                self.write(chunk, stored.chunk(chunk))
+                values = stored.chunk(chunk)
+                assert values is not None
+                self.write(chunk, values)
             self.finished |= good
         for part in self.folder.glob("*.part"):
             part.unlink()
@@ -154,7 +156,8 @@ class ChunkStore:
         """
         kinds = self.layout.kinds
         with replacing(self.folder / f"{chunk}.npz") as scratch, scratch.open("wb") as stream:
-            np.savez(stream, **{name: np.asarray(some, kinds[name]) for name, some in values.items()})
+            arrays: dict[str, Any] = {name: np.asarray(cells, kinds[name]) for name, cells in values.items()}
+            np.savez(stream, **arrays)
 
     def interrupted(self) -> str:
         """What Ctrl-C leaves, and how to go on."""
