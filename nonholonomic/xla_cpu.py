@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
+from jax.interpreters import mlir, partial_eval
 from jaxlib.version import __version__ as jaxlib_version
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
@@ -145,27 +146,85 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     Otherwise every fused operation of a loop's body is a call of its own, and for blocks that fit the first caches calling
     costs as much as computing. XLA does so by itself for loops over very small arrays only. The gain is 2.5 times with jaxlib
     0.10.2 and 1.3 times with 0.12. It can go when XLA's threshold can be set for one program.
+
+    JAX chooses the platform when it lowers a program, and on no other than a CPU does the function leave a trace
+    (`jax.export` lowers for platforms that this machine does not have).
     """
-    if jax.default_backend() != "cpu" or not _knows_the_attributes():
+    if not _knows_the_attributes():
         return function
 
     def called(argument: Any) -> Any:
+        plain = jax.make_jaxpr(jnp.negative)(0.0).jaxpr.eqns[0].ctx
         # The attributes also keep the small functions inside, such as `where`, from being fused into all that use them.
-        with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+        with set_xla_metadata(**_ATTRIBUTES):
             closed, shape = jax.make_jaxpr(function, return_shape=True)(argument)
-
-            def looking_at_all(*arguments: Any) -> Any:
-                constants, leaves = arguments[: len(closed.consts)], arguments[len(closed.consts) :]
-                look = sum(jnp.ravel(leaf)[0].astype(float) for leaf in arguments)
-                return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))(*leaves), look
-
-            # XLA 0.10.2 aborts on a call with an argument that it does not use. So each is looked at, from behind a
-            # barrier, for what is known to be constant would not be.
-            arguments = jax.lax.optimization_barrier([*closed.consts, *jax.tree.leaves(argument)])
-            results, _ = jax.lax.optimization_barrier(jax.jit(looking_at_all)(*arguments))
+        # What the function closes over becomes its first arguments.
+        inputs = [*closed.jaxpr.constvars, *closed.jaxpr.invars]
+        program = closed.jaxpr.replace(constvars=[], invars=inputs)
+        results = _kernel.bind(*closed.consts, *jax.tree.leaves(argument), program=program, plain=plain)
         return jax.tree.unflatten(jax.tree.structure(shape), results)
 
     return called
+
+
+_ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
+
+#: A program with the attributes in all of its equations; `plain` is the context of an equation without them.
+_kernel = Primitive("in_one_kernel")
+_kernel.multiple_results = True
+_kernel.def_impl(lambda *arguments, **rest: jax.jit(functools.partial(_kernel.bind, **rest))(*arguments))
+_kernel.def_abstract_eval(lambda *arguments, program, plain: [variable.aval for variable in program.outvars])
+
+
+def _called_as_one(*arguments: Array, program: Jaxpr, plain: Any) -> list[Array]:
+    """The program as a function that is not inlined."""
+
+    def looking_at_all(*arguments: Any) -> Any:
+        look = sum(jnp.ravel(leaf)[0].astype(float) for leaf in arguments)
+        return jaxpr_as_fun(ClosedJaxpr(program, ()))(*arguments), look
+
+    # XLA 0.10.2 aborts on a call with an argument that it does not use. So each is looked at, from behind a
+    # barrier, for what is known to be constant would not be.
+    with set_xla_metadata(**_ATTRIBUTES):
+        results, _ = jax.lax.optimization_barrier(jax.jit(looking_at_all)(*jax.lax.optimization_barrier(arguments)))
+    return results
+
+
+def _inlined(*arguments: Array, program: Jaxpr, plain: Any) -> list[Array]:
+    """The program without the attributes."""
+    return jaxpr_as_fun(ClosedJaxpr(_without_attributes(program, plain), ()))(*arguments)
+
+
+def _without_attributes(program: Any, plain: Any) -> Any:
+    """A program whose equations, and those of the programs inside, have a plain context; any other value as it is."""
+    if type(program) in (tuple, list):
+        return type(program)(_without_attributes(one, plain) for one in program)
+    # Since JAX 0.12 a `ClosedJaxpr` is a `Jaxpr`.
+    if isinstance(program, ClosedJaxpr) and program.jaxpr is not program:
+        return program.replace(jaxpr=_without_attributes(program.jaxpr, plain))
+    if not isinstance(program, Jaxpr):
+        return program
+    equations = [
+        one.replace(ctx=plain, params={name: _without_attributes(value, plain) for name, value in one.params.items()})
+        for one in program.eqns
+    ]
+    return program.replace(eqns=equations)
+
+
+def _without_unused(used: list[bool], *others: Any) -> tuple[list[bool], Any]:
+    """The equation with a program in which nothing is computed that no output needs, as JAX 0.12 does with its own."""
+    # Since JAX 0.12 a list of inputs stands between the two.
+    equation = others[-1]
+    if not any(used):
+        return [False] * len(equation.invars), None
+    program = equation.params["program"]
+    kept, _ = partial_eval.dce_jaxpr(program, [True] * len(program.outvars), instantiate=True)
+    return [True] * len(equation.invars), equation.replace(params={**equation.params, "program": kept})
+
+
+partial_eval.dce_rules[_kernel] = _without_unused
+mlir.register_lowering(_kernel, mlir.lower_fun(_inlined, multiple_results=True))
+mlir.register_lowering(_kernel, mlir.lower_fun(_called_as_one, multiple_results=True), platform="cpu")
 
 
 def _knows_the_attributes() -> bool:

@@ -204,6 +204,17 @@ def with_spaces(count: int) -> str:
     return f"{count:,}".replace(",", " ")
 
 
+def saved_cells(path: Path) -> int:
+    """How many cells of a table are on the disk: in its file, or in the files that it will be made of."""
+    folder = folder_of(path)
+    if path.exists():
+        return Stored(path).layout.cells
+    if not (folder / "table.h5").exists():
+        return 0
+    layout = Stored(folder / "table.h5").layout
+    return sum(layout.size(int(file.stem)) for file in folder.glob("*.npz"))
+
+
 def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
     """What there is of a table whose file is still to be made; `None` if it is not being computed.
 

@@ -29,7 +29,7 @@ from nonholonomic.geometry import (
     vector_of,
 )
 from nonholonomic.parameters import numbers
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_all, require_kind
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_all, require_kind, uncalled
 
 from .body import AbstractBody
 from .dynamics import TURNING, Dynamics
@@ -108,7 +108,8 @@ class Scene(Bounded, Generic[Body]):
 
     def __check_init__(self):
         if not isinstance(self.body, AbstractBody):
-            raise ValueError(f"body = {self.body!r} must be a Top, a SpheroidBody or a ConvexBody")
+            kinds = f"a Top, a SpheroidBody or a ConvexBody{uncalled(self.body)}"
+            raise ValueError(f"body = {self.body!r} must be {kinds}")
         require_kind(self.surface, "surface", AbstractSurface, ", such as tippe.Plane() or tippe.Cylinder(0.3)")
         require_kind(self.friction, "friction", AbstractFriction, A_LAW)
         # This raises if the surface has no such side.
