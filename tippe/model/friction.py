@@ -125,7 +125,7 @@ class Frictionless(AbstractFriction):
 
 
 class Viscous(AbstractFriction):
-    """Viscous sliding friction, F = -mu N v_s (Rutstam 2012, eq. 1.1).
+    """Viscous sliding friction, F = -mu N v_s (Rutstam 2012, equation 1.1).
 
     **Arguments:**
 

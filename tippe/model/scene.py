@@ -41,7 +41,7 @@ from .top import Top
 #: Tilt [rad] of a launch below which errors across the normal are measured in proportion to it.
 NEARLY_UPRIGHT = 1e-2
 
-#: How fast the foot of a top on a general arena is drawn back to it, over sqrt(g / R); `docs/tippe.md` has the drift.
+#: How fast the foot of a top on a general arena is drawn back to it, over sqrt(g / R); `tippe.md` has the drift.
 PULL = 1.0
 
 

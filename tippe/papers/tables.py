@@ -1,7 +1,7 @@
 """The papers' two inversion tables beside computed times: `python -m tippe --paper`.
 
 The printed times and the computed ones have different trends: the paper lost the numbers of its top, and its own equations of
-motion are not those of a top (`docs/tippe_paper.md`). The same launches run on the plane, too.
+motion are not those of a top (`docs/development/tippe_paper.md`). The same launches run on the plane, too.
 """
 
 import argparse
