@@ -8,28 +8,36 @@ import functools
 import os
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlib
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import mlir, partial_eval
+from jaxlib.version import __version__ as jaxlib_version
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+Result = TypeVar("Result")
+
+
+def _compiler(**options: Any) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
+    """`filter_jit` with options of `jax.jit`, which Equinox's types leave out; compiled functions take NumPy's arrays too."""
+    return eqx.filter_jit(**options)
+
 
 #: Vectors of 512 bits, which compilers avoid by default, make the sums over stages 1.2 to 1.6 times as fast. JAX
 #: takes compiler options only for the outermost compiled function, so it is for programs that are called on their own. It can
 #: go when XLA prefers 512 bits by itself; without AVX-512 it does nothing.
-compiled_alone = eqx.filter_jit(compiler_options={"xla_cpu_prefer_vector_width": 512})
+compiled_alone = _compiler(compiler_options={"xla_cpu_prefer_vector_width": 512})
 
 #: For programs that are called on their own and run for a moment only: jaxlib 0.10 compiles them in half of the time if told to
 #: leave out the newer of its two ways to compile fused operations. Loops may run slower, a table with two derivatives by a
 #: quarter. It can go with 0.10: later versions have a single way, and refuse the option.
-compiled_quickly = eqx.filter_jit(
-    compiler_options={"xla_cpu_use_fusion_emitters": False} if jaxlib.__version__.startswith("0.10.") else {}
+compiled_quickly = _compiler(
+    compiler_options={"xla_cpu_use_fusion_emitters": False} if jaxlib_version.startswith("0.10.") else {}
 )
 
 
@@ -38,16 +46,16 @@ def compile_quickly() -> None:
 
     It halves the time of compiling; loops run three times as slow. XLA reads its flags when it is used first.
     """
-    emitters = ["--xla_cpu_use_fusion_emitters=false"] if jaxlib.__version__.startswith("0.10.") else []
+    emitters = ["--xla_cpu_use_fusion_emitters=false"] if jaxlib_version.startswith("0.10.") else []
     os.environ.setdefault("XLA_FLAGS", " ".join(["--xla_backend_optimization_level=0", *emitters]))
 
 
 #: For what is done once before a run: called on its own it is one program and not dozens of small ones, each of which takes
 #: 40 ms to compile; inside other programs it leaves no trace.
-compiled_setup = eqx.filter_jit(inline=True)
+compiled_setup = _compiler(inline=True)
 
 
-def stored(*values: Float[Array, "..."] | None) -> tuple[Float[Array, "..."] | None, ...]:
+def stored(*values: Float[Array, "..."] | None) -> tuple[Any, ...]:
     """The same values, computed once where several results depend on them; `None` stays.
 
     XLA otherwise fuses every result with all that leads to it and evaluates the common part again for each. A barrier
@@ -103,7 +111,11 @@ def least(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     >>> jax.grad(lambda x: least(2.0 * x, 1.0))(0.3).item()
     2.0
     """
-    return functools.reduce(lambda one, other: jnp.where((one < other) | jnp.isnan(one), one, other), numbers)
+
+    def lesser(one: Any, other: Any) -> Any:
+        return jnp.where((one < other) | jnp.isnan(one), one, other)
+
+    return functools.reduce(lesser, numbers)
 
 
 def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
@@ -115,7 +127,11 @@ def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     >>> jax.grad(lambda x: greatest(2.0 * x, 0.0))(0.3).item()
     2.0
     """
-    return functools.reduce(lambda one, other: jnp.where((one > other) | jnp.isnan(one), one, other), numbers)
+
+    def greater(one: Any, other: Any) -> Any:
+        return jnp.where((one > other) | jnp.isnan(one), one, other)
+
+    return functools.reduce(greater, numbers)
 
 
 def on_device(*arrays: Float[ArrayLike, "..."]) -> tuple[Float[Array, "..."], ...]:
@@ -181,11 +197,11 @@ def _inlined(*arguments: Array, program: Jaxpr, plain: Any) -> list[Array]:
 
 def _without_attributes(program: Any, plain: Any) -> Any:
     """A program whose equations, and those of the programs inside, have a plain context; any other value as it is."""
+    if type(program) in (tuple, list):
+        return type(program)(_without_attributes(one, plain) for one in program)
     # Since JAX 0.12 a `ClosedJaxpr` is a `Jaxpr`.
     if isinstance(program, ClosedJaxpr) and program.jaxpr is not program:
         return program.replace(jaxpr=_without_attributes(program.jaxpr, plain))
-    if type(program) in (tuple, list):
-        return type(program)(_without_attributes(one, plain) for one in program)
     if not isinstance(program, Jaxpr):
         return program
     equations = [
@@ -213,12 +229,12 @@ mlir.register_lowering(_kernel, mlir.lower_fun(_called_as_one, multiple_results=
 
 def _knows_the_attributes() -> bool:
     """Whether the kernel attributes are known to help: they were tried with jaxlib 0.10 to 0.12."""
-    minor = int(jaxlib.__version__.split(".")[1])
-    if jaxlib.__version__.startswith("0.") and 10 <= minor <= 12:
+    minor = int(jaxlib_version.split(".")[1])
+    if jaxlib_version.startswith("0.") and 10 <= minor <= 12:
         return True
     warnings.warn(
         f"loops are compiled without XLA's kernel attributes, which were tried with jaxlib 0.10 to 0.12, not with "
-        f"{jaxlib.__version__}: results are the same, tables may take up to 2.5 times as long. "
+        f"{jaxlib_version}: results are the same, tables may take up to 2.5 times as long. "
         "Install one of these versions where that matters.",
         stacklevel=2,
     )
