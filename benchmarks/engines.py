@@ -3,10 +3,11 @@
     python benchmarks/engines.py [--t1 12] [--engines MuJoCo ...] [--out engines.csv]
 
 Rutstam's top on the level plane, Coulomb friction with mu = 0.3 at a point, theta(0) = 0.1, 155 rad/s, centre of mass at rest.
-With this friction the top stops slipping within a tenth of a second, rolls, and does not invert (`docs/concepts/why_it_turns_over.md`). The
-script prints theta at a few times for every engine and step, the CPU time, and the error: the greatest difference of
-theta from `SetValuedCoulomb` at a tolerance of 1e-12, over 241 times. An engine's contact is compliant; its stiffness
-rises as the step shrinks, as far as the engine remains stable. Engines that are not installed are named and skipped.
+With this friction the top stops slipping within a tenth of a second, rolls, and does not invert
+(`docs/concepts/why_it_turns_over.md`). The script prints theta at a few times for every engine and step, the CPU time, and
+the error: the greatest difference of theta from `SetValuedCoulomb` at a tolerance of 1e-12, over 241 times. An engine's
+contact is compliant; that of MuJoCo gets stiffer as the step shrinks. Engines that are not installed are named and skipped;
+the extra `bench` has MuJoCo and Drake, not PyBullet, which has no wheels for recent versions of Python.
 """
 
 import argparse
