@@ -1,6 +1,13 @@
 """The ground that the models stand on: surfaces, integration, sweeps, tables. Knows neither top nor stroller."""
 
 import os
+import sys
+
+from .command_line import import_quietly as _import_quietly
+
+# While `python -m` looks for the module that it runs, Python names itself so.
+if sys.argv[:1] == ["-m"]:
+    _import_quietly()
 
 import jax
 
