@@ -134,8 +134,8 @@ def measured(
                 if time.monotonic() > deadline:
                     yield f"{program}, {launches} launches, tolerance {tolerance:.0e}"
                     continue
-                exact = np.asarray(run(launches, TIGHT)) if exact is None else exact
                 found = timed(lambda at=tolerance, run=run, many=launches: run(many, at), 2)
+                exact = np.asarray(run(launches, TIGHT)) if exact is None else exact
                 error = float(np.max(np.abs(np.asarray(found.result) - exact)) / np.max(np.abs(exact)))
                 yield Row(program, launches, tolerance, found.wall / launches * 1e6, error, found.first)
 
