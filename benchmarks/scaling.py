@@ -25,7 +25,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from measure import machine, table, timed
-from peak import operations_per_step, peak
+from operations import operations_per_step
+from peak import peak
 from scenes import TOP
 
 import tippe
@@ -133,7 +134,7 @@ def main() -> None:
     scene = tippe.Scene(tippe.Top(*TOP), tippe.Plane(), tippe.Viscous(0.3))
     started = time.perf_counter()
     problem = InversionProblem.of(scene, tippe.Launch(np.linspace(0.05, 0.15, 64), 100.0), 0.95 * np.pi, 64)
-    operations, most = operations_per_step(problem, TOLERANCE), peak()
+    operations, most = operations_per_step(problem).arithmetic, peak()
     device = f"{jax.devices()[0].device_kind}, {'double' if DOUBLE else 'single'} precision"
     print(
         f"{device}: {operations:.0f} operations a step, at most {most:.3g} a second{' on one core' if ON_CPU else ''}"

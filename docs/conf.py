@@ -1,24 +1,36 @@
 """How the manual is built: `sphinx-build -W docs build/manual`."""
 
 import importlib
-import inspect
+import json
 import os
 import re
+import sys
 from pathlib import Path
+
+import nbformat.v4 as notebooks
 
 import nonholonomic
 
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+import api_pages  # noqa: E402
 
 project = "nonholonomic"
 author = "The nonholonomic authors"
 version = release = nonholonomic.__version__
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.mathjax"]
-exclude_patterns = ["tippe.md", "stroller.md", "_build"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.mathjax", "sphinx_design"]
+exclude_patterns = ["_build"]
+
+# MathJax from a package: the manual shows formulas without a network.
+mathjax = Path(next(iter(importlib.import_module("sphinx-mathjax-offline").__path__))) / "static" / "mathjax"
+mathjax_path = "tex-svg-full.js"
 
 html_theme = "sphinx_book_theme"
 html_title = "nonholonomic"
-html_theme_options = {"show_toc_level": 2, "home_page_in_toc": True}
+html_static_path = ["_static", str(mathjax / mathjax_path)]
+html_css_files = ["manual.css"]
+# The sidebar has the search box.
+html_theme_options = {"show_toc_level": 2, "home_page_in_toc": True, "navbar_persistent": []}
 
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3
@@ -28,12 +40,12 @@ nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 
-autodoc_typehints = "none"
+autosummary_generate = False
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+python_maximum_signature_line_length = 80
 autodoc_member_order = "bysource"
 autodoc_class_signature = "mixed"
-
-#: The packages, and the titles of their pages.
-PACKAGES = {"tippe": "The top: tippe", "stroller": "The vehicle: stroller", "nonholonomic": "The ground: nonholonomic"}
 
 # Notebooks keep what they compile, and show no progress bars.
 os.environ["NONHOLONOMIC_PROGRESS"] = "0"
@@ -44,37 +56,37 @@ for name in ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time
         os.environ.setdefault(name.upper(), str(value))
 
 
-def public(package: str) -> list[str]:
-    """What a package hands out: the names that its `__init__.py` imports as themselves."""
-    text = inspect.getsource(importlib.import_module(package))
-    return sorted(set(re.findall(r"import (?!__)(\w+) as \1$", text, re.M)), key=str.lower)
+def write(path: Path, text: str) -> None:
+    """Write a generated page if it changed, so that Sphinx reads only such pages again."""
+    if not path.exists() or path.read_text() != text:
+        path.write_text(text)
 
 
-def write_pages() -> None:
-    """A page for each package, with an entry for every public name."""
-    folder, homes = HERE / "api", {}
-    folder.mkdir(exist_ok=True)
-    for package, title in PACKAGES.items():
-        module = importlib.import_module(package)
-        lines = [title, "=" * len(title), "", f".. currentmodule:: {package}", ""]
-        for name in public(package):
-            value = getattr(module, name)
-            # What several packages hand out stands on the page of the first.
-            home = homes.setdefault(id(value), f"{package}.{name}")
-            if home != f"{package}.{name}":
-                lines += [f"``{package}.{name}``: as ``{home}``.", ""]
-            elif inspect.ismodule(value):
-                lines += [f".. automodule:: {home}", "   :members:", ""]
-            elif inspect.isclass(value):
-                lines += [f".. autoclass:: {home}", "   :members:", ""]
-            else:
-                lines += [f".. autofunction:: {home}", ""]
-        text, page = "\n".join(lines), folder / f"{package}.rst"
-        if not page.exists() or page.read_text() != text:
-            page.write_text(text)
+def write_api() -> None:
+    """A page for each task."""
+    if missing := api_pages.missing():
+        raise ValueError(f"docs/api_pages.py names no page for {missing}")
+    for name, page in api_pages.PAGES.items():
+        write(HERE / "api" / f"{name}.rst", api_pages.text(page))
 
 
-write_pages()
+def write_gallery() -> None:
+    """A notebook for each card of the gallery, from the script of its name in `examples/`."""
+    cards = re.findall(r"^:::\{grid-item-card\} (.+)\n:link: gallery/(\w+)$", (HERE / "gallery.md").read_text(), re.M)
+    for title, name in cards:
+        program = (HERE.parent / "examples" / f"{name}.py").read_text().split('\n\nif __name__ == "__main__":')[0]
+        cells = [
+            notebooks.new_markdown_cell(f"# {title}", id="title"),
+            notebooks.new_code_cell(program.strip(), id="program"),
+            notebooks.new_code_cell("draw()", id="picture"),
+        ]
+        kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
+        notebook = notebooks.new_notebook(cells=cells, metadata=kernel)
+        write(HERE / "gallery" / f"{name}.ipynb", json.dumps(notebook, indent=1) + "\n")
+
+
+write_api()
+write_gallery()
 
 
 def as_rst(app, what, name, obj, options, lines) -> None:
@@ -87,28 +99,30 @@ def as_rst(app, what, name, obj, options, lines) -> None:
             example = starts
         # An example needs no fences; an empty line parts it from the text.
         blocks[-1].append("" if line.strip() == "```" else line)
-    found = []
+    converted = []
     for block in blocks:
         text = "\n".join(block)
         if block and block[0].lstrip().startswith(">>>"):
-            found += ["", *block]
+            converted += ["", *block]
         else:
-            parts = re.split(r"(`+[^`]+`+)", text)
-            found += "".join(_literal(part) if part.startswith("`") else _plain(part) for part in parts).split("\n")
-    lines[:] = found
+            parts = re.split(r"(`(?:tippe|stroller)\.md`,\s+sections? \d+|`+[^`]+`+)", text)
+            converted += "".join(map(_inline, parts)).split("\n")
+    lines[:] = converted
 
 
-def _literal(text: str) -> str:
-    return f"``{text.strip('`')}``"
-
-
-def _plain(text: str) -> str:
+def _inline(text: str) -> str:
+    """Code, a link to a derivation, or plain text."""
+    if cited := re.fullmatch(r"`((\w+)\.md)`,\s+(sections?) (\d+)", text):
+        page, model, word, number = cited.groups()
+        return f":ref:`{page}, {word} {number} <{model}-{number}>`"
+    if text.startswith("`"):
+        return f"``{text.strip('`')}``"
     text = text.replace("\\", "\\\\").replace("|", "\\|")
     return re.sub(r"(?<!\*)\*(?!\*)", r"\\*", text)
 
 
 def skip(app, what, name, obj, skip, options):
-    """Fields without a docstring are told of in that of their class."""
+    """The docstring of a class describes its fields."""
     return True if name.startswith("_") or name == "units" else skip
 
 

@@ -29,12 +29,19 @@ return stage.renderer.domElement.toDataURL('image/webp', 1);
 """
 
 
-def browser() -> Chrome:
-    """Chromium without a window."""
+def browser(*arguments: str) -> Chrome:
+    """Chromium without a window; arguments of yours come last."""
     options = ChromeOptions()
     options.binary_location = shutil.which("chromium")
     drawn_by = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1000,900", *drawn_by):
+    for argument in (
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-dev-shm-usage",
+        "--window-size=1000,900",
+        *drawn_by,
+        *arguments,
+    ):
         options.add_argument(argument)
     return Chrome(options=options, service=Service(shutil.which("chromedriver")))
 

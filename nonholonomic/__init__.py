@@ -1,9 +1,18 @@
 """The ground that the models stand on: surfaces, integration, sweeps, tables. Knows neither top nor stroller."""
 
 import os
-from importlib.metadata import PackageNotFoundError, version
+import sys
+
+from .command_line import import_quietly as _import_quietly
+
+# While `python -m` looks for the module that it runs, Python names itself so.
+if sys.argv[:1] == ["-m"]:
+    _import_quietly()
 
 import jax
+
+#: The one place where a version is set; the package's metadata takes it from here.
+__version__ = "0.2.0"
 
 # Float64 throughout, unless the user chose otherwise; it has to be set before the first array is made.
 if "JAX_ENABLE_X64" not in os.environ:
@@ -30,9 +39,3 @@ from .systems import event_time as event_time
 from .systems import identify as identify
 from .systems import simulate as simulate
 from .systems import sweep as sweep
-
-try:
-    __version__ = version("nonholonomic")
-except PackageNotFoundError:
-    # Run from a checkout that is not installed.
-    __version__ = "unknown"

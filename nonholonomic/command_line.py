@@ -6,15 +6,28 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import NoReturn
+from typing import Any, NoReturn
 
 #: How long the main thread may take to tell what was saved [s] before the process ends without that.
-PATIENCE = 1.5
+PATIENCE = 1.0
 
 #: The exit status of a program that SIGINT ended, as shells report it.
 INTERRUPTED = 130
 
 _ending = threading.Lock()
+
+
+def import_quietly() -> None:
+    """While `python -m` imports the packages, Ctrl-C ends it with one line instead of a traceback."""
+    program, shown = sys.orig_argv[sys.orig_argv.index("-m") + 1], sys.excepthook
+
+    def hook(kind: type[BaseException], error: BaseException, trace: Any) -> None:
+        if issubclass(kind, KeyboardInterrupt):
+            print(f"python -m {program}: interrupted", file=sys.stderr)
+        else:
+            shown(kind, error, trace)
+
+    sys.excepthook = hook
 
 
 def interruptible(main: Callable[[], int], program: str) -> int:

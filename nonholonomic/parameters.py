@@ -10,6 +10,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jax.core import Tracer
 
 
 def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
@@ -131,7 +132,7 @@ def description(root: str, tree: Any) -> dict[str, Any]:
 
     A function has nothing but its name to show.
     """
-    fields = {root: type(tree).__name__}
+    fields: dict[str, Any] = {root: type(tree).__name__}
     for field in dataclasses.fields(tree):
         name, value = f"{root}.{field.name}", getattr(tree, field.name)
         if isinstance(value, eqx.Module):
@@ -169,7 +170,7 @@ def as_text(value: Any, unit: str = "1") -> str:
     """A value as text: a number to six digits with its unit, an array by its first and last numbers."""
     if isinstance(value, eqx.Module):
         return repr(value)
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         return f"traced {value.aval.str_short()}"
     behind = readable_unit(unit)
     behind = f" {behind}" if behind else ""

@@ -6,6 +6,7 @@ refused with a message; for traced ones `legal` is false in the program, whose r
 
 import dataclasses
 import functools
+import inspect
 import operator
 import tempfile
 import warnings
@@ -34,7 +35,8 @@ def as_number(value: Any) -> Float[Array, "..."]:
             raise TypeError
         return jnp.asarray(value, dtype=float)
     except (TypeError, ValueError):
-        return value
+        # The types leave out what `require` will refuse.
+        return value  # pyright: ignore[reportReturnType]
 
 
 def as_number_or_none(value: Any) -> Float[Array, "..."] | None:
@@ -142,7 +144,12 @@ def require_kind(value: Any, name: str, kind: type, example: str = "") -> None:
     if type(value).__name__ == wanted:
         theirs, ours = (one.__module__.partition(".")[0] for one in (type(value), kind))
         raise ValueError(f"{name} is a {theirs}.{wanted} and must be a {ours}.{wanted}: the packages have one each")
-    raise ValueError(f"{name} = {value!r} must be a {wanted}{example}")
+    raise ValueError(f"{name} = {value!r} must be a {wanted}{example}{uncalled(value)}")
+
+
+def uncalled(value: Any) -> str:
+    """What a message adds where a function stands for its result, as `tippe.presets.wooden` for `tippe.presets.wooden()`."""
+    return f"; did you mean {value.__name__}()?" if inspect.isfunction(value) else ""
 
 
 def require_one_run(run: Any, action: str, many: str) -> None:

@@ -8,27 +8,36 @@ import functools
 import os
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlib
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
+from jax.interpreters import mlir, partial_eval
+from jaxlib.version import __version__ as jaxlib_version
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+Result = TypeVar("Result")
+
+
+def _compiler(**options: Any) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
+    """`filter_jit` with options of `jax.jit`, which Equinox's types leave out; compiled functions take NumPy's arrays too."""
+    return eqx.filter_jit(**options)
+
 
 #: Vectors of 512 bits, which compilers avoid by default, make the sums over stages 1.2 to 1.6 times as fast. JAX
 #: takes compiler options only for the outermost compiled function, so it is for programs that are called on their own. It can
 #: go when XLA prefers 512 bits by itself; without AVX-512 it does nothing.
-compiled_alone = eqx.filter_jit(compiler_options={"xla_cpu_prefer_vector_width": 512})
+compiled_alone = _compiler(compiler_options={"xla_cpu_prefer_vector_width": 512})
 
 #: For programs that are called on their own and run for a moment only: jaxlib 0.10 compiles them in half of the time if told to
 #: leave out the newer of its two ways to compile fused operations. Loops may run slower, a table with two derivatives by a
 #: quarter. It can go with 0.10: later versions have a single way, and refuse the option.
-compiled_quickly = eqx.filter_jit(
-    compiler_options={"xla_cpu_use_fusion_emitters": False} if jaxlib.__version__.startswith("0.10.") else {}
+compiled_quickly = _compiler(
+    compiler_options={"xla_cpu_use_fusion_emitters": False} if jaxlib_version.startswith("0.10.") else {}
 )
 
 
@@ -37,16 +46,16 @@ def compile_quickly() -> None:
 
     It halves the time of compiling; loops run three times as slow. XLA reads its flags when it is used first.
     """
-    emitters = ["--xla_cpu_use_fusion_emitters=false"] if jaxlib.__version__.startswith("0.10.") else []
+    emitters = ["--xla_cpu_use_fusion_emitters=false"] if jaxlib_version.startswith("0.10.") else []
     os.environ.setdefault("XLA_FLAGS", " ".join(["--xla_backend_optimization_level=0", *emitters]))
 
 
 #: For what is done once before a run: called on its own it is one program and not dozens of small ones, each of which takes
 #: 40 ms to compile; inside other programs it leaves no trace.
-compiled_setup = eqx.filter_jit(inline=True)
+compiled_setup = _compiler(inline=True)
 
 
-def stored(*values: Float[Array, "..."] | None) -> tuple[Float[Array, "..."] | None, ...]:
+def stored(*values: Float[Array, "..."] | None) -> tuple[Any, ...]:
     """The same values, computed once where several results depend on them; `None` stays.
 
     XLA otherwise fuses every result with all that leads to it and evaluates the common part again for each. A barrier
@@ -102,7 +111,11 @@ def least(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     >>> jax.grad(lambda x: least(2.0 * x, 1.0))(0.3).item()
     2.0
     """
-    return functools.reduce(lambda one, other: jnp.where((one < other) | jnp.isnan(one), one, other), numbers)
+
+    def lesser(one: Any, other: Any) -> Any:
+        return jnp.where((one < other) | jnp.isnan(one), one, other)
+
+    return functools.reduce(lesser, numbers)
 
 
 def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
@@ -114,7 +127,11 @@ def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     >>> jax.grad(lambda x: greatest(2.0 * x, 0.0))(0.3).item()
     2.0
     """
-    return functools.reduce(lambda one, other: jnp.where((one > other) | jnp.isnan(one), one, other), numbers)
+
+    def greater(one: Any, other: Any) -> Any:
+        return jnp.where((one > other) | jnp.isnan(one), one, other)
+
+    return functools.reduce(greater, numbers)
 
 
 def on_device(*arrays: Float[ArrayLike, "..."]) -> tuple[Float[Array, "..."], ...]:
@@ -129,37 +146,95 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     Otherwise every fused operation of a loop's body is a call of its own, and for blocks that fit the first caches calling
     costs as much as computing. XLA does so by itself for loops over very small arrays only. The gain is 2.5 times with jaxlib
     0.10.2 and 1.3 times with 0.12. It can go when XLA's threshold can be set for one program.
+
+    JAX chooses the platform when it lowers a program, and on no other than a CPU does the function leave a trace
+    (`jax.export` lowers for platforms that this machine does not have).
     """
-    if jax.default_backend() != "cpu" or not _knows_the_attributes():
+    if not _knows_the_attributes():
         return function
 
     def called(argument: Any) -> Any:
+        plain = jax.make_jaxpr(jnp.negative)(0.0).jaxpr.eqns[0].ctx
         # The attributes also keep the small functions inside, such as `where`, from being fused into all that use them.
-        with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+        with set_xla_metadata(**_ATTRIBUTES):
             closed, shape = jax.make_jaxpr(function, return_shape=True)(argument)
-
-            def looking_at_all(*arguments: Any) -> Any:
-                constants, leaves = arguments[: len(closed.consts)], arguments[len(closed.consts) :]
-                look = sum(jnp.ravel(leaf)[0].astype(float) for leaf in arguments)
-                return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))(*leaves), look
-
-            # XLA 0.10.2 aborts on a call with an argument that it does not use. So each is looked at, from behind a
-            # barrier, for what is known to be constant would not be.
-            arguments = jax.lax.optimization_barrier([*closed.consts, *jax.tree.leaves(argument)])
-            results, _ = jax.lax.optimization_barrier(jax.jit(looking_at_all)(*arguments))
+        # What the function closes over becomes its first arguments.
+        inputs = [*closed.jaxpr.constvars, *closed.jaxpr.invars]
+        program = closed.jaxpr.replace(constvars=[], invars=inputs)
+        results = _kernel.bind(*closed.consts, *jax.tree.leaves(argument), program=program, plain=plain)
         return jax.tree.unflatten(jax.tree.structure(shape), results)
 
     return called
 
 
+_ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
+
+#: A program with the attributes in all of its equations; `plain` is the context of an equation without them.
+_kernel = Primitive("in_one_kernel")
+_kernel.multiple_results = True
+_kernel.def_impl(lambda *arguments, **rest: jax.jit(functools.partial(_kernel.bind, **rest))(*arguments))
+_kernel.def_abstract_eval(lambda *arguments, program, plain: [variable.aval for variable in program.outvars])
+
+
+def _called_as_one(*arguments: Array, program: Jaxpr, plain: Any) -> list[Array]:
+    """The program as a function that is not inlined."""
+
+    def looking_at_all(*arguments: Any) -> Any:
+        look = sum(jnp.ravel(leaf)[0].astype(float) for leaf in arguments)
+        return jaxpr_as_fun(ClosedJaxpr(program, ()))(*arguments), look
+
+    # XLA 0.10.2 aborts on a call with an argument that it does not use. So each is looked at, from behind a
+    # barrier, for what is known to be constant would not be.
+    with set_xla_metadata(**_ATTRIBUTES):
+        results, _ = jax.lax.optimization_barrier(jax.jit(looking_at_all)(*jax.lax.optimization_barrier(arguments)))
+    return results
+
+
+def _inlined(*arguments: Array, program: Jaxpr, plain: Any) -> list[Array]:
+    """The program without the attributes."""
+    return jaxpr_as_fun(ClosedJaxpr(_without_attributes(program, plain), ()))(*arguments)
+
+
+def _without_attributes(program: Any, plain: Any) -> Any:
+    """A program whose equations, and those of the programs inside, have a plain context; any other value as it is."""
+    if type(program) in (tuple, list):
+        return type(program)(_without_attributes(one, plain) for one in program)
+    # Since JAX 0.12 a `ClosedJaxpr` is a `Jaxpr`.
+    if isinstance(program, ClosedJaxpr) and program.jaxpr is not program:
+        return program.replace(jaxpr=_without_attributes(program.jaxpr, plain))
+    if not isinstance(program, Jaxpr):
+        return program
+    equations = [
+        one.replace(ctx=plain, params={name: _without_attributes(value, plain) for name, value in one.params.items()})
+        for one in program.eqns
+    ]
+    return program.replace(eqns=equations)
+
+
+def _without_unused(used: list[bool], *others: Any) -> tuple[list[bool], Any]:
+    """The equation with a program in which nothing is computed that no output needs, as JAX 0.12 does with its own."""
+    # Since JAX 0.12 a list of inputs stands between the two.
+    equation = others[-1]
+    if not any(used):
+        return [False] * len(equation.invars), None
+    program = equation.params["program"]
+    kept, _ = partial_eval.dce_jaxpr(program, [True] * len(program.outvars), instantiate=True)
+    return [True] * len(equation.invars), equation.replace(params={**equation.params, "program": kept})
+
+
+partial_eval.dce_rules[_kernel] = _without_unused
+mlir.register_lowering(_kernel, mlir.lower_fun(_inlined, multiple_results=True))
+mlir.register_lowering(_kernel, mlir.lower_fun(_called_as_one, multiple_results=True), platform="cpu")
+
+
 def _knows_the_attributes() -> bool:
     """Whether the kernel attributes are known to help: they were tried with jaxlib 0.10 to 0.12."""
-    minor = int(jaxlib.__version__.split(".")[1])
-    if jaxlib.__version__.startswith("0.") and 10 <= minor <= 12:
+    minor = int(jaxlib_version.split(".")[1])
+    if jaxlib_version.startswith("0.") and 10 <= minor <= 12:
         return True
     warnings.warn(
         f"loops are compiled without XLA's kernel attributes, which were tried with jaxlib 0.10 to 0.12, not with "
-        f"{jaxlib.__version__}: results are the same, tables may take up to 2.5 times as long. "
+        f"{jaxlib_version}: results are the same, tables may take up to 2.5 times as long. "
         "Install one of these versions where that matters.",
         stacklevel=2,
     )

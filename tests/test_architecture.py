@@ -202,7 +202,8 @@ def test_few_files_stand_outside_of_the_rooms():
 
 def test_every_file_that_the_walk_names_exists():
     named = re.findall(
-        r"`((?:tests|tippe|nonholonomic|stroller)/[\w/.]*)`", (ROOT / "docs" / "architecture.md").read_text()
+        r"`((?:tests|tippe|nonholonomic|stroller)/[\w/.]*)`",
+        (ROOT / "docs" / "development" / "architecture.md").read_text(),
     )
     assert named
     assert [name for name in named if not (ROOT / name).exists()] == []

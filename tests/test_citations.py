@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 #: A Python file or a document, or a folder in backquotes, with or without the folders that it lies in.
 CITED = re.compile(r"(?<![\w./<])(?:[\w.-]+/)*[\w-]+\.(?:py|md)\b|(?<=`)(?:[\w.-]+/)+(?=`)")
 
-FOLDERS = ("nonholonomic", "tippe", "stroller", "tests", "benchmarks", "examples", "docs")
+FOLDERS = ("nonholonomic", "tippe", "stroller", "tests", "benchmarks", "examples", "docs", "reference", "paper")
 
 TEXTS = [
     *ROOT.glob("*.md"),

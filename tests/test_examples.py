@@ -54,11 +54,3 @@ def test_example_runs(path, capsys, tmp_path, monkeypatch):
         with pytest.warns(FitWarning, match=WARNED[path.stem]) if path.stem in WARNED else contextlib.nullcontext():
             names["main"]()
         assert re.search(FINDS[path.stem], capsys.readouterr().out)
-
-
-def test_the_gallery_shows_every_picture():
-    """Each script that draws is on the page, a dozen of them, and each on the page is a script."""
-    page = (EXAMPLES[0].parents[1] / "docs" / "gallery.md").read_text()
-    shown = re.findall(r'^draw\("(\w+)"\)$', page, re.M)
-    assert len(shown) >= 12
-    assert sorted(shown) == sorted({path.stem for path in EXAMPLES if "def draw(" in path.read_text()})

@@ -1,5 +1,6 @@
-"""What a release needs: one version everywhere, typed packages, and a law and a body written as CONTRIBUTING.md says."""
+"""What a release needs: one version, files for citations, typed packages, a law and a body written as CONTRIBUTING.md says."""
 
+import json
 import re
 import tomllib
 from collections.abc import Iterator
@@ -9,21 +10,58 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import pytest
+import yaml
 from close import assert_close
 from jaxtyping import Array, Float
 
+import nonholonomic
+import stroller
 import tippe
+from nonholonomic.sweeps import versions
 from nonholonomic.validation import Bound, as_number
 from tippe.model.body import AbstractBody, AbstractMeridian, ContactGeometry
 from tippe.model.friction import AbstractFriction, ContactLoad, Slip, length
 
 ROOT = Path(__file__).parents[1]
-VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
-def test_the_version_is_the_same_everywhere():
-    assert f"\nversion: {VERSION}\n" in (ROOT / "CITATION.cff").read_text()
-    assert f"\n## {VERSION}\n" in (ROOT / "CHANGELOG.md").read_text()
+def test_the_version_is_set_in_one_place():
+    """The package's metadata take it from `nonholonomic/__init__.py`; the files for citations and changes repeat it."""
+    assert PROJECT["dynamic"] == ["version"]
+    assert nonholonomic.__version__ == tippe.__version__ == stroller.__version__ == versions()["nonholonomic"]
+    assert f"\nversion: {nonholonomic.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    first = re.search(r"^## (.*)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert first.group(1) == nonholonomic.__version__
+
+
+def test_citations_name_the_same_authors_and_licence():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    deposit = json.loads((ROOT / ".zenodo.json").read_text())
+    paper = yaml.safe_load((ROOT / "paper" / "paper.md").read_text().split("---")[1])
+    names = [author["name"] for author in citation["authors"]]
+    assert (
+        names == [author["name"] for author in deposit["creators"]] == [author["name"] for author in paper["authors"]]
+    )
+    assert citation["title"] == deposit["title"]
+    assert citation["license"] == deposit["license"] == PROJECT["license"]
+
+
+def test_every_python_that_is_named_is_tested():
+    checks = yaml.safe_load((ROOT / ".github" / "workflows" / "check.yml").read_text())
+    tested = checks["jobs"]["run"]["strategy"]["matrix"]["python"]
+    named = [re.fullmatch(r"Programming Language :: Python :: (3\.\d+)", line) for line in PROJECT["classifiers"]]
+    assert tested == [match.group(1) for match in named if match]
+    assert PROJECT["requires-python"] == f">={tested[0]}"
+
+
+def test_the_paper_cites_what_its_bibliography_has():
+    text, bibliography = ((ROOT / "paper" / name).read_text() for name in ("paper.md", "paper.bib"))
+    assert set(re.findall(r"@(\w+)(?=[\];,])", text)) == set(re.findall(r"^@\w+\{(\w+),", bibliography, re.MULTILINE))
+    figures = re.findall(r"\]\(([^)]+\.png)\)", text)
+    assert len(figures) == 2
+    assert all((ROOT / "paper" / figure).exists() for figure in figures)
+    assert 750 <= len(text.split()) <= 1500
 
 
 @pytest.mark.parametrize("package", ["tippe", "stroller", "nonholonomic"])

@@ -1,11 +1,12 @@
 """The main job, `python -m tippe`: a wooden top that climbs onto its stem, on a table and in a cylinder."""
 
 import argparse
+import functools
 import gc
 import math
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from html import escape
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,7 +19,7 @@ from nonholonomic.command_line import interruptible
 from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.progress import Progress, status_line
-from nonholonomic.sweeps import Table
+from nonholonomic.sweeps import Table, saved_cells
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html, table_as_html
 from nonholonomic.xla_cpu import compile_quickly
@@ -123,20 +124,34 @@ def tables(options: argparse.Namespace) -> tuple[dict[str, Table], Any]:
             arenas["plane"], Launch(middle(thetas), spin), min(SHOWN, options.t1), tolerance=options.tolerance
         )
 
-    with Progress(len(arenas) + 1, "job", "compiling") as counted, ThreadPoolExecutor(2) as threads:
-        counted.begin()
-        cylinder, plane, shown = threads.submit(table, "cylinder"), threads.submit(table, "plane"), threads.submit(run)
-        for job in (plane, shown, cylinder):
-            job.result()
-            counted.advance(1)
-    return {"plane": plane.result(), "cylinder": cylinder.result()}, shown.result()
+    jobs = (functools.partial(table, "cylinder"), functools.partial(table, "plane"), run)
+    threads = ThreadPoolExecutor(2)
+    try:
+        with Progress(len(jobs), "job", "compiling") as counted:
+            counted.begin()
+            futures = [threads.submit(job) for job in jobs]
+            for future in as_completed(futures):
+                future.result()
+                counted.advance(1)
+    finally:
+        # After Ctrl-C the process ends while the compiler is at work, to which nothing gets through.
+        threads.shutdown(wait=False, cancel_futures=True)
+    cylinder, plane, shown = (future.result() for future in futures)
+    return {"plane": plane, "cylinder": cylinder}, shown
+
+
+def saved(options: argparse.Namespace) -> str:
+    """What Ctrl-C leaves."""
+    cells = sum(saved_cells(options.out / f"{arena}.h5") for arena in scenes(options))
+    total = len(scenes(options)) * len(options.theta) * len(options.mu)
+    return f"saved {cells} of {total} cells to {options.out}; run the same command again to resume"
 
 
 def rows_of(options: argparse.Namespace, table: Table) -> list[list[str]]:
     """The entries of a table, a number or a word each, under its two headings."""
     rows = [["theta(0)", *(f"mu = {mu:g}" for mu in options.mu)]]
     for theta, times, words in zip(options.theta, table.time, table.status, strict=True):
-        entries = [f"{t:.2f}" if math.isfinite(t) else WORDS.get(w, w) for t, w in zip(times, words, strict=True)]
+        entries = [f"{t:.2f}" if math.isfinite(t) else str(WORDS.get(w, w)) for t, w in zip(times, words, strict=True)]
         rows.append([f"{theta:g} deg", *entries])
     return rows
 
@@ -167,7 +182,8 @@ def picture(options: argparse.Namespace, run: Any) -> Any:
     above = np.flatnonzero(theta > 0.95 * np.pi)
     end = times[above[0]] if len(above) else np.inf
     title = f"{options.top} top, {options.rpm:g} rpm, mu = {middle(options.mu):g}, on a table"
-    return draw_launches([Panel(title, times, theta[None], theta[:1], np.array([end]))], 0.95 * np.pi)
+    panel = Panel(title, times, theta[None], theta[:1], np.array([end]))
+    return draw_launches([panel], 0.95 * np.pi, "for the first time above the dashed angle")
 
 
 def write_page(options: argparse.Namespace, found: dict[str, Table], run: Any, drawing: Path | None) -> Path:
@@ -218,6 +234,8 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"python -m tippe: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(saved(options)) from None
     cells = sum(table.status.size for table in found.values())
     print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
     print(f"Wrote {', '.join(map(str, written))}.")

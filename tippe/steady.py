@@ -99,7 +99,7 @@ def _root_of_ratio(value: Float[Array, "..."], excess: Float[Array, "..."]) -> F
     return jnp.where(excess > 0.0, jnp.sqrt(value / jnp.where(excess > 0.0, excess, 1.0)), jnp.inf)
 
 
-def upright_critical_spin(scene: Scene) -> Float[Array, "..."]:
+def upright_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
     """Spin [rad/s] above which the upright top on the plane is unstable; infinite if it never is.
 
     omega^2 = m g a (1 - alpha)^2 / (I3 (gamma - 1 + alpha)).
@@ -114,7 +114,7 @@ def upright_critical_spin(scene: Scene) -> Float[Array, "..."]:
     return _root_of_ratio(weight * (1.0 - alpha) ** 2 / scene.body.I3, gamma - 1.0 + alpha)
 
 
-def inverted_critical_spin(scene: Scene) -> Float[Array, "..."]:
+def inverted_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
     """Spin [rad/s] above which the inverted top on the plane is stable, on its stem if it has one; infinite if it never is.
 
     omega^2 = m g a (1 + alpha)^2 / (I3 (1 + alpha - gamma)), for a stem with its offset and radius (`tippe.md`, sections 4, 6).
@@ -130,7 +130,7 @@ def inverted_critical_spin(scene: Scene) -> Float[Array, "..."]:
     return _root_of_ratio(weight * (1.0 + alpha) ** 2 / body.I3, 1.0 + alpha - gamma)
 
 
-def jellett_thresholds(scene: Scene) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+def jellett_thresholds(scene: Scene[Top]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Jellett's constant [kg m^3/s] of the standing tops at their critical spins, upright and inverted.
 
     Below the first, the upright top is stable; above the second, the inverted one is (Rutstam's lambda_thres).
@@ -229,7 +229,7 @@ class Tumbling(NamedTuple):
     jellett: Float[Array, "..."]
 
 
-def _lever_and_inertia(scene: Scene, theta: Float[ArrayLike, "..."]):
+def _lever_and_inertia(scene: Scene[Top], theta: Float[ArrayLike, "..."]):
     """D = I3 (alpha - cos) + I1 cos and G = I1 sin^2 + I3 (cos - alpha)^2 [kg m^2]."""
     alpha, _ = proportions(scene.body)
     s, c = jnp.sin(theta), jnp.cos(theta)
@@ -237,7 +237,7 @@ def _lever_and_inertia(scene: Scene, theta: Float[ArrayLike, "..."]):
     return lever, scene.body.I1 * s**2 + scene.body.I3 * (c - alpha) ** 2
 
 
-def tumbling(scene: Scene, theta: Float[ArrayLike, "..."]) -> Tumbling:
+def tumbling(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Tumbling:
     """The tumbling top at an inclination, the one of the two with positive phi'.
 
     phi'^2 = m g a / D, omega3 = (cos - alpha) phi', J = R G phi', with D = I3 (alpha - cos) + I1 cos and
@@ -265,7 +265,7 @@ def tumbling(scene: Scene, theta: Float[ArrayLike, "..."]) -> Tumbling:
     return Tumbling(theta, precession, spin, scene.body.radius * inertia * precession)
 
 
-def tumbling_is_stable(scene: Scene, theta: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
+def tumbling_is_stable(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     """Whether the tumbling top is stable: J^2 grows with theta there, that is 4 D^2 + G (I1 - I3) > 0.
 
     **Example:** of the module's scene.
@@ -278,7 +278,7 @@ def tumbling_is_stable(scene: Scene, theta: Float[ArrayLike, "..."]) -> Float[Ar
 
 
 def effective_energy(
-    scene: Scene, theta: Float[ArrayLike, "..."], jellett: Float[ArrayLike, "..."]
+    scene: Scene[Top], theta: Float[ArrayLike, "..."], jellett: Float[ArrayLike, "..."]
 ) -> Float[Array, "..."]:
     """Least energy [J] of a top with the given inclination and Jellett's constant: J^2 / (2 R^2 G) + m g (R - a cos).
 
@@ -296,7 +296,7 @@ def effective_energy(
     return as_number(jellett) ** 2 / (2.0 * body.radius**2 * inertia) + body.mass * scene.gravity * height
 
 
-def tumbling_angles(scene: Scene, jellett: float, samples: int = 2001) -> list[float]:
+def tumbling_angles(scene: Scene[Top], jellett: float, samples: int = 2001) -> list[float]:
     """Every inclination [rad] at which a tumbling top has the given Jellett's constant, in rising order.
 
     **Arguments:**
@@ -320,7 +320,7 @@ def tumbling_angles(scene: Scene, jellett: float, samples: int = 2001) -> list[f
     return [float(root) for root in sign_changes(slope, grid[1:-1])]
 
 
-def tumbling_state(scene: Scene, motion: Tumbling) -> Float[Array, " 8"]:
+def tumbling_state(scene: Scene[Top], motion: Tumbling) -> Float[Array, " 8"]:
     """State of the vector form of a tumbling top whose axis leans towards t1.
 
     **Example:** of the module's scene.
@@ -352,7 +352,7 @@ def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
 
 
 @eqx.filter_jit
-def tumbling_matrix(scene: Scene, motion: Tumbling) -> Float[Array, "5 5"]:
+def tumbling_matrix(scene: Scene[Top], motion: Tumbling) -> Float[Array, "5 5"]:
     """Matrix [1/s] of the linear motion near a tumbling top, seen by an observer who precesses with it.
 
     Taken on the five directions that keep |e| and Jellett's constant and do not merely turn the top about the vertical.

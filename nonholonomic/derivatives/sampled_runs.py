@@ -31,6 +31,10 @@ from .variation import VariationalProblem, in_groups
 Build = Callable[[Any, int | None], AbstractProblem]
 
 
+#: In the derivative of a `SampledRun`: end state, status and numbers of steps.
+NOT_DIFFERENTIATED: tuple[Any, ...] = (None,) * 4
+
+
 class SampledRun(NamedTuple):
     """A run at given times, all floats: its states, NaN after its end; when and where it ended, the status code
     (`REACHED_END`, `LEFT_DOMAIN` or `FAILED`), and the numbers of accepted and rejected steps.
@@ -232,7 +236,7 @@ def _found(
             later = eqx.filter_jvp(end_time, (varied.problem, end), (direction, at_end))[1]
             later = jnp.where((status == LEFT_DOMAIN) & (time > 0.0), later, 0.0)
         changes = parted(varied.problem, jnp.where(jnp.isnan(states), 0.0, variation))
-        return SampledRun(*changes, later, None, None, None, None)
+        return SampledRun(*changes, later, *NOT_DIFFERENTIATED)
 
     slopes = [slope(*one) for one in zip(varied.tangents, variations, end_variations, strict=True)]
     numbers = (part.astype(float) for part in (status, *counts))

@@ -122,7 +122,9 @@ def _event_time(varied: VariationalProblem, lane_state: LaneState) -> Float[Arra
     """
     crossing, rate = varied.problem.event_function, varied.problem.field(lane_state.time, lane_state.state)
     fall = stop_gradient(jax.jvp(crossing, (stop_gradient(lane_state.state),), (rate,))[1])
-    return lane_state.time - crossing(lane_state.state) / jnp.where(fall == 0.0, 1.0, fall)
+    value = crossing(lane_state.state)
+    assert value is not None
+    return lane_state.time - value / jnp.where(fall == 0.0, 1.0, fall)
 
 
 def _moving(problem: AbstractProblem, direction: Any) -> Any:

@@ -44,3 +44,4 @@ from .vector import scale as scale
 from .vector import subtract as subtract
 from .vector import sum_vectors as sum_vectors
 from .vector import tangents as tangents
+from .vector import vector_of as vector_of

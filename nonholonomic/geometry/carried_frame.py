@@ -21,7 +21,7 @@ from .plane import Plane
 from .quadric import Sphere
 from .surface import AbstractSurface
 from .torus import Torus
-from .vector import Component, Vector, cross, dot, scale, sum_vectors, tangents
+from .vector import Component, Vector, cross, dot, scale, sum_vectors, tangents, vector_of
 
 
 def place_named(surface: AbstractSurface, place: Place) -> Place:
@@ -98,7 +98,7 @@ class CarriedFrame(AbstractFrame):
     def _start(self, foot: Fixed, along_eta: bool) -> tuple[Place, Place]:
         """The frame at a foot. `along_eta`: whether t1 points as in `CylinderFrame`, along growing eta inside; the projection
         of the x axis reverses its direction at eta = pi/2."""
-        foot = tuple(jnp.broadcast_arrays(*(0.0 if x is None else x for x in foot)))
+        foot = vector_of(jnp.broadcast_arrays(*(0.0 if x is None else x for x in foot)))
         normal = self.normal(foot)
         t1 = (normal[2], jnp.zeros_like(normal[1]), -normal[0]) if along_eta else tangents(normal)[0]
         return (*foot, *t1), ()
@@ -106,7 +106,7 @@ class CarriedFrame(AbstractFrame):
     def normal(self, foot: Fixed) -> Fixed:
         """The normal n at a foot, in the surface's axes."""
         normal = scale(self.side, self.surface.normal(foot))
-        return tuple(jnp.broadcast_to(0.0 if x is None else x, jnp.shape(foot[0])) for x in normal)
+        return vector_of(jnp.broadcast_to(0.0 if x is None else x, jnp.shape(foot[0])) for x in normal)
 
     @property
     def place_scales(self) -> tuple[Component, ...]:
@@ -129,16 +129,16 @@ class CarriedFrame(AbstractFrame):
         moved = sum_vectors(scale(q1, t1), scale(q2, t2), scale(back, n))
         # Both are positive where both of 1 - R k are; the first of them to vanish takes the determinant with it.
         room = jnp.minimum(determinant, 0.5 * (A11 + A22))
-        return FrameMotion((o1, o2), tuple(up), (*moved, *scale(o1, n)), room)
+        return FrameMotion((o1, o2), vector_of(up), (*moved, *scale(o1, n)), room)
 
     def _shape(self, foot: Fixed, t1: Fixed, t2: Fixed) -> tuple[Component, Component, Component]:
         """The shape operator of the arena, n' = -S_a q', as (S11, S12, S22)."""
         bending, zero = scale(-self.side, self.surface.bending(foot, t1, t2)), jnp.zeros_like(foot[0])
-        return tuple(zero if S is None else S for S in bending)
+        return vector_of(zero if S is None else S for S in bending)
 
     def _seen(self, *axes: Fixed) -> Vector:
         """The upward vertical in the frame."""
-        return tuple(dot(axis, self.up) for axis in axes)
+        return vector_of(dot(axis, self.up) for axis in axes)
 
     def own_axes(self, place: Place) -> tuple[Fixed, Fixed, Fixed]:
         """The vectors t1, t2 and n in the surface's axes."""
@@ -164,7 +164,7 @@ class CarriedFrame(AbstractFrame):
         return eta + 0.5 * jnp.pi if names[0] == "mu" else eta
 
     def axes(self, place: Place, cyclic: Place) -> tuple[Fixed, Fixed, Fixed]:
-        return tuple(self.surface.in_fixed_frame(axis) for axis in self.own_axes(place))
+        return vector_of(self.surface.in_fixed_frame(axis) for axis in self.own_axes(place))
 
     def position(self, place: Place, cyclic: Place) -> Fixed:
         centre = sum_vectors(place[:3], scale(self.distance, self.normal(place[:3])))

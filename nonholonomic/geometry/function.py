@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import eval_jaxpr
 from jaxtyping import Array, Float
 
 from ..validation import as_number, is_traced
@@ -35,7 +36,7 @@ class Closure(eqx.Module):
         def value(*scalars: Float[Array, ""]) -> Float[Array, ""]:
             replaced = dict(zip(single, scalars, strict=False))
             numbers = [replaced.get(k, number) for k, number in enumerate(self.numbers)]
-            return jax.core.eval_jaxpr(self.program, numbers, *scalars[len(single) :])[0]
+            return eval_jaxpr(self.program, numbers, *scalars[len(single) :])[0]
 
         return jnp.vectorize(value)(*(self.numbers[k] for k in single), *at)
 

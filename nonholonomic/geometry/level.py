@@ -11,8 +11,8 @@ Optimization, chapter 4). A last Newton step carries the derivatives (implicit f
 """
 
 import abc
-from collections.abc import Callable, Iterable
-from typing import Any, ClassVar, NamedTuple, Self
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .surface import AbstractSurface, BallGap
-from .vector import Component, Vector, dot, scale, subtract, sum_vectors, tangents
+from .vector import Component, Vector, dot, scale, subtract, sum_vectors, tangents, vector_of
 
 #: Most steps of a search. Most take three to six; ten times as many move no point.
 MOST_STEPS = 40
@@ -228,13 +228,7 @@ class AbstractLevel(AbstractSurface):
         return t1, t2, Quadratic(along + radius * aa, radius * ab, along + radius * bb, dot(m, t1), dot(m, t2))
 
 
-def vector_of(components: Iterable[Component]) -> Vector:
-    """Three components as a vector."""
-    x, y, z = components
-    return (x, y, z)
-
-
-def _held(surface: Self) -> Self:
+def _held(surface: AbstractLevel) -> AbstractLevel:
     """A surface by whose numbers nothing is differentiated."""
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, surface)
 

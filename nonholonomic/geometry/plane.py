@@ -38,7 +38,7 @@ class Plane(AbstractSurface):
 
     axes: ClassVar[int] = 2
     # "outside" is what one calls the only side of a plane where grounds are compared.
-    sides: ClassVar[Mapping[str, float]] = {"outside": CLOSED["outside"]} | OPEN
+    sides: ClassVar[Mapping[str, float]] = {"outside": CLOSED["outside"], **OPEN}
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("x", "m"), ("y", "m"))
 
     tilt: Float[Array, "..."] | None = eqx.field(converter=none_if_zero, default=None)

@@ -17,12 +17,11 @@ from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from ..validation import Bound, Bounded
 from .vector import Component, Vector, dot, scale, subtract
 
-Place = tuple[Float[Array, "..."], ...]
+Place = tuple[Any, ...]
 
 #: Distance of a place given as (x, y, z) from its surface, relative to its size, up to which it is round-off.
 ROUND_OFF = 1e-9
@@ -176,8 +175,9 @@ class AbstractSurface(Bounded):
         """
         if side is None:
             return self.sides.get(closed, next(iter(self.sides.values())))
-        if not isinstance(side, str) or side not in CLOSED | OPEN | DIVIDED:
-            raise ValueError(f"side = {side!r} must be one of {', '.join(map(repr, CLOSED | OPEN | DIVIDED))}, or None")
+        words = (*CLOSED, *OPEN, *DIVIDED)
+        if not isinstance(side, str) or side not in words:
+            raise ValueError(f"side = {side!r} must be one of {', '.join(map(repr, words))}, or None")
         if side not in self.sides:
             # All words that a surface without this side has mean the same.
             raise ValueError(f"side = {side!r} must be {next(iter(self.sides))!r} on a {type(self).__name__}")

@@ -5,6 +5,7 @@ vanishes identically (no curvature on a plane, no force without friction). Sums 
 `None`, so one formula serves every scene and a scene evaluates only the terms it has.
 """
 
+from collections.abc import Iterable
 from typing import Any, TypeAlias
 
 import jax.numpy as jnp
@@ -26,6 +27,12 @@ def none_if_zero(value: Any) -> Any:
         return None
     number = as_number(value)
     return number if is_traced(number) or np.any(np.asarray(number) != 0.0) else None
+
+
+def vector_of(components: Iterable[Component]) -> Vector:
+    """Three components as a vector."""
+    x, y, z = components
+    return (x, y, z)
 
 
 def add(*terms: Component) -> Component:
@@ -85,8 +92,8 @@ def tangents(normal: Vector) -> tuple[Vector, Vector]:
     along_x = 1.0 - nx * nx < ALONG
     first = _projected((1.0 - nx * nx, -nx * ny, -nx * nz), ~along_x)
     second = _projected((-ny * nx, 1.0 - ny * ny, -ny * nz), along_x)
-    t1 = tuple(jnp.where(along_x, b, a) for a, b in zip(first, second, strict=True))
-    return (t1[0], t1[1], t1[2]), cross(normal, (t1[0], t1[1], t1[2]))
+    t1 = vector_of(jnp.where(along_x, b, a) for a, b in zip(first, second, strict=True))
+    return t1, cross(normal, t1)
 
 
 def _projected(vector: Vector, used: Component) -> Vector:

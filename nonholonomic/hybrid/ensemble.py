@@ -9,7 +9,7 @@ those at its end.
 
 import abc
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from ..integration.ensemble import solve_ensemble
 from ..integration.problem import AbstractProblem
-from ..integration.scheduler import Outcome
+from ..integration.scheduler import Numbers, Outcome
 from ..integration.settings import Settings
 from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 from ..xla_cpu import compiled_quickly
@@ -42,7 +42,7 @@ class TransitionPath(NamedTuple):
     shown: Int[Array, " stretches 1"]
 
 
-class Transition(NamedTuple):
+class Transition(NamedTuple, Generic[Numbers]):
     """The result of a reset map, one number per cell.
 
     `status` is `RUNNING` where the motion continues in the mode numbered `mode`, else how it ended; `state` is the new
@@ -52,14 +52,14 @@ class Transition(NamedTuple):
     logarithms of the rates at which events on the way are met; `None` if there are none.
     """
 
-    mode: Int[Array, " cells"]
-    state: Float[Array, "components cells"]
-    elapsed: Float[Array, " cells"]
-    status: Int[Array, " cells"]
-    crossing_time: Float[Array, " cells"]
-    counts: Int[Array, "kinds cells"]
+    mode: Int[Numbers, " cells"]
+    state: Float[Numbers, "components cells"]
+    elapsed: Float[Numbers, " cells"]
+    status: Int[Numbers, " cells"]
+    crossing_time: Float[Numbers, " cells"]
+    counts: Int[Numbers, "kinds cells"]
     record: TransitionPath | None = None
-    log_rates: Float[Array, " cells"] | None = None
+    log_rates: Float[Numbers, " cells"] | None = None
 
 
 class AbstractBatchedMode(eqx.Module):
@@ -90,17 +90,17 @@ class AbstractBatchedMode(eqx.Module):
         raise NotImplementedError(f"{type(self).__name__} records stretches but does not say what they show")
 
 
-class HybridOutcome(NamedTuple):
+class HybridOutcome(NamedTuple, Generic[Numbers]):
     """How every cell ended, as in `integration.Outcome`, in which mode, and the counters."""
 
-    status: Int[np.ndarray, " cells"]
-    crossing_time: Float[np.ndarray, " cells"]
-    end_time: Float[np.ndarray, " cells"]
-    state: Float[np.ndarray, "components cells"]
-    steps: Int[np.ndarray, " cells"]
-    rejected: Int[np.ndarray, " cells"]
-    mode: Int[np.ndarray, " cells"]
-    counts: Int[np.ndarray, "kinds cells"]
+    status: Int[Numbers, " cells"]
+    crossing_time: Float[Numbers, " cells"]
+    end_time: Float[Numbers, " cells"]
+    state: Float[Numbers, "components cells"]
+    steps: Int[Numbers, " cells"]
+    rejected: Int[Numbers, " cells"]
+    mode: Int[Numbers, " cells"]
+    counts: Int[Numbers, "kinds cells"]
 
 
 @eqx.filter_jit
@@ -127,7 +127,7 @@ def solve_hybrid(
     passes: bool = False,
     parts: int = 1,
     most_rounds: int = MOST_ROUNDS,
-) -> HybridOutcome:
+) -> HybridOutcome[np.ndarray]:
     """Run every cell through its modes to its event, to `t1`, or to where the model ends.
 
     The loop runs on the host, round by round, with concrete numbers. All calls with the same number of cells, padding
@@ -178,7 +178,7 @@ def solve_hybrid(
 
 def _compile(
     modes: tuple[AbstractBatchedMode, ...],
-    found: HybridOutcome,
+    found: HybridOutcome[np.ndarray],
     t1: Float[np.ndarray, " cells"],
     settings: Settings,
     options: dict[str, Any],
@@ -193,7 +193,10 @@ def _compile(
 
 
 def _gather(
-    mode: AbstractBatchedMode, found: HybridOutcome, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
+    mode: AbstractBatchedMode,
+    found: HybridOutcome[np.ndarray],
+    some: Int[np.ndarray, " some"],
+    t1: Float[np.ndarray, " cells"],
 ) -> tuple[Any, ...]:
     """The mode, the states and the remaining times of some cells, padded to the full number of cells."""
     size = len(found.status)
@@ -206,7 +209,7 @@ def _gather(
 
 def _march(
     mode: AbstractBatchedMode,
-    found: HybridOutcome,
+    found: HybridOutcome[np.ndarray],
     some: Int[np.ndarray, " some"],
     t1: Float[np.ndarray, " cells"],
     settings: Settings,
@@ -222,7 +225,10 @@ def _march(
 
 
 def _pass_on(
-    mode: AbstractBatchedMode, found: HybridOutcome, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
+    mode: AbstractBatchedMode,
+    found: HybridOutcome[np.ndarray],
+    some: Int[np.ndarray, " some"],
+    t1: Float[np.ndarray, " cells"],
 ) -> None:
     """Apply the reset map to some cells and store the transition."""
     transition = _leave(*_gather(mode, found, some, t1))
@@ -230,16 +236,18 @@ def _pass_on(
     _store(found, some, after_reset(np, _some(found, some), transition, t1[some]))
 
 
-def _some(found: HybridOutcome, some: Int[np.ndarray, " some"]) -> HybridOutcome:
+def _some(found: HybridOutcome[np.ndarray], some: Int[np.ndarray, " some"]) -> HybridOutcome[np.ndarray]:
     return HybridOutcome(*(values[..., some] for values in found))
 
 
-def _store(found: HybridOutcome, some: Int[np.ndarray, " some"], new: HybridOutcome) -> None:
+def _store(found: HybridOutcome[np.ndarray], some: Int[np.ndarray, " some"], new: HybridOutcome[np.ndarray]) -> None:
     for values, of_some in zip(found, new, strict=True):
         values[..., some] = of_some
 
 
-def after_solve(xp: Any, found: HybridOutcome, outcome: Outcome, t1: Float[Array, " cells"]) -> HybridOutcome:
+def after_solve(
+    xp: Any, found: HybridOutcome[Numbers], outcome: Outcome[Numbers], t1: Float[Numbers, " cells"]
+) -> HybridOutcome[Numbers]:
     """Update the cells after an ensemble solve that ended as in `outcome`. **Arguments:** `xp`: `numpy` or `jax.numpy`."""
     began = found.end_time
     # A cell that enters a mode beyond the event passed the event earlier, unless it started there.
@@ -256,7 +264,9 @@ def after_solve(xp: Any, found: HybridOutcome, outcome: Outcome, t1: Float[Array
     )
 
 
-def after_reset(xp: Any, found: HybridOutcome, transition: Transition, t1: Float[Array, " cells"]) -> HybridOutcome:
+def after_reset(
+    xp: Any, found: HybridOutcome[Numbers], transition: Transition[Numbers], t1: Float[Numbers, " cells"]
+) -> HybridOutcome[Numbers]:
     """Update the cells after the transition to the next mode. **Arguments:** as for `after_solve`."""
     passed = xp.isfinite(transition.crossing_time)
     # Non-finite states would never finish.

@@ -16,7 +16,7 @@ tolerance, the event is grazing and the derivative has no correct digits: such e
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..derivatives.slopes import tangents_of
 from ..derivatives.variation import VariationalProblem, where_active
 from ..integration import AbstractProblem, Settings
+from ..integration.scheduler import Numbers
 from .ensemble import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid
 from .traced_ensemble import traced_solve_hybrid
 
@@ -237,13 +238,13 @@ def _along(function: Any, point: tuple[Array, ...], tangents: list[tuple[Array, 
     return jax.vmap(along, out_axes=(None, 0, None) if has_aux else (None, 0))(stacked)
 
 
-class Slopes(NamedTuple):
+class Slopes(NamedTuple, Generic[Numbers]):
     """Derivatives of the times of the events at which runs ended, (tangents, cells); and where they have no correct
     digits, because an event on the way was `grazing`.
     """
 
-    slopes: Float[Array, "tangents cells"]
-    grazing: Bool[Array, " cells"]
+    slopes: Float[Numbers, "tangents cells"]
+    grazing: Bool[Numbers, " cells"]
 
 
 def solve_hybrid_with_tangents(
@@ -251,13 +252,13 @@ def solve_hybrid_with_tangents(
     tangents: tuple[tuple[tuple[Any, ...], Any], ...],
     mode: Int[np.ndarray, " cells"],
     state: Float[np.ndarray, "components cells"],
-    t1: Float[np.ndarray, "..."],
+    t1: float | Float[np.ndarray, "..."],
     cells: int,
     settings: Settings,
     *,
     kinds: int,
     ends_on_event: bool = True,
-) -> tuple[HybridOutcome, Slopes]:
+) -> tuple[HybridOutcome[np.ndarray], Slopes[np.ndarray]]:
     """Run every cell through its modes to its event, and differentiate the event's time along some tangents.
 
     **Arguments:** as for `solve_hybrid`, and
@@ -284,7 +285,7 @@ def traced_solve_hybrid_with_tangents(
     *,
     kinds: int,
     ends_on_event: bool = True,
-) -> tuple[HybridOutcome, Slopes]:
+) -> tuple[HybridOutcome[Array], Slopes[Array]]:
     """`solve_hybrid_with_tangents` inside other transformed functions, for all cells; arguments and results are traced."""
     varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
     start, parts = variational_start(state, tangents), 1 + len(tangents)
@@ -293,12 +294,12 @@ def traced_solve_hybrid_with_tangents(
     return _own(ended, len(state)), Slopes(slopes, ended.counts[-1] > 0)
 
 
-def _own(ended: HybridOutcome, size: int) -> HybridOutcome:
+def _own(ended: HybridOutcome[Numbers], size: int) -> HybridOutcome[Numbers]:
     """A hybrid outcome without its variations."""
     return ended._replace(state=ended.state[:size], counts=ended.counts[:-1])
 
 
-def _of_mode(xp: Any, ended: HybridOutcome, slopes: list[Float[Array, "tangents cells"]]) -> Any:
+def _of_mode(xp: Any, ended: HybridOutcome[Numbers], slopes: list[Float[Numbers, "tangents cells"]]) -> Any:
     """Select, for each cell, the derivatives of its mode.
 
     A run that has ended between two modes is in none of them: its event is the end of the previous mode, whose

@@ -24,6 +24,10 @@ from .traced_ensemble import in_rounds
 Build = Callable[[Any, Array], tuple[tuple[AbstractBatchedMode, ...], Array, Float[Array, "components 1"]]]
 
 
+#: In the derivative of `HybridSamples`: what has none.
+UNCHANGED: Any = None
+
+
 class HybridSamples(NamedTuple):
     """A hybrid run at given times, all floats.
 
@@ -106,7 +110,7 @@ class HybridSampling(AbstractSampling):
         numbers, (*given, tolerance), spec = self._sorted(leaves)
         settings = spec.settings.with_tolerance(tolerance)
 
-        def build(numbers: tuple[Array, ...], cells: None) -> Any:
+        def build(numbers: tuple[Array, ...], cells: int | None) -> Any:
             return spec.made(numbers, tolerance)
 
         built, tangents, gather = tangents_by(build, active, numbers, None)
@@ -155,7 +159,7 @@ def _followed(
     t1: Float[Array, ""],
     settings: Settings,
     kinds: int,
-) -> tuple[HybridOutcome, Filled]:
+) -> tuple[HybridOutcome[Array], Filled]:
     """Run round by round, as in `traced_solve_hybrid`, with samples of every mode and of the transition to the next."""
     count, zero, none = len(modes[0].tangents), jnp.zeros(1), jnp.zeros(1, int)
     own = VariationalMode.parts(modes[0], state)[0][:-1]
@@ -168,7 +172,9 @@ def _followed(
 
     kinds_of_modes = alike(modes)
 
-    def stay(one: VariationalMode, number: Array, found: HybridOutcome, filled: Filled) -> tuple[HybridOutcome, Filled]:
+    def stay(
+        one: VariationalMode, number: Array, found: HybridOutcome[Array], filled: Filled
+    ) -> tuple[HybridOutcome[Array], Filled]:
         since, left = times - found.end_time, greatest(t1 - found.end_time, 0.0)
         outcome, samples = solve_with_samples(
             one.problem(found.state), since, left, jnp.asarray(1), settings, parts=1 + count
@@ -176,7 +182,9 @@ def _followed(
         after = after_solve(jnp, found, outcome, t1)
         return after, filled.with_samples((since >= 0.0) & (times <= after.end_time), one.seen(samples[0].T), number)
 
-    def change(one: VariationalMode, found: HybridOutcome, filled: Filled) -> tuple[HybridOutcome, Filled]:
+    def change(
+        one: VariationalMode, found: HybridOutcome[Array], filled: Filled
+    ) -> tuple[HybridOutcome[Array], Filled]:
         def seen(mode: AbstractBatchedMode, record: TransitionPath | None, left: Float[Array, " 1"]) -> Any:
             # Relative to an event that is later, a fixed time comes sooner, as the horizon does.
             return None if record is None else _on_the_way(mode, record, times - t1 + left)
@@ -251,7 +259,7 @@ def _on_the_way(
 
 
 def _found(
-    ended: HybridOutcome, filled: Filled, times: Float[Array, " times"], size: int, count: int
+    ended: HybridOutcome[Array], filled: Filled, times: Float[Array, " times"], size: int, count: int
 ) -> tuple[HybridSamples, list[HybridSamples]]:
     """The samples, and their derivative along each tangent."""
     end_time, status, grazed = ended.end_time[0], ended.status[0], ended.counts[-1, 0] > 0
@@ -262,7 +270,5 @@ def _found(
     numbers = (status, ended.steps[0], ended.rejected[0], ended.counts[:-1, 0])
     others = (part.astype(float) for part in numbers)
     found = HybridSamples(filled.shown, filled.number, end_time, ended.state[:size, 0], *others)
-    slopes = [
-        HybridSamples(filled.variations[k] + late, None, later[k], None, None, None, None, None) for k in range(count)
-    ]
+    slopes = [HybridSamples(filled.variations[k] + late, UNCHANGED, later[k], *(UNCHANGED,) * 5) for k in range(count)]
     return found, slopes

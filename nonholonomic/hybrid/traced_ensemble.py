@@ -25,7 +25,7 @@ def traced_solve_hybrid(
     kinds: int,
     passes: bool = False,
     parts: int = 1,
-) -> HybridOutcome:
+) -> HybridOutcome[Array]:
     """Run every cell through its modes to its event, to `t1`, or to where the model ends.
 
     Cells are not gathered: in each round every mode runs all cells, those in another mode for no time.
@@ -48,8 +48,10 @@ def traced_solve_hybrid(
         counts=jnp.zeros((kinds, size), int),
     )
 
-    def through(one: AbstractBatchedMode, found: HybridOutcome, here: Bool[Array, " cells"]) -> HybridOutcome:
-        def ensemble_solve() -> HybridOutcome:
+    def through(
+        one: AbstractBatchedMode, found: HybridOutcome[Array], here: Bool[Array, " cells"]
+    ) -> HybridOutcome[Array]:
+        def ensemble_solve() -> HybridOutcome[Array]:
             there, now = of_cells(one, here), in_place_of(found, here)
             left = jnp.where(here, greatest(t1 - found.end_time, 0.0), 0.0)
             problem = there.problem(now.state)
@@ -59,7 +61,7 @@ def traced_solve_hybrid(
         found = jax.lax.cond(jnp.any(here), ensemble_solve, lambda: found)
         return passing(one, found, here & (found.status == LEFT_DOMAIN), t1)
 
-    def one_round(carry: tuple[HybridOutcome, Int[Array, ""]]) -> tuple[HybridOutcome, Int[Array, ""]]:
+    def one_round(carry: tuple[HybridOutcome[Array], Int[Array, ""]]) -> tuple[HybridOutcome[Array], Int[Array, ""]]:
         found, rounds = carry
         # Selected before the round: a cell that changes its mode during the round waits for the next round.
         here = [(found.status == RUNNING) & (found.mode == number) for number in range(len(modes))]
@@ -70,23 +72,23 @@ def traced_solve_hybrid(
     return in_rounds(one_round, start)
 
 
-def in_rounds(one_round: Callable[[Any], Any], start: HybridOutcome, *more: Any) -> Any:
+def in_rounds(one_round: Callable[[Any], Any], start: HybridOutcome[Array], *more: Any) -> Any:
     """Loop over rounds while a cell is running. The carry is the `HybridOutcome`, any further values, and the round."""
 
     def under_way(carry: Any) -> Bool[Array, ""]:
         return jnp.any(carry[0].status == RUNNING) & (carry[-1] < MOST_ROUNDS)
 
-    found, *more, _ = jax.lax.while_loop(under_way, one_round, (start, *more, jnp.zeros((), int)))
-    found = found._replace(status=jnp.where(found.status == RUNNING, UNRESOLVED, found.status))
-    return (found, *more) if more else found
+    outcome, *values, _ = jax.lax.while_loop(under_way, one_round, (start, *more, jnp.zeros((), int)))
+    outcome = outcome._replace(status=jnp.where(outcome.status == RUNNING, UNRESOLVED, outcome.status))
+    return (outcome, *values) if values else outcome
 
 
 def passing(
-    one: AbstractBatchedMode, found: HybridOutcome, lost: Bool[Array, " cells"], t1: Float[Array, " cells"]
-) -> HybridOutcome:
+    one: AbstractBatchedMode, found: HybridOutcome[Array], lost: Bool[Array, " cells"], t1: Float[Array, " cells"]
+) -> HybridOutcome[Array]:
     """Apply the reset map to the cells at the end of a mode."""
 
-    def passed() -> HybridOutcome:
+    def passed() -> HybridOutcome[Array]:
         there, now = of_cells(one, lost), in_place_of(found, lost)
         transition = there.reset_map(now.state, greatest(t1 - now.end_time, 0.0))
         return chosen(lost, after_reset(jnp, found, transition, t1), found)
@@ -100,7 +102,7 @@ def of_cells(mode: AbstractBatchedMode, some: Bool[Array, " cells"]) -> Abstract
     return eqx.combine(jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[..., _cell(some)], numbers), rest)
 
 
-def in_place_of(found: HybridOutcome, some: Bool[Array, " cells"]) -> HybridOutcome:
+def in_place_of(found: HybridOutcome[Array], some: Bool[Array, " cells"]) -> HybridOutcome[Array]:
     """The state of some cells, with the first of them in place of the others, whose states have another meaning."""
     return jax.tree.map(lambda values: values[..., _cell(some)], found)
 
@@ -109,6 +111,6 @@ def _cell(some: Bool[Array, " cells"]) -> Int[Array, " cells"]:
     return jnp.where(some, jnp.arange(some.size), jnp.argmax(some))
 
 
-def chosen(some: Bool[Array, " cells"], new: HybridOutcome, old: HybridOutcome) -> HybridOutcome:
+def chosen(some: Bool[Array, " cells"], new: HybridOutcome[Array], old: HybridOutcome[Array]) -> HybridOutcome[Array]:
     """The new outcome of some cells and the old one of the others."""
     return jax.tree.map(lambda a, b: jnp.where(some, a, b), new, old)

@@ -6,7 +6,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
 
 from ..progress import status_line
 from ..validation import require, require_flag, require_whole
@@ -28,7 +27,7 @@ DIFFERENCE = 0.01
 
 
 def identify(
-    model: Callable[[dict[str, Float[Array, " rows"]]], Float[Array, "rows n"]],
+    model: Callable[[dict[str, Any]], Any],
     measurements: Measurements,
     free: dict[str, Any],
     *,

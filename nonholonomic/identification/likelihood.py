@@ -132,19 +132,19 @@ class Measurements(eqx.Module):
         flat = jnp.where(small, 1.0 - 0.5 * share, jnp.log1p(share) / jnp.where(small, 1.0, share))
         return jnp.where(heavy, z * jnp.sqrt((freedom + 1.0) / freedom * flat), z)
 
-    def whole_periods(self, off: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    def whole_periods(self, off: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
         """How much of some differences are whole periods, to the nearest; without a slope."""
         wraps = jnp.isfinite(self.period)
         period = jnp.where(wraps, self.period, 1.0)
         return jnp.where(wraps, period * jax.lax.stop_gradient(jnp.round(off / period)), 0.0)
 
-    def standardised(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    def standardised(self, prediction: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
         """(prediction - value) / error, moved by whole periods to the least; 0 for limits."""
         off = jnp.where(self.censored, 0.0, prediction - self.value)
         off = off - self.whole_periods(off)
         return off / self.error
 
-    def information(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    def information(self, prediction: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
         """Roots of Fisher's information about the predictions: those of expected curvature, for standard errors.
 
         1 / error for Gaussian errors, sqrt((nu + 1) / (nu + 3)) / error for Student's t; for limits the slope of the residual.
@@ -160,7 +160,7 @@ class Measurements(eqx.Module):
         measured = jnp.where(self.censored, 0.0, jnp.log(self.error))
         return -jnp.sum(0.5 * self.residuals(prediction) ** 2 + measured, axis=-1)
 
-    def with_errors(self, error: Float[Array, "... n"]) -> "Measurements":
+    def with_errors(self, error: Float[Array | np.ndarray, "... n"]) -> "Measurements":
         """The same with other errors."""
         return eqx.tree_at(lambda measurements: measurements.error, self, jnp.broadcast_to(error, self.error.shape))
 

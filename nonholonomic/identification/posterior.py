@@ -164,7 +164,8 @@ class LogDensity(eqx.Module):
         for k, (name, unknown) in enumerate(self.problem.free):
             if (prior := self.priors.get(name)) is not None:
                 value, slope = jax.value_and_grad(unknown.value)(coordinates[k])
-                total += (prior(value) if callable(prior) else _normal(value, *prior)) + jnp.log(jnp.abs(slope))
+                log_density: Any = prior(value) if callable(prior) else _normal(value, *prior)
+                total += log_density + jnp.log(jnp.abs(slope))
         return total
 
 

@@ -88,7 +88,7 @@ class Linearised(NamedTuple):
 
 @eqx.filter_jit
 def _differentiated(
-    problem: Problem, coordinates: Float[Array, "rows unknowns"]
+    problem: Problem, coordinates: Float[Array | np.ndarray, "rows unknowns"]
 ) -> tuple[Float[Array, "rows n"], Float[Array, "rows n unknowns"]]:
     """Predictions and their slopes; rows do not influence one another, so a coordinate is moved in all of them at once.
 
@@ -129,7 +129,8 @@ def predictions_and_slopes(problem: Problem, coordinates: Rows, asked: Any = Non
     # The program is compiled for a number of rows; where a parameter is not a number, a run is not even begun.
     needed = np.where(asked[:, None], coordinates, np.nan)
     if problem.step is None:
-        return tuple(map(np.asarray, _differentiated(problem, needed)))
+        prediction, slopes = _differentiated(problem, needed)
+        return np.asarray(prediction), np.asarray(slopes)
     return _differences(problem, problem.step, needed)
 
 
@@ -158,7 +159,9 @@ def linearise(problem: Problem, coordinates: Any, measurements: Measurements, as
 
 
 @eqx.filter_jit
-def _residuals(measurements: Measurements, prediction: Float[Array, "rows n"]) -> tuple[Array, Array, Array]:
+def _residuals(
+    measurements: Measurements, prediction: Float[Array | np.ndarray, "rows n"]
+) -> tuple[Array, Array, Array]:
     """Residuals, their slopes by the predictions, and the roots of the expected information."""
     residual, slope = jax.jvp(measurements.residuals, (prediction,), (jnp.ones_like(prediction),))
     return residual, slope, measurements.information(prediction)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -47,7 +47,7 @@ class Quantities:
         words = quantity if isinstance(quantity, tuple) else (quantity,)
         columns: list[str] = []
         for word in words:
-            known = self.columns | {name: (name,) for name in self.units}
+            known = {**self.columns, **{name: (name,) for name in self.units}}
             if not isinstance(word, str) or word not in known:
                 raise ValueError(f"quantity = {word!r} must be one of {', '.join(map(repr, known))}")
             columns += known[word]
@@ -188,7 +188,7 @@ def model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Ar
 
 
 def predicted(
-    recordings: list[tuple[AbstractRecording, Values]],
+    recordings: Sequence[tuple[AbstractRecording, Values]],
     rows: int,
     run: Callable[[Values, Float[Array, " times"]], Any],
     column: Callable[[Any, str], Float[Array, " times"]],

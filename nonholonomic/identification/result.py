@@ -148,7 +148,8 @@ class Identification:
         free = self.problem.unknowns[k]
         reach = deviations * np.sqrt(self.coordinate_covariance[k, k])
         with np.errstate(over="ignore"):
-            return tuple(float(free.value(np.asarray(self.coordinates[k] + side * reach))) for side in (-1.0, 1.0))
+            low, high = (float(free.value(np.asarray(self.coordinates[k] + side * reach))) for side in (-1.0, 1.0))
+        return low, high
 
     @status_line("fitting again")
     def profile(self, name: str, values: Any = None) -> Profile:

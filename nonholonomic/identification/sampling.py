@@ -10,6 +10,7 @@ That is what event times ask for: they are rough on the scale of a nutation peri
 one, and walks that follow them take hundreds of steps.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -193,16 +194,20 @@ def _seen(
     return coordinates, np.asarray(true - surrogate.power * foretold)
 
 
-_predicted = eqx.filter_jit(LogDensity.predict)
-_foretold = eqx.filter_jit(Surrogate.predict)
+# Compiled functions take NumPy's arrays too.
+_predicted: Callable[..., Array] = eqx.filter_jit(LogDensity.predict)
+_foretold: Callable[..., Array] = eqx.filter_jit(Surrogate.predict)
 
 
 @eqx.filter_jit
 def _log_density(
-    density: LogDensity, coordinates: Float[Array, "rows unknowns"], predictions: Float[Array, "rows n"]
+    density: LogDensity,
+    coordinates: Float[Array | np.ndarray, "rows unknowns"],
+    predictions: Float[Array | np.ndarray, "rows n"],
 ) -> Float[Array, " rows"]:
     """The log density of every row, given what is predicted there."""
-    return jax.vmap(density.of_prediction)(coordinates, predictions)
+    of_row: Callable[..., Array] = density.of_prediction
+    return jax.vmap(of_row)(coordinates, predictions)
 
 
 @eqx.filter_jit

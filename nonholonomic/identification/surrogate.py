@@ -65,7 +65,9 @@ class Surrogate(eqx.Module):
         coefficients = jnp.zeros((len(_factors(numbers)), density.measurements.value.size))
         scale = np.linalg.inv(root[:numbers, :numbers])
         bends = np.concatenate([root[None], np.zeros((BENT - 1, *root.shape))])
-        return cls(density, *map(jnp.asarray, (whole, bends, 1.0, whole[:numbers], scale)), coefficients)
+        arrays = map(jnp.asarray, (whole, bends, 1.0, whole[:numbers], scale))
+        middle, bends, power, origin, scale = arrays
+        return cls(density, middle, bends, power, origin, scale, coefficients)
 
     @property
     def runs_a_round(self) -> int:

@@ -48,7 +48,7 @@ class Free(NamedTuple):
         """Whether the parameter cannot be negative."""
         return self.lower >= 0.0
 
-    def value(self, coordinate: Float[Array, "..."]) -> Float[Array, "..."]:
+    def value(self, coordinate: Float[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
         """The parameter at a coordinate."""
         return Unknown.of(self).value(coordinate)
 
@@ -64,27 +64,28 @@ class Unknown(eqx.Module):
     - `prior`: mean and standard deviation, or `None`.
     """
 
-    start: Float[Array, ""]
-    unit: Float[Array, ""]
-    lower: Float[Array, ""]
-    upper: Float[Array, ""]
-    prior: Float[Array, " 2"] | None
+    start: Float[Array | np.ndarray, ""]
+    unit: Float[Array | np.ndarray, ""]
+    lower: Float[Array | np.ndarray, ""]
+    upper: Float[Array | np.ndarray, ""]
+    prior: Float[Array | np.ndarray, " 2"] | None
     has_lower: bool = eqx.field(static=True)
     has_upper: bool = eqx.field(static=True)
 
     @classmethod
     def of(cls, free: Free) -> "Unknown":
         """A `Free` whose numbers are arrays: Python numbers would be compiled in."""
-        numbers = (np.asarray(number, float) for number in (free.start, free.unit, free.lower, free.upper))
+        numbers = (free.start, free.unit, free.lower, free.upper)
+        start, unit, lower, upper = (np.asarray(number, float) for number in numbers)
         prior = None if free.prior is None else np.asarray(free.prior, float)
-        return cls(*numbers, prior, math.isfinite(free.lower), math.isfinite(free.upper))
+        return cls(start, unit, lower, upper, prior, math.isfinite(free.lower), math.isfinite(free.upper))
 
     @property
     def positive(self) -> bool:
         """Whether the parameter cannot be negative."""
         return bool(self.lower >= 0.0)
 
-    def value(self, coordinate: Float[Array, "..."]) -> Float[Array, "..."]:
+    def value(self, coordinate: Float[Array | np.ndarray, "..."]) -> Any:
         """The parameter at a coordinate."""
         if self.has_lower and self.has_upper:
             return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(coordinate)

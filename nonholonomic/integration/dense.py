@@ -52,7 +52,9 @@ def padded(values: Float[np.ndarray, "... times"], least: int) -> Float[np.ndarr
 
 
 @eqx.filter_jit
-def _evaluate(segment: diffrax.Solution, times: Float[Array, " times"]) -> Float[Array, "times components"]:
+def _evaluate(
+    segment: diffrax.Solution, times: Float[Array | np.ndarray, " times"]
+) -> Float[Array, "times components"]:
     return jax.vmap(segment.evaluate)(times)
 
 

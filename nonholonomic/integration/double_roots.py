@@ -5,6 +5,7 @@ negative there, and its zero is located as any other; or the step is accepted, a
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -118,7 +119,7 @@ def _interpolated(
     per_power = np.linalg.inv(places[:, None] ** powers)
     slopes = powers * edges[:, None] ** np.maximum(powers - 1, 0)
 
-    def weighted(weights: Float[np.ndarray, "edges places"]) -> Float[Array, "edges ..."]:
+    def weighted(weights: Float[np.ndarray, "edges places"]) -> Any:
         return sum(weights[:, k].reshape(-1, *(1,) * (values.ndim - 1)) * values[k] for k in range(len(places)))
 
     return weighted(edges[:, None] ** powers @ per_power), weighted(slopes @ per_power)

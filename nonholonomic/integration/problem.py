@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -125,7 +126,7 @@ def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes
     return event_time(problem, problem.event_function, time, state)
 
 
-def event_time(problem: AbstractProblem, function: Callable[[States], Lanes], time: Lanes, state: States) -> Lanes:
+def event_time(problem: AbstractProblem, function: Callable[[States], Any], time: Lanes, state: States) -> Lanes:
     """Time at which a function of the state vanishes along a motion, for a state close to the zero, to third order in
     the distance.
 

@@ -2,7 +2,7 @@
 
 import functools
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
@@ -44,6 +44,17 @@ def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
     if not isinstance(solver, diffrax.AbstractERK) or not isinstance(tableau, diffrax.ButcherTableau):
         raise ValueError(f"solver = {solver!r} must be an explicit Runge-Kutta solver of Diffrax, such as Dopri8()")
     return tableau
+
+
+def explicit_order(solver: diffrax.AbstractSolver) -> int:
+    """The order of such a solver.
+
+    **Raises:** `ValueError` for a solver that does not know its order.
+    """
+    order = solver.order(None)
+    if order is None:
+        raise ValueError(f"solver = {solver!r} must have an order, as Dopri8() has")
+    return order
 
 
 def explicit_step(
@@ -111,7 +122,7 @@ def explicit_step(
     last_rate = jax.lax.optimization_barrier(field(time + length, end))
     last = None if seen is None else jax.lax.optimization_barrier(jnp.stack(margins(time + length, end)))
     watched = jax.lax.optimization_barrier(lesser(_least(last), crossing(end, last_rate), length))
-    seen = None if seen is None else written_in_place(seen, last, at=jnp.asarray(1 + len(looks)))
+    seen = None if seen is None or last is None else written_in_place(seen, last, at=jnp.asarray(1 + len(looks)))
     stages += [last_rate] if tableau.fsal else []
     return Step(end, last_rate, length * weighted_sum(tableau.b_error, stages), watched, first_negative, seen)
 
@@ -157,7 +168,7 @@ def weighted_sum(weights: Float[np.ndarray, " stages"], rates: Sequence[States])
 
 
 def moved_state(
-    stage: Int[Array, ""], rows: Sequence[Float[np.ndarray, " before"]], state: States, length: Lanes, rates: Stages
+    stage: Int[Array, ""], rows: Iterable[Float[np.ndarray, " before"]], state: States, length: Lanes, rates: Stages
 ) -> States:
     """The state moved along the first of the rates, with the weights in the row of a stage.
 
@@ -170,7 +181,9 @@ def moved_state(
     return jax.lax.switch(stage, [moved(row) for row in rows], rates)
 
 
-def scaled_error(error: States, before: States, after: States, rtol: float, atol: States, parts: int) -> Lanes:
+def scaled_error(
+    error: States, before: States, after: States, rtol: Float[Array, ""], atol: States, parts: int
+) -> Lanes:
     """Error in units of the tolerance: the greatest root mean square among the blocks of the state (Diffrax's norm and
     scale).
 
@@ -198,7 +211,7 @@ def first_length(
     state: States,
     rate: States,
     order: int,
-    rtol: float,
+    rtol: Float[Array, ""],
     atol: States,
     parts: int,
 ) -> Lanes:

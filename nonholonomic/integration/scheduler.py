@@ -5,21 +5,25 @@ waiting for one another.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from ..xla_cpu import in_one_kernel
 from .event import Bracket
 from .problem import AbstractProblem, least_margin
-from .runge_kutta import Lanes, States, explicit_tableau, first_length
+from .runge_kutta import Lanes, States, explicit_order, explicit_tableau, first_length
 from .settings import Settings
 from .status import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING
 from .step import Control, LaneState, try_step
+
+#: JAX's arrays, or NumPy's on the host.
+Numbers = TypeVar("Numbers", Array, np.ndarray)
 
 #: Cost of refilling the lanes, in steps of all lanes, measured on a CPU. The lanes are refilled when idle lanes have
 #: missed as many steps, so the loss is at most twice that of the best moment.
@@ -30,7 +34,7 @@ REFILL = 0.25
 SOON, AT_ZERO = 1e-2, 1e-6
 
 
-class Outcome(NamedTuple):
+class Outcome(NamedTuple, Generic[Numbers]):
     """How every cell ended.
 
     `status` is one of the codes of `status.py`; `first_crossing` and `crossing_time` [s] are the times of the first and
@@ -38,13 +42,13 @@ class Outcome(NamedTuple):
     which the run ended; `steps` counts accepted and rejected steps, `rejected` the latter.
     """
 
-    status: Int[Array, " cells"]
-    first_crossing: Float[Array, " cells"]
-    crossing_time: Float[Array, " cells"]
-    end_time: Float[Array, " cells"]
-    state: Float[Array, "components cells"]
-    steps: Int[Array, " cells"]
-    rejected: Int[Array, " cells"]
+    status: Int[Numbers, " cells"]
+    first_crossing: Float[Numbers, " cells"]
+    crossing_time: Float[Numbers, " cells"]
+    end_time: Float[Numbers, " cells"]
+    state: Float[Numbers, "components cells"]
+    steps: Int[Numbers, " cells"]
+    rejected: Int[Numbers, " cells"]
 
 
 class Progress(NamedTuple):
@@ -86,7 +90,7 @@ class LaneScheduler(eqx.Module):
         **Arguments:** as for `ensemble_solve`, and `parts`: the number of equal blocks of the state, as for `Control`.
         """
         solver, rtol = settings.for_lanes, settings.tolerance
-        control = Control(explicit_tableau(solver), solver.order(None), rtol, t1, settings.max_steps, passes, parts)
+        control = Control(explicit_tableau(solver), explicit_order(solver), rtol, t1, settings.max_steps, passes, parts)
         starts, scales = problem.start()
         zero = jnp.zeros_like(starts[0])
         rates, atols = problem.field(zero, starts), settings.absolute * rtol * scales

@@ -158,7 +158,7 @@ def after_step(
         # Just past a crossing the margin is round-off of either sign.
         margin=jnp.where(hit, jnp.abs(margin), jnp.where(forward, margin, lane_state.margin)),
         margins=None
-        if tried.margins is None
+        if tried.margins is None or lane_state.margins is None
         else jnp.where(moved, stop_gradient(tried.margins[-1]), lane_state.margins),
         first_crossing=first,
         crossing_time=latest,

@@ -74,7 +74,9 @@ class ChunkStore:
         if stored is not None:
             damaged |= set(range(self.layout.chunks)) - good - self.finished
             for chunk in sorted(good - self.finished):
-                self.write(chunk, stored.chunk(chunk))
+                values = stored.chunk(chunk)
+                assert values is not None
+                self.write(chunk, values)
             self.finished |= good
         for part in self.folder.glob("*.part"):
             part.unlink()
@@ -154,7 +156,8 @@ class ChunkStore:
         """
         kinds = self.layout.kinds
         with replacing(self.folder / f"{chunk}.npz") as scratch, scratch.open("wb") as stream:
-            np.savez(stream, **{name: np.asarray(some, kinds[name]) for name, some in values.items()})
+            arrays: dict[str, Any] = {name: np.asarray(cells, kinds[name]) for name, cells in values.items()}
+            np.savez(stream, **arrays)
 
     def interrupted(self) -> str:
         """What Ctrl-C leaves, and how to go on."""
@@ -199,6 +202,17 @@ def layout_words(begun: dict[str, tuple[str, ...]], ours: dict[str, tuple[str, .
 def with_spaces(count: int) -> str:
     """A count with its digits in groups of three."""
     return f"{count:,}".replace(",", " ")
+
+
+def saved_cells(path: Path) -> int:
+    """How many cells of a table are on the disk: in its file, or in the files that it will be made of."""
+    folder = folder_of(path)
+    if path.exists():
+        return Stored(path).layout.cells
+    if not (folder / "table.h5").exists():
+        return 0
+    layout = Stored(folder / "table.h5").layout
+    return sum(layout.size(int(file.stem)) for file in folder.glob("*.npz"))
 
 
 def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:

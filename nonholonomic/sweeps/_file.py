@@ -94,12 +94,12 @@ def write_file(
             sums = {name: np.zeros(layout.chunks, np.uint32) for name in layout.kinds}
             for chunk, values in chunks:
                 for name, kind in layout.kinds.items():
-                    some = np.ascontiguousarray(values[name], kind)
-                    sums[name][chunk] = zlib.crc32(some)
-                    _put(file[name], some, layout.shape, *layout.ends(chunk))
+                    cells = np.ascontiguousarray(values[name], kind)
+                    sums[name][chunk] = zlib.crc32(cells.data)
+                    _put(_dataset(file, name), cells, layout.shape, *layout.ends(chunk))
                 stream.check()
             for name in layout.coords:
-                sums[name] = np.array([zlib.crc32(file[name][()])], np.uint32)
+                sums[name] = np.array([zlib.crc32(_dataset(file, name)[()])], np.uint32)
             for name, values in sums.items():
                 group.create_dataset(name, data=values)
         stream.check()
@@ -154,7 +154,9 @@ def _put(array: "h5py.Dataset", values: Values, shape: tuple[int, ...], first: i
 
 def _describe(file: "h5py.File", layout: Layout) -> None:
     """All of a table but the numbers of its variables."""
-    attributes = layout.attributes | ({INNER: layout.inner} if layout.inner else {}) | {"Conventions": "CF-1.10"}
+    attributes: dict[str, Any] = (
+        layout.attributes | ({INNER: layout.inner} if layout.inner else {}) | {"Conventions": "CF-1.10"}
+    )
     long_names = json.loads(attributes.pop(LONG_NAMES, "{}"))
     for name, value in attributes.items():
         _set(file, name, value if isinstance(value, str | int | float) else json.dumps(value))
@@ -189,6 +191,20 @@ def _set(of: Any, name: str, value: Any) -> None:
         of.attrs.create(name, value)
 
 
+def _dataset(group: "h5py.Group", name: str) -> "h5py.Dataset":
+    """A variable.
+
+    **Raises:** `ValueError` for a group by that name.
+    """
+    # Only files need it.
+    import h5py
+
+    array = group[name]
+    if not isinstance(array, h5py.Dataset):
+        raise ValueError(f"{name} is not an array")
+    return array
+
+
 def _attribute(of: Any, name: str) -> Any:
     """An attribute, a number or a string."""
     value = of.attrs[name]
@@ -220,12 +236,12 @@ class Stored:
         **Raises:** `OSError` that names the path if numbers are not those that were written.
         """
         with self._opened() as file:
-            values, sums = np.asarray(file[name][()]), self._sums[name]
+            values, sums = np.asarray(_dataset(file, name)[()]), self._sums[name]
         values = values.reshape(-1, *self.layout.inner_shape(name))
         damaged = 0
         for chunk in range(self.layout.chunks):
             first, end = self.layout.ends(chunk)
-            damaged += zlib.crc32(np.ascontiguousarray(values[first:end])) != sums[chunk]
+            damaged += zlib.crc32(np.ascontiguousarray(values[first:end]).data) != sums[chunk]
         if damaged:
             raise OSError(
                 f"cannot read {self.path}: it is damaged: {damaged} of its {self.layout.chunks} blocks do not match their "
@@ -239,10 +255,10 @@ class Stored:
         found = {}
         with self._opened() as file:
             for name in self.layout.kinds:
-                parts = [np.asarray(file[name][box]) for box in boxes(self.layout.shape, first, end)]
+                parts = [np.asarray(_dataset(file, name)[box]) for box in boxes(self.layout.shape, first, end)]
                 shape = self.layout.inner_shape(name)
                 found[name] = np.concatenate([part.reshape(-1, *shape) for part in parts])
-                if zlib.crc32(found[name]) != self._sums[name][chunk]:
+                if zlib.crc32(found[name].data) != self._sums[name][chunk]:
                     return None
         return found
 
@@ -267,9 +283,15 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
     attributes = {name: _attribute(file, name) for name in file.attrs if name != "Conventions"}
     inner = {name: tuple(dims) for name, dims in json.loads(attributes.pop(INNER, "{}")).items()}
     dims = [*json.loads(attributes["axes"]), *(dim for dims in inner.values() for dim in dims)]
-    sums = {name: array[()] for name, array in file[CHECKSUMS].items()}
-    for name in (*dict.fromkeys(dims), *(name for name in file if name not in (*dims, CHECKSUMS))):
-        array = file[name]
+    # Only files need it.
+    import h5py
+
+    checksums = file[CHECKSUMS]
+    if not isinstance(checksums, h5py.Group):
+        raise ValueError(f"{CHECKSUMS} is not a group")
+    sums = {name: _dataset(checksums, name)[()] for name in map(str, checksums)}
+    for name in (*dict.fromkeys(dims), *(name for name in map(str, file) if name not in (*dims, CHECKSUMS))):
+        array = _dataset(file, name)
         if LONG_NAME in array.attrs:
             long_names[name] = _attribute(array, LONG_NAME)
         if "flag_meanings" in array.attrs:
@@ -289,7 +311,7 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
     if long_names:
         attributes[LONG_NAMES] = json.dumps(long_names, sort_keys=True)
     coords = {name: np.array(words.pop(name))[values] if name in words else values for name, values in coords.items()}
-    layout = Layout(coords, kinds, units, attributes, words, inner, int(file[CHECKSUMS].attrs["block"]))
+    layout = Layout(coords, kinds, units, attributes, words, inner, int(_attribute(checksums, "block")))
     for name, shape in shapes.items():
         if shape != layout.shape + layout.inner_shape(name) or len(sums[name]) != layout.chunks:
             raise ValueError(f"{name} has the wrong shape")

@@ -77,7 +77,7 @@ def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], most: int
             future.cancel()
 
 
-def crashes_reported_by(error: Exception) -> int:
+def crashes_reported_by(error: Any) -> int:
     """How many workers have died of a block, according to what its future raised."""
     if isinstance(error, BrokenExecutor):
         return 1

@@ -6,12 +6,13 @@ import pickle
 import platform
 import threading
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
+from .. import __version__
 from ..compiled_programs import forget_programs_if_many
 from .grid import Axis, columns, size_of
 from .layout import Values
@@ -95,13 +96,8 @@ def _unpacked(sent: bytes) -> ChunkTask:
 @functools.cache
 def versions() -> dict[str, str]:
     """The versions that a result depends on."""
-    found = {"python": platform.python_version()}
-    for name in ("nonholonomic", "jax", "jaxlib", "diffrax", "numpy"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    others = ("jax", "jaxlib", "diffrax", "numpy")
+    return {"python": platform.python_version(), "nonholonomic": __version__} | {name: version(name) for name in others}
 
 
 def stamp() -> dict[str, str]:

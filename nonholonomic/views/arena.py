@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..geometry import AbstractSurface
+from ..geometry import AbstractSurface, vector_of
 from .meshes import of_grid
 from .stage import Arena, Mesh
 
@@ -84,7 +84,7 @@ class _Chart:
     def grid(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         return fixed(self.surface, _charted(self.surface, (first, second)))
 
-    def ranges(self, margin: float, spacing: float) -> tuple[list, list[float], str]:
+    def ranges(self, margin: float, spacing: float) -> tuple[list[tuple[float, float]], list[float], str]:
         """The ranges of both numbers, the steps between lines, and what they are in words."""
         lengths = [self._length(number) for number in (0, 1)]
         found, steps, words = [], [], []
@@ -134,7 +134,7 @@ class _Patch:
         flat = self.middle + first[..., None] * self.axes[0] + second[..., None] * self.axes[1]
         return fixed(self.surface, _nearest(self.surface, own(self.surface, np.moveaxis(flat, -1, 0))))
 
-    def ranges(self, margin: float, spacing: float) -> tuple[list, list[float], str]:
+    def ranges(self, margin: float, spacing: float) -> tuple[list[tuple[float, float]], list[float], str]:
         ranges = [(part.min() - margin, part.max() + margin) for part in self.spread.T]
         step = nice(max(spacing, max(high - low for low, high in ranges) / MOST_LINES), False)
         return ranges, [step, step], f"grid {in_words(step)}"
@@ -142,13 +142,15 @@ class _Patch:
 
 def own(surface: AbstractSurface, position: np.ndarray) -> tuple:
     """A position (3, ...) in the fixed frame in the surface's axes, as surfaces take it."""
-    return surface.in_own_axes(tuple(np.asarray(part, dtype=float) for part in position))
+    return surface.in_own_axes(vector_of(np.asarray(part, dtype=float) for part in position))
 
 
 def fixed(surface: AbstractSurface, vector: tuple) -> np.ndarray:
     """A vector in the surface's axes in the fixed frame, (..., 3)."""
     like = next(part for part in vector if part is not None)
-    full = tuple(np.zeros_like(np.asarray(like, dtype=float)) if part is None else np.asarray(part) for part in vector)
+    full = vector_of(
+        np.zeros_like(np.asarray(like, dtype=float)) if part is None else np.asarray(part) for part in vector
+    )
     return np.stack(np.broadcast_arrays(*(np.asarray(part) for part in surface.in_fixed_frame(full))), axis=-1)
 
 

@@ -67,13 +67,13 @@ def box(lengths: tuple[float, float, float], centre: tuple[float, float, float],
 
 def bar(begin: tuple[float, float, float], end: tuple[float, float, float], radius: float, colour: int) -> Mesh:
     """A round bar between two points [m]."""
-    begin, along = np.asarray(begin), np.subtract(end, begin)
+    foot, along = np.asarray(begin), np.subtract(end, begin)
     straight = revolved([(0.0, 1.0), (radius, 1.0), (radius, 0.0), (0.0, 0.0)], colour)
     z = along / np.linalg.norm(along)
     x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)
     axes = np.stack([x, np.cross(z, x), along])
-    return straight._replace(vertices=straight.vertices @ axes + begin)
+    return straight._replace(vertices=straight.vertices @ axes + foot)
 
 
 def wheel(radius: float, width: float, colours: tuple[int, int]) -> tuple[Mesh, ...]:

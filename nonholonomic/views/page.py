@@ -129,7 +129,7 @@ def _safe(text: str) -> str:
 
 
 def _template(name: str) -> str:
-    return files(__package__).joinpath(name).read_text(encoding="utf-8")
+    return files("nonholonomic.views").joinpath(name).read_text(encoding="utf-8")
 
 
 def _coded(data: bytes) -> str:

@@ -41,6 +41,14 @@ def new_figure(width: float = 7.0, height: float = 4.5) -> Any:
     return _kind_of_figure()(figsize=(width, height), layout="constrained")
 
 
+def _drawing(ax: Any, *size: float) -> tuple[Any, Any]:
+    """A new figure with axes to draw in; or `None`, and the given axes."""
+    if ax is not None:
+        return None, ax
+    figure = new_figure(*size)
+    return figure, figure.add_subplot()
+
+
 def draw_table(
     table: "Table", variable: str | None = None, at: dict[str, float] | None = None, log: bool = False, ax: Any = None
 ) -> Any:
@@ -66,8 +74,7 @@ def draw_table(
         raise ValueError("a table of one cell has nothing to draw")
     names, cut = _drawn(table, variable, at or {})
     shown = _slice(np.where(np.isfinite(values), values, np.nan), dims, names, cut)
-    figure = new_figure() if ax is None else None
-    drawing = ax if figure is None else figure.add_subplot()
+    figure, drawing = _drawing(ax)
     drawing.set_xlabel(table.label(names[0]))
     drawing.set_title(", ".join(_cut_text(table, name, place) for name, place in cut.items()), fontsize="medium")
     if len(names) == 1 or len(table.coords[names[1]]) <= MOST_LINES:
@@ -189,8 +196,7 @@ def draw_portrait(table: "Table", x: str, y: str, ax: Any = None) -> Any:
     **Raises:** `ValueError` for an unknown variable or component.
     """
     (across, across_label), (up, up_label) = _column(table, "x", x), _column(table, "y", y)
-    figure = new_figure(5.0, 4.5) if ax is None else None
-    drawing = ax if figure is None else figure.add_subplot()
+    figure, drawing = _drawing(ax, 5.0, 4.5)
     (line,) = drawing.plot(across, up, linewidth=1.0)
     drawing.plot(across[:1], up[:1], "o", color=line.get_color())
     drawing.set_xlabel(across_label)

@@ -63,9 +63,9 @@ window.views = window.views || {};
       this.light();
       this.arena(fact.arena);
       this.runs = fact.runs.map((run) => this.run(run));
+      this.fit();
       this.reset();
-      new ResizeObserver(() => this.resize()).observe(box);
-      this.resize();
+      new ResizeObserver(() => { if (this.fit()) this.render(); }).observe(box);
     }
 
     light() {
@@ -233,16 +233,17 @@ window.views = window.views || {};
       this.render();
     }
 
-    resize() {
+    // Fit the picture to its box. Until lines know how many pixels there are, each is as wide as the picture.
+    fit() {
       const { clientWidth: width, clientHeight: height } = this.box;
-      if (!width || !height) return;
+      if (!width || !height) return false;
       this.renderer.setSize(width, height);
       for (const { traces } of this.runs) for (const { line } of traces) line.material.resolution.set(width, height);
       this.camera.aspect = width / height;
       // In a narrow picture as much is seen across as is seen up and down in a square one.
       this.camera.fov = 2 * Math.atan(Math.tan((this.fact.angle * Math.PI) / 360) / min(1, this.camera.aspect)) * 180 / Math.PI;
       this.camera.updateProjectionMatrix();
-      this.render();
+      return true;
     }
     // Keep the camera over the floor on which the first body is.
     aboveTheFloor() {
@@ -255,6 +256,7 @@ window.views = window.views || {};
     }
     render() {
       const { camera, scene, sun, focus } = this;
+      if (!this.box.clientWidth || !this.box.clientHeight) return;
       this.aboveTheFloor();
       const distance = camera.position.distanceTo(this.controls.target);
       Object.assign(camera, { near: 0.02 * distance, far: 20 * distance + 200 * this.size });

@@ -5,6 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic import identification as generic
@@ -27,7 +28,7 @@ class SceneModel(eqx.Module):
 
     scene: Scene
     data: tuple[Recording, ...]
-    seen: Int[Array, " n"]
+    seen: Int[Array | np.ndarray, " n"]
     tolerance: Float[Array, ""] = eqx.field(converter=as_number)
 
     def __call__(self, parameters: dict[str, Float[Array, " rows"]]) -> Float[Array, "rows n"]:

@@ -96,4 +96,4 @@ def read_recording(
     [0. 1. 2.] [1.5  1.39 1.31]
     """
     read = read_columns(path, columns, fps, error, QUANTITIES)
-    return Recording(launch, *read, input, t0, student)
+    return Recording(launch, *read, input=input, t0=t0, student=student)

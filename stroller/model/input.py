@@ -127,7 +127,7 @@ def check_input(controls: Any, scene: Any, launch: Any) -> None:
         ) from error
     if shapes != [(), ()]:
         raise ValueError(f"{name} must return one drive force [N] and one steering torque [N m], not shapes {shapes}")
-    values = controls(t, motion)
+    values = jax.tree.leaves(controls(t, motion))
     if not any(is_traced(part) for part in values) and not np.all(np.isfinite([float(part) for part in values])):
         numbers = ", ".join(f"{float(part):g}" for part in values)
         raise ValueError(f"{name} must be finite: at the start it gives ({numbers})")

@@ -314,22 +314,22 @@ EQUATIONS = (
 
 
 def render() -> str:
-    """The audit as a page of Markdown, which `docs/stroller_paper.md` is."""
+    """The audit as a page of Markdown, which `docs/development/stroller_paper.md` is."""
     lines = [
         "# The stroller's paper, equation by equation",
         "",
-        '"Vector Fields of the Dynamics of Non-Holonomic Constraint System With Elliptical Configuration Space".',
-        "D stands for sinh²ξ + sin²η. The corrected forms are functions of `stroller/papers/paper.py`; the tests are in",
-        "`tests/stroller/papers/test_stroller_paper.py`, and show that the corrected form follows from the position on the",
-        "spheroid and, where the verdict is *wrong*, that the printed one does not.",
-        "`stroller.papers.paper.render()` gives this page.",
+        "This page lists which equations of *Vector Fields of the Dynamics of Non-Holonomic Constraint System With",
+        "Elliptical Configuration Space* hold, and the corrected form of the others. D stands for sinh²ξ + sin²η. The",
+        "functions are in `stroller/papers/paper.py`, the tests in `tests/stroller/papers/test_stroller_paper.py`. Each",
+        "test derives the corrected form from the position on the spheroid and shows that a wrong printed form does not",
+        "follow. `stroller.papers.paper.render()` returns this page.",
         "",
-        "The paper announces friction, a constrained Levi-Civita connection, Poincare's equations and graphs; none of",
-        "them is in its text. The program has them (`stroller/model/friction.py`, `nonholonomic/formulations/formulation.py`,",
+        "The paper announces friction, a constrained Levi-Civita connection, Poincare's equations and graphs, but",
+        "contains none. This package has them (`stroller/model/friction.py`, `nonholonomic/formulations/formulation.py`,",
         "`python -m stroller`).",
         "",
         'The paper constrains the horizontal projections of the wheels\' velocities: `heading="projected"`. On a slope',
-        'that is not a vehicle with a rigid frame, which is why `heading="intrinsic"` is the default.',
+        'this is not a vehicle with a rigid frame, so `heading="intrinsic"` is the default.',
         "",
         "| equation | as printed | verdict | correct form | test |",
         "|---|---|---|---|---|",

@@ -119,7 +119,7 @@ class RideSpec(eqx.Module):
         return eqx.combine(self.numbers, self.rest)
 
 
-def as_module(controls: Input | None, scene: Scene, launch: Launch) -> eqx.Module | None:
+def as_module(controls: Input | None, scene: Scene, launch: Launch) -> Any:
     """An input as a module, whose numbers are leaves; a function is read once, as it is called with scalars."""
     if controls is None or isinstance(controls, eqx.Module):
         return controls

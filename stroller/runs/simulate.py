@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import diffrax
 import equinox as eqx
@@ -33,7 +34,7 @@ def simulate(
     t1: Float[ArrayLike, ""],
     input: Input | None = None,
     times: Float[ArrayLike, " times"] | None = None,
-    tolerance: float = 1e-9,
+    tolerance: float | Float[Array, ""] = 1e-9,
     solver: diffrax.AbstractSolver | None = None,
     max_steps: int = 65536,
     adjoint: diffrax.AbstractAdjoint | None = None,
@@ -101,7 +102,8 @@ def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
     return dataclasses.replace(_read_off(spec, times, steps.at(spec, np.asarray(times)), stats), steps=steps)
 
 
-_read_off = eqx.filter_jit(read_off)
+# Compiled functions take NumPy's arrays too.
+_read_off: Callable[..., Trajectory] = eqx.filter_jit(read_off)
 
 # Steps of other implicit solvers cannot be repeated cheaply, so they end on the times.
 _sampled = eqx.filter_jit(functools.partial(traced_ride, adjoint=None))

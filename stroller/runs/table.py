@@ -132,8 +132,8 @@ def sweep(
     if not isinstance(axes, dict) or not all(isinstance(number, str) for number in axes):
         raise ValueError(f"axes = {axes!r} must be a dictionary, full name of a parameter -> values")
     require_whole(max_steps, "max_steps", 1)
-    solver = Settings(tolerance, solver).for_lanes
-    explicit_tableau(solver)
+    method = Settings(tolerance, solver).for_lanes
+    explicit_tableau(method)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
     grid = named_axes(full_axes(axes, variable_numbers(roots)), scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.
@@ -143,11 +143,11 @@ def sweep(
 
     request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
     request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
-    request |= {"solver": type(solver).__name__, "input": "none" if input is None else described(input)}
+    request |= {"solver": type(method).__name__, "input": "none" if input is None else described(input)}
     request |= {grid_axis.number: "an axis" for grid_axis in grid}
     if max_steps != DEFAULT_MAX_STEPS:
         request |= {"max_steps": int(max_steps)}
-    job = RideJob.of(roots, input, float(t1), float(tolerance), solver, int(max_steps))
+    job = RideJob.of(roots, input, float(t1), float(tolerance), method, int(max_steps))
     return computed(job, grid, VARIABLES, request, path=path, progress=progress, executor=executor)
 
 
@@ -170,14 +170,22 @@ class RideJob(NamedTuple):
     input: Input | None
     t1: float
     tolerance: float
-    solver: diffrax.AbstractERK
+    solver: diffrax.AbstractSolver
     max_steps: int
-    controls: eqx.Module | None
+    controls: Input | None
 
     @classmethod
-    def of(cls, roots: dict[str, Any], input: Input | None, *rest: Any) -> "RideJob":
+    def of(
+        cls,
+        roots: dict[str, Any],
+        input: Any,
+        t1: float,
+        tolerance: float,
+        solver: diffrax.AbstractSolver,
+        max_steps: int,
+    ) -> "RideJob":
         """The job, in this process."""
-        return cls(roots, input, *rest, as_module(input, roots["scene"], roots["launch"]))
+        return cls(roots, input, t1, tolerance, solver, max_steps, as_module(input, roots["scene"], roots["launch"]))
 
     def __reduce__(self) -> Any:
         return RideJob.of, tuple(self[:-1])

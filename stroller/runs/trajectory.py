@@ -136,6 +136,7 @@ class Trajectory(eqx.Module, Viewable):
     def contact_lost_at(self) -> float:
         """Time [s] at which the ground first has to pull to keep the stroller on it; infinite if it never does."""
         run = self.with_steps()
+        assert run.steps is not None
         force = watched(run.spec, run.steps.states, "normal_force")
         allowed = -CONTACT_ROUND_OFF * np.max(np.abs(force[np.isfinite(force)]), initial=0.0)
         return run._first_below("normal_force", allowed)
@@ -148,7 +149,9 @@ class Trajectory(eqx.Module, Viewable):
     @property
     def jackknifed_at(self) -> Float[np.ndarray, " times"]:
         """Times [s] at which the steering angle passes a right angle, where the rear axle reverses."""
-        return crossings(self.spec, self.with_steps().steps, "steering_cosine", 0.0)
+        steps = self.with_steps().steps
+        assert steps is not None
+        return crossings(self.spec, steps, "steering_cosine", 0.0)
 
     def _first_below(self, name: str, level: float) -> float:
         """Time [s] at which a watched quantity first is below a level; infinite if it never is."""

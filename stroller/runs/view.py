@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from nonholonomic.geometry import AbstractSurface
+from nonholonomic.geometry import AbstractSurface, vector_of
 from nonholonomic.parameters import distinguishing_labels
 from nonholonomic.validation import require_one_run
 from nonholonomic.views import (
@@ -73,9 +73,9 @@ def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage
 
 def normals(surface: AbstractSurface, side: str | None, position: np.ndarray) -> np.ndarray:
     """Unit normals at positions (times, 3), towards the side on which the stroller is."""
-    components = surface.normal(surface.in_own_axes(tuple(position.T)))
+    components = surface.normal(surface.in_own_axes(vector_of(position.T)))
     like = np.zeros(len(position))
-    full = tuple(like if part is None else np.asarray(part) + like for part in components)
+    full = vector_of(like if part is None else np.asarray(part) + like for part in components)
     return surface.sign(side, DRIVES) * np.stack([np.asarray(part) for part in surface.in_fixed_frame(full)], axis=-1)
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import arena_hop_reference
 import numpy as np
-from arena_hop_reference import CLOSING, OPTIONS, SAMPLES, Hopper, watched
+from arena_hop_reference import CLOSING, SAMPLES, Hopper, watched
 from arena_reference import Case, level
 from scipy.integrate import solve_ivp
 
@@ -132,7 +132,9 @@ def follow(case):
             max_step=5e-4,
             events=events,
             dense_output=True,
-            **OPTIONS,
+            method="DOP853",
+            rtol=1e-13,
+            atol=1e-15,
         )
         while wanted and wanted[0] <= run.t[-1]:
             seen = run.sol(wanted.pop(0))

@@ -14,6 +14,11 @@ from scipy.integrate import solve_ivp
 UP = np.array((0.0, 0.0, 1.0))
 
 
+def cross(a, b):
+    """Vector product; NumPy's own takes twenty times as long on single vectors."""
+    return np.array((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
+
+
 def skew(w):
     return np.array(((0.0, -w[2], w[1]), (w[2], 0.0, -w[0]), (-w[1], w[0], 0.0)))
 
@@ -51,7 +56,7 @@ class Egg:
         def accelerations(N):
             force = N * (UP + f)
             u_dot = force / self.mass - self.gravity * UP
-            w_dot = np.linalg.solve(J, np.cross(r, force) - np.cross(w, J @ w))
+            w_dot = np.linalg.solve(J, cross(r, force) - cross(w, J @ w))
             A = skew(w_dot)
             S_second = A @ S - S @ A + W @ S_dot - S_dot @ W
             rate = UP @ S_dot @ UP / (2.0 * reach)
@@ -69,11 +74,11 @@ class Egg:
         c, s = np.cos(theta), np.sin(theta)
         e = np.array((s * np.cos(azimuth), s * np.sin(azimuth), c))
         first = np.array((c * np.cos(azimuth), c * np.sin(azimuth), -s))
-        Q = np.stack((first, np.cross(e, first), e), axis=1)
+        Q = np.stack((first, cross(e, first), e), axis=1)
         w = spin * e + turning
         y = np.concatenate((np.zeros(3), np.zeros(3), Q.ravel(), w))
         r = self.motion(y)[2]
-        u = np.array((*velocity, -np.cross(w, r)[2]))
+        u = np.array((*velocity, -cross(w, r)[2]))
         return np.concatenate((-r, u, Q.ravel(), w))
 
     def run(self, y, times):

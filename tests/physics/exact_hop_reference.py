@@ -66,8 +66,10 @@ def settled(body: Body, state: np.ndarray) -> tuple[np.ndarray, str]:
     return begun(body, state, 1e-10), "slipping"
 
 
-def follow(body: Body, state: np.ndarray, t1: float, restitution: float, rtol: float = 1e-11) -> list[Stretch]:
-    """Run to `t1` [s] from a state that slips, stretch by stretch."""
+def follow(
+    body: Body, state: np.ndarray, t1: float, restitution: float, rtol: float = 1e-11, floor: float = 1e-8
+) -> list[Stretch]:
+    """Run to `t1` [s] from a state that slips, stretch by stretch; a slip ends where its speed has fallen to `floor` [m/s]."""
     atol = 0.1 * rtol * np.repeat([1.0, np.sqrt(body.gravity * body.radius), 100.0, body.radius], 3)
 
     def event(function):
@@ -79,7 +81,7 @@ def follow(body: Body, state: np.ndarray, t1: float, restitution: float, rtol: f
 
     ends = {
         "slipping": [
-            event(lambda x: np.linalg.norm(Contact(body, x).v) - 1e-8),
+            event(lambda x: np.linalg.norm(Contact(body, x).v) - floor),
             event(lambda x: Contact(body, x).slipping_force() @ Contact(body, x).n),
         ],
         "rolling": [event(lambda x: Contact(body, x).reserve())],

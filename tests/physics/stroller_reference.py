@@ -16,6 +16,11 @@ Array = np.ndarray
 UP = np.array([0.0, 0.0, 1.0])
 
 
+def cross(a, b):
+    """Vector product; NumPy's own takes twenty times as long on single vectors."""
+    return np.array((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
+
+
 class Level(NamedTuple):
     """A function whose zeros are the surface: r [m] -> gradient (3,) and Hessian (3, 3), and the Gaussian curvature [1/m^2]."""
 
@@ -91,9 +96,9 @@ def instant(level: Level, vehicle: Vehicle, t: float, y: Array) -> Instant:
     n, turning = level.normal(r)
     n_rate = turning @ velocity
     up, up_rate = vehicle.side * n, vehicle.side * n_rate
-    e_rate = np.cross(yaw * up + np.cross(n, n_rate), e)
-    left = np.cross(up, e)
-    left_rate = np.cross(up_rate, e) + np.cross(up, e_rate)
+    e_rate = cross(yaw * up + cross(n, n_rate), e)
+    left = cross(up, e)
+    left_rate = cross(up_rate, e) + cross(up, e_rate)
     sine, cosine = np.sin(phi), np.cos(phi)
     ahead, across = cosine * e + sine * left, cosine * left - sine * e
     v, lateral = e @ velocity, left @ velocity

@@ -113,6 +113,7 @@ def over_ripples(tolerance: float):
     return thrown(ground, tippe.Launch(0.4, 100.0, place=(0.0, 0.0), velocity=(3.5, 0.3)), 0.3, tolerance)
 
 
+@pytest.mark.slow
 def test_a_flight_over_ripples_lands_at_the_same_time_at_all_tolerances():
     """At .247905 s, by the reference below; by Newton's nearest point it landed at .0893, .1489 or .2479 s, with twice the
     energy."""

@@ -10,6 +10,17 @@ import pytest
 
 BROWSER, DRIVER = (shutil.which(name) for name in ("chromium", "chromedriver"))
 
+#: How it draws on a processor: stages by WebGL, all else without it, which takes a hundred times as long (half a minute for the
+#: first picture of a page). Pages that play by themselves do not where less motion is asked for.
+DRAWING = (
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-gpu-rasterization",
+    "--disable-accelerated-2d-canvas",
+    "--disable-gpu-compositing",
+    "--force-prefers-reduced-motion",
+)
+
 #: Tests with this mark need the browser.
 needs_browser = pytest.mark.skipif(BROWSER is None or DRIVER is None, reason="no chromium with its chromedriver")
 
@@ -22,8 +33,7 @@ def open_browser(size: str = "500,500") -> Iterator[Any]:
 
     options = ChromeOptions()
     options.binary_location = BROWSER
-    wanted = ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader")
-    for argument in (*wanted, "--enable-unsafe-swiftshader", f"--window-size={size}"):
+    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", *DRAWING, f"--window-size={size}"):
         options.add_argument(argument)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     driver = Chrome(options=options, service=Service(DRIVER))
@@ -42,3 +52,9 @@ def wait(driver: Any, script: str) -> None:
     while not driver.execute_script(script):
         assert time.monotonic() < until, driver.get_log("browser")
         time.sleep(0.05)
+
+
+def complaints(driver: Any) -> list[dict[str, Any]]:
+    """What a browser's console has complained of since it was last asked; how a processor draws is not the page's fault."""
+    entries = [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
+    return [entry for entry in entries if "GL Driver Message" not in entry["message"]]

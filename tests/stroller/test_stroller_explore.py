@@ -5,7 +5,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from browser import needs_browser, open_browser, wait
+from browser import complaints, needs_browser, open_browser, wait
 
 import stroller
 from nonholonomic.views.explore import programs, sliders_of
@@ -35,7 +35,7 @@ def scene_on(ground) -> stroller.Scene:
 
 @pytest.fixture(scope="module")
 def browser():
-    with open_browser("1100,800") as driver:
+    with open_browser("700,500") as driver:
         yield driver
 
 
@@ -91,7 +91,7 @@ def test_the_page_opens_and_rides_anew(browser, tmp_path):
     before = browser.execute_script("return live.outcome.value")
     browser.execute_script("live.set([1.0, 0.0])")
     wait(browser, f"return live.outcome.value < {before!r}")
-    assert [entry for entry in browser.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")] == []
+    assert complaints(browser) == []
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from browser import needs_browser, open_browser, wait
+from browser import complaints, needs_browser, open_browser, wait
 from tops import rutstam_top
 
 import tippe
@@ -42,7 +42,7 @@ SHORT = [("plane", "viscous"), ("graph", "Coulomb")]
 
 @pytest.fixture(scope="module")
 def browser():
-    with open_browser("1100,800") as driver:
+    with open_browser("700,500") as driver:
         yield driver
 
 
@@ -108,7 +108,7 @@ def reset(browser):
 
 def test_the_page_needs_no_network_and_complains_of_nothing(browser, page):
     assert len(page.html) < 2.5e6
-    assert [entry for entry in browser.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")] == []
+    assert complaints(browser) == []
     events = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
     requests = [event["params"]["request"]["url"] for event in events if event["method"] == "Network.requestWillBeSent"]
     assert requests
@@ -192,7 +192,7 @@ def test_keys_play_and_reset(browser, page):
     body.send_keys(" ")
     wait(browser, "return player.time() > 0.51")
     body.send_keys(" ")
-    assert not browser.execute_script("return player.playing()")
+    wait(browser, "return !player.playing()")
     body.send_keys("r")
     wait(browser, "return live.values()[0] === 0.1")
     slider = browser.find_element("css selector", "input[name=theta]")

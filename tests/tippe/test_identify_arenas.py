@@ -41,6 +41,7 @@ def film(arena: str) -> tuple[Case, tippe.Recording]:
     return case, tippe.Recording(launch, times, value, [1e-3] * 3 + [1e-2] * 3, ("position", "axis"))
 
 
+@pytest.mark.slow
 def test_the_height_of_waves():
     """From waves a tenth too high, by differences, which need no derivative of the run; of exact data nothing is left."""
     case, recording = film("graph")

@@ -144,3 +144,10 @@ def test_a_launch_in_degrees_and_revolutions_per_minute():
     assert_close(jax.jit(lambda theta: tippe.Launch.degrees(theta, 60.0).theta)(180.0), math.pi, rtol=1e-15)
     with pytest.raises(ValueError, match=r"theta = 181.0 must be at most 180.0 \(in degrees\)"):
         tippe.Launch.degrees(181, 60)
+
+
+def test_a_preset_that_was_not_called_is_named():
+    with pytest.raises(ValueError, match=r"did you mean wooden\(\)\?"):
+        tippe.Scene(presets.wooden)
+    with pytest.raises(ValueError, match=r"must be a Scene; did you mean classroom\(\)\?"):
+        tippe.simulate(presets.classroom, tippe.Launch(0.1, 155.0), 1.0)

@@ -140,7 +140,9 @@ class InversionTimes(eqx.Module):
         )
         return tuple(f"theta {theta:.4g}, spin {spin:.4g}" for theta, spin in zip(*columns[:2], strict=True))
 
-    def predict(self, scene: Scene, values: Values, rows: int, tolerance: float) -> Float[Array, "rows launches"]:
+    def predict(
+        self, scene: Scene, values: Values, rows: int, tolerance: Float[Array, ""]
+    ) -> Float[Array, "rows launches"]:
         """Times of all launches in every row, all of them lanes of one block."""
         launches = len(self.time)
         lanes = _launches(self.launch, launches, rows)
@@ -201,7 +203,7 @@ class Recording(AbstractRecording):
 
 
 def predict_recordings(
-    scene: Scene, recordings: list[tuple[Recording, Values]], rows: int, tolerance: float
+    scene: Scene, recordings: list[tuple[Recording, Values]], rows: int, tolerance: Float[Array, ""]
 ) -> list[Float[Array, "rows samples"]]:
     """What is recorded of several runs, in every row, as for `nonholonomic.identification.predicted`."""
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nonholonomic import identification as generic
@@ -30,7 +31,7 @@ class SceneModel(eqx.Module):
 
     scene: Scene
     data: tuple[Any, ...]
-    seen: Int[Array, " n"]
+    seen: Int[Array | np.ndarray, " n"]
     tolerance: Float[Array, ""] = eqx.field(converter=as_number)
 
     def __call__(self, parameters: Values) -> Float[Array, "rows n"]:

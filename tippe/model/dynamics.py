@@ -146,7 +146,8 @@ class Dynamics(eqx.Module):
         w1 = self.per_transverse * L[0] + along_axis * e[0]
         w2 = self.per_transverse * L[1] + along_axis * e[1]
         w3 = self.per_transverse * L[2] + along_axis * e[2] if self.friction.uses_spin else None
-        slip = Slip(*stored(V[0] - R * w2, V[1] + R * w1), (w1, w2, w3))
+        slip_x, slip_y = stored(V[0] - R * w2, V[1] + R * w1)
+        slip = Slip(slip_x, slip_y, (w1, w2, w3))
         friction = self.friction.per_normal_force(slip)
         f1, f2 = friction.force
 

@@ -74,7 +74,8 @@ class AbstractFriction(Bounded):
         super().__init_subclass__(**options)
         # A law made from another must say it anew.
         if "per_normal_force" in cls.__dict__ and "isotropic" not in cls.__dict__:
-            cls.isotropic = property(lambda self: False)
+            # The types see the property of the base class only.
+            cls.isotropic = property(lambda self: False)  # pyright: ignore[reportAttributeAccessIssue]
 
     #: Whether the force of a contact at rest is whatever keeps it at rest, within limits.
     set_valued: ClassVar[bool] = False
@@ -125,7 +126,7 @@ class Frictionless(AbstractFriction):
 
 
 class Viscous(AbstractFriction):
-    """Viscous sliding friction, F = -mu N v_s (Rutstam 2012, eq. 1.1).
+    """Viscous sliding friction, F = -mu N v_s (Rutstam 2012, equation 1.1).
 
     **Arguments:**
 

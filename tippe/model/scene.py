@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from typing import ClassVar
+from typing import ClassVar, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -26,9 +26,10 @@ from nonholonomic.geometry import (
     room_bounds,
     scale,
     sum_vectors,
+    vector_of,
 )
 from nonholonomic.parameters import numbers
-from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_all, require_kind
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced, require_all, require_kind, uncalled
 
 from .body import AbstractBody
 from .dynamics import TURNING, Dynamics
@@ -38,10 +39,13 @@ from .state import inclination, joined, parts
 from .stick_slip import StickSlip
 from .top import Top
 
+#: The body's class: what only a sphere can do takes a `Scene[Top]`.
+Body = TypeVar("Body", bound=AbstractBody)
+
 #: Tilt [rad] of a launch below which errors across the normal are measured in proportion to it.
 NEARLY_UPRIGHT = 1e-2
 
-#: How fast the foot of a top on a general arena is drawn back to it, over sqrt(g / R); `docs/tippe.md` has the drift.
+#: How fast the foot of a top on a general arena is drawn back to it, over sqrt(g / R); `tippe.md` has the drift.
 PULL = 1.0
 
 
@@ -49,7 +53,7 @@ PULL = 1.0
 LARGEST_ARENA = 20.0
 
 
-class Scene(Bounded):
+class Scene(Bounded, Generic[Body]):
     """A tippe top on an arena.
 
     Every number in it is a leaf of a pytree: it can be swept, traced and differentiated.
@@ -94,7 +98,7 @@ class Scene(Bounded):
 
     units: ClassVar[dict[str, str]] = {"gravity": "m s-2", "restitution": "1"}
 
-    body: AbstractBody
+    body: Body
     surface: AbstractSurface = Plane()
     friction: AbstractFriction = Frictionless()
     gravity: Float[Array, "..."] = eqx.field(converter=as_number, default=9.81)
@@ -104,7 +108,8 @@ class Scene(Bounded):
 
     def __check_init__(self):
         if not isinstance(self.body, AbstractBody):
-            raise ValueError(f"body = {self.body!r} must be a Top, a SpheroidBody or a ConvexBody")
+            kinds = f"a Top, a SpheroidBody or a ConvexBody{uncalled(self.body)}"
+            raise ValueError(f"body = {self.body!r} must be {kinds}")
         require_kind(self.surface, "surface", AbstractSurface, ", such as tippe.Plane() or tippe.Cylinder(0.3)")
         require_kind(self.friction, "friction", AbstractFriction, A_LAW)
         # This raises if the surface has no such side.
@@ -175,8 +180,10 @@ class Scene(Bounded):
     @property
     def dynamics(self) -> Dynamics | StickSlip:
         """The equations of motion, with the combinations of the scene's numbers that they need."""
-        equations = StickSlip if self.friction.set_valued else Dynamics
-        return equations.of(self.body, self.frame, self.friction, self.gravity)
+        numbers = (self.frame, self.friction, self.gravity)
+        if isinstance(self.body, Top) and self.friction.set_valued:
+            return StickSlip.of(self.body, *numbers)
+        return Dynamics.of(self.body, *numbers)
 
     @property
     def turning_dynamics(self) -> Dynamics | StickSlip:
@@ -185,8 +192,8 @@ class Scene(Bounded):
         On a level plane under an isotropic law the frame turns with the top, and how far it has turned is not known afterwards.
         """
         equations, body = self.dynamics, self.body
-        alike = isinstance(equations, Dynamics) and self.level and self.friction.isotropic
-        if not (alike and isinstance(body, Top)):
+        alike = self.level and self.friction.isotropic
+        if not (isinstance(equations, Dynamics) and isinstance(body, Top)) or not alike:
             return equations
         # The other tops, of group I (`steady.py`), soon stand upright with their axis beside L: turning would move both.
         may_invert = 1.0 - body.offset / body.radius < body.I1 / body.I3
@@ -236,7 +243,7 @@ class Scene(Bounded):
         e = (sine * jnp.cos(launch.azimuth), sine * jnp.sin(launch.azimuth), jnp.cos(launch.theta))
         L, u = scale(body.I3 * launch.spin, e), launch.velocity or (zero, zero)
         if launch.angular_velocity is not None:
-            turning = launch.angular_velocity
+            turning = vector_of(launch.angular_velocity)
             along = dot(turning, e)
             L = sum_vectors(L, scale(body.I1, turning), scale((body.I3 - body.I1) * along, e))
             u = sum_vectors(u, scale(multiply(-1.0, body.offset_of_path), cross(turning, e)[:2]))

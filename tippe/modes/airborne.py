@@ -24,6 +24,7 @@ from nonholonomic.geometry import (
     CarriedFrame,
     Component,
     Vector,
+    add,
     carried,
     cross,
     dot,
@@ -31,14 +32,17 @@ from nonholonomic.geometry import (
     subtract,
     sum_vectors,
     tangents,
+    vector_of,
 )
 from nonholonomic.hybrid import Transition
 from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup, greatest
 
 from ..model.dynamics import Dynamics, stacked
+from ..model.friction import SetValuedCoulomb
 from ..model.scene import Scene
 from ..model.state import COS_THETA, joined, parts
+from ..model.top import Top
 from .coulomb_impact import resolve_coulomb_impact
 from .flying_mode import AbstractFlyingMode
 from .free_body import Ball, FreeBody, axis_rate, balls, energy, gap_rate, standing_on, still_parting
@@ -68,8 +72,7 @@ class FlightState(NamedTuple):
 
 def flight_state(state: Float[Array, "components ..."]) -> FlightState:
     """Split a flight state into its parts."""
-    rows = tuple(state[k] for k in range(12))
-    return FlightState(rows[:3], rows[3:6], rows[6:9], rows[9:12])
+    return FlightState(*(vector_of(state[k + i] for i in range(3)) for k in range(0, 12, 3)))
 
 
 class Below(NamedTuple):
@@ -80,23 +83,23 @@ class Below(NamedTuple):
     gap: Component
 
 
-def below(scene: Scene, flying: FlightState, ball: Ball | None = None) -> Below:
+def below(scene: Scene[Top], flying: FlightState, ball: Ball | None = None) -> Below:
     """The nearest point of the arena to the centre of a sphere, by default the top's own: theta is measured there."""
     frame, ball = carried_frame(scene), balls(scene.body)[0] if ball is None else ball
     centre = centre_of(flying, ball)
-    foot = tuple(0.0 * centre[0] if part is None else part for part in scene.surface.nearest(centre))
+    foot = vector_of(0.0 * centre[0] if part is None else part for part in scene.surface.nearest(centre))
     n = frame.normal(foot)
     away = dot(tuple(subtract(a, b) for a, b in zip(centre, foot, strict=True)), n)
     return Below(foot, (*tangents(n), n), away - ball.radius)
 
 
-def landing_site(scene: Scene, flying: FlightState, ball: Ball) -> Below:
+def landing_site(scene: Scene[Top], flying: FlightState, ball: Ball) -> Below:
     """The point where a sphere lands: the nearest point of the arena at that time. Earlier, only the sign of the gap is
     valid.
     """
     centre = centre_of(flying, ball)
     site, zero = scene.surface.ball_gap(centre, ball.radius, carried_frame(scene).side), jnp.zeros_like(flying.place[0])
-    n = tuple(zero if part is None else part + zero for part in site.normal)
+    n = vector_of(zero if part is None else part + zero for part in site.normal)
     return Below(site.foot, (*tangents(n), n), site.gap)
 
 
@@ -106,7 +109,7 @@ def centre_of(flying: FlightState, ball: Ball) -> Vector:
     return x, y, z
 
 
-def missed(scene: Scene, site: Below, ball: Ball) -> Bool[Array, "..."]:
+def missed(scene: Scene[Top], site: Below, ball: Ball) -> Bool[Array, "..."]:
     """Whether a flight has ended away from a contact of the sphere with the arena, so that no motion may continue from
     there.
     """
@@ -116,7 +119,7 @@ def missed(scene: Scene, site: Below, ball: Ball) -> Bool[Array, "..."]:
     return ~((jnp.abs(site.gap) < LANDED * ball.radius) & (dot(turned, turned) < LANDED**2))
 
 
-def carried_frame(scene: Scene) -> CarriedFrame:
+def carried_frame(scene: Scene[Top]) -> CarriedFrame:
     """The frame of a scene whose contact may be lost and regained."""
     assert isinstance(scene.frame, CarriedFrame)
     return scene.frame
@@ -129,10 +132,10 @@ def to_frame(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
 
 def from_frame(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> Vector:
     """The vector with given components in a frame."""
-    return tuple(sum_vectors(*(scale(part, axis) for part, axis in zip(vector, axes, strict=True))))
+    return vector_of(sum_vectors(*(scale(part, axis) for part, axis in zip(vector, axes, strict=True))))
 
 
-def as_free_body(scene: Scene, flying: FlightState, ground: Below, ball: Ball | None = None) -> FreeBody:
+def as_free_body(scene: Scene[Top], flying: FlightState, ground: Below, ball: Ball | None = None) -> FreeBody:
     """A flying top as a free body above the tangent plane below one of its spheres, by default its own."""
     velocity, axis, momentum = (to_frame(part, ground.axes) for part in flying[1:])
     ball = balls(scene.body)[0] if ball is None else ball
@@ -151,7 +154,7 @@ def in_flight(place: Vector, axes: tuple[Vector, Vector, Vector], free: FreeBody
     return joined(place, *(from_frame(part, axes) for part in (free.velocity, free.axis, free.momentum)), (zero, zero))
 
 
-def standing(scene: Scene, ball: Ball) -> Dynamics:
+def standing(scene: Scene[Top], ball: Ball) -> Dynamics:
     """The equations of motion of a top that stands on one of its spheres."""
     frame = dataclasses.replace(carried_frame(scene), distance=ball.radius)
     return dataclasses.replace(standing_on(scene.dynamics, ball), frame=frame)
@@ -159,14 +162,14 @@ def standing(scene: Scene, ball: Ball) -> Dynamics:
 
 # Before every mode, a single run checks outside of its programs whether the mode is over as it begins.
 @compiled_setup
-def gap_margin(scene: Scene, flying: FlightState, ball: Ball, rounding: float = 0.0) -> Float[Array, "..."]:
+def gap_margin(scene: Scene[Top], flying: FlightState, ball: Ball, rounding: float = 0.0) -> Float[Array, "..."]:
     """Distance of a sphere from the arena as a fraction of R, plus the round-off allowed at lift-off.
 
     **Arguments:** `rounding`: an additional allowance.
     """
     body, ground = scene.body, landing_site(scene, flying, ball)
     rate = gap_rate(body, ball, as_free_body(scene, flying, ground, ball))
-    far = sum(jnp.abs(part) for part in flying.place)
+    far = add(*(jnp.abs(part) for part in flying.place))
     rounding = rounding + 4.0 * jnp.finfo(far.dtype).eps * far / body.radius
     return ground.gap / body.radius + still_parting(rate, scene.gravity, body.radius, rounding)
 
@@ -206,7 +209,7 @@ class Contact(AbstractProblem):
 class Flight(AbstractProblem):
     """Flying until theta reaches an angle or a sphere is back at the arena; `falls` is the acceleration [m/s^2]."""
 
-    scene: Scene
+    scene: Scene[Top]
     cos_angle: Float[Array, "..."]
     states: Float[Array, "components cells"]
     scales: Float[Array, "components cells"]
@@ -242,7 +245,9 @@ class Slide(AbstractFlyingMode):
     """Sliding on the arena."""
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        return Contact(self.scene.dynamics, self.cos_angle, state, self.scales, self.axial)
+        dynamics = self.scene.dynamics
+        assert isinstance(dynamics, Dynamics)
+        return Contact(dynamics, self.cos_angle, state, self.scales, self.axial)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         return jnp.concatenate([state, jnp.zeros_like(state[:2])])
@@ -261,7 +266,7 @@ class Slide(AbstractFlyingMode):
 
 
 def lift_off(
-    scene: Scene, state: Float[Array, "components ..."], rides: bool, ball: Ball | None = None
+    scene: Scene[Top], state: Float[Array, "components ..."], rides: bool, ball: Ball | None = None
 ) -> Float[Array, "components ..."]:
     """The flight state of a top that has lost contact, from its state in contact, with its passive quadratures if any.
 
@@ -278,7 +283,7 @@ def lift_off(
     flies = in_flight(s, axes, FreeBody(velocity, jnp.zeros_like(state[0]), e, L))
     if not rides:
         return flies
-    across = from_frame(tuple(state[OWN + k] for k in range(3)), axes)
+    across = from_frame(vector_of(state[OWN + k] for k in range(3)), axes)
     return jnp.concatenate([flies, jnp.stack(across), state[OWN + 3 :]])
 
 
@@ -286,6 +291,10 @@ class Fly(AbstractFlyingMode):
     """Flying over the arena."""
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+        return self.flight(state)
+
+    def flight(self, state: Float[Array, "components cells"]) -> Flight:
+        """The motion in flight from given states."""
         velocity, momentum = self.scales[0], self.scales[7]
         ones = jnp.ones_like(velocity)
         rows = [ones * self.scene.body.radius] * 3 + [velocity] * 3 + [ones] * 3 + [momentum] * 3 + [ones] * 2
@@ -297,7 +306,7 @@ class Fly(AbstractFlyingMode):
         flying = flight_state(state)
         ground = below(self.scene, flying)
         free = as_free_body(self.scene, flying, ground)
-        across = to_frame(tuple(state[OWN + k] for k in range(3)), ground.axes)
+        across = to_frame(vector_of(state[OWN + k] for k in range(3)), ground.axes)
         rate = gap_rate(self.scene.body, balls(self.scene.body)[0], free)
         rows = [jnp.stack(across), state[OWN + 3 :], jnp.stack([ground.gap, rate])]
         return jnp.concatenate([in_contact(ground, free), *rows])
@@ -310,13 +319,16 @@ class Fly(AbstractFlyingMode):
         speed = greatest(-gap_rate(scene.body, ball, free), 0.0)
         bounce = zero if scene.restitution is None else scene.restitution + zero
         rebounds = bounce * speed > CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
-        blow = resolve_coulomb_impact if scene.friction.set_valued else resolve_impact
-        struck, fails = blow(scene.body, scene.friction, ball, free, jnp.where(rebounds, bounce, 0.0))
+        bounce = jnp.where(rebounds, bounce, 0.0)
+        if isinstance(scene.friction, SetValuedCoulomb):
+            struck, fails = resolve_coulomb_impact(scene.body, scene.friction, ball, free, bounce)
+        else:
+            struck, fails = resolve_impact(scene.body, scene.friction, ball, free, bounce)
         # Where the landing was located slightly below the arena, the next flight would end where it begins.
-        lifted = tuple(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
+        lifted = vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
         after = jnp.where(rebounds, in_flight(lifted, ground.axes, struck), in_contact(ground, struck))
         if self.rides:
-            across = tuple(state[OWN + k] for k in range(3))
+            across = vector_of(state[OWN + k] for k in range(3))
             across = jnp.where(rebounds, jnp.stack(across), jnp.stack(to_frame(across, ground.axes)))
             gained = energy(scene.body, 0.0, struck) - energy(scene.body, 0.0, free)
             after = jnp.concatenate([after, across, state[OWN + 3 :].at[1].add(gained)])
@@ -331,7 +343,7 @@ class Fly(AbstractFlyingMode):
 
 
 def modes(
-    scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
+    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the number of the mode in which each starts. **Arguments:** as for those of `sliding.py`."""
     arguments = (scene, problem.scales, problem.cos_angle, rides)
@@ -339,7 +351,7 @@ def modes(
 
 
 def on_the_ground(
-    scene: Scene, state: Float[Array, "components cells"], mode: Int[Array, " cells"]
+    scene: Scene[Top], state: Float[Array, "components cells"], mode: Int[Array, " cells"]
 ) -> Float[Array, "14 cells"]:
     """States of runs in the layout of a contact of the top's own sphere; for other modes, relative to the foot below
     that sphere.
@@ -353,7 +365,7 @@ def on_the_ground(
     return jnp.where(flies, in_contact(ground, as_free_body(scene, flying, ground)), state[:OWN])
 
 
-def loss(scene: Scene, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+def loss(scene: Scene[Top], state: Float[Array, "components ..."]) -> Int[Array, "..."]:
     """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/dynamics.py`)."""
     own, state = scene.dynamics, state[:OWN]
     if scene.body.stem is None:

@@ -13,13 +13,14 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.geometry import dot, scale, sum_vectors
+from nonholonomic.geometry import dot, scale, sum_vectors, vector_of
 from nonholonomic.hybrid import Transition
 from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup, greatest
 
 from ..model.scene import Scene
 from ..model.state import COS_THETA
+from ..model.top import Top
 from .airborne import (
     FLYING,
     ON_STEM,
@@ -61,7 +62,7 @@ class OneOfTwo(AbstractProblem):
     `contact` is the sliding mode; `own` and `other` are the spheres; `on_stem` is true if the stem slides.
     """
 
-    scene: Scene
+    scene: Scene[Top]
     contact: Contact
     own: Ball
     other: Ball
@@ -87,7 +88,7 @@ class OneOfTwo(AbstractProblem):
 
 
 @compiled_setup
-def clearance(scene: Scene, own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+def clearance(scene: Scene[Top], own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
     """Distance of the other sphere from the arena as a fraction of R, plus the round-off allowed at lift-off."""
     return gap_margin(scene, flight_state(lift_off(scene, state[:OWN], False, own)), other, OVERLAP)
 
@@ -164,7 +165,7 @@ class FlyBoth(Fly):
     strikes: Bool[Array, ""]
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        return FlightToBlow(super().problem(state), self.strikes)
+        return FlightToBlow(self.flight(state), self.strikes)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Strike the arena with the sphere that is there; rebound, or slide on it where the rebound would be slow.
@@ -178,14 +179,14 @@ class FlyBoth(Fly):
         ground = landing_site(scene, flying, own)
         astray = missed(scene, ground, own)
         # Where the landing was located slightly below the arena, the next mode would end where it begins.
-        flying = flying._replace(place=tuple(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
+        flying = flying._replace(place=vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
         ground = ground._replace(gap=zero)
         blow = apply_impulse(scene, flying, ground, own, other)
         flies = blow.rebounds | blow.throws
         after = in_flight(flying.place, ground.axes, blow.free)
         after = jnp.where(flies, after, in_contact(ground, blow.free))
         if self.rides:
-            across = tuple(state[OWN + k] for k in range(3))
+            across = vector_of(state[OWN + k] for k in range(3))
             across = jnp.where(flies, jnp.stack(across), jnp.stack(to_frame(across, ground.axes)))
             gained = energy(scene.body, 0.0, blow.free) - energy(
                 scene.body, 0.0, as_free_body(scene, flying, ground, own)
@@ -217,7 +218,7 @@ class ContactImpulse(NamedTuple):
     fails: Bool[Array, " cells"]
 
 
-def apply_impulse(scene: Scene, flying: FlightState, ground: Below, own: Ball, other: Ball) -> ContactImpulse:
+def apply_impulse(scene: Scene[Top], flying: FlightState, ground: Below, own: Ball, other: Ball) -> ContactImpulse:
     """The impact of one sphere on the tangent plane at its foot; a slow rebound closes the contact.
 
     **Arguments:** `flying`: the top, its sphere `own` at the arena; `ground`: below that sphere; `other`: the other
@@ -239,7 +240,7 @@ def apply_impulse(scene: Scene, flying: FlightState, ground: Below, own: Ball, o
     return ContactImpulse(after, rebounds, touches & ~rests & (now < -closing), rests, fails)
 
 
-def own_and_other(scene: Scene, number: Int[Array, "..."]) -> tuple[Ball, Ball]:
+def own_and_other(scene: Scene[Top], number: Int[Array, "..."]) -> tuple[Ball, Ball]:
     """The sphere of a top with a number, and the other one."""
     main, stem = balls(scene.body)
     own = Ball(*(jnp.where(number == 0, a, b) for a, b in zip(main, stem, strict=True)))
@@ -247,7 +248,7 @@ def own_and_other(scene: Scene, number: Int[Array, "..."]) -> tuple[Ball, Ball]:
 
 
 def modes(
-    scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
+    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the number of the mode in which each starts. **Arguments:** as for those of `sliding.py`.
 

@@ -4,6 +4,8 @@ Slipping and rolling are as in `sticking.py`, flight as in `airborne.py`, with t
 latter.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -13,6 +15,7 @@ from nonholonomic.integration import LEFT_DOMAIN, RUNNING, AbstractProblem
 
 from ..model.scene import Scene
 from ..model.stick_slip import AT_REST, ContactMode, StickSlip
+from ..model.top import Top
 from . import sticking
 from .airborne import FLYING, OWN, SLIDING, Fly, lift_off
 from .flying_mode import AbstractFlyingMode
@@ -40,7 +43,7 @@ class Touch(AbstractFlyingMode):
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         return _at_no_distance(self.contact_state.shown(state))
 
-    def between(self, motion: tuple[Array, ...], passed: Float[Array, " times"]) -> Float[Array, "21 times"]:
+    def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "21 times"]:
         return _at_no_distance(self.contact_state.between(motion, passed))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
@@ -73,7 +76,7 @@ class Land(Fly):
 
 
 def modes(
-    scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
+    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the number of the mode in which each starts. **Arguments:** as for those of `sliding.py`."""
     both, arguments = problem.dynamics, (scene, problem.scales, problem.cos_angle, rides)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.geometry import Vector, dot, scale, sum_vectors
+from nonholonomic.geometry import Vector, dot, scale, sum_vectors, vector_of
 from nonholonomic.integration import LEFT_DOMAIN, MOST_STEPS, AbstractProblem, Settings, traced_solve_ensemble
 from nonholonomic.xla_cpu import greatest, least
 
@@ -93,7 +93,7 @@ def resolve_coulomb_impact(
     state = jnp.where(stops, outcome.state, outcome.state + step * rates)
     blow = impact.blow(state[2], state[:2])
     remaining = _onward(impact, friction.mu, blow.force)
-    force = tuple(jnp.where(stops, a + b, a) for a, b in zip(blow.force, remaining, strict=True))
+    force = vector_of(jnp.where(stops, a + b, a) for a, b in zip(blow.force, remaining, strict=True))
     return apply_impulse(body, meets, free, ContactImpulse(force, None)), outcome.status != LEFT_DOMAIN
 
 

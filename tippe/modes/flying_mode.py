@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 from nonholonomic.hybrid import AbstractBatchedMode
 
 from ..model.scene import Scene
+from ..model.top import Top
 
 
 class AbstractFlyingMode(AbstractBatchedMode):
@@ -16,7 +17,7 @@ class AbstractFlyingMode(AbstractBatchedMode):
     - `rides`: whether this is a single run whose path is kept, with passive quadratures behind its state.
     """
 
-    scene: Scene
+    scene: Scene[Top]
     scales: Float[Array, "components cells"]
     cos_angle: Float[Array, "..."]
     rides: bool = eqx.field(static=True)

@@ -8,13 +8,14 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from nonholonomic.geometry import Vector, cross, dot, scale
 
 from ..model.body import Round
 from ..model.dynamics import Dynamics
 from ..model.state import joined, parts
+from ..model.stick_slip import StickSlip
 from ..model.top import Top
 
 #: Round-off allowed to a sphere that has just left the arena, as a fraction of R. None is allowed to a sphere that
@@ -51,10 +52,11 @@ def balls(body: Top) -> tuple[Ball, ...]:
     return (main,) if body.stem is None else (main, Ball(body.stem.offset, body.stem.radius))
 
 
-def standing_on(dynamics: Dynamics, ball: Ball) -> Dynamics:
+def standing_on(dynamics: Dynamics | StickSlip, ball: Ball) -> Dynamics:
     """The equations of motion of a top that stands on another of its spheres: of the same form with the sphere's
     parameters.
     """
+    assert isinstance(dynamics, Dynamics)
     coupling = dynamics.mass * ball.offset * dynamics.per_transverse
     return dataclasses.replace(dynamics, meridian=Round(ball.offset, ball.radius, coupling))
 
@@ -117,7 +119,7 @@ def still_parting(
     return (ROUNDING + rounding) * jnp.clip(1.0 + rate / (COMES_BACK * jnp.sqrt(gravity * radius)), 0.0, 1.0)
 
 
-def energy(body: Top, gravity: Float[Array, "..."], free: FreeBody) -> Float[Array, "..."]:
+def energy(body: Top, gravity: Float[ArrayLike, "..."], free: FreeBody) -> Float[Array, "..."]:
     """Kinetic energy plus weight times height above the plane [J]."""
     axial = dot(free.momentum, free.axis)
     across = dot(free.momentum, free.momentum) - axial**2

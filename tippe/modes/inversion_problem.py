@@ -13,6 +13,7 @@ from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import COS_THETA
 from ..model.stick_slip import ContactMode, StickSlip
+from ..model.top import Top
 
 
 class InversionProblem(AbstractProblem):
@@ -24,7 +25,7 @@ class InversionProblem(AbstractProblem):
     scales: Float[Array, "components cells"]
 
     @classmethod
-    def of(cls, scene: Scene, launch: Launch, angle: Float[ArrayLike, "..."], cells: int) -> "InversionProblem":
+    def of(cls, scene: Scene[Top], launch: Launch, angle: Float[ArrayLike, "..."], cells: int) -> "InversionProblem":
         """The problem of the given number of cells; the numbers of scene and launch are scalars or one per cell.
 
         Its frame is that of `Scene.turning_dynamics`: directions cannot be read off its final states.
@@ -50,7 +51,7 @@ class InversionProblem(AbstractProblem):
 
 
 @compiled_setup
-def _problem(scene: Scene, launch: Launch, angle: Float[Array, "..."], cells: int) -> InversionProblem:
+def _problem(scene: Scene[Top], launch: Launch, angle: Float[Array, "..."], cells: int) -> InversionProblem:
     states = scene.state(launch)
     shape = (states.shape[0], cells)
     states = jnp.broadcast_to(states.reshape(shape[0], -1), shape)

@@ -94,7 +94,8 @@ class LeaningDynamics(eqx.Module):
         rolling = along / I1 + (1.0 / I3 - 1.0 / I1) * b
 
         turning = (rolling * e[0], rolling * e[1], rolling * c + precession if self.friction.uses_spin else None)
-        slips = [Slip(*sum_vectors(u, scale(rolling * R + precession * a, across)), turning) for a, R in spheres]
+        velocities = [sum_vectors(u, scale(rolling * R + precession * a, across)) for a, R in spheres]
+        slips = [Slip(x, y, turning) for x, y in velocities]
         loads = [self.friction.per_normal_force(slip) for slip in slips]
         height = spheres[0].radius - spheres[0].offset * c
         m_0, m_1 = (

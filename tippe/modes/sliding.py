@@ -183,7 +183,7 @@ class Lean(AbstractFlyingMode):
 
 
 def modes(
-    scene: Scene, problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
+    scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, rides: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
     """The modes of runs, sliding on each sphere and on both if there are two; and the number of the mode in which each
     starts.
@@ -202,7 +202,7 @@ def modes(
     return (*slides, Lean(*arguments)), (height(main, stem, problem.states) < 0.0).astype(int)
 
 
-def leaning(scene: Scene) -> LeaningDynamics:
+def leaning(scene: Scene[Top]) -> LeaningDynamics:
     """The equations of motion of a scene's top on both of its spheres."""
     return LeaningDynamics(scene.body, scene.friction, scene.gravity)
 
@@ -234,7 +234,7 @@ class Air(NamedTuple):
     riding: Float[Array, "7 cells"] | None = None
 
 
-def lost_contact(scene: Scene, number: Int[Array, ""], state: Float[Array, "components cells"]) -> Air:
+def lost_contact(scene: Scene[Top], number: Int[Array, ""], state: Float[Array, "components cells"]) -> Air:
     """The top at the end of sliding on the numbered sphere: its contact is lost or jams, or the other sphere is at the
     plane.
     """
@@ -260,7 +260,7 @@ def lost_contact(scene: Scene, number: Int[Array, ""], state: Float[Array, "comp
 
 
 def take_flight(
-    scene: Scene, air: Air, cos_angle: Float[Array, "..."], left: Cells, last: bool
+    scene: Scene[Top], air: Air, cos_angle: Float[Array, "..."], left: Cells, last: bool
 ) -> tuple[Air, Bool[Array, " cells"]]:
     """One flight, until a sphere reaches the plane, theta the angle (unless `last`), or the time from the loss `left` [s].
 
@@ -289,7 +289,7 @@ def take_flight(
     return after, landed
 
 
-def land(scene: Scene, air: Air) -> Air:
+def land(scene: Scene[Top], air: Air) -> Air:
     """The impact of the sphere that has reached the plane; a slow rebound closes the contact."""
     body, spheres = scene.body, balls(scene.body)
     own, other = _own_and_other(spheres, air.ball)
@@ -309,7 +309,9 @@ def land(scene: Scene, air: Air) -> Air:
     return struck._replace(open=struck.open & ~fails)
 
 
-def _with_other(scene: Scene, air: Air, struck: Air, other: Ball, slow: Bool[Array, " cells"], closing: Cells) -> Air:
+def _with_other(
+    scene: Scene[Top], air: Air, struck: Air, other: Ball, slow: Bool[Array, " cells"], closing: Cells
+) -> Air:
     """Effect of an impact on the other sphere if that is at the plane: it strikes too, or the top comes to rest on
     both.
 

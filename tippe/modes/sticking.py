@@ -16,6 +16,7 @@ from ..model.scene import Scene
 from ..model.slip_onset import Onset
 from ..model.state import COS_THETA
 from ..model.stick_slip import AT_REST, Change, ContactMode, StickSlip
+from ..model.top import Top
 from .inversion_problem import InversionProblem
 from .trajectory_problem import TrajectoryProblem
 
@@ -94,7 +95,7 @@ def _recorded(change: Change) -> TransitionPath:
 
 
 def modes(
-    scene: Scene | None,
+    scene: Scene[Top] | None,
     problem: InversionProblem,
     tolerance: float,
     last: bool,

@@ -14,6 +14,7 @@ from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import parts
 from ..model.stick_slip import ContactMode, StickSlip
+from ..model.top import Top
 
 
 class TrajectoryProblem(AbstractProblem):
@@ -34,7 +35,7 @@ class TrajectoryProblem(AbstractProblem):
     rest: Float[Array, "2 ..."] | None = None
 
     @classmethod
-    def of(cls, scene: Scene, launch: Launch, cells: int | None = None) -> "TrajectoryProblem":
+    def of(cls, scene: Scene[Top], launch: Launch, cells: int | None = None) -> "TrajectoryProblem":
         """The run of one launch, or the runs of some cells, whose numbers are scalars or one per cell."""
         return _problem(scene, launch, cells)
 
@@ -73,7 +74,7 @@ class TrajectoryProblem(AbstractProblem):
 
 
 @compiled_setup
-def _problem(scene: Scene, launch: Launch, cells: int | None) -> TrajectoryProblem:
+def _problem(scene: Scene[Top], launch: Launch, cells: int | None) -> TrajectoryProblem:
     size, weight = scene.body.size, scene.body.mass * scene.gravity
     sine, cosine = jnp.sin(launch.theta), jnp.cos(launch.theta)
     across = (cosine * jnp.cos(launch.azimuth), cosine * jnp.sin(launch.azimuth), -sine)

@@ -1,8 +1,8 @@
 r"""Every numbered equation of the paper: as printed, the verdict, the correct form, and the tests that show it.
 
-`python -m tippe.papers.audit` prints the page `docs/tippe_paper.md`. In its formulas eta is the angle of the place from the
-lowest line, r the arena's radius, rho = r - R that of the centre's path, phi the direction of the axis from that of
-growing eta.
+`python -m tippe.papers.audit` prints the page `docs/development/tippe_paper.md`. In its formulas eta is the angle of the
+position from the lowest line, r the arena's radius, rho = r - R the radius of the centre's path, and phi the direction of the
+axis from that of increasing eta.
 """
 
 import textwrap
@@ -40,8 +40,8 @@ AUDIT = (
         subject="Jellett's constant",
         printed=r"J = Cn\left(R\cos\theta + A\dot\eta R\sin^2\theta\right)",
         verdict="misprint",
-        reason="The bracket closes in the wrong place, the offset a is lost, and the precession has the letter of the "
-        "place. The first formula is that on the plane, the second that in the cylinder.",
+        reason="The bracket closes in the wrong place, the offset a is missing, and the precession has the symbol of the "
+        "position. The first formula holds on the plane, the second in the cylinder.",
         correct=(
             r"J = I_3\omega_3(R\cos\theta - a) + I_1\dot\phi R\sin^2\theta",
             r"J = R\left[I_1(\dot\phi\sin^2\theta + \dot\eta\sin\theta\cos\theta\sin\phi) "
@@ -70,8 +70,8 @@ AUDIT = (
         r"- \sum c^\lambda_{\mu\rho}v^\mu\frac{\partial R}{\partial v^\lambda} "
         r"- \sum c^\lambda_{\mu\rho}v^\mu\beta_1 - X_\rho R = 0",
         verdict="misprint",
-        reason="In the third term the index belongs to the cyclic field, c with upper index 1. The right side is 0 "
-        "only without friction; with friction it is the generalised force, and beta1 is no constant.",
+        reason="The third term needs the structure constants of the cyclic field, with upper index 1. The right side is 0 "
+        "only without friction; with friction it is the generalised force, and beta1 is not constant.",
         correct=(
             r"\frac{d}{dt}\frac{\partial R}{\partial v^\rho} "
             r"- c^\lambda_{\mu\rho}v^\mu\frac{\partial R}{\partial v^\lambda} "
@@ -90,9 +90,9 @@ AUDIT = (
         r"R_\phi = \partial_\eta,\quad "
         r"R_\psi = -y\sin\eta\,\partial_r - \tfrac yr\cos\eta\,\partial_\eta + r\sin\eta\,\partial_y",
         verdict="right",
-        reason="The last lines are right for x = r sin(eta), z = r cos(eta), with eta = 0 at the top; from the lowest "
-        "line, z = -r cos(eta). The first line of (5) has phi and theta where eta and y belong. Only the second field "
-        "and d/dy keep to the cylinder; the model needs none of the others. Their brackets are those of so(3).",
+        reason="The last lines hold for x = r sin(eta), z = r cos(eta), with eta = 0 at the top; from the lowest line, z = "
+        "-r cos(eta). The first line of (5) has phi and theta instead of eta and y. Only the second field and d/dy "
+        "are tangent to the cylinder. The model needs none of the others.",
         correct=(r"[R_x, R_y] = -R_z,\qquad [R_y, R_z] = -R_x,\qquad [R_z, R_x] = -R_y",),
         code=("tippe.papers.paper.rotation_generators",),
         tests=(
@@ -106,10 +106,10 @@ AUDIT = (
         printed=r"L' = \tfrac12\left(m(\dot x^2+\dot y^2) + I\dot\theta^2 + I\sin^2\theta\,\dot\phi^2 "
         r"+ I_3(\dot\psi+\dot\phi\cos\theta)^2\right) - mg(R-a\cos\theta)",
         verdict="incomplete",
-        reason="It is meant for the plane. With x and y of the centre of mass, its vertical motion is missing; with x "
-        "and y of the sphere's centre, all terms that couple translation and rotation are. The first formula is that "
-        "on the plane, in coordinates of the centre of mass; the second that in the cylinder, z being the height of "
-        "that centre.",
+        reason="The Lagrangian is for the plane. If x and y are those of the centre of mass, its vertical motion is missing; "
+        "if they are those of the sphere's centre, all terms that couple translation and rotation are missing. The "
+        "first correct formula is for the plane, in coordinates of the centre of mass; the second is for the "
+        "cylinder, with the height z of that centre.",
         correct=(
             r"L = L' + \tfrac12 ma^2\dot\theta^2\sin^2\theta",
             r"L = \tfrac12 m|\dot{\mathbf O} - a\dot{\mathbf e}|^2 + \tfrac12I_1(p^2+q^2) "
@@ -128,8 +128,8 @@ AUDIT = (
         printed=r"\beta_1 = \frac{J - I\dot\phi R\sin^2\theta}{R\cos\theta-a},\qquad "
         r"\dot\psi = \frac{\beta_1}{I_3} - \dot\phi\cos\theta",
         verdict="right on the plane",
-        reason="Right as algebra on the plane, (7) up to an unbalanced bracket. beta1 is the momentum I3 omega3. In "
-        "the cylinder the place adds a term.",
+        reason="The algebra is right on the plane, except for an unbalanced bracket in (7). beta1 is the momentum I3 omega3. "
+        "In the cylinder the rate of eta adds a term.",
         correct=(r"\dot\psi = \frac{\beta_1}{I_3} - \dot\phi\cos\theta + \dot\eta\sin\theta\sin\phi",),
         code=(
             "tippe.witnesses.reduced.spin_rate_from_jellett",
@@ -143,8 +143,8 @@ AUDIT = (
         subject="constancy of beta1",
         printed=r"\beta_1 = \text{constant}",
         verdict="wrong",
-        reason="Friction changes the spin about the axis. Without friction beta1 is constant; with friction Jellett's "
-        "quantity is, and only on the plane.",
+        reason="Friction changes the spin about the axis. beta1 is constant without friction; Jellett's quantity is constant "
+        "with friction, but only on the plane.",
         correct=(r"\dot\beta_1 = -NR\,(\mathbf n\times\mathbf f)\cdot\mathbf e",),
         code=("tippe.Scene.field",),
         tests=(PAPER + "test_friction_changes_beta1",),
@@ -154,9 +154,8 @@ AUDIT = (
         subject="reduced kinetic energy",
         printed=r"T = \tfrac12\left(I\dot\theta^2 + I\sin^2\theta\,\dot\phi^2 + \frac{\beta_1^2}{I_3}\right)",
         verdict="wrong",
-        reason="It is the value of the rotational kinetic energy, not a function from which equations of motion "
-        "follow. The Routhian has a gyroscopic term and the other sign of the last, besides translation and potential "
-        "energy.",
+        reason="This is the value of the rotational kinetic energy; equations of motion do not follow from it. The Routhian "
+        "has a gyroscopic term, the opposite sign of the last term, and the translational and potential energy.",
         correct=(
             r"R = \tfrac12\left(m(\dot x^2+\dot y^2+a^2\dot\theta^2\sin^2\theta) + I\dot\theta^2 "
             r"+ I\sin^2\theta\,\dot\phi^2\right) + \beta_1\dot\phi\cos\theta - \frac{\beta_1^2}{2I_3} "
@@ -173,10 +172,10 @@ AUDIT = (
         subject="equations of motion in the cylinder",
         printed=r"(\ddot\eta,\ \ddot\phi,\ \ddot\theta,\ \ddot{\ },\ \ddot x)^T = (\ldots)",
         verdict="meaningless",
-        reason="One symbol on the left is lost. The right sides mix forces times lengths with accelerations, the first "
-        "row comes back in the last, S_phi is not defined, and mu does not occur: there is nothing to correct term by "
-        "term. What should stand there is below, M being the moment of the contact forces about the centre of mass per "
-        "unit of N, and p, q, sigma the turning of the axes e1, e2, e.",
+        reason="One symbol on the left is lost. The right sides mix forces times lengths with accelerations, the first row "
+        "is repeated in the last, S_phi is not defined, and mu does not occur. The correct equations follow. M is the "
+        "moment of the contact forces about the centre of mass per unit of N, and p, q, sigma are the components of "
+        "the angular velocity of the axes e1, e2, e.",
         correct=(
             r"m(\ddot{\mathbf O} - a\ddot{\mathbf e}) = N(\mathbf f + \mathbf n) - mg\mathbf z",
             r"I_1\dot p + I_3\omega_3q - I_1q\sigma = N\mathbf M\cdot\mathbf e_1,\qquad "
@@ -196,8 +195,8 @@ AUDIT = (
         subject="normal force in the cylinder",
         printed=r"|F_N| = m\left[g\cos\eta + a(\ddot\theta\sin\theta + \dot\theta^2\cos\theta) + r\dot\eta^2\right]",
         verdict="incomplete",
-        reason="Three terms are missing, because the frame of the angles turns with the place; and r is rho = r - R, "
-        "the radius of the centre's path. On the plane it is right.",
+        reason="Three terms are missing, because the frame of the angles turns with the position, and r must be rho = r - R, "
+        "the radius of the centre's path. On the plane the equation is right.",
         correct=(
             r"\frac Nm = g\cos\eta + \rho\dot\eta^2 + a(\ddot\theta\sin\theta + \dot\theta^2\cos\theta) "
             r"+ a\dot\eta^2\cos\theta - a\ddot\eta\,e_t - 2a\dot\eta\,\dot e_t,\qquad e_t = \sin\theta\cos\phi",
@@ -210,7 +209,7 @@ AUDIT = (
         subject="the top",
         printed=r"I,\ I_3,\ m,\ R,\ D",
         verdict="lost",
-        reason="The numbers are missing. What Tables 2 and 3 can say about them stands at the end of this page.",
+        reason="The values are missing. The last section says what Tables 2 and 3 determine about them.",
         correct=(),
         code=(),
         tests=(
@@ -224,10 +223,10 @@ AUDIT = (
         printed=r"\beta_1 = 2{,}500\ \mathrm{g\,m^2\,rad/s},\qquad "
         r"\dot\theta=\dot\phi=\dot\psi=\dot\eta=\dot X=0",
         verdict="wrong",
-        reason="In the unit of the header a top of ordinary size would spin at more than 1e5 rad/s. All rates zero "
-        "contradict beta1: such a top never rises. Here beta1 is 2500 g cm^2/s and gives the spin at the start. The "
-        "friction law behind mu = 0.3 is not stated, and the text names two different limits of the inclination for "
-        "the same start.",
+        reason="In the unit of the header, a top of ordinary size would spin at more than 1e5 rad/s. Zero rates contradict "
+        "beta1: such a top never rises. We take beta1 as 2500 g cm^2/s, which gives the initial spin. The friction "
+        "law for mu = 0.3 is not stated, and the text gives two different limits of the inclination for the same "
+        "start.",
         correct=(r"\omega_3(0) = \beta_1/I_3,\qquad \beta_1 = 2.5\cdot10^{-4}\ \mathrm{kg\,m^2/s}",),
         code=("tippe.papers.paper.launch",),
         tests=(
@@ -240,28 +239,26 @@ AUDIT = (
 TITLE = "# The paper on the tippe top in the cylinder, equation by equation"
 
 PREFACE = """
-This page is for a reader who has the paper beside them, *Modeling of Dynamics Object with Non-Holonomic Constraints
-Based on Maple in Cylinder Coordinate*. It says which of its equations stand, what the others should be, which
-function computes the corrected form and which test shows it. Four things first.
+This page lists which equations of *Modeling of Dynamics Object with Non-Holonomic Constraints Based on Maple in
+Cylinder Coordinate* hold, the corrected form of the others, the function that computes it and the test that checks it.
 
 * With sliding friction the top has **no nonholonomic constraint**: the contact is holonomic, and friction is a force.
-  It is nonholonomic only when it rolls without slip; then its energy is constant and it cannot turn over.
-* Jellett's quantity is a constant on the plane only. **In the cylinder it is not**, so it cannot replace an equation
-  of motion there, which is what the paper uses it for.
-* The momentum β₁ is not constant while there is friction. Either β₁ or Jellett's quantity can be held, never both.
-* The model of this package uses none of the paper's equations. It is the vector form (`tippe/model/dynamics.py`), to which
-  the corrected equations are compared at 1000 random tops, arenas and states each, to 10⁻¹⁰.
+  Only rolling without slip is nonholonomic; the energy is then constant, and the top cannot turn over.
+* Jellett's quantity is constant on a plane, but **not in the cylinder**, where the paper uses it in place of an
+  equation of motion.
+* Friction changes the momentum β₁. Either β₁ or Jellett's quantity is constant, never both.
+* This package uses none of the paper's equations. The corrected equations agree with its vector form
+  (`tippe/model/dynamics.py`) at 1000 random tops, arenas and states each, to 10⁻¹⁰.
 
-This page is printed by `python -m tippe.papers.audit`.
+`python -m tippe.papers.audit` prints this page.
 """
 
 TABLES = """
-## What Tables 2 and 3 can say about the lost Table 1
+## What Tables 2 and 3 say about the lost Table 1
 
-Little. Eight numbers are free (mass, radius, offset, two moments of inertia, radius of the cylinder, azimuth of the
-axis, and the slip speed of a regularised Coulomb law) and so is the law itself, against six times and eighteen
-answers yes or no. This scan draws tops of 5 to 50 g and 1.5 to 3 cm with beta1 = 2500 g cm^2/s, the centre at rest
-and mu = 0.3, either viscous (s/m) or Coulomb, and takes 0.95 pi for reversed and 40 s for the horizon:
+The tables determine little: six times and eighteen answers yes or no depend on eight unknown parameters and on an
+unknown friction law. This scan draws tops of 5 to 50 g and 1.5 to 3 cm with beta1 = 2500 g cm^2/s, the centre at rest
+and mu = 0.3, viscous (s/m) or Coulomb. A top counts as reversed at 0.95 pi, within 40 s:
 
     python benchmarks/paper_tables_scan.py --table 2 --law viscous --sets 20000 --rounds 25
 
@@ -272,56 +269,41 @@ and mu = 0.3, either viscous (s/m) or Coulomb, and takes 0.95 pi for reversed an
 | 3, viscous | 20000 | 185 | 12 | 20.1 s | 18.9 s |
 | 3, Coulomb | 2000 | 12 | 6 | 17.7 s | 8.6 s |
 
-The pattern is that of reversed and not reversed; the errors are of sets that keep contact in all rows, the last
-column after 25 (Coulomb 15) rounds in which the best sets were varied.
+The pattern is which rows reverse. Errors refer to the sets that keep contact in all rows. The last column gives the error
+after 25 rounds (Coulomb 15) in which the best sets are varied.
 
-* **Table 2 can be had to about a second, by quite different tops.** A viscous top with m = 49.8 g, R = 15.0 mm, a / R
-  = 0.1692, I1 / I3 = 0.9162, I3 / m R^2 = 0.3716 in a cylinder of 7.741 R, azimuth 1.836, reverses at 23.74 s and
-  23.18 s from 0.1 and 0.2 rad and from no other row within 40 s, with contact throughout. Another draw (seed 1, 50
-  rounds) ends at m = 28.8 g, R = 19.5 mm, a / R = 0.196, I1 / I3 = 0.900, I3 / m R^2 = 0.441, a cylinder of 15.9 R
-  and azimuth -3.056, with 23.95 s and 23.05 s. And the limit of the inclination is one of patience: the first of the
-  two reverses from 0.3 rad too, at 45 s.
-* **Table 3 was not had by drawing.** The sets that keep contact in all rows reach 0.95 pi after 3 to 30 s in an order of their
-  own, some at times that change by a second with the tolerance. Where rows may lose contact, the best viscous set
-  drawn reverses at 20.5 s from each of the four inclinations, within 2.5 s of all four times.
-* **Both with one top: to 1.6 s, by many tops.** Taken together, times to a second and "not reversed" as later than 30 s,
+* **Table 2 alone: about 1 s, with different tops.** A viscous top with m = 49.8 g, R = 15.0 mm, a / R = 0.1692, I1 / I3 =
+  0.9162, I3 / m R^2 = 0.3716 in a cylinder of 7.741 R, azimuth 1.836, reverses at 23.74 and 23.18 s from 0.1 and 0.2 rad
+  and from no other row within 40 s; from 0.3 rad it reverses at 45 s.
+* **Table 3 alone: not found by this scan.** Sets with contact in all rows reverse after 3 to 30 s in another order.
+* **Both tables with one top: 1.6 s** (`python benchmarks/paper_tables_joint.py --law viscous`). The smallest -2 log
+  likelihood is 29.6 at 11 degrees of freedom: m = 11.573 g, R = 27.474 mm, a / R = 0.086495, I1 / I3 = 1.0533, I3 / m R^2 =
+  0.4075, a cylinder of 84.428 R, azimuth 1.7971, mu = 0.32573 s/m. From the wall it reverses at 22.6, 19.3, 19.9 and
+  22.4 s (printed 23, 19, 20, 22), and from the lowest line at 26.3, 26.3, 28.2 and 30.3 s (printed 25, 22, not, not). Other
+  tops do as well (`examples/lost_numbers.py`): I1 / I3 from 1.035 to 1.053, a / R from 0.072 to 0.087, spins of 65 to 79 rad/s,
+  masses of 11 to 16 g and any azimuth. No set within 1 s was found.
 
-      python benchmarks/paper_tables_joint.py --law viscous
-
-  the least -2 log likelihood found is 29.6 at 11 degrees of freedom, in 190000 sets of numbers and a fit from the best:
-  m = 11.573 g, R = 27.474 mm, a / R = 0.086495, I1 / I3 = 1.0533, I3 / m R^2 = 0.4075, a cylinder of 84.428 R, azimuth
-  1.7971, mu = 0.32573 s/m. It reverses from 0.1, 0.2, 0.3, 0.4 rad at 22.6, 19.3, 19.9, 22.4 s from the wall (printed 23,
-  19, 20, 22), where it loses contact in the other rows, and at 26.3, 26.3, 28.2, 30.3 s from the lowest line (printed 25,
-  22, not, not), where the limit of the inclination is one of patience again. Other tops do as well, with -2 log
-  likelihoods of 30 to 32 (`examples/lost_numbers.py`): I1 / I3 between 1.035 and 1.053, a / R between 0.072 and 0.087,
-  spins of 65 to 79 rad/s, but masses of 11 to 16 g and any azimuth. Times from the wall jump by seconds when a number
-  changes in its fourth digit, so minima are many and a better one may exist. No set within the error of 1 s was found.
-
-That a largest inclination exists follows from Jellett's threshold, and from loss of contact, for many tops. So the two
-tables can be had, but do not fix Table 1, the less so as the law of friction is unknown: the Coulomb law was searched too
-briefly for both tables to say what it would give.
+So some tops reproduce both tables, but the tables do not determine Table 1.
 """
 
 
 def render() -> str:
     """The audit as a page in Markdown."""
-    summary = ["| equation | subject | verdict |", "|---|---|---|"]
-    summary += [f"| {entry.number} | {entry.subject} | {entry.verdict} |" for entry in AUDIT]
-    parts = [TITLE, PREFACE.strip(), "\n".join(summary), *map(_section, AUDIT), TABLES.strip()]
+    parts = [TITLE, PREFACE.strip(), *map(_section, AUDIT), TABLES.strip()]
     return "\n\n".join(parts) + "\n"
 
 
 def _section(entry: Equation) -> str:
-    lines = [f"## {entry.number}: {entry.subject}", f"As printed:\n\n$$\n{entry.printed}\n$$"]
+    lines = [f"## {entry.number}: {entry.subject}", f"Printed:\n\n$$\n{entry.printed}\n$$"]
     verdict = f"**{entry.verdict[0].upper()}{entry.verdict[1:]}.** {entry.reason}"
     lines.append(textwrap.fill(verdict, 120, break_on_hyphens=False))
     if entry.correct:
         formulas = "\n\n".join(f"$$\n{formula}\n$$" for formula in entry.correct)
-        lines.append(f"As it should read:\n\n{formulas}")
+        lines.append(f"Correct:\n\n{formulas}")
     if entry.code:
-        lines.append("Computed by " + ", ".join(f"`{name}`" for name in entry.code) + ".")
+        lines.append("Code: " + ", ".join(f"`{name}`" for name in entry.code) + ".")
     if entry.tests:
-        lines.append("Shown by:\n\n" + "\n".join(f"* `{test}`" for test in entry.tests))
+        lines.append("Tests: " + ", ".join(f"`{test}`" for test in entry.tests) + ".")
     return "\n\n".join(lines)
 
 

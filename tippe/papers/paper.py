@@ -76,7 +76,7 @@ def rotation_generators(place: Float[Array, " 3"]) -> Float[Array, "3 3"]:
 
 
 def printed_jellett(
-    scene: Scene, theta: Float[Array, ""], omega3: Float[Array, ""], eta_dot: Float[Array, ""]
+    scene: Scene[Top], theta: Float[Array, ""], omega3: Float[Array, ""], eta_dot: Float[Array, ""]
 ) -> Float[Array, ""]:
     """(1) as printed: C n (R cos(theta) + A eta' R sin(theta)^2), with n the spin omega3, C = I3 and A = I1."""
     body = scene.body
@@ -84,7 +84,7 @@ def printed_jellett(
 
 
 def printed_kinetic_energy(
-    scene: Scene,
+    scene: Scene[Top],
     theta: Float[Array, ""],
     theta_dot: Float[Array, ""],
     phi_dot: Float[Array, ""],
@@ -95,7 +95,7 @@ def printed_kinetic_energy(
     return 0.5 * (body.I1 * (theta_dot**2 + (jnp.sin(theta) * phi_dot) ** 2) + beta1**2 / body.I3)
 
 
-def printed_normal_force(scene: Scene, state: Float[Array, " 8"], theta_2: Float[Array, ""]) -> Float[Array, ""]:
+def printed_normal_force(scene: Scene[Top], state: Float[Array, " 8"], theta_2: Float[Array, ""]) -> Float[Array, ""]:
     """(12) as printed, last expression: m (g cos(eta) + a (theta'' sin(theta) + theta'^2 cos(theta)) + r eta'^2) [N].
 
     **Arguments:**

@@ -1,7 +1,7 @@
 """The papers' two inversion tables beside computed times: `python -m tippe --paper`.
 
 The printed times and the computed ones have different trends: the paper lost the numbers of its top, and its own equations of
-motion are not those of a top (`docs/tippe_paper.md`). The same launches run on the plane, too.
+motion are not those of a top (`docs/development/tippe_paper.md`). The same launches run on the plane, too.
 """
 
 import argparse
@@ -142,12 +142,12 @@ def shown_name(options: argparse.Namespace, arena: str) -> str:
     return " ".join(options.surface) if arena == "surface" else arena
 
 
-def counts_eta(scene: Scene) -> bool:
+def counts_eta(scene: Scene[Top]) -> bool:
     """Whether an arena has places by eta; on others every launch starts at the origin."""
     return any(name == "eta" for name, _ in scene.surface.coordinates)
 
 
-def spin_of(options: argparse.Namespace, scene: Scene) -> float:
+def spin_of(options: argparse.Namespace, scene: Scene[Top]) -> float:
     """The launches' spin [rad/s]."""
     return options.beta1 / float(scene.body.I3) if options.spin is None else options.spin
 
@@ -239,7 +239,7 @@ def _friction(law: AbstractFriction) -> str:
 
 
 @compiled_quickly
-def moving(scene: Scene, launches: Launch, times: Any, tolerance: Any) -> Motion:
+def moving(scene: Scene[Top], launches: Launch, times: Any, tolerance: Any) -> Motion:
     """What is drawn of every launch until the last of the times, in one batched run."""
     return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
 
@@ -257,7 +257,7 @@ def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, Motion
         return times, dict(zip(arenas, found, strict=True))
 
 
-def starts(options: argparse.Namespace, scene: Scene) -> tuple[list[float], Launch]:
+def starts(options: argparse.Namespace, scene: Scene[Top]) -> tuple[list[float], Launch]:
     """The places eta(0) of an arena, and the launches from all of them, place after place."""
     etas = options.eta if counts_eta(scene) else [0.0]
     eta, theta = (values.ravel() for values in np.meshgrid(etas, options.theta, indexing="ij"))
@@ -276,7 +276,7 @@ def picture(options: argparse.Namespace, found: dict[str, Table]) -> Any:
             name = shown_name(options, arena)
             title = f"{name}, η(0) = {eta:.4g}" if counts_eta(scene) else name
             panels.append(Panel(title, times, shown[i], thetas, ends[:, i]))
-    return draw_launches(panels, options.angle)
+    return draw_launches(panels, options.angle, "above the dashed angle for good")
 
 
 def motions(options: argparse.Namespace, found: dict[str, Table]) -> list[Stage]:

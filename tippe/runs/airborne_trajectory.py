@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from nonholonomic.geometry import scale, sum_vectors
+from nonholonomic.geometry import scale, sum_vectors, vector_of
 from nonholonomic.hybrid import BETWEEN, Segment, hybrid_samples, solve_hybrid_dense
 from nonholonomic.integration import Settings, Status
 
@@ -17,6 +17,7 @@ from ..model.dynamics import LOSSES, NO_COSINE, Motion
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import parts
+from ..model.top import Top
 from ..modes import airborne, airborne_stem
 from ..modes.airborne import (
     FLYING,
@@ -50,12 +51,12 @@ class ArenaTrajectory(HybridTrajectory):
     @of_each_run
     def energy(self) -> Float[Array, " times"]:
         """Kinetic energy plus weight times the height of the centre of mass [J]."""
-        scene, (_, e, L, place) = self.scene, parts(self.states)
+        scene, (_, e, L, place) = self.scene, parts(self._states)
         (distance, rate), n_up = self.above, scene.frame.vertical(place)[2]
         # In contact the velocity along n is that of the centre of mass about the sphere's centre.
         about = -scene.body.offset * (L[0] * e[1] - L[1] * e[0]) / scene.body.I1
         lifted = scene.gravity * distance * n_up + 0.5 * ((about + rate) ** 2 - about**2)
-        return scene.energy(self.states) + scene.body.mass * lifted
+        return scene.energy(self._states) + scene.body.mass * lifted
 
     @of_each_run
     def theta_rate(self) -> Float[Array, " times"]:
@@ -63,13 +64,13 @@ class ArenaTrajectory(HybridTrajectory):
         dynamics = self.scene.dynamics
         # The frame is carried along by the centre of the top's sphere, wherever that is.
         frame = dataclasses.replace(carried_frame(self.scene), distance=self.scene.body.radius + self.above[0])
-        rates = dataclasses.replace(dynamics, frame=frame).field(self.states)
-        return jax.jvp(self.scene.theta, (self.states,), (rates,))[1]
+        rates = dataclasses.replace(dynamics, frame=frame).field(self._states)
+        return jax.jvp(self.scene.theta, (self._states,), (rates,))[1]
 
     @of_each_run
     def normal_force(self) -> Float[Array, " times"]:
         """Normal force [N]; 0 in flight."""
-        force = self.scene.normal_force(self.states)
+        force = self.scene.normal_force(self._states)
         if self.scene.body.stem is not None:
             force = jnp.where(self.contact == 1, self._on_stem.normal_force, force)
         return jnp.where(self.contact < 0, 0.0, force)
@@ -78,7 +79,7 @@ class ArenaTrajectory(HybridTrajectory):
     def slip(self) -> Float[Array, "times 2"]:
         """Velocity along the tangent plane of the point of a sphere that is closest to the arena [m/s]: of the stem's sphere
         while that touches, else of the top's own."""
-        slip = self.scene.slip_velocity(self.states)
+        slip = self.scene.slip_velocity(self._states)
         if self.scene.body.stem is not None:
             of_stem = self._on_stem.slip
             slip = jnp.where(self.contact == 1, jnp.stack([of_stem.x, of_stem.y]), slip)
@@ -87,12 +88,12 @@ class ArenaTrajectory(HybridTrajectory):
     @property
     def _on_stem(self) -> Motion:
         """The motion on the stem, at times at which that touches; the first tangent is the projection of the one shown."""
-        scene, place = self.scene, parts(self.states).place
+        scene, place = self.scene, parts(self._states).place
         (distance, rate), own, stem = self.above, *balls(scene.body)
         # Its place is that of a top whose own sphere is so much greater that it touches.
-        flying = flight_state(lift_off(scene, self.states, False, Ball(own.offset, own.radius + distance)))
+        flying = flight_state(lift_off(scene, self._states, False, Ball(own.offset, own.radius + distance)))
         frame = carried_frame(scene)
-        flying = flying._replace(velocity=tuple(sum_vectors(flying.velocity, scale(rate, frame.normal(place[:3])))))
+        flying = flying._replace(velocity=vector_of(sum_vectors(flying.velocity, scale(rate, frame.normal(place[:3])))))
         ground = below(scene, flying, stem)
         ground = ground._replace(axes=frame.own_axes((*ground.foot, *place[3:])))
         return standing(scene, stem).motion(in_contact(ground, as_free_body(scene, flying, ground, stem)))
@@ -109,11 +110,11 @@ class ArenaTrajectory(HybridTrajectory):
         return "a flight does not end at the arena"
 
     @staticmethod
-    def parts_of(shown: Float[np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
+    def parts_of(shown: Float[Array | np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
         return shown[:14], shown[14:17], shown[17], shown[18], shown[19:]
 
     @staticmethod
-    def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
+    def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
         # Also of traced numbers, -1 after the end of a run.
         return (numbers == ON_STEM) - 1 * ((numbers == FLYING) | (numbers == STRIKING) | (numbers < 0))
 
@@ -123,7 +124,7 @@ class StickSlipArenaTrajectory(ArenaTrajectory):
     rolling."""
 
     @staticmethod
-    def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
+    def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
         # Between two modes a slip begins.
         return -1 * (numbers == FLYING)
 
@@ -149,7 +150,12 @@ def arena_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int
 
 
 def simulate_airborne(
-    scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver | None
+    scene: Scene[Top],
+    launch: Launch,
+    t1: float,
+    times: Any,
+    tolerance: float | Float[Array, ""],
+    solver: diffrax.AbstractSolver | None,
 ) -> ArenaTrajectory:
     """Run one launch of a hybrid scene whose flights are integrated. **Arguments:** as for `simulate`, checked."""
     kinds, first, state = arena_modes((scene, launch), tolerance)
@@ -167,7 +173,7 @@ def simulate_airborne(
     return run
 
 
-def sampled_airborne(scene: Scene, launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:
+def sampled_airborne(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:
     """Run one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, checked."""
     found = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, kinds=1)
     codes = jnp.array([int(status) for status in LOSSES])

@@ -133,7 +133,7 @@ class InversionRuns(NamedTuple):
     t1: float
     angle: float
     crossing: str
-    solver: diffrax.AbstractERK | None
+    solver: diffrax.AbstractSolver | None
     method: str
     slopes_by: list[str]
     max_steps: int = DEFAULT_MAX_STEPS

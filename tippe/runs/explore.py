@@ -144,7 +144,7 @@ def check_smooth(scene: Scene) -> None:
     if scene.contact == "hybrid":
         raise ValueError(
             "contact = 'hybrid' must be 'stop' for explore, whose page ends a run where contact is lost; leave the stem "
-            "out, or show one run with its flights by simulate(...).view()"
+            "out, by dataclasses.replace(top, stem=None), or show one run with its flights by simulate(...).view()"
         )
     if scene.friction.set_valued:
         raise ValueError(

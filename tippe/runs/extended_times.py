@@ -34,9 +34,9 @@ LEAST_ANGLE = 1e-6
 def extended_inversion_time(
     scene: Scene,
     launch: Launch,
-    t1: float,
+    t1: float | Float[Array, ""],
     angle: Float[ArrayLike, ""] = 0.95 * math.pi,
-    tolerance: float = 1e-8,
+    tolerance: float | Float[Array, ""] = 1e-8,
 ) -> Float[Array, ""]:
     """Inversion time, continued beyond the horizon so that a loss is finite everywhere and leads back.
 

@@ -23,6 +23,7 @@ from nonholonomic.integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVE
 from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch
 from ..model.scene import Scene
+from ..model.top import Top
 from ..modes.free_body import Ball, FreeBody, as_free_body, balls, energy, standing_on
 from ..modes.impact import approach
 from ..modes.inversion_problem import InversionProblem
@@ -78,15 +79,15 @@ class HybridTrajectory(AbstractTrajectory):
     """
 
     t: Float[np.ndarray, " times"]
-    scene: Scene
+    scene: Scene[Top]
     states: Float[np.ndarray, "8 times"]
     cyclic: Float[np.ndarray, "5 times"]
     spin_angle: Float[np.ndarray, " times"]
     work: Float[np.ndarray, " times"]
-    status: str
-    end_time: float
+    status: Any
+    end_time: float | Float[Array, ""]
     stats: dict[str, Any]
-    dense: HybridPath
+    dense: Any
     distance: Float[np.ndarray, "2 times"]
     contact: Int[np.ndarray, " times"]
     hops: Float[np.ndarray, "hops 2"] | None
@@ -100,10 +101,14 @@ class HybridTrajectory(AbstractTrajectory):
         return self.distance[0], self.distance[1]
 
     @property
+    def _states(self) -> Float[Array, "components times"]:
+        return jnp.asarray(self.states)
+
+    @property
     def _free(self) -> FreeBody:
         """The top as a free body, in contact too."""
-        body, states = self.scene.body, self.states
-        free = as_free_body(body, balls(body)[0], jnp.asarray(states))
+        body = self.scene.body
+        free = as_free_body(body, balls(body)[0], self._states)
         (distance, rate), (u1, u2, u3) = self.above, free.velocity
         return FreeBody((u1, u2, u3 + rate), free.height + distance, free.axis, free.momentum)
 
@@ -123,7 +128,7 @@ class HybridTrajectory(AbstractTrajectory):
     @of_each_run
     def normal_force(self) -> Float[Array, " times"]:
         """Normal force [N]; 0 in flight. Where both spheres touch it is their sum, the weight."""
-        motion = standing_on(self.scene.dynamics, self._ball).motion(jnp.asarray(self.states))
+        motion = standing_on(self.scene.dynamics, self._ball).motion(self._states)
         both = jnp.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, motion.normal_force)
         return jnp.where(self.contact < 0, 0.0, both)
 
@@ -143,7 +148,7 @@ class HybridTrajectory(AbstractTrajectory):
         )
 
     @staticmethod
-    def parts_of(shown: Float[np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
+    def parts_of(shown: Float[Array | np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
         """State, cyclic coordinates, spin angle, work, and the distance with its rate, from what the modes show."""
         return shown[:8], shown[8:13], shown[13], shown[14], shown[15:]
 
@@ -153,9 +158,13 @@ class HybridTrajectory(AbstractTrajectory):
         return 0.0 if piece.number == BETWEEN else piece.motion.states[-1, -1] - piece.motion.states[-1, 0]
 
     @staticmethod
-    def touching(numbers: Int[np.ndarray, " times"]) -> Int[np.ndarray, " times"]:
+    def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
         """Which sphere touches, for the numbers of the modes."""
         return numbers
+
+    @property
+    def _flights(self) -> int:
+        return 0 if self.hops is None else len(self.hops)
 
     @property
     def where_the_model_ends(self) -> str:
@@ -164,14 +173,15 @@ class HybridTrajectory(AbstractTrajectory):
 
     def _reason(self) -> str:
         """Why the status is "unresolved"."""
+        contacts = sum(segment.number != BETWEEN for segment in self.dense.segments)
         if self.dense.status != UNRESOLVED:
             return f"the energy residual of {self.stats['energy_residual']:.1e} J is beyond what the tolerance allows"
-        if len(self.hops) >= MOST_BOUNCES or sum(one.number != BETWEEN for one in self.dense.segments) >= MOST_ROUNDS:
+        if self._flights >= MOST_BOUNCES or contacts >= MOST_ROUNDS:
             return "there were too many flights or changes of contact"
         return self.where_the_model_ends
 
     def __str__(self) -> str:
-        text = f"{super().__str__()}\n  {len(self.hops)} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
+        text = f"{super().__str__()}\n  {self._flights} flights, {self.stats['impact_loss']:.3g} J lost in impacts"
         return f"{text}\n  unresolved: {self._reason()}" if self.status == Status.UNRESOLVED.word else text
 
 
@@ -189,7 +199,12 @@ def level_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int
 
 
 def simulate_hybrid(
-    scene: Scene, launch: Launch, t1: float, times: Any, tolerance: float, solver: diffrax.AbstractSolver | None
+    scene: Scene[Top],
+    launch: Launch,
+    t1: float,
+    times: Any,
+    tolerance: float | Float[Array, ""],
+    solver: diffrax.AbstractSolver | None,
 ) -> HybridTrajectory:
     """Run one launch of a hybrid scene until `t1`. **Arguments:** as for `simulate`, checked."""
     kinds, first, state = level_modes((scene, launch), tolerance)
@@ -198,14 +213,14 @@ def simulate_hybrid(
     return flights_of(HybridTrajectory, scene, path, STATUS[path.status].word, hops, times, tolerance)
 
 
-def sampled_hybrid(scene: Scene, launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
+def sampled_hybrid(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
     """Run one launch of a hybrid scene inside a transformation. **Arguments:** as for `simulate`, checked."""
     found = hybrid_samples(level_modes, (scene, launch), times, t1, settings, kinds=1)
     return sampled_flights(HybridTrajectory, scene, times, found, jnp.asarray(int(Status.JAMMED)))
 
 
 def sampled_flights(
-    kind: type[HybridTrajectory], scene: Scene, times: Any, found: HybridSamples, lost: Int[Array, ""]
+    kind: type[HybridTrajectory], scene: Scene[Top], times: Any, found: HybridSamples, lost: Int[Array, ""]
 ) -> Any:
     """A trajectory of some kind from samples; `lost` is the code of how a run ended that left its domain."""
     states, place, spin_angle, work, distance = kind.parts_of(found.shown)
@@ -221,12 +236,12 @@ def sampled_flights(
 
 def flights_of(
     kind: type[HybridTrajectory],
-    scene: Scene,
+    scene: Scene[Top],
     path: HybridPath,
     status: str,
     hops: Float[np.ndarray, "hops 2"],
     times: Any,
-    tolerance: float,
+    tolerance: float | Float[Array, ""],
 ) -> Any:
     """A trajectory of some kind along a path, at given times or at those of its steps.
 

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -34,7 +34,7 @@ from ..modes.inversion_problem import InversionProblem
 
 @eqx.filter_jit
 def permitted(
-    structure: Any, unchecked: bool, leaves: tuple[Float[Array, "..."], ...]
+    structure: Any, unchecked: bool, leaves: Sequence[Float[Array, "..."]]
 ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, ""]]:
     """Which cells have legal numbers; the horizons, 0 for the others; and the tolerance of the ensemble.
 

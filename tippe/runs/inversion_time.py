@@ -96,16 +96,16 @@ def inversion_time(
     """
     check_run(scene, launch, t1, tolerance)
     check_event(angle, crossing)
-    solver = Settings(tolerance, solver).for_lanes
-    explicit_tableau(solver)
+    method = Settings(tolerance, solver).for_lanes
+    explicit_tableau(method)
     warn_if_it_cannot_invert(scene, launch, launch.theta)
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
     unchecked = any(is_traced(leaf) for leaf in leaves)
     question = InversionSolve if run_kind_of(scene).smooth else HybridInversionSolve
     # The last two leaves, horizon and tolerance, do not move the event.
-    found = differentiable_solve(question(len(leaves) - 2, structure, solver, crossing == "last", unchecked), *leaves)
+    found = differentiable_solve(question(len(leaves) - 2, structure, method, crossing == "last", unchecked), *leaves)
     if not is_traced(found) and not unchecked and np.isnan(found):
-        explain_failure(scene, launch, float(t1), float(angle), float(tolerance), crossing, solver)
+        explain_failure(scene, launch, float(t1), np.asarray(angle).item(), float(tolerance), crossing, method)
     return nan_if_illegal(found, structure, unchecked, leaves)
 
 
@@ -116,18 +116,18 @@ def explain_failure(
     angle: float,
     tolerance: float,
     crossing: str,
-    solver: diffrax.AbstractERK,
+    solver: diffrax.AbstractSolver,
 ) -> None:
     """Raise `ValueError` for a run that needed too many steps; warn of any other failure. The run is repeated to find
     out.
 
     **Arguments:** as for `inversion_time`.
     """
-    runs = InversionRuns(run_kind_of(scene), t1, angle, crossing, solver, "ensemble", [])
+    most = Settings(tolerance, solver).max_steps
+    runs = InversionRuns(run_kind_of(scene), t1, angle, crossing, solver, "ensemble", [], most)
     cell = {
         name: values[0] for name, values in runs.results({"scene": scene, "launch": launch}, {}, tolerance, 1).items()
     }
-    most = Settings(tolerance, solver).max_steps
     word = runs.run_kind.words[cell["status"]]
     if word == "failed" and cell["steps"] >= most:
         raise ValueError(too_many_steps(t1, most, cell["end_time"]))
@@ -144,7 +144,7 @@ class InversionSolve(AbstractDifferentiableSolve):
     movable: int
     # JAX's PyTreeDef, which type checkers take for a variable.
     structure: Any = eqx.field(static=True)
-    solver: diffrax.AbstractERK
+    solver: diffrax.AbstractSolver
     last: bool = eqx.field(static=True)
     # Whether some numbers were traced, so that they could not be checked.
     unchecked: bool = eqx.field(static=True)

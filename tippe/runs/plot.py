@@ -18,13 +18,13 @@ class Panel(NamedTuple):
     ends: Values
 
 
-def draw_launches(panels: list[Panel], angle: float) -> Any:
+def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
     """Draw theta(t) of every launch, a panel for each arena and place.
 
     **Arguments:**
 
-    - `panels`: what to draw; `ends` are the times [s] at which the launches ended, not finite if they did not.
-    - `angle`: angle [rad] that counts as inverted.
+    - `panels`: what to draw; `ends` are the times [s] that get a dot, not finite for none.
+    - `angle`: angle [rad] that counts as inverted; `dots`: what the dots show.
 
     **Returns:** a matplotlib figure.
     """
@@ -52,6 +52,6 @@ def draw_launches(panels: list[Panel], angle: float) -> Any:
         drawing.set_xlabel("time [s]")
         drawing.set_yticks([0.0, np.pi / 2.0, np.pi], ["0", "π/2", "π"])
     drawings[0].set_ylabel("θ, angle from the normal to the stem [rad]")
-    figure.suptitle("Dots: above the dashed angle for good", fontsize=9, color="0.4")
+    figure.suptitle(f"Dots: {dots}", fontsize=9, color="0.4")
     drawings[-1].legend(title="θ(0) [rad]", loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure

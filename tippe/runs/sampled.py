@@ -56,4 +56,5 @@ def sampled(
     else:
         found = sampled_run_by_diffrax(run, times, t1, settings, adjoint)
     status = ended(run, found.end_state, found.status == LEFT_DOMAIN, found.status == FAILED)
+    assert found.riding is not None
     return Found(found.states.T, found.riding.T, found.end_time, status, found.accepted, found.rejected)

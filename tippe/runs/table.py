@@ -132,8 +132,8 @@ def inversion_table(
     roots, grid, units = launches(scene, given, axes, t1, tolerance, scattered=scattered)
     require_whole(max_steps, "max_steps", 1)
     settings = Settings(tolerance, solver)
-    solver = settings.for_single_runs if method == "diffrax" else settings.for_lanes
-    explicit_tableau(solver)
+    integrator = settings.for_single_runs if method == "diffrax" else settings.for_lanes
+    explicit_tableau(integrator)
     paths = sensitivity_names(roots, sensitivities)
     run_kind = run_kind_of(scene)
     if paths:
@@ -142,11 +142,11 @@ def inversion_table(
         raise ValueError("method = 'diffrax' is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
     looked_at = {one.number: one.values for one in grid}
     warn_if_it_cannot_invert(scene, roots["launch"], looked_at.get("launch.theta", roots["launch"].theta))
-    runs = InversionRuns(run_kind, float(t1), float(angle), crossing, solver, method, paths, int(max_steps))
+    runs = InversionRuns(run_kind, float(t1), float(angle), crossing, integrator, method, paths, int(max_steps))
     job = InversionJob(runs, roots, float(tolerance), errors)
 
     request = {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
-    request = described(roots, grid) | request | {"solver": type(solver).__name__, "method": method}
+    request = described(roots, grid) | request | {"solver": type(integrator).__name__, "method": method}
     variables = runs.variables
     if max_steps != DEFAULT_MAX_STEPS:
         request |= {"max_steps": int(max_steps)}

@@ -120,9 +120,9 @@ class Trajectory(AbstractTrajectory):
 def simulate(
     scene: Scene,
     launch: Launch,
-    t1: float,
+    t1: float | Float[Array, ""],
     times: Any = None,
-    tolerance: float = 1e-9,
+    tolerance: float | Float[Array, ""] = 1e-9,
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> Trajectory | HybridTrajectory:
@@ -259,6 +259,6 @@ def _as_trajectory(scene: Scene, run: TrajectoryProblem, path: DenseSolution | H
     times, end, last = on_device(path.times, path.times[-1], states[:, -1])
     status = Status(int(_ended(run, last, jnp.asarray(path.left_domain), jnp.asarray(path.failed)))).word
     sticks = {"sticks": int(path.counts[0])} if isinstance(path, HybridPath) else {}
-    return Trajectory(times, scene, *on_device(*_parts(len(run.state), states)), status, end, {}, path).with_stats(
-        path, **sticks
-    )
+    lean, cyclic, spin_angle, work = on_device(*_parts(len(run.state), states))
+    trajectory = Trajectory(times, scene, lean, cyclic, spin_angle, work, status, end, {}, path)
+    return trajectory.with_stats(path, **sticks)

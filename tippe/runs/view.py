@@ -1,6 +1,6 @@
 """A run of a top as it is drawn: its body, its contact's trace, the path of its axis, arrows, and curves over time."""
 
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -51,36 +51,40 @@ GREEN, VIOLET, BLUE, GOLD = 0x1F8A4C, 0x7B4FA3, 0x1B6CA8, 0xE0A100
 BLACK, TEAL, PINK = 0x23262B, 0x008C95, 0xC2378E
 
 
-class Motion(NamedTuple):
+#: JAX's arrays, or NumPy's for drawing.
+Numbers = TypeVar("Numbers", Array, np.ndarray)
+
+
+class Motion(NamedTuple, Generic[Numbers]):
     """What is drawn of a run: vectors in the fixed frame, (times, 3), and the rotation to it from the body."""
 
-    times: Float[Array, " times"]
-    position: Float[Array, "times 3"]
-    axis: Float[Array, "times 3"]
-    normal: Float[Array, "times 3"]
-    contact: Float[Array, "times 3"]
-    slip: Float[Array, "times 3"]
-    rotation: Float[Array, "times 3 3"]
-    theta: Float[Array, " times"]
-    energy: Float[Array, " times"]
-    jellett: Float[Array, " times"]
-    normal_force: Float[Array, " times"]
-    angular_velocity: Float[Array, "times 3"]
-    angular_momentum: Float[Array, "times 3"]
+    times: Float[Numbers, " times"]
+    position: Float[Numbers, "times 3"]
+    axis: Float[Numbers, "times 3"]
+    normal: Float[Numbers, "times 3"]
+    contact: Float[Numbers, "times 3"]
+    slip: Float[Numbers, "times 3"]
+    rotation: Float[Numbers, "times 3 3"]
+    theta: Float[Numbers, " times"]
+    energy: Float[Numbers, " times"]
+    jellett: Float[Numbers, " times"]
+    normal_force: Float[Numbers, " times"]
+    angular_velocity: Float[Numbers, "times 3"]
+    angular_momentum: Float[Numbers, "times 3"]
 
-    @classmethod
-    def of(cls, run: Any) -> "Motion":
+    @staticmethod
+    def of(run: Any) -> "Motion[Array]":
         """The motion of one run, inside or outside of transformations."""
         body, slip = run.scene.body, run.slip
         zero = jnp.zeros_like(run.t)
         position, axis, normal = run.position, run.axis, run._fixed((zero, zero, zero + 1.0))
-        contact = run.contact if not isinstance(body, Top) else position - body.radius * normal
+        contact: Array = run.contact if not isinstance(body, Top) else position - body.radius * normal
         if isinstance(body, Top) and body.stem is not None:
             stem = position + (body.stem.offset - body.offset) * axis - body.stem.radius * normal
             contact = jnp.where((run.contact == 1)[:, None], stem, contact)
         turning = run.angular_velocity
         along = jnp.sum(turning * axis, axis=-1, keepdims=True)
-        return cls(
+        return Motion(
             run.t,
             position,
             axis,
@@ -111,7 +115,7 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     return stages([named] if overlaid else [[one] for one in named])
 
 
-def motion(run: Any) -> Motion:
+def motion(run: Any) -> Motion[np.ndarray]:
     """The motion of one run at times so close together that its turning is seen, where it can be told between its own."""
     if run.dense is not None:
         times = np.asarray(run.t)
@@ -123,7 +127,7 @@ def motion(run: Any) -> Motion:
     return Motion(*(np.asarray(part)[:count] for part in _motion(run.padded())))
 
 
-def show(scene: Scene, motion: Motion, number: int, name: str) -> Show:
+def show(scene: Scene, motion: Motion[np.ndarray], number: int, name: str) -> Show:
     """One run as it is drawn, the `number`-th of its stage."""
     body, colour = scene.body, COLOURS[number % len(COLOURS)]
     motion = Motion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
@@ -150,7 +154,7 @@ def show(scene: Scene, motion: Motion, number: int, name: str) -> Show:
     )
 
 
-def arrows(motion: Motion, offset: float, radius: float, weight: float) -> tuple[Arrow, ...]:
+def arrows(motion: Motion[np.ndarray], offset: float, radius: float, weight: float) -> tuple[Arrow, ...]:
     """Forces and slip at the contact, weight, angular velocity and momentum at the centre of mass."""
     lifted = motion.contact + 0.02 * radius * motion.normal
     # Within the sphere it could not be seen.
@@ -191,7 +195,7 @@ def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
     return found
 
 
-def aside(normal: Float[Array, "times 3"]) -> Float[Array, "times 3"]:
+def aside(normal: Float[Array | np.ndarray, "times 3"]) -> Float[Array, "times 3"]:
     """Unit vectors across the normal, towards x, or towards y where the normal is along x."""
     x, y = jnp.array([[1.0, 0.0, 0.0]]), jnp.array([[0.0, 1.0, 0.0]])
     towards = jnp.where(jnp.abs(normal[:, :1]) < 0.9, x, y)

@@ -20,6 +20,7 @@ from nonholonomic.geometry import carried
 from ..model.friction import Slip
 from ..model.scene import Scene
 from ..model.state import AXIS, MOMENTUM, PLACE, VELOCITY
+from ..model.top import Top
 
 
 class Across(NamedTuple):
@@ -29,7 +30,7 @@ class Across(NamedTuple):
     turning: float
 
 
-def across(scene: Scene) -> Across:
+def across(scene: Scene[Top]) -> Across:
     """Length and turning per unit of the coordinate across the arena: (1, 0) on a plane, (rho, 1) on a cylinder.
 
     **Arguments:**
@@ -44,7 +45,7 @@ def across(scene: Scene) -> Across:
     return Across(1.0, 0.0) if curvature is None else Across(1.0 / curvature, 1.0)
 
 
-def from_vector_state(scene: Scene, state: Float[Array, " components"]) -> Float[Array, " 8"]:
+def from_vector_state(scene: Scene[Top], state: Float[Array, " components"]) -> Float[Array, " 8"]:
     """The state in Euler angles that corresponds to a state of the vector form.
 
     **Arguments:**
@@ -72,7 +73,7 @@ def from_vector_state(scene: Scene, state: Float[Array, " components"]) -> Float
     return jnp.stack([eta, theta, phi, eta_dot, velocity[1], theta_dot, phi_dot, psi_dot])
 
 
-def metric(scene: Scene, q: Float[Array, " 6"]) -> Float[Array, "6 6"]:
+def metric(scene: Scene[Top], q: Float[Array, " 6"]) -> Float[Array, "6 6"]:
     """Kinetic metric G: the kinetic energy is q'.G q' / 2 = m |O' - a e'|^2 / 2 + I1 (p^2 + q^2) / 2 + I3 omega3^2 / 2.
 
     This, with `potential`, is the paper's (6) with nothing left out, and on the cylinder too.
@@ -91,7 +92,7 @@ def metric(scene: Scene, q: Float[Array, " 6"]) -> Float[Array, "6 6"]:
     return body.mass * centre_of_mass.T @ centre_of_mass + (turning.T * inertia) @ turning
 
 
-def potential(scene: Scene, q: Float[Array, " 6"]) -> Float[Array, ""]:
+def potential(scene: Scene[Top], q: Float[Array, " 6"]) -> Float[Array, ""]:
     """Potential energy [J], up to a constant: weight times the height of the centre of mass; `q` as for `metric`."""
     place, _ = scene.frame.at_angle(q[0])
     parts = (jnp.zeros(()) if part is None else jnp.asarray(part) for part in scene.frame.vertical(place))
@@ -108,7 +109,7 @@ def axes(theta: Float[Array, ""], phi: Float[Array, ""]) -> Float[Array, "3 3"]:
 
 
 def contact_motion(
-    scene: Scene, q: Float[Array, " 6"], q_dot: Float[Array, " 6"]
+    scene: Scene[Top], q: Float[Array, " 6"], q_dot: Float[Array, " 6"]
 ) -> tuple[Float[Array, " 3"], Float[Array, " 3"], Float[Array, " 3"]]:
     """Velocity of the sphere's centre, rate of the axis, and angular velocity about (e1, e2, e).
 
@@ -134,20 +135,20 @@ def contact_motion(
     return velocity, rates[1] * e1 - rates[0] * e2, rates
 
 
-def slip_velocity(scene: Scene, q: Float[Array, " 6"], q_dot: Float[Array, " 6"]) -> Float[Array, " 2"]:
+def slip_velocity(scene: Scene[Top], q: Float[Array, " 6"], q_dot: Float[Array, " 6"]) -> Float[Array, " 2"]:
     """Velocity of the material contact point along the arena, V - R w x n [m/s]; arguments as above."""
     velocity = contact_motion(scene, q, q_dot)[0]
     w = angular_velocity(scene, q, q_dot)
     return jnp.stack([velocity[0] - scene.body.radius * w[1], velocity[1] + scene.body.radius * w[0]])
 
 
-def angular_velocity(scene: Scene, q: Float[Array, " 6"], q_dot: Float[Array, " 6"]) -> Float[Array, " 3"]:
+def angular_velocity(scene: Scene[Top], q: Float[Array, " 6"], q_dot: Float[Array, " 6"]) -> Float[Array, " 3"]:
     """Angular velocity of the body in the frame (t1, t2, n) [rad/s]; arguments as above."""
     return contact_motion(scene, q, q_dot)[2] @ axes(q[2], q[3])
 
 
 def friction_per_normal_force(
-    scene: Scene, slip: Float[Array, " 2"], turning: Float[Array, " 3"]
+    scene: Scene[Top], slip: Float[Array, " 2"], turning: Float[Array, " 3"]
 ) -> tuple[Float[Array, " 2"], Float[Array, " 3"]]:
     """Tangential force [1] and torque [m] per unit normal force, zeros where there is none.
 
@@ -162,7 +163,7 @@ def friction_per_normal_force(
     return force, torque
 
 
-def per_normal_force(scene: Scene, q: Float[Array, " 6"], q_dot: Float[Array, " 6"]) -> Float[Array, " 6"]:
+def per_normal_force(scene: Scene[Top], q: Float[Array, " 6"], q_dot: Float[Array, " 6"]) -> Float[Array, " 6"]:
     """Generalised forces of the contact per unit normal force, d gap/dq + f . dv/dq' + tau . dw/dq'; arguments as above."""
 
     def moving(rate):
@@ -187,7 +188,7 @@ class Accelerations(NamedTuple):
 
 
 @eqx.filter_jit
-def by_lagrange(scene: Scene, state: Float[Array, " 8"]) -> Accelerations:
+def by_lagrange(scene: Scene[Top], state: Float[Array, " 8"]) -> Accelerations:
     """Lagrange's equations, by automatic differentiation of the energies, the contact kept by a multiplier.
 
     d/dt dT/dq' - dT/dq + dU/dq = N (d gap/dq + f . dv/dq' + tau . dw/dq'), gap'' = 0: six equations, linear in q'' and in N.
@@ -210,7 +211,7 @@ def by_lagrange(scene: Scene, state: Float[Array, " 8"]) -> Accelerations:
     return Accelerations(solution[:5], solution[5])
 
 
-def equations(scene: Scene, state: Float[Array, " 8"]) -> tuple[Float[Array, "6 6"], Float[Array, " 6"]]:
+def equations(scene: Scene[Top], state: Float[Array, " 8"]) -> tuple[Float[Array, "6 6"], Float[Array, " 6"]]:
     """The paper's (11) as it should read, with (12) among its rows: A (eta'', y'', theta'', phi'', psi'', N) = b.
 
     The rows are the momentum of the centre of mass along t1, t2 and n, the last one being (12), and the angular
@@ -288,13 +289,13 @@ def equations(scene: Scene, state: Float[Array, " 8"]) -> tuple[Float[Array, "6 
 
 
 @eqx.filter_jit
-def by_equation_11(scene: Scene, state: Float[Array, " 8"]) -> Accelerations:
+def by_equation_11(scene: Scene[Top], state: Float[Array, " 8"]) -> Accelerations:
     """Solution of `equations`: the paper's (11) and (12), corrected; arguments and result as for `by_lagrange`."""
     solution = jnp.linalg.solve(*equations(scene, state))
     return Accelerations(solution[:5], solution[5])
 
 
-def normal_force(scene: Scene, state: Float[Array, " 8"], second_rates: Float[Array, " 5"]) -> Float[Array, ""]:
+def normal_force(scene: Scene[Top], state: Float[Array, " 8"], second_rates: Float[Array, " 5"]) -> Float[Array, ""]:
     """The paper's (12) exactly: the normal force [N] that a motion needs.
 
     N/m = g cos(eta) + rho eta'^2 + a (theta'' sin(theta) + theta'^2 cos(theta)) + a eta'^2 cos(theta)

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 from nonholonomic.geometry import Cylinder
 
 from ..model.scene import Scene
+from ..model.top import Top
 from ..steady import inverted_critical_spin, standing_matrix, upright_critical_spin
 
 #: Curvature ratio at which the curve starts: so close to the plane that the plane's critical spin is the first guess.
@@ -44,7 +45,7 @@ class MarginalCurve(NamedTuple):
 
 
 def marginal_curve(
-    scene: Scene,
+    scene: Scene[Top],
     inverted: bool = False,
     start: tuple[float, float] | None = None,
     largest_ratio: float = 0.2,
@@ -104,14 +105,14 @@ def marginal_curve(
     return MarginalCurve(ratio, spin, frequency)
 
 
-def _on_cylinder(scene: Scene, ratio: Float[Array, ""] | float) -> Scene:
+def _on_cylinder(scene: Scene[Top], ratio: Float[Array, ""] | float) -> Scene:
     """The scene on a cylinder whose radius is the top's divided by `ratio`."""
     return Scene(scene.body, Cylinder(scene.body.radius / ratio), scene.friction, scene.gravity)
 
 
 @eqx.filter_jit
 def _residual(
-    scene: Scene, inverted: bool, units: Float[Array, " 3"], point: Float[Array, " 3"]
+    scene: Scene[Top], inverted: bool, units: Float[Array, " 3"], point: Float[Array, " 3"]
 ) -> tuple[Float[Array, " 2"], Float[Array, "2 3"]]:
     """Real and imaginary part of det(A - i nu) in units of sqrt(g / R), and their slope; point in the given units."""
 

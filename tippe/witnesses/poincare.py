@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from nonholonomic.formulations import AbstractSystem, structure_constants
 
 from ..model.scene import Scene
+from ..model.top import Top
 from .euler_angles import Accelerations, metric, per_normal_force, potential, slip_velocity, spread
 
 #: Place of the cyclic angle psi among (eta, y, theta, phi, psi, gap).
@@ -30,7 +31,7 @@ def nodal_frame(q: Float[Array, " n"]) -> Float[Array, "n n"]:
 
 
 @eqx.filter_jit
-def by_equation_2(scene: Scene, state: Float[Array, " 8"]) -> Accelerations:
+def by_equation_2(scene: Scene[Top], state: Float[Array, " 8"]) -> Accelerations:
     """The paper's (2) with its indices right and with friction: Poincare's equations after Routh's reduction.
 
     d/dt dR/dv^rho - c^l_mu,rho v^mu dR/dv^l - c^1_mu,rho v^mu beta1 - X_rho R = Q_rho, R = L - beta1 v^1,
@@ -99,7 +100,7 @@ class TopSystem(AbstractSystem):
     - `rolling`: whether the contact point is at rest, the one case in which the top is nonholonomic.
     """
 
-    scene: Scene
+    scene: Scene[Top]
     rolling: bool = eqx.field(static=True, default=False)
 
     @property

@@ -24,6 +24,7 @@ from nonholonomic.integration import halved
 
 from ..model.scene import Scene
 from ..model.state import AXIS, MOMENTUM, VELOCITY
+from ..model.top import Top
 
 #: Gauss points for the divided difference along each direction, and cosines for the time as a function of chi.
 POINTS, COSINES = 24, 96
@@ -56,13 +57,13 @@ class FrictionlessNutation(AbstractNutation):
     - `precession_momentum`, `spin_momentum`: p_phi = L.z and beta1 = L.e [kg m^2/s].
     """
 
-    scene: Scene
+    scene: Scene[Top]
     energy: Float[Array, ""]
     precession_momentum: Float[Array, ""]
     spin_momentum: Float[Array, ""]
 
     @classmethod
-    def of(cls, scene: Scene, state: Float[Array, " 8"]) -> "FrictionlessNutation":
+    def of(cls, scene: Scene[Top], state: Float[Array, " 8"]) -> "FrictionlessNutation":
         """The nutation that starts at a state of the vector form."""
         drift = 0.5 * scene.body.mass * jnp.sum(state[VELOCITY] ** 2)
         return cls(scene, scene.energy(state) - drift, state[MOMENTUM][2], state[AXIS] @ state[MOMENTUM])
@@ -94,13 +95,13 @@ class RollingNutation(AbstractNutation):
     - `routh`: D [kg m^2/s].
     """
 
-    scene: Scene
+    scene: Scene[Top]
     energy: Float[Array, ""]
     jellett: Float[Array, ""]
     routh: Float[Array, ""]
 
     @classmethod
-    def of(cls, scene: Scene, axis: Float[Array, " 3"], angular_velocity: Float[Array, " 3"]) -> "RollingNutation":
+    def of(cls, scene: Scene[Top], axis: Float[Array, " 3"], angular_velocity: Float[Array, " 3"]) -> "RollingNutation":
         """The nutation that starts at a state of `rolling_rate`."""
         body = scene.body
         w, z = angular_velocity, axis[2]
@@ -126,7 +127,7 @@ class RollingNutation(AbstractNutation):
         return (1.0 - z * z) * left - b**2 / (2.0 * body.I1) - 0.5 * body.mass * sideways**2
 
 
-def routh_factor(scene: Scene, z: Float[Array, ""]) -> Float[Array, ""]:
+def routh_factor(scene: Scene[Top], z: Float[Array, ""]) -> Float[Array, ""]:
     """(D / (I3 omega3))^2 = gamma + sigma (alpha - z)^2 + sigma gamma (1 - z^2) at z = cos(theta)."""
     body = scene.body
     gamma, sigma, alpha = body.I1 / body.I3, body.mass * body.radius**2 / body.I3, body.offset / body.radius
@@ -134,7 +135,7 @@ def routh_factor(scene: Scene, z: Float[Array, ""]) -> Float[Array, ""]:
 
 
 @eqx.filter_jit
-def rolling_rate(scene: Scene, state: Float[Array, " 6"]) -> Float[Array, " 6"]:
+def rolling_rate(scene: Scene[Top], state: Float[Array, " 6"]) -> Float[Array, " 6"]:
     """Rate of the top that rolls on the plane without slip (`tippe.md`, section 5 d).
 
     (J + m (r^2 - r r^T)) w' = -w x L + m r x (r' x w) + m g r x z, e' = w x e, with r = a e - R z and r' = a e'.

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from ..model.friction import Slip
 from ..model.scene import Scene
 from ..model.state import AXIS, VELOCITY
+from ..model.top import Top
 from .euler_angles import from_vector_state
 
 
@@ -26,7 +27,7 @@ def nodal(state: Float[Array, " 8"], vector: Float[Array, " 2"]) -> Float[Array,
     return jnp.stack([c * vector[0] + s * vector[1], c * vector[1] - s * vector[0]])
 
 
-def point_friction(scene: Scene, slip: Float[Array, " 2"]) -> Float[Array, " 2"]:
+def point_friction(scene: Scene[Top], slip: Float[Array, " 2"]) -> Float[Array, " 2"]:
     """Tangential force per unit normal force [1] along (tx, ty), zeros where there is none.
 
     **Arguments:** `slip`: velocity of the contact point along (tx, ty) [m/s].
@@ -43,14 +44,14 @@ def point_friction(scene: Scene, slip: Float[Array, " 2"]) -> Float[Array, " 2"]
 # Rutstam's equations
 
 
-def rutstam_state(scene: Scene, state: Float[Array, " 8"]) -> Float[Array, " 6"]:
+def rutstam_state(scene: Scene[Top], state: Float[Array, " 8"]) -> Float[Array, " 6"]:
     """Rutstam's state (theta, theta', phi', omega3, nu_x, nu_y) for a state of the vector form, nu the slip [m/s]."""
     _, theta, _, _, _, theta_dot, phi_dot, _ = from_vector_state(scene, state)
     slip = nodal(state, scene.slip_velocity(state))
     return jnp.concatenate([jnp.stack([theta, theta_dot, phi_dot, scene.spin(state)]), slip])
 
 
-def rutstam_normal_force(scene: Scene, state: Float[Array, " 6"]) -> Float[Array, ""]:
+def rutstam_normal_force(scene: Scene[Top], state: Float[Array, " 6"]) -> Float[Array, ""]:
     """Normal force g_n [N] of Rutstam (2012), with friction f per unit normal force in place of -mu nu."""
     body = scene.body
     theta, theta_dot, phi_dot, omega, *slip = state
@@ -63,7 +64,7 @@ def rutstam_normal_force(scene: Scene, state: Float[Array, " 6"]) -> Float[Array
 
 
 @eqx.filter_jit
-def rutstam_rate(scene: Scene, state: Float[Array, " 6"]) -> Float[Array, " 6"]:
+def rutstam_rate(scene: Scene[Top], state: Float[Array, " 6"]) -> Float[Array, " 6"]:
     """Rutstam's equations (1.10)-(1.15), SIGMA 8 (2012) 019, for any friction along the slip.
 
     **Arguments:**
@@ -108,7 +109,7 @@ class JellettState(NamedTuple):
     velocity_y: Float[Array, ""]
 
 
-def jellett_state(scene: Scene, state: Float[Array, " 8"]) -> JellettState:
+def jellett_state(scene: Scene[Top], state: Float[Array, " 8"]) -> JellettState:
     """The reduced state for a state of the vector form; Jellett's constant itself is `scene.jellett(state)`."""
     chart = from_vector_state(scene, state)
     velocity = nodal(state, state[VELOCITY])
@@ -116,7 +117,7 @@ def jellett_state(scene: Scene, state: Float[Array, " 8"]) -> JellettState:
 
 
 def jellett_constant(
-    scene: Scene, theta: Float[Array, ""], phi_dot: Float[Array, ""], spin_momentum: Float[Array, ""]
+    scene: Scene[Top], theta: Float[Array, ""], phi_dot: Float[Array, ""], spin_momentum: Float[Array, ""]
 ) -> Float[Array, ""]:
     """The paper's (1) as it should read: J = beta1 (R cos(theta) - a) + I1 phi' R sin(theta)^2 [kg m^3/s]."""
     body, s, c = scene.body, jnp.sin(theta), jnp.cos(theta)
@@ -124,7 +125,7 @@ def jellett_constant(
 
 
 def spin_momentum_from_jellett(
-    scene: Scene, theta: Float[Array, ""], phi_dot: Float[Array, ""], jellett: Float[Array, ""]
+    scene: Scene[Top], theta: Float[Array, ""], phi_dot: Float[Array, ""], jellett: Float[Array, ""]
 ) -> Float[Array, ""]:
     """The paper's (8), right as printed on the plane: beta1 = (J - I1 phi' R sin(theta)^2) / (R cos(theta) - a).
 
@@ -135,7 +136,7 @@ def spin_momentum_from_jellett(
 
 
 def precession_from_jellett(
-    scene: Scene, theta: Float[Array, ""], spin_momentum: Float[Array, ""], jellett: Float[Array, ""]
+    scene: Scene[Top], theta: Float[Array, ""], spin_momentum: Float[Array, ""], jellett: Float[Array, ""]
 ) -> Float[Array, ""]:
     """Precession phi' [rad/s] = (J - beta1 (R cos(theta) - a)) / (R I1 sin(theta)^2)."""
     body, s, c = scene.body, jnp.sin(theta), jnp.cos(theta)
@@ -143,14 +144,14 @@ def precession_from_jellett(
 
 
 def spin_rate(
-    scene: Scene, theta: Float[Array, ""], phi_dot: Float[Array, ""], spin_momentum: Float[Array, ""]
+    scene: Scene[Top], theta: Float[Array, ""], phi_dot: Float[Array, ""], spin_momentum: Float[Array, ""]
 ) -> Float[Array, ""]:
     """The paper's (10), right on the plane: psi' = beta1 / I3 - phi' cos(theta) [rad/s]."""
     return spin_momentum / scene.body.I3 - phi_dot * jnp.cos(theta)
 
 
 def spin_rate_from_jellett(
-    scene: Scene, theta: Float[Array, ""], phi_dot: Float[Array, ""], jellett: Float[Array, ""]
+    scene: Scene[Top], theta: Float[Array, ""], phi_dot: Float[Array, ""], jellett: Float[Array, ""]
 ) -> Float[Array, ""]:
     """The paper's (7), right as printed on the plane: psi' [rad/s] from Jellett's constant alone."""
     body, s, c = scene.body, jnp.sin(theta), jnp.cos(theta)
@@ -160,7 +161,7 @@ def spin_rate_from_jellett(
 
 
 def lagrangian(
-    scene: Scene, theta: Float[Array, ""], rates: Float[Array, " 3"], velocity: Float[Array, " 2"]
+    scene: Scene[Top], theta: Float[Array, ""], rates: Float[Array, " 3"], velocity: Float[Array, " 2"]
 ) -> Float[Array, ""]:
     """The paper's (6) as it should read, in coordinates of the centre of mass [J].
 
@@ -180,7 +181,7 @@ def lagrangian(
 
 
 def routhian(
-    scene: Scene,
+    scene: Scene[Top],
     theta: Float[Array, ""],
     rates: Float[Array, " 2"],
     velocity: Float[Array, " 2"],
@@ -203,7 +204,7 @@ def routhian(
 
 
 @eqx.filter_jit
-def jellett_rate(scene: Scene, state: JellettState, jellett: Float[Array, ""]) -> JellettState:
+def jellett_rate(scene: Scene[Top], state: JellettState, jellett: Float[Array, ""]) -> JellettState:
     """Routh's equation for theta, with beta1 driven by friction and phi' from Jellett's constant.
 
     d/dt dR/dtheta' - dR/dtheta = N f_x (a cos(theta) - R), beta1' = N f_y R sin(theta), and

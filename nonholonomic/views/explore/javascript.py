@@ -7,6 +7,7 @@ branches. Of the packages that read jaxprs none writes JavaScript.
 
 import functools
 import itertools
+import json
 import math
 import operator
 from collections.abc import Callable, Sequence
@@ -102,29 +103,25 @@ def javascript(name: str, function: Callable[..., Any], *arguments: Any) -> str:
 
     ```
     """
-    closed = jax.make_jaxpr(function)(*arguments)
     block, values = _Block(itertools.count(), {}), []
     for number, argument in enumerate(arguments):
         names = (f"a{number}[{place}]" for place in itertools.count())
         shapes = [np.zeros(leaf.shape) for leaf in jax.tree.leaves(argument)]
         values += [_map(lambda _, names=names: block.name(next(names)), shape) for shape in shapes]
-    results = _flat(block.call(closed, values))
+    results = _flat(block.call(jax.make_jaxpr(function)(*arguments), values))
+    written = [f"out[{k}] = {_text(number)};" for k, number in enumerate(results)]
+    heads = ", ".join([*(f"a{number}" for number in range(len(arguments))), "out"])
     lines = [
-        *block.lines(results),
-        *(f"out[{k}] = {_text(number)};" for k, number in enumerate(results)),
-        "return out;",
+        f"function {name}({heads}) {{",
+        *_indented([*block.leading_to(results)[0], *written, "return out;"]),
+        "}",
+        "",
     ]
-    heads = [*(f"a{number}" for number in range(len(arguments))), "out"]
-    return f"function {name}({', '.join(heads)}) {{\n" + "\n".join(f"  {line}" for line in lines) + "\n}\n"
+    return "\n".join(lines)
 
 
 def _text(number: Number) -> str:
-    if isinstance(number, str):
-        return number
-    if isinstance(number, bool | np.bool_):
-        return str(bool(number)).lower()
-    text = repr(float(number)) if isinstance(number, float) else str(int(number))
-    text = text.replace("inf", "Infinity").replace("nan", "NaN")
+    text = number if isinstance(number, str) else json.dumps(number)
     return f"({text})" if text.startswith("-") else text
 
 
@@ -149,33 +146,25 @@ class _Block:
         """The name of what an expression gives, which is written once only."""
         if text not in self.known:
             self.known[text] = f"v{next(self.names)}"
-            line = f"const {self.known[text]} = {text};"
-            self.statements.append(([self.known[text]], set(_strings(reads)), [line]))
+            self.statements.append(([self.known[text]], set(_strings(reads)), [f"const {self.known[text]} = {text};"]))
         return self.known[text]
 
     def inner(self) -> "_Block":
         """A block inside this one, which knows what this one knows."""
         return _Block(self.names, dict(self.known))
 
-    def lines(self, needed: Sequence[Number]) -> list[str]:
-        """The lines that lead to some numbers."""
-        return [line for _, _, lines in self._needed(needed) for line in lines]
-
-    def reads(self, needed: Sequence[Number]) -> set[str]:
-        """The names that are read on the way to some numbers."""
-        return set(_strings(needed)).union(*(reads for _, reads, _ in self._needed(needed)))
-
-    def _needed(self, needed: Sequence[Number]) -> list[tuple[list[Number], set[str], list[str]]]:
-        wanted, kept = set(_strings(needed)), []
-        for statement in reversed(self.statements):
-            if not wanted.isdisjoint(statement[0]):
-                wanted |= statement[1]
-                kept.append(statement)
-        return kept[::-1]
+    def leading_to(self, needed: Sequence[Number]) -> tuple[list[str], set[str]]:
+        """The lines that lead to some numbers, and the names that are read on the way."""
+        names, kept = set(_strings(needed)), []
+        for results, reads, lines in reversed(self.statements):
+            if not names.isdisjoint(results):
+                names |= reads
+                kept.append(lines)
+        return [line for lines in reversed(kept) for line in lines], names
 
     def call(self, closed: Any, arguments: Sequence[Value]) -> Values:
         """The values that a jaxpr gives."""
-        jaxpr, constants = (closed.jaxpr, closed.consts) if isinstance(closed, ClosedJaxpr) else (closed, ())
+        jaxpr, constants = _opened(closed)
         values = dict(zip(jaxpr.constvars, map(_value, constants), strict=True))
         values |= dict(zip(jaxpr.invars, arguments, strict=True))
 
@@ -214,17 +203,13 @@ class _Block:
 
     def kind(self, equation: Any) -> str:
         """What is done element by element: the name of a primitive, or JavaScript."""
-        name, parameters, types = (
-            equation.primitive.name,
-            equation.params,
-            [atom.aval.dtype for atom in equation.invars],
-        )
+        name, parameters = equation.primitive.name, equation.params
+        types = [atom.aval.dtype for atom in equation.invars]
         if name == "integer_pow":
             power = " * ".join(["{0}"] * abs(parameters["y"])) or "1"
             return power if parameters["y"] >= 0 else f"1 / ({power})"
         if name == "select_n":
-            last = len(types) - 1
-            chain = "".join(f"{{0}} == {k - 1} ? {{{k}}} : " for k in range(1, last)) + f"{{{last}}}"
+            chain = "".join(f"{{0}} == {k - 1} ? {{{k}}} : " for k in range(1, len(types))) + "NaN"
             return CHOICE if types[0] == np.bool_ else chain
         if name == "not":
             return "!{}" if types[0] == np.bool_ else "~{}"
@@ -236,10 +221,8 @@ class _Block:
             cut = np.issubdtype(parameters["new_dtype"], np.integer) and np.issubdtype(types[0], np.floating)
             return "Math.trunc({})" if cut else "+{}" if types[0] == np.bool_ else "{}"
         if name not in ELEMENTWISE:
-            raise ValueError(
-                f"the primitive {name!r} of JAX cannot be written in JavaScript; can the function be written with "
-                f"{', '.join(sorted(ELEMENTWISE))}?"
-            )
+            known = ", ".join(sorted(ELEMENTWISE))
+            raise ValueError(f"the primitive {name!r} of JAX cannot be written in JavaScript; use some of {known}")
         return name
 
     def each(self, kind: str, *values: Value) -> Value:
@@ -261,49 +244,43 @@ class _Block:
 
     def product(self, a: Value, b: Value, contracted: Any, together: Any) -> Value:
         """The product of two arrays, summed over some axes of both, with other axes of both side by side."""
-        shapes, factors = [], []
-        for value, summed, beside in zip((a, b), contracted, together, strict=True):
+
+        def factor(value: Value, summed: Sequence[int], beside: Sequence[int]) -> tuple[Value, list[list[int]]]:
             free = [k for k in range(value.ndim) if k not in (*summed, *beside)]
             shape = [[value.shape[k] for k in axes] for axes in (beside, free, summed)]
-            factors.append(np.transpose(value, [*beside, *free, *summed]).reshape([math.prod(part) for part in shape]))
-            shapes.append(shape)
-        whole = self.reduced("add", self.each("mul", factors[0][:, :, None], factors[1][:, None]), [3])
-        return whole.reshape([*shapes[0][0], *shapes[0][1], *shapes[1][1]])
+            return np.transpose(value, [*beside, *free, *summed]).reshape([math.prod(part) for part in shape]), shape
+
+        (left, (common, rows, _)), (right, (_, columns, _)) = map(factor, (a, b), contracted, together)
+        whole = self.reduced("add", self.each("mul", left[:, :, None], right[:, None]), [3])
+        return whole.reshape([*common, *rows, *columns])
 
     def extreme(self, kind: str, value: Value, axis: int) -> Value:
         """The place of the first extreme element along an axis."""
-        rows = _rows(value, axis)
-        place, best = _value(np.zeros(rows[0].shape, int)), rows[0]
-        for number, row in enumerate(rows[1:], 1):
-            better = self.each(kind, row, best)
-            place = self.each(CHOICE, better, place, _value(np.full(place.shape, number)))
-            best = self.each(CHOICE, better, best, row)
-        return place
+
+        def better(best: Values, other: Values) -> Values:
+            is_better = self.each(kind, other[1], best[1])
+            return [self.each(CHOICE, is_better, *pair) for pair in zip(best, other, strict=True)]
+
+        rows = [[_value(np.full(row.shape, number)), row] for number, row in enumerate(_rows(value, axis))]
+        return functools.reduce(better, rows)[0]
 
     def indexed(self, equation: Any, inputs: Values, indices: Sequence[int]) -> Values:
         """Numbers taken from places that may be known only in JavaScript: there all possible ones are told apart."""
         pool = _flat([value for k, value in enumerate(inputs) if k not in indices])
-        places = [(k, index) for k in indices for index in np.ndindex(inputs[k].shape)]
-        unknown = [(k, index) for k, index in places if isinstance(inputs[k][index], str)]
-        values: Values = []
-
-        def numbered(value: Value, labels: Any) -> Value:
-            return np.fromiter(labels, int, value.size).reshape(value.shape)
-
-        def picked(places: Value) -> Value:
-            # A gather beyond the end fills with a number that is none of the labels.
-            return _map(lambda k: pool[k] if 0 <= k < len(pool) else math.nan, places)
-
+        unknown = [(k, place) for k in indices for place, x in np.ndenumerate(inputs[k]) if isinstance(x, str)]
+        labels, values = itertools.count(), []
+        labelled = [value if k in indices else _map(lambda _: next(labels), value) for k, value in enumerate(inputs)]
+        # A gather beyond the end fills with a number that is none of the labels.
+        picked = functools.partial(_map, lambda k: pool[k] if 0 <= k < len(pool) else math.nan)
         # One more than there are: an index beyond the end has a meaning of its own.
         options = range(max(inputs[0].shape, default=0) + 1)
         for option in itertools.product(options, repeat=len(unknown)):
-            labels, same = iter(range(len(pool))), []
-            operands = [value.copy() if k in indices else numbered(value, labels) for k, value in enumerate(inputs)]
+            operands, same = [value.copy() for value in labelled], []
             for (k, index), choice in zip(unknown, option, strict=True):
                 operands[k][index] = choice
                 same.append(self.each("eq", np.asarray(inputs[k][index], object), _value(choice)))
             moved = equation.primitive.bind(*(operand.astype(int) for operand in operands), **equation.params)
-            results = [picked(np.asarray(part)) for part in (moved if equation.primitive.multiple_results else [moved])]
+            results = [picked(np.asarray(part)) for part in jax.tree.leaves(moved)]
             if values:
                 chosen = functools.reduce(functools.partial(self.each, "and"), same)
                 results = [self.each(CHOICE, chosen, *pair) for pair in zip(values, results, strict=True)]
@@ -320,10 +297,10 @@ class _Block:
             for name, number in zip(names, _flat(step(block, variables)), strict=True)
         ]
         moved = [f"{name} = {_text(number)};" for name, number in zip(names, after, strict=True) if name != number]
-        needed = [*after, LEAVES]
+        inside, reads = block.leading_to([*after, LEAVES])
         begin = [f"let {name} = {_text(start)};" for name, start in zip(names, starts, strict=True)]
-        lines = [*begin, f"{head} {{", *(f"  {line}" for line in (*block.lines(needed), *moved)), "}"]
-        self.statements.append((names, block.reads(needed).union(_strings(starts)), lines))
+        lines = [*begin, f"{head} {{", *_indented([*inside, *moved]), "}"]
+        self.statements.append((names, reads.union(_strings(starts)), lines))
         return variables
 
     def variables(self, values: Sequence[Value]) -> Values:
@@ -341,40 +318,33 @@ class _Block:
         return self.loop("while (true)", inputs[cond_nconsts + body_nconsts :], step)
 
     def scan_(self, inputs: Values, jaxpr: Any, length: int, reverse: bool, **counts: Any) -> Values:
-        if "ft_in" in counts:
-            # jax 0.11 and later.
-            num_consts, num_carry, _ = map(len, counts["ft_in"].unpack())
-        else:
-            num_consts, num_carry = counts["num_consts"], counts["num_carry"]
-        constants, carry = inputs[:num_consts], inputs[num_consts : num_consts + num_carry]
-        rows, results = (
-            inputs[num_consts + num_carry :],
-            len((jaxpr.jaxpr if isinstance(jaxpr, ClosedJaxpr) else jaxpr).outvars) - num_carry,
-        )
-        if not rows and not results and length > WRITTEN_OUT:
+        first, count = counts.get("num_consts", 0), counts.get("num_carry", 0)
+        if "ft_in" in counts:  # jax 0.11 and later
+            first, count, _ = map(len, counts["ft_in"].unpack())
+        constants, carry, rows = inputs[:first], inputs[first : first + count], inputs[first + count :]
+        if not rows and len(_opened(jaxpr)[0].outvars) == count and length > WRITTEN_OUT:
             head = f"for (let k = 0; k < {length}; k++)"
             return self.loop(head, carry, lambda block, carry: block.call(jaxpr, [*constants, *carry]))
         stacked: list[Any] = [None] * length
         for k in reversed(range(length)) if reverse else range(length):
             after = self.call(jaxpr, [*constants, *carry, *(np.asarray(row[k], object) for row in rows)])
-            carry, stacked[k] = after[:num_carry], after[num_carry:]
+            carry, stacked[k] = after[:count], after[count:]
         return [*carry, *(np.stack(parts) for parts in zip(*stacked, strict=True))]
 
     def cond_(self, inputs: Values, branches: Sequence[Any], **_: Any) -> Values:
         number, operands = inputs[0].item(), inputs[1:]
         if not isinstance(number, str):
             return self.call(branches[int(number)], operands)
-        blocks = [self.inner() for _ in branches]
-        ends = [block.call(branch, operands) for block, branch in zip(blocks, branches, strict=True)]
-        variables, flat = self.variables(ends[0]), [_flat(end) for end in ends]
-        names, lines, reads = _flat(variables), [], {number}
-        lines += [f"let {', '.join(_strings(names))};"] if names else []
-        for k, (block, end) in enumerate(zip(blocks, flat, strict=True)):
-            last = k == len(blocks) - 1
-            lines += [("} else " if k else "") + ("{" if last else f"if ({number} == {k}) {{")]
-            lines += [f"  {line}" for line in block.lines(end)]
-            lines += [f"  {name} = {_text(value)};" for name, value in zip(names, end, strict=True)]
-            reads |= block.reads(end)
+        variables = self.variables([np.empty(kind.shape) for kind in branches[0].out_avals])
+        names, reads = _flat(variables), {number}
+        lines = [f"let {', '.join(_strings(names))};"] if names else []
+        for k, branch in enumerate(branches):
+            block = self.inner()
+            end = _flat(block.call(branch, operands))
+            inside, inside_reads = block.leading_to(end)
+            written = [f"{name} = {_text(value)};" for name, value in zip(names, end, strict=True)]
+            lines += [f"{'} else ' if k else ''}if ({number} == {k}) {{", *_indented([*inside, *written])]
+            reads |= inside_reads
         self.statements.append((names, reads, [*lines, "}"]))
         return variables
 
@@ -385,6 +355,15 @@ def _rows(value: Value, axis: int) -> Values:
 
 def _flat(values: Sequence[Value]) -> list[Number]:
     return [number for value in values for number in value.ravel()]
+
+
+def _opened(jaxpr: Any) -> tuple[Any, Sequence[Any]]:
+    """A jaxpr without its constants, and these."""
+    return (jaxpr.jaxpr, jaxpr.consts) if isinstance(jaxpr, ClosedJaxpr) else (jaxpr, ())
+
+
+def _indented(lines: list[str]) -> list[str]:
+    return [f"  {line}" for line in lines]
 
 
 def _strings(numbers: Sequence[Number]) -> list[str]:

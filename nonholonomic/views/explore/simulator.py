@@ -75,9 +75,8 @@ def written(simulator: Simulator, values: Numbers) -> str:
     time, state = lane.time, lane.state
     tableau = explicit_tableau(simulator.settings.for_lanes)
     kinds = 0 if lane.margins is None else len(lane.margins)
-    margins = (
-        jax.ShapeDtypeStruct((len(watched_places(tableau)), *lane.margins.shape), lane.margins.dtype) if kinds else None
-    )
+    places = len(watched_places(tableau))
+    margins = jax.tree.map(lambda least: jax.ShapeDtypeStruct((places, *least.shape), least.dtype), lane.margins)
     tried = Step(state, state, state, time, time, margins)
 
     def after(constants: Any, lane: LaneState, length: Any, tried: Step) -> LaneState:

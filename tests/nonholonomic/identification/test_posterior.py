@@ -160,7 +160,7 @@ def test_draws_are_from_a_density_that_the_surrogate_misses():
     exact = np.asarray(decay({"height": jnp.array([1.2]), "rate": jnp.array([0.7])}))[0]
     density = LogDensity.of(rough, Measurements(exact, error), free)
     found = sample(density, density.start, np.diag([0.1, 0.2]), progress=False)
-    grid = np.stack(np.meshgrid(np.linspace(-1.5, 1.5, 201), np.linspace(-3.0, 2.0, 801), indexing="ij"), axis=-1)
+    grid = np.stack(np.meshgrid(np.linspace(-1.5, 1.5, 101), np.linspace(-3.0, 2.0, 401), indexing="ij"), axis=-1)
     flat = jnp.asarray(grid.reshape(-1, 2))
     logs = np.asarray(jax.vmap(density.of_prediction)(flat, density.predict(flat)))
     weights = np.exp(logs - logs.max())

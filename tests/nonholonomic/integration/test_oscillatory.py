@@ -37,6 +37,7 @@ def test_it_belongs_to_the_family_which_leaves_ten_weights_free():
     assert free_directions(OWN).shape[1] == free_directions(unknowns_of(diffrax.Dopri8().tableau)).shape[1] == 10
 
 
+@pytest.mark.slow
 def test_its_errors_along_a_motion_are_small_and_could_not_be_found_by_chance():
     """Steps of Rutstam's top, as the weights were tuned; descending from Prince and Dormand's lowers the errors too."""
     aim = Aim({"plane, viscous": scenes(4)["plane, viscous"]}, seed=0)
@@ -60,7 +61,11 @@ def test_its_weights_magnify_round_off_less():
         assert np.abs(own).sum(axis=-1).max() < np.abs(plain).sum(axis=-1).max()
 
 
-@pytest.mark.parametrize("arena", [tippe.Cylinder(0.3), tippe.Torus(0.3, 0.2)], ids=lambda one: type(one).__name__)
+@pytest.mark.parametrize(
+    "arena",
+    [tippe.Cylinder(0.3), pytest.param(tippe.Torus(0.3, 0.2), marks=pytest.mark.slow)],
+    ids=["cylinder", "torus"],
+)
 def test_off_the_plane_it_reaches_the_same_error_in_fewer_steps(arena):
     """A third of the error of `Dopri8` for the same steps, or less, in an arena and for a top that it was not tuned to too."""
     top = tippe.Top(0.05, 0.03, 0.008, 0.38 * 4.5e-5, 0.4 * 4.5e-5) if isinstance(arena, tippe.Torus) else TOP

@@ -14,8 +14,8 @@ from nonholonomic.command_line import INTERRUPTED, PATIENCE
 
 pytestmark = pytest.mark.newest
 
-#: How long an answer to Ctrl-C may take [s]: 2 s, twice as long where other tests keep all cores busy.
-PROMPT = 4.0
+#: How long an answer to Ctrl-C may take [s]: twice as long where other programs keep all cores busy.
+PROMPT = 2.0 if os.getloadavg()[0] <= (os.cpu_count() or 1) else 4.0
 
 #: Keeps a thread in C for some seconds, deaf to signals, as XLA's compiler does; others go on.
 DEAF = "import hashlib\ndef deaf(): hashlib.pbkdf2_hmac('sha256', b'', b'', 30_000_000)\n"
@@ -66,10 +66,20 @@ interruptible(main, "something")
 """
 )
 
+#: Ctrl-C for itself as soon as jax is about to be imported.
+IMPORTING = """
+import os, signal, sys
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == "jax":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupt())
+"""
+
 
 def started(folder: Path, *arguments: str) -> subprocess.Popen:
     """A process group of its own, as a shell starts a program on a terminal."""
-    paths = [str(Path(__file__).parent), *sys.path]
+    paths = [str(folder), str(Path(__file__).parent), *sys.path]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "XDG_CACHE_HOME": str(folder)}
     return subprocess.Popen(
         [sys.executable, *arguments],
@@ -143,17 +153,24 @@ def test_a_command_line_ends_while_it_compiles(tmp_path):
 
 
 def test_the_main_job_of_the_top_says_what_is_saved(tmp_path):
-    process = started(tmp_path, "-m", "tippe", "--theta", "0.1", "--t1", "5", "--out", "out")
+    process = started(tmp_path, "-m", "tippe", "--theta", "6", "--t1", "5", "--out", "out")
     folder = tmp_path / "out" / "cylinder.h5.blocks"
     wait_for(lambda: (folder / "table.h5").exists(), process)
     # It compiles for some seconds from here on.
     time.sleep(0.5)
     status, _, error, passed = interrupted(process)
     assert status == INTERRUPTED
-    # On a busy machine the process may end before the main thread knows what is saved.
-    saved = "python -m tippe: saved 0 of 2 cells to out/cylinder.h5; run the same call again to resume"
-    assert error in ([saved], ["python -m tippe: interrupted; run the same command again to resume"])
+    assert error == ["python -m tippe: saved 0 of 10 cells to out; run the same command again to resume"]
     assert passed < PROMPT
+
+
+@pytest.mark.parametrize("program", ["tippe", "stroller"])
+def test_a_command_line_ends_with_one_line_while_it_is_imported(program, tmp_path):
+    """Python sends itself the signal as it is about to import jax."""
+    (tmp_path / "sitecustomize.py").write_text(IMPORTING)
+    process = started(tmp_path, "-m", program, "--out", "out")
+    _, out, error = process.wait(timeout=60), *process.communicate()
+    assert (out, error) == ("", f"python -m {program}: interrupted\n")
 
 
 def test_the_main_job_of_the_stroller_ends_with_one_line(tmp_path):
@@ -162,4 +179,4 @@ def test_the_main_job_of_the_stroller_ends_with_one_line(tmp_path):
     status, _, error, passed = interrupted(process)
     assert status == INTERRUPTED
     assert error == ["python -m stroller: interrupted; run the same command again to resume"]
-    assert passed < PROMPT + 0.5
+    assert passed < PROMPT

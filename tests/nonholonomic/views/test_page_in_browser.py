@@ -1,19 +1,17 @@
 """The page of a run, opened in a real browser with the network off: what is drawn is where the run is."""
 
-import shutil
 import time
 
 import numpy as np
 import pytest
+from browser import complaints, needs_browser, open_browser, wait
 
 import stroller
 import tippe
 from nonholonomic.views import page
 from nonholonomic.views.page import ANGLE
 
-BROWSER, DRIVER = (shutil.which(name) for name in ("chromium", "chromedriver"))
-
-pytestmark = pytest.mark.skipif(BROWSER is None or DRIVER is None, reason="no chromium with its chromedriver")
+pytestmark = needs_browser
 
 #: Poses are sent in single precision.
 SINGLE = 2e-6
@@ -43,35 +41,13 @@ def stages(top, ride):
 
 @pytest.fixture(scope="module")
 def browser(stages, tmp_path_factory):
-    from selenium.webdriver import Chrome, ChromeOptions
-    from selenium.webdriver.chrome.service import Service
-
-    options = ChromeOptions()
-    options.binary_location = BROWSER
-    wanted = ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader")
-    for argument in (*wanted, "--enable-unsafe-swiftshader", "--window-size=500,500"):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = Chrome(options=options, service=Service(DRIVER))
-    try:
-        off = {"offline": True, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0}
-        driver.execute_cdp_cmd("Network.enable", {})
-        driver.execute_cdp_cmd("Network.emulateNetworkConditions", off)
+    with open_browser() as driver:
         path = tmp_path_factory.mktemp("page") / "runs.html"
         # Small pictures, as a processor has to draw them here.
         page(stages, "Both models", height=100, autoplay=False).save(path)
         driver.get(path.as_uri())
         wait(driver, "return !!window.player")
         yield driver
-    finally:
-        driver.quit()
-
-
-def wait(driver, script: str) -> None:
-    until = time.monotonic() + 60.0
-    while not driver.execute_script(script):
-        assert time.monotonic() < until, driver.get_log("browser")
-        time.sleep(0.05)
 
 
 def set_speed(driver, factor: float) -> None:
@@ -87,7 +63,7 @@ def poses(driver, at: float, stage: int, bodies: int = 1) -> np.ndarray:
 
 
 def test_nothing_is_missing_without_a_network(browser):
-    assert [entry for entry in browser.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")] == []
+    assert complaints(browser) == []
     assert browser.execute_script("return document.querySelectorAll('.scene canvas').length") >= 2
     assert browser.execute_script("return document.querySelectorAll('.strip').length") == 7
 

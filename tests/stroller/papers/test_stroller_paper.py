@@ -195,6 +195,6 @@ def test_every_equation_names_a_test_that_exists(equation):
 
 
 def test_the_page_is_the_rendered_table():
-    """docs/stroller_paper.md is what `stroller.papers.paper.render()` gives."""
-    page = Path(__file__).parents[3] / "docs" / "stroller_paper.md"
+    """docs/development/stroller_paper.md is what `stroller.papers.paper.render()` gives."""
+    page = Path(__file__).parents[3] / "docs" / "development" / "stroller_paper.md"
     assert page.read_text(encoding="utf-8") == paper.render()

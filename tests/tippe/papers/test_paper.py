@@ -240,8 +240,8 @@ def test_one_top_gives_table_3_to_half_a_second_and_table_2_nearly():
 
 
 def test_the_page_is_what_the_audit_renders():
-    """docs/tippe_paper.md is the output of `python -m tippe.papers.audit`."""
-    assert (ROOT / "docs" / "tippe_paper.md").read_text() == audit.render()
+    """docs/development/tippe_paper.md is the output of `python -m tippe.papers.audit`."""
+    assert (ROOT / "docs" / "development" / "tippe_paper.md").read_text() == audit.render()
 
 
 def test_every_test_and_function_that_the_page_names_exists():

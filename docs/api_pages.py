@@ -1,0 +1,171 @@
+"""The pages of the API by task, and the public names on each; `conf.py` writes them, `tests/test_manual.py` checks them."""
+
+import importlib
+import inspect
+import re
+from typing import Any, NamedTuple
+
+PACKAGES = ("tippe", "stroller", "nonholonomic")
+
+
+class Page(NamedTuple):
+    """A page of the API.
+
+    - `title`: the heading.
+    - `introduction`: what you do with these names.
+    - `names`: dotted names, in the order of the page.
+    """
+
+    title: str
+    introduction: str
+    names: list[str]
+
+
+def of(package: str, names: str) -> list[str]:
+    """Dotted names of a package."""
+    return [f"{package}.{name}" for name in names.split()]
+
+
+PAGES = {
+    "scene": Page(
+        "Scenes and launches",
+        "A scene is a body, an arena and a friction law. A launch is the start of a run.",
+        [*of("tippe", "Scene Launch presets"), *of("stroller", "Scene Launch presets")],
+    ),
+    "bodies": Page(
+        "Bodies",
+        "The bodies that a scene can hold: tops, convex bodies of revolution and the stroller.",
+        [*of("tippe", "Top Stem SpheroidBody ConvexBody"), "stroller.Stroller"],
+    ),
+    "arenas": Page(
+        "Arenas",
+        "The surfaces on which tops and strollers move. All packages share them: `tippe.Plane` is `nonholonomic.Plane`.",
+        of("nonholonomic", "Plane Cylinder Sphere Spheroid Torus Paraboloid Graph Implicit AbstractSurface"),
+    ),
+    "friction": Page(
+        "Friction",
+        "Friction laws for the top and damping for the stroller.",
+        [
+            *of("tippe", "Frictionless Viscous Coulomb SetValuedCoulomb Contensou Rolling AbstractFriction"),
+            *of("stroller", "Frictionless Damping RollingResistance AbstractFriction"),
+        ],
+    ),
+    "simulate": Page(
+        "Single runs",
+        "Simulate one run, and read its motion, forces and energy.",
+        [
+            *of("tippe", "simulate Trajectory HybridTrajectory"),
+            *of("stroller", "simulate Trajectory Motion Steady ImplicitMidpoint"),
+            "tippe.Status",
+        ],
+    ),
+    "sweeps": Page(
+        "Tables",
+        "Simulate many runs at once, in memory or into a file. :doc:`tables` lists the variables, the statuses and the file "
+        "format.",
+        [
+            *of("tippe", "inversion_table trajectory_table"),
+            "stroller.sweep",
+            "tippe.Table",
+            *of("nonholonomic", "local_processes enable_compilation_cache"),
+        ],
+    ),
+    "derivatives": Page(
+        "Times, derivatives and stability",
+        "Differentiable inversion times, Lyapunov exponents and steady states.",
+        of("tippe", "inversion_time extended_inversion_time lyapunov_exponent LyapunovExponent steady"),
+    ),
+    "fitting": Page(
+        "Fitting",
+        "Estimate parameters from recordings and measured times.",
+        [
+            *of("tippe", "identify Recording read_recording InversionTimes Free log_density FitWarning"),
+            *of("stroller", "identify Recording read_recording"),
+        ],
+    ),
+    "views": Page(
+        "Interactive pages",
+        "Pages with sliders. To draw a run or a table, call its own methods: see `view`, `animate`, `plot` and `portrait` of "
+        ":doc:`runs <simulate>` and `plot` of :doc:`tables <sweeps>`.",
+        ["tippe.explore", "stroller.explore"],
+    ),
+    "own_systems": Page(
+        "Your own systems",
+        "Run, time, sweep and fit systems that you write.",
+        of(
+            "nonholonomic",
+            "AbstractMode Hybrid AbstractSystem simulate Trajectory event_time sweep Recording identify",
+        ),
+    ),
+}
+
+
+RUN = "to_table to_xarray save view animate plot portrait"
+TOP = (
+    "theta theta_rate eta azimuth spin position velocity normal axis angular_velocity angular_momentum slip normal_force "
+    "energy jellett inversion_time"
+)
+
+#: The members that a user needs; classes that are not here have none.
+MEMBERS = {
+    "tippe.Scene": "state field energy jellett theta spin normal_force slip_velocity friction_power",
+    "tippe.Launch": "degrees",
+    "tippe.Top": "turned",
+    "nonholonomic.Spheroid": "from_oblate",
+    "nonholonomic.Torus": "from_middle",
+    "nonholonomic.AbstractSurface": "axes sides coordinates up normal normal_rate elevation gaussian_curvature nearest "
+    "distance place_at charted in_fixed_frame in_own_axes",
+    "tippe.AbstractFriction": "set_valued uses_spin isotropic per_normal_force",
+    "stroller.AbstractFriction": "dissipates drag",
+    "tippe.Trajectory": f"at {RUN} {TOP} contact",
+    "tippe.HybridTrajectory": f"at {RUN} {TOP}",
+    "stroller.Scene": "state energy work contact",
+    "stroller.Trajectory": f"{RUN} status energy_residual wheelbase_error grip grip_margin contact_lost_at rank_lost_at "
+    "jackknifed_at",
+    "stroller.Motion": "position heading steering speed front_speed yaw_rate steering_rate",
+    "tippe.Status": "word of",
+    "tippe.Table": "shape dims long_names load save to_xarray to_dataframe plot digits",
+    "tippe.LyapunovExponent": "exponent error status end_time steps times running",
+    "tippe.InversionTimes": "measurements predict",
+    "tippe.Free": "start lower upper prior unit",
+    "nonholonomic.AbstractMode": "field margin reset",
+    "nonholonomic.AbstractSystem": "dimension metric potential constraints frame force lagrangian energy",
+    "nonholonomic.Trajectory": "status to_table to_xarray save portrait plot",
+}
+
+
+def public(package: str) -> list[str]:
+    """The names that the `__init__.py` of a package imports as themselves."""
+    text = inspect.getsource(importlib.import_module(package))
+    return sorted(set(re.findall(r"import (?!__)(\w+) as \1$", text, re.M)), key=str.lower)
+
+
+def resolve(dotted: str) -> Any:
+    """The object behind a name such as "tippe.Scene"."""
+    package, name = dotted.split(".")
+    return getattr(importlib.import_module(package), name)
+
+
+def missing() -> list[str]:
+    """Public names that no page shows, neither by themselves nor by another name of the same object."""
+    shown = {id(resolve(name)) for page in PAGES.values() for name in page.names}
+    every = [f"{package}.{name}" for package in PACKAGES for name in public(package)]
+    return [name for name in every if id(resolve(name)) not in shown]
+
+
+def text(page: Page) -> str:
+    """The page in reStructuredText: a table of all names, then an entry for each."""
+    introduction = re.sub(r"(:\w+:`[^`]+`)|(`[^`]+`)", lambda found: found[1] or f"`{found[2]}`", page.introduction)
+    lines = [page.title, "=" * len(page.title), "", introduction, ""]
+    lines += [".. autosummary::", "   :nosignatures:", "", *(f"   {name}" for name in page.names), ""]
+    for name in page.names:
+        value = resolve(name)
+        if inspect.ismodule(value):
+            heading = f"``{name}``"
+            lines += [heading, "-" * len(heading), "", f".. automodule:: {name}", "   :members:", ""]
+        elif inspect.isclass(value):
+            members = [f"   :members: {', '.join(MEMBERS[name].split())}"] if name in MEMBERS else []
+            lines += [f".. autoclass:: {name}", *members, ""]
+        else:
+            lines += [f".. autofunction:: {name}", ""]
+    return "\n".join(lines)

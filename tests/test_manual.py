@@ -1,0 +1,47 @@
+"""The manual has an entry for every public name, a thumbnail for every picture and a derivation for every citation."""
+
+import inspect
+import re
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+
+
+def test_every_public_name_is_on_a_page_of_the_api():
+    sys.path.insert(0, str(DOCS))
+    try:
+        import api_pages
+    finally:
+        sys.path.remove(str(DOCS))
+    assert api_pages.missing() == []
+    shown = [name for page in api_pages.PAGES.values() for name in page.names]
+    assert len(shown) == len({id(api_pages.resolve(name)) for name in shown})
+    for name, members in api_pages.MEMBERS.items():
+        assert name in shown
+        bases = api_pages.resolve(name).__mro__
+        known = {member for base in bases for member in (*vars(base), *inspect.get_annotations(base))}
+        assert set(members.split()) <= known
+
+
+def test_the_gallery_has_a_card_with_a_thumbnail_for_every_picture():
+    shown = re.findall(r"^:link: gallery/(\w+)$", (DOCS / "gallery.md").read_text(), re.M)
+    assert len(shown) >= 12
+    assert sorted(shown) == sorted(p.stem for p in (ROOT / "examples").glob("*.py") if "def draw(" in p.read_text())
+    assert sorted(shown) == sorted(path.stem for path in (DOCS / "gallery").glob("*.webp"))
+
+
+def test_every_section_of_a_derivation_that_a_docstring_cites_exists():
+    """The manual links "`tippe.md`, section 3" to the heading with that number."""
+    cited = {
+        found
+        for folder in ("nonholonomic", "tippe", "stroller", "tests", "benchmarks")
+        for path in (ROOT / folder).rglob("*.py")
+        for found in re.findall(r"(tippe|stroller)\.md`?,\s+sections? (\d+)", path.read_text())
+    }
+    assert len(cited) > 10
+    for model, number in cited:
+        assert re.search(
+            rf"^\({model}-{number}\)=\n## {number}\. ", (DOCS / "concepts" / f"{model}.md").read_text(), re.M
+        )

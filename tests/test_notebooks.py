@@ -1,0 +1,67 @@
+"""The notebooks for a hosted service are the tutorials: their cells, without what only the manual can do."""
+
+import ast
+import importlib.util
+import re
+from pathlib import Path
+from types import ModuleType
+
+import nbformat
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+@pytest.fixture(scope="module")
+def builder() -> ModuleType:
+    """`docs/notebooks.py`."""
+    spec = importlib.util.spec_from_file_location("notebooks", DOCS / "notebooks.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_notebooks_have_the_code_of_the_tutorials(builder, tmp_path):
+    """Every line of a page's cells, after one that installs the package; valid files, valid Python, no links between pages."""
+    builder.main(tmp_path, None)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.ipynb", "stroller.ipynb", "top.ipynb"]
+    for name, page in builder.PAGES.items():
+        book = nbformat.read(tmp_path / f"{name}.ipynb", as_version=4)
+        nbformat.validate(book)
+        install, *cells = [cell.source for cell in book.cells if cell.cell_type == "code"]
+        assert install == builder.INSTALL
+        blocks = re.findall(r"```\{code-cell\}\n(?::tags:[^\n]*\n)?(.*?)```", (DOCS / page).read_text(), re.DOTALL)
+        lines = [line.strip() for block in blocks for line in block.strip().splitlines()]
+        assert [line for line in lines if line not in "\n".join(cells)] == []
+        assert len(blocks) == len(cells) >= 3
+        for cell in cells:
+            ast.parse(cell)
+        texts = "\n".join(cell.source for cell in book.cells if cell.cell_type == "markdown")
+        assert re.findall(r"\]\((?!https?:)[^)]*\)", texts) == []
+
+
+def test_errors_that_a_page_shows_do_not_stop_a_notebook(builder, capsys):
+    cells = builder.notebook(DOCS / builder.PAGES["stroller"]).cells
+    shown = [cell.source for cell in cells if "raises-exception" in cell.metadata.get("tags", [])]
+    assert len(shown) == 1
+    # The names of the earlier cells are missing: the error is printed.
+    exec(shown[0], {})
+    assert "is not defined" in capsys.readouterr().out
+
+
+def test_a_badge_opens_the_notebook_of_the_repository(builder, tmp_path):
+    builder.main(tmp_path, "owner/name")
+    address = "https://colab.research.google.com/github/owner/name/blob/notebooks/top.ipynb"
+    assert address in nbformat.read(tmp_path / "top.ipynb", as_version=4).cells[0].source
+    assert address in (tmp_path / "README.md").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["top", "fit", "stroller"])
+def test_notebooks_run_as_they_are(builder, name, monkeypatch, tmp_path):
+    """All cells in order, but for the one that installs the package."""
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for cell in builder.notebook(DOCS / builder.PAGES[name]).cells:
+        if cell.cell_type == "code" and not cell.source.startswith("%pip"):
+            exec(cell.source, names)
