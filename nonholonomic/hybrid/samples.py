@@ -142,7 +142,7 @@ class Filled(NamedTuple):
     number: Float[Array, " times"]
     grazed: Float[Array, ""]
 
-    def with_samples(self, here: Bool[Array, " times"], seen: tuple[Array, Array], number: int) -> "Filled":
+    def with_samples(self, here: Bool[Array, " times"], seen: tuple[Array, Array], number: Array | int) -> "Filled":
         """Fill in the samples at some times that have none yet."""
         here = here & jnp.isnan(self.number)
         shown, variations = (
@@ -170,8 +170,10 @@ def _followed(
     missing = jnp.full((rows, len(times)), jnp.nan)
     empty = Filled(missing, jnp.zeros((count, *missing.shape)), missing[0], jnp.full((), jnp.inf))
 
+    kinds_of_modes = alike(modes)
+
     def stay(
-        one: VariationalMode, number: int, found: HybridOutcome[Array], filled: Filled
+        one: VariationalMode, number: Array, found: HybridOutcome[Array], filled: Filled
     ) -> tuple[HybridOutcome[Array], Filled]:
         since, left = times - found.end_time, greatest(t1 - found.end_time, 0.0)
         outcome, samples = solve_with_samples(
@@ -201,17 +203,48 @@ def _followed(
     def one_round(carry: Any) -> Any:
         found, filled, rounds = carry
         at = found.mode[0]
-        for number, one in enumerate(modes):
-            under_way = (found.status[0] == RUNNING) & (at == number)
+        for numbers in kinds_of_modes:
+            under_way = (found.status[0] == RUNNING) & jnp.isin(at, jnp.asarray(numbers))
 
-            def here(one: VariationalMode = one, number: int = number, found: Any = found, filled: Any = filled) -> Any:
-                stayed = stay(one, number, found, filled)
+            def here(numbers: tuple[int, ...] = numbers, found: Any = found, filled: Any = filled) -> Any:
+                one = selected(modes, numbers, at)
+                stayed = stay(one, at, found, filled)
                 return jax.lax.cond(stayed[0].status[0] == LEFT_DOMAIN, lambda: change(one, *stayed), lambda: stayed)
 
             found, filled = jax.lax.cond(under_way, here, lambda found=found, filled=filled: (found, filled))
         return found, filled, rounds + 1
 
     return in_rounds(one_round, start, empty)
+
+
+def alike(modes: tuple[AbstractBatchedMode, ...]) -> list[tuple[int, ...]]:
+    """The numbers of the modes, those together that differ in the values of their arrays only: one program serves them."""
+    groups: list[list[int]] = []
+    for number, mode in enumerate(modes):
+        shape = _shape(mode)
+        group = next((group for group in groups if eqx.tree_equal(_shape(modes[group[0]]), shape)), None)
+        if group is None:
+            groups.append([number])
+        else:
+            group.append(number)
+    return [tuple(group) for group in groups]
+
+
+def _shape(mode: AbstractBatchedMode) -> Any:
+    """A mode with the shapes of its arrays in place of their values."""
+    return jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)) if eqx.is_array(leaf) else leaf, mode)
+
+
+def selected(modes: tuple[VariationalMode, ...], numbers: tuple[int, ...], at: Array) -> VariationalMode:
+    """The mode numbered `at`, one of some that are `alike`."""
+    mode = modes[numbers[0]]
+    for number in numbers[1:]:
+
+        def leaf(old: Any, new: Any, number: int = number) -> Any:
+            return old if old is new or not eqx.is_array(old) else jnp.where(at == number, new, old)
+
+        mode = jax.tree.map(leaf, mode, modes[number])
+    return mode
 
 
 def _on_the_way(
