@@ -1,5 +1,6 @@
 """The manual has an entry for every public name, a thumbnail for every picture and a derivation for every citation."""
 
+import inspect
 import re
 import sys
 from pathlib import Path
@@ -19,8 +20,8 @@ def test_every_public_name_is_on_a_page_of_the_api():
     assert len(shown) == len({id(api_pages.resolve(name)) for name in shown})
     for name, members in api_pages.MEMBERS.items():
         assert name in shown
-        bases = [vars(base) for base in api_pages.resolve(name).__mro__]
-        known = {member for base in bases for member in (*base, *base.get("__annotations__", {}))}
+        bases = api_pages.resolve(name).__mro__
+        known = {member for base in bases for member in (*vars(base), *inspect.get_annotations(base))}
         assert set(members.split()) <= known
 
 

@@ -43,7 +43,7 @@ class HybridSamples(NamedTuple):
     status: Float[Array, ""]
     steps: Float[Array, ""]
     rejected: Float[Array, ""]
-    counts: Float[Array, " counters"]
+    counts: Float[Array, " kinds"]
 
 
 def hybrid_samples(
@@ -69,8 +69,8 @@ def hybrid_samples(
 
     **Raises:** `ValueError` for derivatives by the times, and for second derivatives.
     """
-    sampling = functools.partial(HybridSampling, counters=counters)
-    return solve_for_samples(sampling, build, modules, _fixed(times), t1, settings)
+    question = functools.partial(HybridSampling, counters=counters)
+    return solve_for_samples(question, build, modules, _fixed(times), t1, settings)
 
 
 @eqx.filter_custom_jvp
@@ -97,17 +97,17 @@ class HybridSampling(AbstractSampling):
     counters: int = eqx.field(static=True)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> HybridSamples:
-        numbers, (*arguments, tolerance), spec = self._sorted(leaves)
+        numbers, (*given, tolerance), spec = self._sorted(leaves)
         settings = spec.settings.with_tolerance(tolerance)
-        samples, _ = _follow(spec.made(numbers, tolerance), (), arguments, settings, self.counters)
-        return jax.tree.map(lambda part: part[None], samples)
+        found, _ = _follow(spec.made(numbers, tolerance), (), given, settings, self.counters)
+        return jax.tree.map(lambda part: part[None], found)
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[HybridSamples, list[HybridSamples]]:
         if again:
             raise ValueError("second derivatives do not go through changes of phase: contact = 'hybrid'")
-        numbers, (*arguments, tolerance), spec = self._sorted(leaves)
+        numbers, (*given, tolerance), spec = self._sorted(leaves)
         settings = spec.settings.with_tolerance(tolerance)
 
         def build(numbers: tuple[Array, ...], cells: int | None) -> Any:
@@ -115,23 +115,21 @@ class HybridSampling(AbstractSampling):
 
         built, tangents, gather = tangents_by(build, active, numbers, None)
 
-        def run(group: tuple[Any, ...]) -> tuple[HybridSamples, list[HybridSamples]]:
-            return _follow(
-                built, tuple((tangent[0], tangent[2]) for tangent in group), arguments, settings, self.counters
-            )
+        def run(some: tuple[Any, ...]) -> tuple[HybridSamples, list[HybridSamples]]:
+            return _follow(built, tuple((one[0], one[2]) for one in some), given, settings, self.counters)
 
-        samples, slopes = in_groups(run, tangents)
-        return jax.tree.map(lambda part: part[None], (samples, gather(slopes)))
+        found, slopes = in_groups(run, tangents)
+        return jax.tree.map(lambda part: part[None], (found, gather(slopes)))
 
 
 def _follow(
-    built: Any, tangents: tuple[Any, ...], arguments: Sequence[Array], settings: Settings, counters: int
+    built: Any, tangents: tuple[Any, ...], given: Sequence[Array], settings: Settings, counters: int
 ) -> tuple[HybridSamples, list[HybridSamples]]:
     """The run, and its derivative along each tangent."""
-    (modes, first, state), (times, t1) = built, arguments
+    (modes, first, state), (times, t1) = built, given
     varied, start = variational_modes(modes, tangents, settings.tolerance, False), variational_start(state, tangents)
     ended, filled = _followed(varied, first, start, times, t1, settings, counters)
-    return _assembled(ended, filled, times, len(state), len(tangents))
+    return _found(ended, filled, times, len(state), len(tangents))
 
 
 class Filled(NamedTuple):
@@ -144,13 +142,13 @@ class Filled(NamedTuple):
     number: Float[Array, " times"]
     grazed: Float[Array, ""]
 
-    def with_samples(self, selected: Bool[Array, " times"], seen: tuple[Array, Array], number: int) -> "Filled":
+    def with_samples(self, here: Bool[Array, " times"], seen: tuple[Array, Array], number: Array | int) -> "Filled":
         """Fill in the samples at some times that have none yet."""
-        selected = selected & jnp.isnan(self.number)
+        here = here & jnp.isnan(self.number)
         shown, variations = (
-            jnp.where(selected, new, old) for new, old in zip(seen, (self.shown, self.variations), strict=True)
+            jnp.where(here, new, old) for new, old in zip(seen, (self.shown, self.variations), strict=True)
         )
-        return self._replace(shown=shown, variations=variations, number=jnp.where(selected, number, self.number))
+        return self._replace(shown=shown, variations=variations, number=jnp.where(here, number, self.number))
 
 
 def _followed(
@@ -172,54 +170,81 @@ def _followed(
     missing = jnp.full((rows, len(times)), jnp.nan)
     empty = Filled(missing, jnp.zeros((count, *missing.shape)), missing[0], jnp.full((), jnp.inf))
 
+    kinds_of_modes = alike(modes)
+
     def stay(
-        varied_mode: VariationalMode, number: int, runs: HybridOutcome[Array], filled: Filled
+        one: VariationalMode, number: Array, found: HybridOutcome[Array], filled: Filled
     ) -> tuple[HybridOutcome[Array], Filled]:
-        since, left = times - runs.end_time, greatest(t1 - runs.end_time, 0.0)
+        since, left = times - found.end_time, greatest(t1 - found.end_time, 0.0)
         outcome, samples = solve_with_samples(
-            varied_mode.problem(runs.state), since, left, jnp.asarray(1), settings, n_blocks=1 + count
+            one.problem(found.state), since, left, jnp.asarray(1), settings, n_blocks=1 + count
         )
-        after = after_solve(jnp, runs, outcome, t1)
-        return after, filled.with_samples(
-            (since >= 0.0) & (times <= after.end_time), varied_mode.seen(samples[0].T), number
-        )
+        after = after_solve(jnp, found, outcome, t1)
+        return after, filled.with_samples((since >= 0.0) & (times <= after.end_time), one.seen(samples[0].T), number)
 
     def change(
-        varied_mode: VariationalMode, runs: HybridOutcome[Array], filled: Filled
+        one: VariationalMode, found: HybridOutcome[Array], filled: Filled
     ) -> tuple[HybridOutcome[Array], Filled]:
         def seen(mode: AbstractBatchedMode, record: TransitionPath | None, left: Float[Array, " 1"]) -> Any:
             # Relative to an event that is later, a fixed time comes sooner, as the horizon does.
             return None if record is None else _on_the_way(mode, record, times - t1 + left)
 
-        left = greatest(t1 - runs.end_time, 0.0)
-        transition, shown, variations = varied_mode.left_behind(runs.state, left, seen)
-        after = after_reset(jnp, runs, transition, t1)
+        left = greatest(t1 - found.end_time, 0.0)
+        transition, shown, variations = one.left_behind(found.state, left, seen)
+        after = after_reset(jnp, found, transition, t1)
         if shown is not None:
-            inside = (times > runs.end_time) & (times <= after.end_time)
+            inside = (times > found.end_time) & (times <= after.end_time)
             filled = filled.with_samples(inside, (shown, variations), BETWEEN)
-        grazes = after.counts[-1, 0] > runs.counts[-1, 0]
+        grazes = after.counts[-1, 0] > found.counts[-1, 0]
         return after, filled._replace(
-            grazed=jnp.where(grazes, jnp.minimum(filled.grazed, runs.end_time[0]), filled.grazed)
+            grazed=jnp.where(grazes, jnp.minimum(filled.grazed, found.end_time[0]), filled.grazed)
         )
 
     def one_round(carry: Any) -> Any:
-        runs, filled, rounds = carry
-        at = runs.mode[0]
-        for number, varied_mode in enumerate(modes):
-            under_way = (runs.status[0] == RUNNING) & (at == number)
+        found, filled, rounds = carry
+        at = found.mode[0]
+        for numbers in kinds_of_modes:
+            under_way = (found.status[0] == RUNNING) & jnp.isin(at, jnp.asarray(numbers))
 
-            def solve_mode(
-                varied_mode: VariationalMode = varied_mode, number: int = number, runs: Any = runs, filled: Any = filled
-            ) -> Any:
-                stayed = stay(varied_mode, number, runs, filled)
-                return jax.lax.cond(
-                    stayed[0].status[0] == LEFT_DOMAIN, lambda: change(varied_mode, *stayed), lambda: stayed
-                )
+            def here(numbers: tuple[int, ...] = numbers, found: Any = found, filled: Any = filled) -> Any:
+                one = selected(modes, numbers, at)
+                stayed = stay(one, at, found, filled)
+                return jax.lax.cond(stayed[0].status[0] == LEFT_DOMAIN, lambda: change(one, *stayed), lambda: stayed)
 
-            runs, filled = jax.lax.cond(under_way, solve_mode, lambda runs=runs, filled=filled: (runs, filled))
-        return runs, filled, rounds + 1
+            found, filled = jax.lax.cond(under_way, here, lambda found=found, filled=filled: (found, filled))
+        return found, filled, rounds + 1
 
     return in_rounds(one_round, start, empty)
+
+
+def alike(modes: tuple[AbstractBatchedMode, ...]) -> list[tuple[int, ...]]:
+    """The numbers of the modes, those together that differ in the values of their arrays only: one program serves them."""
+    groups: list[list[int]] = []
+    for number, mode in enumerate(modes):
+        shape = _shape(mode)
+        group = next((group for group in groups if eqx.tree_equal(_shape(modes[group[0]]), shape)), None)
+        if group is None:
+            groups.append([number])
+        else:
+            group.append(number)
+    return [tuple(group) for group in groups]
+
+
+def _shape(mode: AbstractBatchedMode) -> Any:
+    """A mode with the shapes of its arrays in place of their values."""
+    return jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)) if eqx.is_array(leaf) else leaf, mode)
+
+
+def selected(modes: tuple[VariationalMode, ...], numbers: tuple[int, ...], at: Array) -> VariationalMode:
+    """The mode numbered `at`, one of some that are `alike`."""
+    mode = modes[numbers[0]]
+    for number in numbers[1:]:
+
+        def leaf(old: Any, new: Any, number: int = number) -> Any:
+            return old if old is new or not eqx.is_array(old) else jnp.where(at == number, new, old)
+
+        mode = jax.tree.map(leaf, mode, modes[number])
+    return mode
 
 
 def _on_the_way(
@@ -233,7 +258,7 @@ def _on_the_way(
     return mode.between(motions, jnp.where(jnp.isfinite(began), since - began, 0.0))
 
 
-def _assembled(
+def _found(
     ended: HybridOutcome[Array], filled: Filled, times: Float[Array, " times"], size: int, count: int
 ) -> tuple[HybridSamples, list[HybridSamples]]:
     """The samples, and their derivative along each tangent."""
@@ -241,9 +266,9 @@ def _assembled(
     late = jnp.where(times > filled.grazed, jnp.nan, 0.0)
     # The variation of a time stands behind that of the state; a horizon does not move.
     later = [ended.state[k * (size + 1) + size, 0] for k in range(1, count + 1)]
-    later = [jnp.where(status == REACHED_END, 0.0, jnp.where(grazed, jnp.nan, variation)) for variation in later]
+    later = [jnp.where(status == REACHED_END, 0.0, jnp.where(grazed, jnp.nan, one)) for one in later]
     numbers = (status, ended.steps[0], ended.rejected[0], ended.counts[:-1, 0])
     others = (part.astype(float) for part in numbers)
-    samples = HybridSamples(filled.shown, filled.number, end_time, ended.state[:size, 0], *others)
+    found = HybridSamples(filled.shown, filled.number, end_time, ended.state[:size, 0], *others)
     slopes = [HybridSamples(filled.variations[k] + late, UNCHANGED, later[k], *(UNCHANGED,) * 5) for k in range(count)]
-    return samples, slopes
+    return found, slopes

@@ -116,7 +116,7 @@ def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.Ab
     bounds = [*run_bounds(ride.t1, ride.settings.tolerance), *times_bounds(times, ride.t1)]
     may = ride.scene.may_start(ride.launch, ride.input) & jnp.all(legal(bounds)) & jnp.all(jnp.diff(times) > 0.0)
     # A run of illegal numbers might never reach its end, so it is not begun, unless its steps have a given length.
-    begins = may | (ride.grid is not None)
+    begins = may if ride.grid is None else True
     run_times = jnp.where(begins, times, 0.0)
     # Nor is its tolerance that of its block.
     settings = ride.settings.with_tolerance(jnp.where(may, ride.settings.tolerance, LOOSEST))

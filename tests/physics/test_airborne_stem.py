@@ -16,8 +16,10 @@ from hop_reference import CASES as ON_THE_PLANE
 from test_leaning import REFERENCE as FOUND_ON_THE_PLANE
 
 import tippe
+from nonholonomic.hybrid.samples import alike
 from tippe.modes.airborne import ON_STEM, STRIKING
 from tippe.modes.airborne_stem import FlyBoth
+from tippe.runs.airborne_trajectory import arena_modes
 
 REFERENCE = recorded()
 STEM = tippe.Stem(radius=5e-3, offset=0.016)
@@ -90,6 +92,33 @@ def test_a_top_that_leans_ends_as_unresolved():
     assert "unresolved: sphere and stem came to rest on the arena together" in str(run)
     assert_close(run.end_time, leans, atol=1e-4)
     assert_close(run.theta[-1], np.arccos((STEM.radius - TOP.radius) / (STEM.offset - TOP.offset)), atol=1e-4)
+
+
+def test_both_spheres_share_their_programs_in_a_batch():
+    """Sliding on either sphere, and flying and striking, differ in the values of their arrays only."""
+    modes, _, _ = arena_modes((stem_scene(tippe.Cylinder(0.3), 0.3), tippe.Launch(0.1, 180.0)), jnp.asarray(1e-9))
+    assert alike(modes) == [(0, 2), (1, 3)]
+
+
+@pytest.mark.slow
+def test_a_batch_is_its_single_runs():
+    """`vmap` of `simulate` compiles for a minute of CPU time."""
+    scene, times = stem_scene(tippe.Cylinder(0.3), 0.3), jnp.linspace(0.0, 0.05, 6)
+
+    def run(theta):
+        return tippe.simulate(scene, tippe.Launch(theta, 180.0), 0.05, times, 1e-10)
+
+    def seen(theta):
+        found = run(theta)
+        return found.theta, found.contact, found.stats["hops"]
+
+    batch = jax.jit(jax.vmap(seen))(jnp.array([0.1, 2.3]))
+    for theta, found, contact, hops in zip((0.1, 2.3), *batch, strict=True):
+        single = run(theta)
+        assert_close(found, single.theta, atol=1e-8)
+        np.testing.assert_array_equal(contact, single.contact)
+        assert hops == len(single.hops)
+    assert set(np.asarray(batch[1]).ravel()) == {0, 1}
 
 
 @pytest.mark.slow

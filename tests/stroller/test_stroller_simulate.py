@@ -1,5 +1,6 @@
 """Runs: integrators, energy audit, reports, gradients, bad input."""
 
+import dataclasses
 import itertools
 
 import diffrax
@@ -73,6 +74,25 @@ def test_midpoint_steps_end_on_the_times_asked_for():
     np.testing.assert_allclose(run.t, [0.0, 0.333, 1.0], rtol=1e-15)
     assert int(run.stats.steps) == 4 + 7
     np.testing.assert_allclose(run.energy_residual, 0.0, atol=1e-13)
+
+
+def test_a_batch_of_implicit_rides_compiles_without_a_complaint(capfd):
+    """XLA's simplifier wrote that it was stuck in a loop, about `x | true` in a batch."""
+    known = jax.config.jax_enable_compilation_cache
+    jax.config.update("jax_enable_compilation_cache", False)
+
+    @jax.jit
+    @jax.vmap
+    def speed(speed):
+        launch = dataclasses.replace(LAUNCH, speed=speed)
+        return stroller.simulate(FULL, launch, 0.2, times=[0.2], solver=ImplicitMidpoint(0.1)).speed
+
+    try:
+        speeds = speed(jnp.array([1.0, 2.0]))
+    finally:
+        jax.config.update("jax_enable_compilation_cache", known)
+    assert capfd.readouterr().err == ""
+    assert jnp.isfinite(speeds).all()
 
 
 def test_a_ride_by_the_midpoint_rule_can_be_kept_on_disk():
