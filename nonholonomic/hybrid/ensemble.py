@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -104,15 +103,26 @@ class HybridOutcome(NamedTuple):
 
 
 @eqx.filter_jit
-def _problem(mode: AbstractBatchedMode, state: Float[Array, "components cells"]) -> AbstractProblem:
-    return mode.problem(state)
+def _problem(
+    mode: AbstractBatchedMode, cell: Int[Array, " cells"], state: Float[Array, "components cells"]
+) -> AbstractProblem:
+    return _of_cells(mode, cell).problem(state)
 
 
 @compiled_quickly
 def _leave(
-    mode: AbstractBatchedMode, state: Float[Array, "components cells"], left: Float[Array, " cells"]
+    mode: AbstractBatchedMode,
+    cell: Int[Array, " cells"],
+    state: Float[Array, "components cells"],
+    left: Float[Array, " cells"],
 ) -> Transition:
-    return mode.reset_map(state, left)
+    return _of_cells(mode, cell).reset_map(state, left)
+
+
+def _of_cells(mode: AbstractBatchedMode, cell: Int[Array, " cells"]) -> AbstractBatchedMode:
+    """A mode of some cells."""
+    numbers, rest = eqx.partition(mode, eqx.is_array)
+    return eqx.combine(jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[..., cell], numbers), rest)
 
 
 def solve_hybrid(
@@ -193,15 +203,12 @@ def _compile(
 
 
 def _gather(
-    mode: AbstractBatchedMode, found: HybridOutcome, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
-) -> tuple[Any, ...]:
-    """The mode, the states and the remaining times of some cells, padded to the full number of cells."""
+    found: HybridOutcome, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
+) -> tuple[Int[np.ndarray, " cells"], Float[np.ndarray, "components cells"], Float[np.ndarray, " cells"]]:
+    """The numbers, the states and the remaining times of some cells, padded to the full number of cells."""
     size = len(found.status)
     cell = np.concatenate([some, np.full(size - some.size, some[-1] if some.size else 0)])
-    numbers, rest = eqx.partition(mode, eqx.is_array)
-    numbers = jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., cell], numbers)
-    left = jnp.asarray(np.maximum(t1[cell] - found.end_time[cell], 0.0))
-    return eqx.combine(numbers, rest), jnp.asarray(found.state[:, cell]), left
+    return cell, found.state[:, cell], np.maximum(t1[cell] - found.end_time[cell], 0.0)
 
 
 def _march(
@@ -213,10 +220,9 @@ def _march(
     options: dict[str, Any],
 ) -> None:
     """Solve some cells to the end of their mode and store the outcome."""
-    mode, state, left = _gather(mode, found, some, t1)
-    problem = _problem(mode, state)
-    count = jnp.asarray(some.size)
-    outcome, _ = solve_ensemble(problem, left, count, settings, **options)
+    cell, state, left = _gather(found, some, t1)
+    problem = _problem(mode, cell, state)
+    outcome, _ = solve_ensemble(problem, left, np.asarray(some.size), settings, **options)
     outcome = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], outcome)
     _store(found, some, after_solve(np, _some(found, some), outcome, t1[some]))
 
@@ -225,7 +231,7 @@ def _pass_on(
     mode: AbstractBatchedMode, found: HybridOutcome, some: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
 ) -> None:
     """Apply the reset map to some cells and store the transition."""
-    transition = _leave(*_gather(mode, found, some, t1))
+    transition = _leave(mode, *_gather(found, some, t1))
     transition = jax.tree.map(lambda values: np.asarray(values)[..., : some.size], transition)
     _store(found, some, after_reset(np, _some(found, some), transition, t1[some]))
 
