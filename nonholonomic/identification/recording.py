@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -188,7 +188,7 @@ def model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Ar
 
 
 def predicted(
-    recordings: list[tuple[AbstractRecording, Values]],
+    recordings: Sequence[tuple[AbstractRecording, Values]],
     rows: int,
     run: Callable[[Values, Float[Array, " times"]], Any],
     column: Callable[[Any, str], Float[Array, " times"]],
