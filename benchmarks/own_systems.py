@@ -1,4 +1,4 @@
-"""Event times of users' own systems: ten bounces of a ball, and the turn of a Chaplygin sleigh, beside vmapped Diffrax.
+"""Event times of users' own systems: ten bounces of a ball, and the turn of a Chaplygin sleigh, beside Diffrax and heyoka.
 
 `python benchmarks/own_systems.py` prints, for each system, program and tolerance, the CPU time of a run without compilation,
 and the median and largest error of the times against a closed form or an independent reference. A second table compares the
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 from measure import machine, one_core, table, timed
+from peers import available
 from scipy.integrate import solve_ivp
 
 import nonholonomic
@@ -142,10 +143,63 @@ def sleigh_by_diffrax(tolerance: float) -> Callable[[Any, Any], Any]:
     return jax.jit(jax.vmap(time, (0, None)))
 
 
-def diffrax_of(made: Callable[[float], Any], tolerance: float, starts: Any, number: float) -> Callable[[], Any]:
+def times_of(build: Callable[[float], Any], tolerance: float, starts: Any, number: float) -> Callable[[], Any]:
     """The times of all runs, by a program that is compiled once."""
-    run, starts = made(tolerance), jnp.asarray(starts)
+    run = build(tolerance)
     return lambda: run(starts, number)
+
+
+def ball_by_heyoka(tolerance: float) -> Callable[[Any, Any], Any]:
+    """heyoka, one run after the other: each bounce is a terminal event with a callback that resets the velocity."""
+    import heyoka
+
+    height, speed = heyoka.make_vars("height", "speed")
+    bounces, restitution = 0, 0.0
+
+    def bounce(integrator: Any, sign: int) -> bool:
+        nonlocal bounces
+        bounces += 1
+        integrator.state[1] *= -restitution
+        return bounces < BOUNCES
+
+    event = heyoka.t_event(height, callback=bounce, direction=heyoka.event_direction.negative)
+    field = [(height, speed), (speed, heyoka.expression(-GRAVITY))]
+    integrator = heyoka.taylor_adaptive(field, [1.0, 0.0], tol=tolerance, t_events=[event])
+
+    def times(heights: Any, number: float) -> Any:
+        nonlocal bounces, restitution
+        restitution, found = number, np.empty(len(heights))
+        for k, start in enumerate(heights):
+            bounces, integrator.time = 0, 0.0
+            integrator.state[:] = start, 0.0
+            integrator.reset_cooldowns()
+            integrator.propagate_until(20.0)
+            found[k] = integrator.time
+        return found
+
+    return times
+
+
+def sleigh_by_heyoka(tolerance: float) -> Callable[[Any, Any], Any]:
+    """heyoka, one run after the other to a terminal event, from the equations written by hand."""
+    import heyoka
+
+    variables = heyoka.make_vars("heading", "speed", "rate")
+    field = list(zip(variables, sleigh_field(None, variables, heyoka.par[0]), strict=True))
+    event = heyoka.t_event(ANGLE - variables[0], direction=heyoka.event_direction.negative)
+    integrator = heyoka.taylor_adaptive(field, [0.0, 1.0, 1.3], pars=[0.3], tol=tolerance, t_events=[event])
+
+    def times(speeds: Any, ahead: float) -> Any:
+        integrator.pars[0], found = ahead, np.empty(len(speeds))
+        for k, speed in enumerate(speeds):
+            integrator.time = 0.0
+            integrator.state[:] = 0.0, speed, 1.3
+            integrator.reset_cooldowns()
+            integrator.propagate_until(5.0)
+            found[k] = integrator.time
+        return found
+
+    return times
 
 
 def rows_of(name: str, starts: Any, reference: Any, runs: dict[str, Callable[[float], Any]]) -> list[dict[str, str]]:
@@ -200,13 +254,17 @@ def main() -> None:
         "nonholonomic.sweep": table_of(
             nonholonomic.Hybrid([Ball()]), [1.0, 0.0, 0.0], 20.0, tenth, {"start[0]": heights}
         ),
-        "Diffrax, vmapped": lambda tolerance: diffrax_of(ball_by_diffrax, tolerance, heights, 0.8),
+        "Diffrax, vmapped": lambda tolerance: times_of(ball_by_diffrax, tolerance, jnp.asarray(heights), 0.8),
     }
+    if available("heyoka"):
+        balls["heyoka, scalar"] = lambda tolerance: times_of(ball_by_heyoka, tolerance, heights, 0.8)
     rows = rows_of("ball", heights, np.asarray(ball_reference(heights, 0.8)), balls)
     sleighs = {
         "nonholonomic.sweep": table_of(Sleigh(), sleigh_starts, 5.0, turned, {"rate[0]": speeds}),
-        "Diffrax, vmapped": lambda tolerance: diffrax_of(sleigh_by_diffrax, tolerance, speeds, 0.3),
+        "Diffrax, vmapped": lambda tolerance: times_of(sleigh_by_diffrax, tolerance, jnp.asarray(speeds), 0.3),
     }
+    if available("heyoka"):
+        sleighs["heyoka, scalar"] = lambda tolerance: times_of(sleigh_by_heyoka, tolerance, speeds, 0.3)
     rows += rows_of("sleigh", speeds, sleigh_reference(speeds[:64], 0.3), sleighs)
     print(table(rows))
 

@@ -3,12 +3,13 @@
 The forms agree where all of them apply, so each is a check of the others and of equations written out by hand.
 """
 
+from .brackets import Coordinates as Coordinates
+from .brackets import structure_constants as structure_constants
 from .formulation import AbstractFormulation as AbstractFormulation
 from .formulation import AbstractSystem as AbstractSystem
 from .formulation import ConstrainedConnection as ConstrainedConnection
-from .formulation import Coordinates as Coordinates
 from .formulation import Hamel as Hamel
 from .formulation import Multipliers as Multipliers
 from .formulation import ReducedBracket as ReducedBracket
 from .formulation import Routhian as Routhian
-from .formulation import structure_constants as structure_constants
+from .lagrange import Lagrange as Lagrange

@@ -14,7 +14,6 @@ the object. They take one state (n,); use `jax.vmap` for many. The production mo
 
 import abc
 import warnings
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -24,9 +23,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..geometry import solve
 from ..validation import as_number, is_traced, require
-
-Coordinates = Float[Array, " n"]
-Frame = Callable[[Coordinates], Float[Array, "n n"]]
+from .brackets import Coordinates, lie_brackets
 
 #: Violation of the constraints, relative to the velocity, above which a start is worth a warning.
 START_TOLERANCE = 1e-9
@@ -143,27 +140,6 @@ class Routhian(AbstractSystem):
 
     def force(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
         return jnp.delete(self.full.force(t, *self.complete(q, rate)), self.cyclic)
-
-
-def lie_brackets(fields: Callable[[Coordinates], Float[Array, "n m"]], q: Coordinates) -> Float[Array, "n m m"]:
-    """Lie brackets of vector fields: component i of [X_a, X_b] = (X_a.d) X_b - (X_b.d) X_a at [i, a, b].
-
-    **Arguments:**
-
-    - `fields`: function of the coordinates (n,) that gives m fields as the columns of an (n, m) array.
-    - `q`: where to evaluate, (n,).
-    """
-    along = jnp.einsum("ibk,ka->iab", jax.jacfwd(fields)(q), fields(q))
-    return along - jnp.swapaxes(along, 1, 2)
-
-
-def structure_constants(frame: Frame, q: Coordinates) -> Float[Array, "n n n"]:
-    """Structure coefficients of a frame, [E_a, E_b] = c^c_ab E_c, at [c, a, b].
-
-    **Arguments:** as for `lie_brackets`, with as many fields as coordinates.
-    """
-    brackets = lie_brackets(frame, q)
-    return solve(frame(q), brackets.reshape(q.size, -1)).reshape(brackets.shape)
 
 
 class AbstractFormulation(eqx.Module):
@@ -284,7 +260,7 @@ class Hamel(AbstractFormulation):
     def quasi_velocity(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
         """Coordinates and all n quasi-velocities, those that the constraints forbid at 0."""
         n = self.system.dimension
-        return state[:n], jnp.zeros(n, state.dtype).at[: self.system.freedom].set(state[n:])
+        return state[:n], jnp.concatenate([state[n:], jnp.zeros(n - self.system.freedom, state.dtype)])
 
     def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
         q, u = self.quasi_velocity(state)
@@ -300,11 +276,13 @@ class Hamel(AbstractFormulation):
             return system.lagrangian(q, system.frame(q) @ u)
 
         momentum = jax.grad(lagrangian, argnums=1)
-        p, swell = jax.jvp(lambda q: momentum(q, u), (q,), (rate,))
+        swell = jax.jvp(lambda q: momentum(q, u), (q,), (rate,))[1]
         inertia = jax.jacfwd(momentum, argnums=1)(q, u)[:free, :free]
-        gyroscopic = jnp.einsum("kji,j,k->i", structure_constants(system.frame, q), u, p)
+        # c^k_ji p_k is the bracket [E_j, E_i] paired with dL/dq', of which p_k is the part along E_k.
+        along = jax.grad(system.lagrangian, argnums=1)(q, rate)
+        gyroscopic = jnp.einsum("kji,j,k->i", lie_brackets(system.frame, q), u, along)
         forces = E.T @ (jax.grad(lagrangian)(q, u) + system.force(t, q, rate)) + gyroscopic - swell
-        return jnp.concatenate([rate, solve(inertia, forces[:free])])
+        return jnp.concatenate([rate, solve(inertia, forces[:free], positive=True)])
 
 
 class ConstrainedConnection(AbstractFormulation):

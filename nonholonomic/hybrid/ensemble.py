@@ -13,7 +13,6 @@ from typing import Any, Generic, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -104,15 +103,26 @@ class HybridOutcome(NamedTuple, Generic[Numbers]):
 
 
 @eqx.filter_jit
-def _problem(mode: AbstractBatchedMode, state: Float[Array, "components cells"]) -> AbstractProblem:
-    return mode.problem(state)
+def _problem(
+    mode: AbstractBatchedMode, cell: Int[Numbers, " cells"], state: Float[Numbers, "components cells"]
+) -> AbstractProblem:
+    return _of_cells(mode, cell).problem(state)
 
 
 @compiled_quickly
 def _reset_map(
-    mode: AbstractBatchedMode, state: Float[Array, "components cells"], left: Float[Array, " cells"]
+    mode: AbstractBatchedMode,
+    cell: Int[Array, " cells"],
+    state: Float[Array, "components cells"],
+    left: Float[Array, " cells"],
 ) -> Transition:
-    return mode.reset_map(state, left)
+    return _of_cells(mode, cell).reset_map(state, left)
+
+
+def _of_cells(mode: AbstractBatchedMode, cell: Int[Numbers, " cells"]) -> AbstractBatchedMode:
+    """A mode of some cells."""
+    numbers, rest = eqx.partition(mode, eqx.is_array)
+    return eqx.combine(jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[..., cell], numbers), rest)
 
 
 def solve_hybrid(
@@ -195,18 +205,12 @@ def _compile(
 
 
 def _gather(
-    mode: AbstractBatchedMode,
-    runs: HybridOutcome[np.ndarray],
-    selected: Int[np.ndarray, " some"],
-    t1: Float[np.ndarray, " cells"],
-) -> tuple[Any, ...]:
-    """The mode, the states and the remaining times of some cells, padded to the full number of cells."""
+    runs: HybridOutcome[np.ndarray], selected: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
+) -> tuple[Int[np.ndarray, " cells"], Float[np.ndarray, "components cells"], Float[np.ndarray, " cells"]]:
+    """The numbers, the states and the remaining times of some cells, padded to the full number of cells."""
     size = len(runs.status)
     cell = np.concatenate([selected, np.full(size - selected.size, selected[-1] if selected.size else 0)])
-    numbers, static = eqx.partition(mode, eqx.is_array)
-    numbers = jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., cell], numbers)
-    left = jnp.asarray(np.maximum(t1[cell] - runs.end_time[cell], 0.0))
-    return eqx.combine(numbers, static), jnp.asarray(runs.state[:, cell]), left
+    return cell, runs.state[:, cell], np.maximum(t1[cell] - runs.end_time[cell], 0.0)
 
 
 def _solve_mode(
@@ -218,12 +222,11 @@ def _solve_mode(
     options: dict[str, Any],
 ) -> None:
     """Solve some cells to the end of their mode and store the outcome."""
-    mode, state, left = _gather(mode, runs, selected, t1)
-    problem = _problem(mode, state)
-    count = jnp.asarray(selected.size)
-    outcome, _ = solve_ensemble(problem, left, count, settings, **options)
+    cell, state, left = _gather(runs, selected, t1)
+    problem = _problem(mode, cell, state)
+    outcome, _ = solve_ensemble(problem, left, np.asarray(selected.size), settings, **options)
     outcome = jax.tree.map(lambda values: np.asarray(values)[..., : selected.size], outcome)
-    _store(runs, selected, after_solve(np, _of_cells(runs, selected), outcome, t1[selected]))
+    _store(runs, selected, after_solve(np, _selected(runs, selected), outcome, t1[selected]))
 
 
 def _apply_reset(
@@ -233,12 +236,12 @@ def _apply_reset(
     t1: Float[np.ndarray, " cells"],
 ) -> None:
     """Apply the reset map to some cells and store the transition."""
-    transition = _reset_map(*_gather(mode, runs, selected, t1))
+    transition = _reset_map(mode, *_gather(runs, selected, t1))
     transition = jax.tree.map(lambda values: np.asarray(values)[..., : selected.size], transition)
-    _store(runs, selected, after_reset(np, _of_cells(runs, selected), transition, t1[selected]))
+    _store(runs, selected, after_reset(np, _selected(runs, selected), transition, t1[selected]))
 
 
-def _of_cells(runs: HybridOutcome[np.ndarray], selected: Int[np.ndarray, " some"]) -> HybridOutcome[np.ndarray]:
+def _selected(runs: HybridOutcome[np.ndarray], selected: Int[np.ndarray, " some"]) -> HybridOutcome[np.ndarray]:
     return HybridOutcome(*(values[..., selected] for values in runs))
 
 

@@ -36,6 +36,9 @@ from .traced_ensemble import traced_solve_hybrid
 #: allows, changes its rate by more than this fraction. The derivative then errs by about as much.
 GRAZING = 1e-2
 
+#: An event that is nearer than this fraction of the time in its mode is the one at which a run has ended.
+NEARLY = 1e-6
+
 #: Magnitude that scales the error of the clock [s]: the clock has no error, and no share in step-size control.
 UNMEASURED = 1e9
 
@@ -194,13 +197,18 @@ class VariationalMode(AbstractBatchedMode):
             problem = build(*numbers).problem(at)
             if problem.event_function(at) is None:
                 return began
+            # The event was located to a fraction of a step: on the rest of the way the variations change too.
+            rates = problem.field(began, at)
+            value, rate = stop_gradient(jax.jvp(problem.event_function, (at,), (rates,)))
+            rest = -value / jnp.where(rate == 0.0, jnp.inf, rate)
+            at = at + jnp.where(jnp.abs(rest) < NEARLY * lasted, rest, 0.0) * rates
             return began + delay(problem.event_function, at, problem.field(began, at))
 
-        point = (at[:-1], jnp.zeros_like(at[-1]), *numbers)
+        lasted, point = at[-1], (at[:-1], jnp.zeros_like(at[-1]), *numbers)
         tangents = [
             (variation[:-1], variation[-1], *rates) for variation, rates in zip(variations, self._rates(), strict=True)
         ]
-        return jnp.stack([jax.jvp(time, point, tangent)[1] for tangent in tangents])
+        return _along(time, point, tangents)[1]
 
     def parts(self, state: Float[Array, "components cells"]) -> list[Float[Array, "components cells"]]:
         """The state with its clock, and the variations of both."""

@@ -9,10 +9,14 @@ from .csv import read_columns as read_columns
 from .data import free_numbers as free_numbers
 from .data import joined as joined
 from .data import of_data as of_data
+from .data import scene_unknowns as scene_unknowns
 from .data import series_units as series_units
-from .identify import check_search as check_search
 from .identify import identify as identify
 from .likelihood import Measurements as Measurements
+from .model import AbstractDataModel as AbstractDataModel
+from .model import as_sources as as_sources
+from .model import fit_data as fit_data
+from .model import search_options as search_options
 from .posterior import LogDensity as LogDensity
 from .recording import AbstractRecording as AbstractRecording
 from .recording import Quantities as Quantities

@@ -1,12 +1,13 @@
 """Several sets of data fitted together, and the names of the parameters that they share or have of their own."""
 
+import itertools
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from jaxtyping import Int
 
-from ..parameters import full_name
+from ..parameters import full_name, with_numbers
 from . import likelihood
 from .likelihood import Measurements
 from .unknown import Free, as_free
@@ -41,9 +42,19 @@ def of_data(parameters: dict[str, Any], k: int) -> dict[str, Any]:
     return shared | own
 
 
+def scene_unknowns(free: Any, scene: Any, launch: Any, shared: list[str], own: list[list[str]]) -> dict[str, Free]:
+    """The unknowns of a scene, its launches and its data, as for `free_numbers`; scene and launch check their numbers."""
+    roots = {"scene": scene, "launch": launch}
+
+    def check(values: dict[str, float]) -> None:
+        with_numbers(roots, {name: value for name, value in values.items() if name != "t0"})
+
+    return free_numbers(free, shared, own, check)
+
+
 def free_numbers(
     free: Any,
-    known: list[str],
+    shared: list[str],
     own: list[list[str]],
     check: Callable[[dict[str, float]], Any],
 ) -> dict[str, Free]:
@@ -53,13 +64,15 @@ def free_numbers(
 
     - `free`: name, or its unambiguous end, -> a `Free` or where to start. `data[1].launch.azimuth` is a parameter of the
       second set of data alone, and `data[*].launch.azimuth` stands for one of each.
-    - `known`: the full names of the shared parameters; `own`: those of each set of data, without the prefix.
+    - `shared`: full names of the parameters of the model; `own`: those of each set of data, without the prefix, which are
+      shared too where a name has none.
     - `check`: name -> number, without prefixes; it raises `ValueError` for values that are refused.
 
     **Returns:** full name -> `Free`.
 
     **Raises:** `ValueError` for an unknown name, or starts that are refused.
     """
+    known = [*shared, *dict.fromkeys(itertools.chain(*own))]
     unknowns: dict[str, Free] = {}
     for short, unknown in as_free(free).items():
         for name in _full_names(short, known, own):

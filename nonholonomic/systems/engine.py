@@ -5,6 +5,7 @@ out as in equations written for the engine: components along the first axis, lan
 state where a function depends on it.
 """
 
+import contextlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..hybrid import AbstractBatchedMode, Transition
 from ..integration import CROSSED, FAILED, LEFT_DOMAIN, RUNNING, AbstractProblem, Lanes, States
+from .components import TooLarge, by_components
 from .form import Form, OfRun
 from .mode import State
 from .tracing import spelled_out
@@ -72,6 +74,11 @@ class ModeProblem(AbstractProblem):
             return function(numbers, *time_and_state(self.form, parts))
 
         parts = tuple(state)
+        numbers = tuple(jax.ShapeDtypeStruct((), jnp.asarray(number).dtype) for number in self.numbers)
+        shapes = (numbers, tuple(jax.ShapeDtypeStruct((), part.dtype) for part in parts))
+        with contextlib.suppress(TooLarge):
+            results = by_components(of_run, *shapes)(self.numbers, parts)
+            return jax.tree.map(lambda result: jnp.broadcast_to(result, parts[0].shape), results)
         if parts[0].ndim == 0:
             return spelled_out(of_run)(self.numbers, parts)
         axes = tuple(0 if jnp.ndim(number) else None for number in self.numbers)

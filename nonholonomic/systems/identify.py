@@ -1,8 +1,8 @@
 """Numbers of a user's system from recorded runs."""
 
 import dataclasses
-import itertools
 import re
+from collections.abc import Hashable
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -10,9 +10,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .. import identification as generic
 from ..formulations import AbstractSystem
-from ..identification import AbstractRecording, Identification, Quantities, as_quantity, model_times, of_data
+from ..identification import (
+    AbstractDataModel,
+    AbstractRecording,
+    Identification,
+    Quantities,
+    as_quantity,
+    as_sources,
+    fit_data,
+    free_numbers,
+    model_times,
+    search_options,
+)
 from ..integration import tolerance_bound
 from ..progress import status_line
 from ..validation import as_number, as_number_or_none
@@ -66,23 +76,21 @@ class Recording(AbstractRecording):
     quantities: ClassVar[Quantities] = Components({}, {}, frozenset())
 
 
-class SystemModel(eqx.Module):
-    """Predictions of all recordings of a system, in the form that `nonholonomic.identification.identify` expects.
-
-    `seen` says which of the predictions were measured.
-    """
+class SystemModel(AbstractDataModel):
+    """Predictions of all recordings of a system."""
 
     system: System
     data: tuple[Recording, ...]
     seen: Int[Array, " n"]
     tolerance: Float[Array, ""] = eqx.field(converter=as_number)
 
-    def __call__(self, parameters: dict[str, Float[Array, " rows"]]) -> Float[Array, "rows n"]:
-        parts = [
-            jax.vmap(lambda row, one=one: self._predict(one, row))(of_data(parameters, k))
-            for k, one in enumerate(self.data)
-        ]
-        return jnp.concatenate(parts, axis=1)[:, self.seen]
+    def together(self, source: Recording, values: dict[str, Array]) -> Hashable:
+        return None
+
+    def predict(
+        self, sources: list[tuple[Recording, dict[str, Array]]], rows: int
+    ) -> list[Float[Array, "rows samples"]]:
+        return [jax.vmap(lambda row, one=one: self._predict(one, row))(values) for one, values in sources]
 
     def _predict(self, recording: Recording, row: dict[str, Array]) -> Float[Array, " samples"]:
         """What is recorded of one run, a time after the other."""
@@ -150,13 +158,11 @@ def identify(
 
     ```
     """
-    data = tuple(data) if isinstance(data, list | tuple) else (data,)
+    search = search_options(starts, spread, seed, max_steps, progress)
+    data = as_sources(data, Recording, "a nonholonomic.Recording")
     for one in data:
-        if not isinstance(one, Recording):
-            raise ValueError(f"data = {one!r} must be a nonholonomic.Recording, or a list of them")
         check_run(system, one.launch, one.times[-1], tolerance)
     tolerance_bound(tolerance).require()
-    generic.check_search(starts, spread, seed, max_steps, progress)
     if isinstance(system, Hybrid):
         system = dataclasses.replace(system, event=None)
     named = [numbers_of(system, one) for one in data]
@@ -167,16 +173,10 @@ def identify(
         check_again(named[0].tree(named[0].replaced({name: jnp.asarray(value) for name, value in values.items()})))
 
     with status_line("fitting", progress):
-        unknowns = generic.free_numbers(free, [*known, *dict.fromkeys(itertools.chain(*own))], own, check)
-        measurements, labels, seen = generic.joined(data)
-        return generic.identify(
-            SystemModel(system, data, jnp.asarray(seen), tolerance),
-            measurements,
+        unknowns = free_numbers(free, known, own, check)
+        return fit_data(
+            lambda seen: SystemModel(system=system, data=data, seen=jnp.asarray(seen), tolerance=tolerance),
+            data,
             unknowns,
-            starts=starts,
-            spread=spread,
-            seed=seed,
-            max_steps=max_steps,
-            labels=labels,
-            progress=progress,
+            search,
         )

@@ -26,7 +26,7 @@ from ..integration import (
     solve_ensemble,
 )
 from ..parameters import full_name
-from ..sweeps import Table, Variable, axis
+from ..sweeps import Table, Variable, axis, chunk_for, size_of
 from ..sweeps import sweep as computed
 from ..validation import as_number
 from .engine import Cells
@@ -34,6 +34,9 @@ from .mode import Event, Hybrid
 from .numbers import Named, check_again, has_checks, short_names
 from .system import Run, System, check_run, run_of
 from .tracing import dependent_outputs
+
+#: Cells in a block of a large grid at least: runs of small systems are short, and what is done once for a block counts.
+BLOCK = 1024
 
 #: How a run can end, and the code of each word but the first.
 WORDS = ("event", "completed", "stopped", "failed", "unresolved")
@@ -128,7 +131,10 @@ def sweep(
         "tolerance": float(tolerance),
         "solver": type(Settings(tolerance, solver).for_lanes).__name__,
     }
-    return computed(job, grid, job.variables(run, shorts), request, path=path, progress=progress, executor=executor)
+    cells = size_of(grid)
+    chunk = max(BLOCK, chunk_for(cells)) if cells > 4 * BLOCK else None
+    options = {"chunk": chunk, "path": path, "progress": progress, "executor": executor}
+    return computed(job, grid, job.variables(run, shorts), request, **options)
 
 
 def _function(event: Any) -> Any:
@@ -176,23 +182,23 @@ class SweepJob(NamedTuple):
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which the first `count` are to be run."""
         size = next((len(values) for values in columns.values()), 1)
-        cells, tangents, scales = _cells(self.named, columns, self.by, size)
-        settings, traits = Settings(jnp.asarray(self.tolerance), self.solver), cells.form.traits
+        cells, begin, tangents, scales = _cells(self.named, columns, self.by, size)
+        settings, t1 = Settings(np.asarray(self.tolerance), self.solver), np.asarray(self.t1)
         grazing, slopes = None, []
-        if traits.smooth:
-            problem, counted, t1 = cells.problem(size), jnp.asarray(count), jnp.asarray(self.t1)
+        if cells.form.traits.smooth:
+            problem, counted = begin, np.asarray(count)
             if self.by:
                 outcome, slopes = solve_ensemble_with_tangents(problem, tangents, t1, counted, settings)
             else:
                 outcome, _ = solve_ensemble(problem, t1, counted, settings)
         else:
-            modes, first, states = cells.modes(size)
-            begin = (np.asarray(first), np.asarray(states), np.asarray(self.t1), count, settings)
+            modes, first, states = begin
+            options = (np.asarray(first), np.asarray(states), t1, count, settings)
             if self.by:
-                outcome, found = solve_hybrid_with_tangents(modes, tangents, *begin, counters=1)
+                outcome, found = solve_hybrid_with_tangents(modes, tangents, *options, counters=1)
                 slopes, grazing = found.slopes, np.asarray(found.grazing)
             else:
-                outcome = solve_hybrid(modes, *begin, counters=1)
+                outcome = solve_hybrid(modes, *options, counters=1)
         crossed = np.asarray(outcome.status) == CROSSED
         shorts = short_names([*columns, *(name for name in self.by if name not in columns)])
         found = {
@@ -223,8 +229,10 @@ class SweepJob(NamedTuple):
 
 
 @eqx.filter_jit
-def _cells(named: Named, columns: dict[str, Any], by: tuple[str, ...], size: int) -> tuple[Cells, Any, list[Array]]:
-    """The cells, their tangents by some numbers, and by how much these move each."""
+def _cells(
+    named: Named, columns: dict[str, Any], by: tuple[str, ...], size: int
+) -> tuple[Cells, Any, Any, list[Array]]:
+    """The cells, what the engine runs them as, the tangents of that by some numbers, and by how much these move each."""
     values = named.replaced({name: jnp.asarray(column) for name, column in columns.items()})
     varied = [k for k, name in enumerate(named.names) if name in columns or name in by]
 
@@ -257,7 +265,8 @@ def _cells(named: Named, columns: dict[str, Any], by: tuple[str, ...], size: int
     scales = [tangent_scale(point[k]) for k in where]
     rows = [tuple(scale if i == j else jnp.zeros_like(scale) for j, scale in enumerate(scales)) for i in range(len(by))]
     tangents = tangents_of(problem, tuple(point[k] for k in where), rows) if by else ()
-    return of_all(*point), tangents, scales
+    cells = of_all(*point)
+    return cells, cells.problem(size) if cells.form.traits.smooth else cells.modes(size), tangents, scales
 
 
 @eqx.filter_jit

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..formulations import AbstractFormulation, AbstractSystem, Hamel, Multipliers
+from ..formulations import AbstractFormulation, AbstractSystem, Hamel, Lagrange
 from ..integration import run_bounds
 from ..validation import as_number, is_traced, require, require_all
 from .engine import Cells
@@ -45,11 +45,12 @@ class MechanicalEvent(eqx.Module):
 def formulation_of(system: AbstractSystem) -> AbstractFormulation:
     """The equations of motion that a mechanical system is run with.
 
-    They are in the quasi-velocities of its own frame, if it has one, which obey the constraints exactly; otherwise with
-    Lagrange multipliers.
+    They are in the quasi-velocities of its own frame, if it has one, which obey the constraints exactly, or if it writes its
+    own Lagrangian, which may have terms linear in the velocities; otherwise with Lagrange multipliers.
     """
     has_frame = type(system).frame is not AbstractSystem.frame
-    return Hamel(system) if has_frame else Multipliers(system)
+    has_lagrangian = type(system).lagrangian is not AbstractSystem.lagrangian
+    return Hamel(system) if has_frame or has_lagrangian else Lagrange(system)
 
 
 class Run(NamedTuple):
@@ -134,9 +135,9 @@ def _check_mechanical_start(system: AbstractSystem, start: Any) -> None:
         raise ValueError(
             f"start: rate = {np.asarray(rate)} violates the constraints by {worst:.3g}; constraints(q) @ rate must be 0"
         )
-    has_frame = type(system).frame is not AbstractSystem.frame
-    if has_frame and float(jnp.max(jnp.abs(frame))) > VIOLATION * float(jnp.max(jnp.abs(constraints))):
+    across = float(jnp.max(jnp.abs(frame)))
+    if isinstance(formulation_of(system), Hamel) and across > VIOLATION * float(jnp.max(jnp.abs(constraints))):
         raise ValueError(
             f"frame(q): the constraints must annihilate its first {system.freedom} columns, and do so only up to "
-            f"{float(jnp.max(jnp.abs(frame))):.3g}; leave it out to run with Lagrange multipliers"
+            f"{across:.3g}; leave it out to run with Lagrange multipliers"
         )

@@ -19,8 +19,8 @@ ELEMENTARY = """
     concatenate convert_element_type copy copy_p cos cosh custom_jvp_call custom_vjp_call digamma div eq erf erf_inv erfc exp
     exp2 expand_dims expm1 floor full ge gt integer_pow iota is_finite jit le lgamma log log1p logistic lt max min mul ne neg
     nextafter not optimization_barrier or pad pjit pow reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rem
-    reshape rev round rsqrt select_and_n select_n sign sin sinh slice split sqrt square squeeze stop_gradient sub tan tanh
-    transpose xor zeros_like
+    reshape rev round rsqrt select_and_n select_n sign sin sinh slice split sqrt square squeeze stack stop_gradient sub tan
+    tanh transpose unstack xor zeros_like
 """
 
 #: Products with at most this many terms are written as sums of products, which every compiler of XLA takes.

@@ -1,15 +1,22 @@
 """Parameters of a stroller, its ground and its launch from recorded rides."""
 
-import itertools
+from collections.abc import Hashable
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from nonholonomic import identification as generic
-from nonholonomic.identification import Free, Identification, of_data, predicted
+from nonholonomic.identification import (
+    AbstractDataModel,
+    Free,
+    Identification,
+    as_sources,
+    fit_data,
+    predicted,
+    scene_unknowns,
+    search_options,
+)
 from nonholonomic.integration import tolerance_bound
 from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.progress import status_line
@@ -20,34 +27,19 @@ from ..runs.simulate import simulate
 from .recording import Recording
 
 
-class SceneModel(eqx.Module):
-    """Predictions of all recordings of a scene, in the form that `nonholonomic.identification.identify` expects.
-
-    `seen` says which of the predictions were measured.
-    """
+class SceneModel(AbstractDataModel):
+    """Predictions of all recordings of a scene."""
 
     scene: Scene
     data: tuple[Recording, ...]
     seen: Int[Array | np.ndarray, " n"]
     tolerance: Float[Array, ""] = eqx.field(converter=as_number)
 
-    def __call__(self, parameters: dict[str, Float[Array, " rows"]]) -> Float[Array, "rows n"]:
-        rows = len(next(iter(parameters.values())))
-        values = [of_data(parameters, k) for k in range(len(self.data))]
-        parts: dict[int, Array] = {}
-        rides: dict[Any, list[int]] = {}
-        for k, recording in enumerate(self.data):
-            rides.setdefault(
-                (id(recording.input), tuple(numbers("launch", recording.launch)), tuple(values[k])), []
-            ).append(k)
-        for alike in rides.values():
-            predictions = self._predict([(self.data[k], values[k]) for k in alike], rows)
-            parts |= dict(zip(alike, predictions, strict=True))
-        return jnp.concatenate([parts[k] for k in range(len(self.data))], axis=1)[:, self.seen]
+    def together(self, source: Recording, values: dict[str, Array]) -> Hashable:
+        return id(source.input), tuple(numbers("launch", source.launch)), tuple(values)
 
-    def _predict(self, recordings: list[tuple[Recording, Any]], rows: int) -> list[Float[Array, "rows samples"]]:
-        """What is recorded of rides with one input."""
-        first = recordings[0][0]
+    def predict(self, sources: list[tuple[Recording, Any]], rows: int) -> list[Float[Array, "rows samples"]]:
+        first = sources[0][0]
 
         def run(lane: dict[str, Array], times: Float[Array, " times"]) -> Any:
             roots = with_numbers({"scene": self.scene, "launch": first.launch}, lane)
@@ -56,7 +48,7 @@ class SceneModel(eqx.Module):
         def column(run: Any, name: str) -> Float[Array, " times"]:
             return run.position[:, "xyz".index(name)] if name in ("x", "y", "z") else getattr(run, name)
 
-        return predicted(recordings, rows, run, column)
+        return predicted(sources, rows, run, column)
 
 
 def identify(
@@ -103,37 +95,20 @@ def identify(
 
     ```
     """
-    generic.check_search(starts, spread, seed, max_steps, progress)
+    search = search_options(starts, spread, seed, max_steps, progress)
     with status_line("fitting", progress):
         require_kind(scene, "scene", Scene)
-        data = tuple(data) if isinstance(data, list | tuple) else (data,)
-        if not data or not all(isinstance(recording, Recording) for recording in data):
-            raise ValueError(f"data = {data!r} must be a Recording, or a list of them")
+        data = as_sources(data, Recording, "a Recording")
         tolerance_bound(tolerance).require()
         for recording in data:
             scene.check(recording.launch)
         unknowns = _unknowns_of(scene, data, free)
-        measurements, labels, seen = generic.joined(data)
-        return generic.identify(
-            SceneModel(scene, data, seen, tolerance),
-            measurements,
-            unknowns,
-            starts=starts,
-            spread=spread,
-            seed=seed,
-            max_steps=max_steps,
-            labels=labels,
-            progress=progress,
+        return fit_data(
+            lambda seen: SceneModel(scene=scene, data=data, seen=seen, tolerance=tolerance), data, unknowns, search
         )
 
 
 def _unknowns_of(scene: Scene, data: tuple[Recording, ...], free: Any) -> dict[str, Free]:
     """The unknowns of a scene and its data by their full names, checked."""
-    roots = {"scene": scene, "launch": data[0].launch}
     own = [[*numbers("launch", recording.launch), "t0"] for recording in data]
-
-    def check(values: dict[str, float]) -> None:
-        with_numbers(roots, {name: value for name, value in values.items() if name != "t0"})
-
-    known = [*numbers("scene", scene), *dict.fromkeys(itertools.chain(*own))]
-    return generic.free_numbers(free, known, own, check)
+    return scene_unknowns(free, scene, data[0].launch, list(numbers("scene", scene)), own)

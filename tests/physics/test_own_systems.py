@@ -10,7 +10,7 @@ from rigid_systems import GRAVITY, BallOnTurntable, Bicycle, Disc
 from scipy.linalg import null_space
 
 from nonholonomic import AbstractMode, Hybrid, simulate
-from nonholonomic.formulations import Multipliers
+from nonholonomic.formulations import Lagrange
 
 #: Basu-Mandal, Chatterjee and Papadopoulos, Proc. R. Soc. A 463 (2007) 1983, Table 1: q, its rates, and its accelerations, in
 #: the order of `Bicycle`; x, y, theta and the rotations of the wheels are 0.
@@ -34,7 +34,7 @@ def bicycle():
 
     def described(state):
         q, rate = jnp.split(state, 2)
-        acceleration = Multipliers(system).acceleration(0.0, q, rate)
+        acceleration = Lagrange(system).acceleration(0.0, q, rate)
         return jnp.concatenate([rate, acceleration]), jnp.concatenate([system.heights(q), system.slips(q, rate)])
 
     @jax.jit
@@ -122,7 +122,7 @@ def test_the_gradient_of_a_collision_is_exact():
 
 @eqx.filter_jit
 def acceleration_of(system, q, rate):
-    return Multipliers(system).acceleration(0.0, q, rate)
+    return Lagrange(system).acceleration(0.0, q, rate)
 
 
 def test_the_steady_circles_of_a_rolling_disc():

@@ -1,16 +1,22 @@
 """Parameters of a top, its arena and its launches from inversion times and from recorded motion."""
 
-import itertools
+from collections.abc import Hashable
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from nonholonomic import identification as generic
-from nonholonomic.identification import Free, Identification, of_data
-from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.identification import (
+    AbstractDataModel,
+    Free,
+    Identification,
+    as_sources,
+    fit_data,
+    scene_unknowns,
+    search_options,
+)
+from nonholonomic.parameters import numbers
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, require_kind
 
@@ -23,32 +29,24 @@ from .data import InversionTimes, Recording, Values, predict_recordings
 from .hybrid_fit import HybridModel
 
 
-class SceneModel(eqx.Module):
-    """Predictions of all data of a scene, in the form that `nonholonomic.identification.identify` expects.
-
-    `seen` says which of the predictions were measured.
-    """
+class SceneModel(AbstractDataModel):
+    """Predictions of all data of a scene, whose runs are smooth."""
 
     scene: Scene
     data: tuple[Any, ...]
     seen: Int[Array | np.ndarray, " n"]
     tolerance: Float[Array, ""] = eqx.field(converter=as_number)
 
-    def __call__(self, parameters: Values) -> Float[Array, "rows n"]:
-        rows = len(next(iter(parameters.values())))
-        values = [of_data(parameters, k) for k in range(len(self.data))]
-        parts: dict[int, Array] = {}
-        films: dict[Any, list[int]] = {}
-        for k, one in enumerate(self.data):
-            if isinstance(one, Recording):
-                kind = tuple(name for name, value in numbers("launch", one.launch).items() if value is not None)
-                films.setdefault((kind, tuple(values[k])), []).append(k)
-            else:
-                parts[k] = one.predict(self.scene, values[k], rows, self.tolerance)
-        for alike in films.values():
-            found = predict_recordings(self.scene, [(self.data[k], values[k]) for k in alike], rows, self.tolerance)
-            parts |= dict(zip(alike, found, strict=True))
-        return jnp.concatenate([parts[k] for k in range(len(self.data))], axis=1)[:, self.seen]
+    def together(self, source: Any, values: Values) -> Hashable:
+        if isinstance(source, InversionTimes):
+            return InversionTimes
+        names = tuple(name for name, value in numbers("launch", source.launch).items() if value is not None)
+        return names, tuple(values)
+
+    def predict(self, sources: list[tuple[Any, Values]], rows: int) -> list[Float[Array, "rows size"]]:
+        if isinstance(sources[0][0], Recording):
+            return predict_recordings(self.scene, sources, rows, self.tolerance)
+        return [times.predict(self.scene, values, rows, self.tolerance) for times, values in sources]
 
 
 def identify(
@@ -99,24 +97,15 @@ def identify(
 
     ```
     """
-    generic.check_search(starts, spread, seed, max_steps, progress)
+    search = search_options(starts, spread, seed, max_steps, progress)
     with status_line("fitting", progress):
         data = checked_data(scene, data, tolerance, "identify with slopes = 'exact'" if slopes == "exact" else None)
         unknowns = unknowns_of(scene, data, free)
-        measurements, labels, seen = generic.joined(data)
         smooth = run_kind_of(scene).smooth
         kind = SceneModel if smooth else HybridModel
-        return generic.identify(
-            kind(scene, data, seen, tolerance),
-            measurements,
-            unknowns,
-            starts=starts,
-            spread=spread,
-            seed=seed,
-            max_steps=max_steps,
-            slopes=slopes or ("exact" if smooth else "differences"),
-            labels=labels,
-            progress=progress,
+        slopes = slopes or ("exact" if smooth else "differences")
+        return fit_data(
+            lambda seen: kind(scene=scene, data=data, seen=seen, tolerance=tolerance), data, unknowns, search, slopes
         )
 
 
@@ -125,21 +114,13 @@ def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) 
     require_kind(scene, "scene", Scene)
     if caller is not None:
         check_smooth(scene, caller)
-    data = tuple(data) if isinstance(data, list | tuple) else (data,)
-    if not data or not all(isinstance(one, InversionTimes | Recording) for one in data):
-        raise ValueError(f"data = {data!r} must be an InversionTimes or a Recording, or a list of them")
+    data = as_sources(data, InversionTimes | Recording, "an InversionTimes or a Recording")
     check_run(scene, Launch(0.0, 0.0), 1.0, tolerance)
     return data
 
 
 def unknowns_of(scene: Scene, data: tuple[Any, ...], free: Any) -> dict[str, Free]:
     """The unknowns of a scene and its data by their full names, checked."""
-    of_scene = variable_numbers(scene)
     launches = [[name for name, value in numbers("launch", one.launch).items() if value is not None] for one in data]
     own = [names + ["t0"] * isinstance(one, Recording) for names, one in zip(launches, data, strict=True)]
-    roots = {"scene": scene, "launch": data[0].launch}
-
-    def check(values: dict[str, float]) -> None:
-        with_numbers(roots, {name: value for name, value in values.items() if name != "t0"})
-
-    return generic.free_numbers(free, [*of_scene, *dict.fromkeys(itertools.chain(*own))], own, check)
+    return scene_unknowns(free, scene, data[0].launch, list(variable_numbers(scene)), own)

@@ -44,4 +44,5 @@ def log_density(
         raise ValueError(f"priors = {priors!r} must be a dictionary, name of a number -> (mean, standard deviation)")
     named = {full_name("priors", name, list(unknowns)): prior for name, prior in (priors or {}).items()}
     measurements, _, seen = joined(data)
-    return LogDensity.of(SceneModel(scene, data, seen, tolerance), measurements, unknowns, named, series_units(data))
+    model = SceneModel(scene=scene, data=data, seen=seen, tolerance=tolerance)
+    return LogDensity.of(model, measurements, unknowns, named, series_units(data))

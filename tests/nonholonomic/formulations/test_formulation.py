@@ -10,6 +10,7 @@ from nonholonomic.formulations import (
     AbstractSystem,
     ConstrainedConnection,
     Hamel,
+    Lagrange,
     Multipliers,
     ReducedBracket,
     Routhian,
@@ -82,7 +83,7 @@ class Sleigh(AbstractSystem):
 
 TOP = HeavyTop(jnp.array([1.0, 2.3, 2.9]), jnp.array(0.0))
 SLEIGH = Sleigh(mass=1.7, inertia=0.4, ahead=0.3, drag=0.2)
-ALL = [Multipliers(SLEIGH), Hamel(SLEIGH), ConstrainedConnection(SLEIGH), ReducedBracket(SLEIGH)]
+ALL = [Multipliers(SLEIGH), Lagrange(SLEIGH), Hamel(SLEIGH), ConstrainedConnection(SLEIGH), ReducedBracket(SLEIGH)]
 
 
 def sleigh_motion(v=0.8, omega=1.3):
@@ -123,10 +124,10 @@ def test_routhian_of_the_heavy_top_gives_its_precession_and_nutation():
 
 @pytest.mark.parametrize("formulation", ALL, ids=lambda f: type(f).__name__)
 def test_chaplygin_sleigh(formulation):
-    """All four formulations give the sleigh's equations, and carry coordinates, velocity and energy back and forth."""
+    """All formulations give the sleigh's equations, and carry coordinates, velocity and energy back and forth."""
     q, rate, expected = sleigh_motion()
     state = formulation.state(q, rate)
-    assert state.size == (6 if isinstance(formulation, (Multipliers, ConstrainedConnection)) else 5)
+    assert state.size == (6 if isinstance(formulation, (Multipliers, Lagrange, ConstrainedConnection)) else 5)
     np.testing.assert_allclose(formulation.split(state)[1], rate, rtol=1e-14, atol=1e-15)
     np.testing.assert_allclose(formulation.acceleration(0.0, q, rate), expected, rtol=1e-13, atol=1e-14)
     a = SLEIGH.ahead

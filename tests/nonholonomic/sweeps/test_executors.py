@@ -16,6 +16,7 @@ import jax
 import numpy as np
 import pytest
 from cheap_sweep import CELLS, CheapJob, cheap_sweep, finished_blocks, place, resumed
+from own_modes import Sleigh
 from tops import rutstam_top
 
 import nonholonomic
@@ -23,6 +24,7 @@ import stroller
 import tippe
 from nonholonomic.sweeps import Table, running
 from nonholonomic.sweeps.dispatch import ExecutorBroken, handed_out
+from nonholonomic.systems.sweep import SweepJob
 
 HERE = Path(__file__).parent
 
@@ -218,6 +220,14 @@ def test_an_error_of_a_block_is_the_sweep_s_and_starts_no_further_block(processe
         cheap_sweep(None, job=CheapJob(tmp_path, pause=0.3), executor=processes)
     time.sleep(0.8)
     assert len(list(tmp_path.iterdir())) < 7
+
+
+def test_a_user_s_system_is_computed_by_other_processes(processes, monkeypatch):
+    """The same bits as in this process, where nothing is computed then."""
+    start, axes = (np.zeros(3), np.array([1.0, 0.0, 0.0])), {"rate[2]": [0.5, 1.0], "ahead": [0.2, 0.3]}
+    expected = nonholonomic.sweep(Sleigh(), start, 2.0, axes=axes, progress=False)
+    monkeypatch.setattr(SweepJob, "__call__", None)
+    assert_same_bits(nonholonomic.sweep(Sleigh(), start, 2.0, axes=axes, executor=processes, progress=False), expected)
 
 
 def test_local_processes_have_their_cores_and_settings(processes):

@@ -67,7 +67,7 @@ def test_an_event_may_close_over_what_is_differentiated():
     value, slope = jax.value_and_grad(time)(0.1)
     expected, expected_slope = jax.value_and_grad(exact)(0.1)
     assert_close(value, expected, rtol=1e-12)
-    assert_close(slope, expected_slope, rtol=1e-9)
+    assert_close(slope, expected_slope, rtol=1e-12)
 
 
 class Decay(AbstractMode):

@@ -7,6 +7,8 @@ from close import assert_close
 from own_modes import GRAVITY, Ball, Sleigh, bounce, final_turn
 
 from nonholonomic import AbstractMode, Hybrid, simulate
+from nonholonomic.formulations import Hamel, Lagrange, Routhian
+from nonholonomic.systems.system import formulation_of
 
 TIMES = jnp.array([0.3, 0.7, 1.1, 1.5])
 
@@ -122,3 +124,10 @@ def test_a_trajectory_is_a_table():
     assert_close(table.y0, [0.75, 0.5], rtol=1e-12)
     assert table.attributes["status"] == "completed"
     assert run.to_xarray()["y0"].dims == ("time",)
+
+
+def test_a_lagrangian_of_one_s_own_is_run_by_poincare_s_equations():
+    """Metric and potential alone would miss its terms that are linear in the velocities."""
+    whole = Sleigh()
+    assert isinstance(formulation_of(whole), Lagrange)
+    assert isinstance(formulation_of(Routhian(whole, cyclic=0, momentum=0.3)), Hamel)

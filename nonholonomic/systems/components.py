@@ -1,0 +1,279 @@
+"""Functions of small arrays, evaluated number by number, so that every number is a vector of lanes.
+
+A user writes with small matrices. Mapped over lanes they are arrays with a short last axis, which compilers do not turn into
+vector instructions, and their zeros are multiplied like any other number. Here each element of each array is a number of its
+own: zeros and ones disappear, and what is computed twice is computed once.
+"""
+
+import functools
+import itertools
+import operator
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Jaxpr, Literal
+from jaxtyping import Array
+
+from ..validation import is_traced
+from ..xla_cpu import stored
+
+#: Operations on numbers, element by element.
+BY_ELEMENT = """
+    abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy copy_p cos cosh
+    digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le lgamma log log1p logistic lt max min
+    mul ne neg nextafter not or pow rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor
+"""
+
+#: Those that take long enough to be computed once only, where XLA would compute them again for each result.
+COSTLY = """
+    acos acosh asin asinh atan atan2 atanh cbrt cos cosh erf exp exp2 expm1 log log1p logistic pow sin sinh tan tanh
+"""
+
+#: A function of more operations on numbers than these is left in arrays: it would take long to compile.
+MOST_OPERATIONS = 1500
+
+#: Elements of an array: constants, which are NumPy's, or traced numbers, one for all lanes or one for each.
+Elements = Any
+
+
+class TooLarge(Exception):
+    """A function with other operations, or too many."""
+
+
+def by_components(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
+    """A function of numbers as one of vectors of lanes.
+
+    **Arguments:**
+
+    - `function`: of scalars, to scalars.
+    - `shapes`: those of its arguments, as for `jax.eval_shape`.
+
+    **Returns:** the function, of arguments that are scalars or have one number per lane. It raises `TooLarge` for a function
+    that is better left in arrays.
+    """
+
+    def evaluated(*args: Any) -> Any:
+        closed, shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
+        leaves = [_elements(leaf) for leaf in jax.tree.leaves(args)]
+        results = Evaluation().of(closed.jaxpr, [_constants(const) for const in closed.consts], leaves)
+        return jax.tree.unflatten(jax.tree.structure(shape), [jnp.asarray(result.item()) for result in results])
+
+    return evaluated
+
+
+def _elements(number: Array) -> Elements:
+    """A number in every lane as an array with a single element."""
+    elements = np.empty((), object)
+    elements[()] = number
+    return elements
+
+
+def _constants(array: Any) -> Elements:
+    """The elements of an array that is known, or is traced outside of the function."""
+    elements = np.empty(np.shape(array), object)
+    known = array if is_traced(array) else np.asarray(array)
+    for index in np.ndindex(elements.shape):
+        elements[index] = known[index]
+    return elements
+
+
+class Evaluation:
+    """One evaluation: what was computed so far, by operation and operands."""
+
+    def __init__(self):
+        self.computed: dict[Any, Any] = {}
+        # Operands are told apart by their address, so none may be forgotten.
+        self.kept: list[Any] = []
+
+    def of(self, jaxpr: Jaxpr, consts: Sequence[Elements], args: Sequence[Elements]) -> list[Elements]:
+        """The results of a traced function."""
+        values: dict[Any, Elements] = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *args), strict=True))
+
+        def read(variable: Any) -> Elements:
+            return _constants(np.asarray(variable.val)) if isinstance(variable, Literal) else values[variable]
+
+        for equation in jaxpr.eqns:
+            results = self._equation(equation, [read(variable) for variable in equation.invars])
+            values |= dict(zip(equation.outvars, results, strict=True))
+        return [read(variable) for variable in jaxpr.outvars]
+
+    def _equation(self, equation: Any, inputs: list[Elements]) -> list[Elements]:
+        name, params = equation.primitive.name, equation.params
+        if name in ("jit", "pjit"):
+            inner = params["jaxpr"]
+            return self.of(inner.jaxpr, [_constants(const) for const in inner.consts], inputs)
+        if name in BY_ELEMENT.split():
+            return [self._by_element(equation, inputs)]
+        if name == "optimization_barrier":
+            return inputs
+        if name == "dot_general":
+            left, right = inputs
+            return [self._product(left, right, params["dimension_numbers"])]
+        if name in ("reduce_sum", "reduce_max", "reduce_min"):
+            return [self._reduced(name.removeprefix("reduce_").replace("sum", "add"), inputs[0], params["axes"])]
+        if name == "split":
+            return np.split(inputs[0], np.cumsum(params["sizes"])[:-1], axis=params["axis"])
+        if name == "unstack":
+            axis = params["axis"]
+            return [np.take(inputs[0], k, axis=axis) for k in range(inputs[0].shape[axis])]
+        if name in MOVES:
+            return [MOVES[name](equation, *inputs)]
+        raise TooLarge(name)
+
+    def _by_element(self, equation: Any, inputs: list[Elements]) -> Elements:
+        shape = equation.outvars[0].aval.shape
+        results, name = np.empty(shape, object), equation.primitive.name
+        broadcast = [np.broadcast_to(one, shape) for one in inputs]
+        for index in np.ndindex(shape):
+            results[index] = self._number(name, [one[index] for one in broadcast], equation)
+        return results
+
+    def _number(self, name: str, operands: list[Any], equation: Any = None) -> Any:
+        """One operation on numbers: arithmetic, or that of an equation."""
+        simple = _simplified(name, operands)
+        if simple is not None:
+            return simple
+        if all(map(_is_constant, operands)) and name in ("eq", "ne", "lt", "le", "gt", "ge"):
+            return np.bool_(getattr(operator, name)(*operands))
+        if name == "convert_element_type" and _is_constant(operands[0]):
+            return np.dtype(equation.params["new_dtype"]).type(operands[0])
+        keys = tuple((float(one), str(one.dtype)) if _is_constant(one) else id(one) for one in operands)
+        key = (name, "" if name in FUNCTIONS else str(equation.params), keys)
+        if key not in self.computed:
+            if len(self.computed) > MOST_OPERATIONS:
+                raise TooLarge(name)
+            shape = np.broadcast_shapes(*map(np.shape, operands))
+            full = [jnp.broadcast_to(jnp.asarray(one), shape) for one in operands]
+            self.kept += operands
+            bind = (
+                FUNCTIONS[name] if name in FUNCTIONS else functools.partial(equation.primitive.bind, **equation.params)
+            )
+            result = bind(*full)
+            # Joined with what it is computed from: what stands alone is computed again all the same.
+            self.computed[key] = stored(result, full[0])[0] if name in COSTLY.split() else result
+        return self.computed[key]
+
+    def _sum(self, terms: Iterator[Any], name: str = "add") -> Any:
+        return functools.reduce(lambda one, other: self._number(name, [one, other]), terms)
+
+    def _reduced(self, name: str, elements: Elements, axes: Sequence[int]) -> Elements:
+        kept = [k for k in range(elements.ndim) if k not in axes]
+        rows = np.transpose(elements, (*kept, *axes)).reshape(*(elements.shape[k] for k in kept), -1)
+        results = np.empty(rows.shape[:-1], object)
+        for index in np.ndindex(results.shape):
+            results[index] = self._sum(iter(rows[index]), name)
+        return results
+
+    def _product(self, left: Elements, right: Elements, dimensions: Any) -> Elements:
+        """The sum over the contracted axes; batch axes come first, then those of the left and those of the right."""
+        (sums, right_sums), (batch, right_batch) = dimensions
+        free = [k for k in range(left.ndim) if k not in (*sums, *batch)]
+        right_free = [k for k in range(right.ndim) if k not in (*right_sums, *right_batch)]
+        shapes = [[left.shape[k] for k in batch], [left.shape[k] for k in free], [right.shape[k] for k in right_free]]
+        rows = np.transpose(left, (*batch, *free, *sums)).reshape(*shapes[0], *shapes[1], -1)
+        others = np.transpose(right, (*right_batch, *right_free, *right_sums)).reshape(*shapes[0], *shapes[2], -1)
+        results = np.empty([*shapes[0], *shapes[1], *shapes[2]], object)
+        for both, one, other in itertools.product(*(list(np.ndindex(*shape)) for shape in shapes)):
+            pairs = zip(rows[(*both, *one)], others[(*both, *other)], strict=True)
+            terms = (self._number("mul", list(pair)) for pair in pairs)
+            results[(*both, *one, *other)] = self._sum(terms)
+        return results
+
+
+def _is_constant(number: Any) -> bool:
+    return isinstance(number, np.generic)
+
+
+def _simplified(name: str, operands: list[Any]) -> Any:
+    """What an operation gives where it needs no computation; otherwise `None`."""
+    if name == "select_n" and _is_constant(operands[0]):
+        return operands[1 + int(operands[0])]
+    if name in ("copy", "copy_p", "stop_gradient") and _is_constant(operands[0]):
+        return operands[0]
+    if name not in ARITHMETIC or not all(np.issubdtype(one.dtype, np.floating) for one in operands):
+        return None
+    if all(map(_is_constant, operands)):
+        with np.errstate(all="ignore"):
+            return operands[0].dtype.type(ARITHMETIC[name](*operands))
+    if name == "neg":
+        return None
+    left, right = ((float(one) if _is_constant(one) else None) for one in operands)
+    if name in ("add", "add_any"):
+        return operands[1] if left == 0.0 else operands[0] if right == 0.0 else None
+    if name == "sub":
+        return operands[0] if right == 0.0 else None
+    if name == "mul":
+        # The zeros of a matrix: what they are multiplied by is a number somewhere else too, or is not needed.
+        if 0.0 in (left, right):
+            return operands[0].dtype.type(0.0)
+        return operands[1] if left == 1.0 else operands[0] if right == 1.0 else None
+    return operands[0] if right == 1.0 else None
+
+
+#: What is done at once with constants.
+ARITHMETIC = {
+    "add": operator.add,
+    "add_any": operator.add,
+    "sub": operator.sub,
+    "mul": operator.mul,
+    "div": operator.truediv,
+    "neg": operator.neg,
+}
+
+#: What sums and products are made of.
+FUNCTIONS = {"add": jax.lax.add, "mul": jax.lax.mul, "max": jax.lax.max, "min": jax.lax.min}
+
+
+def _broadcast(equation: Any, elements: Elements, *dynamic: Any) -> Elements:
+    shape, places = equation.params["shape"], equation.params["broadcast_dimensions"]
+    inner = [1] * len(shape)
+    for axis, place in enumerate(places):
+        inner[place] = elements.shape[axis]
+    return np.broadcast_to(elements.reshape(inner), shape)
+
+
+def _padded(equation: Any, elements: Elements, filling: Elements) -> Elements:
+    widths = equation.params["padding_config"]
+    if any(inside for _, _, inside in widths) or any(width < 0 for width in np.ravel(widths)):
+        raise TooLarge("pad")
+    whole = np.full(equation.outvars[0].aval.shape, None, object)
+    whole.fill(filling.item())
+    whole[tuple(slice(low, low + size) for (low, _, _), size in zip(widths, elements.shape, strict=True))] = elements
+    return whole
+
+
+def _sliced(equation: Any, elements: Elements) -> Elements:
+    params = equation.params
+    steps = params["strides"] or (1,) * elements.ndim
+    return elements[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]
+
+
+def _reshaped(equation: Any, elements: Elements) -> Elements:
+    return elements.reshape(equation.outvars[0].aval.shape)
+
+
+def _counted(equation: Any) -> Elements:
+    params = equation.params
+    along = np.arange(params["shape"][params["dimension"]]).astype(params["dtype"])
+    axes = [1] * len(params["shape"])
+    axes[params["dimension"]] = -1
+    return _constants(np.broadcast_to(along.reshape(axes), params["shape"]))
+
+
+#: Operations that move numbers.
+MOVES: dict[str, Callable[..., Elements]] = {
+    "broadcast_in_dim": _broadcast,
+    "concatenate": lambda equation, *parts: np.concatenate(parts, axis=equation.params["dimension"]),
+    "expand_dims": _reshaped,
+    "iota": _counted,
+    "pad": _padded,
+    "reshape": _reshaped,
+    "rev": lambda equation, elements: np.flip(elements, equation.params["dimensions"]),
+    "slice": _sliced,
+    "squeeze": _reshaped,
+    "stack": lambda equation, *parts: np.stack(parts, axis=equation.params["axis"]),
+    "transpose": lambda equation, elements: np.transpose(elements, equation.params["permutation"]),
+}

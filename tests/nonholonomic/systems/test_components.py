@@ -1,0 +1,59 @@
+"""Functions of small matrices, evaluated number by number, against the same functions in arrays."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from close import assert_close
+from own_modes import Sleigh
+
+from nonholonomic.formulations import Lagrange
+from nonholonomic.systems.components import TooLarge, by_components
+
+LANES = tuple(jnp.linspace(0.1, 1.0, 8) * scale for scale in (1.0, -2.0, 0.7, 1.3, 0.4, 3.0))
+SCALARS = tuple(jax.ShapeDtypeStruct((), jnp.float64) for _ in LANES)
+
+
+def motion(*parts):
+    """The sleigh's rates: a jvp, a gradient, products and solutions of small matrices, with many zeros."""
+    return tuple(Lagrange(Sleigh()).field(0.0, jnp.stack(parts)))
+
+
+def odds(*parts):
+    """Other operations on arrays and numbers."""
+    y = jnp.stack(parts)
+    table = jnp.pad(y.reshape(2, 3), ((1, 0), (0, 2)))
+    ordered = jnp.where(jnp.arange(5) < 3, table[2, ::-1], table.T @ table @ jnp.ones(5))
+    flat = jnp.concatenate([ordered, jnp.exp(y[:2]) ** 2, jnp.max(table, axis=0)[None, 1]])
+    return jnp.sum(flat), jnp.min(flat), jnp.sqrt(jnp.abs(flat[1])) + (y[0] > 0.5), jnp.arctan2(*y[:2])
+
+
+@pytest.mark.parametrize("function", [motion, odds])
+def test_numbers_and_arrays_give_the_same(function):
+    expected = jax.jit(jax.vmap(function))(*LANES)
+    for result, wanted in zip(jax.jit(by_components(function, *SCALARS))(*LANES), expected, strict=True):
+        assert_close(result, wanted, rtol=1e-13, atol=1e-14)
+
+
+def test_zeros_are_not_computed_with():
+    """A product with a diagonal matrix takes a multiplication per row."""
+
+    def scaled(*parts):
+        return tuple(np.diag(np.arange(6.0)) @ jnp.stack(parts))
+
+    listed = jax.make_jaxpr(by_components(scaled, *SCALARS))(*LANES)
+    assert [equation.primitive.name for equation in listed.eqns].count("mul") == 4
+    assert "add" not in [equation.primitive.name for equation in listed.eqns]
+
+
+def test_large_functions_and_loops_are_left_in_arrays():
+    def large(*parts):
+        matrix = jnp.sin(jnp.outer(jnp.arange(20.0), jnp.stack(parts)))
+        return jnp.sum(matrix @ matrix.T @ matrix)
+
+    def loop(*parts):
+        return jax.lax.fori_loop(0, 3, lambda _, y: y * y, parts[0])
+
+    for function in (large, loop):
+        with pytest.raises(TooLarge):
+            jax.eval_shape(by_components(function, *SCALARS), *LANES)
