@@ -106,7 +106,7 @@ class HybridOutcome(NamedTuple, Generic[Numbers]):
 def _problem(
     mode: AbstractBatchedMode, cell: Int[Numbers, " cells"], state: Float[Numbers, "components cells"]
 ) -> AbstractProblem:
-    return _of_cells(mode, cell).problem(state)
+    return _of_cells(mode, cell).problem(jnp.asarray(state))
 
 
 @compiled_quickly
