@@ -33,8 +33,8 @@ def pytest_configure(config: pytest.Config) -> None:
     `pytest --cache-clear` forgets it; a folder that `JAX_COMPILATION_CACHE_DIR` names is used instead.
 
     The ordinary run compiles without LLVM's optimisations, as JAX's own tests do, and by XLA's older emitters where they still
-    exist: compiling is most of its work, and takes a quarter of the time then. The slow tests and those with the newest
-    libraries run what users run; so do all with `XLA_FLAGS=`.
+    exist: compiling is most of its work, and takes a quarter of the time then. The slow tests run what users run; so do all
+    with `XLA_FLAGS=`.
     """
     if config.option.markexpr == ORDINARY:
         os.environ.setdefault("XLA_FLAGS", " ".join(quick_to_compile()))
