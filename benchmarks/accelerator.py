@@ -1,6 +1,6 @@
 """Cost and error of tables, derivatives and samples on an accelerator, measured in one go, with a page of the results.
 
-    python benchmarks/accelerator.py [--out accelerator.md] [--seconds 540]
+    python benchmarks/accelerator.py [--out PAGE] [--seconds 540]
 
 Without an accelerator the script says so and measures nothing. Rutstam's top on the plane, viscous friction, 100 rad/s,
 theta(0) from 0.05 to 0.15, float64, to theta = 0.95 pi or to 8 s, at two tolerances and for two numbers of launches:
@@ -164,7 +164,7 @@ def page(rows: list[Row], omitted: list[str]) -> str:
 def main(arguments: list[str] | None = None) -> None:
     """Measure, print and write, where there is an accelerator."""
     command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    command.add_argument("--out", type=Path, default=Path("accelerator.md"), help="the page of results")
+    command.add_argument("--out", type=Path, default=Path("accelerator.txt"), help="the page of results")
     command.add_argument("--seconds", type=float, default=540.0, help="no row begins later")
     options = command.parse_args(arguments)
     if jax.default_backend() == "cpu":

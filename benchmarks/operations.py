@@ -63,18 +63,18 @@ def operations(function: Callable[..., Any], *arguments: Any) -> Operations:
     return _of_program(dce_jaxpr(program, [True] * len(program.outvars))[0])
 
 
-def operations_per_step(problem: AbstractProblem, parts: int = 1) -> Operations:
+def operations_per_step(problem: AbstractProblem, n_blocks: int = 1) -> Operations:
     """Count the operations of one attempted step of one lane: stages, error, step-size control and event.
 
-    **Arguments:** `problem`: its numbers may be shapes alone; `parts`: as for `Control`.
+    **Arguments:** `problem`: its numbers may be shapes alone; `n_blocks`: as for `Control`.
     """
     cells = _states(problem).shape[1]
     settings, t1 = Settings(1e-9, lanes=cells), jnp.asarray(30.0)
-    scheduler = eqx.filter_eval_shape(LaneScheduler.of, problem, t1, jnp.asarray(cells), settings, parts=parts)
+    scheduler = eqx.filter_eval_shape(LaneScheduler.of, problem, t1, jnp.asarray(cells), settings, n_blocks=n_blocks)
     lane_state = eqx.filter_eval_shape(lambda scheduler: scheduler.start().lane_state, scheduler)
 
     def step(scheduler: LaneScheduler, lane_state: LaneState) -> LaneState:
-        return try_step(*scheduler.here(lane_state), lane_state)
+        return try_step(*scheduler.in_lanes(lane_state), lane_state)
 
     return operations(step, scheduler, lane_state).times(1.0 / cells)
 
