@@ -24,7 +24,16 @@ from nonholonomic.integration import (
     times_bounds,
 )
 from nonholonomic.progress import status_line
-from nonholonomic.validation import all_bounds, as_number, is_traced, legal, nan_unless, require_all, require_increasing
+from nonholonomic.validation import (
+    all_bounds,
+    as_number,
+    is_traced,
+    legal,
+    nan_unless,
+    require_all,
+    require_increasing,
+    shown,
+)
 from nonholonomic.xla_cpu import on_device
 
 from ..model.launch import Launch
@@ -147,9 +156,9 @@ def simulate(
 
     **Returns:** a `Trajectory`, for a hybrid scene a `HybridTrajectory`.
 
-    **Raises:** `ValueError` for arguments out of range; inside a transformation for a law with several modes
-    (`SetValuedCoulomb`), and for a hybrid scene with `adjoint`, with a solver that is not an explicit Runge-Kutta one, and
-    where derivatives by `times` or second derivatives are asked for.
+    **Raises:** `ValueError` for arguments out of range, and for times that are all after the end of the run; inside a
+    transformation for a law with several modes (`SetValuedCoulomb`), and for a hybrid scene with `adjoint`, with a solver that
+    is not an explicit Runge-Kutta one, and where derivatives by `times` or second derivatives are asked for.
 
     **Example:**
 
@@ -181,7 +190,13 @@ def simulate(
     trajectory = _as_trajectory(scene, run, path)
     if times is None:
         return trajectory
-    return trajectory.at(np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)])
+    reached = np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)]
+    if not reached.size:
+        raise ValueError(
+            f"times = {shown(times)} are all after the end of the run at {float(trajectory.end_time):.6g} s "
+            f"({trajectory.status}): ask for earlier times, or leave `times` out to get those of the steps"
+        )
+    return trajectory.at(reached)
 
 
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
