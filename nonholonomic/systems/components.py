@@ -7,6 +7,7 @@ own: zeros and ones disappear, and what is computed twice is computed once.
 
 import functools
 import itertools
+import math
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -161,10 +162,12 @@ class Evaluation:
 
     def _reduced(self, name: str, elements: Elements, axes: Sequence[int]) -> Elements:
         kept = [k for k in range(elements.ndim) if k not in axes]
-        rows = np.transpose(elements, (*kept, *axes)).reshape(*(elements.shape[k] for k in kept), -1)
+        rows = np.transpose(elements, (*kept, *axes)).reshape(
+            *(elements.shape[k] for k in kept), math.prod(elements.shape[k] for k in axes)
+        )
         results = np.empty(rows.shape[:-1], object)
         for index in np.ndindex(results.shape):
-            results[index] = self._sum(iter(rows[index]), name)
+            results[index] = self._sum(iter(rows[index]), name) if rows.shape[-1] else np.float64(0.0)
         return results
 
     def _product(self, left: Elements, right: Elements, dimensions: Any) -> Elements:
@@ -173,13 +176,15 @@ class Evaluation:
         free = [k for k in range(left.ndim) if k not in (*sums, *batch)]
         right_free = [k for k in range(right.ndim) if k not in (*right_sums, *right_batch)]
         shapes = [[left.shape[k] for k in batch], [left.shape[k] for k in free], [right.shape[k] for k in right_free]]
-        rows = np.transpose(left, (*batch, *free, *sums)).reshape(*shapes[0], *shapes[1], -1)
-        others = np.transpose(right, (*right_batch, *right_free, *right_sums)).reshape(*shapes[0], *shapes[2], -1)
+        # There may be none: a system without constraints has arrays of no elements.
+        count = math.prod(left.shape[k] for k in sums)
+        rows = np.transpose(left, (*batch, *free, *sums)).reshape(*shapes[0], *shapes[1], count)
+        others = np.transpose(right, (*right_batch, *right_free, *right_sums)).reshape(*shapes[0], *shapes[2], count)
         results = np.empty([*shapes[0], *shapes[1], *shapes[2]], object)
         for both, one, other in itertools.product(*(list(np.ndindex(*shape)) for shape in shapes)):
             pairs = zip(rows[(*both, *one)], others[(*both, *other)], strict=True)
             terms = (self._number("mul", list(pair)) for pair in pairs)
-            results[(*both, *one, *other)] = self._sum(terms)
+            results[(*both, *one, *other)] = self._sum(terms) if count else np.float64(0.0)
         return results
 
 
