@@ -5,6 +5,7 @@ import os
 
 import jax
 import pytest
+from quick_compiler import quick_to_compile
 from tops import rutstam_top
 
 import nonholonomic
@@ -19,12 +20,6 @@ from nonholonomic.compiled_programs import (
 
 #: The tests that a plain `pytest` chooses (`pyproject.toml`).
 ORDINARY = "not slow"
-
-
-def quick_to_compile() -> list[str]:
-    """XLA's flags of a quick compiler. One that a version does not know ends the process: jax 0.11 lost the older emitters."""
-    emitters = ["--xla_cpu_use_fusion_emitters=false"] if jax.__version_info__[:2] == (0, 10) else []
-    return ["--xla_backend_optimization_level=0", *emitters]
 
 
 def pytest_configure(config: pytest.Config) -> None:

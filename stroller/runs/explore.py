@@ -14,6 +14,7 @@ from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.progress import status_line
 from nonholonomic.views import Page, Stage, arena
 from nonholonomic.views.explore import (
+    MOST_LIVE_STEPS,
     Answer,
     Frame,
     LiveRun,
@@ -42,9 +43,6 @@ Numbers = Float[Array, " numbers"]
 #: The tolerance in the page, and that of the runs that only say how far the ground is drawn.
 TOLERANCE = 1e-7
 DRAWN = 1e-5
-
-#: Steps after which a run in the page is given up: some hundred milliseconds.
-MOST_STEPS = 50_000
 
 
 @status_line("writing a page")
@@ -104,7 +102,7 @@ def explore(
 
 def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input: Any) -> LiveRun:
     """What the page shows of a scene, a launch and an input, `roots`, some of whose numbers are those of sliders."""
-    settings = Settings(TOLERANCE, max_steps=MOST_STEPS)
+    settings = Settings(TOLERANCE, max_steps=MOST_LIVE_STEPS)
     controls = as_module(input, roots["scene"], roots["launch"])
 
     def modules(values: Numbers) -> tuple[Scene, Launch, Input | None]:

@@ -29,10 +29,9 @@ from nonholonomic.sweeps import Variable
 
 from ..model.dynamics import LOSSES
 from ..model.scene import Scene
-from ..modes import airborne, airborne_stem, airborne_stick_slip
+from ..modes import airborne, airborne_ends, airborne_stem, airborne_stick_slip, sliding, sticking
 from ..modes.inversion_problem import InversionProblem
-from ..modes.sliding import modes as hybrid_modes
-from ..modes.sticking import modes as stick_slip_modes
+from .energy import has_grown
 from .inversion import is_inverted
 from .sensitivities import hybrid_sensitivities_of_cells, sensitivities_of_cells
 
@@ -41,12 +40,14 @@ class RunKind(NamedTuple):
     """How to run a kind of scene: its status words, its counters besides steps, and its modes.
 
     `modes` takes (scene, problem, tolerance, last) and returns the modes and the number of each cell's first; `None`
-    for runs of one smooth motion. `flight_state` is whether states may be those of flight, in a layout of their own.
+    for runs of one smooth motion. `energy_in` takes (scene, state, mode) and returns the least and the greatest energy [J] that
+    the state may have. `flight_state` is whether states may be those of flight, in a layout of their own.
     """
 
     words: tuple[str, ...]
     counts: tuple[str, ...]
     modes: Callable[..., tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]] | None
+    energy_in: Callable[..., tuple[Float[Array, " cells"], Float[Array, " cells"]]]
     flight_state: bool = False
 
     @property
@@ -71,9 +72,9 @@ TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_t
 NAMES = TIMES | {"end_time": "end of the run", "end_theta": "θ at the end of the run"}
 
 # Compiled once for all chunks.
-_on_the_ground = eqx.filter_jit(airborne.on_the_ground)
+_on_the_ground = eqx.filter_jit(airborne_ends.on_the_ground)
 _loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
-_flight_loss = eqx.filter_jit(airborne.loss)
+_flight_loss = eqx.filter_jit(airborne_ends.loss)
 
 
 @eqx.filter_jit
@@ -84,17 +85,51 @@ def _at_the_end(
     return is_inverted(ended, problem, last), scene.theta(jnp.asarray(ended.state))
 
 
+def _of_the_state(
+    scene: Scene, state: Float[Array, "components cells"], mode: Any
+) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
+    """The least and the greatest energy [J] of states of one smooth motion."""
+    total = scene.energy(state)
+    return total, total
+
+
 #: The words of tables, in the order of the integers in their files, which is older than `Status`.
-WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit")
-SMOOTH = RunKind(WORDS, (), None)
-STICK_SLIP = RunKind((*WORDS, "unresolved"), ("sticks",), stick_slip_modes)
-HYBRID = RunKind((*WORDS, "unresolved"), ("hops",), hybrid_modes)
-AIRBORNE = RunKind((*WORDS, "unresolved"), ("hops",), airborne.modes, flight_state=True)
-ON_STEM_TOO = RunKind((*WORDS, "unresolved"), ("hops",), airborne_stem.modes, flight_state=True)
-STICK_SLIP_FLY = RunKind((*WORDS, "unresolved"), ("hops", "sticks"), airborne_stick_slip.modes, flight_state=True)
+WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
+SMOOTH = RunKind(WORDS, (), None, _of_the_state)
+STICK_SLIP = RunKind(WORDS, ("sticks",), sticking.modes, sticking.energy_in)
+HYBRID = RunKind(WORDS, ("hops",), sliding.modes, sliding.energy_in)
+AIRBORNE = RunKind(WORDS, ("hops",), airborne.modes, airborne_ends.energy_in, flight_state=True)
+ON_STEM_TOO = RunKind(WORDS, ("hops",), airborne_stem.modes, airborne_ends.energy_in, flight_state=True)
+STICK_SLIP_FLY = RunKind(
+    WORDS, ("hops", "sticks"), airborne_stick_slip.modes, airborne_ends.energy_in, flight_state=True
+)
 
 #: The word for a run's status if it has not inverted; `not_inverted` for all others.
-WORD_OF_STATUS = {LEFT_DOMAIN: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
+WORD_OF_STATUS = {
+    LEFT_DOMAIN: WORDS.index("contact_lost"),
+    FAILED: WORDS.index("failed"),
+    UNRESOLVED: WORDS.index("unresolved"),
+}
+
+
+@eqx.filter_jit
+def has_gained_energy(
+    scene: Scene, problem: InversionProblem, ended: Outcome | HybridOutcome, tolerance: float | Float[Array, ""]
+) -> Bool[Array, " cells"]:
+    """Where a run has ended with more energy than it began with, which no friction does (`energy.py`).
+
+    **Arguments:** `ended`: with the states in the layouts of their modes.
+    """
+    kind = run_kind_of(scene)
+    first, mode = None, None
+    if kind.modes is not None:
+        assert isinstance(ended, HybridOutcome)
+        first, mode = kind.modes(scene, problem, tolerance, False)[1], ended.mode
+    size = len(problem.states)
+    before = kind.energy_in(scene, problem.states, first)[1]
+    after = kind.energy_in(scene, jnp.asarray(ended.state)[:size], mode)[0]
+    # A run that has failed is said to.
+    return has_grown(scene, before, after, tolerance) & (jnp.asarray(ended.status) != FAILED)
 
 
 def too_many_steps(t1: float, most: int, end: float) -> str:
@@ -103,6 +138,16 @@ def too_many_steps(t1: float, most: int, end: float) -> str:
         f"t1 = {t1:g} s is too long: the run needs more than {most:_} steps, with which it came to {end:.4g} s; "
         "take a shorter t1 or a larger tolerance"
     ).replace("_", " ")
+
+
+def why_unresolved(kind: RunKind) -> str:
+    """Why a run of some kind may be unresolved."""
+    grown = (
+        "its energy has grown by more than the tolerance allows, although nothing drives the top: the law of friction pushes "
+        "it, or the arena's heights do not fit its normals"
+    )
+    others = "the model determines no motion from there on, or its mode changed too often, or"
+    return grown if kind.smooth else f"{others} {grown}; tippe.simulate says which"
 
 
 def run_kind_of(scene: Scene) -> RunKind:
@@ -194,9 +239,10 @@ class InversionRuns(NamedTuple):
             along = functools.partial(hybrid_sensitivities_of_cells, self.run_kind.modes, *numbers, **options)
             return self._hybrid_runs(scene, problem, tolerance, count, along)
         if not self.slopes_by:
-            return self._ended(scene, problem, self._outcome(problem, tolerance, count))
+            return self._ended(scene, problem, self._outcome(problem, tolerance, count), tolerance)
         outcome, slopes = sensitivities_of_cells(*numbers, self.t1, self.settings(tolerance), **options)
-        return self._ended(scene, problem, outcome) | slopes
+        named = self._ended(scene, problem, outcome, tolerance)
+        return named | {name: np.where(named["status"] == 0, slope, 0.0) for name, slope in slopes.items()}
 
     def _hybrid_runs(
         self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, along: Callable[..., Any]
@@ -212,13 +258,16 @@ class InversionRuns(NamedTuple):
                 np.where(np.isfinite(found.crossing_time), found.crossing_time, 0.0), self.settings(tolerance)
             )
             grazing |= there.status != REACHED_END
+        found = self._balanced(scene, problem, found, tolerance)
         loss = functools.partial(self._loss, scene, found.state)
         if self.run_kind.flight_state:
             found = found._replace(state=np.asarray(_on_the_ground(scene, found.state, found.mode)))
         named = self._named(scene, problem, found, loss) | dict(zip(self.run_kind.counts, found.counts, strict=True))
         if self.crossing == "both":
             # With several modes the first crossing takes a hybrid solve of its own, which ends there.
-            first = self._hybrid_outcome(scene, problem, tolerance, count, False)
+            first = self._balanced(
+                scene, problem, self._hybrid_outcome(scene, problem, tolerance, count, False), tolerance
+            )
             named["first_time"] = np.where(first.status == CROSSED, first.crossing_time, np.inf)
         if not self.slopes_by:
             return named
@@ -244,8 +293,14 @@ class InversionRuns(NamedTuple):
             return solve_by_diffrax(problem, horizon, settings)
         return solve_ensemble(problem, horizon, jnp.asarray(count), settings, nonterminal=self.last)[0]
 
-    def _ended(self, scene: Scene, problem: InversionProblem, outcome: Outcome) -> dict[str, Any]:
+    def _balanced(self, scene: Scene, problem: InversionProblem, ended: Any, tolerance: float) -> Any:
+        """The runs, unresolved where they have gained energy."""
+        gained = np.asarray(has_gained_energy(scene, problem, ended, tolerance))
+        return ended._replace(status=np.where(gained, UNRESOLVED, ended.status))
+
+    def _ended(self, scene: Scene, problem: InversionProblem, outcome: Outcome, tolerance: float) -> dict[str, Any]:
         """The variables of cells whose runs are one smooth motion."""
+        outcome = self._balanced(scene, problem, outcome, tolerance)
         return self._named(scene, problem, outcome, functools.partial(self._loss, scene, outcome.state))
 
     def _loss(self, scene: Scene, state: Any) -> Any:
@@ -267,7 +322,8 @@ class InversionRuns(NamedTuple):
             code = np.where(lost, np.array([WORDS.index(status.word) for status in LOSSES])[loss()], code)
         times = {self.times[-1]: np.where(inverted, ended.crossing_time, np.inf)}
         if isinstance(ended, Outcome) and self.crossing == "both":
-            times["first_time"] = np.asarray(ended.first_crossing)
+            unresolved = code == WORDS.index("unresolved")
+            times["first_time"] = np.where(unresolved, np.inf, np.asarray(ended.first_crossing))
         return times | {
             "status": code.astype(np.int8),
             "end_time": np.asarray(ended.end_time),

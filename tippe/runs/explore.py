@@ -21,6 +21,7 @@ from nonholonomic.progress import status_line
 from nonholonomic.validation import all_bounds, legal
 from nonholonomic.views import Page, Stage, arena
 from nonholonomic.views.explore import (
+    MOST_LIVE_STEPS,
     Answer,
     Frame,
     LiveRun,
@@ -52,9 +53,6 @@ TOLERANCE = 1e-7
 
 #: Tolerance of the runs that only say how far the arena is drawn.
 DRAWN = 1e-5
-
-#: Steps after which a run in the page is given up: some hundred milliseconds.
-MOST_STEPS = 50_000
 
 
 @status_line("writing a page")
@@ -126,7 +124,7 @@ def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float) -> Liv
     def moment(values: Numbers, problem: TrajectoryProblem, lane: LaneState) -> Frame:
         return frame(modules(values)[0], problem, lane)
 
-    settings = Settings(TOLERANCE, max_steps=MOST_STEPS)
+    settings = Settings(TOLERANCE, max_steps=MOST_LIVE_STEPS)
     asked = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
     launched = Simulator(lambda values: InversionProblem.of(*modules(values), ANGLE, 1), t1, settings, asked)
     return LiveRun(

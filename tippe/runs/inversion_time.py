@@ -29,6 +29,7 @@ from nonholonomic.integration import (
     FAILED,
     REACHED_END,
     UNRESOLVED,
+    Outcome,
     Settings,
     explicit_tableau,
     traced_solve_ensemble,
@@ -38,9 +39,16 @@ from nonholonomic.validation import as_number, is_traced
 
 from ..model.launch import Launch
 from ..model.scene import Scene
-from ..modes.airborne import on_the_ground
+from ..modes.airborne_ends import on_the_ground
 from ..modes.inversion_problem import InversionProblem
-from .cells import InversionRuns, check_differentiable, run_kind_of, too_many_steps
+from .cells import (
+    InversionRuns,
+    check_differentiable,
+    has_gained_energy,
+    run_kind_of,
+    too_many_steps,
+    why_unresolved,
+)
 from .inversion import check_event, check_run, is_inverted, nan_if_illegal, permitted, warn_if_it_cannot_invert
 
 
@@ -73,7 +81,8 @@ def inversion_time(
       `nonholonomic.integration.Oscillatory8()`.
 
     **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before; NaN
-    if the integration failed, or if numbers inside a transformation are out of range.
+    if the integration failed, if the run is unresolved (its energy has grown, or as for `HybridTrajectory`), or if numbers
+    inside a transformation are out of range.
 
     With `contact="hybrid"` and `SetValuedCoulomb` first derivatives go through flights, impacts, stick and slip
     (`nonholonomic/hybrid/saltation.py`). Where an event on the way is grazing, so that within the tolerance it may
@@ -131,8 +140,10 @@ def explain_failure(
     word = runs.run_kind.words[cell["status"]]
     if word == "failed" and cell["steps"] >= most:
         raise ValueError(too_many_steps(t1, most, cell["end_time"]))
+    why = f": {why_unresolved(runs.run_kind)}" if word == "unresolved" else ""
+    end = f"at {cell['end_time']:.6g} s, at {cell['end_theta']:.6g} rad"
     warnings.warn(
-        f"the inversion time is NaN: the run ended as {word!r} at {cell['end_time']:.6g} s, at {cell['end_theta']:.6g} rad",
+        f"the inversion time is NaN: the run ended as {word!r} {end}{why}",
         UserWarning,
         stacklevel=4,
     )
@@ -172,7 +183,23 @@ class InversionSolve(AbstractDifferentiableSolve):
             one_kernel=True,
         )
         time = jnp.where(is_inverted(outcome, problem, self.last), outcome.crossing_time, jnp.inf)
-        return jnp.where(may & (outcome.status != FAILED), time, jnp.nan)
+        return jnp.where(self.good(leaves, may, problem, outcome, tolerance), time, jnp.nan)
+
+    def good(
+        self,
+        leaves: tuple[Array, ...],
+        may: Bool[Array, "..."],
+        problem: InversionProblem,
+        ended: Outcome | HybridOutcome,
+        tolerance: Float[Array, ""],
+    ) -> Bool[Array, " cells"]:
+        """Which cells have an answer: legal numbers, and a run that neither failed nor gained energy."""
+        gained = has_gained_energy(self.scene(leaves), problem, ended, tolerance)
+        return may & (ended.status != FAILED) & (ended.status != UNRESOLVED) & ~gained
+
+    def scene(self, leaves: tuple[Array, ...]) -> Scene:
+        """The scene of some cells."""
+        return jax.tree.unflatten(self.structure, leaves)[0]
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
@@ -189,7 +216,8 @@ class InversionSolve(AbstractDifferentiableSolve):
             nonterminal=self.last,
             one_kernel=not again,
         )
-        inverted, good = is_inverted(outcome, problem, self.last), may & (outcome.status != FAILED)
+        inverted = is_inverted(outcome, problem, self.last)
+        good = self.good(leaves, may, problem, outcome, tolerance)
         time = jnp.where(good, jnp.where(inverted, outcome.crossing_time, jnp.inf), jnp.nan)
         return time, [jnp.where(good, jnp.where(inverted, slope, 0.0), jnp.nan) for slope in gather(slopes)]
 
@@ -200,7 +228,8 @@ class HybridInversionSolve(InversionSolve):
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         modes, first, problem, scene = self.hybrid((*leaves[: self.movable], tolerance), cells)
-        return self.named(may, self.hybrid_outcome(modes, first, problem, scene, t1, tolerance), problem, scene)
+        ended = self.hybrid_outcome(modes, first, problem, scene, t1, tolerance)
+        return self.named(self.good(leaves, may, problem, ended, tolerance), ended, problem, scene)
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
@@ -229,7 +258,8 @@ class HybridInversionSolve(InversionSolve):
             return (hybrid_outcome, found.grazing), list(found.slopes)
 
         (hybrid_outcome, grazing), slopes = in_groups(run, tangents)
-        time = self.named(may, whole if self.last else hybrid_outcome, problem, scene)
+        known = whole if self.last else hybrid_outcome
+        time = self.named(self.good(leaves, may, problem, known, tolerance), known, problem, scene)
         ended = hybrid_outcome.status == (REACHED_END if self.last else CROSSED)
         digits = ended & ~grazing
         # An event at the start has a fixed time, whatever the tangent.
@@ -258,11 +288,10 @@ class HybridInversionSolve(InversionSolve):
         return traced_solve_hybrid(modes, first, problem.states, t1, settings, counters=counters, nonterminal=self.last)
 
     def named(
-        self, may: Bool[Array, "..."], ended: HybridOutcome, problem: InversionProblem, scene: Scene
+        self, good: Bool[Array, " cells"], ended: HybridOutcome, problem: InversionProblem, scene: Scene
     ) -> Float[Array, " cells"]:
         """The times of inversion."""
         if run_kind_of(scene).flight_state:
             ended = ended._replace(state=on_the_ground(scene, ended.state, ended.mode))
         time = jnp.where(is_inverted(ended, problem, self.last), ended.crossing_time, jnp.inf)
-        failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
-        return jnp.where(may & ~failed, time, jnp.nan)
+        return jnp.where(good, time, jnp.nan)

@@ -15,7 +15,7 @@ from nonholonomic.sweeps import Axis, Table, Variable, sweep
 from nonholonomic.validation import require_flag, require_outside, require_whole
 
 from ..model.scene import Scene
-from .cells import InversionRuns, check_differentiable, run_kind_of, too_many_steps
+from .cells import InversionRuns, RunKind, check_differentiable, run_kind_of, too_many_steps, why_unresolved
 from .inversion import check_event, warn_if_it_cannot_invert
 from .launches import described, launches, rows
 from .sensitivities import sensitivity_names, sensitivity_variables
@@ -82,9 +82,10 @@ def inversion_table(
       100 000 steps at most.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
-    "contact_lost", "failed", "jammed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was
-    lost or jammed, when and at what angle), `steps` and `rejected`. With `errors` also `time_error` [s], a bound that is
-    infinite where the two runs disagree on the status or failed, 0 where they agree that there is no time;
+    "contact_lost", "failed", "jammed", "unresolved" where the energy has grown by more than 1e4 times the tolerance),
+    `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was lost or jammed, when and at what angle),
+    `steps` and `rejected`. With `errors` also `time_error` [s], a bound that is infinite where the two runs disagree on the
+    status or failed, 0 where they agree that there is no time;
     `Table.digits("time")` shows the digits it leaves. The same for `end_time` and `end_theta`; `hops_error` and
     `sticks_error` are the differences of the two runs, and `status_error` is 1 where the runs disagree on the status or
     failed. With `sensitivities` also the derivative of `time` by each number, `time_by_mu` for
@@ -164,6 +165,8 @@ def inversion_table(
         grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
     table = sweep(job, grid, variables, request, path=path, progress=progress, executor=executor)
     warn_of_long_runs(table, float(t1), max_steps)
+    if run_kind.smooth:
+        warn_of_unresolved_runs(table, run_kind)
     return table
 
 
@@ -177,6 +180,16 @@ def warn_of_long_runs(table: Table, t1: float, most: int) -> None:
         warnings.warn(
             f"{long.sum()} of {long.size} runs have failed: {too_many_steps(t1, most, end)}", UserWarning, stacklevel=3
         )
+
+
+def warn_of_unresolved_runs(table: Table, run_kind: RunKind) -> None:
+    """Warn of runs that are unresolved and say why; a table that stays in its file is not looked at."""
+    if not isinstance(table.variables, dict):
+        return
+    unresolved = np.asarray(table.variables["status"] == "unresolved")
+    if unresolved.any():
+        number = f"{unresolved.sum()} of {unresolved.size} runs are unresolved"
+        warnings.warn(f"{number}: {why_unresolved(run_kind)}", UserWarning, stacklevel=3)
 
 
 class InversionJob(NamedTuple):

@@ -76,7 +76,8 @@ def _followed(
     """How the runs end, as integers of `Status`, and the named quantities on the way."""
     outcome, samples = solve_with_samples(problem, times, times[-1], count, settings, one_kernel=True)
     run = cast(TrajectoryProblem, problem.whole)
-    status = ended(run, outcome.state, outcome.status == LEFT_DOMAIN, outcome.status == FAILED)
+    codes = (outcome.status == LEFT_DOMAIN, outcome.status == FAILED)
+    status = ended(run, scene, outcome.state, *codes, settings.tolerance)
     return outcome, status, {name: _read(run, scene, times, samples, name) for name in names}
 
 
