@@ -56,6 +56,11 @@ def scene_and_launch(scenes: Batch, cell: int) -> tuple[tippe.Scene, tippe.Launc
     return roots["scene"], roots["launch"]
 
 
+def apart(times: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Differences of times, 0 where both are infinite."""
+    return np.abs(np.subtract(times, others, where=times != others, out=np.zeros(times.shape)))
+
+
 def batch_of_times(scenes: Batch) -> np.ndarray:
     """The times of all scenes by `jit` of `vmap`."""
 
@@ -111,7 +116,7 @@ def compare_roads(kind: str, count: int, singles: int, seed: int = 5) -> tuple[F
 
     times = batch_of_times(scenes)
     found.check("a batch of times inverts, or not", np.flatnonzero(known), np.isfinite(times) == inverted, times)
-    near = np.abs(times - table["time"]) <= APART * time_error
+    near = apart(times, table["time"]) <= APART * time_error
     found.check("time in a batch, in a table", np.flatnonzero(known & inverted), near, times, table["time"], time_error)
 
     flat = FASTEST * (1e-6 * T1 + APART * end_error) + APART * table["end_theta_error"]
@@ -152,9 +157,8 @@ def compare_with_stops(found: Findings, scenes: Batch, flies: dict[str, np.ndarr
     kept = np.flatnonzero(sure & (stops["word"] != "contact_lost") & (flies["hops"] == 0))
     same = (stops["word"] == flies["word"]) & (np.isfinite(stops["time"]) == np.isfinite(flies["time"]))
     found.check("status with stop and hybrid", kept, same, stops["end_time"], flies["end_time"])
-    with np.errstate(invalid="ignore"):
-        error = APART * (stops["time_error"] + flies["time_error"])
-        near = (stops["time"] == flies["time"]) | (np.abs(stops["time"] - flies["time"]) <= error)
+    error = APART * (stops["time_error"] + flies["time_error"])
+    near = apart(stops["time"], flies["time"]) <= error
     found.check("time with stop and hybrid", kept, near, stops["time"], flies["time"], error)
     lost = np.flatnonzero(sure & (stops["word"] == "contact_lost") & (flies["end_time"] > stops["end_time"]))
     found.check("flights of a top that loses its contact", lost, flies["hops"] > 0, flies["hops"])

@@ -77,14 +77,6 @@ _loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
 _flight_loss = eqx.filter_jit(airborne_ends.loss)
 
 
-@eqx.filter_jit
-def _at_the_end(
-    scene: Scene, problem: InversionProblem, ended: Outcome | HybridOutcome, last: bool
-) -> tuple[Bool[Array, " cells"], Float[Array, " cells"]]:
-    """Which cells count as inverted, and theta [rad] at the end of each."""
-    return is_inverted(ended, problem, last), scene.theta(jnp.asarray(ended.state))
-
-
 def _of_the_state(
     scene: Scene, state: Float[Array, "components cells"], mode: Any
 ) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
@@ -130,6 +122,25 @@ def has_gained_energy(
     after = kind.energy_in(scene, jnp.asarray(ended.state)[:size], mode)[0]
     # A run that has failed is said to.
     return has_grown(scene, before, after, tolerance) & (jnp.asarray(ended.status) != FAILED)
+
+
+@eqx.filter_jit
+def _at_the_end(
+    scene: Scene,
+    problem: InversionProblem,
+    ended: Outcome | HybridOutcome,
+    last: bool,
+    tolerance: Float[Array, ""] | None,
+) -> tuple[Bool[Array, " cells"], Float[Array, " cells"], Bool[Array, " cells"]]:
+    """Which cells count as inverted, theta [rad] at the end of each, and which have gained energy.
+
+    **Arguments:** `tolerance`: `None` where this is known and part of the status.
+    """
+    inverted, theta = is_inverted(ended, problem, last), scene.theta(jnp.asarray(ended.state))
+    if tolerance is None:
+        return inverted, theta, jnp.zeros_like(inverted)
+    gained = has_gained_energy(scene, problem, ended, tolerance)
+    return inverted & ~gained, theta, gained
 
 
 def too_many_steps(t1: float, most: int, end: float) -> str:
@@ -293,15 +304,17 @@ class InversionRuns(NamedTuple):
             return solve_by_diffrax(problem, horizon, settings)
         return solve_ensemble(problem, horizon, jnp.asarray(count), settings, nonterminal=self.last)[0]
 
-    def _balanced(self, scene: Scene, problem: InversionProblem, ended: Any, tolerance: float) -> Any:
-        """The runs, unresolved where they have gained energy."""
-        gained = np.asarray(has_gained_energy(scene, problem, ended, tolerance))
+    def _balanced(
+        self, scene: Scene, problem: InversionProblem, ended: HybridOutcome, tolerance: float
+    ) -> HybridOutcome:
+        """The hybrid runs, unresolved where they have gained energy."""
+        gained = np.asarray(has_gained_energy(scene, problem, ended, np.asarray(tolerance)))
         return ended._replace(status=np.where(gained, UNRESOLVED, ended.status))
 
     def _ended(self, scene: Scene, problem: InversionProblem, outcome: Outcome, tolerance: float) -> dict[str, Any]:
         """The variables of cells whose runs are one smooth motion."""
-        outcome = self._balanced(scene, problem, outcome, tolerance)
-        return self._named(scene, problem, outcome, functools.partial(self._loss, scene, outcome.state))
+        loss = functools.partial(self._loss, scene, outcome.state)
+        return self._named(scene, problem, outcome, loss, np.asarray(tolerance))
 
     def _loss(self, scene: Scene, state: Any) -> Any:
         """Why contact ended in each cell, as a code in `LOSSES`."""
@@ -312,10 +325,16 @@ class InversionRuns(NamedTuple):
         return np.asarray(_flight_loss(scene, state) if self.run_kind.flight_state else _loss(scene.dynamics, state))
 
     def _named(
-        self, scene: Scene, problem: InversionProblem, ended: Outcome | HybridOutcome, loss: Callable[[], Any]
+        self,
+        scene: Scene,
+        problem: InversionProblem,
+        ended: Outcome | HybridOutcome,
+        loss: Callable[[], Any],
+        tolerance: Any = None,
     ) -> dict[str, Any]:
-        inverted, theta = _at_the_end(scene, problem, ended, self.last)
-        others = [np.asarray(ended.status) == status for status in WORD_OF_STATUS]
+        inverted, theta, gained = _at_the_end(scene, problem, ended, self.last, tolerance)
+        ended_as = np.where(gained, UNRESOLVED, ended.status)
+        others = [ended_as == status for status in WORD_OF_STATUS]
         code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
         lost = code == WORDS.index("contact_lost")
         if lost.any():
