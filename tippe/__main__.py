@@ -22,6 +22,7 @@ from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table, saved_cells
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html, table_as_html
+from nonholonomic.views.explore import live_page
 from nonholonomic.xla_cpu import compile_quickly
 
 from . import presets, steady
@@ -29,6 +30,7 @@ from .model.friction import Coulomb
 from .model.launch import Launch
 from .model.scene import Scene
 from .papers import tables as paper_tables
+from .runs.explore import live_run, stage
 from .runs.plot import Panel, draw_launches
 from .runs.table import inversion_table
 from .runs.trajectory import simulate
@@ -187,17 +189,19 @@ def picture(options: argparse.Namespace, run: Any) -> Any:
 
 
 def write_page(options: argparse.Namespace, found: dict[str, Table], run: Any, drawing: Path | None) -> Path:
-    """The page of the main job: the top in motion where three.js is installed, the tables, and the picture if there is one."""
+    """The page of the main job: the top with sliders, where three.js is installed, the tables, and the picture, if any."""
     below = ""
     for name, heading in headings(options).items():
         below += f"<h2>Time until it has turned over, {heading}</h2>" + table_as_html(rows_of(options, found[name]), 1)
     below += "".join(f'<p class="note">{escape(line)}</p>' for line in described(options))
     below += "" if drawing is None else "<h2>θ(t)</h2>" + picture_as_html(drawing)
-    above = "" if can_view() else f'<p class="note">{NO_VIEW}</p>'
-    path, stages = options.out / "index.html", []
+    path, title = options.out / "index.html", "A tippe top climbs onto its stem"
     if can_view():
-        stages = run.stages()
-    page(stages, "A tippe top climbs onto its stem", 0.2, above, below).save(path)
+        launch = Launch.degrees(middle(options.theta), options.rpm)
+        live = live_run(scenes(options)["plane"], launch, None, min(SHOWN, options.t1))
+        live_page(live._replace(title=title), stage([run]), 0.2, below).save(path)
+    else:
+        page([], title, 1.0, f'<p class="note">{NO_VIEW}</p>', below).save(path)
     return path
 
 

@@ -193,7 +193,8 @@ def level_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int
     scene = modules[0]
     state, scales = TrajectoryProblem.of(*modules).start()
     # The place is that of the centre of mass.
-    state = state.at[8:10].add(-scene.body.offset * state[2:4])
+    place = state[8:10] - scene.body.offset * state[2:4]
+    state = jnp.concatenate([state[:8], place, state[10:]])
     problem = InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
     return (*modes(scene, problem, tolerance, last=False, with_quadratures=True), state[:, None])
 
