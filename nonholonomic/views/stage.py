@@ -103,11 +103,12 @@ class Arena(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """An arena and the runs on it, seen by one camera."""
+    """An arena and the runs on it, seen by one camera, which follows them where they go far or `follows` says so."""
 
     title: str
     arena: Arena
     shows: tuple[Show, ...]
+    follows: bool = False
 
 
 #: Colours of the runs of a page, none of them an arrow's: that of a run's curves, and of one half of its body.

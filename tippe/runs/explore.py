@@ -1,9 +1,11 @@
 """A page with sliders in which a top is simulated anew in the browser."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -42,14 +44,13 @@ from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.top import Top
 from ..modes.inversion_problem import InversionProblem
-from ..modes.sliding import modes
+from ..modes.sliding import Slide, modes
 from ..modes.trajectory_problem import TrajectoryProblem
 from .flight_trajectory import HybridTrajectory, level_modes
 from .inversion import check_run
 from .launches import LONG_NAMES, UNITS
-from .observables import AbstractTrajectory
 from .trajectory import Trajectory, simulate
-from .view import AXIS, BESIDE, Motion, aside
+from .view import AXIS, BESIDE, Motion, aside, show
 
 Numbers = Float[Array, " numbers"]
 
@@ -59,6 +60,9 @@ TOLERANCE = 1e-7
 
 #: Tolerance of the runs that only say how far the arena is drawn.
 DRAWN = 1e-5
+
+#: How far a level plane is drawn about the start of a run with flights, in units of the radius.
+REACH = 20.0
 
 #: Steps after which a run in the page is given up: some hundred milliseconds.
 MOST_STEPS = 50_000
@@ -109,7 +113,8 @@ def explore(
     ```
     """
     live = live_run(scene, launch, sliders, t1)
-    page = live_page(live, stage(drawn_runs(scene, launch, live.sliders, float(t1))))
+    drawn = stage_at_start(scene, launch) if flies(scene) else stage_of_runs(scene, launch, live.sliders, float(t1))
+    page = live_page(live, drawn)
     if path is not None:
         page.save(path)
     return page
@@ -241,24 +246,36 @@ def hybrid_outcome(runs: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""
     return status, jnp.where(inverted, runs.crossing_time[0], jnp.inf)
 
 
-def drawn_runs(scene: Scene, launch: Launch, knobs: tuple[Slider, ...], t1: float) -> list[AbstractTrajectory]:
-    """The run at the start, and those at the ends of the sliders where the arena may be curved."""
+def stage_of_runs(scene: Scene, launch: Launch, knobs: tuple[Slider, ...], t1: float) -> Stage:
+    """The run at the start, on a piece of the arena on which are also the runs at the ends of the sliders."""
     roots = {"scene": scene, "launch": launch}
-    others = [] if flies(scene) else [with_numbers(roots, {path: end}) for path, end in ends_of(knobs)]
-    return [simulate(run["scene"], run["launch"], t1, tolerance=DRAWN) for run in [roots, *others]]
+    shapes = [roots, *(with_numbers(roots, {path: end}) for path, end in ends_of(knobs))]
+    paths = [simulate(run["scene"], run["launch"], t1, tolerance=DRAWN) for run in shapes]
+    (first,), size = paths[0].stages(), float(scene.body.size)
+    points = np.concatenate([np.asarray(path.contact) for path in paths])
+    return first._replace(arena=arena(scene.surface, points, first.arena.normal, 4.0 * size, 2.5 * size))
 
 
-def stage(runs: list[AbstractTrajectory]) -> Stage:
-    """The first of some runs as it is drawn, on a piece of the arena on which all of them are."""
-    (first,), scene = runs[0].stages(), runs[0].scene
-    size, margin = float(scene.body.size), 4.0 * float(scene.body.size)
-    if flies(scene):
-        # A level plane, below the centre: other launches may go as far again.
-        points = np.asarray(runs[0].position)
-        margin += float(np.linalg.norm(np.ptp(points, axis=0)))
-    else:
-        points = np.concatenate([np.asarray(run.contact) for run in runs])
-    return first._replace(arena=arena(scene.surface, points, first.arena.normal, margin, 2.5 * size))
+def stage_at_start(scene: Scene[Top], launch: Launch) -> Stage:
+    """A top on a level plane as it is launched: the page simulates before it shows anything."""
+    start = Motion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(scene, launch)))
+    drawn, size = show(scene, start._replace(times=np.array([0.0, 1.0])), 0, ""), float(scene.body.size)
+    # Slips grow as the top rises: the arrow of one half as fast as the equator is as long as the longest.
+    normal_force, slip, *others = drawn.arrows
+    assert slip.limit is not None
+    fastest = 0.5 * size * float(np.linalg.norm(start.angular_velocity[0]))
+    drawn = drawn._replace(arrows=(normal_force, slip._replace(scale=slip.limit / max(fastest, 1e-12)), *others))
+    ground = arena(scene.surface, start.contact, start.normal[0], REACH * size, 2.5 * size)
+    return Stage("", ground, (drawn,), follows=True)
+
+
+@eqx.filter_jit
+def _motion_at_start(scene: Scene[Top], launch: Launch) -> Motion[Array]:
+    modes, number, state = level_modes((scene, launch), TOLERANCE)
+    assert isinstance(modes[0], Slide)
+    # The others stand on their stem.
+    rows = dataclasses.replace(modes[0], number=number).shown(state)
+    return Motion.of(hybrid_run(scene, number, rows, jnp.zeros(1)))
 
 
 def smooth_frame(scene: Scene, problem: TrajectoryProblem, lane: LaneState) -> Frame:
@@ -270,9 +287,16 @@ def smooth_frame(scene: Scene, problem: TrajectoryProblem, lane: LaneState) -> F
 
 def hybrid_frame(scene: Scene, number: Int[Array, "1"], rows: Float[Array, "17 1"], time: Float[Array, "1"]) -> Frame:
     """What is drawn of a top at one time in contact or in flight; `rows` are what the modes show."""
+    return frame(scene, hybrid_run(scene, number, rows, time))
+
+
+def hybrid_run(
+    scene: Scene[Top], number: Int[Array, "1"], rows: Float[Array, "17 1"], time: Float[Array, "1"]
+) -> HybridTrajectory:
+    """The only time of a run in contact or in flight."""
     states, place, spin_angle, work, distance = HybridTrajectory.parts_of(rows)
     ends = (0, time[0], {}, None, distance, number, None)
-    return frame(scene, HybridTrajectory(time, scene, states, place, spin_angle, work, *ends))
+    return HybridTrajectory(time, scene, states, place, spin_angle, work, *ends)
 
 
 def frame(scene: Scene, run: Any) -> Frame:

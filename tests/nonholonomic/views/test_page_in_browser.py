@@ -179,7 +179,7 @@ def test_curves_and_arrows_tell_the_same_between_frames(browser, stages):
     show = stages[0].shows[0]
     force = next(curve.values for curve in show.curves if curve.label == "normal force [N]")
     swing = int(np.argmax(np.abs(np.diff(force))))
-    at = 0.51 * show.times[swing] + 0.49 * show.times[swing + 1]
+    at = float(0.51 * show.times[swing] + 0.49 * show.times[swing + 1])
     expected = 0.51 * force[swing] + 0.49 * force[swing + 1]
     assert abs(expected - force[swing]) > 3e-3 * expected
     arrow, curve = browser.execute_script(
