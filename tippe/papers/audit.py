@@ -106,8 +106,8 @@ AUDIT = (
         printed=r"L' = \tfrac12\left(m(\dot x^2+\dot y^2) + I\dot\theta^2 + I\sin^2\theta\,\dot\phi^2 "
         r"+ I_3(\dot\psi+\dot\phi\cos\theta)^2\right) - mg(R-a\cos\theta)",
         verdict="incomplete",
-        reason="The Lagrangian is for the plane, and lacks the vertical motion of the centre of mass. The first correct formula "
-        "is for the plane, in coordinates of the centre of mass; the second is for the cylinder, with the height z of "
+        reason="The Lagrangian is for the plane, and lacks the vertical motion of the centre of mass. The first correct "
+        "formula is for the plane, in coordinates of the centre of mass; the second is for the cylinder, with the height z of "
         "that centre.",
         correct=(
             r"L = L' + \tfrac12 ma^2\dot\theta^2\sin^2\theta",
@@ -172,8 +172,8 @@ AUDIT = (
         printed=r"(\ddot\eta,\ \ddot\phi,\ \ddot\theta,\ \ddot{\ },\ \ddot x)^T = (\ldots)",
         verdict="meaningless",
         reason="One symbol on the left is lost. The right sides mix forces times lengths with accelerations, and mu does not "
-        "occur. In the correct equations, M is the moment of the contact forces about the centre of mass per unit of N, and p, q, sigma are the components of "
-        "the angular velocity of the axes e1, e2, e.",
+        "occur. In the correct equations, M is the moment of the contact forces about the centre of mass per unit of N, "
+        "and p, q, sigma are the components of the angular velocity of the axes e1, e2, e.",
         correct=(
             r"m(\ddot{\mathbf O} - a\ddot{\mathbf e}) = N(\mathbf f + \mathbf n) - mg\mathbf z",
             r"I_1\dot p + I_3\omega_3q - I_1q\sigma = N\mathbf M\cdot\mathbf e_1,\qquad "
@@ -255,14 +255,14 @@ TABLES = """
 Tables 2 and 3 contain six times and eighteen answers yes or no. They depend on eight unknown parameters and an unknown
 friction law. Here a top counts as reversed when it reaches 0.95 pi within 40 s.
 
-* **Table 2 alone** (`python benchmarks/paper_tables_scan.py`). Of 20 000 random tops under viscous friction, 293 reverse in the printed
-  rows; after variation, the best of them misses the times by 1.25 s.
+* **Table 2 alone** (`python benchmarks/paper_tables_scan.py`). Of 20 000 random tops under viscous friction, 293 reverse in
+  the printed rows; after variation, the best of them misses the times by 1.25 s.
 * **Table 3 alone** (the same program). No top was found: those that keep contact reverse after 3 to 30 s in another order.
-* **Both tables with one top** (`python benchmarks/paper_tables_joint.py --law viscous`). With an error of 1 s in each row, the
-  smallest -2 log likelihood is 29.6 at 11 degrees of freedom, for m = 11.573 g, R = 27.474 mm, a / R = 0.086495, I1 / I3 =
-  1.0533, I3 / m R^2 = 0.4075, a cylinder of 84.428 R, azimuth 1.7971, mu = 0.32573 s/m. From the wall this top reverses at
-  22.6, 19.3, 19.9 and 22.4 s (printed 23, 19, 20, 22), and from the lowest line at 26.3, 26.3, 28.2 and 30.3 s (printed 25,
-  22, not, not). Other tops do as well (`examples/lost_numbers.py`).
+* **Both tables with one top** (`python benchmarks/paper_tables_joint.py --law viscous`). With an error of 1 s in each row,
+  the smallest -2 log likelihood is 29.6 at 11 degrees of freedom, for m = 11.573 g, R = 27.474 mm, a / R = 0.086495, I1 /
+  I3 = 1.0533, I3 / m R^2 = 0.4075, a cylinder of 84.428 R, azimuth 1.7971, mu = 0.32573 s/m. From the wall this top
+  reverses at 22.6, 19.3, 19.9 and 22.4 s (printed 23, 19, 20, 22), and from the lowest line at 26.3, 26.3, 28.2 and 30.3 s
+  (printed 25, 22, not, not). Other tops do as well (`examples/lost_numbers.py`).
 
 So the tables do not determine Table 1.
 """
