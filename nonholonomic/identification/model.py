@@ -31,7 +31,7 @@ class AbstractDataModel(eqx.Module):
 
     @abc.abstractmethod
     def together(self, source: Any, values: Values) -> Hashable:
-        """A key for sets of data that can be predicted together: sets with equal keys can."""
+        """A key for sets of data; sets with equal keys can be predicted together."""
 
     @abc.abstractmethod
     def predict(self, sources: list[tuple[Any, Values]], rows: int) -> list[Float[Array, "rows size"]]:

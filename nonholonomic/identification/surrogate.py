@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 
 from .posterior import LogDensity
 
-#: Degree of the polynomials: at least 2 up to the first number of unknowns, lower if there would be more terms than the
-#: second.
+#: Highest degree of the polynomials, and their greatest number of terms, for which the degree is lowered, but not below
+#: 2.
 HIGHEST, MOST_TERMS = 4, 90
 
 #: The highest power in the bends of points.
