@@ -64,9 +64,8 @@ def proportions(body: Top) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
 def group(body: Top) -> str:
     """The group of a top (Rutstam 2012; Ciocci et al. 2012).
 
-    **Returns:** "I" if gamma < 1 - alpha: the top stands upright at every spin and never inverts; "III" if gamma > 1 +
-    alpha: it never stands inverted, and ends tumbling; "II" otherwise: it inverts if Jellett's constant is large
-    enough.
+    **Returns:** "I" if gamma < 1 - alpha: the top stands upright at every spin; "III" if gamma > 1 + alpha: it never
+    stands inverted, and ends tumbling; "II" otherwise: it inverts if Jellett's constant is large enough.
 
     **Example:** with the scene of the module.
 
@@ -117,8 +116,7 @@ def upright_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
 
 
 def inverted_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
-    """Spin [rad/s] above which the inverted top on the plane is stable, on its stem if it has one; infinite if it never
-    is.
+    """Spin [rad/s] above which the inverted top on the plane (on its stem, if any) is stable; infinite if it never is.
 
     omega^2 = m g a (1 + alpha)^2 / (I3 (1 + alpha - gamma)), for a stem with its offset and radius (`tippe.md`, sections 4, 6).
 
@@ -179,8 +177,7 @@ def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = F
     """Matrix [1/s] of the linear motion near a standing top, on any arena.
 
     Components along n change only at second order and are omitted, as are the frame's own direction and the places that
-    a symmetry makes equivalent (plane, cylinder, torus). A scene with `contact="hybrid"` is treated like one with
-    "stop".
+    a symmetry makes equivalent. A scene with `contact="hybrid"` is treated like one with "stop".
 
     **Arguments:** as for `standing_state`.
 

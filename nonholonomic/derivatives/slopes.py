@@ -165,11 +165,11 @@ def tangents_of(
     - `numbers`: the arguments of `build`, arrays.
     - `tangents`: each with the rates at which the numbers move.
 
-    **Returns:** for each tangent that of the problem, `None` for leaves that depend on no number.
+    **Returns:** for each tangent the tangent of the problem, `None` for leaves that depend on no number.
     """
 
     def built(*numbers: Any) -> Any:
-        # A problem may hold functions too.
+        # A problem may also hold functions.
         return eqx.filter(build(*numbers), eqx.is_inexact_array)
 
     reached = _reached(jax.make_jaxpr(built)(*numbers))
