@@ -97,7 +97,7 @@ class Surrogate(eqx.Module):
         runs."""
         known = np.all(np.isfinite(predictions), axis=1)
         if not np.any(known):
-            raise ValueError("density: the model predicts nothing within the covariance around the centre")
+            raise ValueError("density: the model has no predictions within the covariance around the centre")
         # An angle that jumps by a whole turn is not a polynomial.
         middle = predictions[np.argmax(np.where(known, log_densities, -np.inf))]
         predictions = predictions - np.asarray(self.density.measurements.whole_periods(predictions - middle))

@@ -92,7 +92,7 @@ HEADERS = "t,tilt,x\n0.0,5,1\n0.1,6,2\n"
         (HEADERS, {"phi": ("tilt", "deg")}, 25.0, "quantity = 'phi'"),
         (HEADERS, {"position": ("x", "m")}, 25.0, "'position' must be a single column"),
         (HEADERS, {"theta": ("tilt", "deg")}, None, "fps must be given"),
-        (HEADERS, {"time": ("t", "s"), "theta": ("tilt", "deg")}, 25.0, "fps = 25.0 must be left out"),
+        (HEADERS, {"time": ("t", "s"), "theta": ("tilt", "deg")}, 25.0, "fps = 25.0 must be omitted"),
         (HEADERS.replace("6", "six"), {"theta": ("tilt", "deg")}, 25.0, "tilt = 'six' in line 3"),
         (HEADERS + "1\n", {"theta": ("tilt", "deg")}, 25.0, "line 4 has 1 cells, not 3"),
     ],

@@ -292,9 +292,7 @@ class Rolling(AbstractFriction):
     def __check_init__(self):
         require_kind(self.sliding, "sliding", AbstractFriction, A_LAW)
         if isinstance(self.sliding, Rolling) or self.sliding.set_valued:
-            raise ValueError(
-                f"sliding = {self.sliding!r} must be a law of sliding that has a force at every slip velocity"
-            )
+            raise ValueError(f"sliding = {self.sliding!r} must be a sliding law with a force at every slip velocity")
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.resistance, "resistance", at_least=0.0)

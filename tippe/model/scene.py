@@ -116,14 +116,14 @@ class Scene(Bounded, Generic[Body]):
         if self.contact not in ("stop", "hybrid"):
             raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
         if self.restitution is not None and self.contact == "stop":
-            raise ValueError(f"restitution = {self.restitution!r} must be left out where contact = 'stop'")
+            raise ValueError(f"restitution = {self.restitution!r} must be omitted for contact = 'stop'")
         if not isinstance(self.body, Top):
             self._check_convex(type(self.body).__name__)
             return
         if self.friction.set_valued and self.body.stem is not None:
             raise ValueError(
-                f"friction = {self.friction!r} must be a law without phases for a top with a stem, such as Coulomb: which of "
-                "two contacts sticks and which slips has no single answer"
+                f"friction = {self.friction!r} must be a law with a single mode for a top with a stem, such as Coulomb: "
+                "with two contacts it is undetermined which one sticks"
             )
         if self.contact == "stop" and self.body.stem is not None:
             raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
@@ -133,9 +133,11 @@ class Scene(Bounded, Generic[Body]):
         if not isinstance(self.surface, Plane):
             raise ValueError(f"surface = {self.surface!r} must be a Plane for a {kind}; a Top runs on any arena")
         if self.contact != "stop":
-            raise ValueError(f"contact = {self.contact!r} must be 'stop' for a {kind}; a Top flies on")
+            raise ValueError(f"contact = {self.contact!r} must be 'stop' for a {kind}; only a Top can fly")
         if self.friction.set_valued:
-            raise ValueError(f"friction = {self.friction!r} must be a law without phases for a {kind}, such as Coulomb")
+            raise ValueError(
+                f"friction = {self.friction!r} must be a law with a single mode for a {kind}, such as Coulomb"
+            )
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.gravity, "gravity", above=0.0)
@@ -213,7 +215,7 @@ class Scene(Bounded, Generic[Body]):
         names, kind = [name for name, _ in surface.coordinates], type(surface).__name__
         if launch.place is None:
             if len(names) == 3:
-                raise ValueError(f"place = None must be (x, y, z) on a {kind}, which names no place by eta")
+                raise ValueError(f"place = None must be (x, y, z) on a {kind}, which has no places by eta")
             if "eta" not in names and not isinstance(self.frame, PlaneFrame):
                 yield Bound(launch.eta, "eta", at_least=0.0, at_most=0.0, why=f"a place on a {kind} is given by place")
             return
