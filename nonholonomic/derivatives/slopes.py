@@ -128,7 +128,7 @@ def _event_time(varied: VariationalProblem, lane_state: LaneState) -> Float[Arra
 
 
 def _moving(problem: AbstractProblem, direction: Any) -> Any:
-    """Which leaves a tangent moves, of those on which the field or the event function depends."""
+    """The leaves that a tangent moves, as far as the field or the event function depends on them."""
     leaves, structure = jax.tree.flatten(problem)
     states = problem.start()[0]
 

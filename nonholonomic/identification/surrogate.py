@@ -110,7 +110,8 @@ class Surrogate(eqx.Module):
     def among(
         self, coordinates: Float[np.ndarray, "draws unknowns"]
     ) -> tuple["Surrogate", Float[np.ndarray, "draws unknowns"]]:
-        """The surrogate with points in which the given draws are nearly round, and the draws as such points.
+        """A surrogate whose points are adapted to some draws, which are nearly round in the new points; also returns
+        these points.
 
         Along the principal axes of the draws, the widest first, the part that is predicted by powers of the earlier
         points is subtracted.

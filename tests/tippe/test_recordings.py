@@ -110,7 +110,7 @@ def test_files_that_cannot_be_read_are_refused(tmp_path, text, columns, fps, mes
         ({"value": [np.nan, np.nan]}, "at least one number"),
         ({"times": [1.0, 0.5]}, "increasing"),
         ({"quantity": "phi"}, "quantity = 'phi' must be one of"),
-        ({"quantity": ("theta", "theta")}, "each once"),
+        ({"quantity": ("theta", "theta")}, "each only once"),
         ({"error": [0.1, 0.1, 0.1]}, "error must be one number"),
         ({"error": 0.0}, "error = 0.0 must be greater"),
         ({"t0": 2.0}, "t0 = 2.0 must be less than"),

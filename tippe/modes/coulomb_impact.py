@@ -38,7 +38,8 @@ ITERATIONS = 30
 class Skid(AbstractProblem):
     """The slipping part of impacts: tangential and normal impulse as the state, the slip distance as the time.
 
-    - `impact`: the impacts, in whose units the impulses are; `pace`: the speed with which the sphere arrives [m/s].
+    - `impact`: the impacts, which define the units of the impulses; `pace`: the speed with which the sphere arrives
+      [m/s].
     """
 
     impact: Impact

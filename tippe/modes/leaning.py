@@ -14,7 +14,7 @@ own slip, the vertical force on the centre of mass and the torque that raises th
 with tau_j the torque per unit normal force of a law that has one. Then m u' = N_0 f_0 + N_1 f_1, and with
 t_j = f_j.(n x e) the momenta change by p' = sum N_j (a_j t_j + tau_j.n) and b' = sum N_j (R_j t_j + tau_j.e).
 
-The slips differ across the direction of leaning only. So m_1 - m_0 is (a_1 - a_0) (1 - c^2) without friction and with
+The slips differ only across the direction of leaning. So m_1 - m_0 is (a_1 - a_0) (1 - c^2) without friction and with
 viscous friction; Coulomb's law can make it vanish if mu h is more than (a_1 - a_0) sin theta. The first of two normal
 forces vanishes before that.
 """
@@ -146,8 +146,9 @@ class LeaningDynamics(eqx.Module):
         order of the speeds g, so the error is of the order of their square.
         this errs by their square.
 
-        **Returns:** the body after these impulses, before `at_rest`; and whether their friction takes energy. One P_j
-        is negative, the reduction of that sphere's load in T; if its friction adds energy now, it takes some after the
+        **Returns:** the body after these impulses, before `at_rest`; and whether their friction dissipates energy. One
+        P_j is negative, the reduction of that sphere's load in T; if its friction adds energy now, it dissipates some
+        after the
         impact of the other sphere (det G > 0).
         """
         spheres, zero = balls(self.body), jnp.zeros_like(free.height)
