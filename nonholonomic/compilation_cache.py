@@ -79,7 +79,7 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
         remove_damaged(place)
     except (OSError, RuntimeError) as error:
         # Log instead of warn: if warnings are errors, a cache must not stop a computation.
-        _log.warning("compiled programs are not kept: %s", error)
+        _log.warning("compiled programs are not stored: %s", error)
         return None
     if chosen != str(place):
         # JAX opens its folder only once.
@@ -160,7 +160,7 @@ def remove_damaged(folder: Path) -> None:
         looking.unlink(missing_ok=True)
         if error.errno not in NO_ROOM:
             raise
-        _log.warning("no more compiled programs are kept in %s: %s", folder, error)
+        _log.warning("compiled programs can no longer be stored in %s: %s", folder, error)
 
 
 def _line(entry: Path) -> bytes:

@@ -58,7 +58,7 @@ def forget_programs_if_many(most_memory: int = MOST_MEMORY) -> bool:
     gc.collect()
     release_memory()
     _log.warning(
-        "compiled programs took %.2g GB and %d memory mappings and are forgotten; the next calls compile again",
+        "compiled programs took %.2g GB and %d memory mappings and were cleared; the next calls compile again",
         1e-9 * memory,
         mappings,
     )

@@ -144,7 +144,7 @@ def require_kind(value: Any, name: str, kind: type, example: str = "") -> None:
     wanted = kind.__name__.removeprefix("Abstract")
     if type(value).__name__ == wanted:
         theirs, ours = (one.__module__.partition(".")[0] for one in (type(value), kind))
-        raise ValueError(f"{name} is a {theirs}.{wanted} and must be a {ours}.{wanted}: the packages have one each")
+        raise ValueError(f"{name} is a {theirs}.{wanted} and must be a {ours}.{wanted}: each package has its own")
     raise ValueError(f"{name} = {value!r} must be a {wanted}{example}{uncalled(value)}")
 
 
@@ -158,7 +158,7 @@ def require_one_run(run: Any, action: str, many: str) -> None:
     several."""
     if np.ndim(run.t) != 1:
         raise ValueError(
-            f"this is a batch of runs, with t of shape {np.shape(run.t)}, and {action} takes one run: take the first by "
+            f"this is a batch of runs, with t of shape {np.shape(run.t)}, and {action} takes one run: select one by "
             f"jax.tree.map(lambda leaf: leaf[0], runs){many}"
         )
 
@@ -318,8 +318,8 @@ class Bounded(eqx.Module):
         except ValueError:
             lists = ", ".join(f"{name} of shape {shape}" for name, shape in shapes.items() if shape)
             raise ValueError(
-                f"{type(self).__name__}: {lists}: the numbers of one object are scalars or lists of one length; a grid "
-                "of all combinations is made by the tables, such as inversion_table"
+                f"{type(self).__name__}: {lists}: the numbers of one object must be scalars or lists of equal length; "
+                "for a grid of all combinations, use a table, such as inversion_table"
             ) from None
 
     def __repr__(self) -> str:

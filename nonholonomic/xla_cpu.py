@@ -249,9 +249,9 @@ def _knows_the_attributes() -> bool:
     if jaxlib_version.startswith("0.") and 10 <= minor <= 12:
         return True
     warnings.warn(
-        f"loops are compiled without XLA's kernel attributes, which were tried with jaxlib 0.10 to 0.12, not with "
-        f"{jaxlib_version}: results are the same, tables may take up to 2.5 times as long. "
-        "Install one of these versions where that matters.",
+        f"loops are compiled without XLA's kernel attributes, which are tested with jaxlib 0.10 to 0.12, but not with "
+        f"{jaxlib_version}: results are the same, but tables may take up to 2.5 times as long. "
+        "If that matters, install one of these versions.",
         stacklevel=2,
     )
     return False

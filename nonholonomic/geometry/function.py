@@ -65,7 +65,7 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
     results = traced.out_avals
     if len(results) != 1 or results[0].shape not in shapes or not jnp.issubdtype(results[0].dtype, jnp.floating):
         shown = ", ".join(map(str, results))
-        raise ValueError(f"{name} = {value!r} must give one number for numbers {', '.join(arguments)}, not {shown}")
+        raise ValueError(f"{name} = {value!r} must return one number for numbers {', '.join(arguments)}, not {shown}")
     if isinstance(value, eqx.Module):
         return value
     closes_over = any(is_traced(constant) for constant in traced.consts)

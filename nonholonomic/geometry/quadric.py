@@ -34,7 +34,7 @@ class AbstractQuadric(AbstractSurface):
         """Equatorial radius A and polar semi-axis c [m]."""
 
     def gradient(self, vector: Vector) -> Vector:
-        """The vector N r [1/m]; also N times any other vector."""
+        """The vector N r [1/m] for a position r, along the normal; also N times any other vector."""
         equatorial, polar = self.semi_axes
         across, along = 1.0 / (equatorial * equatorial), 1.0 / (polar * polar)
         return (multiply(across, vector[0]), multiply(across, vector[1]), multiply(along, vector[2]))

@@ -163,7 +163,7 @@ class AbstractSurface(Bounded):
         if len(place) == 3:
             off = self.offset(self.in_own_axes((place[0], place[1], place[2])))
             most = ROUND_OFF * (size + jnp.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2))
-            why = "of a place from the surface, in metres: it must be on it but for round-off"
+            why = "of the place from the surface, in metres: the place must be on the surface up to round-off"
             yield Bound(0.0 if off is None else off, "distance", at_least=-most, at_most=most, why=why)
 
     def sign(self, side: str | None, closed: str) -> float:

@@ -77,7 +77,7 @@ def _table(path: Path) -> dict[str, list[str]]:
         line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip() and line.lstrip()[0] != "#"
     ]
     if len(lines) < 2:
-        raise ValueError(f"path = {str(path)!r} must have a line of headers and at least one of numbers")
+        raise ValueError(f"path = {str(path)!r} must have a header line and at least one line of numbers")
     parted = next((mark for mark in ("\t", ";", ",") if mark in lines[0]), None)
     rows = list(csv.reader(lines, delimiter=parted)) if parted else [line.split() for line in lines]
     headers = [header.strip() for header in rows[0]]
@@ -92,7 +92,7 @@ def _times(table: dict[str, list[str]], columns: Mapping[str, Any], fps: Any, pa
     if fps is not None:
         require(fps, "fps", above=0.0)
         if "time" in columns:
-            raise ValueError(f"fps = {fps!r} must be left out where 'time' is among the columns")
+            raise ValueError(f"fps = {fps!r} must be omitted because 'time' is among the columns")
         if "frame" not in columns:
             return np.arange(len(next(iter(table.values())))) / float(fps)
         return _column(table, "frame", columns["frame"], "1", path) / float(fps)

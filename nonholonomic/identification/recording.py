@@ -52,7 +52,7 @@ class Quantities:
                 raise ValueError(f"quantity = {word!r} must be one of {', '.join(map(repr, known))}")
             columns += known[word]
         if not columns or len(set(columns)) < len(columns):
-            raise ValueError(f"quantity = {quantity!r} must name at least one column, and each once")
+            raise ValueError(f"quantity = {quantity!r} must name at least one column, and each only once")
         return tuple(columns)
 
 

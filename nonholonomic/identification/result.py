@@ -217,7 +217,7 @@ class Identification:
             f"Identification of {len(self.estimates)} numbers from {len(self.residuals)} measurements: {self.status}",
             f"  {self.statuses.count('converged')} of {len(self.statuses)} starts converged, {self.verdict.agree} ended here",
             f"  -2 log likelihood {self.deviance:.4g} at {self.degrees} degrees of freedom",
-            "whether it can be believed",
+            "verdict",
             str(self.verdict),
             "estimates, standard errors and 95 % intervals",
         ]
@@ -225,9 +225,9 @@ class Identification:
         for name, value in self.estimates.items():
             low, high = self.interval(name)
             lines.append(f"  {name:{width}}  {value:.6g} +- {self.standard_errors[name]:.2g}  ({low:.6g}, {high:.6g})")
-        lines.append("what the data fix, by the relative error of what moves together")
+        lines.append("combinations of parameters and their relative errors")
         for value, words in zip(self.identifiability.singular_values, self.identifiability.words, strict=True):
-            mark = "  NOT SEEN" if words in self.identifiability.unseen else ""
+            mark = "  UNDETERMINED" if words in self.identifiability.unseen else ""
             lines.append(f"  {1.0 / max(value, 1e-300):8.2g}  {words}{mark}")
         lines.append("measured, predicted, residual in units of the error")
         width = max(len(row.label) for row in self.residuals)

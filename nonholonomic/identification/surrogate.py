@@ -97,7 +97,7 @@ class Surrogate(eqx.Module):
         runs."""
         known = np.all(np.isfinite(predictions), axis=1)
         if not np.any(known):
-            raise ValueError("density: the model predicts nothing within the covariance around the centre")
+            raise ValueError("density: the model has no predictions within the covariance around the centre")
         # An angle that jumps by a whole turn is not a polynomial.
         middle = predictions[np.argmax(np.where(known, log_densities, -np.inf))]
         predictions = predictions - np.asarray(self.density.measurements.whole_periods(predictions - middle))
@@ -110,7 +110,8 @@ class Surrogate(eqx.Module):
     def among(
         self, coordinates: Float[np.ndarray, "draws unknowns"]
     ) -> tuple["Surrogate", Float[np.ndarray, "draws unknowns"]]:
-        """The surrogate with points in which the given draws are nearly round, and the draws as such points.
+        """A surrogate whose points are adapted to some draws, which are nearly round in the new points; also returns
+        these points.
 
         Along the principal axes of the draws, the widest first, the part that is predicted by powers of the earlier
         points is subtracted.

@@ -121,7 +121,7 @@ def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]
     **Raises:** `ValueError` that names the unknown and the problem.
     """
     if not isinstance(free, dict) or not free:
-        raise ValueError(f"free = {free!r} must be a non-empty dictionary, name of a number -> where to start")
+        raise ValueError(f"free = {free!r} must be a non-empty dictionary, name of a number -> start value")
     unknowns = {}
     for name, start in free.items():
         unknown = start if isinstance(start, Free) else Free(start)

@@ -75,7 +75,7 @@ class Verdict(NamedTuple):
 
     def __str__(self) -> str:
         scatter = (
-            "the scatter says nothing of the fit: the errors were estimated from it, or no degree of freedom is left"
+            "the size of the residuals cannot test the fit: the errors were estimated from it, or no degree of freedom is left"
             if math.isnan(self.p_value)
             else f"residuals this large have a probability of {self.p_value:.2g}"
         )

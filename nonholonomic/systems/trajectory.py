@@ -72,7 +72,9 @@ class Trajectory(eqx.Module):
         **Raises:** `ValueError` for a batch of runs.
         """
         if np.ndim(self.t) != 1 or np.ndim(self.state) != 2:
-            raise ValueError("a batch of runs is no table of one: nonholonomic.sweep makes a table of many")
+            raise ValueError(
+                "this is a batch of runs, and to_table takes one run; nonholonomic.sweep makes a table of many"
+            )
         columns = dict(zip(self.names, np.asarray(self.state).T, strict=True)) | {"mode": np.asarray(self.mode)}
         return Table({"time": np.asarray(self.t)}, columns, {"time": "s"}, {"status": self.status})
 

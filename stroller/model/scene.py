@@ -136,12 +136,12 @@ class Scene(Bounded):
         if _holds_somewhere(self.sideways(launch)):
             raise ValueError(
                 f"steering = {shown(launch.steering)} must differ from a right angle for speed = {shown(launch.speed)}: "
-                "the rear axle stands still when the front wheel stands across"
+                "the rear axle cannot move while the front wheel is at a right angle"
             )
         if _holds_somewhere(self.level(launch)):
             raise ValueError(
-                f"place[1] = {shown(launch.place[1])} must differ from 0 for heading = 'projected': on the equator no "
-                "horizontal speed belongs to a motion along the ground, and the constraints may lose rank"
+                f"place[1] = {shown(launch.place[1])} must differ from 0 for heading = 'projected': on the equator, motion "
+                "along the ground has no horizontal speed, and the constraints may lose rank"
             )
 
     def start_bounds(self, launch: Launch) -> Iterator[Bound]:
