@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.geometry import dot, multiply, scale
 from nonholonomic.hybrid import Transition, TransitionPath
 from nonholonomic.integration import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED, AbstractProblem
-from nonholonomic.xla_cpu import greatest, least
+from nonholonomic.xla_cpu import compiled_setup, greatest, least
 
 from ..model.dynamics import Dynamics, stacked
 from ..model.scene import Scene
@@ -198,8 +198,14 @@ def modes(
     slides = tuple(Slide(*arguments, jnp.asarray(number), last) for number in range(len(spheres)))
     if len(spheres) == 1:
         return slides, jnp.zeros(problem.states.shape[1:], int)
-    main, stem = spheres
-    return (*slides, Lean(*arguments)), (height(main, stem, problem.states) < 0.0).astype(int)
+    return (*slides, Lean(*arguments)), _first_mode(scene.body, problem.states)
+
+
+@compiled_setup
+def _first_mode(body: Top, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+    """The number of the lower of the two spheres."""
+    main, stem = balls(body)
+    return (height(main, stem, states) < 0.0).astype(int)
 
 
 def leaning(scene: Scene[Top]) -> LeaningDynamics:
