@@ -1,8 +1,7 @@
 """Fit the lost Table 1 of the paper on the cylinder to its Tables 2 and 3: seven numbers and the cylinder's radius.
 
-Rows "not reversed" have a one-sided likelihood, times an error of a second; the friction law is not stated (here
-viscous). The start values are from searches as in `benchmarks/paper_tables_joint.py` with 190000 sets of numbers; the
-first is fitted further.
+Rows "not reversed" have a one-sided likelihood, times an error of a second; the friction law is unknown (here viscous).
+The start values come from 190000 sets of numbers (`benchmarks/paper_tables_joint.py`); the first is fitted further.
 """
 
 import jax

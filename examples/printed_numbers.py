@@ -21,8 +21,7 @@ def scene(mass: float, radius: float, one: dict) -> tippe.Scene:
 
 
 def thresholds(one: dict) -> jnp.ndarray:
-    """Spins [rad/s] above which Rutstam's top inverts if launched upright, and above which it leaves the upright
-    position."""
+    """Spins [rad/s] above which Rutstam's top inverts if launched upright, and above which standing upright is unstable."""
     of, lever = scene(0.02, 0.02, one), 0.02 - one["offset"]
     return jnp.stack([steady.jellett_thresholds(of)[1] / (lever * one["I3"]), steady.upright_critical_spin(of)])
 
