@@ -31,6 +31,7 @@ from .model.launch import Launch
 from .model.scene import Scene
 from .papers import tables as paper_tables
 from .runs.explore import live_run, stage_at_start
+from .runs.observables import INVERTED
 from .runs.plot import Panel, draw_launches
 from .runs.table import inversion_table
 from .runs.theta_over_time import theta_over_time
@@ -38,7 +39,7 @@ from .runs.theta_over_time import theta_over_time
 TOPS = {top.__name__: top for top in (presets.wooden, presets.rutstam, presets.cohen, presets.leine_glocker)}
 
 #: Times at which theta is drawn, and how long the run is that is shown [s].
-SAMPLES, SHOWN = 128, 5.0
+SAMPLES, SHOWN = 256, 5.0
 
 #: The page's title, and what stands for what is below the top.
 TITLE, BELOW = "A tippe top climbs onto its stem", "<!-- below -->"
@@ -127,9 +128,9 @@ def sliders(options: argparse.Namespace) -> str:
     """The page of the top with sliders, a placeholder for what stands below it; empty without three.js."""
     if not can_view():
         return ""
-    scene, launch = scenes(options)["plane"], launch_shown(options)
-    live = live_run(scene, launch, None, min(SHOWN, options.t1))._replace(title=TITLE)
-    return live_page(live, stage_at_start(scene, launch), 0.2, BELOW).html
+    run = (scenes(options)["plane"], launch_shown(options))
+    t1 = min(SHOWN, options.t1)
+    return live_page(live_run(*run, None, t1)._replace(title=TITLE), stage_at_start(*run, t1), 0.2, BELOW).html
 
 
 def computed(options: argparse.Namespace, folder: Path | None) -> tuple[dict[str, Table], Any, str]:
@@ -209,8 +210,12 @@ def report(options: argparse.Namespace, found: dict[str, Table]) -> str:
 def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> Any:
     """theta(t) of the launch that is shown, which has turned over at `end` [s]."""
     title = f"{options.top} top, {options.rpm:g} rpm, mu = {middle(options.mu):g}, on a table"
+    if end <= times[-1]:
+        # Between the times it may be above the angle for a moment only.
+        after = np.searchsorted(times, end)
+        times, theta = np.insert(times, after, end), np.insert(theta, after, INVERTED)
     panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]))
-    return draw_launches([panel], 0.95 * np.pi, "for the first time above the dashed angle")
+    return draw_launches([panel], INVERTED, "for the first time above the dashed angle")
 
 
 def write_page(options: argparse.Namespace, found: dict[str, Table], live: str, drawing: Path | None) -> Path:

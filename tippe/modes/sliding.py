@@ -154,29 +154,26 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         return self.closed(air)._replace(record=record)
 
     def lost(self, state: Float[Array, "components cells"]) -> "Air":
-        """The top where this mode ends."""
         start = lost_contact(self.scene, self.number, state)
         return start._replace(quadratures=state[OWN:]) if self.with_quadratures else start
 
     def hop(self, air: "Air", left: Cells) -> tuple["Air", "Air"]:
-        """One flight of a top whose contact is open, and the impact at its end."""
+        """One flight of a top whose contact is open, and after it the impact at its end."""
         after, landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
         if air.falls is not None:
             after, landed = _where(air.falls, air, after), air.falls | landed
         return after, _where(air.open, _where(landed, land(self.scene, after), after), air)
 
     def motion_in(self, air: "Air") -> tuple[FreeBody, Float[Array, "7 cells"] | None]:
-        """What `between` needs of a flight that begins."""
         return air.free, air.quadratures
 
     def closed(self, air: "Air") -> Transition:
         """The transition of a top that is back on the plane, or whose run has ended."""
-        status = jnp.where(air.open, UNRESOLVED, air.status)
-        state = contact_state(air.free)
+        status, state = jnp.where(air.open, UNRESOLVED, air.status), contact_state(air.free)
         if air.quadratures is not None:
             state = jnp.concatenate([state, air.quadratures])
-        fields = (air.ball, state, air.elapsed, status, air.crossing_time, air.flights[None])
-        return Transition(*fields, log_rates=air.log_rates)
+        counts = air.flights[None]
+        return Transition(air.ball, state, air.elapsed, status, air.crossing_time, counts, log_rates=air.log_rates)
 
 
 class Lean(AbstractFlyingMode):

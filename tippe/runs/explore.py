@@ -61,8 +61,8 @@ TOLERANCE = 1e-7
 #: Tolerance of the runs that only say how far the arena is drawn.
 DRAWN = 1e-5
 
-#: How far a level plane is drawn about the start of a run with flights, in units of the radius.
-REACH = 20.0
+#: How far a level plane is drawn about the start of a run with flights, in units of sqrt(g R) t1.
+REACH = 0.5
 
 #: Steps after which a run in the page is given up: some hundred milliseconds.
 MOST_STEPS = 50_000
@@ -113,7 +113,7 @@ def explore(
     ```
     """
     live = live_run(scene, launch, sliders, t1)
-    drawn = stage_at_start(scene, launch) if flies(scene) else stage_of_runs(scene, launch, live.sliders, float(t1))
+    drawn = stage_at_start(scene, launch, t1) if flies(scene) else stage_of_runs(scene, launch, live.sliders, float(t1))
     page = live_page(live, drawn)
     if path is not None:
         page.save(path)
@@ -256,7 +256,7 @@ def stage_of_runs(scene: Scene, launch: Launch, knobs: tuple[Slider, ...], t1: f
     return first._replace(arena=arena(scene.surface, points, first.arena.normal, 4.0 * size, 2.5 * size))
 
 
-def stage_at_start(scene: Scene[Top], launch: Launch) -> Stage:
+def stage_at_start(scene: Scene[Top], launch: Launch, t1: float) -> Stage:
     """A top on a level plane as it is launched: the page simulates before it shows anything."""
     start = Motion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(scene, launch)))
     drawn, size = show(scene, start._replace(times=np.array([0.0, 1.0])), 0, ""), float(scene.body.size)
@@ -265,7 +265,8 @@ def stage_at_start(scene: Scene[Top], launch: Launch) -> Stage:
     assert slip.limit is not None
     fastest = 0.5 * size * float(np.linalg.norm(start.angular_velocity[0]))
     drawn = drawn._replace(arrows=(normal_force, slip._replace(scale=slip.limit / max(fastest, 1e-12)), *others))
-    ground = arena(scene.surface, start.contact, start.normal[0], REACH * size, 2.5 * size)
+    reach = REACH * math.sqrt(float(scene.gravity) * size) * t1
+    ground = arena(scene.surface, start.contact, start.normal[0], max(reach, 10.0 * size), 2.5 * size)
     return Stage("", ground, (drawn,), follows=True)
 
 

@@ -70,7 +70,9 @@ def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "") 
     # Its name and its warning are those of one run.
     drawn = stage._replace(title="", shows=tuple(show._replace(note="") for show in stage.shows))
     scripts = [script(text) for text in (programs(live), _file("map.js"), _file("explore.js"))]
-    return page([drawn], live.title, speed, above=_file("explore.html"), below=below, scripts=scripts)
+    return page(
+        [drawn], live.title, speed, _file("explore.html"), f'<section id="below">{below}</section>', scripts=scripts
+    )
 
 
 def programs(live: LiveRun) -> str:
