@@ -33,21 +33,27 @@ def _compiler(**options: Any) -> Callable[[Callable[..., Result]], Callable[...,
 #: go when XLA prefers 512 bits by itself; without AVX-512 it does nothing.
 compiled_alone = _compiler(compiler_options={"xla_cpu_prefer_vector_width": 512})
 
+_HAS_OLDER_EMITTERS = jaxlib_version.startswith("0.10.")
+
 #: For programs that are called on their own and run for a moment only: jaxlib 0.10 compiles them in half of the time if told to
 #: leave out the newer of its two ways to compile fused operations. Loops may run slower, a table with two derivatives by a
 #: quarter. It can go with 0.10: later versions have a single way, and refuse the option.
-compiled_quickly = _compiler(
-    compiler_options={"xla_cpu_use_fusion_emitters": False} if jaxlib_version.startswith("0.10.") else {}
+compiled_quickly = _compiler(compiler_options={"xla_cpu_use_fusion_emitters": False} if _HAS_OLDER_EMITTERS else {})
+
+
+#: XLA's flags for short jobs: no optimisations by LLVM, and the older of the two ways to compile fused operations. XLA ends the
+#: process if it does not know a flag, and later versions do not know the second.
+QUICK_FLAGS = "--xla_backend_optimization_level=0" + (
+    " --xla_cpu_use_fusion_emitters=false" if _HAS_OLDER_EMITTERS else ""
 )
 
 
 def compile_quickly() -> None:
-    """Compile all programs of this process without LLVM's optimisations, unless XLA_FLAGS says otherwise: for jobs of seconds.
+    """Compile all programs of this process by `QUICK_FLAGS`, unless XLA_FLAGS is set: for jobs of seconds.
 
     It halves the time of compiling; loops run three times as slow. XLA reads its flags when it is used first.
     """
-    emitters = ["--xla_cpu_use_fusion_emitters=false"] if jaxlib_version.startswith("0.10.") else []
-    os.environ.setdefault("XLA_FLAGS", " ".join(["--xla_backend_optimization_level=0", *emitters]))
+    os.environ.setdefault("XLA_FLAGS", QUICK_FLAGS)
 
 
 #: For what is done once before a run: called on its own it is one program and not dozens of small ones, each of which takes

@@ -95,23 +95,27 @@ def _sampled(
     settings = Settings(jnp.where(may, tolerance, LOOSEST), solver)
     horizon, at = jnp.where(may, t1, 0.0), jnp.where(may, times, 0.0)
     if cells.form.traits.smooth:
-        found = sampled_run(_problem, cells, at, horizon, settings)
-        states, reached = found.states, jnp.all(jnp.isfinite(found.states), axis=1)
+        samples = sampled_run(_problem, cells, at, horizon, settings)
+        states, reached = samples.states, jnp.all(jnp.isfinite(samples.states), axis=1)
         mode, switches = jnp.where(reached, cells.form.first, -1), jnp.zeros(())
-        status, steps = found.status, found.accepted + found.rejected
+        status, steps = samples.status, samples.accepted + samples.rejected
     else:
-        found = hybrid_samples(_modes, cells, at, horizon, settings, 1)
-        states, mode, switches = found.shown.T, jnp.where(jnp.isnan(found.number), -1, found.number), found.counts[0]
-        status, steps = found.status, found.steps
+        samples = hybrid_samples(_modes, cells, at, horizon, settings, 1)
+        states, mode, switches = (
+            samples.shown.T,
+            jnp.where(jnp.isnan(samples.number), -1, samples.number),
+            samples.counts[0],
+        )
+        status, steps = samples.status, samples.steps
     states = jax.vmap(run.shown)(nan_unless(may, states))
     return Trajectory(
         t=times,
         state=states,
         mode=mode.astype(int),
-        end_time=nan_unless(may, found.end_time),
+        end_time=nan_unless(may, samples.end_time),
         switches=switches.astype(int),
         steps=steps.astype(int),
-        rejected=found.rejected.astype(int),
+        rejected=samples.rejected.astype(int),
         code=jnp.where(may, status, FAILED).astype(int),
         names=run.names,
     )

@@ -54,7 +54,7 @@ TOLERANCE = 1e-7
 DRAWN = 1e-5
 
 #: Steps after which a run in the page is given up: some hundred milliseconds.
-MOST_STEPS = 50_000
+MOST_STEPS_OF_A_PAGE = 50_000
 
 
 @status_line("writing a page")
@@ -126,7 +126,7 @@ def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float) -> Liv
     def moment(values: Numbers, problem: TrajectoryProblem, lane: LaneState) -> Frame:
         return frame(modules(values)[0], problem, lane)
 
-    settings = Settings(TOLERANCE, max_steps=MOST_STEPS)
+    settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
     asked = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
     launched = Simulator(lambda values: InversionProblem.of(*modules(values), ANGLE, 1), t1, settings, asked)
     return LiveRun(

@@ -106,7 +106,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         scene, launch, angle, *_ = jax.tree.unflatten(self.structure, (*leaves, None, None))
         return InversionProblem.of(scene, launch, angle, cells)
 
-    def _found(
+    def _extended(
         self,
         tangents: tuple[Any, ...],
         problem: InversionProblem,

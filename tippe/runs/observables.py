@@ -187,8 +187,8 @@ class AbstractTrajectory(eqx.Module, Viewable):
         frame, where = self.scene.frame, (self._place, self._path)
         centre = sum_vectors(frame.position(*where), scale(self.above[0], frame.axes(*where)[2]))
         beside = self.scene.body.path_from_frame(parts(self.states).axis)
-        found = jnp.stack(centre, axis=-1)
-        return found if beside == (None, None, None) else found + self._fixed(beside)
+        point = jnp.stack(centre, axis=-1)
+        return point if beside == (None, None, None) else point + self._fixed(beside)
 
     @of_each_run
     def jellett(self) -> Float[Array, " times"]:
@@ -260,7 +260,7 @@ class AbstractTrajectory(eqx.Module, Viewable):
             "axis_drift": float(np.max(np.abs(np.linalg.norm(np.asarray(self.states)[2:5], axis=0) - 1.0))),
             "energy_residual": float(np.max(np.abs(energy - energy[0] - work))),
         }
-        return eqx.tree_at(lambda one: one.stats, self, stats | more)
+        return eqx.tree_at(lambda run: run.stats, self, stats | more)
 
     @of_each_run
     def normal(self) -> Float[Array, "times 3"]:
