@@ -28,7 +28,7 @@ from nonholonomic.integration import AbstractProblem, Oscillatory8, Settings, so
 from nonholonomic.parameters import with_numbers
 from stroller.runs.table import RideProblem
 from tippe.modes.inversion_problem import InversionProblem
-from tippe.runs.cells import run_kind_of
+from tippe.runs.run_kind import run_kind_of
 
 RECORD = Path(__file__).with_name("cost.json")
 

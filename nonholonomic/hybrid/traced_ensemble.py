@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..integration.ensemble import traced_solve_ensemble
 from ..integration.settings import Settings
-from ..integration.status import LEFT_DOMAIN, RUNNING, UNRESOLVED
+from ..integration.status import LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 from ..xla_cpu import greatest
 from .ensemble import (
     MOST_ROUNDS,
@@ -27,6 +27,7 @@ def traced_solve_hybrid(
     mode: Int[Array, " cells"],
     state: Float[Array, "components cells"],
     t1: Float[Array, "..."],
+    cells: int,
     settings: Settings,
     *,
     counters: int,
@@ -45,7 +46,7 @@ def traced_solve_hybrid(
     t1 = jnp.broadcast_to(t1, (size,))
     zero, none = jnp.zeros(size), jnp.zeros(size, int)
     start = HybridOutcome(
-        status=jnp.full(size, RUNNING),
+        status=jnp.where(jnp.arange(size) < cells, RUNNING, REACHED_END),
         crossing_time=jnp.full(size, jnp.inf),
         end_time=zero,
         state=state,

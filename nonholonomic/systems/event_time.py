@@ -11,7 +11,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from ..derivatives import (
     AbstractDifferentiableSolve,
     differentiable_solve,
-    in_groups,
     tangents_by,
     traced_solve_ensemble_with_tangents,
 )
@@ -179,7 +178,7 @@ class HybridEvent(SmoothEvent):
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, settings = self.permitted(leaves)
         modes, first, states = self.of_leaves(leaves).modes(cells)
-        return _named(may, traced_solve_hybrid(modes, first, states, t1, settings, counters=1))
+        return _named(may, traced_solve_hybrid(modes, first, states, t1, cells, settings, counters=1))
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
@@ -194,17 +193,12 @@ class HybridEvent(SmoothEvent):
         may, t1, settings = self.permitted(leaves)
         (modes, first, states), tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
 
-        def run(group: tuple[Any, ...]) -> tuple[tuple[HybridOutcome, Array], list[Float[Array, " cells"]]]:
-            moved = tuple((tangent[0], tangent[2]) for tangent in group)
-            outcome, sensitivities = traced_solve_hybrid_with_tangents(
-                modes, moved, first, states, t1, settings, counters=1
-            )
-            return (outcome, sensitivities.grazing), list(sensitivities.slopes)
-
-        (outcome, grazing), slopes = in_groups(run, tangents)
+        moved = tuple((tangent[0], tangent[2]) for tangent in tangents)
+        outcome, sensitivities = traced_solve_hybrid_with_tangents(
+            modes, moved, first, states, t1, cells, settings, counters=1
+        )
         time = _named(may, outcome)
-        slopes = [jnp.where(grazing, jnp.nan, slope) for slope in gather(slopes)]
-        return time, [jnp.where(jnp.isinf(time), 0.0, slope + 0.0 * time) for slope in slopes]
+        return time, [jnp.where(jnp.isinf(time), 0.0, slope + 0.0 * time) for slope in gather([*sensitivities.slopes])]
 
 
 def _named(may: Bool[Array, "..."], ended: Outcome | HybridOutcome) -> Float[Array, " cells"]:

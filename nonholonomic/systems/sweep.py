@@ -203,8 +203,7 @@ class SweepJob(NamedTuple):
         shorts = short_names([*columns, *(name for name in self.by if name not in columns)])
         ends = self._ends(cells, columns, outcome, crossed, size)
         for name, slope, scale in zip(self.by, slopes, scales, strict=True):
-            known = np.where(grazing, np.nan, np.asarray(slope) / np.asarray(scale))
-            ends[f"time_by_{shorts[name]}"] = np.where(crossed, known, 0.0)
+            ends[f"time_by_{shorts[name]}"] = np.where(crossed, np.asarray(slope) / np.asarray(scale), 0.0)
         if self.by and not cells.form.traits.smooth:
             ends["grazes"] = (crossed & grazing).astype(np.int8)
         return ends

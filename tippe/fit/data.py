@@ -15,8 +15,8 @@ from nonholonomic.validation import as_number, as_number_or_none, require
 
 from ..model.launch import Launch
 from ..model.scene import Scene
+from ..runs.checks import check_event
 from ..runs.extended_times import extended_inversion_time
-from ..runs.inversion import check_event
 from ..runs.trajectory import simulate
 
 #: What can be recorded of a top: as the properties of a `Trajectory` call it.

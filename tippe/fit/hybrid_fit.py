@@ -9,8 +9,9 @@ from nonholonomic.identification import of_data
 from nonholonomic.parameters import numbers, with_numbers
 
 from ..model.scene import Scene
-from ..runs.cells import InversionRuns, run_kind_of
+from ..runs.cells import InversionRuns
 from ..runs.extended_times import LEAST_ANGLE
+from ..runs.run_kind import run_kind_of
 from ..runs.trajectory import simulate
 from .data import InversionTimes, Recording, column_of
 

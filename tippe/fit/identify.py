@@ -22,9 +22,9 @@ from nonholonomic.validation import as_number, require_kind
 
 from ..model.launch import Launch
 from ..model.scene import Scene
-from ..runs.cells import run_kind_of
-from ..runs.inversion import check_run, check_smooth
+from ..runs.checks import check_run, check_smooth
 from ..runs.launches import variable_numbers
+from ..runs.run_kind import run_kind_of
 from .data import InversionTimes, Recording, Values, predict_recordings
 from .hybrid_fit import HybridModel
 

@@ -39,7 +39,7 @@ from ..model.scene import Scene
 from ..model.top import Top
 from ..modes.inversion_problem import InversionProblem
 from ..modes.trajectory_problem import TrajectoryProblem
-from .inversion import check_run
+from .checks import check_run
 from .launches import LONG_NAMES, UNITS
 from .trajectory import Trajectory, simulate
 from .view import AXIS, BESIDE, Motion, aside

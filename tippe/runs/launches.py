@@ -13,7 +13,7 @@ from nonholonomic.validation import require_kind
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.top import Top
-from .inversion import check_numbers
+from .checks import check_numbers
 
 UNITS = Top.units | Scene.units | Launch.units
 

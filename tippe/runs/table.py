@@ -15,9 +15,10 @@ from nonholonomic.sweeps import Axis, Table, Variable, sweep
 from nonholonomic.validation import require_flag, require_outside, require_whole
 
 from ..model.scene import Scene
-from .cells import InversionRuns, check_differentiable, run_kind_of, too_many_steps
-from .inversion import check_event, warn_if_it_cannot_invert
+from .cells import InversionRuns, too_many_steps
+from .checks import check_event, warn_if_it_cannot_invert
 from .launches import described, launches, rows
+from .run_kind import check_differentiable, run_kind_of
 from .sensitivities import sensitivity_names, sensitivity_variables
 from .time_error import errors_of, second_tolerance
 

@@ -40,8 +40,8 @@ from ..model.launch import Launch
 from ..model.scene import Scene
 from ..modes.trajectory_problem import TrajectoryProblem
 from .airborne_trajectory import sampled_airborne, simulate_airborne
+from .checks import check_run
 from .flight_trajectory import HybridTrajectory, sampled_hybrid, simulate_hybrid
-from .inversion import check_run
 from .observables import AbstractTrajectory, of_each_run
 from .sampled import ended, sampled
 from .stick_slip_trajectory import solve_stick_slip_dense

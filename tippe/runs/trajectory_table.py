@@ -13,9 +13,9 @@ from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
 from nonholonomic.validation import as_number, require, require_all, require_increasing, require_outside, require_whole
 
 from ..model.scene import Scene
-from .cells import COUNTED
 from .launches import described, launches
 from .quantities import COMPONENTS, QUANTITIES
+from .run_kind import COUNTED
 from .trajectory_cells import solve_cells
 
 #: How a run may end, in the order of `Status`.
