@@ -1,4 +1,5 @@
-"""Lagrange's equations with multipliers, in coordinates and velocities: the form that users' own systems are run in."""
+"""Lagrange's equations with multipliers, in coordinates and velocities: the form in which users' own systems are
+run."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from .formulation import AbstractSystem, AbstractVelocityFormulation, Coordinate
 class Lagrange(AbstractVelocityFormulation):
     """Lagrange's equations with multipliers, G q'' + G' q' = dL/dq + f + W^T lambda, with W q'' + W' q' = 0.
 
-    The multipliers are those of `Multipliers`. Here the state is (q, q'), so that the metric's equations are solved once, for
+    The multipliers are those of `Multipliers`, but the state is (q, q'), so the metric's equations are solved once, for
     the force and the rows of W together. The Lagrangian must be kinetic minus potential energy. Source: `stroller.md`,
     section 6, F1.
 

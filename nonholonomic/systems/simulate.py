@@ -1,4 +1,4 @@
-"""Follow one run of a user's system."""
+"""Simulate one run of a user's system."""
 
 import dataclasses
 from typing import Any
@@ -20,7 +20,7 @@ from .mode import Hybrid
 from .system import Run, System, check_run, run_of
 from .trajectory import Trajectory
 
-#: How many times are saved if none are asked for.
+#: Default number of times to report.
 DEFAULT_TIMES = 201
 
 
@@ -33,9 +33,9 @@ def simulate(
     tolerance: Float[ArrayLike, ""] = 1e-9,
     solver: diffrax.AbstractERK | None = None,
 ) -> Trajectory:
-    """Follow one run of a system to `t1`; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
+    """Simulate one run of a system to `t1`; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
 
-    A run goes on through all resets, and through the system's event. Derivatives go through resets by the saltation matrix.
+    A run continues through all resets and through the system's event. Derivatives use the saltation matrix at resets.
 
     **Arguments:**
 
@@ -45,8 +45,8 @@ def simulate(
 
     **Returns:** a `Trajectory`, whose `status` says how the run ended.
 
-    **Raises:** `ValueError` for arguments out of range, times that do not increase, functions that return something else than
-    they should, and second derivatives through resets.
+    **Raises:** `ValueError` for arguments out of range, times that do not increase, functions that return a wrong type
+    or shape, and second derivatives through resets.
 
     **Example:** a pendulum as an `AbstractSystem`.
 
@@ -89,7 +89,7 @@ def _sampled(
     tolerance: Float[Array, ""],
     solver: diffrax.AbstractERK | None,
 ) -> Trajectory:
-    """The run, or NaN and "failed" where a traced number is out of range."""
+    """The run, or NaN and "failed" if a traced number is out of range."""
     cells = run.cells
     may = jnp.all(legal([*run_bounds(t1, tolerance), *times_bounds(times, t1)])) & jnp.all(jnp.diff(times) > 0.0)
     settings = Settings(jnp.where(may, tolerance, LOOSEST), solver)
@@ -128,5 +128,5 @@ def _problem(cells: Cells, count: int | None) -> ModeProblem:
 def _modes(
     cells: Cells, tolerance: Array
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " 1"], Float[Array, "components 1"]]:
-    """The modes of one run, its first and its start."""
+    """The modes of one run, the index of its first mode, and its start."""
     return cells.modes(1)

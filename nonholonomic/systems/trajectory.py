@@ -11,21 +11,21 @@ from ..integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
 from ..sweeps import Table
 from ..validation import is_traced
 
-#: The words for how a run without an event ends, by its code.
+#: The words for how a run without an event ends, by code.
 WORDS = {REACHED_END: "completed", LEFT_DOMAIN: "stopped", FAILED: "failed", UNRESOLVED: "unresolved"}
 
 
 class Trajectory(eqx.Module):
-    """A run of a user's system at given times, which are the first axis of its arrays; a batch made by `jax.vmap` has one more.
+    """A run of a user's system at given times, which are the first axis of its arrays; `jax.vmap` adds an axis.
 
     - `t`: times [s], (times,).
-    - `state`: (times, components), NaN after the end of the run; of an `AbstractSystem` the coordinates, and behind them their
-      rates. At the time of a reset it is the state before.
-    - `mode`: number of the mode, (times,), -1 after the end.
-    - `end_time`: when the run ended [s]; `switches`: how many resets there were.
-    - `steps`, `rejected`: steps of the integration, and how many of them were rejected.
-    - `code`: what `status` puts in words.
-    - `names`: of the components in tables.
+    - `state`: (times, components), NaN after the end of the run; for an `AbstractSystem` the coordinates, followed by
+      their rates. At the time of a reset, this is the state before the reset.
+    - `mode`: index of the mode, (times,), -1 after the end.
+    - `end_time`: time at which the run ended [s]; `switches`: number of resets.
+    - `steps`, `rejected`: numbers of integration steps and of rejected ones.
+    - `code`: code of `status`.
+    - `names`: names of the components in tables.
 
     **Example:**
 
@@ -56,10 +56,10 @@ class Trajectory(eqx.Module):
 
     @property
     def status(self) -> Any:
-        """How the run ended: "completed" at `t1`; "stopped" where a mode without a reset ended; "failed"; or "unresolved" where
-        resets followed one another without end.
+        """How the run ended: "completed" at `t1`; "stopped" if a mode without a reset ended; "failed"; or "unresolved"
+        if resets followed one another without end.
 
-        An array of words for a batch of runs; inside a transformation the code.
+        For a batch of runs, an array of words; inside a transformation, the code.
         """
         if is_traced(self.code):
             return self.code
@@ -72,7 +72,9 @@ class Trajectory(eqx.Module):
         **Raises:** `ValueError` for a batch of runs.
         """
         if np.ndim(self.t) != 1 or np.ndim(self.state) != 2:
-            raise ValueError("a batch of runs is no table of one: nonholonomic.sweep makes a table of many")
+            raise ValueError(
+                "this is a batch of runs, and to_table takes one run; nonholonomic.sweep makes a table of many"
+            )
         columns = dict(zip(self.names, np.asarray(self.state).T, strict=True)) | {"mode": np.asarray(self.mode)}
         return Table({"time": np.asarray(self.t)}, columns, {"time": "s"}, {"status": self.status})
 
