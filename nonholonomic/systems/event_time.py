@@ -18,16 +18,15 @@ from ..hybrid import HybridOutcome, traced_solve_hybrid, traced_solve_hybrid_wit
 from ..integration import (
     CROSSED,
     FAILED,
-    LOOSEST,
     UNRESOLVED,
     Outcome,
     Settings,
     explicit_tableau,
-    run_bounds,
+    legal_run,
     traced_solve_ensemble,
 )
 from ..progress import status_line
-from ..validation import as_number, legal
+from ..validation import as_number
 from .engine import Cells
 from .mode import Event
 from .system import System, check_run, run_of
@@ -146,9 +145,9 @@ class SmoothEvent(AbstractDifferentiableSolve):
         A batch has one tolerance: the smallest.
         """
         *_, t1, tolerance = leaves
-        may = legal(run_bounds(t1, tolerance))
-        may = may & jnp.isfinite(jnp.asarray(sum(self.of_leaves(leaves).start)))
-        return may, jnp.where(may, t1, 0.0), Settings(jnp.min(jnp.where(may, tolerance, LOOSEST)), self.solver)
+        finite = jnp.isfinite(jnp.asarray(sum(self.of_leaves(leaves).start)))
+        may, t1, tolerance = legal_run(finite, t1, tolerance)
+        return may, t1, Settings(jnp.min(tolerance), self.solver)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, settings = self.permitted(leaves)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.integration import LOOSEST, run_bounds
+from nonholonomic.integration import legal_run, run_bounds
 from nonholonomic.parameters import numbers
 from nonholonomic.validation import (
     Bound,
@@ -44,15 +44,8 @@ def permitted(
     scene, launch, angle, t1, tolerance = jax.tree.unflatten(structure, leaves)
     may = jnp.asarray(True)
     if unchecked:
-        bounds = (
-            *all_bounds(scene),
-            *all_bounds(launch),
-            *scene.start_bounds(launch),
-            *event_bounds(angle),
-            *run_bounds(t1, tolerance),
-        )
-        may = legal(bounds)
-        t1, tolerance = jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
+        bounds = (*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch), *event_bounds(angle))
+        may, t1, tolerance = legal_run(legal(bounds), t1, tolerance)
     return may, t1, jnp.min(tolerance)
 
 

@@ -105,7 +105,7 @@ def trajectory_table(
     inner = [axis("time", "time", "s", times, "time")]
     variables = {}
     for name in names:
-        unit, components, long_name = QUANTITIES[name]
+        unit, long_name, components, _ = QUANTITIES[name]
         dims = ("time",) if components is None else ("time", components)
         variables[name] = Variable(unit, np.float64, inner=dims, long_name=long_name)
     for dim in dict.fromkeys(QUANTITIES[name].components for name in names):
