@@ -90,9 +90,9 @@ AUDIT = (
         r"R_\phi = \partial_\eta,\quad "
         r"R_\psi = -y\sin\eta\,\partial_r - \tfrac yr\cos\eta\,\partial_\eta + r\sin\eta\,\partial_y",
         verdict="right",
-        reason="The last lines hold for x = r sin(eta), z = r cos(eta), with eta = 0 at the top; from the lowest line, z = "
-        "-r cos(eta). The first line of (5) has phi and theta instead of eta and y. Only the second field and d/dy "
-        "are tangent to the cylinder. The model needs none of the others.",
+        reason="The last lines hold for x = r sin(eta), z = r cos(eta), with eta = 0 at the top; if eta counts from the "
+        "lowest line, z = -r cos(eta). The first line of (5) has phi and theta instead of eta and y. Only the "
+        "second field and d/dy are tangent to the cylinder. The model needs none of the others.",
         correct=(r"[R_x, R_y] = -R_z,\qquad [R_y, R_z] = -R_x,\qquad [R_z, R_x] = -R_y",),
         code=("tippe.papers.paper.rotation_generators",),
         tests=(
