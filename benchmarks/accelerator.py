@@ -67,9 +67,9 @@ def times_of(scene: tippe.Scene, names: list[str], result: str = "time") -> Run:
 
     def run(launches: int, tolerance: float) -> np.ndarray:
         grid = {"theta": thetas(launches), "spin": SPIN, "t1": T1, "tolerance": tolerance}
-        found = tippe.inversion_table(scene, **grid, sensitivities=names, progress=False)
-        columns = [one for one in found.variables if one.startswith("time_by_")] or [result]
-        return np.stack([np.where(np.isfinite(found[one]), found[one], 0.0) for one in columns])
+        table = tippe.inversion_table(scene, **grid, sensitivities=names, progress=False)
+        columns = [name for name in table.variables if name.startswith("time_by_")] or [result]
+        return np.stack([np.where(np.isfinite(table[name]), table[name], 0.0) for name in columns])
 
     return run
 
@@ -77,8 +77,8 @@ def times_of(scene: tippe.Scene, names: list[str], result: str = "time") -> Run:
 def gradient(launches: int, tolerance: float) -> np.ndarray:
     """The gradient of a loss with respect to six numbers, relative to each."""
     loss, values = loss_of(scene(tippe.Viscous(0.3)), thetas(launches), SIX)
-    found = _gradient_of(launches, loss)(values, jnp.asarray(tolerance))
-    return np.stack([np.sum(slope * value) for slope, value in zip(found, values, strict=True)])
+    slopes = _gradient_of(launches, loss)(values, jnp.asarray(tolerance))
+    return np.stack([np.sum(slope * value) for slope, value in zip(slopes, values, strict=True)])
 
 
 def samples(launches: int, tolerance: float) -> Any:
@@ -89,8 +89,8 @@ def samples(launches: int, tolerance: float) -> Any:
 def sampled_table(launches: int, tolerance: float) -> np.ndarray:
     """The same by `trajectory_table`."""
     grid = {"theta": thetas(launches), "spin": SPIN, "times": np.linspace(0.0, T1, 201)}
-    found = tippe.trajectory_table(scene(tippe.Viscous(0.3)), **grid, tolerance=tolerance, progress=False)
-    return found.theta
+    table = tippe.trajectory_table(scene(tippe.Viscous(0.3)), **grid, tolerance=tolerance, progress=False)
+    return table.theta
 
 
 @jax.jit
@@ -135,10 +135,10 @@ def measured(
                 if time.monotonic() > deadline:
                     yield f"{program}, {launches} launches, tolerance {tolerance:.0e}"
                     continue
-                found = timed(lambda at=tolerance, run=run, many=launches: run(many, at), 2)
+                timing = timed(lambda at=tolerance, run=run, many=launches: run(many, at), 2)
                 exact = np.asarray(run(launches, TIGHT)) if exact is None else exact
-                error = float(np.max(np.abs(np.asarray(found.result) - exact)) / np.max(np.abs(exact)))
-                yield Row(program, launches, tolerance, found.wall / launches * 1e6, error, found.first)
+                error = float(np.max(np.abs(np.asarray(timing.result) - exact)) / np.max(np.abs(exact)))
+                yield Row(program, launches, tolerance, timing.wall / launches * 1e6, error, timing.first)
 
 
 def page(rows: list[Row], omitted: list[str]) -> str:
@@ -173,9 +173,9 @@ def main(arguments: list[str] | None = None) -> None:
     if jnp.result_type(float) != jnp.float64:
         raise SystemExit("JAX_ENABLE_X64 = 0 must be left out: the measurements are of float64")
     rows, omitted = [], []
-    for one in measured(programs(), LAUNCHES, TOLERANCES, options.seconds):
-        print(one, flush=True)
-        (rows if isinstance(one, Row) else omitted).append(one)
+    for row in measured(programs(), LAUNCHES, TOLERANCES, options.seconds):
+        print(row, flush=True)
+        (rows if isinstance(row, Row) else omitted).append(row)
         # Written after every row, so that nothing is lost.
         options.out.write_text(page(rows, omitted))
 

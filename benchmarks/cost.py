@@ -28,7 +28,7 @@ from nonholonomic.integration import AbstractProblem, Oscillatory8, Settings, so
 from nonholonomic.parameters import with_numbers
 from stroller.runs.table import RideProblem
 from tippe.modes.inversion_problem import InversionProblem
-from tippe.runs.cells import run_kind_of
+from tippe.runs.run_kind import run_kind_of
 
 RECORD = Path(__file__).with_name("cost.json")
 
@@ -136,8 +136,8 @@ def rounded(operations: Operations) -> int:
 
 def steps(case: Case) -> list[float]:
     """Mean number of steps of a launch."""
-    given = (jnp.asarray(case.task.t1), jnp.asarray(case.task.launches), Settings(1e-9, Oscillatory8()))
-    return [round(float(solve_ensemble(case.problem, *given)[0].steps.mean()), 2)]
+    run = (jnp.asarray(case.task.t1), jnp.asarray(case.task.launches), Settings(1e-9, Oscillatory8()))
+    return [round(float(solve_ensemble(case.problem, *run)[0].steps.mean()), 2)]
 
 
 def record() -> dict[str, dict[str, list[float]]]:
@@ -170,8 +170,9 @@ def main() -> None:
                 print(f"{kind}, {name}: {before} recorded, {number} now")
     if options.write:
         lines = (
-            f'  "{kind}": {{\n' + ",\n".join(f"    {json.dumps(name)}: {json.dumps(one)}" for name, one in some.items())
-            for kind, some in counted.items()
+            f'  "{kind}": {{\n'
+            + ",\n".join(f"    {json.dumps(name)}: {json.dumps(entry)}" for name, entry in entries.items())
+            for kind, entries in counted.items()
         )
         RECORD.write_text("{\n" + "\n  },\n".join(lines) + "\n  }\n}\n")
 

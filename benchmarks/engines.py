@@ -66,11 +66,11 @@ def mujoco(times: np.ndarray, step: float) -> np.ndarray:
     # A free joint's angular velocity is in the frame of the body.
     data.qvel[5] = SPIN
     mujoco.mj_forward(model, data)
-    found = []
+    angles = []
     for count in np.diff(np.rint(times / step).astype(int), prepend=0):
         mujoco.mj_step(model, data, int(count))
-        found.append(np.arccos(np.clip(data.xmat[1].reshape(3, 3)[2, 2], -1.0, 1.0)))
-    return np.array(found)
+        angles.append(np.arccos(np.clip(data.xmat[1].reshape(3, 3)[2, 2], -1.0, 1.0)))
+    return np.array(angles)
 
 
 def drake(times: np.ndarray, step: float) -> np.ndarray:
@@ -99,12 +99,12 @@ def drake(times: np.ndarray, step: float) -> np.ndarray:
     turned = RotationMatrix.MakeYRotation(THETA)
     plant.SetFreeBodyPose(context, body, RigidTransform(turned, [0.0, 0.0, HEIGHT]))
     plant.SetFreeBodySpatialVelocity(context, body, SpatialVelocity(SPIN * AXIS, np.zeros(3)))
-    found = []
+    angles = []
     for moment in times:
         simulator.AdvanceTo(moment)
         rotation = plant.EvalBodyPoseInWorld(context, body).rotation().matrix()
-        found.append(np.arccos(np.clip(rotation[2, 2], -1.0, 1.0)))
-    return np.array(found)
+        angles.append(np.arccos(np.clip(rotation[2, 2], -1.0, 1.0)))
+    return np.array(angles)
 
 
 def pybullet(times: np.ndarray, step: float) -> np.ndarray:
@@ -133,14 +133,14 @@ def pybullet(times: np.ndarray, step: float) -> np.ndarray:
         top, -1, angularDamping=0.0, maxJointVelocity=1e6, activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING
     )
     bullet.resetBaseVelocity(top, angularVelocity=list(SPIN * AXIS))
-    found = []
+    angles = []
     for count in np.diff(np.rint(times / step).astype(int), prepend=0):
         for _ in range(count):
             bullet.stepSimulation()
         matrix = bullet.getMatrixFromQuaternion(bullet.getBasePositionAndOrientation(top)[1])
-        found.append(np.arccos(np.clip(matrix[8], -1.0, 1.0)))
+        angles.append(np.arccos(np.clip(matrix[8], -1.0, 1.0)))
     bullet.disconnect(client)
-    return np.array(found)
+    return np.array(angles)
 
 
 #: Name -> (package, engine, steps [s]).

@@ -168,14 +168,14 @@ def ball_by_heyoka(tolerance: float) -> Callable[[Any, Any], Any]:
 
     def times(heights: Any, number: float) -> Any:
         nonlocal bounces, restitution
-        restitution, found = number, np.empty(len(heights))
+        restitution, event_times = number, np.empty(len(heights))
         for k, start in enumerate(heights):
             bounces, integrator.time = 0, 0.0
             integrator.state[:] = start, 0.0
             integrator.reset_cooldowns()
             integrator.propagate_until(20.0)
-            found[k] = integrator.time
-        return found
+            event_times[k] = integrator.time
+        return event_times
 
     return times
 
@@ -190,14 +190,14 @@ def sleigh_by_heyoka(tolerance: float) -> Callable[[Any, Any], Any]:
     integrator = heyoka.taylor_adaptive(field, [0.0, 1.0, 1.3], pars=[0.3], tol=tolerance, t_events=[event])
 
     def times(speeds: Any, ahead: float) -> Any:
-        integrator.pars[0], found = ahead, np.empty(len(speeds))
+        integrator.pars[0], event_times = ahead, np.empty(len(speeds))
         for k, speed in enumerate(speeds):
             integrator.time = 0.0
             integrator.state[:] = 0.0, speed, 1.3
             integrator.reset_cooldowns()
             integrator.propagate_until(5.0)
-            found[k] = integrator.time
-        return found
+            event_times[k] = integrator.time
+        return event_times
 
     return times
 

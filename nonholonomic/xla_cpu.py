@@ -34,22 +34,26 @@ def _compiler(**options: Any) -> Callable[[Callable[..., Result]], Callable[...,
 #: own. It has no effect without AVX-512. It can be removed when XLA prefers 512 bits by itself.
 compiled_alone = _compiler(compiler_options={"xla_cpu_prefer_vector_width": 512})
 
+_HAS_OLDER_EMITTERS = jaxlib_version.startswith("0.10.")
+
 #: For programs that are called on their own and run only for a moment: jaxlib 0.10 compiles them in half the time
 #: without the newer of its two emitters of fused operations. Loops may run slower, a table with two derivatives by a
 #: quarter. It can be removed with 0.10: later versions have a single emitter, and reject the option.
-compiled_quickly = _compiler(
-    compiler_options={"xla_cpu_use_fusion_emitters": False} if jaxlib_version.startswith("0.10.") else {}
+compiled_quickly = _compiler(compiler_options={"xla_cpu_use_fusion_emitters": False} if _HAS_OLDER_EMITTERS else {})
+
+#: XLA's flags for short jobs: without LLVM's optimisations, and without the newer emitter. A flag that XLA does not know ends
+#: the process, and later versions do not know the second.
+QUICK_FLAGS = "--xla_backend_optimization_level=0" + (
+    " --xla_cpu_use_fusion_emitters=false" if _HAS_OLDER_EMITTERS else ""
 )
 
 
 def compile_quickly() -> None:
-    """Compile all programs of this process without LLVM's optimisations, unless XLA_FLAGS says otherwise: for jobs of
-    seconds.
+    """Compile all programs of this process with `QUICK_FLAGS`, unless XLA_FLAGS is set: for jobs of seconds.
 
     This halves the compile time; loops run three times as slowly. XLA reads its flags on its first use.
     """
-    emitters = ["--xla_cpu_use_fusion_emitters=false"] if jaxlib_version.startswith("0.10.") else []
-    os.environ.setdefault("XLA_FLAGS", " ".join(["--xla_backend_optimization_level=0", *emitters]))
+    os.environ.setdefault("XLA_FLAGS", QUICK_FLAGS)
 
 
 #: For preparations that run once before a run: called on their own they are one program and not dozens of small ones,

@@ -108,8 +108,8 @@ class Push(eqx.Module):
 
     def __call__(self, t, motion):
         return tuple(
-            one["mean"] + one["amplitude"] * jnp.sin(one["frequency"] * t + one["phase"])
-            for one in (self.force, self.torque)
+            wave["mean"] + wave["amplitude"] * jnp.sin(wave["frequency"] * t + wave["phase"])
+            for wave in (self.force, self.torque)
         )
 
 
@@ -119,7 +119,7 @@ def ride(scene: dict[str, Any]) -> dict[str, Any]:
     side = "inside" if scene["arena"]["shape"] == "torus" else scene["arena"].get("side")
     set_up = stroller.Scene(body, surface, law, scene["gravity"], side, "absolute")
     place = tuple(start["position"])
-    east, north = (np.array(surface.in_fixed_frame(one)) for one in surface.chart(place)[1:])
+    east, north = (np.array(surface.in_fixed_frame(vector)) for vector in surface.chart(place)[1:])
     heading = np.arctan2(start["direction"] @ north, start["direction"] @ east)
     launch = stroller.Launch(place, heading, start["speed"], start["steering"], start["steering_rate"])
     push = Push(**jax.tree.map(jnp.asarray, scene["input"]))

@@ -196,11 +196,11 @@ def headings(options: argparse.Namespace) -> dict[str, str]:
     }
 
 
-def report(options: argparse.Namespace, found: dict[str, Table]) -> str:
+def report(options: argparse.Namespace, arenas: dict[str, Table]) -> str:
     """The tables as text."""
     lines = []
     for name, heading in headings(options).items():
-        rows = rows_of(options, found[name])
+        rows = rows_of(options, arenas[name])
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines += ["", f"Time until it has turned over, {heading}"]
         lines += ["  ".join(entry.rjust(width) for entry, width in zip(row, widths, strict=True)) for row in rows]
@@ -218,11 +218,11 @@ def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> 
     return draw_launches([panel], INVERTED, "for the first time above the dashed angle")
 
 
-def write_page(options: argparse.Namespace, found: dict[str, Table], live: str, drawing: Path | None) -> Path:
+def write_page(options: argparse.Namespace, arenas: dict[str, Table], live: str, drawing: Path | None) -> Path:
     """The page of the main job: the top with sliders, where three.js is installed, the tables, and the picture, if any."""
     below = ""
     for name, heading in headings(options).items():
-        below += f"<h2>Time until it has turned over, {heading}</h2>" + table_as_html(rows_of(options, found[name]), 1)
+        below += f"<h2>Time until it has turned over, {heading}</h2>" + table_as_html(rows_of(options, arenas[name]), 1)
     below += "".join(f'<p class="note">{escape(line)}</p>' for line in described(options))
     below += "" if drawing is None else "<h2>θ(t)</h2>" + picture_as_html(drawing)
     path = options.out / "index.html"
@@ -247,10 +247,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         print("\n".join(described(options)), flush=True)
         require_folder(options.out, "--out")
-        found, shown, live = computed(options, folder)
-        print(report(options, found), flush=True)
+        arenas, shown, live = computed(options, folder)
+        print(report(options, arenas), flush=True)
         with status_line("drawing") as line:
-            written, drawing = [options.out / f"{arena}.h5" for arena in found], None
+            written, drawing = [options.out / f"{arena}.h5" for arena in arenas], None
             if shown is None:
                 with line.aside():
                     print(
@@ -259,15 +259,15 @@ def main(arguments: list[str] | None = None) -> int:
             else:
                 drawing = options.out / "theta.png"
                 middle_cell = options.theta.index(middle(options.theta)), options.mu.index(middle(options.mu))
-                picture(options, *shown, float(found["plane"].time[middle_cell])).savefig(drawing, dpi=130)
+                picture(options, *shown, float(arenas["plane"].time[middle_cell])).savefig(drawing, dpi=130)
                 written.append(drawing)
-            path = write_page(options, found, live, drawing)
+            path = write_page(options, arenas, live, drawing)
     except (ValueError, OSError) as error:
         print(f"python -m tippe: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         raise KeyboardInterrupt(saved(options)) from None
-    cells = sum(table.status.size for table in found.values())
+    cells = sum(table.status.size for table in arenas.values())
     print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
     print(f"Wrote {', '.join(map(str, written))}.")
     print(f"To see the top climb onto its stem, open {path}{'' if can_view() else f'. {NO_VIEW}'}")

@@ -285,7 +285,18 @@ class Hamel(AbstractFormulation):
         return jnp.concatenate([rate, solve(inertia, forces[:free], positive=True)])
 
 
-class ConstrainedConnection(AbstractFormulation):
+class AbstractVelocityFormulation(AbstractFormulation):
+    """Equations of motion whose state is (q, q')."""
+
+    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
+        return jnp.concatenate([q, rate])
+
+    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
+        q, rate = jnp.split(state, 2)
+        return q, rate
+
+
+class ConstrainedConnection(AbstractVelocityFormulation):
     """Geodesics, with forces, of the constrained Levi-Civita connection (`stroller.md`, section 6, F3).
 
     With Q the metric projector on the forbidden directions, nabla^D = nabla + nabla Q is a connection on all of the
@@ -298,13 +309,6 @@ class ConstrainedConnection(AbstractFormulation):
     """
 
     system: AbstractSystem
-
-    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
-        return jnp.concatenate([q, rate])
-
-    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
-        q, rate = jnp.split(state, 2)
-        return q, rate
 
     def forbidden(self, q: Coordinates) -> Float[Array, "n n"]:
         """Projector Q = G^-1 W^T (W G^-1 W^T)^-1 W on the directions orthogonal to the allowed ones."""

@@ -23,8 +23,8 @@ from jaxtyping import Array, Bool, Float
 from .surface import AbstractSurface, BallGap
 from .vector import Component, Vector, dot, scale, subtract, sum_vectors, tangents, vector_of
 
-#: Most steps of a search. Most take three to six; ten times as many move no point.
-MOST_STEPS = 40
+#: Most iterations of a search. Most take three to six; ten times as many move no point.
+MOST_ITERATIONS = 40
 
 #: Least curvature of the minimised function for which a step is computed, relative to that above a flat surface.
 LEAST_CURVATURE = 0.05
@@ -86,7 +86,7 @@ def descended(
 
     def going_on(carry: tuple[Descent, Any]) -> Bool[Array, ""]:
         descent, count = carry
-        return ~jnp.all(descent.ended) & (count < MOST_STEPS)
+        return ~jnp.all(descent.ended) & (count < MOST_ITERATIONS)
 
     def descend(carry: tuple[Descent, Any]) -> tuple[Descent, Any]:
         descent, count = carry

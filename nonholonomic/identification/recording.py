@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..parameters import numbers, one_line
+from ..parameters import numbers, one_line, with_numbers
 from ..validation import as_number, as_number_or_none, require
 from ..xla_cpu import greatest
 from .likelihood import Measurements
@@ -54,6 +54,13 @@ class Quantities:
         if not columns or len(set(columns)) < len(columns):
             raise ValueError(f"quantity = {quantity!r} must name at least one column, and each only once")
         return tuple(columns)
+
+    def samples(self, run: Any, column: str) -> Float[Array, " times"]:
+        """A column of a trajectory, which has the quantities as properties."""
+        for quantity, columns in self.columns.items():
+            if column in columns:
+                return getattr(run, quantity)[:, columns.index(column)]
+        return getattr(run, column)
 
 
 def as_quantity(words: Any) -> Any:
@@ -188,24 +195,23 @@ def model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Ar
 
 
 def predicted(
+    scene: Any,
     recordings: Sequence[tuple[AbstractRecording, Values]],
     rows: int,
-    run: Callable[[Values, Float[Array, " times"]], Any],
-    column: Callable[[Any, str], Float[Array, " times"]],
+    run: Callable[[Any, Any, Float[Array, " times"]], Any],
 ) -> list[Float[Array, "rows samples"]]:
     """Predictions for several recordings, in every row; all runs are lanes of one ensemble.
 
     **Arguments:**
 
+    - `scene`: the scene of all runs, before its parameters are replaced.
     - `recordings`: each with its parameters, name -> (rows,), with the same names for all; their launches hold the same
       numbers.
-    - `run`: from parameters, name -> number, including those of the launch, and times since the launch [s] to a
-      trajectory.
-    - `column`: from (trajectory, name of a column) to its samples.
+    - `run`: from a scene, a launch and times since the launch [s] to a trajectory.
 
     **Returns:** for each recording its samples, ordered by time, including missing ones; NaN after the end of a run.
     """
-    longest = max(len(recording.times) for recording, _ in recordings)
+    first, longest = recordings[0][0], max(len(recording.times) for recording, _ in recordings)
     columns = tuple(dict.fromkeys(name for recording, _ in recordings for name in recording.columns))
 
     def lanes(of_each: list[Array]) -> Array:
@@ -222,8 +228,9 @@ def predicted(
 
     def samples_of_lane(lane: Values, times: Float[Array, " times"]) -> Float[Array, "times columns"]:
         values = {name: value for name, value in lane.items() if name != "t0"}
-        trajectory = run(values, model_times(times, lane["t0"]))
-        return jnp.stack([column(trajectory, name) for name in columns], axis=-1)
+        roots = with_numbers({"scene": scene, "launch": first.launch}, values)
+        trajectory = run(roots["scene"], roots["launch"], model_times(times, lane["t0"]))
+        return jnp.stack([first.quantities.samples(trajectory, name) for name in columns], axis=-1)
 
     predictions = jax.vmap(samples_of_lane)(lane_numbers, jnp.tile(clock, (rows, 1))).reshape(
         rows, len(recordings), longest, len(columns)

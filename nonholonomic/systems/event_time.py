@@ -11,7 +11,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from ..derivatives import (
     AbstractDifferentiableSolve,
     differentiable_solve,
-    in_groups,
     tangents_by,
     traced_solve_ensemble_with_tangents,
 )
@@ -19,16 +18,15 @@ from ..hybrid import HybridOutcome, traced_solve_hybrid, traced_solve_hybrid_wit
 from ..integration import (
     CROSSED,
     FAILED,
-    LOOSEST,
     UNRESOLVED,
     Outcome,
     Settings,
     explicit_tableau,
-    run_bounds,
+    legal_run,
     traced_solve_ensemble,
 )
 from ..progress import status_line
-from ..validation import as_number, legal
+from ..validation import as_number
 from .engine import Cells
 from .mode import Event
 from .system import System, check_run, run_of
@@ -115,8 +113,8 @@ def _time(
     movable = [number for number in numbers if eqx.is_inexact_array(number)]
     others = [number for number in numbers if not eqx.is_inexact_array(number)]
     places = tuple(eqx.is_inexact_array(number) for number in numbers)
-    question = SmoothEvent if cells.form.traits.smooth else HybridEvent
-    return differentiable_solve(question(len(movable), structure, places, solver), *movable, *others, t1, tolerance)
+    solve = SmoothEvent if cells.form.traits.smooth else HybridEvent
+    return differentiable_solve(solve(len(movable), structure, places, solver), *movable, *others, t1, tolerance)
 
 
 class SmoothEvent(AbstractDifferentiableSolve):
@@ -147,9 +145,9 @@ class SmoothEvent(AbstractDifferentiableSolve):
         A batch has one tolerance: the smallest.
         """
         *_, t1, tolerance = leaves
-        may = legal(run_bounds(t1, tolerance))
-        may = may & jnp.isfinite(jnp.asarray(sum(self.of_leaves(leaves).start)))
-        return may, jnp.where(may, t1, 0.0), Settings(jnp.min(jnp.where(may, tolerance, LOOSEST)), self.solver)
+        finite = jnp.isfinite(jnp.asarray(sum(self.of_leaves(leaves).start)))
+        may, t1, tolerance = legal_run(finite, t1, tolerance)
+        return may, t1, Settings(jnp.min(tolerance), self.solver)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, settings = self.permitted(leaves)
@@ -164,9 +162,9 @@ class SmoothEvent(AbstractDifferentiableSolve):
             return self.of_leaves((*movable, *leaves[self.movable :])).problem(cells)
 
         may, t1, settings = self.permitted(leaves)
-        problem, directions, gather = tangents_by(build, active, leaves[: self.movable], cells)
+        problem, tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
         outcome, slopes = traced_solve_ensemble_with_tangents(
-            problem, directions, t1, jnp.asarray(cells), settings, one_kernel=not again
+            problem, tangents, t1, jnp.asarray(cells), settings, one_kernel=not again
         )
         time = _named(may, outcome)
         return time, [jnp.where(jnp.isinf(time), 0.0, slope + 0.0 * time) for slope in gather(slopes)]
@@ -177,8 +175,8 @@ class HybridEvent(SmoothEvent):
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, settings = self.permitted(leaves)
-        phases, first, states = self.of_leaves(leaves).modes(cells)
-        return _named(may, traced_solve_hybrid(phases, first, states, t1, settings, counters=1))
+        modes, first, states = self.of_leaves(leaves).modes(cells)
+        return _named(may, traced_solve_hybrid(modes, first, states, t1, cells, settings, counters=1))
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
@@ -191,17 +189,14 @@ class HybridEvent(SmoothEvent):
             return self.of_leaves((*movable, *leaves[self.movable :])).modes(cells)
 
         may, t1, settings = self.permitted(leaves)
-        (phases, first, states), directions, gather = tangents_by(build, active, leaves[: self.movable], cells)
+        (modes, first, states), tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
 
-        def run(some: tuple[Any, ...]) -> tuple[tuple[HybridOutcome, Array], list[Float[Array, " cells"]]]:
-            moved = tuple((one[0], one[2]) for one in some)
-            journey, found = traced_solve_hybrid_with_tangents(phases, moved, first, states, t1, settings, counters=1)
-            return (journey, found.grazing), list(found.slopes)
-
-        (journey, grazing), slopes = in_groups(run, directions)
-        time = _named(may, journey)
-        slopes = [jnp.where(grazing, jnp.nan, slope) for slope in gather(slopes)]
-        return time, [jnp.where(jnp.isinf(time), 0.0, slope + 0.0 * time) for slope in slopes]
+        moved = tuple((tangent[0], tangent[2]) for tangent in tangents)
+        outcome, sensitivities = traced_solve_hybrid_with_tangents(
+            modes, moved, first, states, t1, cells, settings, counters=1
+        )
+        time = _named(may, outcome)
+        return time, [jnp.where(jnp.isinf(time), 0.0, slope + 0.0 * time) for slope in gather([*sensitivities.slopes])]
 
 
 def _named(may: Bool[Array, "..."], ended: Outcome | HybridOutcome) -> Float[Array, " cells"]:

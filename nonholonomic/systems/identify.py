@@ -90,7 +90,7 @@ class SystemModel(AbstractDataModel):
     def predict(
         self, sources: list[tuple[Recording, dict[str, Array]]], rows: int
     ) -> list[Float[Array, "rows samples"]]:
-        return [jax.vmap(lambda row, one=one: self._predict(one, row))(values) for one, values in sources]
+        return [jax.vmap(lambda row, launch=launch: self._predict(launch, row))(values) for launch, values in sources]
 
     def _predict(self, recording: Recording, row: dict[str, Array]) -> Float[Array, " samples"]:
         """Predictions for the recording of one run, ordered by time."""
@@ -160,12 +160,12 @@ def identify(
     """
     search = search_options(starts, spread, seed, max_steps, progress)
     data = as_sources(data, Recording, "a nonholonomic.Recording")
-    for one in data:
-        check_run(system, one.launch, one.times[-1], tolerance)
+    for recording in data:
+        check_run(system, recording.launch, recording.times[-1], tolerance)
     tolerance_bound(tolerance).require()
     if isinstance(system, Hybrid):
         system = dataclasses.replace(system, event=None)
-    named = [numbers_of(system, one) for one in data]
+    named = [numbers_of(system, recording) for recording in data]
     own = [[name for name in numbers.movable if name.startswith("start")] + ["t0"] for numbers in named]
     known = [name for name in named[0].movable if name.startswith("system")]
 

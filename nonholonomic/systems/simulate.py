@@ -12,9 +12,9 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..derivatives import sampled_run
 from ..hybrid import AbstractBatchedMode, hybrid_samples
-from ..integration import FAILED, LOOSEST, Settings, explicit_tableau, run_bounds, times_bounds
+from ..integration import FAILED, Settings, explicit_tableau, legal_run, times_bounds
 from ..progress import status_line
-from ..validation import as_known, as_number, is_traced, legal, nan_unless, require_all, require_increasing
+from ..validation import as_known, as_number, is_traced, nan_unless, require_all, require_increasing
 from .engine import Cells, ModeProblem
 from .mode import Hybrid
 from .system import Run, System, check_run, run_of
@@ -91,27 +91,30 @@ def _sampled(
 ) -> Trajectory:
     """The run, or NaN and "failed" if a traced number is out of range."""
     cells = run.cells
-    may = jnp.all(legal([*run_bounds(t1, tolerance), *times_bounds(times, t1)])) & jnp.all(jnp.diff(times) > 0.0)
-    settings = Settings(jnp.where(may, tolerance, LOOSEST), solver)
-    horizon, at = jnp.where(may, t1, 0.0), jnp.where(may, times, 0.0)
+    may, horizon, tolerance = legal_run(True, t1, tolerance, times)
+    settings, at = Settings(tolerance, solver), jnp.where(may, times, 0.0)
     if cells.form.traits.smooth:
-        found = sampled_run(_problem, cells, at, horizon, settings)
-        states, reached = found.states, jnp.all(jnp.isfinite(found.states), axis=1)
+        samples = sampled_run(_problem, cells, at, horizon, settings)
+        states, reached = samples.states, jnp.all(jnp.isfinite(samples.states), axis=1)
         mode, switches = jnp.where(reached, cells.form.first, -1), jnp.zeros(())
-        status, steps = found.status, found.accepted + found.rejected
+        status, steps = samples.status, samples.accepted + samples.rejected
     else:
-        found = hybrid_samples(_modes, cells, at, horizon, settings, 1)
-        states, mode, switches = found.shown.T, jnp.where(jnp.isnan(found.number), -1, found.number), found.counts[0]
-        status, steps = found.status, found.steps
+        samples = hybrid_samples(_modes, cells, at, horizon, settings, 1)
+        states, mode, switches = (
+            samples.shown.T,
+            jnp.where(jnp.isnan(samples.number), -1, samples.number),
+            samples.counts[0],
+        )
+        status, steps = samples.status, samples.steps
     states = jax.vmap(run.shown)(nan_unless(may, states))
     return Trajectory(
         t=times,
         state=states,
         mode=mode.astype(int),
-        end_time=nan_unless(may, found.end_time),
+        end_time=nan_unless(may, samples.end_time),
         switches=switches.astype(int),
         steps=steps.astype(int),
-        rejected=found.rejected.astype(int),
+        rejected=samples.rejected.astype(int),
         code=jnp.where(may, status, FAILED).astype(int),
         names=run.names,
     )

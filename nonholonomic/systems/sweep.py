@@ -37,7 +37,7 @@ from .tracing import dependent_outputs
 
 #: Smallest number of cells in a chunk of a large grid: runs of small systems are short, so the overhead of a chunk
 #: counts.
-BLOCK = 1024
+LEAST_CHUNK = 1024
 
 #: The words for how a run can end, and the code of each word but the first.
 WORDS = ("event", "completed", "stopped", "failed", "unresolved")
@@ -114,9 +114,9 @@ def sweep(
     by = [full_name("sensitivities", name, named.movable) for name in sensitivities]
     shorts = short_names([*full, *(name for name in by if name not in full)])
     grid = [axis(shorts[name], name, "1", values) for name, values in full.items()]
-    for one in grid if has_checks(system) or has_checks(event) else ():
-        for value in one.values:
-            check_again(named.tree(named.replaced({one.number: jnp.asarray(value)})))
+    for grid_axis in grid if has_checks(system) or has_checks(event) else ():
+        for value in grid_axis.values:
+            check_again(named.tree(named.replaced({grid_axis.number: jnp.asarray(value)})))
     job = SweepJob(named, float(t1), float(tolerance), solver, tuple(by))
     run = _run(named.tree(named.values))
     if by and not run.cells.form.has_event:
@@ -134,7 +134,7 @@ def sweep(
         "solver": type(Settings(tolerance, solver).for_lanes).__name__,
     }
     cells = size_of(grid)
-    chunk = max(BLOCK, chunk_for(cells)) if cells > 4 * BLOCK else None
+    chunk = max(LEAST_CHUNK, chunk_for(cells)) if cells > 4 * LEAST_CHUNK else None
     options = {"chunk": chunk, "path": path, "progress": progress, "executor": executor}
     return computed(job, grid, job.variables(run, shorts), request, **options)
 
@@ -170,23 +170,23 @@ class SweepJob(NamedTuple):
     def variables(self, run: Run, shorts: dict[str, str]) -> dict[str, Variable]:
         """The variables of the table."""
         event, smooth = run.cells.form.has_event, run.cells.form.traits.smooth
-        found = {"time": Variable("s", np.float64, long_name="time of the event")} if event else {}
-        found |= {"status": Variable("1", np.int8, WORDS, long_name="how the run ended")}
-        found |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
-        found |= {name: Variable("1", np.float64, long_name=f"{name} at the end") for name in run.names}
+        variables = {"time": Variable("s", np.float64, long_name="time of the event")} if event else {}
+        variables |= {"status": Variable("1", np.int8, WORDS, long_name="how the run ended")}
+        variables |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
+        variables |= {name: Variable("1", np.float64, long_name=f"{name} at the end") for name in run.names}
         counts = {"steps": "steps", "rejected": "rejected steps"} | ({} if smooth else {"switches": "resets"})
-        found |= {name: Variable("1", np.int64, long_name=words) for name, words in counts.items()}
-        found |= {f"time_by_{shorts[name]}": Variable("1", np.float64) for name in self.by}
+        variables |= {name: Variable("1", np.int64, long_name=words) for name, words in counts.items()}
+        variables |= {f"time_by_{shorts[name]}": Variable("1", np.float64) for name in self.by}
         if self.by and not smooth:
-            found |= {"grazes": Variable("1", np.int8, long_name="whether the end of a mode was grazing")}
-        return found
+            variables |= {"grazes": Variable("1", np.int8, long_name="whether the end of a mode was grazing")}
+        return variables
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which only the first `count` are run."""
         size = next((len(values) for values in columns.values()), 1)
         cells, begin, tangents, scales = _cells(self.named, columns, self.by, size)
         settings, t1 = Settings(np.asarray(self.tolerance), self.solver), np.asarray(self.t1)
-        grazing, slopes = None, []
+        grazing, slopes = np.zeros(size, bool), []
         if cells.form.traits.smooth:
             problem, counted = begin, np.asarray(count)
             if self.by:
@@ -197,21 +197,18 @@ class SweepJob(NamedTuple):
             modes, first, states = begin
             options = (np.asarray(first), np.asarray(states), t1, count, settings)
             if self.by:
-                outcome, found = solve_hybrid_with_tangents(modes, tangents, *options, counters=1)
-                slopes, grazing = found.slopes, np.asarray(found.grazing)
+                outcome, sensitivities = solve_hybrid_with_tangents(modes, tangents, *options, counters=1)
+                slopes, grazing = sensitivities.slopes, np.asarray(sensitivities.grazing)
             else:
                 outcome = solve_hybrid(modes, *options, counters=1)
         crossed = np.asarray(outcome.status) == CROSSED
         shorts = short_names([*columns, *(name for name in self.by if name not in columns)])
-        found = {
-            f"time_by_{shorts[name]}": np.asarray(slope) / np.asarray(scale)
-            for name, slope, scale in zip(self.by, slopes, scales, strict=True)
-        }
-        found = {name: np.where(crossed, slope, 0.0) for name, slope in found.items()}
-        if grazing is not None:
-            found = {name: np.where(crossed & grazing, np.nan, slope) for name, slope in found.items()}
-            found |= {"grazes": (crossed & grazing).astype(np.int8)}
-        return found | self._ends(cells, columns, outcome, crossed, size)
+        ends = self._ends(cells, columns, outcome, crossed, size)
+        for name, slope, scale in zip(self.by, slopes, scales, strict=True):
+            ends[f"time_by_{shorts[name]}"] = np.where(crossed, np.asarray(slope) / np.asarray(scale), 0.0)
+        if self.by and not cells.form.traits.smooth:
+            ends["grazes"] = (crossed & grazing).astype(np.int8)
+        return ends
 
     def _ends(
         self, cells: Cells, columns: dict[str, Any], outcome: Outcome | HybridOutcome, crossed: Any, size: int
@@ -219,15 +216,15 @@ class SweepJob(NamedTuple):
         """The variables of the table that describe the ends of runs."""
         status = np.asarray(outcome.status)
         words = np.select([crossed, *(status == code for code in CODES)], [0, *CODES.values()], 1)
-        found = {"time": np.where(crossed, outcome.crossing_time, np.inf)} if cells.form.has_event else {}
+        ends = {"time": np.where(crossed, outcome.crossing_time, np.inf)} if cells.form.has_event else {}
         if cells.form.has_event:
-            found["time"] = np.where(words >= CODES[FAILED], np.nan, found["time"])
+            ends["time"] = np.where(words >= CODES[FAILED], np.nan, ends["time"])
         counts = {"steps": outcome.steps, "rejected": outcome.rejected}
         if isinstance(outcome, HybridOutcome):
             counts |= {"switches": outcome.counts[0]}
         states = _shown(self.named, columns, jnp.asarray(outcome.state), size)
-        found |= {"status": words.astype(np.int8), "end_time": np.asarray(outcome.end_time)}
-        return found | {name: np.asarray(values) for name, values in (counts | states).items()}
+        ends |= {"status": words.astype(np.int8), "end_time": np.asarray(outcome.end_time)}
+        return ends | {name: np.asarray(values) for name, values in (counts | states).items()}
 
 
 @eqx.filter_jit

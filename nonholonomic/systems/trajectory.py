@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
-from ..sweeps import Table
+from ..sweeps import Table, Tabular
 from ..validation import is_traced
 
 #: The words for how a run without an event ends, by code.
 WORDS = {REACHED_END: "completed", LEFT_DOMAIN: "stopped", FAILED: "failed", UNRESOLVED: "unresolved"}
 
 
-class Trajectory(eqx.Module):
+class Trajectory(Tabular, eqx.Module):
     """A run of a user's system at given times, which are the first axis of its arrays; `jax.vmap` adds an axis.
 
     - `t`: times [s], (times,).
@@ -66,6 +66,10 @@ class Trajectory(eqx.Module):
         words = np.vectorize(WORDS.get, otypes=[object])(np.asarray(self.code))
         return str(words) if words.ndim == 0 else words.astype(str)
 
+    @property
+    def portrait_axes(self) -> tuple[str, str]:
+        return self.names[0], self.names[-1]
+
     def to_table(self) -> Table:
         """The run as a `Table` over its times.
 
@@ -77,31 +81,6 @@ class Trajectory(eqx.Module):
             )
         columns = dict(zip(self.names, np.asarray(self.state).T, strict=True)) | {"mode": np.asarray(self.mode)}
         return Table({"time": np.asarray(self.t)}, columns, {"time": "s"}, {"status": self.status})
-
-    def to_xarray(self) -> Any:
-        """The run as an `xarray.Dataset` over "time" (needs xarray).
-
-        **Raises:** `ValueError` for a batch of runs.
-        """
-        return self.to_table().to_xarray()
-
-    def save(self, path: Any) -> None:
-        """Write the run to an HDF5 file that `tippe.Table.load` and xarray (`engine="h5netcdf"`) read.
-
-        **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for a batch of runs.
-        """
-        self.to_table().save(path)
-
-    def portrait(self, x: str, y: str, ax: Any = None) -> Any:
-        """Draw one component over another, a phase portrait (needs matplotlib).
-
-        **Arguments:** `x`, `y`: names of components, such as "y0" and "y1"; `ax`: axes of matplotlib to draw in.
-
-        **Returns:** the matplotlib figure, or `ax`.
-        """
-        from ..views import draw_portrait
-
-        return draw_portrait(self.to_table(), x, y, ax)
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the components over time (needs matplotlib).
@@ -119,6 +98,6 @@ class Trajectory(eqx.Module):
         own.legend()
         return own if figure is None else figure
 
-    def __repr__(self) -> str:
+    def __str__(self) -> str:
         shape = "x".join(map(str, jnp.shape(self.state)))
         return f"Trajectory(status={self.status}, state of shape {shape}, {', '.join(self.names)})"

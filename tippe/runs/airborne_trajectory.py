@@ -171,7 +171,9 @@ def simulate_airborne(
     status = STATUS[path.status]
     if status == Status.JAMMED:
         status = LOSSES[int(loss(scene, jnp.asarray(path.state)))]
-    hops = np.array([(one.begin, one.end) for one in path.mode_segments if one.number == FLYING]).reshape(-1, 2)
+    hops = np.array(
+        [(segment.begin, segment.end) for segment in path.mode_segments if segment.number == FLYING]
+    ).reshape(-1, 2)
     run = flights_of(
         StickSlipArenaTrajectory if exact else ArenaTrajectory, scene, path, status.word, hops, times, tolerance
     )
@@ -182,6 +184,6 @@ def simulate_airborne(
 
 def sampled_airborne(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:
     """Run one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, checked."""
-    found = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, counters=1)
+    samples = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, counters=1)
     codes = jnp.array([int(status) for status in LOSSES])
-    return sampled_flights(ArenaTrajectory, scene, times, found, codes[loss(scene, found.end_state)])
+    return sampled_flights(ArenaTrajectory, scene, times, samples, codes[loss(scene, samples.end_state)])

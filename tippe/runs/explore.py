@@ -46,8 +46,8 @@ from ..model.top import Top
 from ..modes.inversion_problem import InversionProblem
 from ..modes.sliding import Slide, modes
 from ..modes.trajectory_problem import TrajectoryProblem
+from .checks import check_run
 from .flight_trajectory import HybridTrajectory, level_modes
-from .inversion import check_run
 from .launches import LONG_NAMES, UNITS
 from .trajectory import Trajectory, simulate
 from .view import AXIS, BESIDE, Motion, aside, show
@@ -65,7 +65,7 @@ DRAWN = 1e-5
 REACH = 0.5
 
 #: Steps after which a run in the page is given up: some hundred milliseconds.
-MOST_STEPS = 50_000
+MOST_STEPS_OF_A_PAGE = 50_000
 
 
 @status_line("writing a page")
@@ -138,7 +138,7 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
         scene, launch = modules(values)
         return jnp.all(legal((*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch))))
 
-    settings = Settings(TOLERANCE, max_steps=MOST_STEPS)
+    settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
     answer, motion = (hybrid_simulators if flies(scene) else smooth_simulators)(modules, float(t1), settings)
     return LiveRun(
         title=f"Tippe top on a {type(scene.surface).__name__.lower()}",
