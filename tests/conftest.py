@@ -17,6 +17,7 @@ from nonholonomic.compiled_programs import (
     release_memory,
     resident_memory,
 )
+from nonholonomic.xla_cpu import compile_quickly
 
 #: The tests that a plain `pytest` chooses (`pyproject.toml`).
 ORDINARY = "not slow"
@@ -32,7 +33,7 @@ def pytest_configure(config: pytest.Config) -> None:
     with `XLA_FLAGS=`.
     """
     if config.option.markexpr == ORDINARY:
-        os.environ.setdefault("XLA_FLAGS", " ".join(quick_to_compile()))
+        compile_quickly()
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ and hasattr(config, "cache"):
         folder = nonholonomic.enable_compilation_cache(config.cache.mkdir("compiled"))
         if folder is not None:

@@ -6,7 +6,7 @@ mass [m], the vector c of `trajectory_problem.py`, the rotation angle of the top
 friction and impacts [J].
 """
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import dot, multiply, scale
-from nonholonomic.hybrid import Transition, TransitionPath
+from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
 from nonholonomic.integration import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED, AbstractProblem
-from nonholonomic.xla_cpu import greatest, least
+from nonholonomic.xla_cpu import compiled_setup, greatest, least
 
 from ..model.dynamics import Dynamics, stacked
 from ..model.scene import Scene
@@ -43,7 +43,7 @@ from .leaning import BOTH, LeaningDynamics, at_rest
 
 Cells = Float[Array, " cells"]
 
-#: Most bounces in a row before a run fails.
+#: Most consecutive bounces before a run fails.
 MOST_BOUNCES = 10_000
 
 #: Components of a state, behind which passive quadratures may follow.
@@ -108,12 +108,14 @@ def height(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Flo
     return own.radius - other.radius + (other.offset - own.offset) * state[COS_THETA]
 
 
-class Slide(AbstractFlyingMode):
+class Slide(AbstractFlyingMode, AbstractHoppingMode):
     """Sliding on the sphere numbered `number`, in the order of `free_body.balls`, up to an angle of theta.
 
     The number is an array, so that one program serves both spheres; with `last` a run continues through the angle. A
     single run whose path is kept records its flights.
     """
+
+    most_hops: ClassVar[int] = MOST_BOUNCES
 
     number: Int[Array, ""]
     last: bool = eqx.field(static=True)
@@ -133,34 +135,45 @@ class Slide(AbstractFlyingMode):
         return shown(self.scene.body, later, _carried(self.scene.body, free, quadratures, passed))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Cells) -> Transition:
-        """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land where that one touches.
+        """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land if it touches the plane.
 
         Counts the flights.
         """
 
         def hop(carry: tuple[Air, Array, TransitionPath | None]) -> tuple[Air, Array, TransitionPath | None]:
             air, count, record = carry
-            after, landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
-            if air.falls is not None:
-                after, landed = _where(air.falls, air, after), air.falls | landed
-            record = _with_flight(self.scene.body, record, air, after)
-            after = _where(landed, land(self.scene, after), after)
-            return _where(air.open, after, air), count + 1, record
+            after, landed = self.hop(air, left)
+            return landed, count + 1, _with_flight(self.scene.body, record, air, after)
 
         def under_way(carry: tuple[Air, Array, TransitionPath | None]) -> Array:
             return jnp.any(carry[0].open) & (carry[1] < MOST_BOUNCES)
 
-        start = lost_contact(self.scene, self.number, state)
-        if self.with_quadratures:
-            start = start._replace(quadratures=state[OWN:])
+        start = self.lost(state)
         record = _no_flights(start) if self.with_quadratures else None
         air, _, record = jax.lax.while_loop(under_way, hop, (start, jnp.zeros((), int), record))
-        status = jnp.where(air.open, UNRESOLVED, air.status)
-        state = contact_state(air.free)
+        return self.closed(air)._replace(record=record)
+
+    def lost(self, state: Float[Array, "components cells"]) -> "Air":
+        start = lost_contact(self.scene, self.number, state)
+        return start._replace(quadratures=state[OWN:]) if self.with_quadratures else start
+
+    def hop(self, air: "Air", left: Cells) -> tuple["Air", "Air"]:
+        """One flight of a top whose contact is open, and after it the impact at its end."""
+        after, landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
+        if air.falls is not None:
+            after, landed = _where(air.falls, air, after), air.falls | landed
+        return after, _where(air.open, _where(landed, land(self.scene, after), after), air)
+
+    def motion_in(self, air: "Air") -> tuple[FreeBody, Float[Array, "7 cells"] | None]:
+        return air.free, air.quadratures
+
+    def closed(self, air: "Air") -> Transition:
+        """The transition of a top that is back on the plane, or whose run has ended."""
+        status, state = jnp.where(air.open, UNRESOLVED, air.status), contact_state(air.free)
         if air.quadratures is not None:
             state = jnp.concatenate([state, air.quadratures])
-        fields = (air.ball, state, air.elapsed, status, air.crossing_time, air.flights[None])
-        return Transition(*fields, record, air.log_rates)
+        counts = air.flights[None]
+        return Transition(air.ball, state, air.elapsed, status, air.crossing_time, counts, log_rates=air.log_rates)
 
 
 class Lean(AbstractFlyingMode):
@@ -185,12 +198,12 @@ class Lean(AbstractFlyingMode):
 def modes(
     scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
-    """The modes of runs, sliding on each sphere and on both if there are two; and the number of the mode in which each
+    """The modes of runs, sliding on each sphere and on both if there are two; and the index of the mode in which each
     starts.
 
     **Arguments:**
 
-    - `scene`: with `contact="hybrid"`; `problem`: of its launches, which stand on their lower sphere.
+    - `scene`: with `contact="hybrid"`; `problem`: the problem of its launches, which stand on their lower sphere.
     - `tolerance`: unused by these modes; `last`: whether the last crossing counts; `with_quadratures`: as for
       `AbstractFlyingMode`.
     """
@@ -198,8 +211,14 @@ def modes(
     slides = tuple(Slide(*arguments, jnp.asarray(number), last) for number in range(len(spheres)))
     if len(spheres) == 1:
         return slides, jnp.zeros(problem.states.shape[1:], int)
-    main, stem = spheres
-    return (*slides, Lean(*arguments)), (height(main, stem, problem.states) < 0.0).astype(int)
+    return (*slides, Lean(*arguments)), _first_mode(scene.body, problem.states)
+
+
+@compiled_setup
+def _first_mode(body: Top, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+    """The number of the lower of the two spheres."""
+    main, stem = balls(body)
+    return (height(main, stem, states) < 0.0).astype(int)
 
 
 def energy_in(
@@ -225,7 +244,7 @@ class Air(NamedTuple):
 
     - `free`, `elapsed` [s]: the body and the time since the contact was lost.
     - `ball`: the sphere that touched last; `rising`: whether it left with a speed; `falls`: whether, without a flight,
-      it is about to strike the plane, `None` for a top without stem. Once the contact is closed, `ball` is the number
+      it is about to strike the plane, `None` for a top without a stem. Once the contact is closed, `ball` is the index
       of the mode.
     - `status`: `RUNNING`, or how the run ended, `LEFT_DOMAIN` if it has jammed; `crossing_time` [s] of the event,
       infinite if there was none.
@@ -248,8 +267,8 @@ class Air(NamedTuple):
 
 
 def lost_contact(scene: Scene[Top], number: Int[Array, ""], state: Float[Array, "components cells"]) -> Air:
-    """The top at the end of sliding on the numbered sphere: its contact is lost or jams, or the other sphere is at the
-    plane.
+    """The top at the end of sliding on the sphere with the given number: its contact is lost or jams, or the other
+    sphere is at the plane.
     """
     own, other = _own_and_other(balls(scene.body), number)
     zero = jnp.zeros_like(state[0])
@@ -275,9 +294,10 @@ def lost_contact(scene: Scene[Top], number: Int[Array, ""], state: Float[Array, 
 def take_flight(
     scene: Scene[Top], air: Air, cos_angle: Float[Array, "..."], left: Cells, last: bool
 ) -> tuple[Air, Bool[Array, " cells"]]:
-    """One flight, until a sphere reaches the plane, theta the angle (unless `last`), or the time from the loss `left` [s].
+    """One flight, until a sphere reaches the plane, theta reaches the angle (unless `last`), or the time since the loss
+    of contact reaches `left` [s].
 
-    **Returns:** the top at its end; and where a sphere has reached the plane.
+    **Returns:** the top at the end of the flight; and whether a sphere has reached the plane.
     """
     body, gravity = scene.body, scene.gravity
     flight = fly(body, gravity, balls(body), air.free, air.ball, air.rising, greatest(left - air.elapsed, 0.0))
@@ -318,14 +338,15 @@ def land(scene: Scene[Top], air: Air) -> Air:
         struck = _with_other(scene, air, struck, other, (speed <= closing) & ~rebounds, closing)
     if air.quadratures is not None:
         gained = energy(body, scene.gravity, struck.free) - energy(body, scene.gravity, air.free)
-        struck = struck._replace(quadratures=air.quadratures.at[-1].add(gained))
+        *others, work = air.quadratures
+        struck = struck._replace(quadratures=jnp.stack([*others, work + gained]))
     return struck._replace(open=struck.open & ~fails)
 
 
 def _with_other(
     scene: Scene[Top], air: Air, struck: Air, other: Ball, slow: Bool[Array, " cells"], closing: Cells
 ) -> Air:
-    """Effect of an impact on the other sphere if that is at the plane: it strikes too, or the top comes to rest on
+    """Effect of an impact on the other sphere if that is at the plane: it also strikes, or the top comes to rest on
     both.
 
     **Arguments:** `air`: before the impact; `struck`: after it; `slow`: where it is so slow that it may be the last.
@@ -367,7 +388,7 @@ def _no_flights(start: Air) -> TransitionPath:
 
 
 def _with_flight(body: Top, record: TransitionPath | None, before: Air, after: Air) -> TransitionPath | None:
-    """The record, if one is kept, with the flight between two states of a single run, if it flew."""
+    """The record, if one is kept, with the flight of a single run between two states added, if it flew."""
     if record is None:
         return None
     place, flew = before.flights[0], after.flights > before.flights

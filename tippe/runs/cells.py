@@ -1,78 +1,41 @@
-"""How to run the cells of a table: the kinds of scene, and the variables of each."""
+"""The cells of an inversion table: how they are run, and the variables of each."""
 
-import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from nonholonomic.hybrid import AbstractBatchedMode, HybridOutcome, solve_hybrid
+from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import (
     CROSSED,
     DEFAULT_MAX_STEPS,
     FAILED,
     LEFT_DOMAIN,
-    REACHED_END,
     UNRESOLVED,
     Outcome,
     Settings,
     Status,
     solve_by_diffrax,
-    solve_ensemble,
 )
 from nonholonomic.parameters import with_numbers
 from nonholonomic.sweeps import Variable
 
 from ..model.dynamics import LOSSES
 from ..model.scene import Scene
-from ..modes import airborne, airborne_ends, airborne_stem, airborne_stick_slip, sliding, sticking
+from ..modes import airborne
 from ..modes.inversion_problem import InversionProblem
-from .energy import has_grown
-from .inversion import is_inverted
-from .sensitivities import hybrid_sensitivities_of_cells, sensitivities_of_cells
+from .inversion import Inversions, is_inverted, with_contact_state
+from .run_kind import COUNTED, HYBRID, WORDS, RunKind
+from .sensitivities import sensitivities_of_cells
 
-
-class RunKind(NamedTuple):
-    """How to run a kind of scene: its status words, its counters besides steps, and its modes.
-
-    `modes` takes (scene, problem, tolerance, last) and returns the modes and the number of each cell's first; `None`
-    for runs of one smooth motion. `energy_in` takes (scene, state, mode) and returns the least and the greatest energy [J] that
-    the state may have. `flight_state` is whether states may be those of flight, in a layout of their own.
-    """
-
-    words: tuple[str, ...]
-    counts: tuple[str, ...]
-    modes: Callable[..., tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]] | None
-    energy_in: Callable[..., tuple[Float[Array, " cells"], Float[Array, " cells"]]]
-    flight_state: bool = False
-
-    @property
-    def smooth(self) -> bool:
-        """Whether a run is one smooth motion."""
-        return self.modes is None
-
-    @property
-    def variables(self) -> dict[str, Variable]:
-        """The table's variables besides the times."""
-        found = {"status": Variable("1", np.int8, self.words, long_name="how the run ended")}
-        found |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
-        found |= {"end_theta": Variable("rad", np.float64, long_name="θ at the end of the run")}
-        counts = ("steps", "rejected", *self.counts)
-        return found | {name: Variable("1", np.int64, long_name=COUNTED[name]) for name in counts}
-
-
-#: Descriptions of the counters of a run.
-COUNTED = {"steps": "steps", "rejected": "rejected steps", "hops": "flights", "sticks": "changes from slip to rolling"}
 TIMES = {"time": "inversion time", "first_time": "first inversion time", "last_time": "last inversion time"}
 
 NAMES = TIMES | {"end_time": "end of the run", "end_theta": "θ at the end of the run"}
 
 # Compiled once for all chunks.
-_on_the_ground = eqx.filter_jit(airborne_ends.on_the_ground)
 _loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
 _flight_loss = eqx.filter_jit(airborne_ends.loss)
 
@@ -134,13 +97,9 @@ def _at_the_end(
 ) -> tuple[Bool[Array, " cells"], Float[Array, " cells"], Bool[Array, " cells"]]:
     """Which cells count as inverted, theta [rad] at the end of each, and which have gained energy.
 
-    **Arguments:** `tolerance`: `None` where this is known and part of the status.
-    """
-    inverted, theta = is_inverted(ended, problem, last), scene.theta(jnp.asarray(ended.state))
-    if tolerance is None:
-        return inverted, theta, jnp.zeros_like(inverted)
-    gained = has_gained_energy(scene, problem, ended, tolerance)
-    return inverted & ~gained, theta, gained
+
+#: The word for a run's status if it has not inverted; `not_inverted` for all others.
+WORD_OF_STATUS = {LEFT_DOMAIN: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
 
 
 def too_many_steps(t1: float, most: int, end: float) -> str:
@@ -149,37 +108,6 @@ def too_many_steps(t1: float, most: int, end: float) -> str:
         f"t1 = {t1:g} s is too long: the run needs more than {most:_} steps, with which it came to {end:.4g} s; "
         "take a shorter t1 or a larger tolerance"
     ).replace("_", " ")
-
-
-def why_unresolved(kind: RunKind) -> str:
-    """Why a run of some kind may be unresolved."""
-    grown = (
-        "its energy has grown by more than the tolerance allows, although nothing drives the top: the law of friction pushes "
-        "it, or the arena's heights do not fit its normals"
-    )
-    others = "the model determines no motion from there on, or its mode changed too often, or"
-    return grown if kind.smooth else f"{others} {grown}; tippe.simulate says which"
-
-
-def run_kind_of(scene: Scene) -> RunKind:
-    """The run kind of a scene."""
-    hybrid = scene.contact == "hybrid"
-    if scene.friction.set_valued:
-        return STICK_SLIP_FLY if hybrid else STICK_SLIP
-    if not hybrid:
-        return SMOOTH
-    if scene.flies_in_closed_form:
-        return HYBRID
-    return AIRBORNE if scene.body.stem is None else ON_STEM_TOO
-
-
-def check_differentiable(scene: Scene) -> None:
-    """Raise `ValueError` for a scene whose modes do not support derivatives."""
-    if run_kind_of(scene) is STICK_SLIP_FLY:
-        raise ValueError(
-            "friction = SetValuedCoulomb with contact = 'hybrid' has no derivatives: they do not go through impacts in which a "
-            "slip may stop"
-        )
 
 
 class InversionRuns(NamedTuple):
@@ -193,10 +121,6 @@ class InversionRuns(NamedTuple):
     method: str
     slopes_by: list[str]
     max_steps: int = DEFAULT_MAX_STEPS
-
-    def settings(self, tolerance: float) -> Settings:
-        """How the runs are integrated at a tolerance."""
-        return Settings(tolerance, self.solver, max_steps=self.max_steps)
 
     @property
     def times(self) -> tuple[str, ...]:
@@ -223,15 +147,15 @@ class InversionRuns(NamedTuple):
     def error_variables(self) -> dict[str, Variable]:
         """The table's variables that describe the accuracy of others (`time_error.py`)."""
         bounds = dict.fromkeys((*self.times, "end_time"), "s") | {"end_theta": "rad"}
-        found = {
+        variables = {
             name: Variable(unit, np.float64, long_name=f"error of the {NAMES[name]}") for name, unit in bounds.items()
         }
-        found |= {"status": Variable("1", np.int8, long_name="whether the two runs disagree on the status")}
-        found |= {
+        variables |= {"status": Variable("1", np.int8, long_name="whether the two runs disagree on the status")}
+        variables |= {
             name: Variable("1", np.int64, long_name=f"difference of the two runs in {COUNTED[name]}")
             for name in self.run_kind.counts
         }
-        return {f"{name}_error": variable for name, variable in found.items()}
+        return {f"{name}_error": variable for name, variable in variables.items()}
 
     def results(self, roots: dict[str, Any], columns: dict[str, Any], tolerance: float, count: int) -> dict[str, Any]:
         """The variables of some cells.
@@ -242,111 +166,64 @@ class InversionRuns(NamedTuple):
         cells = with_numbers(roots, columns)
         scene, launch = cells["scene"], cells["launch"]
         size = next((len(values) for values in columns.values()), 1)
-        problem = InversionProblem.of(scene, launch, self.angle, size)
-        options = {"count": count, "size": size, "last": self.last}
-        numbers = (roots, columns, self.slopes_by, self.angle)
-        if self.run_kind.modes is not None:
-            options |= {"counters": len(self.run_kind.counts)}
-            along = functools.partial(hybrid_sensitivities_of_cells, self.run_kind.modes, *numbers, **options)
-            return self._hybrid_runs(scene, problem, tolerance, count, along)
-        if not self.slopes_by:
-            return self._ended(scene, problem, self._outcome(problem, tolerance, count), tolerance)
-        outcome, slopes = sensitivities_of_cells(*numbers, self.t1, self.settings(tolerance), **options)
-        named = self._ended(scene, problem, outcome, tolerance)
-        return named | {name: np.where(named["status"] == 0, slope, 0.0) for name, slope in slopes.items()}
+        settings = Settings(tolerance, self.solver, max_steps=self.max_steps)
 
-    def _hybrid_runs(
-        self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, along: Callable[..., Any]
-    ) -> dict[str, Any]:
-        """The variables of cells with hybrid runs; `along` takes (horizon, settings) and returns runs and derivatives."""
-        if self.slopes_by and not self.last:
-            found, slopes, grazing = along(self.t1, self.settings(tolerance))
+        problem = InversionProblem.of(scene, launch, self.angle, size)
+
+        def solved(last: bool) -> Outcome | HybridOutcome:
+            return Inversions.of(scene, problem, tolerance, last).solve(self.t1, count, settings)
+
+        slopes, grazing = {}, False
+        if self.slopes_by:
+            numbers = (roots, columns, self.slopes_by, self.angle, self.t1, settings)
+            outcome, slopes, grazing = sensitivities_of_cells(*numbers, count=count, size=size, last=self.last)
+        elif self.method == "diffrax":
+            outcome = solve_by_diffrax(problem, jnp.asarray(self.t1), settings)
         else:
-            found = self._hybrid_outcome(scene, problem, tolerance, count, self.last)
-        if self.slopes_by and self.last:
-            # The derivatives need the run only up to the event, whose time is now known.
-            there, slopes, grazing = along(
-                np.where(np.isfinite(found.crossing_time), found.crossing_time, 0.0), self.settings(tolerance)
-            )
-            grazing |= there.status != REACHED_END
-        found = self._balanced(scene, problem, found, tolerance)
-        loss = functools.partial(self._loss, scene, found.state)
-        if self.run_kind.flight_state:
-            found = found._replace(state=np.asarray(_on_the_ground(scene, found.state, found.mode)))
-        named = self._named(scene, problem, found, loss) | dict(zip(self.run_kind.counts, found.counts, strict=True))
+            outcome = solved(self.last)
+        variables = self._named(scene, problem, outcome)
         if self.crossing == "both":
             # With several modes the first crossing takes a hybrid solve of its own, which ends there.
-            first = self._balanced(
-                scene, problem, self._hybrid_outcome(scene, problem, tolerance, count, False), tolerance
+            variables["first_time"] = (
+                np.asarray(outcome.first_crossing) if isinstance(outcome, Outcome) else _time_of_first(solved(False))
             )
-            named["first_time"] = np.where(first.status == CROSSED, first.crossing_time, np.inf)
-        if not self.slopes_by:
-            return named
-        # An event at the start has a fixed time, whatever the tangent.
-        moves = (named["status"] == 0) & (named[self.times[-1]] > 0.0)
-        slopes = {name: np.where(moves, np.where(grazing, np.nan, slope), 0.0) for name, slope in slopes.items()}
-        return named | slopes | {"grazes": (moves & grazing).astype(np.int8)}
+        inverted = variables["status"] == WORDS.index("inverted")
+        variables |= {name: np.where(inverted, slope, 0.0) for name, slope in slopes.items()}
+        if slopes and not self.run_kind.smooth:
+            variables["grazes"] = (inverted & grazing).astype(np.int8)
+        return variables
 
-    def _hybrid_outcome(
-        self, scene: Scene, problem: InversionProblem, tolerance: float, count: int, last: bool
-    ) -> HybridOutcome:
-        """The hybrid runs of cells."""
-        assert self.run_kind.modes is not None
-        modes, first = self.run_kind.modes(scene, problem, tolerance, last)
-        start, settings = (np.asarray(first), np.asarray(problem.states)), self.settings(tolerance)
-        return solve_hybrid(
-            modes, *start, self.t1, count, settings, counters=len(self.run_kind.counts), nonterminal=last
-        )
+    def _named(self, scene: Scene, problem: InversionProblem, outcome: Outcome | HybridOutcome) -> dict[str, Any]:
+        """The variables that describe how the runs ended, but for the first of two times."""
+        state = jnp.asarray(outcome.state)
+        outcome = with_contact_state(scene, outcome)
+        inverted, theta = _at_the_end(scene, problem, outcome, self.last)
+        others = [np.asarray(outcome.status) == status for status in WORD_OF_STATUS]
+        code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
+        lost = code == WORDS.index("contact_lost")
+        if lost.any():
+            code = np.where(
+                lost, np.array([WORDS.index(status.word) for status in LOSSES])[self._loss(scene, state)], code
+            )
+        counts = zip(self.run_kind.counts, outcome.counts, strict=True) if isinstance(outcome, HybridOutcome) else ()
+        return {
+            self.times[-1]: np.where(inverted, outcome.crossing_time, np.inf),
+            "status": code.astype(np.int8),
+            "end_time": np.asarray(outcome.end_time),
+            "end_theta": np.asarray(theta),
+            "steps": np.asarray(outcome.steps),
+            "rejected": np.asarray(outcome.rejected),
+            **dict(counts),
+        }
 
-    def _outcome(self, problem: InversionProblem, tolerance: float, count: int) -> Outcome:
-        horizon, settings = jnp.asarray(self.t1), self.settings(tolerance)
-        if self.method == "diffrax":
-            return solve_by_diffrax(problem, horizon, settings)
-        return solve_ensemble(problem, horizon, jnp.asarray(count), settings, nonterminal=self.last)[0]
-
-    def _balanced(
-        self, scene: Scene, problem: InversionProblem, ended: HybridOutcome, tolerance: float
-    ) -> HybridOutcome:
-        """The hybrid runs, unresolved where they have gained energy."""
-        gained = np.asarray(has_gained_energy(scene, problem, ended, np.asarray(tolerance)))
-        return ended._replace(status=np.where(gained, UNRESOLVED, ended.status))
-
-    def _ended(self, scene: Scene, problem: InversionProblem, outcome: Outcome, tolerance: float) -> dict[str, Any]:
-        """The variables of cells whose runs are one smooth motion."""
-        loss = functools.partial(self._loss, scene, outcome.state)
-        return self._named(scene, problem, outcome, loss, np.asarray(tolerance))
-
-    def _loss(self, scene: Scene, state: Any) -> Any:
+    def _loss(self, scene: Scene, state: Float[Array, "components cells"]) -> Any:
         """Why contact ended in each cell, as a code in `LOSSES`."""
         if self.run_kind is HYBRID:
             # A run with flights continues where contact is lost, and its ball fits everywhere.
             return LOSSES.index(Status.JAMMED)
-        state = jnp.asarray(state)
         return np.asarray(_flight_loss(scene, state) if self.run_kind.flight_state else _loss(scene.dynamics, state))
 
-    def _named(
-        self,
-        scene: Scene,
-        problem: InversionProblem,
-        ended: Outcome | HybridOutcome,
-        loss: Callable[[], Any],
-        tolerance: Any = None,
-    ) -> dict[str, Any]:
-        inverted, theta, gained = _at_the_end(scene, problem, ended, self.last, tolerance)
-        ended_as = np.where(gained, UNRESOLVED, ended.status)
-        others = [ended_as == status for status in WORD_OF_STATUS]
-        code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
-        lost = code == WORDS.index("contact_lost")
-        if lost.any():
-            code = np.where(lost, np.array([WORDS.index(status.word) for status in LOSSES])[loss()], code)
-        times = {self.times[-1]: np.where(inverted, ended.crossing_time, np.inf)}
-        if isinstance(ended, Outcome) and self.crossing == "both":
-            unresolved = code == WORDS.index("unresolved")
-            times["first_time"] = np.where(unresolved, np.inf, np.asarray(ended.first_crossing))
-        return times | {
-            "status": code.astype(np.int8),
-            "end_time": np.asarray(ended.end_time),
-            "end_theta": np.asarray(theta),
-            "steps": np.asarray(ended.steps),
-            "rejected": np.asarray(ended.rejected),
-        }
+
+def _time_of_first(outcome: HybridOutcome) -> Float[np.ndarray, " cells"]:
+    """The time of the first crossing, infinite in cells that ended otherwise."""
+    return np.where(outcome.status == CROSSED, outcome.crossing_time, np.inf)

@@ -20,7 +20,7 @@ from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import joined, parts
 from ..modes.inversion_problem import InversionProblem
-from .cells import run_kind_of
+from .run_kind import run_kind_of
 
 #: Stretches of time whose growth is recorded; half of them give the exponent and its scatter.
 STRETCHES = 32
