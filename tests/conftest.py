@@ -5,7 +5,6 @@ import os
 
 import jax
 import pytest
-from quick_compiler import quick_to_compile
 from tops import rutstam_top
 
 import nonholonomic

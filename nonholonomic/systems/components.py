@@ -2,7 +2,8 @@
 
 Users write functions of small matrices. Mapped over lanes, these are arrays with a short last axis, which compilers do
 not turn into vector instructions, and their zeros are multiplied like other numbers. Here each element of each array is
-a separate number: zeros and ones disappear, and repeated expressions are computed once.
+a separate number: zeros and ones disappear, and repeated expressions are computed once. A factor of zero that is not
+finite still makes a result NaN.
 """
 
 import functools
@@ -31,6 +32,16 @@ BY_ELEMENT = """
 #: Operations that are expensive enough to be computed once only; XLA would compute them again for each result.
 COSTLY = """
     acos acosh asin asinh atan atan2 atanh cbrt cos cosh erf exp exp2 expm1 log log1p logistic pow sin sinh tan tanh
+"""
+
+#: Operations whose result may not be finite although their operands are, apart from overflow in sums and products.
+RISKY = """
+    acos acosh asin atanh cosh digamma div erf_inv exp exp2 expm1 integer_pow lgamma log log1p pow rem rsqrt sinh sqrt
+"""
+
+#: Operations whose result is not finite if an operand is not; for a quotient, if the dividend is not.
+TRANSPARENT = """
+    abs add add_any cbrt convert_element_type copy copy_p cos div log log1p mul neg sin sinh sqrt square stop_gradient sub tan
 """
 
 #: A function with more scalar operations than this is left in arrays: it would take long to compile.
@@ -161,7 +172,12 @@ class Evaluation:
             )
             result = bind(*full)
             # Joined with its operands: XLA would compute a result that stands alone again.
-            self.computed[key] = stored(result, full[0])[0] if name in COSTLY.split() else result
+            result = stored(result, full[0])[0] if name in COSTLY.split() else result
+            if _is_risky(name, operands, equation) or any(id(one) in self.risky for one in operands):
+                self.risky.add(id(result))
+            if name in TRANSPARENT.split():
+                self.sources[id(result)] = operands[:1] if name == "div" else operands
+            self.computed[key] = result
         return self.computed[key]
 
     def with_hidden(self, results: list[Any]) -> list[Any]:
@@ -246,7 +262,7 @@ def _simplified(name: str, operands: list[Any]) -> Any:
     if name == "sub":
         return operands[0] if right == 0.0 else None
     if name == "mul":
-        # The zeros of a matrix: the other factor is used elsewhere, too, or is not needed.
+        # The zeros of a matrix (`Evaluation.with_hidden`).
         if 0.0 in (left, right):
             return operands[0].dtype.type(0.0)
         return operands[1] if left == 1.0 else operands[0] if right == 1.0 else None

@@ -14,7 +14,6 @@ from nonholonomic.parameters import numbers, with_numbers
 from nonholonomic.progress import status_line
 from nonholonomic.views import Page, Stage, arena
 from nonholonomic.views.explore import (
-    MOST_LIVE_STEPS,
     Answer,
     Frame,
     LiveRun,

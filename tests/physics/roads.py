@@ -16,7 +16,9 @@ from random_scenes import Batch, batch
 
 import tippe
 from nonholonomic.parameters import with_numbers
-from tippe.runs.cells import InversionRuns, run_kind_of
+from nonholonomic.xla_cpu import compile_quickly
+from tippe.runs.cells import InversionRuns
+from tippe.runs.run_kind import run_kind_of
 from tippe.runs.time_error import errors_of, second_tolerance
 
 ANGLE, TOLERANCE, T1 = 0.95 * np.pi, 1e-9, 8.0
@@ -177,4 +179,5 @@ def main(kinds: list[str], count: int = 45, singles: int = 3) -> int:
 
 
 if __name__ == "__main__":
+    compile_quickly()
     sys.exit(main(sys.argv[1:]) > 0)

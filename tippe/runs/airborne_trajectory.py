@@ -181,4 +181,5 @@ def sampled_airborne(scene: Scene[Top], launch: Launch, times: Any, t1: Any, set
     """Run one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, checked."""
     samples = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, counters=1)
     codes = jnp.array([int(status) for status in LOSSES])
-    return sampled_flights(ArenaTrajectory, scene, times, samples, codes[loss(scene, samples.end_state)])
+    grown = has_grown_between(scene, arena_modes((scene, launch), settings.tolerance), samples, energy_in, settings)
+    return sampled_flights(ArenaTrajectory, scene, times, samples, codes[loss(scene, samples.end_state)], grown)

@@ -6,7 +6,7 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import (
@@ -25,9 +25,9 @@ from nonholonomic.sweeps import Variable
 
 from ..model.dynamics import LOSSES
 from ..model.scene import Scene
-from ..modes import airborne
+from ..modes import airborne_ends
 from ..modes.inversion_problem import InversionProblem
-from .inversion import Inversions, is_inverted, with_contact_state
+from .inversion import Inversions, checked, is_inverted
 from .run_kind import COUNTED, HYBRID, WORDS, RunKind
 from .sensitivities import sensitivities_of_cells
 
@@ -40,24 +40,18 @@ _loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
 _flight_loss = eqx.filter_jit(airborne_ends.loss)
 
 
-def _of_the_state(
-    scene: Scene, state: Float[Array, "components cells"], mode: Any
-) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
-    """The least and the greatest energy [J] of states of one smooth motion."""
-    total = scene.energy(state)
-    return total, total
+@eqx.filter_jit
+def _at_the_end(
+    scene: Scene,
+    problem: InversionProblem,
+    outcome: Outcome | HybridOutcome,
+    last: bool,
+    tolerance: Float[Array, ""],
+) -> tuple[Int[Array, " cells"], Bool[Array, " cells"], Float[Array, " cells"]]:
+    """The status of all cells, which of them count as inverted, and theta [rad] at the end of each."""
+    outcome = checked(scene, problem, outcome, tolerance)
+    return outcome.status, is_inverted(outcome, problem, last), scene.theta(jnp.asarray(outcome.state))
 
-
-#: The words of tables, in the order of the integers in their files, which is older than `Status`.
-WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
-SMOOTH = RunKind(WORDS, (), None, _of_the_state)
-STICK_SLIP = RunKind(WORDS, ("sticks",), sticking.modes, sticking.energy_in)
-HYBRID = RunKind(WORDS, ("hops",), sliding.modes, sliding.energy_in)
-AIRBORNE = RunKind(WORDS, ("hops",), airborne.modes, airborne_ends.energy_in, flight_state=True)
-ON_STEM_TOO = RunKind(WORDS, ("hops",), airborne_stem.modes, airborne_ends.energy_in, flight_state=True)
-STICK_SLIP_FLY = RunKind(
-    WORDS, ("hops", "sticks"), airborne_stick_slip.modes, airborne_ends.energy_in, flight_state=True
-)
 
 #: The word for a run's status if it has not inverted; `not_inverted` for all others.
 WORD_OF_STATUS = {
@@ -65,41 +59,6 @@ WORD_OF_STATUS = {
     FAILED: WORDS.index("failed"),
     UNRESOLVED: WORDS.index("unresolved"),
 }
-
-
-@eqx.filter_jit
-def has_gained_energy(
-    scene: Scene, problem: InversionProblem, ended: Outcome | HybridOutcome, tolerance: float | Float[Array, ""]
-) -> Bool[Array, " cells"]:
-    """Where a run has ended with more energy than it began with, which no friction does (`energy.py`).
-
-    **Arguments:** `ended`: with the states in the layouts of their modes.
-    """
-    kind = run_kind_of(scene)
-    first, mode = None, None
-    if kind.modes is not None:
-        assert isinstance(ended, HybridOutcome)
-        first, mode = kind.modes(scene, problem, tolerance, False)[1], ended.mode
-    size = len(problem.states)
-    before = kind.energy_in(scene, problem.states, first)[1]
-    after = kind.energy_in(scene, jnp.asarray(ended.state)[:size], mode)[0]
-    # A run that has failed is said to.
-    return has_grown(scene, before, after, tolerance) & (jnp.asarray(ended.status) != FAILED)
-
-
-@eqx.filter_jit
-def _at_the_end(
-    scene: Scene,
-    problem: InversionProblem,
-    ended: Outcome | HybridOutcome,
-    last: bool,
-    tolerance: Float[Array, ""] | None,
-) -> tuple[Bool[Array, " cells"], Float[Array, " cells"], Bool[Array, " cells"]]:
-    """Which cells count as inverted, theta [rad] at the end of each, and which have gained energy.
-
-
-#: The word for a run's status if it has not inverted; `not_inverted` for all others.
-WORD_OF_STATUS = {LEFT_DOMAIN: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
 
 
 def too_many_steps(t1: float, most: int, end: float) -> str:
@@ -181,11 +140,13 @@ class InversionRuns(NamedTuple):
             outcome = solve_by_diffrax(problem, jnp.asarray(self.t1), settings)
         else:
             outcome = solved(self.last)
-        variables = self._named(scene, problem, outcome)
+        variables = self._named(scene, problem, outcome, settings.tolerance)
         if self.crossing == "both":
             # With several modes the first crossing takes a hybrid solve of its own, which ends there.
             variables["first_time"] = (
-                np.asarray(outcome.first_crossing) if isinstance(outcome, Outcome) else _time_of_first(solved(False))
+                _time_of_first(checked(scene, problem, solved(False), settings.tolerance))
+                if isinstance(outcome, HybridOutcome)
+                else np.where(variables["status"] == WORDS.index("unresolved"), np.inf, outcome.first_crossing)
             )
         inverted = variables["status"] == WORDS.index("inverted")
         variables |= {name: np.where(inverted, slope, 0.0) for name, slope in slopes.items()}
@@ -193,18 +154,21 @@ class InversionRuns(NamedTuple):
             variables["grazes"] = (inverted & grazing).astype(np.int8)
         return variables
 
-    def _named(self, scene: Scene, problem: InversionProblem, outcome: Outcome | HybridOutcome) -> dict[str, Any]:
+    def _named(
+        self,
+        scene: Scene,
+        problem: InversionProblem,
+        outcome: Outcome | HybridOutcome,
+        tolerance: Float[Array, ""],
+    ) -> dict[str, Any]:
         """The variables that describe how the runs ended, but for the first of two times."""
-        state = jnp.asarray(outcome.state)
-        outcome = with_contact_state(scene, outcome)
-        inverted, theta = _at_the_end(scene, problem, outcome, self.last)
-        others = [np.asarray(outcome.status) == status for status in WORD_OF_STATUS]
+        ended, inverted, theta = _at_the_end(scene, problem, outcome, self.last, tolerance)
+        others = [np.asarray(ended) == status for status in WORD_OF_STATUS]
         code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
         lost = code == WORDS.index("contact_lost")
         if lost.any():
-            code = np.where(
-                lost, np.array([WORDS.index(status.word) for status in LOSSES])[self._loss(scene, state)], code
-            )
+            words = np.array([WORDS.index(status.word) for status in LOSSES])
+            code = np.where(lost, words[self._loss(scene, jnp.asarray(outcome.state))], code)
         counts = zip(self.run_kind.counts, outcome.counts, strict=True) if isinstance(outcome, HybridOutcome) else ()
         return {
             self.times[-1]: np.where(inverted, outcome.crossing_time, np.inf),

@@ -26,7 +26,6 @@ from nonholonomic.progress import status_line
 from nonholonomic.validation import all_bounds, legal
 from nonholonomic.views import Page, Stage, arena
 from nonholonomic.views.explore import (
-    MOST_LIVE_STEPS,
     Answer,
     Frame,
     HybridSimulator,

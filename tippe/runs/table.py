@@ -18,7 +18,7 @@ from ..model.scene import Scene
 from .cells import InversionRuns, too_many_steps
 from .checks import check_event, warn_if_it_cannot_invert
 from .launches import described, launches, rows
-from .run_kind import check_differentiable, run_kind_of
+from .run_kind import RunKind, check_differentiable, run_kind_of, why_unresolved
 from .sensitivities import sensitivity_names, sensitivity_variables
 from .time_error import errors_of, second_tolerance
 

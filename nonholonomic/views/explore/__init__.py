@@ -4,7 +4,6 @@ from .frame import Frame as Frame
 from .frame import quaternion as quaternion
 from .hybrid_simulator import HybridSimulator as HybridSimulator
 from .javascript import javascript as javascript
-from .live import MOST_LIVE_STEPS as MOST_LIVE_STEPS
 from .live import Answer as Answer
 from .live import LiveRun as LiveRun
 from .live import Summary as Summary

@@ -20,9 +20,6 @@ from .slider import Slider
 
 Numbers = Float[Array, " numbers"]
 
-#: Steps after which a run in a page is given up: some hundred milliseconds.
-MOST_LIVE_STEPS = 50_000
-
 
 class Answer(NamedTuple):
     """What is asked of every run, and shown as a map: its `label` and `unit`, and the `simulator` that finds it.
