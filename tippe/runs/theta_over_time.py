@@ -12,7 +12,8 @@ from nonholonomic.sweeps import chunk_for
 
 from ..model.launch import Launch
 from ..model.scene import Scene
-from .cells import InversionRuns, run_kind_of
+from .cells import InversionRuns
+from .run_kind import run_kind_of
 
 
 def theta_over_time(
