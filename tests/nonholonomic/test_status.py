@@ -10,7 +10,7 @@ import stroller
 import tippe
 from nonholonomic.sweeps import Table, Variable, axis, sweep
 from stroller.runs.table import WORDS as OF_RIDES
-from tippe.runs import cells
+from tippe.runs import run_kind
 from tippe.runs.trajectory_table import WORDS as OF_TRAJECTORIES
 
 pytestmark = pytest.mark.newest
@@ -48,7 +48,7 @@ def test_words_of_earlier_versions_are_understood_and_others_refused():
 
 
 def test_all_tables_use_words_of_the_list():
-    drivers = [one for one in vars(cells).values() if isinstance(one, cells.RunKind)]
+    drivers = [one for one in vars(run_kind).values() if isinstance(one, run_kind.RunKind)]
     assert len(drivers) == 6
     known = {status.word for status in Status}
     for words in (OF_RIDES, OF_TRAJECTORIES, *(one.words for one in drivers)):
@@ -56,7 +56,7 @@ def test_all_tables_use_words_of_the_list():
         assert len(set(words)) == len(words)
     # Files say themselves what their integers mean; these are the ones that they have had from the beginning.
     words = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
-    assert words == cells.WORDS
+    assert words == run_kind.WORDS
     assert OF_TRAJECTORIES[:4] == ("completed", "contact_lost", "failed", "jammed")
     assert OF_RIDES == ("completed", "contact_lost", "rank_lost", "failed")
 
