@@ -39,7 +39,7 @@ from .free_body import (
 )
 from .impact import CLOSING_SPEED, TOUCHING, resolve_impact
 from .inversion_problem import InversionProblem
-from .leaning import BOTH, LeaningDynamics, at_rest
+from .leaning import LeaningDynamics, at_rest
 
 Cells = Float[Array, " cells"]
 
@@ -219,19 +219,6 @@ def _first_mode(body: Top, states: Float[Array, "components cells"]) -> Int[Arra
     """The number of the lower of the two spheres."""
     main, stem = balls(body)
     return (height(main, stem, states) < 0.0).astype(int)
-
-
-def energy_in(
-    scene: Scene[Top], state: Float[Array, "components cells"], number: Int[Array, " cells"]
-) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
-    """The least and the greatest energy [J] that a state at the end of a mode, or of a flight from there, may have.
-
-    In flight its sphere is above the plane, and the state does not tell at which speed along the normal.
-    """
-    own, _ = _own_and_other(balls(scene.body), jnp.where(number == BOTH, 0, number))
-    free = as_free_body(scene.body, own, state[:OWN])
-    whole = energy(scene.body, scene.gravity, free)
-    return whole - 0.5 * scene.body.mass * free.velocity[2] ** 2, whole
 
 
 def leaning(scene: Scene[Top]) -> LeaningDynamics:

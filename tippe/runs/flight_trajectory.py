@@ -24,11 +24,11 @@ from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.top import Top
-from ..modes.free_body import Ball, FreeBody, as_free_body, balls, energy, standing_on
+from ..modes.free_body import Ball, FreeBody, as_free_body, balls, energy, energy_in, standing_on
 from ..modes.impact import approach
 from ..modes.inversion_problem import InversionProblem
 from ..modes.leaning import BOTH
-from ..modes.sliding import MOST_BOUNCES, energy_in, modes
+from ..modes.sliding import MOST_BOUNCES, modes
 from ..modes.trajectory_problem import TrajectoryProblem
 from .energy import has_grown, if_balanced, why_unbalanced
 from .observables import AbstractTrajectory, of_each_run

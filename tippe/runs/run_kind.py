@@ -10,7 +10,7 @@ from nonholonomic.hybrid import AbstractBatchedMode
 from nonholonomic.sweeps import Variable
 
 from ..model.scene import Scene
-from ..modes import airborne, airborne_ends, airborne_stem, airborne_stick_slip, sliding, sticking
+from ..modes import airborne, airborne_ends, airborne_stem, airborne_stick_slip, free_body, sliding, sticking
 
 
 class RunKind(NamedTuple):
@@ -61,7 +61,7 @@ WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_n
 
 SMOOTH = RunKind(WORDS, (), None, energy_of_state)
 STICK_SLIP = RunKind(WORDS, ("sticks",), sticking.modes, sticking.energy_in)
-HYBRID = RunKind(WORDS, ("hops",), sliding.modes, sliding.energy_in)
+HYBRID = RunKind(WORDS, ("hops",), sliding.modes, free_body.energy_in)
 AIRBORNE = RunKind(WORDS, ("hops",), airborne.modes, airborne_ends.energy_in, flight_state=True)
 ON_STEM_TOO = RunKind(WORDS, ("hops",), airborne_stem.modes, airborne_ends.energy_in, flight_state=True)
 STICK_SLIP_FLY = RunKind(

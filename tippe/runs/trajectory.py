@@ -40,6 +40,7 @@ from ..model.scene import Scene
 from ..modes.trajectory_problem import TrajectoryProblem
 from .airborne_trajectory import sampled_airborne, simulate_airborne
 from .checks import check_run
+from .energy import if_balanced, why_unbalanced
 from .flight_trajectory import HybridTrajectory, sampled_hybrid, simulate_hybrid
 from .observables import AbstractTrajectory, of_each_run
 from .sampled import ended, sampled
