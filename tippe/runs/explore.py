@@ -1,4 +1,4 @@
-"""A page with sliders in which a top is simulated anew in the browser."""
+"""A page with sliders that simulates a top in the browser."""
 
 import math
 from typing import Any
@@ -50,10 +50,10 @@ Numbers = Float[Array, " numbers"]
 ANGLE = 0.95 * math.pi
 TOLERANCE = 1e-7
 
-#: Tolerance of the runs that only say how far the arena is drawn.
+#: Tolerance of the runs that determine the drawn part of the arena.
 DRAWN = 1e-5
 
-#: Steps after which a run in the page is given up: some hundred milliseconds.
+#: Greatest number of steps of a run in the page, some hundred milliseconds.
 MOST_STEPS_OF_A_PAGE = 50_000
 
 
@@ -78,8 +78,9 @@ def explore(
     - `scene`, `launch`: the run at the start, every number a scalar; `contact` must be "stop", and the friction law
       must have a single mode.
     - `path`: file to write the page to, or `None`.
-    - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name will do where only one parameter fits, such
-      as "theta", "spin", "mu", "friction.mu" or "offset". By default theta, spin, the coefficient of friction and the offset.
+    - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name is enough if only one parameter
+      matches, such as "theta", "spin", "mu", "friction.mu" or "offset". By default theta, spin, the coefficient of
+      friction and the offset.
     - `t1`: horizon [s].
 
     **Returns:** a `Page`, with its `html`.
@@ -113,7 +114,7 @@ def explore(
 
 
 def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float) -> LiveRun:
-    """What the page shows of a scene and a launch, `roots`, some of whose numbers are those of sliders."""
+    """The contents of the page for a scene and a launch, `roots`, some of whose numbers come from sliders."""
 
     def modules(values: Numbers) -> tuple[Scene, Launch]:
         replaced = with_numbers(roots, {knob.path: value for knob, value in zip(knobs, values, strict=True)})
@@ -140,7 +141,7 @@ def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float) -> Liv
 
 
 def check_smooth(scene: Scene) -> None:
-    """Raise `ValueError` for a scene whose runs have several modes, which the page does not know."""
+    """Raise `ValueError` for a scene whose runs have several modes, which the page does not support."""
     if scene.contact == "hybrid":
         raise ValueError(
             "contact = 'hybrid' must be 'stop' for explore, whose page ends a run where contact is lost; leave the stem "
@@ -153,7 +154,7 @@ def check_smooth(scene: Scene) -> None:
 
 
 def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
-    """The sliders if a user names none: theta, spin, the coefficient of friction and the offset, about their own values."""
+    """The default sliders: theta, spin, the coefficient of friction and the offset, around their own values."""
     theta, spin = float(launch.theta), float(launch.spin)
     ranges = {"theta": (min(0.02, theta), max(0.6, theta)), "spin": tuple(sorted((0.4 * spin, 1.4 * spin)))}
     if spin == 0.0:
@@ -171,9 +172,9 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
 
 
 def outcome(problem: InversionProblem, lane: LaneState) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """How a run that ends with the inversion ended, a `Status`, and its inversion time [s], or infinity."""
+    """The `Status` of a run that ends with the inversion, and its inversion time [s], or infinity."""
     inverted = lane.status == CROSSED
-    # A run that starts above the angle is there at once.
+    # A run that starts above the angle is inverted at once.
     time = jnp.where(lane.time > 0.0, crossing_time(problem, lane.time, lane.state), 0.0)
     lost = jnp.array([int(status) for status in LOSSES])[problem.dynamics.loss(lane.state)]
     others = jnp.where(lane.status == FAILED, int(Status.FAILED), int(Status.NOT_INVERTED))
@@ -182,7 +183,7 @@ def outcome(problem: InversionProblem, lane: LaneState) -> tuple[Int[Array, ""],
 
 
 def stage(runs: list[dict[str, Any]], t1: float) -> Stage:
-    """The first of some scenes and launches as it is drawn, on a piece of the arena on which all of them are."""
+    """The stage of the first of some scenes and launches, on a part of the arena that contains all of them."""
     paths = [simulate(run["scene"], run["launch"], t1, tolerance=DRAWN) for run in runs]
     (first,), size = paths[0].stages(), float(runs[0]["scene"].body.size)
     points = np.concatenate([np.asarray(path.contact) for path in paths])
@@ -191,7 +192,7 @@ def stage(runs: list[dict[str, Any]], t1: float) -> Stage:
 
 
 def frame(scene: Scene, problem: TrajectoryProblem, lane: LaneState) -> Frame:
-    """What is drawn of a top at one time, as `view.show` orders it."""
+    """The drawn quantities of a top at one time, in the order of `view.show`."""
     lean, rows = len(problem.state), lane.state
     parts = (rows[:lean], rows[lean:-2], rows[-2], rows[-1])
     run = Trajectory(lane.time, scene, *parts, status=0, end_time=lane.time[0], stats={}, dense=None)
