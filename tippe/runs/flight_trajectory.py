@@ -201,7 +201,8 @@ def level_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int
 def _start(scene: Scene[Top], launch: Launch) -> InversionProblem:
     """The launch as one cell, with the passive quadratures, whose position is that of the centre of mass."""
     state, scales = TrajectoryProblem.of(scene, launch).start()
-    state = state.at[8:10].add(-scene.body.offset * state[2:4])
+    place = state[8:10] - scene.body.offset * state[2:4]
+    state = jnp.concatenate([state[:8], place, state[10:]])
     return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
 
 
