@@ -45,9 +45,9 @@ NEAR = 1e-6
 
 
 class ArenaTrajectory(HybridTrajectory):
-    """A `HybridTrajectory` over any arena: `theta` and `azimuth` refer to the frame at the foot, the point of the arena nearest
-    to the centre of the top's own sphere, and `distance` is that of this sphere from it. The frame of `slip` is that at the
-    foot of the sphere that touches."""
+    """A `HybridTrajectory` over any arena: `theta` and `azimuth` refer to the frame at the foot, the point of the arena
+    nearest to the centre of the top's own sphere, and `distance` is the distance of this sphere from the arena. `slip`
+    refers to the frame at the foot of the touching sphere."""
 
     @of_each_run
     def energy(self) -> Float[Array, " times"]:
@@ -58,7 +58,7 @@ class ArenaTrajectory(HybridTrajectory):
     def theta_rate(self) -> Float[Array, " times"]:
         """Rate of change of theta [rad/s]."""
         dynamics = self.scene.dynamics
-        # The frame is carried along by the centre of the top's sphere, wherever that is.
+        # The frame moves with the centre of the top's sphere, in flight, too.
         frame = dataclasses.replace(carried_frame(self.scene), distance=self.scene.body.radius + self.above[0])
         rates = dataclasses.replace(dynamics, frame=frame).field(self._states)
         return jax.jvp(self.scene.theta, (self._states,), (rates,))[1]
@@ -73,8 +73,8 @@ class ArenaTrajectory(HybridTrajectory):
 
     @of_each_run
     def slip(self) -> Float[Array, "times 2"]:
-        """Velocity along the tangent plane of the point of a sphere that is closest to the arena [m/s]: of the stem's sphere
-        while that touches, else of the top's own."""
+        """Velocity along the tangent plane of the point of a sphere that is closest to the arena [m/s]: of the stem's
+        sphere while it touches, otherwise of the top's own."""
         slip = self.scene.slip_velocity(self._states)
         if self.scene.body.stem is not None:
             of_stem = self._on_stem.slip
@@ -83,10 +83,11 @@ class ArenaTrajectory(HybridTrajectory):
 
     @property
     def _on_stem(self) -> Motion:
-        """The motion on the stem, at times at which that touches; the first tangent is the projection of the one shown."""
+        """The motion on the stem, at times at which the stem touches; the first tangent is the projection of the
+        reported one."""
         scene, place = self.scene, parts(self._states).place
         (distance, rate), own, stem = self.above, *balls(scene.body)
-        # Its place is that of a top whose own sphere is so much greater that it touches.
+        # Its place is that of a top with a larger sphere that touches.
         flying = flight_state(lift_off(scene, self._states, False, Ball(own.offset, own.radius + distance)))
         frame = carried_frame(scene)
         flying = flying._replace(velocity=vector_of(sum_vectors(flying.velocity, scale(rate, frame.normal(place[:3])))))
@@ -111,17 +112,17 @@ class ArenaTrajectory(HybridTrajectory):
 
     @staticmethod
     def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
-        # Also of traced numbers, -1 after the end of a run.
+        # Also for traced numbers; -1 after the end of a run.
         return (numbers == ON_STEM) - 1 * ((numbers == FLYING) | (numbers == STRIKING) | (numbers < 0))
 
 
 class StickSlipArenaTrajectory(ArenaTrajectory):
-    """An `ArenaTrajectory` under Coulomb's law as it stands; `stats` holds `sticks` too, how often a slip has turned into
-    rolling."""
+    """An `ArenaTrajectory` under exact Coulomb friction; `stats` also holds `sticks`, the number of changes from slip
+    to rolling."""
 
     @staticmethod
     def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
-        # Between two modes a slip begins.
+        # Between two modes, a slip begins.
         return -1 * (numbers == FLYING)
 
     @staticmethod
@@ -132,9 +133,9 @@ class StickSlipArenaTrajectory(ArenaTrajectory):
 
 
 def arena_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "19 1"]]:
-    """The modes of one launch of a hybrid scene on any arena, the number of the first, and the state there.
+    """The modes of one launch of a hybrid scene on any arena, the index of the first, and its initial state.
 
-    **Arguments:** `modules`: scene and launch; `tolerance`: relative, of the integration.
+    **Arguments:** `modules`: scene and launch; `tolerance`: relative tolerance of the integration.
     """
     problem = _start(*modules)
     modes = airborne.modes if modules[0].body.stem is None else airborne_stem.modes
@@ -158,7 +159,8 @@ def simulate_airborne(
     tolerance: float | Float[Array, ""],
     solver: diffrax.AbstractSolver | None,
 ) -> ArenaTrajectory:
-    """Run one launch of a hybrid scene whose flights are integrated. **Arguments:** as for `simulate`, checked."""
+    """Simulate one launch of a hybrid scene whose flights are integrated. **Arguments:** as for `simulate`, already
+    checked."""
     batched_modes, first, state = arena_modes((scene, launch), tolerance)
     exact = scene.friction.set_valued
     start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
@@ -178,7 +180,8 @@ def simulate_airborne(
 
 
 def sampled_airborne(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:
-    """Run one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, checked."""
+    """Simulate one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, already
+    checked."""
     samples = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, counters=1)
     codes = jnp.array([int(status) for status in LOSSES])
     grown = has_grown_between(scene, arena_modes((scene, launch), settings.tolerance), samples, energy_in, settings)

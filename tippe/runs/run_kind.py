@@ -1,4 +1,5 @@
-"""The kinds of runs: one smooth motion, or several modes of contact and flight; and what a table says of each."""
+"""The kinds of runs: one smooth motion, or several modes of contact and flight; and the variables of a table for
+each."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -34,7 +35,7 @@ class RunKind(NamedTuple):
 
     @property
     def variables(self) -> dict[str, Variable]:
-        """The table's variables besides the times."""
+        """The table's variables in addition to the times."""
         counts = ("steps", "rejected", *self.counts)
         return {
             "status": Variable("1", np.int8, self.words, long_name="how the run ended"),

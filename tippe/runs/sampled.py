@@ -33,8 +33,8 @@ def ended(
 
 
 class Found(NamedTuple):
-    """What is found of a run: `states`, and as `quadratures` what else a `TrajectoryProblem` carries, are NaN after the end;
-    `status` is a `Status`, a float."""
+    """The samples of a run: `states`, and `quadratures` (the other components of a `TrajectoryProblem`), are NaN after
+    the end; `status` is a `Status` as a float."""
 
     states: Float[Array, "components times"]
     quadratures: Float[Array, "quadratures times"]
@@ -52,7 +52,7 @@ def sampled(
     settings: Settings,
     adjoint: diffrax.AbstractAdjoint | None,
 ) -> Found:
-    """Run one launch inside a transformation and sample it.
+    """Simulate one launch inside a transformation and sample it.
 
     **Arguments:** as for `simulate`.
     """
