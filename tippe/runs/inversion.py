@@ -137,11 +137,10 @@ def checked(
     """The outcome with all states in the layout of a contact, those of flight too, and unresolved where a run has ended with
     more energy than it began with, which friction cannot do (`energy.py`).
     """
-    kind, first, mode = run_kind_of(scene), None, None
+    kind = run_kind_of(scene)
+    first: Any = None if kind.modes is None else kind.modes(scene, problem, tolerance, False)[1]
+    mode: Any = outcome.mode if isinstance(outcome, HybridOutcome) else None
     state = jnp.asarray(outcome.state)[: len(problem.states)]
-    if kind.modes is not None:
-        assert isinstance(outcome, HybridOutcome)
-        first, mode = kind.modes(scene, problem, tolerance, False)[1], outcome.mode
     before, after = kind.energy_in(scene, problem.states, first)[1], kind.energy_in(scene, state, mode)[0]
     grown = has_grown(scene, before, after, tolerance) & (outcome.status != FAILED)
     outcome = outcome._replace(status=jnp.where(grown, UNRESOLVED, outcome.status))

@@ -83,8 +83,8 @@ def inversion_table(
       limit applies to each stay in a mode; `method="diffrax"` allows 100 000 steps at most.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
-    "contact_lost", "failed", "jammed", "unresolved" if the energy grows), `end_time` [s] and `end_theta` [rad] at which the run ended (also if contact
-    was lost or jammed), `steps` and `rejected`. With `errors` also `time_error` [s], a bound that is infinite if the
+    "contact_lost", "failed", "jammed", "unresolved" if the energy grows), `end_time` [s] and `end_theta` [rad] at which
+    the run ended (also if contact was lost or jammed), `steps` and `rejected`. With `errors` also `time_error` [s], a bound that is infinite if the
     two runs disagree on the status or failed, and 0 if both find no time; `Table.digits("time")` shows the correct
     digits. The same for `end_time` and `end_theta`; `hops_error` and `sticks_error` are the differences of the two
     runs, and `status_error` is 1 if the runs disagree on the status or failed. With `sensitivities` also the derivative
