@@ -1,5 +1,7 @@
 """States of runs over any arena at their ends, in contact or in flight: as if in contact, their energy, why a contact ended."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -43,9 +45,7 @@ def energy_in(
     return total, total
 
 
-def lifted(
-    scene: Scene[Top], state: Float[Array, "14 ..."], distance: Float[Array, "..."], rate: Float[Array, "..."]
-) -> Float[Array, "..."]:
+def lifted(scene: Scene[Top], state: Float[Array, "14 ..."], distance: Any, rate: Any) -> Float[Array, "..."]:
     """Energy [J] of a top beyond that of its state in contact, where its sphere has a distance [m] with a rate [m/s]."""
     _, e, L, place = parts(state)
     # In contact the velocity along n is that of the centre of mass about the sphere's centre.

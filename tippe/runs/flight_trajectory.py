@@ -45,19 +45,19 @@ STATUS = {
 class HybridTrajectory(AbstractTrajectory):
     """A run through contacts, flights and impacts; vectors are arrays (times, 3) in the fixed frame (x, y, z).
 
-    `status` is "completed", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a row
-    or 2000 contacts; sphere and stem on the plane together with so much friction that the forces are not determined;
-    sphere and stem at rest together on another arena, where the equations of both contacts at once are not implemented;
-    a flight that does not end at the arena; an energy that grows, or does not balance, by more than 1e4 times the
-    tolerance, relative to the energy); the run ends at `end_time`, and `print(run)` says why it is unresolved.
-    `contact` is the sphere that touches at each time: 0 the top's, 1 its stem's, 2 both, -1 none. At the time of an impact, values are those before the impact.
-    `distance` is the distance of the top's own sphere from the plane [m] with its rate [m/s]. `hops` has a row for each
-    flight until `end_time`, with its start and end [s]; a table counts only the flights before the inversion. Bounces
-    that shrink by the restitution e are followed down to a speed of 1e-5 sqrt(g R); after that the top counts as in
-    contact, although the remaining bounces would take e / (1 - e) of the last one's time. `work` is the work of
-    friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest drift of |e|, the greatest
-    energy residual |E - E(0) - work| and the energy lost in impacts [J]. `rotation` and `angular_velocity` are those of
-    `Trajectory`.
+    `status` is "completed", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a
+    row or 2000 contacts; sphere and stem on the plane together with so much friction that the forces are not
+    determined; sphere and stem at rest together on another arena, where the equations of both contacts at once are
+    not implemented; a flight that does not end at the arena; an energy that grows, or does not balance, by more than
+    1e4 times the tolerance, relative to the energy); the run ends at `end_time`, and `print(run)` says why it is
+    unresolved. `contact` is the sphere that touches at each time: 0 the top's, 1 its stem's, 2 both, -1 none. At the
+    time of an impact, values are those before the impact. `distance` is the distance of the top's own sphere from the
+    plane [m] with its rate [m/s]. `hops` has a row for each flight until `end_time`, with its start and end [s]; a
+    table counts only the flights before the inversion. Bounces that shrink by the restitution e are followed down to
+    a speed of 1e-5 sqrt(g R); after that the top counts as in contact, although the remaining bounces would take e /
+    (1 - e) of the last one's time. `work` is the work of friction and of the impacts [J]. `stats` holds accepted and
+    rejected steps, the greatest drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in
+    impacts [J]. `rotation` and `angular_velocity` are those of `Trajectory`.
 
     Inside a transformation `status` is the integer of the `Status`; `hops` is `None`, `stats["hops"]` counts the
     flights. First derivatives by the scene and the launch go through flights and impacts; they are NaN after a grazing

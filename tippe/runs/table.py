@@ -83,18 +83,19 @@ def inversion_table(
       limit applies to each stay in a mode; `method="diffrax"` allows 100 000 steps at most.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
-    "contact_lost", "failed", "jammed", "unresolved" if the energy grows), `end_time` [s] and `end_theta` [rad] at which
-    the run ended (also if contact was lost or jammed), `steps` and `rejected`. With `errors` also `time_error` [s], a bound that is infinite if the
-    two runs disagree on the status or failed, and 0 if both find no time; `Table.digits("time")` shows the correct
-    digits. The same for `end_time` and `end_theta`; `hops_error` and `sticks_error` are the differences of the two
-    runs, and `status_error` is 1 if the runs disagree on the status or failed. With `sensitivities` also the derivative
-    of `time` with respect to each parameter, `time_by_mu` for `"scene.friction.mu"`, 0 if the top did not invert. It
-    includes flights, impacts, stick and slip; `grazes` is 1 and the derivative is NaN if an earlier event, such as a
-    landing, was grazing, so that it may not happen within the tolerance (`SetValuedCoulomb` with `contact="hybrid"` has
-    none). With `contact="hybrid"`, a run continues through flights, and the angle also counts in flight; `hops` is the
-    number of flights until the run ended, and `status` may be "unresolved" (10 000 flights in a row, or sphere and stem
-    on the plane together with so much friction that the forces are undetermined). With `SetValuedCoulomb`, `sticks` is
-    the number of changes from slip to rolling outside impacts, and `status` may be "unresolved" (too many changes).
+    "contact_lost", "failed", "jammed", "unresolved" if the energy grows), `end_time` [s] and `end_theta` [rad] at
+    which the run ended (also if contact was lost or jammed), `steps` and `rejected`. With `errors` also `time_error`
+    [s], a bound that is infinite if the two runs disagree on the status or failed, and 0 if both find no time;
+    `Table.digits("time")` shows the correct digits. The same for `end_time` and `end_theta`; `hops_error` and
+    `sticks_error` are the differences of the two runs, and `status_error` is 1 if the runs disagree on the status or
+    failed. With `sensitivities` also the derivative of `time` with respect to each parameter, `time_by_mu` for
+    `"scene.friction.mu"`, 0 if the top did not invert. It includes flights, impacts, stick and slip; `grazes` is 1
+    and the derivative is NaN if an earlier event, such as a landing, was grazing, so that it may not happen within
+    the tolerance (`SetValuedCoulomb` with `contact="hybrid"` has none). With `contact="hybrid"`, a run continues
+    through flights, and the angle also counts in flight; `hops` is the number of flights until the run ended, and
+    `status` may be "unresolved" (10 000 flights in a row, or sphere and stem on the plane together with so much
+    friction that the forces are undetermined). With `SetValuedCoulomb`, `sticks` is the number of changes from slip
+    to rolling outside impacts, and `status` may be "unresolved" (too many changes).
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
     `RuntimeError` for an executor that breaks down, or a worker with other versions.
