@@ -87,6 +87,7 @@ def _at_the_end(
 #: The words of tables, in the order of the integers in their files, which is older than `Status`.
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit")
 SMOOTH = RunKind(WORDS, (), None)
+REVERSAL = RunKind(("reversed", "not_reversed", *WORDS[2:]), (), None)
 STICK_SLIP = RunKind((*WORDS, "unresolved"), ("sticks",), stick_slip_modes)
 HYBRID = RunKind((*WORDS, "unresolved"), ("hops",), hybrid_modes)
 AIRBORNE = RunKind((*WORDS, "unresolved"), ("hops",), airborne.modes, flight_state=True)
@@ -127,11 +128,11 @@ def check_differentiable(scene: Scene) -> None:
 
 
 class InversionRuns(NamedTuple):
-    """The requested variables of every cell of a table; see `inversion_table`."""
+    """The requested variables of every cell of a table; see `inversion_table`. `angle` is `None` where reversals are timed."""
 
     run_kind: RunKind
     t1: float
-    angle: float
+    angle: float | None
     crossing: str
     solver: diffrax.AbstractSolver | None
     method: str
@@ -155,7 +156,8 @@ class InversionRuns(NamedTuple):
     @property
     def variables(self) -> dict[str, Variable]:
         """The table's variables, without errors and derivatives."""
-        times = {name: Variable("s", np.float64, long_name=TIMES[name]) for name in self.times}
+        names = TIMES if self.angle is not None else {"time": "reversal time"}
+        times = {name: Variable("s", np.float64, long_name=names[name]) for name in self.times}
         grazes = Variable("1", np.int8, long_name="whether an event on the way was grazing")
         return (
             times

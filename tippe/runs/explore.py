@@ -39,7 +39,7 @@ from ..model.scene import Scene
 from ..model.top import Top
 from ..modes.inversion_problem import InversionProblem
 from ..modes.trajectory_problem import TrajectoryProblem
-from .inversion import check_run
+from .inversion import check_revolution, check_run
 from .launches import LONG_NAMES, UNITS
 from .trajectory import Trajectory, simulate
 from .view import AXIS, BESIDE, Motion, aside
@@ -102,6 +102,7 @@ def explore(
     """
     check_run(scene, launch, t1, TOLERANCE)
     check_smooth(scene)
+    check_revolution(scene, "explore")
     roots = {"scene": scene, "launch": launch}
     ranges = default_ranges(scene, launch) if sliders is None else sliders
     knobs = sliders_of(ranges, roots, LONG_NAMES, UNITS | scene.body.units | scene.friction.units)

@@ -21,6 +21,7 @@ from ..model.scene import Scene
 from ..model.state import joined, parts
 from ..modes.inversion_problem import InversionProblem
 from .cells import run_kind_of
+from .inversion import check_revolution
 
 #: Stretches of time whose growth is recorded; half of them give the exponent and its scatter.
 STRETCHES = 32
@@ -96,6 +97,7 @@ def lyapunov_exponent(
     """
     require_kind(scene, "scene", Scene)
     require_kind(launch, "launch", Launch)
+    check_revolution(scene, "lyapunov_exponent")
     if not run_kind_of(scene).smooth:
         raise ValueError(
             "contact = 'hybrid' and SetValuedCoulomb have no exponents: variations end at a change of phase"

@@ -9,6 +9,8 @@ from nonholonomic.parameters import description
 from nonholonomic.sweeps import Table, versions
 from nonholonomic.validation import require_one_run
 
+from ..model.rigid_body import AbstractRigidBody
+
 
 class Quantity(NamedTuple):
     """A property of `Trajectory`: its unit, the dimension of its components if it is a vector, and what it is in words."""
@@ -43,6 +45,13 @@ OF_ONE_RUN = {
     "work": Quantity("J", long_name="work of friction"),
 }
 
+#: Of one run of a body of any shape and inertia.
+OF_RIGID_BODIES = {
+    "normal_spin": Quantity("rad s-1", long_name="spin about the normal"),
+    "grip": Quantity("1", long_name="friction over normal force"),
+    "reaction": Quantity("N", "component", "force of the arena"),
+}
+
 
 def table_of(run: Any) -> Table:
     """Everything that is read off a run, over its times.
@@ -53,6 +62,8 @@ def table_of(run: Any) -> Table:
     """
     require_one_run(run, "to_table", "; trajectory_table makes a table of many")
     known = QUANTITIES | OF_ONE_RUN
+    if isinstance(run.scene.body, AbstractRigidBody):
+        known |= OF_RIGID_BODIES
     dims = [quantity.components for quantity in known.values() if quantity.components is not None]
     coords = {"time": np.asarray(run.t)} | {dim: np.array(COMPONENTS[dim]) for dim in dict.fromkeys(dims)}
     request = description("scene", run.scene) | {"status": str(run.status), "end_time": float(run.end_time)}

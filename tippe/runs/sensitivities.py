@@ -43,15 +43,15 @@ def sensitivity_columns(names: list[str]) -> list[str]:
     ]
 
 
-def sensitivity_variables(names: list[str], units: dict[str, str]) -> dict[str, Variable]:
-    """The table's variables, with their units."""
+def sensitivity_variables(names: list[str], units: dict[str, str], event: str = "inversion") -> dict[str, Variable]:
+    """The table's variables, with their units; `event`: what is timed."""
 
     def unit(name: str) -> str:
         of_number = units.get(name.rsplit(".", 1)[-1], "1")
         return "s" if of_number == "1" else f"s ({of_number})-1"
 
     return {
-        slope: Variable(unit(name), np.float64, long_name=f"inversion time by {name}")
+        slope: Variable(unit(name), np.float64, long_name=f"{event} time by {name}")
         for slope, name in zip(sensitivity_columns(names), names, strict=True)
     }
 
@@ -60,7 +60,7 @@ def sensitivities_of_cells(
     roots: dict[str, Any],
     columns: dict[str, Any],
     names: list[str],
-    angle: float,
+    angle: float | None,
     t1: float,
     settings: Settings,
     *,
@@ -78,7 +78,8 @@ def sensitivities_of_cells(
     **Returns:** the `Outcome`, and name of the variable -> derivatives (size,). Source: implicit function theorem at
     the event.
     """
-    problem, tangents, sizes = _problem_and_tangents(roots, columns, names, jnp.asarray(angle, float), size)
+    number = None if angle is None else jnp.asarray(angle, float)
+    problem, tangents, sizes = _problem_and_tangents(roots, columns, names, number, size)
     outcome, slopes = solve_ensemble_with_tangents(
         problem,
         tangents,
@@ -94,7 +95,7 @@ def sensitivities_of_cells(
 
 @eqx.filter_jit
 def _problem_and_tangents(
-    roots: dict[str, Any], columns: dict[str, Any], names: list[str], angle: Float[Array, ""], size: int
+    roots: dict[str, Any], columns: dict[str, Any], names: list[str], angle: Float[Array, ""] | None, size: int
 ) -> tuple[InversionProblem, tuple[Any, ...], list[Float[Array, "..."]]]:
     """The problem of the cells, its tangents along the numbers to differentiate by, and the scale of each tangent."""
 
