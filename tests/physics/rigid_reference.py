@@ -1,7 +1,7 @@
 """An ellipsoid of any inertia that slides or rolls on a level plane: a reference in plain NumPy and SciPy, SI units.
 
-A rigid body in space, with nothing of the simulator: centre of mass x, its velocity u, a unit quaternion from the body's axes to
-the fixed ones, and the angular velocity w in the fixed axes. Accelerations and the contact force come from one linear system:
+A rigid body in space, with nothing of the simulator: centre of mass x, its velocity u, a unit quaternion from the body's axes
+to the fixed ones, and the angular velocity w in the fixed axes. Accelerations and contact force come from one linear system:
 m u' = F - m g z, J w' + w x J w = r x F, and as many conditions on the contact as there are unknown forces. Rolling, the
 velocity of the contact point stays zero as a vector; sliding, its normal component does, and F = N (z + f(slip)).
 """
@@ -36,7 +36,7 @@ class Rattleback:
     gravity: float = 9.81
 
     def lever(self, Q):
-        """The lowest point from the centre of mass, in the fixed axes, and its rate for a body that turns with w, as a matrix."""
+        """The lowest point from the centre of mass, in the fixed axes, and its rate as a function of the angular velocity."""
         S = Q @ np.diag(np.square(self.semi_axes)) @ Q.T
         reach = np.sqrt(UP @ S @ UP)
         centre = -Q @ np.array(self.centre_of_mass)
@@ -74,7 +74,9 @@ class Rattleback:
 
     def start(self, theta, azimuth, spin, turning=(0.0, 0.0, 0.0), velocity=(0.0, 0.0)):
         """The launch of `tippe.Launch` with the contact at the origin: the body is turned by theta about a horizontal axis."""
-        q = np.array((np.cos(theta / 2), -np.sin(azimuth) * np.sin(theta / 2), np.cos(azimuth) * np.sin(theta / 2), 0.0))
+        q = np.array(
+            (np.cos(theta / 2), -np.sin(azimuth) * np.sin(theta / 2), np.cos(azimuth) * np.sin(theta / 2), 0.0)
+        )
         Q = rotation(q)
         w = spin * Q[:, 2] + turning
         r, _ = self.lever(Q)
@@ -83,9 +85,9 @@ class Rattleback:
             u[:2] = velocity
         return np.concatenate((-r, u, q, w))
 
-    def run(self, y, times):
+    def run(self, y, times, rtol=1e-12):
         """The states at the times, (times, 13)."""
-        return self._solve(y, times[-1], t_eval=times).y.T
+        return self._solve(y, times[-1], rtol=rtol, t_eval=times).y.T
 
     def reversal(self, y, t1, rtol=1e-12):
         """The first time at which the spin about the vertical vanishes."""
