@@ -10,9 +10,9 @@ theta(0) from 0.05 to 0.15, float64, to theta = 0.95 pi or to 8 s, at two tolera
 * theta at 201 times, by `jit(vmap(simulate))` and by `trajectory_table`;
 * a table of tops that may leave the plane, and one with set-valued friction.
 
-Cost is wall time per launch, the least of two runs; the first call, which compiles, has a column of its own. Error is the
+Cost is wall time per launch, the less of two runs; the first call, which compiles, has a separate column. Error is the
 greatest difference from the same program at a tolerance of 1e-13, divided by the greatest result. No row begins after
-`--seconds`; what is left out is named on the page.
+`--seconds`; the page names the rows that are left out.
 """
 
 import argparse
@@ -30,10 +30,10 @@ from scenes import TOP
 
 import tippe
 
-#: The tolerances that are timed, and that of the reference.
+#: The measured tolerances, and the tolerance of the reference.
 TOLERANCES, TIGHT = (1e-6, 1e-9), 1e-13
 
-#: Numbers of launches: one that a CPU would do as well, and one that fills the device.
+#: Numbers of launches: one that suits a CPU, and one that fills the device.
 LAUNCHES = (1024, 131_072)
 
 SPIN, T1 = 100.0, 8.0
@@ -43,7 +43,7 @@ Run = Callable[[int, float], Any]
 
 
 class Row(NamedTuple):
-    """What was measured of a program."""
+    """The measurements of a program."""
 
     program: str
     launches: int
@@ -67,18 +67,18 @@ def times_of(scene: tippe.Scene, names: list[str], result: str = "time") -> Run:
 
     def run(launches: int, tolerance: float) -> np.ndarray:
         grid = {"theta": thetas(launches), "spin": SPIN, "t1": T1, "tolerance": tolerance}
-        found = tippe.inversion_table(scene, **grid, sensitivities=names, progress=False)
-        columns = [one for one in found.variables if one.startswith("time_by_")] or [result]
-        return np.stack([np.where(np.isfinite(found[one]), found[one], 0.0) for one in columns])
+        table = tippe.inversion_table(scene, **grid, sensitivities=names, progress=False)
+        columns = [name for name in table.variables if name.startswith("time_by_")] or [result]
+        return np.stack([np.where(np.isfinite(table[name]), table[name], 0.0) for name in columns])
 
     return run
 
 
 def gradient(launches: int, tolerance: float) -> np.ndarray:
-    """The gradient of a loss by six numbers, relative to each."""
+    """The gradient of a loss with respect to six numbers, relative to each."""
     loss, values = loss_of(scene(tippe.Viscous(0.3)), thetas(launches), SIX)
-    found = _gradient_of(launches, loss)(values, jnp.asarray(tolerance))
-    return np.stack([np.sum(slope * value) for slope, value in zip(found, values, strict=True)])
+    slopes = _gradient_of(launches, loss)(values, jnp.asarray(tolerance))
+    return np.stack([np.sum(slope * value) for slope, value in zip(slopes, values, strict=True)])
 
 
 def samples(launches: int, tolerance: float) -> Any:
@@ -89,8 +89,8 @@ def samples(launches: int, tolerance: float) -> Any:
 def sampled_table(launches: int, tolerance: float) -> np.ndarray:
     """The same by `trajectory_table`."""
     grid = {"theta": thetas(launches), "spin": SPIN, "times": np.linspace(0.0, T1, 201)}
-    found = tippe.trajectory_table(scene(tippe.Viscous(0.3)), **grid, tolerance=tolerance, progress=False)
-    return found.theta
+    table = tippe.trajectory_table(scene(tippe.Viscous(0.3)), **grid, tolerance=tolerance, progress=False)
+    return table.theta
 
 
 @jax.jit
@@ -108,7 +108,7 @@ def _gradient_of(launches: int, loss: Any) -> Any:
 
 
 def programs() -> dict[str, Run]:
-    """Every program by its name, the most important first."""
+    """Every program by name, the most important first."""
     viscous = scene(tippe.Viscous(0.3))
     derivatives = {f"table with derivatives by {count}": times_of(viscous, SIX[:count]) for count in (1, 2, 6)}
     return {
@@ -126,7 +126,7 @@ def programs() -> dict[str, Run]:
 def measured(
     runs: dict[str, Run], sizes: tuple[int, ...], tolerances: tuple[float, ...], seconds: float
 ) -> Iterator[Row | str]:
-    """The rows of all programs, the smaller sizes first; the name of each row for which no time is left."""
+    """The rows of all programs, the smaller sizes first, and the names of the rows for which no time is left."""
     deadline = time.monotonic() + seconds
     for launches in sizes:
         for program, run in runs.items():
@@ -135,10 +135,10 @@ def measured(
                 if time.monotonic() > deadline:
                     yield f"{program}, {launches} launches, tolerance {tolerance:.0e}"
                     continue
-                found = timed(lambda at=tolerance, run=run, many=launches: run(many, at), 2)
+                timing = timed(lambda at=tolerance, run=run, many=launches: run(many, at), 2)
                 exact = np.asarray(run(launches, TIGHT)) if exact is None else exact
-                error = float(np.max(np.abs(np.asarray(found.result) - exact)) / np.max(np.abs(exact)))
-                yield Row(program, launches, tolerance, found.wall / launches * 1e6, error, found.first)
+                error = float(np.max(np.abs(np.asarray(timing.result) - exact)) / np.max(np.abs(exact)))
+                yield Row(program, launches, tolerance, timing.wall / launches * 1e6, error, timing.first)
 
 
 def page(rows: list[Row], omitted: list[str]) -> str:
@@ -162,7 +162,7 @@ def page(rows: list[Row], omitted: list[str]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measure, print and write, where there is an accelerator."""
+    """Measure, print and write, if there is an accelerator."""
     command = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     command.add_argument("--out", type=Path, default=Path("accelerator.txt"), help="the page of results")
     command.add_argument("--seconds", type=float, default=540.0, help="no row begins later")
@@ -173,9 +173,9 @@ def main(arguments: list[str] | None = None) -> None:
     if jnp.result_type(float) != jnp.float64:
         raise SystemExit("JAX_ENABLE_X64 = 0 must be left out: the measurements are of float64")
     rows, omitted = [], []
-    for one in measured(programs(), LAUNCHES, TOLERANCES, options.seconds):
-        print(one, flush=True)
-        (rows if isinstance(one, Row) else omitted).append(one)
+    for row in measured(programs(), LAUNCHES, TOLERANCES, options.seconds):
+        print(row, flush=True)
+        (rows if isinstance(row, Row) else omitted).append(row)
         # Written after every row, so that nothing is lost.
         options.out.write_text(page(rows, omitted))
 

@@ -1,12 +1,13 @@
-"""What a step costs on every arena, beside one on the plane, and how far a foot drifts off a general one.
+"""Cost of a step on every arena relative to the plane, and drift of the foot off general arenas.
 
     python benchmarks/arenas.py [--drift]
 
-Rutstam's top with viscous friction in a table of 512 launches, theta(0) from 0.05 to 0.3 and spins from 80 to 120 rad/s, 8 s,
-tolerance 1e-9, one core. Plane, cylinder and sphere have frames of their own; "carried" is the general frame, of any other.
-Seconds to compile are those of a first call over a later one. The error is the greatest change of an inversion time, relative,
-if the tolerance is a hundredth. `--drift` adds runs of 1000 s: the greatest distance of the foot from the arena, in units of R,
-at two tolerances. Run it alone: other work on the machine shows in every number.
+Rutstam's top with viscous friction in a table of 512 launches, theta(0) from 0.05 to 0.3 and spins from 80 to 120
+rad/s, 8 s, tolerance 1e-9, one core. Plane, cylinder and sphere have their own frames; "carried" is the general frame
+of the other arenas. The compile time is that of a first call less that of a later one. The error is the greatest
+relative change of an inversion time at a hundredth of the tolerance. `--drift` adds runs of 1000 s: the greatest
+distance of the foot from the arena, in units of R, at two tolerances. Run the script alone: other work on the machine
+changes every number.
 """
 
 import argparse
@@ -37,12 +38,12 @@ ARENAS = {
 }
 
 
-#: Runs of which the fastest counts.
+#: Number of runs, of which the fastest counts.
 RUNS = 9
 
 
 def rows() -> list[dict[str, str]]:
-    """Steps in a second on every arena, and the cost of one over that on the plane."""
+    """Steps per second on every arena, and the cost of a step relative to the plane."""
     grid.workers = lambda: 1
     found, plane = [], None
     for name, surface in ARENAS.items():
@@ -73,7 +74,7 @@ def rows() -> list[dict[str, str]]:
 
 
 def drifts() -> list[dict[str, str]]:
-    """How far the foot is off the arena at most in 1000 s."""
+    """Greatest distance of the foot from the arena in 1000 s."""
     times, found = np.linspace(0.0, 1000.0, 501), []
     for name in ("paraboloid", "torus", "graph"):
         scene = tippe.Scene(tippe.Top(*TOP), ARENAS[name], tippe.Viscous(0.02))

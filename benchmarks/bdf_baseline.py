@@ -1,9 +1,9 @@
-"""What the paper's method costs: differentiation formulas of second order at a relative tolerance of 1e-9.
+"""Cost of the paper's method: differentiation formulas of second order at a relative tolerance of 1e-9.
 
 The paper integrates with "an adaptive method based on second-order numerical differential formulae" at 1e-9. SciPy's
-`BDF` has these formulas (Shampine and Reichelt's NDF) with orders 1 to 5; here it runs as it is, and held at order 2.
-Both see the compiled vector field and its exact Jacobian, so what differs is the method. Beside them,
-`tippe.inversion_time`.
+`BDF` has these formulas (Shampine and Reichelt's NDF) with orders 1 to 5; here it runs as it is, and limited to order
+2. Both get the compiled vector field and its exact Jacobian, so only the method differs. For comparison, the script
+also runs `tippe.inversion_time`.
 
 The quantity is the time at which Rutstam's top reaches 0.95 pi on the plane; its error is against DOP853 at 3e-14. The
 wall time of the SciPy rows is mostly Python's; the evaluations of the field are the fair measure of the method.
@@ -42,7 +42,7 @@ def inversion_with(make: Callable[[], OdeSolver], highest_order: int | None, t1:
     """Time of inversion, evaluations and steps of a SciPy solver, the event found on its dense output."""
     solver, steps = make(), 0
     usual = bdf.MAX_ORDER
-    # A solver reads the highest order at each step; its tables are made with the usual one.
+    # A solver reads the highest order at each step; its tables are created with the usual order.
     bdf.MAX_ORDER = highest_order or usual
     try:
         while solver.status == "running" and solver.t < t1:
@@ -81,7 +81,7 @@ def measure(options: argparse.Namespace) -> tuple[float, list[Measured]]:
         found, evaluations, steps = inversion_with(make, highest_order, options.t1)
         return Measured(name, rtol, found, evaluations, steps, time.perf_counter() - begin)
 
-    # The sharpest that SciPy accepts is a hundred rounding units.
+    # The smallest tolerance that SciPy accepts is a hundred rounding units.
     reference = run("DOP853", DOP853, 3e-14).time
     rows = []
     for rtol in options.tolerances:

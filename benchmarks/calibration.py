@@ -2,13 +2,13 @@
 
     nice python benchmarks/calibration.py [--tables 200] [--draws 64]
 
-Friction, offset and I1 of a top are drawn from their prior, ten inversion times of it are found and given noise, and the
-posterior is found from the times: a fit of all tables in one program, and draws around each fit from Student's t distribution
-with its covariance, weighted by the posterior's density (importance sampling, one run each). The share of the posterior below
-the true number must be uniform over the tables. It is a check of density, prior, fit and covariance; that the no-U-turn sampler
-draws from such a density is checked in `tests/nonholonomic/identification/test_posterior.py`. Printed are the p-values of
-Kolmogorov and Smirnov's test and of chi squared in ten bins, the shares of tables whose central 50 and 90 % hold the truth,
-and how many draws the weights are worth: their finite number widens the ranks by 2 / draws.
+The script draws friction, offset and I1 of a top from their prior, adds noise to ten inversion times, and computes the
+posterior from the times: a fit of all tables in one program, and draws around each fit from Student's t distribution
+with its covariance, weighted by the posterior's density (importance sampling, one run each). The fraction of the
+posterior below the true number must be uniform over the tables. This checks density, prior, fit and covariance;
+`tests/nonholonomic/identification/test_posterior.py` checks that the no-U-turn sampler draws from such a density. The
+script prints the p-values of the Kolmogorov-Smirnov test and of chi squared in ten bins, the fractions of tables whose
+central 50 and 90 % contain the truth, and the effective number of draws, which widens the ranks by 2 / draws.
 """
 
 import argparse
@@ -47,7 +47,7 @@ _predicted = eqx.filter_jit(LogDensity.predict)
 
 
 def predictions(density: LogDensity, coordinates: np.ndarray) -> np.ndarray:
-    """What the model predicts in every row, in calls of one size."""
+    """The model's predictions in every row, in calls of equal size."""
     padded = np.pad(coordinates, ((0, -len(coordinates) % ROWS), (0, 0)), mode="edge")
     parts = [np.asarray(_predicted(density, padded[i : i + ROWS])) for i in range(0, len(padded), ROWS)]
     return np.concatenate(parts)[: len(coordinates)]
@@ -79,7 +79,7 @@ def main() -> None:
     truth = np.log(mean + deviation * random.normal(size=(given.tables, len(mean))))
     exact = predictions(density, truth)
     noisy = exact + ERROR * random.normal(size=exact.shape)
-    # Beyond the horizon a time is only known to be late.
+    # Beyond the horizon, a time is only known to be later.
     tables = Measurements(np.minimum(noisy, 60.0), ERROR, noisy > 60.0)
     print(
         f"{np.sum(noisy > 60.0)} of {noisy.size} tops did not invert; {time.process_time() - spent:.0f} s of CPU",

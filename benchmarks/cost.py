@@ -1,4 +1,4 @@
-"""The record of what a program costs on any machine: operations of every field, and steps of the scenes of `work_precision.py`.
+"""A record of machine-independent cost: operations of every field, and steps of the scenes of `work_precision.py`.
 
     python benchmarks/cost.py [--write]
 
@@ -28,20 +28,20 @@ from nonholonomic.integration import AbstractProblem, Oscillatory8, Settings, so
 from nonholonomic.parameters import with_numbers
 from stroller.runs.table import RideProblem
 from tippe.modes.inversion_problem import InversionProblem
-from tippe.runs.cells import run_kind_of
+from tippe.runs.run_kind import run_kind_of
 
 RECORD = Path(__file__).with_name("cost.json")
 
-#: A number may grow by this fraction of itself.
+#: Relative growth that is allowed.
 GROWTH = 0.02
 
-#: Launches whose steps are counted: one block of a table.
+#: Number of launches whose steps are counted: one chunk of a table.
 LAUNCHES = 64
 
-#: How many operations a slow function (`operations.FUNCTIONS`) counts as.
+#: Number of operations for a slow function (`operations.FUNCTIONS`).
 FUNCTION = 20
 
-#: A function of no arguments that returns problems, whose numbers may be shapes alone.
+#: A function without arguments that returns problems, whose numbers may be shapes alone.
 Problems = Callable[[], tuple[AbstractProblem, ...]]
 
 LAWS = {
@@ -67,7 +67,7 @@ GROUNDS = {
 
 
 def fields() -> Iterator[tuple[str, Problems]]:
-    """Every field by a name: of tops on every arena and under every law, with derivatives, and of strollers."""
+    """Every field by name: of tops on every arena and under every law, with derivatives, and of strollers."""
     top, viscous = tippe.Top(*TOP), tippe.Viscous(0.3)
     tops = {f"top, {name}": tippe.Scene(top, arena, viscous) for name, arena in ARENAS.items()}
     tops |= {f"top, plane, {name}": tippe.Scene(top, tippe.Plane(), law) for name, law in LAWS.items()}
@@ -83,7 +83,7 @@ def fields() -> Iterator[tuple[str, Problems]]:
 
 
 def of_top(scene: tippe.Scene) -> tuple[AbstractProblem, ...]:
-    """The problems that a table of the scene integrates: one, or that of every mode."""
+    """The problems that a table of the scene integrates: one, or one per mode."""
     place = (0.0, 0.0, 0.0) if isinstance(scene.surface, tippe.Implicit) else None
     return eqx.filter_eval_shape(_problems_of_top, scene, tippe.Launch(0.3, 100.0, place=place))
 
@@ -126,7 +126,7 @@ def counts_of_field(problems: Problems) -> list[int]:
 
 
 def counts_of_step(problems: Problems) -> list[int]:
-    """Operations of an attempted step, likewise."""
+    """Operations of an attempted step, counted in the same way."""
     return [rounded(operations_per_step(problem, 1 + len(getattr(problem, "tangents", ())))) for problem in problems()]
 
 
@@ -136,8 +136,8 @@ def rounded(operations: Operations) -> int:
 
 def steps(case: Case) -> list[float]:
     """Mean number of steps of a launch."""
-    given = (jnp.asarray(case.task.t1), jnp.asarray(case.task.launches), Settings(1e-9, Oscillatory8()))
-    return [round(float(solve_ensemble(case.problem, *given)[0].steps.mean()), 2)]
+    run = (jnp.asarray(case.task.t1), jnp.asarray(case.task.launches), Settings(1e-9, Oscillatory8()))
+    return [round(float(solve_ensemble(case.problem, *run)[0].steps.mean()), 2)]
 
 
 def record() -> dict[str, dict[str, list[float]]]:
@@ -146,7 +146,7 @@ def record() -> dict[str, dict[str, list[float]]]:
 
 
 def has_grown(recorded: list[float], counted: list[float]) -> bool:
-    """Whether a number has grown by more than 2 %; also if there are more or fewer of them than recorded."""
+    """Whether a number has grown by more than 2 %, or the set of numbers has changed."""
     if len(recorded) != len(counted):
         return True
     return any(now > (1.0 + GROWTH) * before for before, now in zip(recorded, counted, strict=True))
@@ -170,8 +170,9 @@ def main() -> None:
                 print(f"{kind}, {name}: {before} recorded, {number} now")
     if options.write:
         lines = (
-            f'  "{kind}": {{\n' + ",\n".join(f"    {json.dumps(name)}: {json.dumps(one)}" for name, one in some.items())
-            for kind, some in counted.items()
+            f'  "{kind}": {{\n'
+            + ",\n".join(f"    {json.dumps(name)}: {json.dumps(entry)}" for name, entry in entries.items())
+            for kind, entries in counted.items()
         )
         RECORD.write_text("{\n" + "\n  },\n".join(lines) + "\n  }\n}\n")
 

@@ -1,4 +1,5 @@
-"""The same top in general physics engines: MuJoCo, Drake and PyBullet, beside rigid Coulomb friction (`SetValuedCoulomb`).
+"""The same top in general physics engines (MuJoCo, Drake and PyBullet), compared with rigid Coulomb friction
+(`SetValuedCoulomb`).
 
     python benchmarks/engines.py [--t1 12] [--engines MuJoCo ...] [--out engines.csv]
 
@@ -30,7 +31,7 @@ MU, GRAVITY, THETA, SPIN = 0.3, 9.81, 0.1, 155.0
 #: The height of the centre of mass at the start, where the sphere touches the plane.
 HEIGHT = RADIUS - OFFSET * np.cos(THETA)
 
-#: How many times theta is compared at, and at which of them it is printed.
+#: Number of times at which theta is compared, and indices of the printed ones.
 TIMES, PRINTED = 241, (10, 60, 240)
 
 #: The axis at the start, and the unit quaternion (w, x, y, z) that turns z into it.
@@ -49,7 +50,7 @@ class Measured(NamedTuple):
 
 
 def mujoco(times: np.ndarray, step: float) -> np.ndarray:
-    """MuJoCo with RK4, elliptic cones and impratio 100, its contact as stiff as its manual allows (2 steps)."""
+    """MuJoCo with RK4, elliptic cones and impratio 100, with the stiffest contact that its manual allows (2 steps)."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(
@@ -65,15 +66,15 @@ def mujoco(times: np.ndarray, step: float) -> np.ndarray:
     # A free joint's angular velocity is in the frame of the body.
     data.qvel[5] = SPIN
     mujoco.mj_forward(model, data)
-    found = []
+    angles = []
     for count in np.diff(np.rint(times / step).astype(int), prepend=0):
         mujoco.mj_step(model, data, int(count))
-        found.append(np.arccos(np.clip(data.xmat[1].reshape(3, 3)[2, 2], -1.0, 1.0)))
-    return np.array(found)
+        angles.append(np.arccos(np.clip(data.xmat[1].reshape(3, 3)[2, 2], -1.0, 1.0)))
+    return np.array(angles)
 
 
 def drake(times: np.ndarray, step: float) -> np.ndarray:
-    """Drake's discrete contact (SAP) at a point, its stiffness such that the top sinks in by 1e-7 m at rest."""
+    """Drake's discrete contact (SAP) at a point, with a stiffness such that the top sinks in by 1e-7 m at rest."""
     from pydrake.geometry import AddContactMaterial, HalfSpace, ProximityProperties, Sphere
     from pydrake.math import RigidTransform, RotationMatrix
     from pydrake.multibody.math import SpatialVelocity
@@ -98,16 +99,16 @@ def drake(times: np.ndarray, step: float) -> np.ndarray:
     turned = RotationMatrix.MakeYRotation(THETA)
     plant.SetFreeBodyPose(context, body, RigidTransform(turned, [0.0, 0.0, HEIGHT]))
     plant.SetFreeBodySpatialVelocity(context, body, SpatialVelocity(SPIN * AXIS, np.zeros(3)))
-    found = []
+    angles = []
     for moment in times:
         simulator.AdvanceTo(moment)
         rotation = plant.EvalBodyPoseInWorld(context, body).rotation().matrix()
-        found.append(np.arccos(np.clip(rotation[2, 2], -1.0, 1.0)))
-    return np.array(found)
+        angles.append(np.arccos(np.clip(rotation[2, 2], -1.0, 1.0)))
+    return np.array(angles)
 
 
 def pybullet(times: np.ndarray, step: float) -> np.ndarray:
-    """PyBullet without damping, lengths times 100 (its contact margins are made for metres)."""
+    """PyBullet without damping, with lengths times 100 (its contact margins are designed for metres)."""
     import pybullet as bullet
 
     scale = 100.0
@@ -132,14 +133,14 @@ def pybullet(times: np.ndarray, step: float) -> np.ndarray:
         top, -1, angularDamping=0.0, maxJointVelocity=1e6, activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING
     )
     bullet.resetBaseVelocity(top, angularVelocity=list(SPIN * AXIS))
-    found = []
+    angles = []
     for count in np.diff(np.rint(times / step).astype(int), prepend=0):
         for _ in range(count):
             bullet.stepSimulation()
         matrix = bullet.getMatrixFromQuaternion(bullet.getBasePositionAndOrientation(top)[1])
-        found.append(np.arccos(np.clip(matrix[8], -1.0, 1.0)))
+        angles.append(np.arccos(np.clip(matrix[8], -1.0, 1.0)))
     bullet.disconnect(client)
-    return np.array(found)
+    return np.array(angles)
 
 
 #: Name -> (package, engine, steps [s]).
@@ -151,7 +152,7 @@ ENGINES: dict[str, tuple[str, Engine, tuple[float, ...]]] = {
 
 
 def spent(run: Callable[[], Any]) -> Measured:
-    """Call once and take the CPU time."""
+    """Call once and measure the CPU time."""
     began = time.process_time()
     theta = run()
     return Measured(np.asarray(theta), time.process_time() - began)

@@ -1,14 +1,15 @@
-"""What one parent can feed: a sweep whose cells cost nothing but time, to many workers and into a file.
+"""Throughput of one parent process: a sweep whose cells only take time, with many workers and a file.
 
     python benchmarks/feeding.py [--cells 1e8] [--workers 64] [--each 2e-4] [--quick]
 
-The workers are threads that sleep for as long as the cells of a block would take, and then send their results pickled, as
-processes do; making the results is left out of the account. So the parent does all that it does in earnest: hands out,
-unpickles, writes and syncs each block, and makes the table's file of them. `each` is the time that a cell takes [s]; 2e-4 is
-that of a top on the plane at a tolerance of 1e-9. First nobody sleeps: that is the most that the parent can feed. Then they
-sleep, on fewer cells: what they wait for blocks is the parent's overhead. Their blocks all take the same
-time, so the last of all come at once: what the parent has to do with those, when everybody else is done, is told apart. So is
-its processor's time, which another load on the machine does not change. Before all that, what a cell costs in earnest.
+The workers are threads that sleep for as long as the cells of a chunk would take, and then send their results pickled,
+as processes do; the computation of results is not measured. The parent does its real work: it dispatches, unpickles,
+writes and syncs each chunk, and writes the table's file. `each` is the time per cell [s]; 2e-4 is that of a top on the
+plane at a tolerance of 1e-9. In the first run nobody sleeps, which gives the parent's maximum throughput. In the second
+run, on fewer cells, the workers sleep: the time that they wait for chunks is the parent's overhead. All chunks take the
+same time, so the last ones arrive together; the parent's work on those, when the workers have finished, is reported
+separately, as is its CPU time, which does not depend on other load. At the start, the script measures the real cost of
+a cell.
 """
 
 import argparse
@@ -34,14 +35,15 @@ VARIABLES |= {name: Variable("1", np.int64) for name in ("steps", "rejected")}
 
 
 def results(columns, count):
-    """Numbers that cost next to nothing."""
+    """Numbers that cost nearly nothing."""
     found = {name: columns["x"] for name in NAMES}
     whole = np.zeros(len(columns["x"]), int)
     return found | {"status": whole.astype(np.int8), "steps": whole, "rejected": whole}
 
 
 class Sleepers(Executor):
-    """Workers that sleep for `each` seconds a cell; their results arrive as bytes, and are read by the thread of a pool."""
+    """Workers that sleep for `each` seconds per cell; their results arrive as bytes, and a thread of a pool unpickles
+    them."""
 
     def __init__(self, workers: int, each: float, cells: int):
         self._pool, self._each, self._cells = ThreadPoolExecutor(workers), each, cells
@@ -68,8 +70,8 @@ class Sleepers(Executor):
 
 
 class Took(NamedTuple):
-    """What a sweep took [s]: until the last worker was done, until the last block was written, for what came after; on the
-    processor until then; and how many blocks there were."""
+    """The times of a sweep [s]: until the last worker had finished, until the last chunk was written, afterwards, and
+    CPU time until then; and the number of chunks."""
 
     worked: float
     fed: float
@@ -102,7 +104,7 @@ def run(cells: int, workers: int, each: float, folder: Path) -> Took:
 
 
 def cost_of_a_cell() -> float:
-    """The processor's time for a cell [s]: Rutstam's top on the plane, 64 x 64 launches, to an error of about 1e-8."""
+    """The CPU time per cell [s]: Rutstam's top on the plane, 64 x 64 launches, to an error of about 1e-8."""
     inertia = 0.02 * 0.02**2
     scene = tippe.Scene(tippe.Top(0.02, 0.02, 0.006, 131 / 350 * inertia, 0.4 * inertia), friction=tippe.Viscous(0.3))
     launches = {"theta": np.linspace(0.05, 0.4, 64), "spin": np.linspace(60.0, 160.0, 64), "t1": 30.0}
@@ -114,7 +116,7 @@ def cost_of_a_cell() -> float:
 
 
 def peak() -> float:
-    """The most memory that this process has held [GiB]."""
+    """The greatest memory of this process [GiB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
@@ -139,7 +141,7 @@ def main() -> None:
         )
         print(f"after the last block: {took.after:.1f} s; at most {peak():.2f} GiB held")
         print(f"so one parent feeds {rate * options.each:.0f} workers that take {options.each:g} s a cell")
-        # As many blocks of the same size for each worker, whatever the number of workers.
+        # Every worker gets the same number of chunks of the same size, whatever the number of workers.
         size = -(-cells // took.blocks // 512) * 512
         running.chunks_together, once = lambda layout, chunk: size // chunk, running.chunks_together
         few = size * options.workers * 8 >> 12 << 12

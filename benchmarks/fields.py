@@ -1,9 +1,8 @@
-"""The lean vector fields in scalar arithmetic, for the peers.
+"""The vector fields in scalar arithmetic, for other programs.
 
-They are the formulas of `tippe/model/dynamics.py` and `stroller/model/dynamics.py`.
-
-One text serves NumPy, numba, JAX and heyoka: the components are numbers, arrays or symbolic expressions, the functions are
-the caller's. `scenes.misprint` compares each field with the scene's own.
+They are the formulas of `tippe/model/dynamics.py` and `stroller/model/dynamics.py`. The same text serves NumPy, numba,
+JAX and heyoka: the components are numbers, arrays or symbolic expressions, and the caller passes the functions.
+`scenes.misprint` compares each field with the scene's own.
 """
 
 from typing import Any, NamedTuple

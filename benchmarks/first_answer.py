@@ -1,12 +1,12 @@
-"""How long the first answer takes: fresh processes, nothing compiled (cold) or everything kept on disk (warm).
+"""Time to the first answer: fresh processes, with nothing compiled (cold) or everything kept on disk (warm).
 
     python benchmarks/first_answer.py [--launches 1 100 10000 1000000] [--out FILE.csv]
 
 The reference problem is that of `work_precision.py`: Rutstam's top on the plane, to the inversion, at a tolerance of 1e-9.
-Each process imports one program, computes all launches once and tells what it waited for: importing, tracing (for heyoka:
-writing the equations down), compiling (or fetching what was compiled) and running. Diffrax's first answers are those of
-`jax.vmap(diffrax.diffeqsolve)` with an event, with JAX's own cache. The CPU time is that of the whole process. A program
-that is not installed is named and skipped; with more launches than `MOST` has for it, it would take hours.
+Each process imports one program, computes all launches once and reports the time for importing, tracing (for heyoka:
+writing down the equations), compiling (or loading compiled programs) and running. Diffrax's first answers are those of
+`jax.vmap(diffrax.diffeqsolve)` with an event, with JAX's own cache. The CPU time is that of the whole process. A
+program that is not installed is named and skipped; `MOST` limits the launches of a program that would take hours.
 """
 
 import argparse
@@ -25,7 +25,7 @@ import numpy as np
 
 PROGRAMS = ("inversion_table", "heyoka, batches", "Diffrax")
 
-#: Beyond so many launches a program is not tried.
+#: Greatest number of launches for each program.
 MOST = {"inversion_table": 10**7, "heyoka, batches": 10**6, "Diffrax": 10**4}
 
 TOLERANCE = 1e-9
@@ -33,7 +33,7 @@ MODES = ("import", "trace", "compile", "run")
 
 
 def phases_of_jax(begin: float, imported: float, spent: dict[str, float]) -> dict[str, float]:
-    """What a program on JAX waited for [s], from the durations that JAX reports."""
+    """Times of the phases of a JAX program [s], from the durations that JAX reports."""
     trace = sum(
         spent.get(f"/jax/core/compile/{name}_duration", 0.0) for name in ("jaxpr_trace", "jaxpr_to_mlir_module")
     )
@@ -43,7 +43,7 @@ def phases_of_jax(begin: float, imported: float, spent: dict[str, float]) -> dic
 
 
 def listen() -> dict[str, float]:
-    """The durations that JAX reports, summed by their names as they come."""
+    """The durations that JAX reports, summed by name."""
     import jax
 
     spent: dict[str, float] = {}
@@ -80,7 +80,7 @@ def heyoka(launches: int, folder: Path) -> dict[str, float]:
     task = task_of(launches, folder)
     run = heyoka_batch(task)
     written = time.perf_counter()
-    # One launch has everything compiled, in a hundredth of the time.
+    # A single launch compiles everything, in a hundredth of the time.
     heyoka_first = heyoka_batch(task.of(slice(0, 1)))
     heyoka_first(TOLERANCE)
     compiled = time.perf_counter()
@@ -127,7 +127,7 @@ def diffrax(launches: int, folder: Path) -> dict[str, float]:
 
 
 def task_of(launches: int, folder: Path) -> Any:
-    """The task that the parent has written down: a peer's process need not import this package."""
+    """The task that the parent has written, so that other programs need not import this package."""
     import fields
     from peers import Task
 
@@ -137,7 +137,7 @@ def task_of(launches: int, folder: Path) -> Any:
 
 
 def write_task(launches: int, folder: Path) -> None:
-    """Write down the launches as the peers take them."""
+    """Write the launches for other programs."""
     from scenes import scenes
 
     task = scenes(launches)["plane, viscous"].task
@@ -148,9 +148,9 @@ RUNS = dict(zip(PROGRAMS, (ours, heyoka, diffrax), strict=True))
 
 
 def measured(program: str, launches: int, state: str, folder: Path) -> dict[str, str] | None:
-    """One process of a program; `None` if it cannot run."""
+    """Measure one process of a program; `None` if it cannot run."""
     command = [sys.executable, __file__, "--child", program, "--launches", str(launches), "--folder", str(folder)]
-    # heyoka keeps what it has compiled here, JAX and this package where they are told to.
+    # heyoka stores compiled code here, JAX and this package in the given folders.
     environment = os.environ | {"XDG_CACHE_HOME": str(folder / "home")}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     begin = time.perf_counter()

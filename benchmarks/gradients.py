@@ -5,9 +5,10 @@
 The reference problem (Rutstam's top on the plane, viscous friction, 100 rad/s, theta(0) from 0.05 to 0.15) and the same
 top in a cylinder: a table of times; the same table with the derivative by mu, and with those by two, four and six numbers;
 and the gradient of a scalar loss of 256 launches by reverse mode, `jax.grad` through `vmap(inversion_time)`, with two numbers
-and with six. Cost is CPU time on one core, compilation apart, as a multiple of the table's, or, for the loss, of the loss's
-own. Error is the largest relative difference of the derivatives by mu to those at tolerance 1e-13, and that of one of
-them to extrapolated central differences. Run it alone: other work on the machine shows in every number.
+and with six. Cost is CPU time on one core without compilation, as a multiple of the table's cost, or, for the loss, of
+the loss's own cost. Error is the largest relative difference of the derivatives by mu from those at tolerance 1e-13,
+and that of one of them from extrapolated central differences. Run the script alone: other work on the machine changes
+every number.
 """
 
 import argparse
@@ -30,18 +31,18 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "physics"))
 from make_gradient_reference import RATIO, extrapolated
 
 ONE = ["scene.friction.mu"]
-#: Launches in the loss.
+#: Number of launches in the loss.
 OF_LOSS = 256
 SIX = [*ONE, "scene.body.offset", "scene.body.I1", "scene.body.I3", "launch.spin", "launch.theta"]
 
 
 def times(scene: tippe.Scene, theta: np.ndarray, tolerance: float, paths: list[str]) -> tippe.Table:
-    """The table, with derivatives by the given numbers."""
+    """The table, with derivatives with respect to the given numbers."""
     return tippe.inversion_table(scene, theta=theta, spin=100.0, t1=30.0, tolerance=tolerance, sensitivities=paths)
 
 
 def loss_of(scene: tippe.Scene, theta: np.ndarray, paths: list[str]) -> tuple[Callable[..., Any], list[Any]]:
-    """Mean square of the launches' times, as a function of some numbers and the tolerance, and the numbers."""
+    """Mean square of the launches' times, as a function of some numbers and the tolerance; and the numbers."""
     known = {"scene.friction.mu": scene.friction.mu, "launch.spin": 100.0, "launch.theta": theta}
     known |= {f"scene.body.{name}": getattr(scene.body, name) for name in ("offset", "I1", "I3")}
 
@@ -58,7 +59,7 @@ def loss_of(scene: tippe.Scene, theta: np.ndarray, paths: list[str]) -> tuple[Ca
 
 
 def differences(scene: tippe.Scene, theta: float) -> tuple[float, float]:
-    """The derivative by mu of one launch's time from extrapolated central differences, and its error."""
+    """The derivative of one launch's time with respect to mu from extrapolated central differences, and its error."""
     mu = float(scene.friction.mu)
     steps = 1e-3 * mu / RATIO ** np.arange(16)
     found = tippe.inversion_table(
@@ -68,7 +69,7 @@ def differences(scene: tippe.Scene, theta: float) -> tuple[float, float]:
 
 
 def rows_of(name: str, scene: tippe.Scene, launches: int) -> list[dict[str, str]]:
-    """One scene over tolerances."""
+    """The rows of one scene, for all tolerances."""
     theta = np.linspace(0.05, 0.15, launches)
     exact = times(scene, theta, 1e-13, ONE).time_by_mu
     slope, doubt = differences(scene, theta[0])

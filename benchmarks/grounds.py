@@ -1,7 +1,7 @@
-"""What a step of a stroller costs on each surface, beside the plane: `python benchmarks/grounds.py [--rides N]`.
+"""Cost of a stroller's step on each surface, relative to the plane: `python benchmarks/grounds.py [--rides N]`.
 
-A table of damped rides over their speed, one thread's CPU time for each step of a lane, the least of five calls after one to
-compile. The last two surfaces are the paraboloid and the spheroid again, given as functions.
+A table of damped rides over their speed: one thread's CPU time per step of a lane, the least of five calls after a
+first call that compiles. The last two surfaces are the paraboloid and the spheroid again, given as functions.
 """
 
 import argparse
@@ -49,7 +49,7 @@ GROUNDS = {
 
 
 def cost(surface, place, rides: int) -> tuple[float, int]:
-    """CPU time [s] of a step of one lane, and the steps of all rides."""
+    """CPU time [s] of a step of one lane, and the number of steps of all rides."""
     scene = stroller.Scene(BODY, surface, FRICTION, side="inside" if "inside" in surface.sides else None)
     launch = stroller.Launch(place, 0.3, 1.0, 0.2, 0.5)
     spent = []

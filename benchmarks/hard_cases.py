@@ -1,15 +1,15 @@
-"""What the simulator does where others break: one table of hard cases, each with its error against a reference.
+"""Hard cases for a simulator in one table, each with its error against a reference.
 
     python benchmarks/hard_cases.py [--only upright_exactly ...] [--csv hard_cases.csv]
 
-A row says what is hard, what happens, how large the error is against something independent (a closed form, another
-formulation, an eigenvalue), the bound the error must keep, the steps, the CPU time and the status. The script exits with 1
-if a row breaks its bound, after printing all of them.
+Each row states the difficulty, the result, the error against something independent (a closed form, another formulation,
+an eigenvalue), the bound of the error, the steps, the CPU time and the status. The script exits with 1 if a row exceeds
+its bound, after printing all rows.
 
-To add a row: write a function without arguments in a file of `benchmarks/hard/` that returns a `hard.row.Row`, and name it in
-that file's `rows()`. Its name is what `--only` takes. A new file goes into `SUBJECTS` below. Measure the error, then set the
-bound to about ten times of it; an order of convergence counts as its distance from the order that is due. A result that is
-not a number breaks every bound. Keep a row under a minute: `tests/physics/test_hard_cases.py` runs them all.
+To add a row, write a function without arguments in a file of `benchmarks/hard/` that returns a `hard.row.Row`, and name
+it in that file's `rows()`. `--only` takes its name. Add a new file to `SUBJECTS` below. Measure the error, then set the
+bound to about ten times the error; for an order of convergence, the error is its distance from the expected order. NaN
+exceeds every bound. Keep a row under a minute: `tests/physics/test_hard_cases.py` runs them all.
 """
 
 import argparse

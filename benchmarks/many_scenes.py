@@ -1,6 +1,6 @@
 """Many different hybrid scenes in one process: time and memory, `python benchmarks/many_scenes.py [SCENES]`.
 
-Each scene has a law of friction of its own class, so that none shares its program with another. Nothing is kept on the disk.
+Each scene has a friction law of its own class, so that no two scenes share a program. Nothing is stored on disk.
 """
 
 import os

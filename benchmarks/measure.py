@@ -1,4 +1,4 @@
-"""What every benchmark needs: the machine, the versions, clocks, and rows that go to the screen, a CSV and the README."""
+"""Shared parts of the benchmarks: the machine, versions, clocks, and rows for the screen, a CSV file and the README."""
 
 import csv
 import os
@@ -15,7 +15,8 @@ PACKAGES = ("nonholonomic", "jax", "diffrax", "numpy", "scipy", "numba", "heyoka
 
 
 class Timed(NamedTuple):
-    """A result, with the least wall time and the least CPU time of the process [s] over the runs, compilation apart."""
+    """A result, with the least wall time and the least CPU time of the process [s] over the runs, without
+    compilation."""
 
     result: Any
     wall: float
@@ -24,7 +25,7 @@ class Timed(NamedTuple):
 
 
 def timed(run: Callable[[], Any], runs: int = 3) -> Timed:
-    """Call once to warm up, then `runs` times."""
+    """Call once to compile, then `runs` times."""
     started = time.perf_counter()
     result = jax.block_until_ready(run())
     first = time.perf_counter() - started
@@ -57,7 +58,7 @@ def machine() -> str:
 
 
 def one_core() -> None:
-    """Keep this process on one core, so that CPU time and wall time tell the same story."""
+    """Keep this process on one core, so that CPU time and wall time agree."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 

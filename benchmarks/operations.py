@@ -1,4 +1,4 @@
-"""Operations of a program, counted in what JAX traces: nothing is compiled, and no machine matters."""
+"""Count the operations of a program in what JAX traces; nothing is compiled, so the machine does not matter."""
 
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 
 from nonholonomic.integration import AbstractProblem, LaneScheduler, LaneState, Settings, try_step
 
-#: What counts as one operation for each number of the result.
+#: Primitives that count as one operation per number of the result.
 ARITHMETIC = (
     "add",
     "add_any",
@@ -28,7 +28,7 @@ ARITHMETIC = (
     "integer_pow",
 )
 
-#: Functions that cost as much as 16 to 44 operations, and are counted by themselves.
+#: Functions that cost as much as 16 to 44 operations, and are counted separately.
 FUNCTIONS = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2", "expm1")
 FUNCTIONS += ("log", "log1p", "logistic", "pow", "cbrt", "erf", "erf_inv")
 
@@ -40,7 +40,7 @@ class Operations(NamedTuple):
     functions: float
 
     def times(self, factor: float) -> "Operations":
-        """The operations of a program that is run so many times."""
+        """The operations of a program that runs several times."""
         return Operations(factor * self.arithmetic, factor * self.functions)
 
     def __add__(self, other: "Operations") -> "Operations":
@@ -53,11 +53,11 @@ NONE = Operations(0.0, 0.0)
 def operations(function: Callable[..., Any], *arguments: Any) -> Operations:
     """Count the operations that lead to a function's results.
 
-    A loop of known length counts as many times as it runs, any other loop once. Of two branches the shorter one counts: the
-    other is for what happens rarely. Of more branches the mean counts, which is exact where a loop over the stages of a step
-    takes each of them once.
+    A loop of known length counts as many times as it runs, any other loop once. Of two branches, the shorter one
+    counts: the other is for rare cases. Of more branches, the mean counts, which is exact if a loop over the stages of
+    a step takes each of them once.
 
-    **Arguments:** `arguments` may be shapes alone.
+    **Arguments:** `arguments`: may be shapes alone.
     """
     program = eqx.filter_make_jaxpr(function)(*arguments)[0].jaxpr
     return _of_program(dce_jaxpr(program, [True] * len(program.outvars))[0])

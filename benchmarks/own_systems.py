@@ -1,8 +1,8 @@
-"""Event times of users' own systems: ten bounces of a ball, and the turn of a Chaplygin sleigh, beside Diffrax and heyoka.
+"""Event times of users' own systems, compared with Diffrax and heyoka: ten bounces of a ball, and a Chaplygin sleigh.
 
 `python benchmarks/own_systems.py` prints, for each system, program and tolerance, the CPU time of a run without compilation,
 and the median and largest error of the times against a closed form or an independent reference. A second table compares the
-derivative by a number with the best central difference of a scan.
+derivative with respect to a number with the best central difference of a scan.
 """
 
 import argparse
@@ -96,7 +96,7 @@ def sleigh_reference(speeds: Any, ahead: float) -> Any:
 
 
 def ball_by_diffrax(tolerance: float) -> Callable[[Any, Any], Any]:
-    """Diffrax as its manual has it: solve to the event, reset, solve again, all mapped over the runs."""
+    """Diffrax as in its manual: solve to the event, reset, solve again, all mapped over the runs."""
 
     def time(height, restitution):
         def leg(carry, _):
@@ -168,14 +168,14 @@ def ball_by_heyoka(tolerance: float) -> Callable[[Any, Any], Any]:
 
     def times(heights: Any, number: float) -> Any:
         nonlocal bounces, restitution
-        restitution, found = number, np.empty(len(heights))
+        restitution, event_times = number, np.empty(len(heights))
         for k, start in enumerate(heights):
             bounces, integrator.time = 0, 0.0
             integrator.state[:] = start, 0.0
             integrator.reset_cooldowns()
             integrator.propagate_until(20.0)
-            found[k] = integrator.time
-        return found
+            event_times[k] = integrator.time
+        return event_times
 
     return times
 
@@ -190,14 +190,14 @@ def sleigh_by_heyoka(tolerance: float) -> Callable[[Any, Any], Any]:
     integrator = heyoka.taylor_adaptive(field, [0.0, 1.0, 1.3], pars=[0.3], tol=tolerance, t_events=[event])
 
     def times(speeds: Any, ahead: float) -> Any:
-        integrator.pars[0], found = ahead, np.empty(len(speeds))
+        integrator.pars[0], event_times = ahead, np.empty(len(speeds))
         for k, speed in enumerate(speeds):
             integrator.time = 0.0
             integrator.state[:] = 0.0, speed, 1.3
             integrator.reset_cooldowns()
             integrator.propagate_until(5.0)
-            found[k] = integrator.time
-        return found
+            event_times[k] = integrator.time
+        return event_times
 
     return times
 
@@ -223,7 +223,7 @@ def rows_of(name: str, starts: Any, reference: Any, runs: dict[str, Callable[[fl
 
 
 def derivative_row(name: str, time: Callable[[Any], Any], at: float, exact: float | None) -> dict[str, str]:
-    """The derivative by a number beside a central difference, whose step is the best of a scan."""
+    """The derivative with respect to a number, and a central difference with the best step of a scan."""
     slope = float(eqx.filter_jit(jax.grad(time))(at))
     jitted = eqx.filter_jit(time)
     differences = [float((jitted(at + h) - jitted(at - h)) / (2 * h)) for h in 10.0 ** -np.arange(2.0, 8.0)]

@@ -1,9 +1,10 @@
-"""Is there one top that reproduces Table 2 and Table 3 of the paper, whose Table 1 lost its numbers?
+"""Search for a top that reproduces Tables 2 and 3 of the paper, whose Table 1 is lost.
 
 Differential evolution (SciPy) over the top, the cylinder, the azimuth of the axis and the coefficient of friction, from
-the best of many random draws, all members of a generation in one call. Every row counts as in `examples/lost_numbers.py`:
-times with an error of 1 s, rows "not reversed" by 30 s with a one-sided likelihood, mu = 0.3 +- 0.03. Large residuals are
-bent down in the search, so that it does not give up many rows for one. The best of the last generation are printed.
+the best of many random draws, with all members of a generation in one call. Every row counts as in
+`examples/lost_numbers.py`: times with an error of 1 s, rows "not reversed" by 30 s with a one-sided likelihood, mu =
+0.3 +- 0.03. The search counts large residuals by their logarithm, so that it does not sacrifice many rows for one. The
+script prints the best of the last generation.
 
     python benchmarks/paper_tables_joint.py --law viscous --seconds 600
     python benchmarks/paper_tables_joint.py --law coulomb --seconds 600
@@ -24,7 +25,7 @@ from tippe.papers import paper
 HORIZON, ANGLE = 30.0, 0.95 * np.pi
 ROWS = [(table, row) for table in (paper.TABLE_2, paper.TABLE_3) for row in table.rows]
 THETA = np.array([row.theta for _, row in ROWS])
-# The wall itself has N = 0 at rest: start a hair below it.
+# At rest on the wall itself, N = 0: start slightly below it.
 ETA = np.array([min(table.eta, np.pi / 2.0 - 1e-6) for table, _ in ROWS])
 NAMES = ("mass [g]", "R [mm]", "alpha", "I1/I3", "I3/mR^2", "log rc/R", "azimuth", "mu", "log slip speed [m/s]")
 LOW = np.array([5.0, 15.0, 0.05, 0.85, 0.3, np.log(3.0), -np.pi, 0.27, np.log(0.003)])
@@ -52,7 +53,7 @@ def times(numbers: jax.Array, law: str) -> jax.Array:
 
 
 def deviances(numbers: np.ndarray, law: str, run) -> tuple[np.ndarray, np.ndarray]:
-    """-2 log posterior of every set, and the same with large residuals bent down."""
+    """-2 log posterior of every set, and the same with large residuals replaced by logarithms."""
     residuals = np.abs(DATA.residuals(run(jnp.asarray(numbers))))
     prior = ((numbers[7] - 0.3) / 0.03) ** 2
     bent = LARGE**2 * (1.0 + np.log1p(np.maximum(residuals - LARGE, 0.0)))

@@ -1,9 +1,10 @@
-"""Which tops reproduce which rows of the paper's Tables 2 and 3, whose Table 1 lost its numbers.
+"""Search for tops that reproduce rows of the paper's Tables 2 and 3, whose Table 1 is lost.
 
-Draws tops, cylinders, azimuths and friction laws at random, runs the rows of a table for each, and counts the sets that
-give its pattern of reversed and not reversed, with contact kept in all rows or lost in some. A row whose contact is
-lost counts as not reversed. The sets with the closest times are then varied at random, ever less, keeping the pattern
-and the contact. The best is repeated with `tippe.inversion_table` at a tolerance of 1e-10, on both tables.
+The script draws tops, cylinders, azimuths and friction laws at random, runs the rows of a table for each, and counts
+the sets that give its pattern of reversed and not reversed, with contact kept in all rows or lost in some. A row whose
+contact is lost counts as not reversed. The sets with the closest times are then varied at random by smaller and smaller
+amounts, keeping the pattern and the contact. The best is repeated with `tippe.inversion_table` at a tolerance of 1e-10,
+on both tables.
 
     python benchmarks/paper_tables_scan.py --table 2 --law viscous --sets 20000 --rounds 20
     python benchmarks/paper_tables_scan.py --table 3 --law coulomb --sets 5000 --rounds 20
@@ -36,7 +37,7 @@ TABLES = {2: paper.TABLE_2, 3: paper.TABLE_3}
 
 
 class Rows(NamedTuple):
-    """What became of every set: times [s] (sets, rows), infinite where not reversed, and three flags (sets,).
+    """The results of every set: times [s] (sets, rows), infinite if not reversed, and three flags (sets,).
 
     `pattern`: exactly the paper's rows reversed; `contact`: and no other lost contact; `failed`: a row could not be
     run. Once a row spoils the pattern of a set, its further rows are not run.
@@ -54,7 +55,7 @@ def draw(rng: np.random.Generator, sets: int) -> np.ndarray:
 
 
 def exponentials(numbers: np.ndarray) -> np.ndarray:
-    """The sets with the numbers that are drawn on a logarithmic scale made plain."""
+    """The sets, with the numbers on a logarithmic scale converted to plain numbers."""
     return np.where(LOGARITHMIC, np.exp(np.where(LOGARITHMIC, numbers, 0.0)), numbers)
 
 
@@ -72,7 +73,7 @@ def scene_and_launch(
     I3 = inertia * mass * radius**2
     body = tippe.Top(mass, radius, alpha * radius, gamma * I3, I3)
     friction = tippe.Viscous(table.mu) if law == "viscous" else tippe.Coulomb(table.mu, slip_speed)
-    # The wall itself has N = 0 at rest: start a hair below it, so that rounding does not decide.
+    # At rest on the wall itself, N = 0: start slightly below it, so that rounding does not decide.
     eta = min(table.eta, np.pi / 2.0 - 1e-6)
     eta, azimuth = np.broadcast_arrays(eta, azimuth)
     scene = tippe.Scene(body, tippe.Cylinder(ratio * radius), friction)
@@ -125,7 +126,7 @@ def run(numbers: np.ndarray, table: paper.Table, options: argparse.Namespace) ->
 
 
 def worst_error(runs: Rows, table: paper.Table, wanted_sets: np.ndarray) -> np.ndarray:
-    """Largest error of the times of a set [s], infinite where the set is not wanted."""
+    """Largest error of the times of a set [s], infinite for unwanted sets."""
     _, wanted = inclinations_and_times(table)
     reversing = np.isfinite(wanted)
     with np.errstate(invalid="ignore"):
@@ -180,7 +181,7 @@ def show(label: str, numbers: np.ndarray, error: float, times: np.ndarray) -> No
 
 
 def confirm(numbers: np.ndarray, options: argparse.Namespace) -> None:
-    """Repeat one set with the package's own table at a sharp tolerance, on both tables of the paper."""
+    """Repeat one set with the package's own table at a small tolerance, on both tables of the paper."""
     for name, table in TABLES.items():
         theta, _ = inclinations_and_times(table)
         scene, launch = scene_and_launch(numbers, table, theta[0], options.law)

@@ -1,4 +1,4 @@
-"""How many operations a machine can make in a second, measured."""
+"""Measure how many operations a machine computes per second."""
 
 from typing import Any
 

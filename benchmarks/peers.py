@@ -1,6 +1,6 @@
 """Other programs on the same scenes: each takes a task and a tolerance and returns how every launch ended.
 
-A peer that is not installed is named and skipped. None of them is installed by the benchmark.
+Programs that are not installed are named and skipped. The benchmark installs none of them.
 """
 
 import math
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from fields import Functions
 
-#: Where the axis' component along the normal stands in a top's state.
+#: Index of the axis' component along the normal in a top's state.
 E3 = 4
 
 #: The functions of a field on numbers.
@@ -19,7 +19,7 @@ NUMPY = Functions(np.sqrt)
 
 
 class Task(NamedTuple):
-    """What is computed: the time at which theta reaches an angle (`angle`), or `t1` (`angle` None), and the state there.
+    """The task: the time at which theta reaches an angle (`angle`), or `t1` (`angle` None), and the state there.
 
     `field` and `numbers` are those of `fields.py`; `starts` and `scales`, the magnitudes of the components, are
     (components, launches); `compared` says which components of the end state are.
@@ -43,7 +43,8 @@ class Task(NamedTuple):
 
 
 class Ends(NamedTuple):
-    """When every launch ended [s], at its angle or at `t1`, and the components of its state there that are compared."""
+    """The time at which every launch ended [s], at its angle or at `t1`, and the compared components of its state
+    there."""
 
     time: Any
     state: Any
@@ -91,11 +92,11 @@ def heyoka_scalar(task: Task) -> Callable[[float], Any]:
 
 
 def heyoka_batch(task: Task) -> Callable[[float], Any]:
-    """heyoka's SIMD batches: events are not terminal there, so a batch runs on in pieces until its last lane is there."""
+    """heyoka's SIMD batches: events are not terminal there, so a batch runs in pieces until its last lane has ended."""
     import heyoka
 
     system, variables = _heyoka_system(heyoka, task)
-    # The callback keeps what is outside of it, not what is in the integrator's copy of it.
+    # The callback stores the values outside, not in the integrator's copy.
     width, made, ends = heyoka.recommended_simd_size(), {}, {}
 
     def found(integrator, time, sign, lane):
@@ -216,7 +217,7 @@ def cvode(task: Task) -> Callable[[float], Any]:
 
 
 def cyrk(task: Task) -> Callable[[float], Any]:
-    """CyRK's DOP853 with a numba field; it has no events, so it serves end states only."""
+    """CyRK's DOP853 with a numba field; it has no events, so it is used for end states only."""
     from CyRK import pysolve_ivp
 
     if task.angle is not None:
@@ -276,7 +277,7 @@ def vmapped_diffrax(task: Task) -> Callable[[float], Any]:
     return run
 
 
-#: Name -> (packages, how to make it, how many launches it can bear in a benchmark).
+#: Name -> (packages, constructor, greatest number of launches in a benchmark).
 PEERS = {
     "heyoka scalar": (("heyoka",), heyoka_scalar, 64),
     "heyoka batch": (("heyoka",), heyoka_batch, 64),

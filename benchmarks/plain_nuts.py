@@ -13,12 +13,12 @@ from nonholonomic.identification import Draws, LogDensity
 from nonholonomic.identification.sampling import learn
 from nonholonomic.identification.surrogate import Surrogate
 
-#: How often a walk doubles at most.
+#: Greatest number of doublings of a walk.
 DEEPEST = 6
 
 
 class InPoints(eqx.Module):
-    """A density as a function of a surrogate's points, whose volumes are those of coordinates but for a factor."""
+    """A density as a function of a surrogate's points, whose volumes equal those of coordinates up to a factor."""
 
     density: LogDensity
     surrogate: Surrogate

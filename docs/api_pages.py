@@ -106,7 +106,7 @@ TOP = (
     "energy jellett inversion_time"
 )
 
-#: The members that a user needs; classes that are not here have none.
+#: The members that users need; classes that are not listed show none.
 MEMBERS = {
     "tippe.Scene": "state field energy jellett theta spin normal_force slip_velocity friction_power",
     "tippe.Launch": "degrees",
@@ -135,7 +135,7 @@ MEMBERS = {
 
 
 def public(package: str) -> list[str]:
-    """The names that the `__init__.py` of a package imports as themselves."""
+    """The names that the `__init__.py` of a package exports."""
     text = inspect.getsource(importlib.import_module(package))
     return sorted(set(re.findall(r"import (?!__)(\w+) as \1$", text, re.M)), key=str.lower)
 
@@ -147,7 +147,7 @@ def resolve(dotted: str) -> Any:
 
 
 def missing() -> list[str]:
-    """Public names that no page shows, neither by themselves nor by another name of the same object."""
+    """Public names that are on no page, neither themselves nor another name of the same object."""
     shown = {id(resolve(name)) for page in PAGES.values() for name in page.names}
     every = [f"{package}.{name}" for package in PACKAGES for name in public(package)]
     return [name for name in every if id(resolve(name)) not in shown]

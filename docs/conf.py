@@ -1,4 +1,4 @@
-"""How the manual is built: `sphinx-build -W docs build/manual`."""
+"""Configuration of the manual: `sphinx-build -W docs build/manual`."""
 
 import importlib
 import json
@@ -21,7 +21,7 @@ version = release = nonholonomic.__version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.mathjax", "sphinx_design"]
 exclude_patterns = ["_build"]
 
-# MathJax from a package: the manual shows formulas without a network.
+# MathJax from a package, so that the manual shows formulas without a network.
 mathjax = Path(next(iter(importlib.import_module("sphinx-mathjax-offline").__path__))) / "static" / "mathjax"
 mathjax_path = "tex-svg-full.js"
 
@@ -29,7 +29,7 @@ html_theme = "sphinx_book_theme"
 html_title = "nonholonomic"
 html_static_path = ["_static", str(mathjax / mathjax_path)]
 html_css_files = ["manual.css"]
-# The sidebar has the search box.
+# The sidebar already has the search box.
 html_theme_options = {"show_toc_level": 2, "home_page_in_toc": True, "navbar_persistent": []}
 
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
@@ -47,7 +47,7 @@ python_maximum_signature_line_length = 80
 autodoc_member_order = "bysource"
 autodoc_class_signature = "mixed"
 
-# Notebooks keep what they compile, and show no progress bars.
+# Notebooks keep compiled programs, and show no progress bars.
 os.environ["NONHOLONOMIC_PROGRESS"] = "0"
 nonholonomic.enable_compilation_cache()
 for name in ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"):
@@ -63,7 +63,7 @@ def write(path: Path, text: str) -> None:
 
 
 def write_api() -> None:
-    """A page for each task."""
+    """Write an API page for each task."""
     if missing := api_pages.missing():
         raise ValueError(f"docs/api_pages.py names no page for {missing}")
     for name, page in api_pages.PAGES.items():
@@ -71,7 +71,7 @@ def write_api() -> None:
 
 
 def write_gallery() -> None:
-    """A notebook for each card of the gallery, from the script of its name in `examples/`."""
+    """Write a notebook for each card of the gallery, from the script of its name in `examples/`."""
     cards = re.findall(r"^:::\{grid-item-card\} (.+)\n:link: gallery/(\w+)$", (HERE / "gallery.md").read_text(), re.M)
     for title, name in cards:
         program = (HERE.parent / "examples" / f"{name}.py").read_text().split('\n\nif __name__ == "__main__":')[0]
@@ -90,14 +90,14 @@ write_gallery()
 
 
 def as_rst(app, what, name, obj, options, lines) -> None:
-    """Docstrings are written in Markdown; what of it they use is turned into reStructuredText."""
+    """Convert docstrings from Markdown to reStructuredText, as far as they use Markdown."""
     blocks, example = [[]], False
     for line in lines:
         starts, ends = line.lstrip().startswith(">>>"), example and not line.strip()
         if (starts and not example) or ends:
             blocks.append([])
             example = starts
-        # An example needs no fences; an empty line parts it from the text.
+        # An example needs no fences; an empty line separates it from the text.
         blocks[-1].append("" if line.strip() == "```" else line)
     converted = []
     for block in blocks:

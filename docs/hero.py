@@ -1,4 +1,4 @@
-"""Draws `docs/top.webp`, the README's picture: a wooden top climbs onto its stem, as its page shows it (needs Chromium).
+"""Draw `docs/top.webp`, the README's picture: a wooden top climbs onto its stem, as on its page (needs Chromium).
 
 Run `python docs/hero.py`; it needs the extras `view` and `test`.
 """
@@ -16,11 +16,11 @@ from selenium.webdriver.chrome.service import Service
 
 import tippe
 
-#: Size of the picture in pixels, and its frames: times of the run [s], at 25 a second.
+#: Size of the picture in pixels, and its frames: times of the run [s], 25 per second.
 WIDTH, HEIGHT = 720, 450
 TIMES = np.linspace(0.9, 3.9, 150)
 
-#: Frames of the end that stand still.
+#: Number of still frames at the end.
 REST = 25
 
 FRAME = """
@@ -30,7 +30,7 @@ return stage.renderer.domElement.toDataURL('image/webp', 1);
 
 
 def browser(*arguments: str) -> Chrome:
-    """Chromium without a window; arguments of yours come last."""
+    """Chromium without a window; your arguments come last."""
     options = ChromeOptions()
     options.binary_location = shutil.which("chromium")
     drawn_by = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")

@@ -29,7 +29,7 @@ def badge(name: str, repository: str) -> str:
 
 def notebook(page: Path) -> nbformat.NotebookNode:
     """The notebook of a page."""
-    # A notebook must say what its kernel is called.
+    # A notebook must state the name of its kernel.
     kernel = "  name: python3\n"
     book = jupytext.reads(page.read_text().replace(kernel, f"{kernel}  display_name: Python 3\n", 1), fmt="md:myst")
     for cell in book.cells:
@@ -38,14 +38,14 @@ def notebook(page: Path) -> nbformat.NotebookNode:
         elif "raises-exception" in cell.metadata.get("tags", []):
             cell.source = f"try:\n{textwrap.indent(cell.source, '    ')}\nexcept Exception as error:\n    print(error)"
     book.cells.insert(0, nbformat.v4.new_code_cell(INSTALL))
-    # Cells are numbered: random names would differ from run to run.
+    # Numbered cells: random names would differ from run to run.
     for number, cell in enumerate(book.cells):
         cell.id = f"cell-{number}"
     return book
 
 
 def main(folder: Path, repository: str | None) -> None:
-    """Write the notebooks and, where the repository is known, a list of badges."""
+    """Write the notebooks and, if the repository is known, a list of badges."""
     folder.mkdir(parents=True, exist_ok=True)
     lines = []
     for name, page in PAGES.items():

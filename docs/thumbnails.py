@@ -1,4 +1,4 @@
-"""Draws the gallery's thumbnails, `docs/gallery/*.webp`: figures, and the scenes of pages (needs Chromium).
+"""Draw the gallery's thumbnails, `docs/gallery/*.webp`: figures, and the scenes of pages (needs Chromium).
 
 Run `python docs/thumbnails.py [NAME ...]`; it needs the extras `view` and `test`.
 """
@@ -16,10 +16,10 @@ from PIL import Image, ImageOps
 
 HERE = Path(__file__).parent
 
-#: Size of a thumbnail in pixels, and the time of the run that it shows [s].
+#: Size of a thumbnail in pixels, and the displayed time of the run [s].
 SIZE, HALFWAY = (480, 300), 3.0
 
-#: Draws the scene of a page at some time.
+#: Script that draws the scene of a page at a given time.
 DRAW = """
 const [time, done] = arguments;
 views.ready.then((player) => {

@@ -1,6 +1,8 @@
-"""See a top turn over: a page that moves, an animation for slides, and the curves (needs the extras `view` and `plot`).
+"""Show a top that turns over: an animated page, an animation for slides, and the curves (needs the extras `view` and
+`plot`).
 
-The same launch in the cylinder and on the plane, side by side. Open `page-out/tops.html` in a browser; it needs no network.
+The same launch in the cylinder and on the plane, side by side. Open `page-out/tops.html` in a browser; it needs no
+network.
 """
 
 from pathlib import Path
@@ -19,7 +21,7 @@ def runs() -> list[Any]:
 
 
 def draw() -> Any:
-    """The page of both."""
+    """The page with both runs."""
     cylinder, plane = runs()
     return cylinder.view(others=[plane])
 
@@ -29,7 +31,7 @@ def main(folder: Path = Path("page-out")) -> None:
     folder.mkdir(exist_ok=True)
     cylinder, plane = runs()
     print(cylinder.view(folder / "tops.html", others=[plane]))
-    # Two seconds at a fifth of their speed; `times` are those of the pictures, 25 a second.
+    # Two seconds at a fifth of real time; `times` are those of the frames, 25 per second.
     plane.animate(folder / "top.gif", times=np.linspace(3.5, 5.5, 250))
     plane.plot(others=[cylinder]).savefig(folder / "curves.png", dpi=110)
     print(f"wrote tops.html, top.gif and curves.png into {folder}")

@@ -1,6 +1,6 @@
-"""Where in a bowl does a top turn over fastest? A map of inversion times over its places, smooth and with frozen waves.
+"""Map inversion times over the places of a bowl, smooth and with frozen waves: where does a top turn over fastest?
 
-Run: python examples/bowl_map.py   prints both maps; with matplotlib it also draws them.
+Run `python examples/bowl_map.py` to print both maps; with matplotlib it also draws them.
 """
 
 from importlib.util import find_spec
@@ -15,7 +15,7 @@ PLACES = np.linspace(-0.12, 0.12, 9)
 
 
 class WavyBowl(eqx.Module):
-    """z = (x^2 + y^2) / (2 p) + height sin(k x); its numbers can be swept and differentiated like any other."""
+    """z = (x^2 + y^2) / (2 p) + height sin(k x); you can sweep and differentiate its numbers."""
 
     p: float
     height: float
@@ -26,7 +26,7 @@ class WavyBowl(eqx.Module):
 
 
 def times(surface) -> tippe.Table:
-    """Inversion times over the places of an arena, for one top, one lean and one spin."""
+    """Inversion times over the places of an arena, for one top, one inclination and one spin."""
     mass, radius = 0.02, 0.02
     inertia = mass * radius**2
     top = tippe.Top(mass, radius, 0.3 * radius, I1=131 / 350 * inertia, I3=0.4 * inertia)
@@ -36,7 +36,7 @@ def times(surface) -> tippe.Table:
 
 
 def shown(table: tippe.Table) -> str:
-    """The times as text, y upwards; where there is none, the first letter of why."""
+    """The times as text, y upwards; for runs without a time, the first letter of the status."""
     rows = []
     for y in reversed(range(len(PLACES))):
         cells = zip(table.time[:, y], table.status[:, y], strict=True)

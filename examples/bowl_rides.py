@@ -1,4 +1,4 @@
-"""Rides inside a spheroid from above, steered to and fro: free, and pulled against friction."""
+"""Rides inside a spheroid, seen from above and steered to and fro: coasting, and pulled against friction."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ import stroller
 
 
 def draw() -> Any:
-    """The picture, a matplotlib figure."""
+    """The plot, a matplotlib figure."""
     body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
     launch = stroller.Launch(place=(0.0, -0.8), heading=0.3, speed=3.0)
     times = np.linspace(0.0, 40.0, 4001)

@@ -1,7 +1,8 @@
-"""What four angles read off a printed figure determine: Cohen's Figure 5 (Am. J. Phys. 45 (1977) 12) as data.
+"""Determine friction from four angles read off a printed figure: Cohen's Figure 5 (Am. J. Phys. 45 (1977) 12) as data.
 
-The figure is said to be Coulomb friction with mu = 0.3. With exact Coulomb friction this top does not invert: slip stops after
-0.03 s. So the figure is of a law that is smooth at low slip, here mu N v / sqrt(v^2 + v0^2), and v0 is not stated.
+According to the paper, the figure shows Coulomb friction with mu = 0.3. With exact Coulomb friction this top does not
+invert: slip stops after 0.03 s. So the figure belongs to a law that is smooth at low slip, here mu N v / sqrt(v^2 +
+v0^2), with unknown v0.
 """
 
 import warnings
@@ -31,7 +32,7 @@ def main() -> None:
     figure = tippe.Recording(launch, TIMES, THETA, [READING * theta for theta in THETA])
     shown(tippe.identify(scene(0.3, 0.08), figure, {"slip_speed": 0.08}), "the slip speed, if mu is 0.3 as printed:")
     with warnings.catch_warnings():
-        # How well the data determine both is the point.
+        # The example shows how well the data determine both.
         warnings.simplefilter("ignore", tippe.FitWarning)
         both = tippe.identify(scene(0.3, 0.08), figure, {"mu": 0.3, "slip_speed": 0.08})
     shown(both, "both:")

@@ -1,4 +1,4 @@
-"""The normal force while a top rises, for spins up to where it jumps."""
+"""The normal force while a top rises, for spins up to the first jump."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ import tippe
 
 
 def draw() -> Any:
-    """The picture, a matplotlib figure."""
+    """The plot, a matplotlib figure."""
     top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
     scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
     times = np.linspace(0.0, 7.0, 3501)

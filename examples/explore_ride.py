@@ -1,6 +1,6 @@
-"""Turn the knobs of a stroller on a hillside: a page with sliders that simulates in the browser.
+"""Write a page with sliders that simulates a stroller on a hillside in the browser.
 
-Open `explore-out/ride.html`; it needs no network. The map shows how far the ride leads; click it.
+Open `explore-out/ride.html`; it needs no network. The map shows the distance of the ride's end; click on it.
 """
 
 from pathlib import Path
@@ -16,7 +16,7 @@ def draw() -> Any:
     scene = stroller.Scene(body, stroller.Plane(0.05), friction)
     launch = stroller.Launch(place=(0.0, 0.0), heading=1.2, speed=2.0, steering=0.2)
     sliders = {"speed": (0.5, 4.0), "launch.steering": (-0.6, 0.6), "heading": (-3.1, 3.1), "rolling": (0.0, 6.0)}
-    # A pedestrian holds the fork: it turns slowly back to the middle.
+    # A pedestrian holds the fork and turns it slowly back to the middle.
     return stroller.explore(
         scene, launch, sliders=sliders, t1=6.0, input=lambda t, motion: (0.0, -0.2 * motion.steering)
     )

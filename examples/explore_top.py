@@ -1,6 +1,6 @@
-"""Turn the knobs of a tippe top: a page with sliders that simulates in the browser.
+"""Write a page with sliders that simulates a tippe top in the browser.
 
-Open `explore-out/top.html`; it needs no network. The map shows where the top turns over, and how soon; click it.
+Open `explore-out/top.html`; it needs no network. The map shows where the top turns over, and how soon; click on it.
 """
 
 from pathlib import Path

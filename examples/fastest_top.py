@@ -1,7 +1,8 @@
-"""Design: which offset and inertia turn a top over fastest at a given spin, with a least normal force kept throughout?
+"""Design a top: which offset and inertia make it turn over fastest at a given spin, while the normal force keeps a
+margin?
 
-Sequential quadratic programming from the best tops of a grid, then the tops around it: beside the best top another dip of the
-normal force becomes the deepest, so slopes alone do not show that it is the best.
+Sequential quadratic programming starts from the best tops of a grid; then the neighbours are checked, because close to
+the best top another minimum of the normal force becomes the deepest, so slopes alone do not show that it is the best.
 """
 
 import diffrax
@@ -18,7 +19,8 @@ BOUNDS = [(0.1, 0.5), (0.85, 1.1)]
 
 
 def time_and_force(numbers: jax.Array) -> jax.Array:
-    """Inversion time [s] and the least normal force on the way, per weight, for offset / radius and I1 / I3."""
+    """Inversion time [s], and the least normal force before it relative to the weight, for offset / radius and I1 /
+    I3."""
     I3 = 0.4 * MASS * RADIUS**2
     top = tippe.Top(MASS, RADIUS, numbers[0] * RADIUS, numbers[1] * I3, I3)
     scene, times = tippe.Scene(top, friction=tippe.Viscous(0.3)), jnp.linspace(0.0, T1, TIMES)

@@ -1,4 +1,4 @@
-"""A top so fast that it leaves the ground while it rises: how high above it, flight after flight."""
+"""A top that is so fast that it leaves the ground while it rises: its height in each flight."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ import tippe
 
 
 def draw() -> Any:
-    """The picture, a matplotlib figure."""
+    """The plot, a matplotlib figure."""
     top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
     scene = tippe.Scene(top, friction=tippe.Viscous(0.3), contact="hybrid", restitution=0.0)
     run = tippe.simulate(scene, tippe.Launch(theta=0.1, spin=200.0), t1=6.0, tolerance=1e-6)

@@ -1,4 +1,5 @@
-"""A vehicle coasts over hills that are any function of the map: one ride, how it depends on the hills, a table of speeds."""
+"""A vehicle coasts over hills given by a function: one ride, its derivative with respect to the hills, a table of
+speeds."""
 
 import equinox as eqx
 import jax

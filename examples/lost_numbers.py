@@ -1,7 +1,7 @@
-"""What Tables 2 and 3 of the paper on the cylinder say about its lost Table 1: seven numbers and the cylinder's radius.
+"""Fit the lost Table 1 of the paper on the cylinder to its Tables 2 and 3: seven numbers and the cylinder's radius.
 
-Rows "not reversed" count with a one-sided likelihood, times to a second; the friction's law is not stated (here viscous).
-The tops are from searches as in `benchmarks/paper_tables_joint.py`, 190000 sets of numbers; the first is fitted further.
+Rows "not reversed" have a one-sided likelihood, times an error of a second; the friction law is unknown (here viscous).
+The start values come from 190000 sets of numbers (`benchmarks/paper_tables_joint.py`); the first is fitted further.
 """
 
 import jax
@@ -15,7 +15,7 @@ from tippe.papers import paper
 HORIZON = 30.0
 ROWS = [(table, row) for table in (paper.TABLE_2, paper.TABLE_3) for row in table.rows]
 THETA = np.array([row.theta for _, row in ROWS])
-# The wall itself has N = 0 at rest: start a hair below it.
+# At rest on the wall itself, N = 0: start slightly below it.
 ETA = np.array([min(table.eta, np.pi / 2.0 - 1e-6) for table, _ in ROWS])
 NAMES = "m [g]", "R [mm]", "offset / R", "I1 / I3", "I3 / m R^2", "cylinder / R", "azimuth", "mu [s/m]"
 BOUNDS = (5.0, 60.0), (15.0, 35.0), (0.05, 0.4), (0.85, 1.12), (0.3, 0.45), (3.0, 150.0)
@@ -27,7 +27,7 @@ TOPS = np.array(TOPS.split(), float).reshape(4, 8)
 
 
 def time(mass, radius, alpha, ratio, inertia, cylinder, azimuth, mu, theta, eta) -> jnp.ndarray:
-    """Time of reversal of one row [s], finite beyond the horizon too."""
+    """Time of reversal of one row [s], finite even beyond the horizon."""
     radius, I3 = radius * 1e-3, inertia * mass * paper.GRAM * (radius * 1e-3) ** 2
     body = tippe.Top(mass * paper.GRAM, radius, alpha * radius, ratio * I3, I3)
     scene = tippe.Scene(body, tippe.Cylinder(cylinder * radius), tippe.Viscous(mu))

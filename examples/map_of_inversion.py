@@ -1,4 +1,4 @@
-"""Where a top turns over on a plane, with the border that Jellett's constant draws."""
+"""A map of inversion times on a plane, with the border from Jellett's constant."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from tippe import steady
 
 
 def draw() -> Any:
-    """The picture, a matplotlib figure."""
+    """The plot, a matplotlib figure."""
     top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
     scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
     theta, spin = np.linspace(0.02, 1.2, 63), np.linspace(30.0, 180.0, 64)

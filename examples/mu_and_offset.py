@@ -5,7 +5,7 @@ import numpy as np
 
 import tippe
 
-# Small angles at the launch and 90 degrees to be reached keep the steps of the time below its error.
+# Small initial angles, and 90 degrees as the target angle, keep the steps of the time below its error.
 THETA, SPIN = np.repeat([0.005, 0.015], 5), np.tile([70.0, 80.0, 100.0, 120.0, 150.0], 2)
 ANGLE, ERROR = 0.5 * np.pi, 0.02
 

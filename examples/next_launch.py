@@ -1,4 +1,4 @@
-"""Which launch to measure next: the one that tells most about friction and offset together (D-optimal design)."""
+"""Which launch to measure next: the most informative one for friction and offset together (D-optimal design)."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ def scene() -> tippe.Scene:
 
 
 def errors(information: np.ndarray) -> str:
-    """The relative standard errors that an information matrix stands for."""
+    """The relative standard errors from an information matrix."""
     found = np.sqrt(np.diag(np.linalg.inv(information)))
     return ", ".join(f"{name} to {100.0 * error:.2g} %" for name, error in zip(NAMES, found, strict=True))
 
@@ -27,7 +27,7 @@ def main() -> None:
     table = tippe.inversion_table(
         scene(), theta=THETA, spin=SPIN, t1=60.0, angle=ANGLE, tolerance=1e-7, sensitivities=list(NAMES)
     )
-    # Slopes of the times by relative changes, in units of the error: a launch adds their outer product to the information.
+    # Slopes of the times with respect to relative changes, in units of the error: a launch adds their outer product.
     slopes = [at * np.asarray(table.variables[f"time_by_{name}"]) / ERROR for name, at in NAMES.items()]
     slopes = np.stack(slopes, axis=-1)
     information = sum(np.outer(slopes[launch], slopes[launch]) for launch in DONE)

@@ -1,4 +1,4 @@
-"""A top with a stem: it turns over, touches with its stem, and rises on it (needs the extra `view`)."""
+"""A top with a stem: it turns over, touches the table with its stem, and rises on it (needs the extra `view`)."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Two strollers coast over hills from the same place, with headings that differ a little (needs the extra `view`)."""
+"""Two strollers coast over hills from the same place with slightly different headings (needs the extra `view`)."""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ def hills(x, y):
 
 
 def draw() -> Any:
-    """The page of both rides."""
+    """The page with both rides."""
     body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
     scene = stroller.Scene(body, surface=stroller.Graph(hills), friction=stroller.Damping(1.0))
     starts = [stroller.Launch(place=(0.0, 0.0), heading=heading, speed=3.0) for heading in (0.6, 0.8)]

@@ -1,4 +1,4 @@
-"""A stroller that is pushed backwards with a free fork: it jackknifes, and goes on forwards."""
+"""A stroller pushed backwards with a free fork: it jackknifes, and continues forwards."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ import stroller
 
 
 def draw() -> Any:
-    """The picture, a matplotlib figure."""
+    """The plot, a matplotlib figure."""
     body = stroller.Stroller(mass=12.0, wheelbase=0.7, inertia=1.5, steering_inertia=0.05)
     scene = stroller.Scene(body, fork="absolute")
     launch = stroller.Launch(place=(0.0, 0.0), heading=0.3, speed=-2.0, steering=0.02, steering_rate=0.06)

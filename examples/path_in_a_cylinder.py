@@ -1,4 +1,4 @@
-"""The path of a top's centre inside a cylinder, and its inclination, from the wall."""
+"""The path of a top's centre inside a cylinder, and its inclination, for a start at the wall."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ import tippe
 
 
 def draw() -> Any:
-    """The picture, a matplotlib figure."""
+    """The plot, a matplotlib figure."""
     top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
     scene = tippe.Scene(top, surface=tippe.Cylinder(0.3), friction=tippe.Viscous(0.3))
     times = np.linspace(0.0, 8.0, 4001)

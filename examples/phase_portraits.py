@@ -9,7 +9,7 @@ import tippe
 
 
 def draw() -> Any:
-    """The picture, a matplotlib figure."""
+    """The plot, a matplotlib figure."""
     top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
     scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
     figure, axes = plt.subplots(1, 3, figsize=(11.0, 3.6), layout="constrained")

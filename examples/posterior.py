@@ -1,4 +1,5 @@
-"""The posterior of friction, offset and I1 / I3 from ten times, and what it predicts (needs blackjax, and matplotlib)."""
+"""The posterior of friction, offset and I1 / I3 from ten times, and its predictions (needs blackjax; matplotlib to
+plot)."""
 
 import sys
 
@@ -26,7 +27,7 @@ def measured() -> tippe.InversionTimes:
 
 
 def free_numbers() -> dict[str, tippe.Free]:
-    """I3 is known; I1 is known to 3 %, from weighing and measuring; friction is known beforehand to a third."""
+    """I3 is known; I1 has a prior of 3 %, from weighing and measuring, and friction a prior of a third."""
     free = {"friction.mu": tippe.Free(0.3, 0.0, prior=(0.3, 0.1)), "offset": tippe.Free(0.0035, 0.0)}
     return free | {"scene.body.I1": tippe.Free(I1, 0.0, prior=(I1, 0.03 * I1))}
 

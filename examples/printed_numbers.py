@@ -1,7 +1,7 @@
-"""What printed thresholds and angles say of a top, and what they do not: Rutstam's (SIGMA 8 (2012) 019) and Cohen's (1977).
+"""What printed thresholds and angles determine about a top: Rutstam's (SIGMA 8 (2012) 019) and Cohen's (1977).
 
-They follow from the top in closed form. They are taken as a laboratory has them: a threshold lies between two launches, of
-which one inverts; an angle is read off a film to 1 degree, a rate of turning to 1 %.
+They follow from the top in closed form. As in a laboratory, a threshold lies between two launches, one of which
+inverts; an angle is read from a video to 1 degree, a rate of rotation to 1 %.
 """
 
 import warnings
@@ -21,13 +21,13 @@ def scene(mass: float, radius: float, one: dict) -> tippe.Scene:
 
 
 def thresholds(one: dict) -> jnp.ndarray:
-    """Spins [rad/s] above which Rutstam's top inverts if it is launched upright, and above which it leaves the upright."""
+    """Spins [rad/s] above which Rutstam's top inverts if launched upright, and above which standing upright is unstable."""
     of, lever = scene(0.02, 0.02, one), 0.02 - one["offset"]
     return jnp.stack([steady.jellett_thresholds(of)[1] / (lever * one["I3"]), steady.upright_critical_spin(of)])
 
 
 def final_motion(one: dict) -> jnp.ndarray:
-    """Inclination [rad], phi' and psi' [rad/s] in which Cohen's top ends, launched at 0.1 rad with 100 rad/s."""
+    """Final inclination [rad], phi' and psi' [rad/s] of Cohen's top, launched at 0.1 rad with 100 rad/s."""
     of = scene(0.015, 0.025, one)
     launched = 100.0 * one["I3"] * (0.025 * jnp.cos(0.1) - one["offset"])
     theta = jnp.asarray(2.0)

@@ -1,4 +1,4 @@
-"""The egg that rises: a prolate spheroid, spun where it lies, stands up, if it is fast enough and does not jump."""
+"""A rising egg: a prolate spheroid, spun while it lies, stands up if it is fast enough and does not jump."""
 
 import math
 from typing import Any
@@ -22,13 +22,14 @@ def launch(turning: float) -> tippe.Launch:
 
 
 def fast_limit(times: Any) -> Any:
-    """Moffatt and Shimomura's rise under viscous friction, at every great spin: tan(theta - pi/2) grows as exp(k t)."""
+    """Moffatt and Shimomura's rise under viscous friction, in the limit of fast spin: tan(theta - pi/2) grows as exp(k
+    t)."""
     k = 2.5 * MU * 9.81 * (POLAR**2 - EQUATORIAL**2) / (POLAR**2 + EQUATORIAL**2)
     return math.pi / 2.0 + np.arctan(math.tan(RAISED) * np.exp(k * times))
 
 
 def draw() -> Any:
-    """The picture, a matplotlib figure."""
+    """The plot, a matplotlib figure."""
     egg = tippe.SpheroidBody(MASS, EQUATORIAL, POLAR, I1, I3)
     scene = tippe.Scene(egg, friction=tippe.Viscous(MU))
     figure, axes = plt.subplots(1, 3, figsize=(12.0, 3.6), layout="constrained")

@@ -1,4 +1,4 @@
-"""Steady states of a top: inclination over Jellett's constant, stable ones drawn in full."""
+"""Steady states of a top: inclination over Jellett's constant, with solid lines for stable states."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from tippe import steady
 
 
 def draw() -> Any:
-    """The picture, a matplotlib figure."""
+    """The plot, a matplotlib figure."""
     top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
     scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
     theta = np.linspace(1e-3, np.pi - 1e-3, 400)

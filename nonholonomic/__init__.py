@@ -1,20 +1,20 @@
-"""The ground that the models stand on: surfaces, integration, sweeps, tables. Knows neither top nor stroller."""
+"""The shared foundation of the models: surfaces, integration, sweeps, tables, and users' own systems."""
 
 import os
 import sys
 
 from .command_line import import_quietly as _import_quietly
 
-# While `python -m` looks for the module that it runs, Python names itself so.
+# While `python -m` looks for the module to run, `sys.argv[0]` is "-m".
 if sys.argv[:1] == ["-m"]:
     _import_quietly()
 
 import jax
 
-#: The one place where a version is set; the package's metadata takes it from here.
+#: The only place where the version is set; the package's metadata reads it from here.
 __version__ = "0.2.0"
 
-# Float64 throughout, unless the user chose otherwise; it has to be set before the first array is made.
+# Use float64 throughout, unless the user chose otherwise. This must be set before the first array is created.
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 

@@ -1,4 +1,4 @@
-"""Ctrl-C on the command lines: the process ends at once, with one line and no traceback."""
+"""Handle Ctrl-C on the command lines: the process ends at once, with one line and no traceback."""
 
 import os
 import signal
@@ -8,17 +8,17 @@ import time
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-#: How long the main thread may take to tell what was saved [s] before the process ends without that.
+#: Longest time [s] that the main thread may take to report what was saved before the process ends without the report.
 PATIENCE = 1.0
 
-#: The exit status of a program that SIGINT ended, as shells report it.
+#: The exit status that shells report for a program ended by SIGINT.
 INTERRUPTED = 130
 
 _ending = threading.Lock()
 
 
 def import_quietly() -> None:
-    """While `python -m` imports the packages, Ctrl-C ends it with one line instead of a traceback."""
+    """End the process with one line instead of a traceback if Ctrl-C arrives while `python -m` imports the packages."""
     program, shown = sys.orig_argv[sys.orig_argv.index("-m") + 1], sys.excepthook
 
     def hook(kind: type[BaseException], error: BaseException, trace: Any) -> None:
@@ -33,12 +33,12 @@ def import_quietly() -> None:
 def interruptible(main: Callable[[], int], program: str) -> int:
     """Run a command line; Ctrl-C ends it within two seconds, even while XLA compiles.
 
-    Python raises `KeyboardInterrupt` only when the main thread is back from C++, which takes up to half a minute while XLA
-    compiles. So a second thread, which Python's wake-up descriptor tells of the signal at once, ends the process if the main
-    thread does not. The process ends without finalization, which would wait for compilations or crash in them; all that was
-    saved is on the disk by then.
+    Python raises `KeyboardInterrupt` only when the main thread returns from C++, which takes up to half a minute while
+    XLA compiles. Python's wake-up descriptor therefore also notifies a second thread, which ends the process if the
+    main thread does not. The process ends without finalization, which would wait for compilations or crash in them; all
+    results are on disk by then.
 
-    **Arguments:** `main`: the command line, which returns the exit status; `program`: how it is called.
+    **Arguments:** `main`: the command line, a function that returns the exit status; `program`: its name.
 
     **Returns:** the exit status of `main`.
     """
@@ -61,10 +61,10 @@ def interruptible(main: Callable[[], int], program: str) -> int:
 
 def _end(message: str) -> NoReturn:
     """End the process with one line."""
-    # The first thread to come here ends the process, the other one waits for that.
+    # The first thread that gets here ends the process; the other one waits.
     _ending.acquire()
     sys.stdout.flush()
-    # On a terminal the status line is still there.
+    # On a terminal, the status line is still visible.
     start = "\r\x1b[K" if sys.stderr.isatty() else ""
     print(f"{start}{message}", file=sys.stderr, flush=True)
     os._exit(INTERRUPTED)

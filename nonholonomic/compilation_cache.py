@@ -1,8 +1,8 @@
-"""Compiled programs kept on disk, so that a second process need not compile them again.
+"""Keep compiled programs on disk, so that later processes need not compile them again.
 
-The store is JAX's persistent compilation cache. This module adds two things: a separate folder for every jaxlib, kind of
-processor and set of XLA flags, because code compiled for one processor may not run on another; and a check of the entries,
-because a process that is killed while writing leaves half an entry, which JAX would warn about forever.
+The store is JAX's persistent compilation cache. This module adds a separate folder for every jaxlib, kind of processor
+and set of XLA flags, because code compiled for one processor may not run on another. It also checks the entries,
+because a process that is killed while writing leaves half an entry, about which JAX would warn forever.
 """
 
 import errno
@@ -20,13 +20,13 @@ from typing import Any
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
-#: The file that tells which entries were found sound, a line for each.
+#: The file that lists the entries that passed the check, one per line.
 LOOKED_AT = ".looked_at"
 
-#: What switches something off, as the value of an environment variable.
+#: Values of an environment variable that switch a feature off.
 OFF = ("0", "off", "false", "no")
 
-#: How writing fails where there is no room: the disk is full, or the user's share of it, or a file may not be so long.
+#: Errors of writing without space: the disk is full, the user's quota is used up, or the file is too long.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 _log = logging.getLogger(__name__)
@@ -35,24 +35,24 @@ _log = logging.getLogger(__name__)
 def enable_compilation_cache(folder: Any = None) -> Path | None:
     """Keep compiled programs on disk, where later processes find them.
 
-    Call it before the first computation. A folder that was already chosen, by JAX's own `jax_compilation_cache_dir` or by an
-    earlier call, is kept unless another is given. One of JAX's own is left as it is: unless
-    `jax_persistent_cache_min_compile_time_secs` is 0, programs that compile in less than a second are not kept in it.
+    Call it before the first computation. A folder that was already chosen, by JAX's own `jax_compilation_cache_dir` or
+    by an earlier call, is kept unless you pass another. In JAX's own folder, programs that compile in less than a
+    second are not stored unless `jax_persistent_cache_min_compile_time_secs` is 0.
 
-    In other folders an entry that was written since the last look, in any process, is looked at once: if it does not
-    decompress, because its writer was killed or its copy is damaged, it is removed, and costs one compilation. What cannot be
-    seen so stays, and costs a compilation in every process: an entry that the disk damages later without a trace, one that
-    decompresses to something else, and a bad one compressed by zstandard, which JAX uses where that package is installed.
-    Nothing else is ever removed: delete the folder to be rid of such entries, and to reclaim its space. It holds code, so it
-    should be where nobody else can write.
+    In other folders, each new entry is checked once. If it does not decompress, because its writer was killed or its
+    copy is damaged, it is removed and compiled again. The check misses entries that are damaged later, entries that
+    decompress to something else, and damaged entries compressed by zstandard, which JAX uses if that package is
+    installed; these cost one compilation in every process. Nothing else is ever removed: delete the folder to remove
+    such entries and to reclaim space. The folder contains code, so choose one where nobody else can write.
 
-    **Arguments:** `folder`: where to keep them, by default `nonholonomic` in the user's cache folder (`XDG_CACHE_HOME`, or
-    `~/.cache`). In it there is a folder for every version of jaxlib, kind of processor and set of XLA flags.
+    **Arguments:** `folder`: where to store the programs, by default `nonholonomic` in the user's cache folder
+    (`XDG_CACHE_HOME`, or `~/.cache`). It gets a subfolder for every version of jaxlib, kind of processor and set of XLA
+    flags.
 
-    **Returns:** the folder in use; `None` if `NONHOLONOMIC_CACHE` (0, off, false or no) forbids it or it cannot be written,
-    which is logged as a warning. So is a full disk, from which programs are still read.
+    **Returns:** the folder in use; `None` if `NONHOLONOMIC_CACHE` (0, off, false or no) forbids it or if the folder
+    cannot be written, which is logged as a warning. A full disk is also logged; programs are still read from it.
 
-    **Raises:** `ValueError` for a folder that is no path.
+    **Raises:** `ValueError` if the folder is not a path.
 
     **Example:**
 
@@ -78,8 +78,8 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
         place.mkdir(parents=True, exist_ok=True)
         remove_damaged(place)
     except (OSError, RuntimeError) as error:
-        # Logged, not a Python warning: where warnings are errors, a cache must not stop a computation.
-        _log.warning("compiled programs are not kept: %s", error)
+        # Log instead of warn: if warnings are errors, a cache must not stop a computation.
+        _log.warning("compiled programs are not stored: %s", error)
         return None
     if chosen != str(place):
         # JAX opens its folder only once.
@@ -87,9 +87,9 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
     settings.update("jax_compilation_cache_dir", str(place))
     settings.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     settings.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    # A limit would need a lock, which parallel processes wait for.
+    # A size limit would need a lock, for which parallel processes would wait.
     settings.update("jax_compilation_cache_max_size", -1)
-    # Another process may be writing the entry that this one reads. It is compiled then; that is no reason to stop.
+    # Another process may be writing the entry that this one reads. Then compile the program and go on.
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry", UserWarning)
     return place
 
@@ -97,26 +97,27 @@ def enable_compilation_cache(folder: Any = None) -> Path | None:
 def user_folder() -> Path:
     """The package's folder in the user's cache folder, the same on all systems.
 
-    **Raises:** `RuntimeError` if the user has no home.
+    **Raises:** `RuntimeError` if the user has no home folder.
     """
     cache_home = os.environ.get("XDG_CACHE_HOME", "")
-    # The specification of XDG_CACHE_HOME has relative paths ignored.
+    # The XDG specification says that relative paths must be ignored.
     return (Path(cache_home) if os.path.isabs(cache_home) else Path.home() / ".cache") / "nonholonomic"
 
 
 def environment_name() -> str:
-    """A name for all that compiled code depends on besides the program: jaxlib, the processor, and the flags of XLA."""
+    """A name for everything, besides the program, that compiled code depends on: jaxlib, the processor, and the XLA
+    flags."""
     machine = "\n".join([platform.system(), platform.machine(), processor(), os.environ.get("XLA_FLAGS", "")])
     return f"jaxlib-{version('jaxlib')}-{hashlib.sha256(machine.encode()).hexdigest()[:12]}"
 
 
 def processor() -> str:
-    """The processor's kind and features, as far as the system says."""
+    """The kind and features of the processor, as far as the system reports them."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return platform.processor()
-    # All cores are taken to be alike. On ARM the features have another name.
+    # Assume that all cores are alike. ARM calls the features by another name.
     kinds = ("vendor_id", "cpu family", "model", "flags", "CPU implementer", "CPU part", "Features")
     lines_by_name = dict(line.split(":", 1) for line in reversed(lines) if ":" in line)
     lines_by_name = {name.strip(): value.strip() for name, value in lines_by_name.items()}
@@ -124,15 +125,16 @@ def processor() -> str:
 
 
 def is_off(variable: str) -> bool:
-    """Whether an environment variable switches off what it is named for."""
+    """Whether an environment variable switches its feature off."""
     return os.environ.get(variable, "").strip().lower() in OFF
 
 
 def remove_damaged(folder: Path) -> None:
-    """Remove the entries that do not decompress, among those written since they were last looked at.
+    """Remove entries that do not decompress, among those written since the last check.
 
-    JAX neither writes entries at once nor replaces bad ones: without this, a program whose writer was killed (Ctrl-C on a
-    command line does that too) is compiled in every later process. To look at 600 known entries takes 30 ms.
+    JAX neither writes entries atomically nor replaces damaged ones. Without this check, a program whose writer was
+    killed (as by Ctrl-C on a command line) would be compiled in every later process. Checking 600 known entries takes
+    30 ms.
 
     **Raises:** `OSError` if the folder cannot be written; a full disk is only logged.
     """
@@ -140,7 +142,7 @@ def remove_damaged(folder: Path) -> None:
     known = set(looked_at.read_bytes().split(b"\n")) if looked_at.exists() else set()
     found = []
     for entry in folder.glob("*-cache"):
-        # Another process may remove one, too.
+        # Another process may remove the entry, too.
         try:
             line = _line(entry)
             if line in known or sound(entry.read_bytes()):
@@ -149,7 +151,7 @@ def remove_damaged(folder: Path) -> None:
                 entry.unlink()
         except FileNotFoundError:
             pass
-    # Under a name of its own: of processes that start together each writes one, and the last one stays.
+    # Use a unique name: each of several processes that start together writes a file, and the last file remains.
     looking = folder / f"{LOOKED_AT}-{uuid.uuid4().hex}"
     try:
         looking.write_bytes(b"\n".join([b"sound:", *found]))
@@ -158,17 +160,18 @@ def remove_damaged(folder: Path) -> None:
         looking.unlink(missing_ok=True)
         if error.errno not in NO_ROOM:
             raise
-        _log.warning("no more compiled programs are kept in %s: %s", folder, error)
+        _log.warning("compiled programs can no longer be stored in %s: %s", folder, error)
 
 
 def _line(entry: Path) -> bytes:
-    """An entry's name, and what changes when it is written, even if its modification time is set back: that of its state."""
+    """The name of an entry and its change time, which changes on every write even if the modification time is set
+    back."""
     state = entry.stat()
     return f"{entry.name} {state.st_size} {state.st_mtime_ns} {state.st_ctime_ns}".encode()
 
 
 def sound(entry: bytes) -> bool:
-    """Whether an entry decompresses; zlib's checksum covers every byte of it."""
+    """Whether an entry decompresses; zlib's checksum covers every byte."""
     if entry.startswith(b"\x28\xb5\x2f\xfd"):  # zstandard's mark
         return True
     try:

@@ -1,7 +1,7 @@
-"""Compiled programs in memory: all of them are forgotten before they exhaust it.
+"""Clear compiled programs from memory before they exhaust it.
 
-A program of a hybrid scene takes 60 to 180 MB and 200 to 800 memory mappings. Linux allows a process 65 530 mappings, and a
-compiler that gets no more of them crashes the process.
+A program of a hybrid scene takes 60 to 180 MB and 200 to 800 memory mappings. Linux allows 65 530 mappings per process,
+and a compiler that gets no more mappings crashes the process.
 """
 
 import ctypes
@@ -16,40 +16,41 @@ import numpy as np
 
 from .validation import is_traced
 
-#: A process may hold so much memory [bytes] before it forgets its programs, if these are why: if there are so many mappings.
+#: Memory [bytes] of the process above which programs are cleared, if there are so many mappings that programs are the
+#: cause.
 MOST_MEMORY, MANY_MAPPINGS = 2_500_000_000, 4_000
 
-#: The part of the mappings that Linux allows from which on programs are forgotten however little memory they take.
+#: Fraction of the allowed mappings above which programs are cleared, however little memory they take.
 PART_OF_MAPPINGS = 0.5
 
-#: With less memory than this [bytes] there cannot be that many mappings, and they are not counted: that takes some ms.
+#: Below this memory [bytes] there cannot be that many mappings, so they are not counted; counting takes some ms.
 LITTLE_MEMORY = 1_000_000_000
 
 _log = logging.getLogger(__name__)
 
 
 def forget_programs_if_many(most_memory: int = MOST_MEMORY) -> bool:
-    """Forget all compiled programs where they take too much memory, and log a warning of one line.
+    """Clear all compiled programs if they take too much memory, and log a one-line warning.
 
-    A program that is used again is then compiled again, or read from the disk (`enable_compilation_cache`). Inside
-    transformations nothing is forgotten, nor outside of the main thread, and where the system does not report what a
-    process uses (`/proc`).
+    A program that is used again is then compiled again, or read from disk (`enable_compilation_cache`). Nothing is
+    cleared inside transformations, outside the main thread, or if the system does not report the memory of a process
+    (`/proc`).
 
-    **Arguments:** `most_memory`: that the process may hold [bytes].
+    **Arguments:** `most_memory`: memory [bytes] that the process may hold.
 
-    **Returns:** whether programs were forgotten.
+    **Returns:** whether programs were cleared.
     """
     memory = resident_memory()
     if memory < min(LITTLE_MEMORY, most_memory) or threading.current_thread() is not threading.main_thread():
         return False
-    # Putting a number on a device compiles nothing, as adding two would.
+    # Putting a number on a device compiles nothing; adding two numbers would.
     if is_traced(jax.device_put(np.zeros(()))):
         return False
     mappings = count_mappings()
     if mappings < PART_OF_MAPPINGS * most_mappings():
         if memory < most_memory or mappings < MANY_MAPPINGS:
             return False
-        # What the compiler has freed may go back to the system first.
+        # First return to the system what the compiler has freed.
         release_memory()
         if resident_memory() < most_memory:
             return False
@@ -57,7 +58,7 @@ def forget_programs_if_many(most_memory: int = MOST_MEMORY) -> bool:
     gc.collect()
     release_memory()
     _log.warning(
-        "compiled programs took %.2g GB and %d memory mappings and are forgotten; the next calls compile again",
+        "compiled programs took %.2g GB and %d memory mappings and were cleared; the next calls compile again",
         1e-9 * memory,
         mappings,
     )
@@ -65,7 +66,7 @@ def forget_programs_if_many(most_memory: int = MOST_MEMORY) -> bool:
 
 
 def resident_memory() -> int:
-    """The memory of this process [bytes]; 0 where the system does not say."""
+    """Resident memory of this process [bytes]; 0 if the system does not report it."""
     try:
         return int(Path("/proc/self/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
@@ -73,7 +74,7 @@ def resident_memory() -> int:
 
 
 def count_mappings() -> int:
-    """How many memory mappings this process has; 0 where the system does not say."""
+    """Number of memory mappings of this process; 0 if the system does not report it."""
     try:
         return Path("/proc/self/maps").read_bytes().count(b"\n")
     except OSError:
@@ -81,7 +82,7 @@ def count_mappings() -> int:
 
 
 def most_mappings() -> int:
-    """How many memory mappings a process may have."""
+    """Number of memory mappings that a process may have."""
     try:
         return int(Path("/proc/sys/vm/max_map_count").read_bytes())
     except OSError:
@@ -89,7 +90,7 @@ def most_mappings() -> int:
 
 
 def release_memory() -> None:
-    """Give freed memory back to the system: after a compilation of a hybrid scene 240 of 700 MB. Only glibc keeps so much."""
+    """Return freed memory to the system: 240 of 700 MB after compiling a hybrid scene. Only glibc holds so much."""
     if hasattr(_libc, "malloc_trim"):
         _libc.malloc_trim(0)
 

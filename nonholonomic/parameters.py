@@ -1,4 +1,4 @@
-"""The numbers of a scene by name: `"scene.body.offset"`, `"launch.place[0]"`; and as a person reads them, with their units."""
+"""The parameters of a scene by name, such as `"scene.body.offset"` or `"launch.place[0]"`, and as text with units."""
 
 import dataclasses
 import difflib
@@ -14,16 +14,16 @@ from jax.core import Tracer
 
 
 def numbers(root: str, tree: Any, functions: bool = True) -> dict[str, Any]:
-    """Every number of a tree of modules under its dotted name.
+    """Every parameter of a tree of modules under its dotted name.
 
     **Arguments:**
 
     - `root`: name of the tree itself.
     - `tree`: an `equinox.Module`.
-    - `functions`: whether to go into modules that are functions, whose numbers may be arrays.
+    - `functions`: whether to include the parameters of modules that are functions, which may be arrays.
 
-    **Returns:** dotted name -> number, in the order in which the modules declare them; `None` for a number that is left
-    out, which the `units` of its module tell from another part that is.
+    **Returns:** dotted name -> number, in the order in which the modules declare them; `None` for an omitted number
+    (one that has an entry in the `units` of its module).
     """
     values = {}
     for field in dataclasses.fields(tree):
@@ -42,7 +42,7 @@ def _is_number(value: Any) -> bool:
 
 
 def with_numbers(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """The trees with some of their numbers replaced; the modules check the new ones.
+    """The trees with some parameters replaced; the modules check the new values.
 
     **Arguments:**
 
@@ -51,7 +51,7 @@ def with_numbers(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any
 
     **Returns:** name -> tree.
 
-    **Raises:** `ValueError` for a name that no number of the trees has.
+    **Raises:** `ValueError` for a name that matches no parameter.
     """
     known = {name: number for root, tree in roots.items() for name, number in numbers(root, tree).items()}
     for name in values:
@@ -61,12 +61,12 @@ def with_numbers(roots: dict[str, Any], values: dict[str, Any]) -> dict[str, Any
 
 
 def full_name(argument: str, name: str, known: list[str]) -> str:
-    """The full name that a name means: itself, or the only full name that ends in it.
+    """The full name for a name: the name itself, or the only full name that ends in it.
 
-    **Arguments:** `argument`: what the name was given for; `name`: such as `"scene.friction.mu"` or `"friction.mu"`; `known`:
-    the full names to choose from.
+    **Arguments:** `argument`: the argument that contains the name, for messages; `name`: such as `"scene.friction.mu"`
+    or `"friction.mu"`; `known`: the full names to choose from.
 
-    **Raises:** `ValueError` for a name that means none of them, or several.
+    **Raises:** `ValueError` for a name that matches none or several of them.
     """
     meant = _meant(name, known)
     if len(meant) != 1:
@@ -76,11 +76,12 @@ def full_name(argument: str, name: str, known: list[str]) -> str:
 
 
 def full_axes(axes: dict[str, Any], known: list[str]) -> dict[str, Any]:
-    """The axes of a grid by full names, which may be given by their ends, such as `"offset"`.
+    """The axes of a grid under full names; a name may be the end of a full name, such as `"offset"`.
 
-    **Arguments:** `axes`: name -> values; `known`: the full names of what can be varied.
+    **Arguments:** `axes`: name -> values; `known`: the full names of the parameters.
 
-    **Raises:** `ValueError` for a name that means none of them, or several, and for a number that is named twice.
+    **Raises:** `ValueError` for a name that matches none or several parameters, and for a parameter that is named
+    twice.
     """
     by_full_name: dict[str, Any] = {}
     for name, values in axes.items():
@@ -94,7 +95,7 @@ def full_axes(axes: dict[str, Any], known: list[str]) -> dict[str, Any]:
 
 
 def _meant(name: Any, known: list[str]) -> list[str]:
-    """The full names that a name may mean."""
+    """The full names that match a name."""
     return [name] if name in known else [known_name for known_name in known if known_name.endswith("." + str(name))]
 
 
@@ -107,7 +108,7 @@ def _unknown_axis(name: str, known: list[str]) -> ValueError:
 
 
 def likely(name: Any, known: Iterable[str]) -> str:
-    """What a message about an unknown name adds: the known name that it resembles, if any."""
+    """The known name that resembles an unknown one, as an addition to a message; empty if there is none."""
     close = difflib.get_close_matches(str(name), list(known), 1)
     return f"; did you mean {close[0]!r}?" if close else ""
 
@@ -128,9 +129,9 @@ def _replaced(name: str, tree: Any, values: dict[str, Any]) -> Any:
 
 
 def description(root: str, tree: Any) -> dict[str, Any]:
-    """What a tree of modules is made of, as plain data: the kind of every module, the value of every number.
+    """A tree of modules as plain data: the kind of every module and the value of every number.
 
-    A function has nothing but its name to show.
+    A function is described by its name alone.
     """
     fields: dict[str, Any] = {root: type(tree).__name__}
     for field in dataclasses.fields(tree):
@@ -146,14 +147,14 @@ def description(root: str, tree: Any) -> dict[str, Any]:
     return fields
 
 
-#: Numbers of an array that are shown; of a longer one the first and the last.
+#: How many numbers of an array are shown; longer arrays show the first and the last ones.
 SHOWN = 4
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def readable_unit(unit: str) -> str:
-    """A unit as a person writes it, "kg m²/s" for "kg m2 s-1"; an empty string for "1"."""
+    """A unit in common notation, "kg m²/s" for "kg m2 s-1"; an empty string for "1"."""
     above, below = [], []
     for part in unit.split():
         match = re.fullmatch(r"([A-Za-z]+)(-?\d+)?", part)
@@ -167,7 +168,7 @@ def readable_unit(unit: str) -> str:
 
 
 def as_text(value: Any, unit: str = "1") -> str:
-    """A value as text: a number to six digits with its unit, an array by its first and last numbers."""
+    """A value as text: a number to six digits with its unit, or the first and last numbers of an array."""
     if isinstance(value, eqx.Module):
         return repr(value)
     if isinstance(value, Tracer):
@@ -188,7 +189,7 @@ def as_text(value: Any, unit: str = "1") -> str:
 
 
 def contents(module: Any) -> list[tuple[str, str]]:
-    """What a module holds, field by field: (name, value as text); what is left out is left out."""
+    """The fields of a module as (name, value as text); omitted fields are left out."""
     fields = [(field.name, getattr(module, field.name, None)) for field in dataclasses.fields(module)]
     units = getattr(module, "units", {})
     return [(name, as_text(value, units.get(name, "1"))) for name, value in fields if value is not None]
@@ -200,17 +201,17 @@ def one_line(module: Any) -> str:
 
 
 def in_lines(title: str, rows: list[tuple[str, str]]) -> str:
-    """A title, and a line for each row."""
+    """A title, followed by one line per row."""
     width = max((len(name) for name, _ in rows), default=0)
     return "\n".join([title, *(f"  {name:{width}}  {text}" for name, text in rows)])
 
 
 def distinguishing_labels(starts: list[str], *groups: list[Any]) -> list[str]:
-    """A name for each of some things: what it starts with, and where its modules differ from those of the others.
+    """Labels that tell things apart: the start of each label, followed by what differs between the modules.
 
-    **Arguments:** `starts`: the beginnings; `groups`: modules of one role, such as the scenes, one for each thing.
+    **Arguments:** `starts`: the starts of the labels; `groups`: modules of one role, such as the scenes, one per label.
 
-    **Returns:** the names. Those that would be the same are numbered.
+    **Returns:** the labels. Equal labels are numbered.
     """
     apart = [differences(group) for group in groups]
     names = [
@@ -222,7 +223,7 @@ def distinguishing_labels(starts: list[str], *groups: list[Any]) -> list[str]:
 
 
 def differences(modules: list[Any]) -> list[list[str]]:
-    """For each of some modules, as text, what the others do not have like it: its kind, or some of its numbers."""
+    """What distinguishes each module from the others, as text: its kind, or some of its parameters."""
     if len({type(module) for module in modules}) > 1:
         return [[type(module).__name__] for module in modules]
     labels: list[list[str]] = [[] for _ in modules]
@@ -239,13 +240,13 @@ def differences(modules: list[Any]) -> list[list[str]]:
 
 
 def as_html(title: str, rows: list[tuple[str, ...]]) -> str:
-    """A title and a table of rows, as a notebook shows them."""
+    """A title and a table of rows, as HTML for a notebook."""
     style = "text-align: left; vertical-align: top"
     cells = ("".join(f'<td style="{style}">{html.escape(text)}</td>' for text in row) for row in rows)
     return f"<div><b>{html.escape(title)}</b><table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table></div>"
 
 
 def text_as_html(text: str) -> str:
-    """A text whose first line is a title, as a notebook shows it."""
+    """A text whose first line is a title, as HTML for a notebook."""
     title, _, rest = text.partition("\n")
     return f"<div><b>{html.escape(title)}</b><pre>{html.escape(rest)}</pre></div>"

@@ -1,4 +1,4 @@
-"""What a long call is doing, in one line on a terminal or in a notebook."""
+"""Status lines for long calls, on a terminal or in a notebook."""
 
 import sys
 import threading
@@ -12,11 +12,12 @@ from typing import Any
 from .compilation_cache import is_off
 from .compiled_programs import forget_programs_if_many
 
-#: How often the line is written [s]; a call that ends sooner shows nothing. How often is looked whether it is time [s], and
-#: how long after the last call [s]: starting a thread for every call would cost short ones a millisecond.
+#: How often the line is written [s] (a shorter call shows nothing), how often the thread checks whether the line is due
+#: [s], and how long the thread waits for another call [s]: starting a thread for every call would cost short calls a
+#: millisecond.
 INTERVAL, TICK, LINGER = 0.5, 0.1, 5.0
 
-#: Functions of JAX, by their module and how their names begin, that are at work while a program is made.
+#: Functions of JAX that run while a program is traced or compiled: module, and start of the function's name.
 COMPILERS = (
     ("jax._src.interpreters.partial_eval", "trace_to_jaxpr"),
     ("jax._src.interpreters.mlir", "lower_jaxpr"),
@@ -25,22 +26,24 @@ COMPILERS = (
 
 
 class Progress:
-    """A line that says what is being done, and once items are counted, how many are done, how fast, and how many are left.
+    """A status line: what is being done and, once items are counted, how many are done, how fast, and how many are
+    left.
 
-    It is a context. Of several, one inside the other, the innermost that counts has the line, or else the outermost. What is
-    left of the line in the end is nothing, or what the outermost has counted.
-    A separate thread writes the line, because compiling blocks the caller's for many seconds. Nothing is
-    written where standard error is neither a terminal nor a notebook's, nor with `NONHOLONOMIC_PROGRESS=0`.
+    Use it as a context manager. If several are nested, the innermost one that counts items owns the line, or else the
+    outermost one. The line disappears at the end, unless the outermost context counts items.
+
+    A separate thread writes the line, because compiling blocks the caller's thread for many seconds. Nothing is written
+    if standard error is neither a terminal nor a notebook's, or with `NONHOLONOMIC_PROGRESS=0`.
     """
 
     def __init__(self, total: int | None, unit: str = "", doing: str = "compiling", *, shown: bool = True):
-        """State what is to be done.
+        """Describe the work.
 
         **Arguments:**
 
-        - `total`: how many items are to be done, `None` if none are counted; `unit`: what one is called.
-        - `doing`: what is done before `begin`; while JAX makes a program for the caller, the line says "compiling".
-        - `shown`: whether to show anything at all, of calls within this one, too.
+        - `total`: number of items, `None` if none are counted; `unit`: name of an item.
+        - `doing`: activity before `begin`; while JAX traces or compiles for the caller, the line says "compiling".
+        - `shown`: whether to show anything at all, including calls within this one.
         """
         self._total, self._unit, self._doing = total, unit, doing
         self._heard = not is_off("NONHOLONOMIC_PROGRESS") and is_watched()
@@ -49,14 +52,14 @@ class Progress:
         self._bar: Any = None
 
     def begin(self, done: int = 0) -> None:
-        """The preparations are over; `done` items had been done before."""
+        """End the preparations; `done` items had been done before."""
         with _LINE.lock:
             self._done = self._first = done
             self._since = time.time()
             self._clear()
 
     def advance(self, count: int, **notes: Any) -> None:
-        """`count` more items are done; `notes` are shown beside their number."""
+        """Count `count` more items as done; `notes` are shown beside their number."""
         with _LINE.lock:
             self._done, self._notes = self._done + count, notes
             if self._bar is not None and self._since is not None:
@@ -65,7 +68,7 @@ class Progress:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Takes the line away while something else is written."""
+        """Remove the line while something else is written."""
         with _LINE.lock:
             self._clear()
             yield
@@ -91,7 +94,7 @@ class Progress:
                 self._bar = None
 
     def _show(self) -> None:
-        """Writes the line, if it is time."""
+        """Write the line, if it is due."""
         if self._bar is not None and time.time() - self._written < INTERVAL:
             return
         self._written = time.time()
@@ -106,13 +109,13 @@ class Progress:
 
     def _line(self) -> Any:
         """The line in its present state, not yet written."""
-        # With a delay, or tqdm writes the line before all is known of it.
+        # Without a delay, tqdm writes the line before everything in it is known.
         options = {"delay": 1e-9, "leave": self._since is not None and not self._inner}
         if self._since is None:
             bar = self._tqdm(bar_format="{desc} [{elapsed}]", **options)
             bar.start_t = self._start
             return bar
-        # The rate is that of the whole run, without the preparations: items are done in blocks, some cheap, some expensive.
+        # The rate is that of the whole run without the preparations, because chunks of items differ in cost.
         bar = self._tqdm(total=self._total, initial=self._first, unit=self._unit, smoothing=0, **options)
         bar.start_t = self._since
         bar.n = self._done
@@ -120,7 +123,7 @@ class Progress:
         return bar
 
     def _clear(self) -> None:
-        """Takes the line away, until it is written again."""
+        """Remove the line until it is written again."""
         if self._bar is not None:
             self._bar.leave = False
             self._bar.close()
@@ -128,9 +131,9 @@ class Progress:
 
 
 class _Line:
-    """The line of the whole process, whose standard error is one, and the thread that writes it.
+    """The only status line of the process (there is one standard error), and the thread that writes it.
 
-    - `speakers`: who has something to say, the outermost call first.
+    - `speakers`: the calls that have something to show, the outermost first.
     """
 
     def __init__(self):
@@ -138,7 +141,7 @@ class _Line:
         self._writer: threading.Thread | None = None
 
     def add(self, speaker: Progress) -> None:
-        """One more has something to say."""
+        """Add a call that has something to show."""
         self.speakers.append(speaker)
         if self._writer is None or not self._writer.is_alive():
             self._writer = threading.Thread(target=self._write, daemon=True)
@@ -172,9 +175,9 @@ _LINE = _Line()
 
 @contextmanager
 def status_line(doing: str, shown: bool = True) -> Iterator[Progress]:
-    """Says what a call is doing that takes long when it is new to the compiler; decorates functions, too.
+    """Show what a call is doing if it takes long because it compiles; also a decorator for functions.
 
-    Before that, programs are forgotten if they take too much memory (`compiled_programs.py`).
+    Before that, clear programs that take too much memory (`compiled_programs.py`).
     """
     forget_programs_if_many()
     with Progress(None, doing=doing, shown=shown) as line:
@@ -182,7 +185,8 @@ def status_line(doing: str, shown: bool = True) -> Iterator[Progress]:
 
 
 def is_making_programs(thread: int) -> bool:
-    """Whether JAX is tracing or compiling in a thread; JAX does not report when it begins to. Costs 0.5 ms, twice a second."""
+    """Whether JAX is tracing or compiling in a thread, which JAX does not report. A call takes 0.5 ms, twice a
+    second."""
     frame = sys._current_frames().get(thread)
     while frame is not None:
         module, name = frame.f_globals.get("__name__"), frame.f_code.co_name
@@ -194,21 +198,21 @@ def is_making_programs(thread: int) -> bool:
 
 def is_watched() -> bool:
     """Whether somebody may be looking: standard error is a terminal, or this is a notebook."""
-    # A stream that is closed does not answer.
+    # A closed stream raises an error.
     is_open = not getattr(sys.stderr, "closed", False)
     return (is_open and getattr(sys.stderr, "isatty", bool)()) or is_notebook()
 
 
 def is_notebook() -> bool:
-    """Whether this is the kernel of a notebook."""
+    """Whether this process is the kernel of a notebook."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return "IPKernelApp" in getattr(shell, "config", {})
 
 
 def bar_class() -> type:
-    """The bar of tqdm for a terminal, or for a notebook that has the widgets for it.
+    """The tqdm bar for a terminal, or for a notebook that has the widgets for it.
 
-    `tqdm.auto` chooses too, but warns where there are no widgets, and sets the warning filters while it is imported.
+    `tqdm.auto` also chooses, but it warns if there are no widgets, and sets the warning filters when it is imported.
     """
     if is_notebook() and find_spec("ipywidgets") is not None:
         from tqdm.notebook import tqdm

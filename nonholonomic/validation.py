@@ -1,7 +1,7 @@
-"""Checks of arguments, made on concrete numbers before anything compiles.
+"""Check arguments on concrete numbers, before anything compiles.
 
-Traced numbers pass them. A module states the ranges of its numbers once, in `bounds`: concrete numbers out of range are
-refused with a message; for traced ones `legal` is false in the program, whose results are then NaN.
+Traced numbers pass these checks. A module states the ranges of its numbers once, in `bounds`: concrete numbers out of
+range raise an error; for traced ones, `legal` is false in the program, whose results are then NaN.
 """
 
 import dataclasses
@@ -24,28 +24,29 @@ from jaxtyping import Array, Bool, Float
 
 from .parameters import as_html, as_text, contents, in_lines, one_line
 
-#: What the message about an angle above its bounds adds.
+#: Addition to the message about an angle above its bounds.
 IN_DEGREES = "; angles are in radians: did you mean np.radians({})?"
 
 
 def as_number(value: Any) -> Float[Array, "..."]:
-    """Convert to a floating-point array of the default precision; what is not a number is left for `require`."""
+    """Convert to a floating-point array of the default precision; anything that is not a number is left for
+    `require`."""
     try:
         if isinstance(value, str):
             raise TypeError
         return jnp.asarray(value, dtype=float)
     except (TypeError, ValueError):
-        # The types leave out what `require` will refuse.
+        # The types exclude what `require` will reject.
         return value  # pyright: ignore[reportReturnType]
 
 
 def as_number_or_none(value: Any) -> Float[Array, "..."] | None:
-    """As `as_number`, for a number that may be left out."""
+    """Like `as_number`, for an optional number."""
     return None if value is None else as_number(value)
 
 
 def as_known(value: Any) -> Float[Array, "..."]:
-    """As `as_number`, but what is known stays known inside a transformation; `jax.jit` would trace the array."""
+    """Like `as_number`, but a known number stays known inside a transformation; `jax.jit` would trace the array."""
     if any(is_traced(leaf) for leaf in jax.tree.leaves(value)):
         return as_number(value)
     with jax.ensure_compile_time_eval():
@@ -58,7 +59,7 @@ def is_traced(value: Any) -> bool:
 
 
 def shown(value: Any) -> str:
-    """The value as a message should show it: a plain number if it is one."""
+    """The value for a message: a plain number if possible."""
     if any(is_traced(leaf) for leaf in jax.tree.leaves(value)):
         return as_text(value)
     array = np.asarray(value)
@@ -66,7 +67,7 @@ def shown(value: Any) -> str:
 
 
 def _first(numbers: np.ndarray, holds: np.ndarray) -> str:
-    """The first number for which the condition does not hold."""
+    """The first number for which the condition is false."""
     return shown(numbers[~holds].ravel()[0]) if numbers.ndim else shown(numbers)
 
 
@@ -86,7 +87,7 @@ def require(
     **Arguments:**
 
     - `value`: a number or an array of numbers; a traced value or traced bounds pass unchecked.
-    - `name`: what to call it in the message.
+    - `name`: name in the message.
     - `above`, `at_least`, `below`, `at_most`: bounds, each a number.
     - `why`: a remark to append to the message.
     - `unit`: "rad" for an angle, so that the message asks whether a number above its bounds is in degrees.
@@ -98,7 +99,7 @@ def require(
     # NumPy would convert these to numbers.
     if value is None or isinstance(value, str):
         raise ValueError(f"{name} = {value!r} is not a number")
-    # A pytree rebuilt by a JAX transformation may hold placeholders; they never reach here through a constructor.
+    # A pytree rebuilt by a JAX transformation may hold placeholders, but not if it was made by a constructor.
     try:
         numbers = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
@@ -126,61 +127,63 @@ def require(
 
 
 def require_scalars(values: dict[str, Any], otherwise: str) -> None:
-    """Raise `ValueError` unless each of these, by its name, is one number or left out; `otherwise`: what takes lists."""
+    """Raise `ValueError` unless each named value is one number or omitted; `otherwise` says what accepts lists."""
     for name, value in values.items():
         if value is not None and np.ndim(value) != 0:
             raise ValueError(f"{name} must be one number, not of shape {np.shape(value)}; {otherwise}")
 
 
 def require_kind(value: Any, name: str, kind: type, example: str = "") -> None:
-    """Raise `ValueError` unless this is of a kind, such as a `Scene`.
+    """Raise `ValueError` unless a value is of a kind, such as a `Scene`.
 
-    The message about a module of the same name from another package, such as a stroller's scene for a top, names both
-    packages; otherwise it ends in the `example`.
+    If the value is a module of the same name from another package, such as a stroller's scene for a top, the message
+    names both packages; otherwise it ends in the `example`.
     """
     if isinstance(value, kind):
         return
     wanted = kind.__name__.removeprefix("Abstract")
     if type(value).__name__ == wanted:
         theirs, ours = (one.__module__.partition(".")[0] for one in (type(value), kind))
-        raise ValueError(f"{name} is a {theirs}.{wanted} and must be a {ours}.{wanted}: the packages have one each")
+        raise ValueError(f"{name} is a {theirs}.{wanted} and must be a {ours}.{wanted}: each package has its own")
     raise ValueError(f"{name} = {value!r} must be a {wanted}{example}{uncalled(value)}")
 
 
 def uncalled(value: Any) -> str:
-    """What a message adds where a function stands for its result, as `tippe.presets.wooden` for `tippe.presets.wooden()`."""
+    """Hint for a function passed instead of its result, as `tippe.presets.wooden` for `tippe.presets.wooden()`."""
     return f"; did you mean {value.__name__}()?" if inspect.isfunction(value) else ""
 
 
 def require_one_run(run: Any, action: str, many: str) -> None:
-    """Raise `ValueError` for a batch of runs. **Arguments:** `action`: what takes one run; `many`: what serves several."""
+    """Raise `ValueError` for a batch of runs. **Arguments:** `action`: what takes one run; `many`: what accepts
+    several."""
     if np.ndim(run.t) != 1:
         raise ValueError(
-            f"this is a batch of runs, with t of shape {np.shape(run.t)}, and {action} takes one run: take the first by "
+            f"this is a batch of runs, with t of shape {np.shape(run.t)}, and {action} takes one run: select one by "
             f"jax.tree.map(lambda leaf: leaf[0], runs){many}"
         )
 
 
 def require_outside(values: Any, caller: str, instead: str) -> None:
-    """Raise `ValueError` inside `jit`, `vmap` and `grad` for what runs on the host only.
+    """Raise `ValueError` inside `jit`, `vmap` and `grad` for functions that run on the host only.
 
-    **Arguments:** `values`: what was handed over; `caller`: the function; `instead`: what to use there.
+    **Arguments:** `values`: the arguments to check; `caller`: the function; `instead`: what to use inside
+    transformations.
     """
-    # Inside `jit` a new array is traced even if all numbers are known.
+    # Inside `jit`, a new array is traced even if all its numbers are known.
     if any(is_traced(leaf) for leaf in (as_number(0.0), *jax.tree.leaves(values))):
         raise ValueError(f"{caller} cannot be called inside jit, vmap or grad: use {instead} there")
 
 
 def require_whole(value: Any, name: str, at_least: int) -> None:
-    """Raise `ValueError` unless this is a whole number of at least so much."""
+    """Raise `ValueError` unless the value is a whole number of at least `at_least`."""
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < at_least:
         raise ValueError(f"{name} = {value!r} must be a whole number of at least {at_least}")
 
 
 def require_increasing(values: Any, name: str) -> None:
-    """Raise `ValueError` unless this is a list of one number or more, each greater than the one before it.
+    """Raise `ValueError` unless the values are a non-empty list, each greater than the one before.
 
-    **Arguments:** `values`: numbers; traced ones pass, if they are a list; `name`: what to call them in the message.
+    **Arguments:** `values`: numbers; traced lists pass; `name`: name in the message.
     """
     if np.ndim(values) != 1 or np.shape(values)[0] == 0:
         raise ValueError(
@@ -199,13 +202,13 @@ def require_increasing(values: Any, name: str) -> None:
 
 
 def require_flag(value: Any, name: str) -> None:
-    """Raise `ValueError` unless this is true or false; a word such as "no" would count as true."""
+    """Raise `ValueError` unless the value is true or false; a word such as "no" would count as true."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} = {value!r} must be True or False")
 
 
 def require_folder(path: Path, name: str) -> None:
-    """Make a folder if it is not there, and raise `OSError` unless files can be written in it."""
+    """Create a folder if necessary, and raise `OSError` unless files can be written in it."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
@@ -236,16 +239,17 @@ def require_file(path: Any, name: str, *endings: str) -> Path:
 
 
 def require_package(name: str, extra: str, purpose: str) -> None:
-    """Raise `ModuleNotFoundError` unless an optional package is installed. To be called before the work begins.
+    """Raise `ModuleNotFoundError` unless an optional package is installed. Call this before the work begins.
 
-    **Arguments:** `name`: of the package; `extra`: of this distribution that has it; `purpose`: what needs it.
+    **Arguments:** `name`: of the package; `extra`: the extra of this distribution that installs it; `purpose`: what
+    needs it.
     """
     if find_spec(name) is None:
         raise ModuleNotFoundError(f"{purpose} needs {name}: pip install 'nonholonomic[{extra}]'", name=name)
 
 
 class Bound(NamedTuple):
-    """A number, what to call it, and the range in which it is legal; as for `require`."""
+    """A number, its name, and the range in which it is legal; arguments as for `require`."""
 
     value: Any
     name: str
@@ -275,7 +279,7 @@ class Bound(NamedTuple):
 
 
 class Bounded(eqx.Module):
-    """A module whose numbers have ranges and units; concrete numbers out of range are refused."""
+    """A module whose numbers have ranges and units; concrete numbers out of range raise an error."""
 
     #: The units of the module's own numbers, by name.
     units: ClassVar[dict[str, str]] = {}
@@ -283,12 +287,13 @@ class Bounded(eqx.Module):
     def bounds(self) -> Iterable[Bound]:
         """The ranges of the module's own numbers, in the order in which they are to be checked.
 
-        A generator, so that a range computed from another number is computed only after that number has been checked.
+        This is a generator, so that a range computed from another number is computed only after that number has been
+        checked.
         """
         return ()
 
     def suspicion(self) -> str | None:
-        """What legal numbers make one suspect, such as another unit; `None` if nothing."""
+        """A doubt that legal numbers raise, such as another unit; `None` if there is none."""
         return None
 
     def __check_init__(self):
@@ -296,11 +301,11 @@ class Bounded(eqx.Module):
         require_all(self.bounds())
         suspicion = self.suspicion()
         if suspicion is not None:
-            # From one place of the code, so that Python shows each of them once.
+            # Warn from one place in the code, so that Python shows each warning once.
             warnings.warn(suspicion, UserWarning, stacklevel=1)
 
     def _require_one_shape(self) -> None:
-        """Raise `ValueError` for lists of different lengths among the module's own numbers."""
+        """Raise `ValueError` if the module's own numbers are lists of different lengths."""
         shapes = {}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
@@ -313,8 +318,8 @@ class Bounded(eqx.Module):
         except ValueError:
             lists = ", ".join(f"{name} of shape {shape}" for name, shape in shapes.items() if shape)
             raise ValueError(
-                f"{type(self).__name__}: {lists}: the numbers of one object are scalars or lists of one length; a grid "
-                "of all combinations is made by the tables, such as inversion_table"
+                f"{type(self).__name__}: {lists}: the numbers of one object must be scalars or lists of equal length; "
+                "for a grid of all combinations, use a table, such as inversion_table"
             ) from None
 
     def __repr__(self) -> str:
@@ -335,7 +340,7 @@ def require_all(bounds: Iterable[Bound]) -> None:
 
 
 def all_bounds(module: Any) -> Iterator[Bound]:
-    """The ranges of the numbers of a module and of the modules in it; none for a module that is not `Bounded`."""
+    """The ranges of the numbers of a module and its submodules; none for a module that is not `Bounded`."""
     if isinstance(module, Bounded):
         yield from module.bounds()
         for field in dataclasses.fields(module):
@@ -343,15 +348,15 @@ def all_bounds(module: Any) -> Iterator[Bound]:
 
 
 def legal(bounds: Iterable[Bound]) -> Bool[Array, "..."]:
-    """Whether all numbers are within their ranges, for numbers that were traced when `require` saw them.
+    """Whether all numbers are within their ranges, for numbers that were traced when `require` checked them.
 
-    Numbers of different shapes are broadcast: one for all cells, or one for each.
+    Numbers of different shapes are broadcast: one for all cells, or one per cell.
     """
     return functools.reduce(jnp.logical_and, (bound.holds for bound in bounds), jnp.asarray(True))
 
 
 def nan_unless(holds: Bool[Array, ""], tree: Any) -> Any:
     """The tree with every floating-point number, and every derivative through it, NaN unless `holds`."""
-    # A product, not a select: the derivative of what was not selected would be 0.
+    # Multiply instead of selecting: the derivative of a value that was not selected would be 0.
     factor = jnp.where(holds, 1.0, jnp.nan)
     return jax.tree.map(lambda leaf: leaf * factor if eqx.is_inexact_array(leaf) else leaf, tree)

@@ -1,7 +1,7 @@
-"""What is done for XLA on a CPU, each trick with what it gains, the versions it is for, and when it can go.
+"""Workarounds for XLA on a CPU: for each, what it gains, the versions that need it, and when it can be removed.
 
-Measured on jaxlib 0.10.2 and a core with AVX-512 unless another version is named; `benchmarks/scaling.py` and
-`benchmarks/work_precision.py` time the whole.
+Unless another version is named, gains are measured with jaxlib 0.10.2 on a core with AVX-512; `benchmarks/scaling.py`
+and `benchmarks/work_precision.py` measure all of them together.
 """
 
 import functools
@@ -24,43 +24,50 @@ Result = TypeVar("Result")
 
 
 def _compiler(**options: Any) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
-    """`filter_jit` with options of `jax.jit`, which Equinox's types leave out; compiled functions take NumPy's arrays too."""
+    """`filter_jit` with options of `jax.jit`, which Equinox's types omit; compiled functions also accept NumPy
+    arrays."""
     return eqx.filter_jit(**options)
 
 
 #: Vectors of 512 bits, which compilers avoid by default, make the sums over stages 1.2 to 1.6 times as fast. JAX
-#: takes compiler options only for the outermost compiled function, so it is for programs that are called on their own. It can
-#: go when XLA prefers 512 bits by itself; without AVX-512 it does nothing.
+#: accepts compiler options only for the outermost compiled function, so this is for programs that are called on their
+#: own. It has no effect without AVX-512. It can be removed when XLA prefers 512 bits by itself.
 compiled_alone = _compiler(compiler_options={"xla_cpu_prefer_vector_width": 512})
 
-#: For programs that are called on their own and run for a moment only: jaxlib 0.10 compiles them in half of the time if told to
-#: leave out the newer of its two ways to compile fused operations. Loops may run slower, a table with two derivatives by a
-#: quarter. It can go with 0.10: later versions have a single way, and refuse the option.
-compiled_quickly = _compiler(
-    compiler_options={"xla_cpu_use_fusion_emitters": False} if jaxlib_version.startswith("0.10.") else {}
+_HAS_OLDER_EMITTERS = jaxlib_version.startswith("0.10.")
+
+#: For programs that are called on their own and run only for a moment: jaxlib 0.10 compiles them in half the time
+#: without the newer of its two emitters of fused operations. Loops may run slower, a table with two derivatives by a
+#: quarter. It can be removed with 0.10: later versions have a single emitter, and reject the option.
+compiled_quickly = _compiler(compiler_options={"xla_cpu_use_fusion_emitters": False} if _HAS_OLDER_EMITTERS else {})
+
+#: XLA's flags for short jobs: without LLVM's optimisations, and without the newer emitter. A flag that XLA does not know ends
+#: the process, and later versions do not know the second.
+QUICK_FLAGS = "--xla_backend_optimization_level=0" + (
+    " --xla_cpu_use_fusion_emitters=false" if _HAS_OLDER_EMITTERS else ""
 )
 
 
 def compile_quickly() -> None:
-    """Compile all programs of this process without LLVM's optimisations, unless XLA_FLAGS says otherwise: for jobs of seconds.
+    """Compile all programs of this process with `QUICK_FLAGS`, unless XLA_FLAGS is set: for jobs of seconds.
 
-    It halves the time of compiling; loops run three times as slow. XLA reads its flags when it is used first.
+    This halves the compile time; loops run three times as slowly. XLA reads its flags on its first use.
     """
-    emitters = ["--xla_cpu_use_fusion_emitters=false"] if jaxlib_version.startswith("0.10.") else []
-    os.environ.setdefault("XLA_FLAGS", " ".join(["--xla_backend_optimization_level=0", *emitters]))
+    os.environ.setdefault("XLA_FLAGS", QUICK_FLAGS)
 
 
-#: For what is done once before a run: called on its own it is one program and not dozens of small ones, each of which takes
-#: 40 ms to compile; inside other programs it leaves no trace.
+#: For preparations that run once before a run: called on their own they are one program and not dozens of small ones,
+#: each of which takes 40 ms to compile; inside other programs this has no effect.
 compiled_setup = _compiler(inline=True)
 
 
 def stored(*values: Float[Array, "..."] | None) -> tuple[Any, ...]:
-    """The same values, computed once where several results depend on them; `None` stays.
+    """The same values, computed once even if several results depend on them; `None` stays `None`.
 
-    XLA otherwise fuses every result with all that leads to it and evaluates the common part again for each. A barrier
-    alone does not keep it from that; joining the values, with a barrier behind it, does: 1.2 times for the top's field. It also
-    gives one value to all who read it: two kernels may round differently. It can go when XLA's fusion counts what it repeats.
+    Otherwise XLA fuses every result with everything that leads to it, and evaluates the common part again for each. A
+    barrier alone does not prevent this; joining the values with a barrier behind them does, and makes the top's field
+    1.2 times as fast. It also gives all readers the same value: two kernels may round differently. It can be removed
+    when XLA's fusion counts what it repeats.
     """
     present = [value for value in values if value is not None]
     if not present:
@@ -72,8 +79,12 @@ def stored(*values: Float[Array, "..."] | None) -> tuple[Any, ...]:
 def written_in_place(
     whole: Float[Array, "stack ..."], entry: Float[Array, "..."], at: Int[Array, ""]
 ) -> Float[Array, "stack ..."]:
-    """A stack of arrays with one of them replaced, in place: 1.2 times for a Runge-Kutta step over `at[].set`, which checks the
-    index, and over `dynamic_update_index_in_dim`, which is a call of its own and so copies. It can go when XLA inlines that."""
+    """A stack of arrays with one of them replaced, in place.
+
+    This makes a Runge-Kutta step 1.2 times as fast as with `at[].set`, which checks the index, or with
+    `dynamic_update_index_in_dim`, which is a separate call and therefore copies. It can be removed when XLA inlines
+    that call.
+    """
     start = (at, *(0 for _ in entry.shape))
     return jax.lax.dynamic_update_slice(whole, entry[None], start, allow_negative_indices=False)
 
@@ -81,29 +92,33 @@ def written_in_place(
 def written_by_component(
     whole: Float[Array, "stack components lanes"], entry: Float[Array, "components lanes"], at: Int[Array, ""]
 ) -> Float[Array, "stack components lanes"]:
-    """`written_in_place`, every component by itself, from where it is computed: joined first they are copied twice, which costs
-    a quarter of a Runge-Kutta step. It can go when XLA fuses a concatenation with the update that it is for."""
+    """`written_in_place` for every component separately, from where it is computed.
+
+    If the components are joined first, they are copied twice, which costs a quarter of a Runge-Kutta step. It can be
+    removed when XLA fuses a concatenation with the update that it is for.
+    """
     for row, component in enumerate(entry):
         whole = jax.lax.dynamic_update_slice(whole, component[None, None], (at, row, 0), allow_negative_indices=False)
     return whole
 
 
 def uncounted(going: Bool[Array, ""], carried: Int[Array, ""]) -> Bool[Array, ""]:
-    """The condition of a loop, joined with a carried number that is never negative.
+    """The condition of a loop, joined with a loop variable that is never negative.
 
-    XLA tries to count the passes of a loop whose condition reads a single carried value. To do so it copies all that leads to
-    the value's next one, which may be the whole body, and again in every round of its simplifications: a twelfth of the
-    compilation of derivatives by several numbers. Conditions that read two values are left alone. It can go when XLA looks at
-    how the value is changed before it copies.
+    XLA tries to count the iterations of a loop whose condition reads a single loop variable. To do so it copies
+    everything that leads to the variable's next value, possibly the whole body, and again in every round of its
+    simplifications: a twelfth of the time to compile derivatives by several numbers. XLA leaves conditions that read
+    two variables alone. This can be removed when XLA looks at how the variable changes before it copies.
     """
     return going & (carried >= 0)
 
 
 def least(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
-    """The least of some numbers, with the derivative of that one; what is not a number stays so.
+    """The least of some numbers, with the derivative of that number; NaN stays NaN.
 
-    JAX differentiates `minimum`, `maximum` and `clip` by asking which number equals the result. Where XLA computes that number
-    again and rounds it differently, none does, and the derivative is 0. It can go when JAX asks which number is less.
+    JAX differentiates `minimum`, `maximum` and `clip` by comparing each number with the result. If XLA computes a
+    number again and rounds it differently, no number is equal, and the derivative is 0. It can be removed when JAX
+    compares the numbers with each other.
 
     **Example:**
 
@@ -119,7 +134,7 @@ def least(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
 
 
 def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
-    """The greatest of some numbers, with the derivative of that one, as `least`.
+    """The greatest of some numbers, with the derivative of that number, like `least`.
 
     **Example:**
 
@@ -135,19 +150,23 @@ def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
 
 
 def on_device(*arrays: Float[ArrayLike, "..."]) -> tuple[Float[Array, "..."], ...]:
-    """NumPy's arrays as JAX's, without a compilation: `jnp.asarray` compiles a copy for every new shape since JAX 0.10, which
-    takes 30 ms. Not for numbers under a transformation. It can go when `jnp.asarray` only copies."""
+    """NumPy arrays as JAX arrays, without compiling.
+
+    Since JAX 0.10, `jnp.asarray` compiles a copy for every new shape, which takes 30 ms. Not for traced numbers. This
+    can be removed when `jnp.asarray` only copies.
+    """
     return tuple(jax.device_put(np.asarray(array, dtype=float)) for array in arrays)
 
 
 def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """A function of a tree of arrays that XLA compiles, on a CPU, into a single kernel.
 
-    Otherwise every fused operation of a loop's body is a call of its own, and for blocks that fit the first caches calling
-    costs as much as computing. XLA does so by itself for loops over very small arrays only. The gain is 2.5 times with jaxlib
-    0.10.2 and 1.3 times with 0.12. It can go when XLA's threshold can be set for one program.
+    Otherwise every fused operation in the body of a loop is a separate call; for blocks that fit the first-level
+    caches, calling costs as much as computing. XLA does this by itself only for loops over very small arrays. The gain
+    is 2.5 times with jaxlib 0.10.2 and 1.3 times with 0.12. It can be removed when XLA's threshold can be set for one
+    program.
 
-    JAX chooses the platform when it lowers a program, and on no other than a CPU does the function leave a trace
+    JAX chooses the platform when it lowers a program; on platforms other than CPUs this function has no effect
     (`jax.export` lowers for platforms that this machine does not have).
     """
     if not _knows_the_attributes():
@@ -155,10 +174,11 @@ def in_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
     def called(argument: Any) -> Any:
         plain = jax.make_jaxpr(jnp.negative)(0.0).jaxpr.eqns[0].ctx
-        # The attributes also keep the small functions inside, such as `where`, from being fused into all that use them.
+        # The attributes also prevent that small functions inside, such as `where`, are fused into everything that uses
+        # them.
         with set_xla_metadata(**_ATTRIBUTES):
             closed, shape = jax.make_jaxpr(function, return_shape=True)(argument)
-        # What the function closes over becomes its first arguments.
+        # The values that the function closes over become its first arguments.
         inputs = [*closed.jaxpr.constvars, *closed.jaxpr.invars]
         program = closed.jaxpr.replace(constvars=[], invars=inputs)
         results = _kernel.bind(*closed.consts, *jax.tree.leaves(argument), program=program, plain=plain)
@@ -183,8 +203,8 @@ def _called_as_one(*arguments: Array, program: Jaxpr, plain: Any) -> list[Array]
         look = sum(jnp.ravel(leaf)[0].astype(float) for leaf in arguments)
         return jaxpr_as_fun(ClosedJaxpr(program, ()))(*arguments), look
 
-    # XLA 0.10.2 aborts on a call with an argument that it does not use. So each is looked at, from behind a
-    # barrier, for what is known to be constant would not be.
+    # XLA 0.10.2 aborts on a call with an argument that is not used. Therefore use each argument behind a barrier,
+    # without which XLA would simplify the use away.
     with set_xla_metadata(**_ATTRIBUTES):
         results, _ = jax.lax.optimization_barrier(jax.jit(looking_at_all)(*jax.lax.optimization_barrier(arguments)))
     return results
@@ -196,10 +216,10 @@ def _inlined(*arguments: Array, program: Jaxpr, plain: Any) -> list[Array]:
 
 
 def _without_attributes(program: Any, plain: Any) -> Any:
-    """A program whose equations, and those of the programs inside, have a plain context; any other value as it is."""
+    """A program with plain contexts in its equations and those of the programs inside; other values unchanged."""
     if type(program) in (tuple, list):
         return type(program)(_without_attributes(one, plain) for one in program)
-    # Since JAX 0.12 a `ClosedJaxpr` is a `Jaxpr`.
+    # Since JAX 0.12, a `ClosedJaxpr` is a `Jaxpr`.
     if isinstance(program, ClosedJaxpr) and program.jaxpr is not program:
         return program.replace(jaxpr=_without_attributes(program.jaxpr, plain))
     if not isinstance(program, Jaxpr):
@@ -212,8 +232,8 @@ def _without_attributes(program: Any, plain: Any) -> Any:
 
 
 def _without_unused(used: list[bool], *others: Any) -> tuple[list[bool], Any]:
-    """The equation with a program in which nothing is computed that no output needs, as JAX 0.12 does with its own."""
-    # Since JAX 0.12 a list of inputs stands between the two.
+    """The equation with a program without unused computations, as JAX 0.12 prunes its own."""
+    # Since JAX 0.12, a list of inputs is between the two.
     equation = others[-1]
     if not any(used):
         return [False] * len(equation.invars), None
@@ -228,14 +248,14 @@ mlir.register_lowering(_kernel, mlir.lower_fun(_called_as_one, multiple_results=
 
 
 def _knows_the_attributes() -> bool:
-    """Whether the kernel attributes are known to help: they were tried with jaxlib 0.10 to 0.12."""
+    """Whether the kernel attributes are known to help: they were tested with jaxlib 0.10 to 0.12."""
     minor = int(jaxlib_version.split(".")[1])
     if jaxlib_version.startswith("0.") and 10 <= minor <= 12:
         return True
     warnings.warn(
-        f"loops are compiled without XLA's kernel attributes, which were tried with jaxlib 0.10 to 0.12, not with "
-        f"{jaxlib_version}: results are the same, tables may take up to 2.5 times as long. "
-        "Install one of these versions where that matters.",
+        f"loops are compiled without XLA's kernel attributes, which are tested with jaxlib 0.10 to 0.12, but not with "
+        f"{jaxlib_version}: results are the same, but tables may take up to 2.5 times as long. "
+        "If that matters, install one of these versions.",
         stacklevel=2,
     )
     return False

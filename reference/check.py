@@ -1,8 +1,9 @@
 """Check a simulator against the reference scenes: `python reference/check.py with_nonholonomic [PART OF A NAME ...]`.
 
-The module defines `simulate(scene) -> {"events": [times], "states": {name: values}}` for a scene as in `scenes`. A simulator
-may leave out events or quantities, and returns `None` for a scene that it cannot run. A report line has the error of every
-event time [s] and the largest error of each quantity, relative to its largest value, and in brackets the file's error bounds.
+The module defines `simulate(scene) -> {"events": [times], "states": {name: values}}` for a scene as in `scenes`. A
+simulator may omit events or quantities, and returns `None` for a scene that it cannot run. Each report line shows the
+error of every event time [s], the largest error of each quantity relative to its largest value, and the file's error
+bounds in brackets.
 """
 
 import importlib
@@ -16,7 +17,7 @@ SCENES = Path(__file__).parent / "scenes"
 
 
 def errors(scene: dict, answer: dict) -> dict[str, tuple[float, float]]:
-    """Quantity -> error and bound, both relative but for event times [s]; a missing event has an infinite error."""
+    """Quantity -> error and bound, both relative except for event times [s]; a missing event has an infinite error."""
     compared = {}
     times = answer.get("events", [])
     for number, event in enumerate(scene["events"] if "events" in answer else []):

@@ -1,8 +1,8 @@
 """Write the scenes of `reference/scenes`: `python reference/generate.py [FAMILY ...]`, half an hour on one core for all.
 
-The numbers come from the programs in `tests/physics/`, written in NumPy and SciPy; nothing here imports the simulator. Every
-scene is computed twice, by two formulations or at two tolerances. The values are those of the finer run. An error bound is the
-largest difference between the two runs, and at least `ROUND_OFF` times the size of the quantity.
+The numbers come from the programs in `tests/physics/`, written in NumPy and SciPy; nothing here imports the simulator.
+Every scene is computed twice, by two formulations or at two tolerances. The values are those of the finer run. An error
+bound is the largest difference between the two runs, and at least `ROUND_OFF` times the size of the quantity.
 """
 
 import json

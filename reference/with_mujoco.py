@@ -1,7 +1,8 @@
-"""The reference scenes of a sphere on a level plane by MuJoCo, for `check.py`: `pip install mujoco`, about 20 s a scene.
+"""The reference scenes of a sphere on a level plane by MuJoCo, for `check.py`: `pip install mujoco`, about 20 s per
+scene.
 
-MuJoCo's contact is soft, and its friction is Coulomb's. Exact Coulomb friction is left to MuJoCo. Other laws of friction are
-applied as a force to a contact without friction, with the normal force of the step before.
+MuJoCo's contact is soft, and its friction is Coulomb's. MuJoCo computes exact Coulomb friction itself. Other friction
+laws are applied as a force to a frictionless contact, with the normal force of the previous step.
 """
 
 from typing import Any

@@ -11,7 +11,7 @@ import stroller
 import tippe
 
 TOLERANCE = 1e-12
-#: Under exact Coulomb friction a slip ends where what is left of it is within the tolerance.
+#: Under exact Coulomb friction, a slip ends when the remaining slip is within the tolerance.
 HYBRID_TOLERANCE = 1e-11
 
 
@@ -61,7 +61,7 @@ def top_launch(scene: dict[str, Any]) -> tippe.Launch:
     t2 = np.cross(n, t1)
     spin = w @ e
     rest = w - spin * e
-    # The launch has the velocity of a sphere's centre, and that of other bodies' centre of mass.
+    # The velocity of a launch is that of a sphere's centre, or of the centre of mass for other bodies.
     velocity = start["velocity"] + (0.0 if "polar" in scene["body"] else scene["body"]["offset"]) * np.cross(w, e)
     theta = np.arctan2(np.linalg.norm(np.cross(n, e)), n @ e)
     moving = np.linalg.norm(velocity) > 1e-14 or np.linalg.norm(rest) > 1e-11
@@ -91,7 +91,7 @@ def top(scene: dict[str, Any]) -> dict[str, Any]:
     elif scene["outcome"] == "contact_lost":
         events = [float(run.end_time)] if run.status == "contact_lost" else []
     elif exact:
-        # Not the begins: the onset of a slip is solved apart, between two segments.
+        # Without the beginnings: the onset of a slip is solved separately, between two segments.
         events = [segment.end for segment in run.dense.mode_segments[:-1]]
     elif "restitution" in scene:
         events = [time for time in run.hops.ravel() if time > 0.0][: len(scene["events"])]
@@ -108,8 +108,8 @@ class Push(eqx.Module):
 
     def __call__(self, t, motion):
         return tuple(
-            one["mean"] + one["amplitude"] * jnp.sin(one["frequency"] * t + one["phase"])
-            for one in (self.force, self.torque)
+            wave["mean"] + wave["amplitude"] * jnp.sin(wave["frequency"] * t + wave["phase"])
+            for wave in (self.force, self.torque)
         )
 
 
@@ -119,7 +119,7 @@ def ride(scene: dict[str, Any]) -> dict[str, Any]:
     side = "inside" if scene["arena"]["shape"] == "torus" else scene["arena"].get("side")
     set_up = stroller.Scene(body, surface, law, scene["gravity"], side, "absolute")
     place = tuple(start["position"])
-    east, north = (np.array(surface.in_fixed_frame(one)) for one in surface.chart(place)[1:])
+    east, north = (np.array(surface.in_fixed_frame(vector)) for vector in surface.chart(place)[1:])
     heading = np.arctan2(start["direction"] @ north, start["direction"] @ east)
     launch = stroller.Launch(place, heading, start["speed"], start["steering"], start["steering_rate"])
     push = Push(**jax.tree.map(jnp.asarray, scene["input"]))

@@ -1,6 +1,6 @@
-"""Strollers and rides to begin with.
+"""Ready-made strollers and rides.
 
-The papers on the stroller print no numbers, and no stroller was measured for these: they are declared, and of ordinary size.
+The papers on the stroller print no numbers. These values were chosen to be of ordinary size; no stroller was measured.
 
 **Example:**
 
@@ -23,7 +23,8 @@ from .model.stroller import Stroller
 def light() -> Stroller:
     """An empty stroller: 12 kg, 0.7 m from the rear axle to the front wheel.
 
-    Its yaw inertia of 1.5 kg m^2 is that of 12 kg spread 0.35 m about the rear axle. The centre of mass is above the rear axle.
+    Its yaw inertia of 1.5 kg m^2 corresponds to 12 kg at 0.35 m from the rear axle. The centre of mass is above the
+    rear axle.
 
     **Example:**
 

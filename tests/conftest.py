@@ -16,15 +16,10 @@ from nonholonomic.compiled_programs import (
     release_memory,
     resident_memory,
 )
+from nonholonomic.xla_cpu import compile_quickly
 
 #: The tests that a plain `pytest` chooses (`pyproject.toml`).
 ORDINARY = "not slow"
-
-
-def quick_to_compile() -> list[str]:
-    """XLA's flags of a quick compiler. One that a version does not know ends the process: jax 0.11 lost the older emitters."""
-    emitters = ["--xla_cpu_use_fusion_emitters=false"] if jax.__version_info__[:2] == (0, 10) else []
-    return ["--xla_backend_optimization_level=0", *emitters]
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -37,7 +32,7 @@ def pytest_configure(config: pytest.Config) -> None:
     with `XLA_FLAGS=`.
     """
     if config.option.markexpr == ORDINARY:
-        os.environ.setdefault("XLA_FLAGS", " ".join(quick_to_compile()))
+        compile_quickly()
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ and hasattr(config, "cache"):
         folder = nonholonomic.enable_compilation_cache(config.cache.mkdir("compiled"))
         if folder is not None:

@@ -21,8 +21,8 @@ from tippe.modes.impact import Impact, approach
 from tippe.modes.inversion_problem import InversionProblem
 from tippe.modes.sticking import contact_modes
 from tippe.runs.airborne_trajectory import arena_modes
-from tippe.runs.cells import run_kind_of
 from tippe.runs.flight_trajectory import level_modes
+from tippe.runs.run_kind import run_kind_of
 from tippe.runs.trajectory import TrajectoryProblem
 
 #: 16 to 44 ns for each number on a CPU, where a product takes one.

@@ -88,7 +88,7 @@ REFUSED = {
     ),
     "a launch of three thetas and two spins": (
         lambda: tippe.Launch([0.1, 0.2, 0.3], [100.0, 150.0]),
-        "Launch: theta of shape (3,), spin of shape (2,): the numbers of one object are scalars or lists of one length",
+        "Launch: theta of shape (3,), spin of shape (2,): the numbers of one object must be scalars or lists of equal length",
     ),
     "a ride of two speeds and three places": (
         lambda: stroller.Launch(([0.0, 1.0, 2.0], 0.0), 0.3, [1.0, 2.0]),
@@ -132,7 +132,7 @@ REFUSED = {
         lambda: batch(2, 51).to_table(),
         "this is a batch of runs, with t of shape (2, 51), and to_table takes",
     ),
-    "a batch for a page": (lambda: batch(2, 51).view(), "and a picture takes one run: take the first by jax.tree.map"),
+    "a batch for a page": (lambda: batch(2, 51).view(), "and a picture takes one run: select one by jax.tree.map"),
     "a page that is no page": (lambda: run_of_nothing().view("x.txt"), "path = 'x.txt' must end in .html or .htm"),
     "a page without a path": (lambda: run_of_nothing().view(3), "path = 3 must be the path of a file"),
     "an unknown variable to draw": (

@@ -18,11 +18,11 @@ from nonholonomic.sweeps import Table as Table
 
 from . import presets as presets
 from . import steady as steady
-from .fit.csv import read_recording as read_recording
-from .fit.data import InversionTimes as InversionTimes
-from .fit.data import Recording as Recording
 from .fit.identify import identify as identify
+from .fit.inversion_times import InversionTimes as InversionTimes
 from .fit.posterior import log_density as log_density
+from .fit.recording import Recording as Recording
+from .fit.recording import read_recording as read_recording
 from .model.convex import ConvexBody as ConvexBody
 from .model.convex import SpheroidBody as SpheroidBody
 from .model.friction import AbstractFriction as AbstractFriction

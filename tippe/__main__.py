@@ -164,11 +164,11 @@ def headings(options: argparse.Namespace) -> dict[str, str]:
     }
 
 
-def report(options: argparse.Namespace, found: dict[str, Table]) -> str:
+def report(options: argparse.Namespace, arenas: dict[str, Table]) -> str:
     """The tables as text."""
     lines = []
     for name, heading in headings(options).items():
-        rows = rows_of(options, found[name])
+        rows = rows_of(options, arenas[name])
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines += ["", f"Time until it has turned over, {heading}"]
         lines += ["  ".join(entry.rjust(width) for entry, width in zip(row, widths, strict=True)) for row in rows]
@@ -186,11 +186,11 @@ def picture(options: argparse.Namespace, run: Any) -> Any:
     return draw_launches([panel], 0.95 * np.pi, "for the first time above the dashed angle")
 
 
-def write_page(options: argparse.Namespace, found: dict[str, Table], run: Any, drawing: Path | None) -> Path:
+def write_page(options: argparse.Namespace, arenas: dict[str, Table], run: Any, drawing: Path | None) -> Path:
     """The page of the main job: the top in motion where three.js is installed, the tables, and the picture if there is one."""
     below = ""
     for name, heading in headings(options).items():
-        below += f"<h2>Time until it has turned over, {heading}</h2>" + table_as_html(rows_of(options, found[name]), 1)
+        below += f"<h2>Time until it has turned over, {heading}</h2>" + table_as_html(rows_of(options, arenas[name]), 1)
     below += "".join(f'<p class="note">{escape(line)}</p>' for line in described(options))
     below += "" if drawing is None else "<h2>θ(t)</h2>" + picture_as_html(drawing)
     above = "" if can_view() else f'<p class="note">{NO_VIEW}</p>'
@@ -217,10 +217,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         print("\n".join(described(options)), flush=True)
         require_folder(options.out, "--out")
-        found, run = tables(options)
-        print(report(options, found), flush=True)
+        arenas, run = tables(options)
+        print(report(options, arenas), flush=True)
         with status_line("drawing") as line:
-            written, drawing = [options.out / f"{arena}.h5" for arena in found], None
+            written, drawing = [options.out / f"{arena}.h5" for arena in arenas], None
             if find_spec("matplotlib") is None:
                 with line.aside():
                     print(
@@ -230,13 +230,13 @@ def main(arguments: list[str] | None = None) -> int:
                 drawing = options.out / "theta.png"
                 picture(options, run).savefig(drawing, dpi=130)
                 written.append(drawing)
-            shown = write_page(options, found, run, drawing)
+            shown = write_page(options, arenas, run, drawing)
     except (ValueError, OSError) as error:
         print(f"python -m tippe: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         raise KeyboardInterrupt(saved(options)) from None
-    cells = sum(table.status.size for table in found.values())
+    cells = sum(table.status.size for table in arenas.values())
     print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
     print(f"Wrote {', '.join(map(str, written))}.")
     print(f"To see the top climb onto its stem, open {shown}{'' if can_view() else f'. {NO_VIEW}'}")

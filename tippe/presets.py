@@ -1,4 +1,4 @@
-"""Tops from a classroom and from the literature, each with its source.
+"""Ready-made tops from a classroom and from the literature, each with its source.
 
 **Example:** a wooden top, spun by hand with `tippe.Launch.degrees(theta=6, rpm=1900)`, climbs onto its stem within 3 s.
 
@@ -21,8 +21,8 @@ from .model.top import Stem, Top
 def wooden() -> Top:
     """A classroom top of beech, 4 cm across and 4.7 cm high, drilled around a stem 1 cm thick, of 18 g.
 
-    The shape is ours, after the wooden tippe tops of toy shops: a sphere with its cap cut off, hollow around the stem. No
-    particular top was measured.
+    We designed the shape after the wooden tippe tops of toy shops: a sphere with its cap cut off, hollow around the
+    stem. No particular top was measured.
 
     **Example:**
 
@@ -36,9 +36,9 @@ def wooden() -> Top:
 def classroom(surface: AbstractSurface = Plane()) -> Scene:  # noqa: B008
     """The wooden top on a table, or on another surface: Coulomb friction, through flights and onto the stem.
 
-    The coefficient 0.3 is usual for wood on wood. The slip speed 0.05 m/s, below which friction falls to zero, stands for a
-    contact that is a small disc: a spin of 200 rad/s moves the rim of a disc of 0.25 mm that fast. The inversion time depends
-    on the slip speed (`docs/tutorials/friction.md`).
+    The coefficient 0.3 is usual for wood on wood. The slip speed 0.05 m/s, below which friction falls to zero,
+    represents a small contact disc: at a spin of 200 rad/s, the rim of a disc of 0.25 mm moves at this speed. The
+    inversion time depends on the slip speed (`docs/tutorials/friction.md`).
 
     **Example:** in a cylinder.
 
@@ -51,8 +51,8 @@ def classroom(surface: AbstractSurface = Plane()) -> Scene:  # noqa: B008
 def rutstam() -> Top:
     """Rutstam's top: 20 g, R = 2 cm, alpha = 0.3, I3 = 2/5 m R^2, I1 = 131/350 m R^2 (his later papers have this I1).
 
-    He computes with viscous friction, `Viscous(0.3)`. The papers do not say how the top is made, and give it
-    no stem. I1 = 235/625 m R^2 in SIGMA 8 (2012) 019; use that value for that paper's figures.
+    He computes with viscous friction, `Viscous(0.3)`. The papers do not say how the top is made, and it has no stem.
+    SIGMA 8 (2012) 019 has I1 = 235/625 m R^2; use that value for the figures of that paper.
 
     **Example:**
 
@@ -66,8 +66,8 @@ def rutstam() -> Top:
 def cohen() -> Top:
     """Cohen's top: 15 g, R = 2.5 cm, a = 0.5 cm, I1 = I3 = 2/5 m R^2 (Am. J. Phys. 45 (1977) 12).
 
-    He computes with Coulomb friction, mu = 0.3. The paper does not say how friction behaves as the slip vanishes, and exact
-    Coulomb friction does not turn this top over: regularised with 0.11 m/s it follows his Figure 5
+    He computes with Coulomb friction, mu = 0.3. The paper does not say how friction behaves as the slip vanishes, and
+    exact Coulomb friction does not turn this top over; regularised with 0.11 m/s, it follows his Figure 5
     (`examples/cohens_figure.py`). The top has no stem.
 
     **Example:**
@@ -82,8 +82,8 @@ def cohen() -> Top:
 def leine_glocker() -> Top:
     """Leine and Glocker's top with a stem: 6 g, R = 1.5 cm (Eur. J. Mech. A/Solids 22 (2003) 193).
 
-    Their top starts at theta = 0.1 rad with 180 rad/s and mu = 0.3, under Coulomb-Contensou friction. The moments of inertia
-    are given as numbers; how the top is made is not said.
+    Their top starts at theta = 0.1 rad with 180 rad/s and mu = 0.3, under Coulomb-Contensou friction. The paper gives
+    the moments of inertia as numbers, but not how the top is made.
 
     **Example:**
 

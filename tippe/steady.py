@@ -1,13 +1,13 @@
-"""Steady motions of the tippe top, their stability, and the thresholds and groups that follow (`tippe.md`, section 6).
+"""Steady motions of the tippe top, their stability, and the resulting thresholds and groups (`tippe.md`, section 6).
 
 A standing top spins with its axis along the normal: upright (stem out, theta = 0) or inverted (stem in, theta = pi). On
-the plane there are tumbling tops between: the axis precesses at a fixed inclination, the centre of mass at rest,
-without slip. The formulas hold for every friction law that vanishes with the slip only, not for `Contensou` and
-`Rolling`, under which every spin runs down; alpha = a / R and gamma = I1 / I3. Of a top with a stem they describe the motions
-on its own sphere; only `inverted_critical_spin` is of the stem, on which such a top stands inverted.
+the plane, tumbling tops lie between: the axis precesses at a fixed inclination, with the centre of mass at rest and
+without slip. The formulas hold for friction laws that vanish only with the slip, not for `Contensou` and `Rolling`,
+under which every spin decays; alpha = a / R and gamma = I1 / I3. For a top with a stem, they describe the motions on
+its own sphere; only `inverted_critical_spin` refers to the stem, on which such a top stands inverted.
 
-The stability matrices are Jacobians of the scene's own field, less the directions that are neutral by symmetry or by
-conservation, so that an eigenvalue with positive real part is an instability and nothing else.
+The stability matrices are Jacobians of the scene's own field, without the directions that are neutral by symmetry or by
+conservation, so an eigenvalue with a positive real part always means instability.
 
 **Example:**
 
@@ -48,9 +48,9 @@ from .model.top import Top
 def proportions(body: Top) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """The two numbers that classify a top: alpha = a / R and gamma = I1 / I3.
 
-    **Raises:** `ValueError` for a body that is no `Top`, of which these formulas do not hold.
+    **Raises:** `ValueError` for a body other than a `Top`, for which these formulas do not hold.
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> alpha, gamma = steady.proportions(top)
     >>> print(f"{alpha:.2f} {gamma:.3f}")
@@ -62,12 +62,12 @@ def proportions(body: Top) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
 
 
 def group(body: Top) -> str:
-    """Which of the three groups a top belongs to (Rutstam 2012; Ciocci et al. 2012).
+    """The group of a top (Rutstam 2012; Ciocci et al. 2012).
 
-    **Returns:** "I" if gamma < 1 - alpha: it stands upright at every spin and never inverts; "III" if gamma > 1 +
-    alpha: it never stands inverted, and ends tumbling; "II" between: it inverts if Jellett's constant is large enough.
+    **Returns:** "I" if gamma < 1 - alpha: the top stands upright at every spin; "III" if gamma > 1 + alpha: it never
+    stands inverted, and ends tumbling; "II" otherwise: it inverts if Jellett's constant is large enough.
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> steady.group(top)
     'II'
@@ -77,11 +77,12 @@ def group(body: Top) -> str:
 
 
 def folds(body: Top) -> bool:
-    """Whether Jellett's constant has an extremum over the tumbling angles of a top of group II, and so hysteresis.
+    """Whether Jellett's constant has an extremum over the tumbling angles of a top of group II, which causes
+    hysteresis.
 
     It has none if gamma > 1 - delta, delta = (1 + 6 alpha + alpha^2 - (1 - alpha) sqrt(1 + 14 alpha + alpha^2)) / 8.
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> steady.folds(top), steady.folds(tippe.Top(0.02, 0.02, 0.006, I1=2.5e-6, I3=3.2e-6))
     (False, True)
@@ -95,7 +96,7 @@ def folds(body: Top) -> bool:
 
 
 def _root_of_ratio(value: Float[Array, "..."], excess: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Square root of value / excess, or infinity where the excess is not positive."""
+    """Square root of value / excess, or infinity if the excess is not positive."""
     return jnp.where(excess > 0.0, jnp.sqrt(value / jnp.where(excess > 0.0, excess, 1.0)), jnp.inf)
 
 
@@ -104,7 +105,7 @@ def upright_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
 
     omega^2 = m g a (1 - alpha)^2 / (I3 (gamma - 1 + alpha)).
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> print(f"{steady.upright_critical_spin(scene):.1f} rad/s")
     27.7 rad/s
@@ -115,11 +116,11 @@ def upright_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
 
 
 def inverted_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
-    """Spin [rad/s] above which the inverted top on the plane is stable, on its stem if it has one; infinite if it never is.
+    """Spin [rad/s] above which the inverted top on the plane (on its stem, if any) is stable; infinite if it never is.
 
     omega^2 = m g a (1 + alpha)^2 / (I3 (1 + alpha - gamma)), for a stem with its offset and radius (`tippe.md`, sections 4, 6).
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> print(f"{steady.inverted_critical_spin(scene):.1f} rad/s")
     41.3 rad/s
@@ -137,7 +138,7 @@ def jellett_thresholds(scene: Scene[Top]) -> tuple[Float[Array, "..."], Float[Ar
 
     **Raises:** `ValueError` for a top with a stem: Jellett's constant of its sphere is not that of its stem.
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> print(" ".join(f"{jellett:.2e}" for jellett in steady.jellett_thresholds(scene)))
     1.24e-06 3.44e-06
@@ -161,7 +162,7 @@ def standing_state(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = Fa
     - `spin`: angular velocity about the axis [rad/s].
     - `inverted`: whether the stem points into the arena.
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> print(f"{scene.theta(steady.standing_state(scene, 100.0, inverted=True)):.4f} rad")
     3.1416 rad
@@ -175,14 +176,14 @@ def standing_state(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = Fa
 def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = False) -> Float[Array, "k k"]:
     """Matrix [1/s] of the linear motion near a standing top, on any arena.
 
-    Components along n change at second order only and are left out, as are the frame's own direction and the places that a
-    symmetry makes equivalent (plane, cylinder, torus). A scene with `contact="hybrid"` counts as one with "stop".
+    Components along n change only at second order and are omitted, as are the frame's own direction and the places that
+    a symmetry makes equivalent. A scene with `contact="hybrid"` is treated like one with "stop".
 
     **Arguments:** as for `standing_state`.
 
     **Returns:** (k, k), for the velocity, axis, angular momentum and place across n, in the units of `Scene.scales`.
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> steady.standing_matrix(scene, 50.0, inverted=True).shape
     (6, 6)
@@ -200,7 +201,7 @@ def _places_across(scene: Scene) -> range:
     """Which components of a state are places that differ near the arena's lowest point."""
     count = max(len(scene.frame.place_scales) - 1, 0)
     if isinstance(scene.frame, CarriedFrame):
-        # The foot (x, y, z), of which z is along n, and the first tangent, which is only the frame's choice of axes.
+        # The foot (x, y, z), whose z is along n, and the first tangent, which is only the frame's choice of axes.
         count = 1 if isinstance(scene.surface, Torus) else 2
     return range(PLACE.start, PLACE.start + count)
 
@@ -216,7 +217,7 @@ class Tumbling(NamedTuple):
     - `spin`: omega3 [rad/s].
     - `jellett`: Jellett's constant [kg m^3/s].
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> motion = steady.tumbling(scene, 1.0)
     >>> print(f"it turns about its axis at {motion.spin:.2f} rad/s")
@@ -238,7 +239,7 @@ def _lever_and_inertia(scene: Scene[Top], theta: Float[ArrayLike, "..."]):
 
 
 def tumbling(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Tumbling:
-    """The tumbling top at an inclination, the one of the two with positive phi'.
+    """The tumbling top at an inclination; of the two solutions, the one with positive phi'.
 
     phi'^2 = m g a / D, omega3 = (cos - alpha) phi', J = R G phi', with D = I3 (alpha - cos) + I1 cos and
     G = I1 sin^2 + I3 (cos - alpha)^2 (Rutstam 2012, eq. 2.8).
@@ -246,11 +247,11 @@ def tumbling(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Tumbling:
     **Arguments:**
 
     - `scene`: a `Scene` on the plane.
-    - `theta`: inclination [rad] with D > 0; in group II that is every inclination.
+    - `theta`: inclination [rad] with D > 0, which holds for every inclination in group II.
 
     **Raises:** `ValueError` if the arena is not a plane, or if no tumbling top exists at the inclination.
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> print(f"{steady.tumbling(scene, 2.0).precession:.2f} rad/s")
     33.55 rad/s
@@ -268,7 +269,7 @@ def tumbling(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Tumbling:
 def tumbling_is_stable(scene: Scene[Top], theta: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     """Whether the tumbling top is stable: J^2 grows with theta there, that is 4 D^2 + G (I1 - I3) > 0.
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> bool(steady.tumbling_is_stable(scene, 1.0))
     True
@@ -284,7 +285,7 @@ def effective_energy(
 
     Its extrema over theta are the steady motions, its minima the stable ones.
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> motion = steady.tumbling(scene, 1.0)
     >>> print(f"{1e3 * steady.effective_energy(scene, 1.0, motion.jellett):.3f} mJ")
@@ -297,15 +298,15 @@ def effective_energy(
 
 
 def tumbling_angles(scene: Scene[Top], jellett: float, samples: int = 2001) -> list[float]:
-    """Every inclination [rad] at which a tumbling top has the given Jellett's constant, in rising order.
+    """Every inclination [rad] at which a tumbling top has the given Jellett's constant, in increasing order.
 
     **Arguments:**
 
     - `scene`: a `Scene` on the plane with concrete numbers.
     - `jellett`: Jellett's constant [kg m^3/s], of either sign.
-    - `samples`: points of the grid on which brackets are sought; each is then halved down to the zero.
+    - `samples`: number of grid points for finding brackets; each bracket is then bisected.
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> jellett = steady.tumbling(scene, 1.0).jellett
     >>> print([round(theta, 3) for theta in steady.tumbling_angles(scene, float(jellett))])
@@ -323,7 +324,7 @@ def tumbling_angles(scene: Scene[Top], jellett: float, samples: int = 2001) -> l
 def tumbling_state(scene: Scene[Top], motion: Tumbling) -> Float[Array, " 8"]:
     """State of the vector form of a tumbling top whose axis leans towards t1.
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> motion = steady.tumbling(scene, 1.0)
     >>> print(f"{1e3 * scene.energy(steady.tumbling_state(scene, motion)):.3f} mJ")
@@ -336,9 +337,9 @@ def tumbling_state(scene: Scene[Top], motion: Tumbling) -> Float[Array, " 8"]:
 
 
 def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
-    """Rate of a state of the plane when everything turns about the vertical at 1 rad/s.
+    """Rate of a state on the plane if everything turns about the vertical at 1 rad/s.
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> motion = steady.tumbling(scene, 1.0)
     >>> state = steady.tumbling_state(scene, motion)
@@ -353,16 +354,16 @@ def quarter_turn(state: Float[Array, " 8"]) -> Float[Array, " 8"]:
 
 @eqx.filter_jit
 def tumbling_matrix(scene: Scene[Top], motion: Tumbling) -> Float[Array, "5 5"]:
-    """Matrix [1/s] of the linear motion near a tumbling top, seen by an observer who precesses with it.
+    """Matrix [1/s] of the linear motion near a tumbling top, in a frame that precesses with it.
 
-    Taken on the five directions that keep |e| and Jellett's constant and do not merely turn the top about the vertical.
+    It covers the five directions that keep |e| and Jellett's constant and do not only turn the top about the vertical.
 
     **Arguments:**
 
     - `scene`: a `Scene` on the plane, with friction.
     - `motion`: from `tumbling`.
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> motion = steady.tumbling(scene, 1.0)
     >>> print(f"{steady.growth_rate(steady.tumbling_matrix(scene, motion)):.2f} 1/s")
@@ -386,7 +387,7 @@ def tumbling_matrix(scene: Scene[Top], motion: Tumbling) -> Float[Array, "5 5"]:
 def growth_rate(matrix: Float[Array, "k k"]) -> Float[Array, ""]:
     """Largest real part [1/s] of the eigenvalues of a stability matrix: positive if the motion is unstable.
 
-    **Example:** of the module's scene.
+    **Example:** with the scene of the module.
 
     >>> print(f"{steady.growth_rate(steady.standing_matrix(scene, 50.0, inverted=True)):.2f} 1/s")
     -0.80 1/s

@@ -1,4 +1,4 @@
-"""The figures of these pages: what the symbols mean, and two curves that follow from the formulas beside them."""
+"""Draw the figures of these pages: the meaning of the symbols, and two curves that follow from the formulas."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ BODY, FORCE, SLIP, PLAIN = "#c8412b", "#7b4fa3", "#b58300", "#3a3a3e"
 
 
 def arrow(ax: Any, begin: Any, along: Any, words: str, colour: str, shift: Any = (0.06, 0.0)) -> None:
-    """An arrow with its name at the tip."""
+    """An arrow with its label at the tip."""
     end = np.add(begin, along)
     ax.annotate(
         "", end, begin, arrowprops={"arrowstyle": "-|>", "color": colour, "linewidth": 1.6, "shrinkA": 0, "shrinkB": 0}
@@ -18,7 +18,7 @@ def arrow(ax: Any, begin: Any, along: Any, words: str, colour: str, shift: Any =
 
 
 def arc(ax: Any, centre: Any, radius: float, angles: tuple[float, float], words: str) -> None:
-    """The arc of an angle, counted from x, with its name."""
+    """The arc of an angle, counted from x, with its label."""
     turn = np.linspace(*angles, 40)
     ax.plot(centre[0] + radius * np.cos(turn), centre[1] + radius * np.sin(turn), color=PLAIN, linewidth=1.0)
     middle = np.mean(angles)
@@ -67,7 +67,7 @@ def top() -> Any:
 
 
 def torque() -> Any:
-    """Slip, friction and torque of a tilted, fast top: along the slip, and from above."""
+    """Slip, friction and torque of a tilted, fast top: seen along the slip, and from above."""
     figure, (side, above) = plt.subplots(1, 2, figsize=(9.0, 4.4), layout="constrained")
     theta, offset = 0.6, 0.42
     axis, O = np.array([np.sin(theta), np.cos(theta)]), np.array([0.0, 1.0])  # noqa: E741
@@ -156,7 +156,7 @@ def angles() -> Any:
 
 
 def vehicle() -> Any:
-    """The stroller from above, and the point about which it turns."""
+    """The stroller from above, and its centre of rotation."""
     figure, ax = empty(6.4, 4.6)
     psi, phi, half = 0.25, 0.5, 0.35
     along, left = np.array([np.cos(psi), np.sin(psi)]), np.array([-np.sin(psi), np.cos(psi)])
@@ -185,7 +185,7 @@ def vehicle() -> Any:
 
 
 def groups() -> Any:
-    """The least energy at Jellett's constant, for a top of each group and constants that grow."""
+    """The least energy at a given Jellett constant, for a top of each group and increasing constants."""
     figure, axes = plt.subplots(1, 3, figsize=(10.0, 3.2), layout="constrained")
     theta, alpha = np.linspace(0.0, np.pi, 400), 0.3
     for ax, (name, gamma) in zip(axes, {"I": 0.6, "II": 1.0, "III": 1.5}.items(), strict=True):
@@ -205,7 +205,7 @@ def groups() -> Any:
 
 
 def lanes() -> Any:
-    """Four lanes over time: every run has steps of its own, and a lane that is free takes the next cell."""
+    """Four lanes over time: every run has its own steps, and a free lane takes the next cell."""
     figure, ax = plt.subplots(figsize=(8.0, 2.2), layout="constrained")
     random, free, cell = np.random.default_rng(3), np.zeros(4, int), 0
     while free.min() < 30:

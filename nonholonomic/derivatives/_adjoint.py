@@ -38,10 +38,10 @@ from ..xla_cpu import uncounted, written_by_component, written_in_place
 from ._shared_values import sharing_values
 from .variation import VariationalProblem
 
-#: Iterations per period: as many as fit the caches with their record.
+#: Iterations per period: as many as fit in the caches with their record.
 PERIOD = 128
 
-#: Cost of refilling the lanes here, in steps of all lanes: a period ends with the refill.
+#: Cost of refilling the lanes, in steps of all lanes; a period ends with a refill.
 REFILL = 2.0
 
 #: Number of checkpoints. With more periods, some checkpoints are dropped and computed again from an earlier one. With
@@ -107,10 +107,10 @@ class Checkpoints(NamedTuple):
 
 
 class Backward(NamedTuple):
-    """State of a backward pass: `needed` is the period after the one that comes next.
+    """State of a backward pass: `needed` is the period after the next one.
 
-    `adjoint` holds, for the cell in each lane, the derivatives of the measured quantity: by the state in its first
-    rows, then by the parameters; `gradient` holds those of every cell by its initial state.
+    `adjoint` holds, for the cell in each lane, the derivatives of the measured quantity: with respect to the state in
+    its first rows, then to the parameters; `gradient` holds those of every cell with respect to its initial state.
     """
 
     kept: Checkpoints
@@ -137,7 +137,7 @@ def solve_with_adjoint(
 
     - `problem`: without tangents.
     - `moving`: a tree of booleans like the problem: which of its leaves, scalars or (cells,), to differentiate by.
-    - `probe`: a tangent of the inner problem. Its variation is integrated too and takes part in step-size control, so
+    - `probe`: a tangent of the inner problem. Its variation is also integrated and takes part in step-size control, so
       that the steps suit tangents even where the state is at rest.
     - `measured`: the quantity to differentiate.
 
@@ -154,7 +154,7 @@ def solve_with_adjoint(
             raise ValueError(f"moving: a number must be a scalar or ({size},), not of shape {jnp.shape(leaf)}")
     numbers = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (size,)), numbers)
     problem = eqx.combine(numbers, rest)
-    # The chosen parameters now have one value per cell, and so must their rates.
+    # The chosen parameters now have one value per cell, so their rates must, too.
     probe = jax.tree.map(
         lambda rate, number: None if rate is None else jnp.broadcast_to(rate, jnp.shape(number)),
         probe,
@@ -162,7 +162,7 @@ def solve_with_adjoint(
         is_leaf=lambda rate: rate is None,
     )
     probed = dataclasses.replace(problem, tangents=(probe,))
-    # As many lanes as without the probe: the backward pass, which costs most, does not use the probe.
+    # As many lanes as without the probe: the backward pass, which is the most expensive part, does not use the probe.
     settings = dataclasses.replace(settings, lanes=settings.lanes_of(size))
     scheduler = LaneScheduler.of(probed, t1, cells, settings, one_kernel=one_kernel, n_blocks=2)
     rows = components + len(jax.tree.leaves(numbers))
@@ -269,7 +269,7 @@ def _taken_back(
 def _at_the_end(
     problem: AbstractProblem, moving: Any, measured: Measured, lane_state: LaneState
 ) -> Float[Array, "rows lanes"]:
-    """The derivatives of the measured quantity by the final state and by the parameters."""
+    """The derivatives of the measured quantity with respect to the final state and the parameters."""
     numbers, rest = eqx.partition(problem, moving)
 
     def value(numbers: Any, state: States) -> Lanes:
@@ -321,9 +321,10 @@ def step_taken_back(
     **Arguments:**
 
     - `weights`: the method.
-    - `problem`, `moving`: the problem, its leaves scalars or one number per lane; which leaves to differentiate by.
-    - `time`, `state`, `length`: where the step starts, and its length; 0 where no step was made.
-    - `adjoint`: derivatives at the end of the step, by the state and by the parameters.
+    - `problem`, `moving`: the problem, with leaves that are scalars or have one number per lane; the leaves to
+      differentiate by.
+    - `time`, `state`, `length`: where the step starts, and its length; 0 if no step was made.
+    - `adjoint`: derivatives at the end of the step, with respect to the state and the parameters.
     - `room`: working memory for the derivatives by the end and by the stages; finite.
 
     **Returns:** the derivatives at the start, and the working memory for reuse.
@@ -356,7 +357,7 @@ def step_taken_back(
         pulled = sharing_values(pull)(
             at, numbers, tuple(jnp.unstack(_read(along, at=stage))), tuple(jnp.unstack(by_rate))
         )
-        # Where no step was made, values may not be finite.
+        # If no step was made, values may not be finite.
         pulled = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(pulled), 0.0))
         return written_in_place(by_stage, pulled[:components], at=stage + 1), total + pulled
 

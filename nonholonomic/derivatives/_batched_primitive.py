@@ -1,7 +1,7 @@
 """A JAX primitive that solves for all members of a batch at once and, under `jit`, computes only the outputs that are
 used.
 
-`custom_vmap` batches too, but computes all outputs as soon as one is used. The rule for unused outputs is JAX's
+`custom_vmap` also batches, but computes all outputs as soon as one is used. The rule for unused outputs is JAX's
 `partial_eval.dce_rules`, as in its own `scan`.
 """
 
@@ -65,23 +65,22 @@ def find(request: Request, *leaves: Float[Array, "..."]) -> Any:
 
 @eqx.filter_jit
 def _compiled_tree(question: Any, active: tuple[int, ...] | None, *leaves: Float[Array, "..."]) -> Any:
-    """The outputs for a single cell; never run, but JAX caches their shapes for solves that are equal."""
+    """The outputs for a single cell; never run, but JAX caches their shapes for equal solves."""
     return Request(question, active).tree(1, *leaves)
 
 
 def _parts(
     question: Any, active: tuple[int, ...] | None, wanted: tuple[int, ...], cells: int, leaves: list[Array]
 ) -> list[Array]:
-    """`Request.parts` as one program, which serves all solves that are equal, whatever the values of the leaves.
+    """`Request.parts` as one program, which serves all equal solves, whatever the values of the leaves.
 
-    Otherwise, outside of `jit`, each operation would be a program of its own, and every call would compile its loops
-    anew.
+    Otherwise, outside `jit`, each operation would be a separate program, and every call would compile its loops again.
     """
     return Request(question, active, wanted).parts(cells, *leaves)
 
 
-#: For one run: a hybrid scene compiles in half the time, with a third of the memory and of the mappings (289 for 818),
-#: and runs as fast; 256 runs at once would take 2.5 times as long.
+#: For one run: a hybrid scene compiles in half the time, with a third of the memory and of the mappings (289 instead of
+#: 818), and runs equally fast; 256 runs at once would take 2.5 times as long.
 _parts_of_one = compiled_quickly(_parts)
 _parts_of_many = compiled_alone(_parts)
 
@@ -142,7 +141,7 @@ batching.primitive_batchers[_found] = _batched
 
 def _only_read(read: list[bool], *others: Any) -> tuple[list[bool], Any]:
     """The operation restricted to the parts that are used."""
-    # Since JAX 0.12 a list of inputs stands between the two.
+    # Since JAX 0.12, a list of inputs is between the two.
     equation = others[-1]
     if not any(read):
         return [False] * len(equation.invars), None

@@ -42,9 +42,10 @@ class Stack(NamedTuple):
 
 
 class Listing:
-    """The operations of a function: equal operations listed once; barriers, and stacks that are split again, left out.
+    """The operations of a function: equal operations are listed once; barriers, and stacks that are split again, are
+    omitted.
 
-    - `operations`: in an order in which they can be done.
+    - `operations`: in an order in which they can be evaluated.
     - `given`: index of a value -> the array, for values that are not the result of an operation.
     - `kinds`: shape and dtype of every value.
     """
@@ -56,7 +57,7 @@ class Listing:
         self._known: dict[Any, Any] = {}
 
     def enter(self, value: Any, key: Any = None) -> int:
-        """The index of an input value; values with the same key are the same."""
+        """The index of an input value; values with the same key are equal."""
         key = ("given", id(value)) if key is None else key
         if key not in self._known:
             self._known[key] = self._new(jnp.shape(value), jnp.result_type(value))

@@ -52,7 +52,7 @@ class AbstractDifferentiableSolve(eqx.Module):
         """
 
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
-        """A solve that may omit (as `None`) all outputs but some; by default it omits none.
+        """A solve that may omit (as `None`) all but some outputs; by default it omits none.
 
         **Arguments:** `wanted`: indices into the parts of the primal, or of the primal followed by its derivatives.
         """
@@ -154,7 +154,7 @@ def tangents_by(
     **Arguments:**
 
     - `build`: (leaves, cells) -> problem.
-    - `active`, `leaves`: the leaves, and which of them to move. With `cells` they are scalars or one per cell; without,
+    - `active`, `leaves`: the leaves to move, and all leaves. With `cells` they are scalars or one per cell; without,
       arrays of any shape, each entry of which has its own tangent.
 
     **Returns:** the problem; its tangents; and a function that turns derivatives along the tangents (trees of arrays)

@@ -69,7 +69,7 @@ def sampled_run(
 
     - `build`: makes the problem from the modules; compared by identity, so do not create a new function for each call.
     - `modules`: the tree whose numbers are differentiable.
-    - `times`: of the samples [s], growing; `t1`: horizon [s].
+    - `times`: of the samples [s], increasing; `t1`: horizon [s].
     - `settings`: the tolerance may be traced.
     - `grid`: the ends of the steps [s], concrete, for a solver without an error estimate.
 

@@ -14,7 +14,7 @@ from .differentiable import AbstractDifferentiableSolve, differentiable_solve
 
 
 class ProblemSpec(eqx.Module):
-    """How to build a problem from numbers and how to integrate it, all but the tolerance."""
+    """How to build a problem from numbers and how to integrate it, except for the tolerance."""
 
     build: Callable[[Any, Any], Any] = eqx.field(static=True)
     # JAX's PyTreeDef, which type checkers take for a variable.
@@ -63,7 +63,7 @@ def solve_for_samples(
     """
     numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(numbers)
-    # Arrays, such as those of the solver, may be traced, so they go among the leaves.
+    # Arrays, such as those of the solver, may be traced, so they belong to the leaves.
     arrays, spec = eqx.partition(ProblemSpec(build, structure, rest, settings.with_tolerance(None), grid), eqx.is_array)
     held, places = jax.tree.flatten(arrays)
     return differentiable_solve(

@@ -128,7 +128,7 @@ def _event_time(varied: VariationalProblem, lane_state: LaneState) -> Float[Arra
 
 
 def _moving(problem: AbstractProblem, direction: Any) -> Any:
-    """Which leaves a tangent moves, of those on which the field or the event function depends."""
+    """The leaves that a tangent moves, as far as the field or the event function depends on them."""
     leaves, structure = jax.tree.flatten(problem)
     states = problem.start()[0]
 
@@ -165,11 +165,11 @@ def tangents_of(
     - `numbers`: the arguments of `build`, arrays.
     - `tangents`: each with the rates at which the numbers move.
 
-    **Returns:** for each tangent that of the problem, `None` for leaves that depend on no number.
+    **Returns:** for each tangent the tangent of the problem, `None` for leaves that depend on no number.
     """
 
     def built(*numbers: Any) -> Any:
-        # A problem may hold functions too.
+        # A problem may also hold functions.
         return eqx.filter(build(*numbers), eqx.is_inexact_array)
 
     reached = _reached(jax.make_jaxpr(built)(*numbers))

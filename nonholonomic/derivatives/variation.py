@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 
 from ..integration import AbstractProblem, LaneScheduler, Outcome, crossing_time
 
-#: Tangents integrated together: two take 0.6 to 1.0 times as long as one after the other, and compile for an eighth
-#: longer; four take 1.1 times as long as two pairs.
+#: Tangents integrated together: two take 0.6 to 1.0 times as long as one after the other, and an eighth longer to
+#: compile; four take 1.1 times as long as two pairs.
 TOGETHER = 2
 
 
@@ -96,8 +96,8 @@ def slopes_by_variations(
     **Returns:** the `Outcome`, without crossing times, and for each tangent the derivative of the event's time.
     """
     varied = VariationalProblem(problem, tangents, ends_on_event)
-    # The variations take part in step-size control: the state alone may be at rest where its tangent is not, and the
-    # steps would grow too long for the tangent.
+    # The variations take part in step-size control: the state alone may be at rest while its tangent is not, and the
+    # steps would become too long for the tangent.
     ended, _ = LaneScheduler.of(varied, *options, n_blocks=1 + len(tangents), one_kernel=one_kernel).outcome()
     state, *variations = varied.parts(ended.state)
 

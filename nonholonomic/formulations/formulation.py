@@ -1,4 +1,4 @@
-"""Four formulations of one constrained mechanical system, from its data alone; every derivative is taken by JAX.
+"""Four formulations of one constrained mechanical system, derived from its data alone; JAX computes every derivative.
 
 The data of a system are its metric G(q), potential V(q), constraint one-forms W(q) with W q' = 0, frame E(q), and the
 generalised force f(t, q, q') of drives and friction. From them follow
@@ -8,8 +8,8 @@ generalised force f(t, q, q') of drives and friction. From them follow
 - `ConstrainedConnection`: geodesics, with forces, of the constrained Levi-Civita connection;
 - `ReducedBracket`: the reduced Poisson-like bracket of van der Schaft and Maschke.
 
-They use the data in different ways, so that their agreement is a check on all of them. A user chooses one by passing
-the object. They take one state (n,); use `jax.vmap` for many. The production models are faster and do not need them.
+They use the data in different ways, so their agreement checks all of them. To choose one, pass its object. They take
+one state (n,); use `jax.vmap` for many. The models of the vehicles are faster and do not need them.
 """
 
 import abc
@@ -25,12 +25,12 @@ from ..geometry import solve
 from ..validation import as_number, is_traced, require
 from .brackets import Coordinates, lie_brackets
 
-#: Violation of the constraints, relative to the velocity, above which a start is worth a warning.
+#: Relative violation of the constraints above which a start gives a warning.
 START_TOLERANCE = 1e-9
 
 
 class AbstractSystem(eqx.Module):
-    """A mechanical system with n coordinates and k linear constraints on its velocity, by its data.
+    """A mechanical system with n coordinates and k linear constraints on its velocity.
 
     Subclass it, declare the numbers of your model as fields, set `dimension` to the number of coordinates, and write functions
     of one set of coordinates: the `metric`, and as needed `potential`, `constraints`, `force` and `frame`. The equations of
@@ -73,19 +73,19 @@ class AbstractSystem(eqx.Module):
         """Kinetic metric G(q): the kinetic energy is q'.G q' / 2."""
 
     def potential(self, q: Coordinates) -> Float[Array, ""]:
-        """Potential energy V(q); zero unless a system says otherwise."""
+        """Potential energy V(q); zero by default."""
         return jnp.zeros((), q.dtype)
 
     def constraints(self, q: Coordinates) -> Float[Array, "k n"]:
-        """One-forms W(q), a row each, that vanish on every velocity; none unless a system says otherwise."""
+        """One-forms W(q), one per row, that vanish on every velocity; none by default."""
         return jnp.zeros((0, q.size), q.dtype)
 
     def frame(self, q: Coordinates) -> Float[Array, "n n"]:
-        """Frame fields E(q), a column each; the first n - k are annihilated by W. By default, the coordinates' own."""
+        """Frame fields E(q), one per column; W annihilates the first n - k. By default, the coordinate fields."""
         return jnp.eye(q.size, dtype=q.dtype)
 
     def force(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Coordinates:
-        """Generalised force f(t, q, q') besides that of the potential; zero unless a system says otherwise."""
+        """Generalised force f(t, q, q') in addition to that of the potential; zero by default."""
         return jnp.zeros_like(q)
 
     def lagrangian(self, q: Coordinates, rate: Coordinates) -> Float[Array, ""]:
@@ -101,7 +101,7 @@ class Routhian(AbstractSystem):
     """A system with one cyclic coordinate eliminated, at a given momentum, R = L - beta psi'.
 
     The coordinate is cyclic if neither metric, potential nor force depends on it, and the force has no component along
-    it. What remains has a Lagrangian with terms linear in the velocity, which `Hamel` takes as it is.
+    it. The reduced Lagrangian has terms linear in the velocity, which `Hamel` accepts.
 
     **Arguments:**
 
@@ -122,7 +122,7 @@ class Routhian(AbstractSystem):
         return self.full.dimension - 1
 
     def complete(self, q: Coordinates, rate: Coordinates) -> tuple[Coordinates, Coordinates]:
-        """All coordinates and velocities, the cyclic coordinate at 0, its velocity from the momentum."""
+        """All coordinates and velocities, with the cyclic coordinate at 0 and its velocity from the momentum."""
         q = jnp.insert(q, self.cyclic, 0.0)
         rate = jnp.insert(rate, self.cyclic, 0.0)
         row = self.full.metric(q)[self.cyclic]
@@ -183,8 +183,8 @@ def reduced_fields(system: AbstractSystem, q: Coordinates) -> Float[Array, "n r"
 class Multipliers(AbstractFormulation):
     """Hamilton's equations with multipliers, q' = dH/dp, p' = -dH/dq + f + W^T lambda (`stroller.md`, section 6, F1).
 
-    The state is (q, p). The multipliers keep W q' constant, whatever it is at the start, but it drifts with the
-    integrator's error; there are two remedies, and both leave an exact solution as it is.
+    The state is (q, p). The multipliers keep W q' constant at its initial value, but the integrator's error makes it
+    drift. The following two options remove the drift; neither changes an exact solution.
 
     **Arguments:**
 
@@ -224,7 +224,7 @@ class Multipliers(AbstractFormulation):
         return q, solve(self.system.metric(q), p, positive=True)
 
     def multipliers(self, t: Float[ArrayLike, ""], q: Coordinates, rate: Coordinates) -> Float[Array, " k"]:
-        """Multipliers lambda, the forces that keep W q' from changing."""
+        """Multipliers lambda, whose forces keep W q' from changing."""
         system = self.system
         W, bend = jax.jvp(system.constraints, (q,), (rate,))
         G, swell = jax.jvp(system.metric, (q,), (rate,))
@@ -243,9 +243,9 @@ class Multipliers(AbstractFormulation):
 class Hamel(AbstractFormulation):
     """Poincare's equations in quasi-velocities u, q' = E u (`stroller.md`, section 6, F2).
 
-    With l(q, u) = L(q, E u) and p = dl/du, p_i' = E_i(l) + c^k_ji u^j p_k + E_i.f. Constraints drop the equations and
-    the quasi-velocities of the frame's last fields, but not their momenta, through which nonholonomy enters (Hamel). The
-    Lagrangian may have terms linear in the velocity (`Routhian`). The state is (q, u).
+    With l(q, u) = L(q, E u) and p = dl/du, p_i' = E_i(l) + c^k_ji u^j p_k + E_i.f. Constraints remove the equations and
+    the quasi-velocities of the frame's last fields, but not their momenta, which carry the nonholonomic terms (Hamel).
+    The Lagrangian may have terms linear in the velocity (`Routhian`). The state is (q, u).
 
     **Arguments:**
 
@@ -258,7 +258,7 @@ class Hamel(AbstractFormulation):
         return jnp.concatenate([q, solve(self.system.frame(q), rate)[: self.system.freedom]])
 
     def quasi_velocity(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
-        """Coordinates and all n quasi-velocities, those that the constraints forbid at 0."""
+        """Coordinates and all n quasi-velocities; those that the constraints forbid are 0."""
         n = self.system.dimension
         return state[:n], jnp.concatenate([state[n:], jnp.zeros(n - self.system.freedom, state.dtype)])
 
@@ -285,7 +285,18 @@ class Hamel(AbstractFormulation):
         return jnp.concatenate([rate, solve(inertia, forces[:free], positive=True)])
 
 
-class ConstrainedConnection(AbstractFormulation):
+class AbstractVelocityFormulation(AbstractFormulation):
+    """Equations of motion whose state is (q, q')."""
+
+    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
+        return jnp.concatenate([q, rate])
+
+    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
+        q, rate = jnp.split(state, 2)
+        return q, rate
+
+
+class ConstrainedConnection(AbstractVelocityFormulation):
     """Geodesics, with forces, of the constrained Levi-Civita connection (`stroller.md`, section 6, F3).
 
     With Q the metric projector on the forbidden directions, nabla^D = nabla + nabla Q is a connection on all of the
@@ -298,13 +309,6 @@ class ConstrainedConnection(AbstractFormulation):
     """
 
     system: AbstractSystem
-
-    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
-        return jnp.concatenate([q, rate])
-
-    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
-        q, rate = jnp.split(state, 2)
-        return q, rate
 
     def forbidden(self, q: Coordinates) -> Float[Array, "n n"]:
         """Projector Q = G^-1 W^T (W G^-1 W^T)^-1 W on the directions orthogonal to the allowed ones."""

@@ -1,17 +1,18 @@
-"""Lagrange's equations with multipliers, in coordinates and velocities: the form that users' own systems are run in."""
+"""Lagrange's equations with multipliers, in coordinates and velocities: the form in which users' own systems are
+run."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..geometry import solve
-from .formulation import AbstractFormulation, AbstractSystem, Coordinates
+from .formulation import AbstractSystem, AbstractVelocityFormulation, Coordinates
 
 
-class Lagrange(AbstractFormulation):
+class Lagrange(AbstractVelocityFormulation):
     """Lagrange's equations with multipliers, G q'' + G' q' = dL/dq + f + W^T lambda, with W q'' + W' q' = 0.
 
-    The multipliers are those of `Multipliers`. Here the state is (q, q'), so that the metric's equations are solved once, for
+    The multipliers are those of `Multipliers`, but the state is (q, q'), so the metric's equations are solved once, for
     the force and the rows of W together. The Lagrangian must be kinetic minus potential energy. Source: `stroller.md`,
     section 6, F1.
 
@@ -21,13 +22,6 @@ class Lagrange(AbstractFormulation):
     """
 
     system: AbstractSystem
-
-    def state(self, q: Coordinates, rate: Coordinates) -> Float[Array, " state"]:
-        return jnp.concatenate([q, rate])
-
-    def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:
-        q, rate = jnp.split(state, 2)
-        return q, rate
 
     def field(self, t: Float[ArrayLike, ""], state: Float[Array, " state"], args=None) -> Float[Array, " state"]:
         q, rate = self.split(state)

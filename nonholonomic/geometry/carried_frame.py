@@ -1,8 +1,9 @@
-"""The moving frame of a ball on any smooth surface, without a chart and without a pole; and which surface has which frame.
+"""The moving frame of a ball on any smooth surface, without coordinate singularities, and the choice of frame for a
+surface.
 
-The place is the foot, the point at which the ball touches the surface, and the first tangent, both in the surface's axes. The
-surface says which way its normal n points and how that changes, n' = -S_a q' for a velocity q' along it. The centre is at
-O = q + R n, so that its velocity is V = (1 - R S_a) q', and with S = S_a (1 - R S_a)^-1 it is n' = -S V (`tippe.md`, section 2
+The place consists of the foot, where the ball touches the surface, and the first tangent, both in the surface's axes.
+The surface gives its normal n and the rate n' = -S_a q' for a velocity q' along the surface. The centre is at O = q + R
+n, so its velocity is V = (1 - R S_a) q', and with S = S_a (1 - R S_a)^-1 the rate is n' = -S V (`tippe.md`, section 2
 (iv)). The ball fits while no principal curvature reaches 1/R.
 """
 
@@ -25,7 +26,8 @@ from .vector import Component, Vector, cross, dot, scale, sum_vectors, tangents,
 
 
 def place_named(surface: AbstractSurface, place: Place) -> Place:
-    """A place as `surface.chart` takes it, given one in which the eta of a closed surface counts from the lowest point.
+    """A place in the form that `surface.chart` takes, from one in which the eta of a closed surface counts from the
+    lowest point.
 
     **Arguments:** `place`: numbers named by `surface.coordinates`, or (x, y, z).
     """
@@ -51,7 +53,7 @@ def frame_of(
 
 
 def room_bounds(surface: AbstractSurface, side: float, distance: Float[Array, "..."]) -> Iterator[Bound]:
-    """The ranges of a surface's numbers in which a ball fits anywhere at all.
+    """The ranges of a surface's numbers within which a ball fits somewhere.
 
     **Arguments:** as for `CarriedFrame`.
     """
@@ -64,9 +66,10 @@ def room_bounds(surface: AbstractSurface, side: float, distance: Float[Array, ".
 class CarriedFrame(AbstractFrame):
     """A frame that is carried along any surface.
 
-    - `surface`: what the ball touches; `side`: 1 where the room is on the side of the surface's normal, else -1.
+    - `surface`: the surface that the ball touches; `side`: 1 if the ball is on the side of the surface's normal, else
+      -1.
     - `distance`: R [m].
-    - `pull`: rate [1/s] at which the foot is drawn back to the surface, should round-off and step errors take it off.
+    - `pull`: rate [1/s] at which the foot is pulled back to the surface if round-off and step errors move it off.
     - `up`: the upward vertical in the surface's axes.
     """
 
@@ -80,8 +83,8 @@ class CarriedFrame(AbstractFrame):
     def of(
         cls, surface: AbstractSurface, distance: Float[Array, "..."], pull: Float[Array, "..."], side: float = 1.0
     ) -> "CarriedFrame":
-        """The frame of a ball on a surface. **Arguments:** the fields but `up`."""
-        # Found once: a tilted plane knows its tilt as an angle, and no step is to take the sine of it.
+        """The frame of a ball on a surface. **Arguments:** the fields except `up`."""
+        # Computed once: a tilted plane stores its tilt as an angle, and no step should compute the sine.
         return cls(surface, distance, pull, surface.up, side)
 
     def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
@@ -96,8 +99,8 @@ class CarriedFrame(AbstractFrame):
         return self._start(foot, along_eta=isinstance(self.surface, Cylinder))
 
     def _start(self, foot: Fixed, along_eta: bool) -> tuple[Place, Place]:
-        """The frame at a foot. `along_eta`: whether t1 points as in `CylinderFrame`, along growing eta inside; the projection
-        of the x axis reverses its direction at eta = pi/2."""
+        """The frame at a foot. `along_eta`: whether t1 points along growing eta inside, as in `CylinderFrame`; the
+        projection of the x axis reverses its direction at eta = pi/2."""
         foot = vector_of(jnp.broadcast_arrays(*(0.0 if x is None else x for x in foot)))
         normal = self.normal(foot)
         t1 = (normal[2], jnp.zeros_like(normal[1]), -normal[0]) if along_eta else tangents(normal)[0]
@@ -114,9 +117,9 @@ class CarriedFrame(AbstractFrame):
 
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
         foot, R = place[:3], self.distance
-        # Stored: what follows, and its derivatives above all, would each compute these anew.
+        # Stored: otherwise the values below, and above all their derivatives, would each compute these again.
         n = stored(*self.normal(foot))
-        # Of a first tangent that has drifted, only the direction along the surface counts.
+        # If the first tangent has drifted, only its direction along the surface counts.
         t1 = stored(*along(n, place[3:])[0])
         t2 = cross(n, t1)
         S11, S12, S22 = stored(*self._shape(foot, t1, t2))
@@ -127,7 +130,7 @@ class CarriedFrame(AbstractFrame):
         o1, o2, *up = stored(S11 * q1 + S12 * q2, S12 * q1 + S22 * q2, *self._seen(t1, t2, n))
         back = -self.pull * self.side * self.surface.offset(foot)
         moved = sum_vectors(scale(q1, t1), scale(q2, t2), scale(back, n))
-        # Both are positive where both of 1 - R k are; the first of them to vanish takes the determinant with it.
+        # Both are positive if both values 1 - R k are; when the first of these vanishes, so does the determinant.
         room = jnp.minimum(determinant, 0.5 * (A11 + A22))
         return FrameMotion((o1, o2), vector_of(up), (*moved, *scale(o1, n)), room)
 
@@ -155,7 +158,8 @@ class CarriedFrame(AbstractFrame):
         return ()
 
     def angle(self, place: Place, cyclic: Place) -> Float[Array, "..."]:
-        """As the surface counts it, or the slope of the ground where no coordinate of the surface is one."""
+        """The angle eta in the surface's convention, or the slope of the ground if no coordinate of the surface is an
+        angle."""
         foot, names = place[:3], [name for name, _ in self.surface.coordinates]
         if "eta" not in names:
             t1_up, t2_up, n_up = self.vertical(place)

@@ -1,12 +1,12 @@
-"""Frames (t1, t2, n) that move with a ball on a surface, n being the surface's normal into the room where the ball is.
+"""Frames (t1, t2, n) that move with a ball on a surface, where n is the surface's normal towards the ball.
 
-The ball touches the surface at its foot; its centre is at a distance R from there along n, on the parallel surface. With V the
-velocity of the centre the frame turns as t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2), where (o1, o2) = S V and S is the shape
-operator of the parallel surface, positive where it is concave towards the ball. The frame does not turn about n, so the
-components of a fixed vector change as `carried` states.
+The ball touches the surface at its foot; its centre is at a distance R from there along n, on the parallel surface.
+With V the velocity of the centre, the frame turns as t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2), where (o1, o2) = S
+V and S is the shape operator of the parallel surface, positive where it is concave towards the ball. The frame does not
+turn about n, so the components of a fixed vector change as `carried` states.
 
-Plane, cylinder and sphere have frames of their own, with fewer numbers than the general one (`carried_frame.py`). A sphere or
-cylinder is the same from both sides but for the sign of its radius, which is positive inside.
+Plane, cylinder and sphere have their own frames, with fewer numbers than the general one (`carried_frame.py`). A sphere
+or cylinder is the same from both sides, except for the sign of its radius, which is positive inside.
 """
 
 import abc
@@ -20,7 +20,7 @@ from ..validation import as_number
 from .planar_length import planar_length
 from .vector import Component, Vector, cross, dot, multiply, scale, subtract, sum_vectors, tangents
 
-#: What a frame integrates, as components along axis 0 of a state.
+#: The numbers that a frame integrates, as components along axis 0 of a state.
 Place = tuple[Component, ...]
 Tangent = tuple[Component, Component]
 #: A vector's three components in the fixed frame (x, y, z), z up.
@@ -34,7 +34,7 @@ def carried(vector: tuple[Component, ...], turning: Tangent) -> tuple[Component,
 
 
 class FrameMotion(NamedTuple):
-    """What a frame does while the ball moves.
+    """The motion of a frame while the ball moves.
 
     - `turning`: (o1, o2) = S V [rad/s]; `vertical`: the upward vertical in the frame.
     - `place_rate`: rate of the place.
@@ -50,7 +50,8 @@ class FrameMotion(NamedTuple):
 class AbstractFrame(eqx.Module):
     """A moving frame of a ball on a surface.
 
-    The place is what the frame must integrate to know where it is; `cyclic` is what else it takes to draw it.
+    The place contains the numbers that the frame must integrate to know its position; `cyclic` contains those needed
+    only to draw it.
     """
 
     @abc.abstractmethod
@@ -68,7 +69,7 @@ class AbstractFrame(eqx.Module):
 
     @abc.abstractmethod
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
-        """What the frame does while the centre moves with the velocity (V1, V2) [m/s]."""
+        """Motion of the frame while the centre moves with the velocity (V1, V2) [m/s]."""
 
     @abc.abstractmethod
     def vertical(self, place: Place) -> Vector:
@@ -96,7 +97,8 @@ class AbstractFrame(eqx.Module):
 
 
 class PlaneFrame(AbstractFrame):
-    """On a plane the frame does not turn, and a level one has no place; on a tilted one it is x, the way up the plane [m].
+    """A plane: the frame does not turn. A level plane has no place; the place on a tilted one is x [m], along the
+    rising axis.
 
     - `distance`: R [m]; `slope`: sine and cosine of the tilt, `None` for a level plane.
     """

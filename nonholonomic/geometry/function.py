@@ -1,4 +1,4 @@
-"""Functions that a user gives a surface: made into modules whose numbers a program sees, checked, differentiated."""
+"""User functions for surfaces: convert them to modules with visible parameters, check them, and differentiate them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from ..validation import as_number, is_traced
 
 
 class Plain(eqx.Module):
-    """A function that holds no number of interest; the same function is the same program."""
+    """A function without parameters; the same function gives the same program."""
 
     function: Callable[..., Any] = eqx.field(static=True)
 
@@ -23,11 +23,11 @@ class Plain(eqx.Module):
 
 
 class Closure(eqx.Module):
-    """A function with the traced numbers that it closes over as leaves; it was traced with single numbers, which may since
-    have become one for each lane."""
+    """A function with the traced numbers that it closes over as leaves; it was traced with single numbers, which may
+    have become one number per lane since."""
 
     numbers: tuple[Any, ...]
-    # JAX's Jaxpr; the same only for the same construction.
+    # JAX's Jaxpr; equal only if it is the same object.
     program: Any = eqx.field(static=True)
 
     def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -42,9 +42,9 @@ class Closure(eqx.Module):
 
 
 def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module:
-    """A function of some lengths [m] as a module, its numbers as arrays.
+    """A function of some lengths [m] as a module whose numbers are arrays.
 
-    **Raises:** `ValueError` unless it gives one number for numbers.
+    **Raises:** `ValueError` unless the function returns one number for numbers.
     """
     if not callable(value):
         raise ValueError(f"{name} = {value!r} must be a function of ({', '.join(arguments)})")
@@ -60,12 +60,12 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
         ) from error
     except TypeError as error:
         raise ValueError(f"{name} = {value!r} must be a function of ({', '.join(arguments)}): {error}") from error
-    # The numbers of a module may be one for each lane.
+    # The parameters of a module may have one value per lane.
     shapes = {(), *(leaf.shape for leaf in jax.tree.leaves(value) if eqx.is_array(leaf))}
     results = traced.out_avals
     if len(results) != 1 or results[0].shape not in shapes or not jnp.issubdtype(results[0].dtype, jnp.floating):
         shown = ", ".join(map(str, results))
-        raise ValueError(f"{name} = {value!r} must give one number for numbers {', '.join(arguments)}, not {shown}")
+        raise ValueError(f"{name} = {value!r} must return one number for numbers {', '.join(arguments)}, not {shown}")
     if isinstance(value, eqx.Module):
         return value
     closes_over = any(is_traced(constant) for constant in traced.consts)

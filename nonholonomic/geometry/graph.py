@@ -16,17 +16,17 @@ from .level import AbstractLevel
 from .surface import OPEN, AbstractSurface, Place
 from .vector import Component, Vector, dot, scale, subtract, sum_vectors, tangents
 
-#: Newton steps to the nearest point of a paraboloid from above it: as many as its worst positions need.
+#: Newton steps to the nearest point of a paraboloid, from above: enough for the worst positions.
 NEWTON_STEPS = 12
 
-#: A distance [m] that is as good as none, by which numbers can be divided.
+#: A negligible distance [m], to avoid division by zero.
 TINY = 1e-100
 
 
 class AbstractOpen(AbstractSurface):
     """A surface above the whole x-y plane.
 
-    A place on it is (x, y) [m]; east is the projection of x on the surface, and north is to the left of it.
+    A place on it is (x, y) [m]; east is the projection of x onto the surface, and north is to its left.
     """
 
     sides: ClassVar[Mapping[str, float]] = OPEN
@@ -97,8 +97,8 @@ class Paraboloid(AbstractOpen):
         return (position[2] - self.ground(position[0], position[1])) * self.normal(position)[2]
 
     def nearest(self, position: Vector) -> Vector:
-        # At a distance s from the axis, s^3 / (2 p^2) + (1 - z / p) s = r: the greatest root is nearest of all. Above it the
-        # cubic is convex, so that Newton's method falls to it.
+        # At a distance s from the axis, s^3 / (2 p^2) + (1 - z / p) s = r; the greatest root is the nearest point.
+        # Above this root the cubic is convex, so Newton's method converges from above.
         x, y, z = position
         square = x * x + y * y
         r = jnp.sqrt(jnp.maximum(square, TINY * TINY))
@@ -110,7 +110,7 @@ class Paraboloid(AbstractOpen):
         held = jax.lax.stop_gradient((r, rise, bend))
         s = jax.lax.fori_loop(0, NEWTON_STEPS, lambda _, s: fallen(s, *held), _above_the_root(*held))
         s = fallen(s, r, rise, bend)
-        # On the axis, above the centre of curvature, all directions are as near.
+        # On the axis, above the centre of curvature, all directions are equally near.
         part, x = s / r, x + jnp.where(square == 0.0, TINY, 0.0)
         return (part * x, part * y, s * s / (2.0 * self.p))
 
@@ -119,7 +119,8 @@ def _above_the_root(r: Component, rise: Component, bend: Component) -> Component
     """A number not below the greatest root s of bend s^3 + rise s = r, for r and bend above 0."""
     cube = r / bend
     fourth_root = jnp.sqrt(jnp.sqrt(cube))
-    # The cube root is dear. By the mean inequality (2 c + cube / c^2) / 3 is not below it for any c; this c is close to it.
+    # A cube root is expensive. By the inequality of means, (2 c + cube / c^2) / 3 is not below it for any c; this c is
+    # close to it.
     c = fourth_root * jnp.sqrt(jnp.sqrt(fourth_root))
     bound = jnp.sqrt(jnp.maximum(-rise / bend, 0.0)) + (2.0 * c + cube / (c * c)) / 3.0
     return jnp.where(rise > 0.0, jnp.minimum(bound, r / jnp.where(rise > 0.0, rise, 1.0)), bound)
@@ -128,7 +129,7 @@ def _above_the_root(r: Component, rise: Component, bend: Component) -> Component
 def _disc(sectors: int, starts: int) -> Float[np.ndarray, "sectors starts 3"]:
     """Points spread evenly over sectors of the unit disc of x and y."""
     distance = np.sqrt((np.arange(starts) + 0.5) / starts)
-    # The golden section keeps the angles of neighbouring distances apart.
+    # The golden ratio prevents neighbouring radii from having similar angles.
     part = (np.arange(starts) * 0.5 * (np.sqrt(5.0) - 1.0)) % 1.0
     angle = 2.0 * np.pi * (np.arange(sectors)[:, None] + part) / sectors
     return np.stack([distance * np.cos(angle), distance * np.sin(angle), 0.0 * angle], axis=2)
@@ -139,11 +140,11 @@ class Graph(AbstractOpen, AbstractLevel):
 
     **Arguments:**
 
-    - `height`: gives z [m] for x and y [m]. It is called with arrays of any shape, a number for each lane, so it is written
-      with `jax.numpy` and without `if`. The numbers of an `equinox.Module` are numbers of the scene, to be swept and
-      differentiated by.
+    - `height`: returns z [m] for x and y [m]. It is called with arrays of any shape, one number per lane, so write it
+      with `jax.numpy` and without `if`. If it is an `equinox.Module`, its numbers are parameters of the scene, which
+      you can sweep and differentiate.
 
-    **Raises:** `ValueError` for what is not such a function.
+    **Raises:** `ValueError` for anything but such a function.
 
     **Example:**
 

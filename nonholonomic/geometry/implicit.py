@@ -1,4 +1,4 @@
-"""The surface on which any smooth function of three coordinates is zero."""
+"""The zero set of any smooth function of three coordinates."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -14,7 +14,7 @@ from .vector import Component, Vector, tangents
 
 
 def _sphere() -> Float[np.ndarray, "6 9 3"]:
-    """Points spread over the unit sphere, as a square grid on each side of a cube, seen from its middle."""
+    """Points spread over the unit sphere: a square grid on each face of a cube, projected from its centre."""
     a, b = np.meshgrid(*[np.tan(np.pi / 4.0 * np.array([-2.0, 0.0, 2.0]) / 3.0)] * 2)
     sides = [np.stack([a, b, side + 0.0 * a], axis=-1).reshape(-1, 3) for side in (-1.0, 1.0)]
     points = np.stack([np.roll(side, axis, axis=1) for axis in range(3) for side in sides])
@@ -22,18 +22,18 @@ def _sphere() -> Float[np.ndarray, "6 9 3"]:
 
 
 class Implicit(AbstractLevel):
-    """The surface function(x, y, z) = 0 in the fixed frame; the room where bodies are is where the function is positive.
+    """The surface function(x, y, z) = 0 in the fixed frame; bodies are where the function is positive.
 
-    A place on it is (x, y, z) [m]; east is the projection of x on the surface, or of y where the normal is along x, and
-    north is to the left of it.
+    A place on it is (x, y, z) [m]; east is the projection of x onto the surface, or of y where the normal is along x,
+    and north is to its left.
 
     **Arguments:**
 
-    - `function`: a smooth function of x, y and z [m] whose gradient does not vanish on the surface. It is called with arrays
-      of any shape, a number for each lane, so it is written with `jax.numpy` and without `if`. The numbers of an
-      `equinox.Module` are numbers of the scene, to be swept and differentiated by.
+    - `function`: a smooth function of x, y and z [m] whose gradient does not vanish on the surface. It is called with
+      arrays of any shape, one number per lane, so write it with `jax.numpy` and without `if`. If it is an
+      `equinox.Module`, its numbers are parameters of the scene, which you can sweep and differentiate.
 
-    **Raises:** `ValueError` for what is not such a function.
+    **Raises:** `ValueError` for anything but such a function.
 
     **Example:**
 

@@ -1,10 +1,10 @@
-"""Surfaces on which a function is zero, known by the function and its derivatives alone.
+"""Zero sets of functions, known only by the function and its derivatives.
 
-Both searches here are minimisations. The nearest point minimises the distance over the surface, which may have many local
-minima for positions farther than the surface's least radius of curvature. The places where the nearest point can be are
-therefore divided into sectors, and a descent starts at the best of some points in each. The gap below a ball needs no nearest
-point: the ball touches where the function is least over the ball, so the search never leaves the ball, however far the surface
-is. The gap is negative only where a point of the ball is in the arena.
+Both searches here are minimisations. The nearest point minimises the distance over the surface, which may have many
+local minima for positions farther than the surface's least radius of curvature. The region that can contain the nearest
+point is therefore divided into sectors, and a descent starts at the best of some points in each. The gap below a ball
+needs no nearest point: the ball touches where the function is least over the ball, so the search never leaves the ball,
+however far the surface is. The gap is negative only if a point of the ball is in the arena.
 
 Each descent is Newton's method with the curvature kept positive and steps cut to a trust region (Nocedal and Wright, Numerical
 Optimization, chapter 4). A last Newton step carries the derivatives (implicit function theorem).
@@ -23,16 +23,16 @@ from jaxtyping import Array, Bool, Float
 from .surface import AbstractSurface, BallGap
 from .vector import Component, Vector, dot, scale, subtract, sum_vectors, tangents, vector_of
 
-#: Most steps of a search. Most take three to six; ten times as many move no point.
-MOST_STEPS = 40
+#: Most iterations of a search. Most take three to six; ten times as many move no point.
+MOST_ITERATIONS = 40
 
-#: Least curvature of what is minimised, relative to that above a flat surface, with which a step is computed.
+#: Least curvature of the minimised function for which a step is computed, relative to that above a flat surface.
 LEAST_CURVATURE = 0.05
 
-#: A search has ended where a step is shorter than this fraction of the distance; the last step squares it.
+#: A search ends when a step is shorter than this fraction of the distance; the last step squares this error.
 SETTLED = 1e-8
 
-#: Steps shorter than this fraction are taken unseen: what they gain is round-off.
+#: Steps shorter than this fraction are accepted without comparing values: the gain is below round-off.
 UNSEEN = 1e-4
 
 
@@ -51,7 +51,7 @@ class Quadratic(NamedTuple):
         return 0.5 * (self.a + self.c) - jnp.sqrt((0.5 * (self.a - self.c)) ** 2 + self.b**2)
 
     def solved(self) -> tuple[Component, Component]:
-        """Solution s of matrix times s = vector, with the eigenvalues raised to `LEAST_CURVATURE` where they are less."""
+        """Solution s of matrix times s = vector, with smaller eigenvalues raised to `LEAST_CURVATURE`."""
         raised = jnp.maximum(LEAST_CURVATURE - jax.lax.stop_gradient(self.least_eigenvalue), 0.0)
         a, c = self.a + raised, self.c + raised
         per_determinant = 1.0 / (a * c - self.b * self.b)
@@ -59,7 +59,7 @@ class Quadratic(NamedTuple):
 
 
 class Descent(NamedTuple):
-    """Where a search is: at a vector, with the value there, the longest step that is allowed next, and whether it has ended."""
+    """The state of a search: a vector, its value, the longest step allowed next, and whether the search has ended."""
 
     at: Float[Array, "3 ..."]
     value: Float[Array, "..."]
@@ -75,18 +75,18 @@ def descended(
     size: Component,
     reach: Component,
 ) -> Vector:
-    """A local minimum of a function of a vector that is held on a surface.
+    """A local minimum of a function of a vector that stays on a surface.
 
     **Arguments:**
 
-    - `step`: Newton's step, as two components, and the unit tangents along which they are.
-    - `onto`: brings a vector back to the surface; `value`: what is minimised.
-    - `start`: a vector on the surface; `size`: by which steps are measured; `reach`: the longest first step.
+    - `step`: Newton's step, as two components, and the unit tangents for these components.
+    - `onto`: brings a vector back to the surface; `value`: the function to minimise.
+    - `start`: a vector on the surface; `size`: unit for steps; `reach`: the longest first step.
     """
 
     def going_on(carry: tuple[Descent, Any]) -> Bool[Array, ""]:
         descent, count = carry
-        return ~jnp.all(descent.ended) & (count < MOST_STEPS)
+        return ~jnp.all(descent.ended) & (count < MOST_ITERATIONS)
 
     def descend(carry: tuple[Descent, Any]) -> tuple[Descent, Any]:
         descent, count = carry
@@ -98,7 +98,7 @@ def descended(
         after = value(moved)
         better = (after <= descent.value) | (length <= UNSEEN * size)
         taken = better & ~descent.ended
-        # What is not a number ends the search too.
+        # NaN ends the search, too.
         ended = descent.ended | ~(length > SETTLED * size)
         new = Descent(
             at=jnp.where(taken, _stacked(moved), descent.at),
@@ -116,9 +116,9 @@ def descended(
 
 
 class AbstractLevel(AbstractSurface):
-    """A surface on which a function is zero, and positive in the room where bodies are."""
+    """A surface on which a function is zero; bodies are where the function is positive."""
 
-    #: Points about a position from which the search for the nearest point may start; its distance is less than 1 in their unit.
+    #: Start points for the search for the nearest point, about a position; its distance is less than 1 in their unit.
     starts: ClassVar[Float[np.ndarray, "sectors starts 3"]]
 
     @abc.abstractmethod
@@ -146,7 +146,7 @@ class AbstractLevel(AbstractSurface):
         return jax.jvp(self.normal, (vector_of(together[:3]),), (vector_of(together[3:]),))[1]
 
     def bending(self, position: Vector, a: Vector, b: Vector) -> tuple[Component, Component, Component]:
-        # Along the surface the change of the gradient's size is across a and b.
+        # The gradient's size changes the normal only along n, which is perpendicular to a and b.
         gradient = self.gradient(position)
         per_size = 1.0 / jnp.sqrt(dot(gradient, gradient))
         aa, ab, bb = (self.second_derivative(position, *pair) for pair in ((a, a), (a, b), (b, b)))
@@ -164,7 +164,7 @@ class AbstractLevel(AbstractSurface):
 
     def nearest(self, position: Vector) -> Vector:
         surface, place = _held(self), jax.lax.stop_gradient(position)
-        # A start that is off the surface on the position's side would be nearer than every point of the surface.
+        # A start off the surface, on the position's side, would be nearer than every point of the surface.
         first = surface.onto(surface.onto(place))
         within = jnp.sqrt(_square(place, first))
         starts = jnp.asarray(self.starts)
@@ -210,8 +210,8 @@ class AbstractLevel(AbstractSurface):
         return BallGap(_lowered(lowest, gap, normal), normal, gap)
 
     def _about(self, position: Vector, foot: Vector) -> tuple[Vector, Vector, Quadratic]:
-        """Two tangents at a foot, and the square of the distance to a position along them: half its second derivatives, and
-        minus half its first ones."""
+        """Two tangents at a foot, and the squared distance to a position along them: half its second derivatives, and
+        minus half its first derivatives."""
         n = self.normal(foot)
         away = vector_of(subtract(a, b) for a, b in zip(position, foot, strict=True))
         d, (t1, t2) = dot(away, n), tangents(n)
@@ -219,8 +219,8 @@ class AbstractLevel(AbstractSurface):
         return t1, t2, Quadratic(1.0 + d * aa, d * ab, 1.0 + d * bb, dot(away, t1), dot(away, t2))
 
     def _under(self, centre: Vector, radius: Component, normal: Vector) -> tuple[Vector, Vector, Quadratic]:
-        """Two tangents of a ball at its point against a normal, and the function along them, per unit gradient and radius: its
-        second derivatives by the normal, and minus its first ones."""
+        """Two tangents of a ball at its point opposite to a normal, and the function along them, per unit gradient and
+        radius: its second derivatives, and minus its first derivatives."""
         lowest, (t1, t2) = _lowered(centre, radius, normal), tangents(normal)
         m = self.normal(lowest)
         aa, ab, bb = self.bending(lowest, t1, t2)
@@ -229,7 +229,7 @@ class AbstractLevel(AbstractSurface):
 
 
 def _held(surface: AbstractLevel) -> AbstractLevel:
-    """A surface by whose numbers nothing is differentiated."""
+    """A surface that is not differentiated by its numbers."""
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, surface)
 
 

@@ -1,7 +1,8 @@
 """The length of a vector in a plane, such as the sine of an angle from a pole, with its derivative where the length is 0.
 
-There the length has no gradient, only one-sided derivatives: it grows in every direction. A forward derivative is that of a
-step in the direction of the tangent, |tangent|. A reverse one is NaN, and 0 by numbers that do not move the vector.
+At length 0 there is no gradient, only one-sided derivatives: the length grows in every direction. The forward
+derivative is that of a step in the direction of the tangent, |tangent|. The reverse derivative is NaN, and 0 by numbers
+that do not move the vector.
 """
 
 from typing import Any
@@ -41,7 +42,8 @@ def _change(primals: Any, tangents: Any) -> Any:
     return length, jnp.where(at_pole, _departure.bind(dx, dy), (x * dx + y * dy) / divisor)
 
 
-#: The length of a tangent at the pole: as its own transpose, which no linear function is, NaN for every cotangent but 0.
+#: The length of a tangent at the pole, which no linear function has as its own transpose: NaN for every cotangent but
+#: 0.
 _departure = Primitive("departure_from_pole")
 _departure.def_impl(lambda dx, dy: jnp.hypot(dx, dy))
 _departure.def_abstract_eval(lambda dx, dy: ShapedArray(dx.shape, dx.dtype))

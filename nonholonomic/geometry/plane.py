@@ -37,7 +37,7 @@ class Plane(AbstractSurface):
     units: ClassVar[dict[str, str]] = {"tilt": "rad"}
 
     axes: ClassVar[int] = 2
-    # "outside" is what one calls the only side of a plane where grounds are compared.
+    # "outside" is accepted for the only side of a plane, so that grounds can be compared.
     sides: ClassVar[Mapping[str, float]] = {"outside": CLOSED["outside"], **OPEN}
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("x", "m"), ("y", "m"))
 

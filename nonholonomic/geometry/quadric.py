@@ -15,10 +15,10 @@ from .planar_length import planar_length
 from .surface import AbstractSurface, Place
 from .vector import Component, Vector, dot, multiply, scale, subtract, sum_vectors
 
-#: Newton steps to the nearest point of a spheroid: as many as its worst positions need.
+#: Newton steps to the nearest point of a spheroid: enough for the worst positions.
 NEWTON_STEPS = 12
 
-#: A distance [m] that is as good as none, by which numbers can be divided.
+#: A negligible distance [m], to avoid division by zero.
 TINY = 1e-100
 
 
@@ -34,13 +34,13 @@ class AbstractQuadric(AbstractSurface):
         """Equatorial radius A and polar semi-axis c [m]."""
 
     def gradient(self, vector: Vector) -> Vector:
-        """The vector N r [1/m]; also N times any other vector."""
+        """The vector N r [1/m] for a position r, along the normal; also N times any other vector."""
         equatorial, polar = self.semi_axes
         across, along = 1.0 / (equatorial * equatorial), 1.0 / (polar * polar)
         return (multiply(across, vector[0]), multiply(across, vector[1]), multiply(along, vector[2]))
 
     def normal(self, position: Vector) -> Vector:
-        # Normalised even where N r has unit length on the surface, so that a drift off it does not amplify itself.
+        # Normalised even though N r has unit length on the surface, so that a drift off the surface does not grow.
         gradient = self.gradient(position)
         return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), gradient)
 
@@ -51,7 +51,7 @@ class AbstractQuadric(AbstractSurface):
         return scale(1.0 / jnp.sqrt(dot(gradient, gradient)), sum_vectors(turning, along))
 
     def bending(self, position: Vector, a: Vector, b: Vector) -> tuple[Component, Component, Component]:
-        # Along the surface the change of the gradient's size is across a and b.
+        # The gradient's size changes the normal only along n, which is perpendicular to a and b.
         gradient, by_a = self.gradient(position), self.gradient(a)
         per_size = 1.0 / jnp.sqrt(dot(gradient, gradient))
         aa, ab, bb = dot(a, by_a), dot(b, by_a), dot(b, self.gradient(b))
@@ -183,12 +183,12 @@ class Spheroid(AbstractQuadric):
         return 0.5 * (dot(position, gradient) - 1.0) / jnp.sqrt(dot(gradient, gradient))
 
     def nearest(self, position: Vector) -> Vector:
-        # q = (1 + t N)^-1 r, with the greatest t for which q is on the surface: of all solutions the nearest point. The inverse
-        # length of N^1/2 q is almost linear in t, so Newton's method needs few steps (Moré and Sorensen, SIAM Journal on
-        # Scientific and Statistical Computing 4 (1983) 553).
+        # q = (1 + t N)^-1 r, with the greatest t for which q is on the surface: this is the nearest solution. The
+        # inverse length of N^1/2 q is almost linear in t, so Newton's method needs few steps (Moré and Sorensen, SIAM
+        # Journal on Scientific and Statistical Computing 4 (1983) 553).
         equatorial, polar = self.semi_axes
         x, y, z = position
-        # Where all directions are as near, the one of growing coordinates is taken.
+        # Where all directions are equally near, take that of growing coordinates.
         across, along = jnp.sqrt(jnp.maximum(x * x + y * y, TINY * TINY)), jnp.maximum(jnp.abs(z), TINY)
         least = jnp.minimum(equatorial, polar)
         numbers = (equatorial * across, polar * along, equatorial**2 - least**2, polar**2 - least**2)

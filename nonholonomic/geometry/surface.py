@@ -1,13 +1,13 @@
-"""What a surface answers to whoever moves on it: the one interface of all of them.
+"""The interface of all surfaces.
 
-A surface has axes of its own, in which positions, velocities and normals are given. They are those of the fixed frame
-(x, y, z), z up, everywhere but on a tilted plane, whose third axis is its normal; `up` is the vertical in them. No
-component has a pole, an edge or an angle in it. `chart` and `place_at` convert between positions and the few numbers with
-which a person would name a place.
+A surface has its own axes, in which positions, velocities and normals are given. They are those of the fixed frame (x,
+y, z), z up, except on a tilted plane, whose third axis is its normal; `up` is the vertical in them. The components have
+no singularities. `chart` and `place_at` convert between positions and places, the few coordinates with which users name
+a position.
 
 The unit normal points outward on a closed surface (sphere, spheroid, torus, cylinder), upward on an open one (plane,
-paraboloid, graph) and to positive values of an implicit surface's function. On which side of it the body is, is the
-scene's business: `sign` reads the word.
+paraboloid, graph) and to positive values of an implicit surface's function. The scene decides on which side of the
+surface the body is; `sign` converts the word for a side.
 
 Vectors are tuples of three components, each a number or an array over lanes, or `None` where it vanishes identically.
 """
@@ -23,11 +23,11 @@ from .vector import Component, Vector, dot, scale, subtract
 
 Place = tuple[Any, ...]
 
-#: Distance of a place given as (x, y, z) from its surface, relative to its size, up to which it is round-off.
+#: Largest distance of a place (x, y, z) from its surface, relative to its size, that counts as round-off.
 ROUND_OFF = 1e-9
 
-#: The words for the sides of a surface that encloses a room, of one with a room above it only, and of one that a function
-#: divides from the rest; with each the sign of the normal that points into the room.
+#: The words for the sides of a closed surface, of an open surface, and of an implicit one, each with the sign of the
+#: normal that points to that side.
 CLOSED: Mapping[str, float] = {"outside": 1.0, "inside": -1.0}
 OPEN: Mapping[str, float] = {"above": 1.0}
 DIVIDED: Mapping[str, float] = {"positive": 1.0}
@@ -37,8 +37,8 @@ class BallGap(NamedTuple):
     """The gap between a ball and a surface.
 
     - `foot`: the point [m] that the ball is about to touch; `normal`: from it towards the ball.
-    - `gap`: distance [m] between them, to first order where the surface is given by a function alone; negative where the ball
-      is in the arena, and only there.
+    - `gap`: distance [m] between them, to first order if the surface is given by a function alone; negative only where
+      the ball is in the arena.
     """
 
     foot: Vector
@@ -65,10 +65,10 @@ class AbstractSurface(Bounded):
     #: How many of a position's three components do not vanish identically.
     axes: ClassVar[int] = 3
 
-    #: The words for the side on which a body is, and the sign of n that points to it.
+    #: The words for the side on which a body can be, and the sign of n that points to that side.
     sides: ClassVar[Mapping[str, float]] = CLOSED
 
-    #: Names and units of the numbers of a place.
+    #: Names and units of the coordinates of a place.
     coordinates: ClassVar[tuple[tuple[str, str], ...]] = (("mu", "rad"), ("eta", "rad"))
 
     @property
@@ -78,7 +78,7 @@ class AbstractSurface(Bounded):
 
     @abc.abstractmethod
     def normal(self, position: Vector) -> Vector:
-        """Unit normal n at a position [m]; off the surface, that of a surface alongside."""
+        """Unit normal n at a position [m]; off the surface, the normal of a surface alongside."""
 
     @abc.abstractmethod
     def normal_rate(self, position: Vector, velocity: Vector) -> Vector:
@@ -99,17 +99,17 @@ class AbstractSurface(Bounded):
 
     @abc.abstractmethod
     def nearest(self, position: Vector) -> Vector:
-        """The point [m] of the surface that is nearest to a position [m]; one of them where several are."""
+        """The point [m] of the surface that is nearest to a position [m]; if there are several, one of them."""
 
     def onto(self, position: Vector) -> Vector:
         """A position [m] that has drifted off the surface, brought back to it."""
         return self.nearest(position)
 
     def ball_gap(self, centre: Vector, radius: Component, side: float) -> BallGap:
-        """Where a ball is about to touch the surface.
+        """The point where a ball is about to touch the surface, and the gap.
 
-        **Arguments:** `centre`: of the ball [m]; `radius`: of the ball [m], less than the radii of curvature where the surface
-        is hollow; `side`: 1.0 if the ball is on the side to which n points, else -1.0.
+        **Arguments:** `centre`: of the ball [m]; `radius`: of the ball [m], less than the radii of curvature where the
+        surface is concave; `side`: 1.0 if the ball is on the side to which n points, else -1.0.
         """
         foot = self.nearest(centre)
         foot = tuple(0.0 * centre[0] if part is None else part for part in foot)
@@ -120,7 +120,7 @@ class AbstractSurface(Bounded):
         )
 
     def offset(self, position: Vector) -> Component:
-        """`distance` [m], to first order where that is cheaper: for positions next to the surface."""
+        """Distance [m], to first order if that is cheaper: for positions close to the surface."""
         return self.distance(position)
 
     def distance(self, position: Vector) -> Component:
@@ -135,7 +135,7 @@ class AbstractSurface(Bounded):
 
     @abc.abstractmethod
     def charted(self, place: Place) -> tuple[Vector, Vector, Vector]:
-        """`chart`, for a place that is named by `coordinates`."""
+        """Like `chart`, for a place that is named by `coordinates`."""
 
     def chart(self, place: Place) -> tuple[Vector, Vector, Vector]:
         """Position [m] of a place, and two unit vectors along the surface there, east and north; n = east x north.
@@ -151,7 +151,7 @@ class AbstractSurface(Bounded):
     def place_bounds(self, place: Place, size: Any) -> Iterator[Bound]:
         """The ranges of the numbers of a place.
 
-        **Arguments:** `place`: as for `chart`; `size`: a length [m] of the body, against which round-off is seen.
+        **Arguments:** `place`: as for `chart`; `size`: a length [m] of the body, the scale for round-off.
 
         **Raises:** `ValueError` for a wrong number of numbers.
         """
@@ -163,13 +163,13 @@ class AbstractSurface(Bounded):
         if len(place) == 3:
             off = self.offset(self.in_own_axes((place[0], place[1], place[2])))
             most = ROUND_OFF * (size + jnp.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2))
-            why = "of a place from the surface, in metres: it must be on it but for round-off"
+            why = "of the place from the surface, in metres: the place must be on the surface up to round-off"
             yield Bound(0.0 if off is None else off, "distance", at_least=-most, at_most=most, why=why)
 
     def sign(self, side: str | None, closed: str) -> float:
-        """1.0 if n points into the room where the body is, -1.0 if it points out of it.
+        """1.0 if n points to the side where the body is, else -1.0.
 
-        **Arguments:** `side`: one of `sides`, or `None`; `closed`: what `None` means where there are two sides.
+        **Arguments:** `side`: one of `sides`, or `None`; `closed`: the meaning of `None` if there are two sides.
 
         **Raises:** `ValueError` for another word.
         """
@@ -179,7 +179,7 @@ class AbstractSurface(Bounded):
         if not isinstance(side, str) or side not in words:
             raise ValueError(f"side = {side!r} must be one of {', '.join(map(repr, words))}, or None")
         if side not in self.sides:
-            # All words that a surface without this side has mean the same.
+            # On a surface without this side, all words have the same meaning.
             raise ValueError(f"side = {side!r} must be {next(iter(self.sides))!r} on a {type(self).__name__}")
         return self.sides[side]
 

@@ -42,7 +42,9 @@ class Torus(AbstractSurface):
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.ring, "ring", above=0.0)
         yield Bound(self.tube, "tube", above=0.0)
-        yield Bound(self.tube, "tube", below=self.ring, why="the ring; the tube would meet itself")
+        yield Bound(
+            self.tube, "tube", below=self.ring, why="the radius of the ring: otherwise the tube would intersect itself"
+        )
 
     def from_middle(self, position: Vector) -> Vector:
         """The vector [m] to a position from the nearest point of the circle along the middle of the tube."""

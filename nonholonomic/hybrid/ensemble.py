@@ -107,7 +107,7 @@ class HybridOutcome(NamedTuple, Generic[Numbers]):
 def _problem(
     mode: AbstractBatchedMode, cell: Int[Numbers, " cells"], state: Float[Numbers, "components cells"]
 ) -> AbstractProblem:
-    return _of_cells(mode, cell).problem(jnp.asarray(state))
+    return mode_of_cells(mode, cell).problem(jnp.asarray(state))
 
 
 @compiled_quickly
@@ -117,13 +117,18 @@ def _reset_map(
     state: Float[Array, "components cells"],
     left: Float[Array, " cells"],
 ) -> Transition:
-    return _of_cells(mode, cell).reset_map(state, left)
+    return mode_of_cells(mode, cell).reset_map(state, left)
 
 
-def _of_cells(mode: AbstractBatchedMode, cell: Int[Numbers, " cells"]) -> AbstractBatchedMode:
-    """A mode of some cells."""
-    numbers, rest = eqx.partition(mode, eqx.is_array)
-    return eqx.combine(jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[..., cell], numbers), rest)
+def mode_of_cells(mode: AbstractBatchedMode, cell: Int[Numbers, " selected"]) -> AbstractBatchedMode:
+    """The mode of the cells with these numbers."""
+    numbers, static = eqx.partition(mode, eqx.is_array)
+    return eqx.combine(jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[..., cell], numbers), static)
+
+
+def runs_of_cells(runs: HybridOutcome[Numbers], cell: Int[Numbers, " selected"]) -> HybridOutcome[Numbers]:
+    """The runs of the cells with these numbers."""
+    return HybridOutcome(*(values[..., cell] for values in runs))
 
 
 def solve_hybrid(
@@ -206,7 +211,7 @@ def _compile(
 
 
 def _gather(
-    runs: HybridOutcome[np.ndarray], selected: Int[np.ndarray, " some"], t1: Float[np.ndarray, " cells"]
+    runs: HybridOutcome[np.ndarray], selected: Int[np.ndarray, " selected"], t1: Float[np.ndarray, " cells"]
 ) -> tuple[Int[np.ndarray, " cells"], Float[np.ndarray, "components cells"], Float[np.ndarray, " cells"]]:
     """The numbers, the states and the remaining times of some cells, padded to the full number of cells."""
     size = len(runs.status)
@@ -217,7 +222,7 @@ def _gather(
 def _solve_mode(
     mode: AbstractBatchedMode,
     runs: HybridOutcome[np.ndarray],
-    selected: Int[np.ndarray, " some"],
+    selected: Int[np.ndarray, " selected"],
     t1: Float[np.ndarray, " cells"],
     settings: Settings,
     options: dict[str, Any],
@@ -227,26 +232,24 @@ def _solve_mode(
     problem = _problem(mode, cell, state)
     outcome, _ = solve_ensemble(problem, left, np.asarray(selected.size), settings, **options)
     outcome = jax.tree.map(lambda values: np.asarray(values)[..., : selected.size], outcome)
-    _store(runs, selected, after_solve(np, _selected(runs, selected), outcome, t1[selected]))
+    _store(runs, selected, after_solve(np, runs_of_cells(runs, selected), outcome, t1[selected]))
 
 
 def _apply_reset(
     mode: AbstractBatchedMode,
     runs: HybridOutcome[np.ndarray],
-    selected: Int[np.ndarray, " some"],
+    selected: Int[np.ndarray, " selected"],
     t1: Float[np.ndarray, " cells"],
 ) -> None:
     """Apply the reset map to some cells and store the transition."""
     transition = _reset_map(mode, *_gather(runs, selected, t1))
     transition = jax.tree.map(lambda values: np.asarray(values)[..., : selected.size], transition)
-    _store(runs, selected, after_reset(np, _selected(runs, selected), transition, t1[selected]))
+    _store(runs, selected, after_reset(np, runs_of_cells(runs, selected), transition, t1[selected]))
 
 
-def _selected(runs: HybridOutcome[np.ndarray], selected: Int[np.ndarray, " some"]) -> HybridOutcome[np.ndarray]:
-    return HybridOutcome(*(values[..., selected] for values in runs))
-
-
-def _store(runs: HybridOutcome[np.ndarray], selected: Int[np.ndarray, " some"], new: HybridOutcome[np.ndarray]) -> None:
+def _store(
+    runs: HybridOutcome[np.ndarray], selected: Int[np.ndarray, " selected"], new: HybridOutcome[np.ndarray]
+) -> None:
     for values, of_selected in zip(runs, new, strict=True):
         values[..., selected] = of_selected
 

@@ -164,8 +164,13 @@ def solve_hybrid_dense(
         transition = _leave(mode, state, jnp.asarray(t1 - time))
         segments += _way(mode, transition, time)
         counts += np.asarray(transition.counts)[:, 0]
-        number, status, state = int(transition.mode[0]), int(transition.status[0]), transition.state[:, 0]
-        time = t1 if status == REACHED_END else time + float(transition.elapsed[0])
+        # NumPy cuts these: JAX would compile every cut.
+        number, status, state, elapsed = (
+            np.asarray(part)[..., 0]
+            for part in (transition.mode, transition.status, transition.state, transition.elapsed)
+        )
+        number, status = int(number), int(status)
+        time = t1 if status == REACHED_END else time + float(elapsed)
         if not (np.isfinite(state).all() and np.isfinite(time)):
             status, time = FAILED, segments[-1].end
         if status != RUNNING:

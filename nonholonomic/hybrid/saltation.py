@@ -26,8 +26,8 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Bool, Float, Int
 
 from ..derivatives.slopes import tangents_of
-from ..derivatives.variation import VariationalProblem, where_active
-from ..integration import AbstractProblem, Settings
+from ..derivatives.variation import VariationalProblem, in_groups, where_active
+from ..integration import CROSSED, REACHED_END, AbstractProblem, Settings
 from ..integration.scheduler import Numbers
 from .ensemble import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid
 from .traced_ensemble import traced_solve_hybrid
@@ -258,8 +258,8 @@ def _along(function: Any, point: tuple[Array, ...], tangents: list[tuple[Array, 
 
 
 class Slopes(NamedTuple, Generic[Numbers]):
-    """Derivatives of the times of the events at which runs ended, (tangents, cells); and where they have no correct
-    digits, because an event on the way was `grazing`.
+    """Derivatives of the times of the events at which runs ended, (tangents, cells); and where they are NaN because an event on
+    the way was `grazing`, so that they have no correct digits.
     """
 
     slopes: Float[Numbers, "tangents cells"]
@@ -286,12 +286,14 @@ def solve_hybrid_with_tangents(
     - `ends_on_event`: whether runs end on the event; else they end at `t1`, which is then the event's time.
 
     **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event, or it is at the start.
+    Source: implicit function theorem at the event, saltation at every change of mode.
     """
     varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
     start, n_blocks = np.asarray(variational_start(jnp.asarray(state), tangents)), 1 + len(tangents)
     ended = solve_hybrid(varied, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks)
     slopes = [np.asarray(_slopes(varied_mode, jnp.asarray(ended.state))) for varied_mode in varied]
-    return _own(ended, len(state)), Slopes(_of_mode(np, ended, slopes), ended.counts[-1] > 0)
+    event_time = ended.crossing_time if ends_on_event else np.broadcast_to(t1, len(mode))
+    return _own(ended, len(state)), _known(np, ended, _of_mode(np, ended, slopes), event_time, ends_on_event)
 
 
 def traced_solve_hybrid_with_tangents(
@@ -300,17 +302,41 @@ def traced_solve_hybrid_with_tangents(
     mode: Int[Array, " cells"],
     state: Float[Array, "components cells"],
     t1: Float[Array, "..."],
+    cells: int,
     settings: Settings,
     *,
     counters: int,
     ends_on_event: bool = True,
 ) -> tuple[HybridOutcome[Array], Slopes[Array]]:
-    """`solve_hybrid_with_tangents` inside other transformed functions, for all cells; arguments and results are traced."""
-    varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
-    start, n_blocks = variational_start(state, tangents), 1 + len(tangents)
-    ended = traced_solve_hybrid(varied, mode, start, t1, settings, counters=counters + 1, n_blocks=n_blocks)
-    slopes = _of_mode(jnp, ended, [varied_mode.slopes(ended.state) for varied_mode in varied])
-    return _own(ended, len(state)), Slopes(slopes, ended.counts[-1] > 0)
+    """`solve_hybrid_with_tangents` inside other transformed functions; arguments and results are traced."""
+
+    def run(group: tuple[Any, ...]) -> tuple[tuple[HybridOutcome[Array], Array], list[Float[Array, " cells"]]]:
+        varied = variational_modes(modes, group, settings.tolerance, ends_on_event)
+        start, n_blocks = variational_start(state, group), 1 + len(group)
+        ended = traced_solve_hybrid(varied, mode, start, t1, cells, settings, counters=counters + 1, n_blocks=n_blocks)
+        slopes = _of_mode(jnp, ended, [varied_mode.slopes(ended.state) for varied_mode in varied])
+        event_time = ended.crossing_time if ends_on_event else jnp.broadcast_to(t1, mode.shape)
+        known = _known(jnp, ended, slopes, event_time, ends_on_event)
+        return (_own(ended, len(state)), known.grazing), list(known.slopes)
+
+    (outcome, grazing), slopes = in_groups(run, tangents)
+    return outcome, Slopes(jnp.stack(slopes), grazing)
+
+
+def _known(
+    xp: Any,
+    ended: HybridOutcome[Numbers],
+    slopes: Float[Numbers, "tangents cells"],
+    event_time: Float[Numbers, " cells"],
+    ends_on_event: bool,
+) -> Slopes[Numbers]:
+    """The derivatives of the times of events, where these happened and the derivatives have correct digits."""
+    # An event at the start has a fixed time, whatever the tangent.
+    happened = xp.isfinite(event_time) & (event_time > 0.0)
+    # With its variations a run takes other steps: where it does not reach the event, it has no derivative.
+    arrived = ended.status == (CROSSED if ends_on_event else REACHED_END)
+    grazing = happened & ((ended.counts[-1] > 0) | ~arrived)
+    return Slopes(xp.where(happened, xp.where(grazing, xp.nan, slopes), 0.0), grazing)
 
 
 def _own(ended: HybridOutcome[Numbers], size: int) -> HybridOutcome[Numbers]:

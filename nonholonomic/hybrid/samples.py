@@ -97,17 +97,17 @@ class HybridSampling(AbstractSampling):
     counters: int = eqx.field(static=True)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> HybridSamples:
-        numbers, (*given, tolerance), spec = self._sorted(leaves)
+        numbers, (*horizon, tolerance), spec = self._sorted(leaves)
         settings = spec.settings.with_tolerance(tolerance)
-        found, _ = _follow(spec.made(numbers, tolerance), (), given, settings, self.counters)
-        return jax.tree.map(lambda part: part[None], found)
+        samples, _ = _follow(spec.made(numbers, tolerance), (), horizon, settings, self.counters)
+        return jax.tree.map(lambda part: part[None], samples)
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[HybridSamples, list[HybridSamples]]:
         if again:
             raise ValueError("second derivatives do not go through changes of phase: contact = 'hybrid'")
-        numbers, (*given, tolerance), spec = self._sorted(leaves)
+        numbers, (*horizon, tolerance), spec = self._sorted(leaves)
         settings = spec.settings.with_tolerance(tolerance)
 
         def build(numbers: tuple[Array, ...], cells: int | None) -> Any:
@@ -115,18 +115,20 @@ class HybridSampling(AbstractSampling):
 
         built, tangents, gather = tangents_by(build, active, numbers, None)
 
-        def run(some: tuple[Any, ...]) -> tuple[HybridSamples, list[HybridSamples]]:
-            return _follow(built, tuple((one[0], one[2]) for one in some), given, settings, self.counters)
+        def run(group: tuple[Any, ...]) -> tuple[HybridSamples, list[HybridSamples]]:
+            return _follow(
+                built, tuple((tangent[0], tangent[2]) for tangent in group), horizon, settings, self.counters
+            )
 
-        found, slopes = in_groups(run, tangents)
-        return jax.tree.map(lambda part: part[None], (found, gather(slopes)))
+        samples, slopes = in_groups(run, tangents)
+        return jax.tree.map(lambda part: part[None], (samples, gather(slopes)))
 
 
 def _follow(
-    built: Any, tangents: tuple[Any, ...], given: Sequence[Array], settings: Settings, counters: int
+    built: Any, tangents: tuple[Any, ...], horizon: Sequence[Array], settings: Settings, counters: int
 ) -> tuple[HybridSamples, list[HybridSamples]]:
     """The run, and its derivative along each tangent."""
-    (modes, first, state), (times, t1) = built, given
+    (modes, first, state), (times, t1) = built, horizon
     varied, start = variational_modes(modes, tangents, settings.tolerance, False), variational_start(state, tangents)
     ended, filled = _followed(varied, first, start, times, t1, settings, counters)
     return _found(ended, filled, times, len(state), len(tangents))
@@ -142,13 +144,13 @@ class Filled(NamedTuple):
     number: Float[Array, " times"]
     grazed: Float[Array, ""]
 
-    def with_samples(self, here: Bool[Array, " times"], seen: tuple[Array, Array], number: Array | int) -> "Filled":
+    def with_samples(self, at: Bool[Array, " times"], output: tuple[Array, Array], number: Array | int) -> "Filled":
         """Fill in the samples at some times that have none yet."""
-        here = here & jnp.isnan(self.number)
+        at = at & jnp.isnan(self.number)
         shown, variations = (
-            jnp.where(here, new, old) for new, old in zip(seen, (self.shown, self.variations), strict=True)
+            jnp.where(at, new, old) for new, old in zip(output, (self.shown, self.variations), strict=True)
         )
-        return self._replace(shown=shown, variations=variations, number=jnp.where(here, number, self.number))
+        return self._replace(shown=shown, variations=variations, number=jnp.where(at, number, self.number))
 
 
 def _followed(
@@ -173,46 +175,44 @@ def _followed(
     kinds_of_modes = alike(modes)
 
     def stay(
-        one: VariationalMode, number: Array, found: HybridOutcome[Array], filled: Filled
+        mode: VariationalMode, number: Array, run: HybridOutcome[Array], filled: Filled
     ) -> tuple[HybridOutcome[Array], Filled]:
-        since, left = times - found.end_time, greatest(t1 - found.end_time, 0.0)
+        since, left = times - run.end_time, greatest(t1 - run.end_time, 0.0)
         outcome, samples = solve_with_samples(
-            one.problem(found.state), since, left, jnp.asarray(1), settings, n_blocks=1 + count
+            mode.problem(run.state), since, left, jnp.asarray(1), settings, n_blocks=1 + count
         )
-        after = after_solve(jnp, found, outcome, t1)
-        return after, filled.with_samples((since >= 0.0) & (times <= after.end_time), one.seen(samples[0].T), number)
+        after = after_solve(jnp, run, outcome, t1)
+        return after, filled.with_samples((since >= 0.0) & (times <= after.end_time), mode.seen(samples[0].T), number)
 
-    def change(
-        one: VariationalMode, found: HybridOutcome[Array], filled: Filled
-    ) -> tuple[HybridOutcome[Array], Filled]:
+    def change(mode: VariationalMode, run: HybridOutcome[Array], filled: Filled) -> tuple[HybridOutcome[Array], Filled]:
         def seen(mode: AbstractBatchedMode, record: TransitionPath | None, left: Float[Array, " 1"]) -> Any:
             # Relative to an event that is later, a fixed time comes sooner, as the horizon does.
             return None if record is None else _on_the_way(mode, record, times - t1 + left)
 
-        left = greatest(t1 - found.end_time, 0.0)
-        transition, shown, variations = one.left_behind(found.state, left, seen)
-        after = after_reset(jnp, found, transition, t1)
+        left = greatest(t1 - run.end_time, 0.0)
+        transition, shown, variations = mode.left_behind(run.state, left, seen)
+        after = after_reset(jnp, run, transition, t1)
         if shown is not None:
-            inside = (times > found.end_time) & (times <= after.end_time)
+            inside = (times > run.end_time) & (times <= after.end_time)
             filled = filled.with_samples(inside, (shown, variations), BETWEEN)
-        grazes = after.counts[-1, 0] > found.counts[-1, 0]
+        grazes = after.counts[-1, 0] > run.counts[-1, 0]
         return after, filled._replace(
-            grazed=jnp.where(grazes, jnp.minimum(filled.grazed, found.end_time[0]), filled.grazed)
+            grazed=jnp.where(grazes, jnp.minimum(filled.grazed, run.end_time[0]), filled.grazed)
         )
 
     def one_round(carry: Any) -> Any:
-        found, filled, rounds = carry
-        at = found.mode[0]
+        run, filled, rounds = carry
+        at = run.mode[0]
         for numbers in kinds_of_modes:
-            under_way = (found.status[0] == RUNNING) & jnp.isin(at, jnp.asarray(numbers))
+            under_way = (run.status[0] == RUNNING) & jnp.isin(at, jnp.asarray(numbers))
 
-            def here(numbers: tuple[int, ...] = numbers, found: Any = found, filled: Any = filled) -> Any:
-                one = selected(modes, numbers, at)
-                stayed = stay(one, at, found, filled)
-                return jax.lax.cond(stayed[0].status[0] == LEFT_DOMAIN, lambda: change(one, *stayed), lambda: stayed)
+            def advance(numbers: tuple[int, ...] = numbers, run: Any = run, filled: Any = filled) -> Any:
+                mode = selected(modes, numbers, at)
+                stayed = stay(mode, at, run, filled)
+                return jax.lax.cond(stayed[0].status[0] == LEFT_DOMAIN, lambda: change(mode, *stayed), lambda: stayed)
 
-            found, filled = jax.lax.cond(under_way, here, lambda found=found, filled=filled: (found, filled))
-        return found, filled, rounds + 1
+            run, filled = jax.lax.cond(under_way, advance, lambda run=run, filled=filled: (run, filled))
+        return run, filled, rounds + 1
 
     return in_rounds(one_round, start, empty)
 
@@ -266,9 +266,9 @@ def _found(
     late = jnp.where(times > filled.grazed, jnp.nan, 0.0)
     # The variation of a time stands behind that of the state; a horizon does not move.
     later = [ended.state[k * (size + 1) + size, 0] for k in range(1, count + 1)]
-    later = [jnp.where(status == REACHED_END, 0.0, jnp.where(grazed, jnp.nan, one)) for one in later]
+    later = [jnp.where(status == REACHED_END, 0.0, jnp.where(grazed, jnp.nan, delay)) for delay in later]
     numbers = (status, ended.steps[0], ended.rejected[0], ended.counts[:-1, 0])
     others = (part.astype(float) for part in numbers)
-    found = HybridSamples(filled.shown, filled.number, end_time, ended.state[:size, 0], *others)
+    samples = HybridSamples(filled.shown, filled.number, end_time, ended.state[:size, 0], *others)
     slopes = [HybridSamples(filled.variations[k] + late, UNCHANGED, later[k], *(UNCHANGED,) * 5) for k in range(count)]
-    return found, slopes
+    return samples, slopes

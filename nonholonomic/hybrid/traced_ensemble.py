@@ -3,16 +3,23 @@
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..integration.ensemble import traced_solve_ensemble
 from ..integration.settings import Settings
-from ..integration.status import LEFT_DOMAIN, RUNNING, UNRESOLVED
+from ..integration.status import LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
 from ..xla_cpu import greatest
-from .ensemble import MOST_ROUNDS, AbstractBatchedMode, HybridOutcome, after_reset, after_solve
+from .ensemble import (
+    MOST_ROUNDS,
+    AbstractBatchedMode,
+    HybridOutcome,
+    after_reset,
+    after_solve,
+    mode_of_cells,
+    runs_of_cells,
+)
 
 
 def traced_solve_hybrid(
@@ -20,6 +27,7 @@ def traced_solve_hybrid(
     mode: Int[Array, " cells"],
     state: Float[Array, "components cells"],
     t1: Float[Array, "..."],
+    cells: int,
     settings: Settings,
     *,
     counters: int,
@@ -38,7 +46,7 @@ def traced_solve_hybrid(
     t1 = jnp.broadcast_to(t1, (size,))
     zero, none = jnp.zeros(size), jnp.zeros(size, int)
     start = HybridOutcome(
-        status=jnp.full(size, RUNNING),
+        status=jnp.where(jnp.arange(size) < cells, RUNNING, REACHED_END),
         crossing_time=jnp.full(size, jnp.inf),
         end_time=zero,
         state=state,
@@ -52,7 +60,8 @@ def traced_solve_hybrid(
         batched_mode: AbstractBatchedMode, runs: HybridOutcome[Array], active: Bool[Array, " cells"]
     ) -> HybridOutcome[Array]:
         def ensemble_solve() -> HybridOutcome[Array]:
-            padded_mode, padded_runs = of_cells(batched_mode, active), in_place_of(runs, active)
+            cell = padded(active)
+            padded_mode, padded_runs = mode_of_cells(batched_mode, cell), runs_of_cells(runs, cell)
             left = jnp.where(active, greatest(t1 - runs.end_time, 0.0), 0.0)
             problem = padded_mode.problem(padded_runs.state)
             outcome, _ = traced_solve_ensemble(
@@ -94,27 +103,17 @@ def apply_reset(
     """Apply the reset map to the cells at the end of a mode."""
 
     def passed() -> HybridOutcome[Array]:
-        padded_mode, padded_runs = of_cells(batched_mode, lost), in_place_of(runs, lost)
+        cell = padded(lost)
+        padded_mode, padded_runs = mode_of_cells(batched_mode, cell), runs_of_cells(runs, cell)
         transition = padded_mode.reset_map(padded_runs.state, greatest(t1 - padded_runs.end_time, 0.0))
         return chosen(lost, after_reset(jnp, runs, transition, t1), runs)
 
     return jax.lax.cond(jnp.any(lost), passed, lambda: runs)
 
 
-def of_cells(mode: AbstractBatchedMode, selected: Bool[Array, " cells"]) -> AbstractBatchedMode:
-    """A mode of some cells; the numbers of the first of them replace those of the others."""
-    numbers, static = eqx.partition(mode, eqx.is_array)
-    return eqx.combine(
-        jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[..., _cell(selected)], numbers), static
-    )
-
-
-def in_place_of(runs: HybridOutcome[Array], selected: Bool[Array, " cells"]) -> HybridOutcome[Array]:
-    """The state of some cells, with the first of them in place of the others, whose states have another meaning."""
-    return jax.tree.map(lambda values: values[..., _cell(selected)], runs)
-
-
-def _cell(selected: Bool[Array, " cells"]) -> Int[Array, " cells"]:
+def padded(selected: Bool[Array, " cells"]) -> Int[Array, " cells"]:
+    """The numbers of the selected cells, and that of the first of them in place of the others, whose states may have another
+    meaning."""
     return jnp.where(selected, jnp.arange(selected.size), jnp.argmax(selected))
 
 

@@ -1,8 +1,8 @@
-"""Finding the parameters of a model from measurements, and how well the measurements determine them.
+"""Estimate parameters of a model from measurements, and report how well the measurements determine them.
 
 `identify` fits the `Free` parameters from several starts; the `Identification` has standard errors, profile
-likelihoods, the combinations that the data do not determine, and a `Verdict`. `Measurements` are what is fitted; recordings of
-both models are checked, read from files and turned into them here.
+likelihoods, the combinations that the data do not determine, and a `Verdict`. `Measurements` are the data of a fit.
+Recordings of both vehicles are checked, read from files and converted to `Measurements` here.
 """
 
 from .csv import read_columns as read_columns

@@ -1,4 +1,4 @@
-"""Recordings from a file of columns, in the units in which they were written down."""
+"""Read recordings from a file of columns, in the units of the file."""
 
 import csv
 import math
@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ..validation import require
 from .recording import Quantities
 
-#: What one of a unit is, in the SI unit of the same dimension.
+#: Value of each unit in the SI unit of the same dimension.
 UNITS = {
     "s": {"s": 1.0, "ms": 1e-3, "min": 60.0},
     "rad": {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi},
@@ -24,9 +24,10 @@ UNITS = {
 
 
 class Read(NamedTuple):
-    """What was read: times [s], samples in SI units, NaN where missing, their errors or `None`, and what was recorded.
+    """The contents of a file: times [s]; samples in SI units, NaN where missing; their errors or `None`; and the
+    quantity.
 
-    A single column is named by its word, and its samples are (times,).
+    A single column is given by its name, and its samples are (times,).
     """
 
     times: Float[np.ndarray, " times"]
@@ -36,18 +37,18 @@ class Read(NamedTuple):
 
 
 def read_columns(path: Any, columns: Any, fps: float | None, error: Any, quantities: Quantities) -> Read:
-    """Samples from a text file with a line of headers, its columns parted by commas, semicolons, tabs or blanks.
+    """Read samples from a text file with a header line and columns separated by commas, semicolons, tabs or blanks.
 
     **Arguments:**
 
-    - `path`: of the file; lines that begin with # are left out, empty cells and `nan` are missing samples.
-    - `columns`: name of a column of the model -> (header, unit); the unit is one of `UNITS`, or a number: how many SI units
-      one of the file is. `"time"` is the clock, `"frame"` the number of the frame, which needs `fps`.
-    - `fps`: frames a second; without a column for the frame, each line is one.
+    - `path`: of the file; lines that begin with # are ignored, empty cells and `nan` are missing samples.
+    - `columns`: name of a column of the model -> (header, unit); the unit is one of `UNITS`, or a factor that converts
+      the file's numbers to SI units. `"time"` is the clock, `"frame"` the number of the frame, which needs `fps`.
+    - `fps`: frames per second; without a column for the frame, each line is a frame.
     - `error`: name of a column -> (standard error or header of its column, unit), for some or all of them; or `None`.
-    - `quantities`: what can be recorded.
+    - `quantities`: the quantities that can be recorded.
 
-    **Raises:** `ValueError` that names the file, the column and what is wrong with it.
+    **Raises:** `ValueError` that names the file, the column and the problem.
     """
     if not isinstance(columns, Mapping) or not columns:
         raise ValueError(f"columns = {columns!r} must be a dictionary, such as {{'theta': ('tilt', 'deg')}}")
@@ -71,12 +72,12 @@ def read_columns(path: Any, columns: Any, fps: float | None, error: Any, quantit
 
 
 def _table(path: Path) -> dict[str, list[str]]:
-    """The cells of every column, as text, by its header."""
+    """The cells of every column, as text, by header."""
     lines = [
         line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip() and line.lstrip()[0] != "#"
     ]
     if len(lines) < 2:
-        raise ValueError(f"path = {str(path)!r} must have a line of headers and at least one of numbers")
+        raise ValueError(f"path = {str(path)!r} must have a header line and at least one line of numbers")
     parted = next((mark for mark in ("\t", ";", ",") if mark in lines[0]), None)
     rows = list(csv.reader(lines, delimiter=parted)) if parted else [line.split() for line in lines]
     headers = [header.strip() for header in rows[0]]
@@ -87,11 +88,11 @@ def _table(path: Path) -> dict[str, list[str]]:
 
 
 def _times(table: dict[str, list[str]], columns: Mapping[str, Any], fps: Any, path: Any) -> np.ndarray:
-    """The clock's readings of all lines [s]."""
+    """The clock's readings in all lines [s]."""
     if fps is not None:
         require(fps, "fps", above=0.0)
         if "time" in columns:
-            raise ValueError(f"fps = {fps!r} must be left out where 'time' is among the columns")
+            raise ValueError(f"fps = {fps!r} must be omitted because 'time' is among the columns")
         if "frame" not in columns:
             return np.arange(len(next(iter(table.values())))) / float(fps)
         return _column(table, "frame", columns["frame"], "1", path) / float(fps)
@@ -124,7 +125,7 @@ def _errors(table: dict[str, list[str]], name: str, header_and_unit: Any, si: st
 
 
 def _parts(name: str, header_and_unit: Any, si: str) -> tuple[Any, float]:
-    """Header, or number, and how many SI units one of the file is."""
+    """The header or number, and the factor that converts the file's numbers to SI units."""
     if not isinstance(header_and_unit, tuple) or len(header_and_unit) != 2:
         raise ValueError(f"columns: {name!r} = {header_and_unit!r} must be (header, unit), such as ('tilt', 'deg')")
     first, unit = header_and_unit

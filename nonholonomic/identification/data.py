@@ -1,4 +1,5 @@
-"""Several sets of data fitted together, and the names of the parameters that they share or have of their own."""
+"""Fit several sets of data together: joined measurements, and names for shared parameters and for those of a single
+set."""
 
 import itertools
 from collections.abc import Callable
@@ -12,14 +13,14 @@ from . import likelihood
 from .likelihood import Measurements
 from .unknown import Free, as_free
 
-#: What stands for every set of data that has the parameter.
+#: Stands for every set of data that has the parameter.
 EACH = "data[*]."
 
 
 def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np.ndarray, " n"]]:
-    """The measurements of several sets of data, their labels, and which of all predictions were measured.
+    """The measurements of several sets of data, their labels, and a mask of the predictions that were measured.
 
-    **Arguments:** `data`: each with `measurements`, `labels`, `seen`, and `size`, how many numbers are predicted for it.
+    **Arguments:** `data`: each with `measurements`, `labels`, `seen`, and `size`, the number of its predictions.
     """
     labels = tuple(
         f"{i + 1}: {label}" if len(data) > 1 else label for i, source in enumerate(data) for label in source.labels
@@ -35,7 +36,7 @@ def series_units(data: tuple[Any, ...]) -> tuple[str, ...]:
 
 
 def of_data(parameters: dict[str, Any], k: int) -> dict[str, Any]:
-    """The parameters of one set of data: those that all share, and its own without the prefix `data[k].`."""
+    """The parameters of one set of data: the shared ones, and its own without the prefix `data[k].`."""
     prefix = f"data[{k}]."
     shared = {name: value for name, value in parameters.items() if not name.startswith("data[")}
     own = {name.removeprefix(prefix): value for name, value in parameters.items() if name.startswith(prefix)}
@@ -62,15 +63,15 @@ def free_numbers(
 
     **Arguments:**
 
-    - `free`: name, or its unambiguous end, -> a `Free` or where to start. `data[1].launch.azimuth` is a parameter of the
-      second set of data alone, and `data[*].launch.azimuth` stands for one of each.
-    - `shared`: full names of the parameters of the model; `own`: those of each set of data, without the prefix, which are
-      shared too where a name has none.
-    - `check`: name -> number, without prefixes; it raises `ValueError` for values that are refused.
+    - `free`: name, or its unambiguous end, -> a `Free` or a start value. `data[1].launch.azimuth` is a parameter of the
+      second set of data alone, and `data[*].launch.azimuth` stands for one parameter of each set.
+    - `shared`: full names of the parameters of the model; `own`: names of the parameters of each set of data, without
+      the prefix. A name of `own` without a prefix is shared, too.
+    - `check`: name -> number, without prefixes; it raises `ValueError` for illegal values.
 
     **Returns:** full name -> `Free`.
 
-    **Raises:** `ValueError` for an unknown name, or starts that are refused.
+    **Raises:** `ValueError` for an unknown name or illegal start values.
     """
     known = [*shared, *dict.fromkeys(itertools.chain(*own))]
     unknowns: dict[str, Free] = {}
@@ -94,7 +95,7 @@ def free_numbers(
 
 
 def _full_names(short: str, known: list[str], own: list[list[str]]) -> list[str]:
-    """The full names that a name stands for."""
+    """The full names for a name."""
     if not str(short).startswith("data["):
         return [full_name("free", short, known)]
     if short.startswith(EACH):

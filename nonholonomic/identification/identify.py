@@ -1,4 +1,4 @@
-"""Parameters from measurements: maximum likelihood, with errors and with what the measurements do not determine."""
+"""Estimate parameters by maximum likelihood, with errors and undetermined combinations."""
 
 import warnings
 from collections.abc import Callable
@@ -16,13 +16,13 @@ from .result import Identification, summarise
 from .unknown import as_free, draw_starts
 from .verdict import FitWarning
 
-#: Errors that are estimated are found together with the parameters, in turns, until none changes by more than this fraction.
+#: Unknown errors and parameters are estimated in turns, until no error changes by more than this fraction.
 ROUNDS, SETTLED = 10, 0.01
 
-#: The parts of a recording that are fitted before the whole.
+#: The fractions of a recording that are fitted before the whole.
 PARTS = (0.1, 0.25, 0.5)
 
-#: By how much differences move the coordinates: 1 % of a positive parameter. Differences smooth over what is narrower.
+#: Step of differences in the coordinates: 1 % of a positive parameter. Differences smooth over narrower structure.
 DIFFERENCE = 0.01
 
 
@@ -41,24 +41,23 @@ def identify(
 ) -> Identification:
     """Find the parameters of a model that make measurements most likely.
 
-    Levenberg-Marquardt from every start at once, on the residuals of the data (`likelihood.py`) and of the priors. It finds
-    a minimum near each start, not the global one; the result is the best of them and says where the others ended.
+    Levenberg-Marquardt runs from every start at once, on the residuals of the data (`likelihood.py`) and of the priors.
+    It finds a local minimum near each start; the result is the best of them and reports where the others ended.
 
     **Arguments:**
 
-    - `model`: parameters, name -> (rows,), to predictions (rows, n); `jax.vmap` turns a function of one set into
-      one. It is differentiated in forward mode, or not at all (see `slopes`).
+    - `model`: function from parameters, name -> (rows,), to predictions (rows, n); `jax.vmap` converts a function of
+      one set of parameters. It is differentiated in forward mode, or not at all (see `slopes`).
     - `measurements`: `Measurements` of shape (n,).
-    - `free`: name -> a `Free`, or only the value from which to start.
-    - `starts`: number of points from which to fit: the one given, and others drawn around it.
-    - `spread`: how far they are drawn, as a factor either way, greater than 1; `seed`: of the draw.
-    - `max_steps`: a fit that needs more has not converged.
-    - `slopes`: "exact", by automatic differentiation; or "differences", central ones of 1 % in every parameter, for a
-      model that has no derivative, or a rough one: twice as many runs as parameters, and one more.
+    - `free`: name -> a `Free`, or only the start value.
+    - `starts`: number of start points: the given one, and others drawn around it.
+    - `spread`: range of the drawn points, as a factor greater than 1 in either direction; `seed`: of the draw.
+    - `max_steps`: a fit that needs more steps has not converged.
+    - `slopes`: "exact", by automatic differentiation; or "differences", central differences of 1 % in every parameter,
+      for a model that has no derivative or a rough one. They take twice as many runs as parameters, and one more.
     - `labels`: (n,), names of the measurements in the result.
-    - `progress`: whether to show it, on a terminal or in a notebook.
-
-    **Returns:** an `Identification`, with its `verdict`; of which it warns (`FitWarning`) if it is not good.
+    - `progress`: whether to show progress, on a terminal or in a notebook.
+    **Returns:** an `Identification` with its `verdict`; a doubtful fit gives a `FitWarning`.
 
     **Raises:** `ValueError` for arguments out of range.
 
@@ -107,9 +106,9 @@ def identify(
 def _fitted(
     problem: Problem, begins: Any, measurements: Measurements, max_steps: int, progress: bool
 ) -> tuple[Ends, Linearised]:
-    """Where the fits end. Those of recordings also go by way of longer and longer parts of them; the better end counts.
+    """The ends of the fits. Recordings are also fitted by way of longer and longer parts; the better end counts.
 
-    A run is followed from its start on: late samples, whole turns off, would lead to a minimum of their own.
+    A run is followed from its start: late samples can be whole turns off, and would lead to another minimum.
     """
     ends = minimise(problem, begins, measurements, max_steps=max_steps, progress=progress)
     at_ends = linearise(problem, ends.coordinates, measurements)
@@ -131,7 +130,8 @@ def _fitted(
 
 
 def check_search(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: Any) -> None:
-    """Raise `ValueError` unless these are as `identify` takes them: a model checks them before it prepares its data."""
+    """Raise `ValueError` unless the arguments are legal for `identify`; a model checks them before it prepares its
+    data."""
     for name, value, least in (("starts", starts, 1), ("seed", seed, 0), ("max_steps", max_steps, 1)):
         require_whole(value, name, least)
     require(spread, "spread", above=1.0)
@@ -139,9 +139,9 @@ def check_search(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: 
 
 
 def step_of(slopes: str) -> float | None:
-    """By how much coordinates are moved for slopes found in a way, `None` for automatic differentiation.
+    """Step of the coordinates for each kind of slopes; `None` for automatic differentiation.
 
-    **Raises:** `ValueError` for an unknown way.
+    **Raises:** `ValueError` for an unknown kind.
     """
     ways = {"exact": None, "differences": DIFFERENCE}
     if slopes not in ways:

@@ -1,8 +1,8 @@
-"""Nonlinear least squares from many starts, or of many data, at once.
+"""Nonlinear least squares from many starts, or for many sets of data, at once.
 
-A row is one fit. All rows advance together, and the model is evaluated for all of them, with its slopes, in one call; a
-model that runs its own cases as lanes of one block therefore runs the cases of all rows in one block. Optimistix under `vmap`
-compiles the model twice, once with slopes and once without, and goes on evaluating rows that are done.
+Each row is a fit. All rows advance together, and the model is evaluated for all of them, with its slopes, in one call,
+so a model that computes its cases as lanes computes the cases of all rows together. Optimistix under `vmap` compiles
+the model twice, with slopes and without, and continues to evaluate finished rows.
 
 Source: Madsen, Nielsen and Tingleff, "Methods for non-linear least squares problems", 2nd edition (2004), section 3.2; the
 scaling is More's (Lecture Notes in Mathematics 630 (1978) 105).
@@ -19,26 +19,27 @@ from ..progress import Progress
 from .likelihood import Measurements
 from .problem import Linearised, Problem, linearise
 
-#: Damping of the first step, as a fraction of the squared slope by each coordinate.
+#: Damping of the first step, as a fraction of the squared slope with respect to each coordinate.
 FIRST_DAMPING = 1e-2
 
-#: A step that gains more than this fraction of what it promised is followed by one with less damping, by the factor `EASED`;
-#: one that gains nothing is undone, and tried again with more damping, by the factor `HARDENED`.
+#: After a step that gains more than this fraction of the predicted gain, damping decreases by the factor `EASED`; a
+#: step that gains nothing is undone and repeated with damping increased by the factor `HARDENED`.
 GOOD, EASED, HARDENED = 0.5, 0.1, 4.0
 
-#: A fit has converged once an undamped step would lower -2 log likelihood by no more than this.
+#: A fit has converged if an undamped step would lower -2 log likelihood by no more than this.
 CONVERGED = 1e-16
 
-#: It has also converged if a step gains nothing and an undamped one would lower -2 log likelihood by no more than this: it is
-#: as close as the errors of the integration allow, within a thirtieth of a standard error of the minimum.
+#: A fit has also converged if a step gains nothing and an undamped step would lower -2 log likelihood by no more than
+#: this: it is as close as the integration errors allow, within a thirtieth of a standard error of the minimum.
 NEGLIGIBLE = 1e-3
 
-#: On a staircase steps go on to gain next to nothing: it has converged, too, where `PATIENCE` of them together lower -2 log
-#: likelihood by less than `STALLED`, and a bad fit by less than this fraction of what exceeds `BAD` for each degree of freedom.
+#: On a staircase, steps keep gaining very little. A fit has also converged if `PATIENCE` steps together lower -2 log
+#: likelihood by less than `STALLED`, or, for a bad fit, by less than this fraction of its excess over `BAD` per degree
+#: of freedom.
 PATIENCE, STALLED, BAD = 8, 1e-2, 3.0
 
-#: No step changes a parameter with a bound by more than a factor of e: slopes say nothing of what is further off, and there
-#: runs may take thousands of times as long.
+#: No step changes a parameter with a bound by more than a factor of e: slopes are not valid farther away, where runs
+#: may also take thousands of times as long.
 FARTHEST = 1.0
 
 #: Singular values of a row's slopes below this fraction of the largest are round-off.
@@ -46,7 +47,7 @@ ROUND_OFF = 1e-7
 
 
 class Ends(NamedTuple):
-    """Where the rows ended: coordinates (rows, unknowns), whether each converged, and in how many steps."""
+    """The ends of the rows: coordinates (rows, unknowns), whether each converged, and its number of steps."""
 
     coordinates: Float[np.ndarray, "rows unknowns"]
     converged: Bool[np.ndarray, " rows"]
@@ -69,8 +70,8 @@ def minimise(
     - `problem`: the `Problem`.
     - `starts`: coordinates, (rows, unknowns).
     - `measurements`: (n,), the same for all rows, or (rows, n).
-    - `held`: index of an unknown that keeps its start, or `None`.
-    - `max_steps`: a row that needs more has not converged.
+    - `held`: index of an unknown that keeps its start value, or `None`.
+    - `max_steps`: a row that needs more steps has not converged.
     - `progress`: whether to show, on a terminal or in a notebook, how many rows are done.
 
     **Returns:** the `Ends`.
@@ -115,7 +116,8 @@ def minimise(
 
 
 class _Fit(NamedTuple):
-    """Where every row stands: -2 log posterior, the residuals, and their slopes by the coordinates that move."""
+    """The state of every row: -2 log posterior, the residuals, and their slopes with respect to the moving
+    coordinates."""
 
     deviance: Float[np.ndarray, " rows"]
     residual: Float[np.ndarray, "rows residuals"]
@@ -128,7 +130,7 @@ class _Fit(NamedTuple):
 
 
 def _chosen(better: Bool[np.ndarray, " rows"], new: np.ndarray, old: np.ndarray) -> np.ndarray:
-    """The new rows where they are better."""
+    """The new rows where they are better, the old ones elsewhere."""
     return np.where(better.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
 
 
@@ -138,7 +140,8 @@ def _step(
     damping: Float[np.ndarray, " rows"],
     reach: Float[np.ndarray, " moving"],
 ) -> tuple[Float[np.ndarray, "rows moving"], Float[np.ndarray, " rows"]]:
-    """The damped step of every row, cut to the reach, and by how much it would lower -2 log posterior of a linear model."""
+    """The damped step of every row, limited in length, and the decrease of -2 log posterior that a linear model
+    predicts."""
     unit = np.where(scale > 0.0, scale, 1.0)
     squares = np.einsum("rni,rnj->rij", current.jacobian, current.jacobian)
     slope = np.einsum("rni,rn->ri", current.jacobian, current.residual)
@@ -149,7 +152,7 @@ def _step(
 
 
 def _promise(current: _Fit) -> Float[np.ndarray, " rows"]:
-    """By how much an undamped step would lower -2 log posterior, to first order in the model."""
+    """Decrease of -2 log posterior by an undamped step, to first order in the model."""
     norms = np.linalg.norm(current.jacobian, axis=1, keepdims=True)
     sides, values, _ = np.linalg.svd(current.jacobian / np.where(norms > 0.0, norms, 1.0), full_matrices=False)
     seen = values > ROUND_OFF * np.max(values, axis=1, keepdims=True, initial=0.0)

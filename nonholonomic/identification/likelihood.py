@@ -1,4 +1,4 @@
-"""What measurements say about predictions: residuals whose squares add up to -2 log likelihood."""
+"""Compare predictions with measurements: residuals whose squares add up to -2 log likelihood."""
 
 import math
 from typing import Any
@@ -15,7 +15,7 @@ from ..validation import require
 #: Residual of a measurement for which the model has no prediction: a penalty without a slope.
 MISSING = 1e4
 
-#: The factor on the error of a measurement that is not to count yet.
+#: Factor on the error of a measurement that does not count yet.
 DOWN_WEIGHTED = 1e6
 
 
@@ -24,20 +24,21 @@ class Measurements(eqx.Module):
 
     **Arguments:**
 
-    - `value`: (n,), what was measured; where `censored`, what the quantity was only seen to exceed, with its own
-      error (a clock stopped by hand is uncertain too). -inf where it was only seen to stay below `upper`.
-    - `error`: (n,), standard deviations, positive; a scalar serves for all.
-    - `censored`: (n,), which are lower limits; none by default.
-    - `upper`: (n,), what the quantity was seen not to exceed: infinite for lower limits, `value` itself for what was
-      measured, which is the default.
-    - `period`: (n,), by which a quantity may be moved without a change, such as 2 pi for an azimuth; infinite by default.
-    - `student`: (n,), degrees of freedom of Student's t distribution of the errors, whose scale `error` is then; infinite
-      by default, for Gaussian errors. Limits have Gaussian errors in any case.
-    - `series`: (n,), numbers of the series, each in the order in which it was measured; 0 by default.
-    - `time`: (n,) [s], of a sample since the start of its recording; 0 by default. Fits follow a recording from its start on.
-    - `estimated`: (n,), where `error` is only where to start, to be found from the scatter of the series.
+    - `value`: (n,), the measured values; where `censored`, a lower limit of the quantity with its own error (a clock
+      stopped by hand is also uncertain). -inf if the quantity is only known to be below `upper`.
+    - `error`: (n,), standard deviations, positive; or one scalar for all.
+    - `censored`: (n,), which values are lower limits; none by default.
+    - `upper`: (n,), upper limits of the quantities: infinite for lower limits; by default `value` itself, for measured
+      values.
+    - `period`: (n,), period of a quantity, such as 2 pi for an azimuth; infinite by default.
+    - `student`: (n,), degrees of freedom of Student's t distribution of the errors, whose scale is then `error`;
+      infinite by default, for Gaussian errors. Limits always have Gaussian errors.
+    - `series`: (n,), index of the series, each in the order in which it was measured; 0 by default.
+    - `time`: (n,) [s], time of a sample since the start of its recording; 0 by default. Fits follow a recording from
+      its start.
+    - `estimated`: (n,), whether `error` is only a start value, to be estimated from the residuals of the series.
 
-    **Raises:** `ValueError` for numbers that are not finite or shapes that do not fit.
+    **Raises:** `ValueError` for numbers that are not finite or shapes that do not match.
     """
 
     value: Float[Array, "... n"]
@@ -91,17 +92,17 @@ class Measurements(eqx.Module):
 
     @property
     def censored(self) -> Bool[Array, "... n"]:
-        """Which are limits, or pairs of them."""
+        """Which measurements are limits, or pairs of limits."""
         return self.upper > self.value
 
     def residuals(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
         """Residuals whose squares are -2 log likelihood, up to a constant.
 
-        For a measurement it is z = (prediction - value) / error, or with Student's t of nu degrees of freedom
-        r = sign(z) sqrt((nu + 1) log(1 + z^2 / nu)). For a lower limit it is the one-sided r = -sqrt(-2 log Phi(z)), Phi being
-        the normal distribution: close to z where the prediction is far below the limit, to 0 where it is above; for an upper
-        limit the mirror image. Between two limits it is that of `between`. A prediction that is not finite counts as
-        `MISSING`, except for an infinite one of a lower limit, which exceeds it.
+        For a measurement the residual is z = (prediction - value) / error, or with Student's t of nu degrees of freedom
+        r = sign(z) sqrt((nu + 1) log(1 + z^2 / nu)). For a lower limit it is the one-sided r = -sqrt(-2 log Phi(z)),
+        where Phi is the normal distribution: close to z if the prediction is far below the limit, close to 0 if it is
+        above; upper limits are the mirror image. Between two limits, see `between`. A prediction that is not finite
+        counts as `MISSING`, except that an infinite prediction exceeds a lower limit.
 
         **Arguments:** `prediction`: (..., n). **Returns:** (..., n).
         """
@@ -122,32 +123,33 @@ class Measurements(eqx.Module):
         return jnp.where(known, residuals, jnp.where(beyond, 0.0, MISSING))
 
     def _of_value(self, prediction: Float[Array, "... n"]) -> Float[Array, "... n"]:
-        """The residual of what was measured itself."""
+        """The residual of a measured value."""
         z = self.standardised(prediction)
         heavy = jnp.isfinite(self.student)
         freedom = jnp.where(heavy, self.student, 1.0)
         share = z**2 / freedom
-        # log(1 + q) / q without 0 / 0; it is divided before the root, whose slope at 0 is infinite.
+        # log(1 + q) / q without 0 / 0; divided before the square root, whose slope at 0 is infinite.
         small = share < 1e-8
         flat = jnp.where(small, 1.0 - 0.5 * share, jnp.log1p(share) / jnp.where(small, 1.0, share))
         return jnp.where(heavy, z * jnp.sqrt((freedom + 1.0) / freedom * flat), z)
 
     def whole_periods(self, off: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
-        """How much of some differences are whole periods, to the nearest; without a slope."""
+        """The part of some differences that is whole periods, rounded to the nearest; without a slope."""
         wraps = jnp.isfinite(self.period)
         period = jnp.where(wraps, self.period, 1.0)
         return jnp.where(wraps, period * jax.lax.stop_gradient(jnp.round(off / period)), 0.0)
 
     def standardised(self, prediction: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
-        """(prediction - value) / error, moved by whole periods to the least; 0 for limits."""
+        """(prediction - value) / error, with whole periods removed; 0 for limits."""
         off = jnp.where(self.censored, 0.0, prediction - self.value)
         off = off - self.whole_periods(off)
         return off / self.error
 
     def information(self, prediction: Float[Array | np.ndarray, "... n"]) -> Float[Array, "... n"]:
-        """Roots of Fisher's information about the predictions: those of expected curvature, for standard errors.
+        """Square roots of Fisher's information about the predictions, from the expected curvature, for standard errors.
 
-        1 / error for Gaussian errors, sqrt((nu + 1) / (nu + 3)) / error for Student's t; for limits the slope of the residual.
+        1 / error for Gaussian errors, sqrt((nu + 1) / (nu + 3)) / error for Student's t; the slope of the residual for
+        limits.
         """
         _, slope = jax.jvp(self.residuals, (prediction,), (jnp.ones_like(prediction),))
         heavy = jnp.isfinite(self.student)
@@ -161,12 +163,12 @@ class Measurements(eqx.Module):
         return -jnp.sum(0.5 * self.residuals(prediction) ** 2 + measured, axis=-1)
 
     def with_errors(self, error: Float[Array | np.ndarray, "... n"]) -> "Measurements":
-        """The same with other errors."""
+        """The same measurements with other errors."""
         return eqx.tree_at(lambda measurements: measurements.error, self, jnp.broadcast_to(error, self.error.shape))
 
 
 def joined(parts: list[Measurements]) -> Measurements:
-    """The measurements of several sets, one after the other; their series are numbered on."""
+    """The measurements of several sets, one after the other; their series are renumbered consecutively."""
     first, whole = 0, []
     for part in parts:
         whole.append(eqx.tree_at(lambda part: part.series, part, part.series + first))
@@ -175,8 +177,8 @@ def joined(parts: list[Measurements]) -> Measurements:
 
 
 def one_sided(z: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The residual -sqrt(-2 log Phi(z)) of a lower limit; 0 from where it is less than 1e-9."""
-    # Beyond that, the derivative of the square root would be infinity times zero.
+    """The residual -sqrt(-2 log Phi(z)) of a lower limit; 0 where it is less than 1e-9."""
+    # Beyond this, the derivative of the square root would be infinity times zero.
     near = z < 9.0
     return jnp.where(near, -jnp.sqrt(-2.0 * log_ndtr(jnp.where(near, z, 0.0))), 0.0)
 
@@ -184,14 +186,16 @@ def one_sided(z: Float[Array, "..."]) -> Float[Array, "..."]:
 def between(z: Float[Array, "..."], half: Float[Array, "..."]) -> Float[Array, "..."]:
     """The residual of two limits: sign(z) sqrt(2 log(P(0) / P(z))), P(z) = Phi(half - z) - Phi(-half - z).
 
-    **Arguments:** `z`: by how many errors the prediction is above the middle; `half`: half their distance in errors.
+    **Arguments:** `z`: distance of the prediction above the middle, in errors; `half`: half the distance of the limits,
+    in errors.
     """
 
     def log_probability(off: Float[Array, "..."]) -> Float[Array, "..."]:
         upper, lower = log_ndtr(half - off), log_ndtr(-half - off)
         return upper + jnp.log(-jnp.expm1(lower - upper))
 
-    # Near the middle it is z times the root of the curvature, 2 half phi(half) / P(0): the difference of logarithms is lost.
+    # Near the middle, use z times the root of the curvature, 2 half phi(half) / P(0): the difference of logarithms
+    # cancels there.
     off = jnp.abs(z)
     lost = 2.0 * (log_probability(jnp.zeros_like(off)) - log_probability(off))
     near = lost < 1e-9
@@ -201,10 +205,10 @@ def between(z: Float[Array, "..."], half: Float[Array, "..."]) -> Float[Array, "
 
 
 def estimated_errors(measurements: Measurements, prediction: Any, unknowns: int) -> Float[np.ndarray, " n"]:
-    """The errors, where they are to be estimated those of the scatter of their series.
+    """The errors; unknown ones are estimated from the residuals of their series.
 
-    With n values in the series and k unknowns shared by N values in all, it is the root of the sum of squares / (n - k n / N);
-    for Student's t the scale is found such that the mean weight of the squares is 1 (maximum likelihood).
+    With n values in the series and k unknowns shared by N values in all, the estimate is the root of the sum of squares
+    / (n - k n / N); for Student's t, the scale for which the mean weight of the squares is 1 (maximum likelihood).
     """
     errors = np.array(measurements.error)
     series, open_ = np.asarray(measurements.series), np.asarray(measurements.estimated)
@@ -224,6 +228,6 @@ def estimated_errors(measurements: Measurements, prediction: Any, unknowns: int)
 
 
 def down_weighted(measurements: Measurements, horizon: float) -> Measurements:
-    """The same, but what was measured after a time counts for next to nothing."""
+    """The same measurements, but those after a given time have nearly no weight."""
     late = measurements.time > horizon
     return measurements.with_errors(jnp.where(late, measurements.error * DOWN_WEIGHTED, measurements.error))

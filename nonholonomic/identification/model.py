@@ -1,6 +1,6 @@
-"""What the fits of tops, strollers and users' systems share: sets of data, their predictions, and the search.
+"""The part that fits of tops, strollers and users' systems share: sets of data, their predictions, and the search.
 
-Each of these fits adds what is its own: the names of its numbers, and how it predicts a set of data.
+Each of these fits adds the names of its parameters and the prediction of a set of data.
 """
 
 import abc
@@ -23,7 +23,7 @@ Values = dict[str, Float[Array, " rows"]]
 class AbstractDataModel(eqx.Module):
     """Predictions of several sets of data, in the form that `identify` expects.
 
-    `seen` says which of the predictions were measured.
+    `seen`: mask of the predictions that were measured.
     """
 
     data: eqx.AbstractVar[tuple[Any, ...]]
@@ -31,11 +31,11 @@ class AbstractDataModel(eqx.Module):
 
     @abc.abstractmethod
     def together(self, source: Any, values: Values) -> Hashable:
-        """What sets of data that are predicted at once have in common."""
+        """A key for sets of data; sets with equal keys can be predicted together."""
 
     @abc.abstractmethod
     def predict(self, sources: list[tuple[Any, Values]], rows: int) -> list[Float[Array, "rows size"]]:
-        """The predictions of sets of data with the same `together`, each with its parameters."""
+        """The predictions for sets of data with the same `together`, each with its parameters."""
 
     def __call__(self, parameters: Values) -> Float[Array, "rows n"]:
         rows = len(next(iter(parameters.values())))
@@ -53,7 +53,7 @@ class AbstractDataModel(eqx.Module):
 def as_sources(data: Any, kinds: Any, expected: str) -> tuple[Any, ...]:
     """Sets of data as a tuple.
 
-    **Raises:** `ValueError`, with what was expected, unless there is one at least and all are of these kinds.
+    **Raises:** `ValueError`, with what was expected, unless there is at least one set and all are of these kinds.
     """
     sources = tuple(data) if isinstance(data, list | tuple) else (data,)
     if not sources or not all(isinstance(source, kinds) for source in sources):
@@ -62,7 +62,7 @@ def as_sources(data: Any, kinds: Any, expected: str) -> tuple[Any, ...]:
 
 
 def search_options(starts: Any, spread: Any, seed: Any, max_steps: Any, progress: Any) -> dict[str, Any]:
-    """The options of the search as `identify` takes them, checked before a model prepares its data."""
+    """The options of the search for `identify`, checked before a model prepares its data."""
     check_search(starts, spread, seed, max_steps, progress)
     return {"starts": starts, "spread": spread, "seed": seed, "max_steps": max_steps, "progress": progress}
 
@@ -76,8 +76,8 @@ def fit_data(
 ) -> Identification:
     """Fit a model to sets of data.
 
-    **Arguments:** `build`: which of the predictions were measured -> the model; `search`: `search_options`; the others as for
-    `identify`.
+    **Arguments:** `build`: function from the mask of measured predictions to the model; `search`: `search_options`; the
+    others as for `identify`.
     """
     measurements, labels, seen = joined(data)
     return identify(build(seen), measurements, unknowns, slopes=slopes, labels=labels, **search)

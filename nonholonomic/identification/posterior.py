@@ -1,4 +1,4 @@
-"""The posterior of parameters, as a function of unconstrained coordinates for any sampler."""
+"""The posterior of parameters, as a function of unbounded coordinates for any sampler."""
 
 import math
 from collections.abc import Callable
@@ -23,12 +23,12 @@ Prior = tuple[float, float] | Callable[[Float[Array, ""]], Float[Array, ""]]
 class LogDensity(eqx.Module):
     """The log of a posterior density, up to a constant, as a function of coordinates (unknowns,) without bounds.
 
-    It can be differentiated, forwards and backwards, compiled, and batched by `jax.vmap`: then all cells of all chains run in
-    one block. Errors that were not given are unknowns too, each in its logarithm, with a flat prior. Where the model has no
-    prediction it is about -1e8, without a slope.
+    You can differentiate it, forwards and backwards, compile it, and batch it by `jax.vmap`: then all cells of all
+    chains run together. Unknown errors are unknowns, too, each by its logarithm, with a flat prior. Where the model has
+    no prediction, the value is about -1e8, without a slope.
 
     - `names`: of the unknowns, in the order of the coordinates; `start`: (unknowns,), where to start.
-    - `units`: name of an unknown -> its unit, where it is known.
+    - `units`: name of an unknown -> its unit, if known.
     """
 
     problem: Problem
@@ -84,7 +84,7 @@ class LogDensity(eqx.Module):
 
     @property
     def units(self) -> dict[str, str]:
-        """The units of the unknown errors, where they are known."""
+        """The units of the unknown errors, if known."""
         known = {k: self.series_units[k] for k in self.open_series if k < len(self.series_units)}
         return {f"error[{k}]": unit for k, unit in known.items()}
 
@@ -96,14 +96,15 @@ class LogDensity(eqx.Module):
 
     @property
     def start(self) -> Float[Array, " unknowns"]:
-        """The coordinates from which to start."""
+        """The coordinates of the start."""
         values = [float(unknown.coordinate(unknown.start)) for unknown in self.problem.unknowns]
         return jnp.array([*values, *(0.0 for _ in self.open_series)])
 
     def values(self, coordinates: Float[Array, "... unknowns"]) -> dict[str, Float[Array, "..."]]:
         """The unknowns at some coordinates: name -> (...,).
 
-        **Arguments:** `coordinates`: of all unknowns, or of a fit, which leaves out the errors: these are then the first guess.
+        **Arguments:** `coordinates`: of all unknowns, or those of a fit, without the errors, which are then the first
+        guess.
 
         **Raises:** `ValueError` for another number of coordinates.
         """
@@ -121,12 +122,12 @@ class LogDensity(eqx.Module):
         return dict(zip(self.names, jnp.moveaxis(jnp.concatenate([unknowns, errors], axis=-1), -1, 0), strict=True))
 
     def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
-        """What the model predicts for every measurement, at several coordinates."""
+        """The model's predictions for all measurements, at several sets of coordinates."""
         return self.problem.predict(coordinates[:, : len(self.problem.names)])
 
     @status_line("simulating")
     def replicate(self, coordinates: Float[Array, "rows unknowns"], seed: int = 0) -> Float[np.ndarray, "rows n"]:
-        """New measurements as the posterior predicts them, an error drawn for each; those of limits are without limits."""
+        """New measurements drawn from the predictions and their errors; limits are replaced by values."""
         random, predicted = np.random.default_rng(seed), np.asarray(_predicted(self, jnp.asarray(coordinates)))
         heavy = np.isfinite(freedom := np.asarray(self.measurements.student))
         drawn = random.normal(size=predicted.shape)
@@ -141,7 +142,7 @@ class LogDensity(eqx.Module):
         return self.of_prediction(coordinates, self.predict(coordinates[None])[0])
 
     def of_prediction(self, coordinates: Float[Array, " unknowns"], prediction: Float[Array, " n"]) -> Float[Array, ""]:
-        """The log density at some coordinates, given what the model predicts there."""
+        """The log density at some coordinates, for given predictions of the model."""
         return self._with_errors(coordinates).log_likelihood(prediction) + self._log_prior(coordinates)
 
     @status_line("simulating")
@@ -159,7 +160,8 @@ class LogDensity(eqx.Module):
         return self.measurements.with_errors(errors)
 
     def _log_prior(self, coordinates: Float[Array, " unknowns"]) -> Float[Array, ""]:
-        """The log density of the priors in the coordinates: that of a parameter, and how the coordinate stretches it."""
+        """The log density of the priors in the coordinates: the density of each parameter, and the Jacobian of its
+        coordinate."""
         total = jnp.zeros(())
         for k, (name, unknown) in enumerate(self.problem.free):
             if (prior := self.priors.get(name)) is not None:
@@ -181,12 +183,12 @@ def _value_and_gradient(density: LogDensity, coordinates: Float[Array, "*batch u
 
 
 def _as_leaves(prior: Prior) -> Any:
-    """A prior whose numbers are handed to compiled programs, and whose function, if it is one, is part of them."""
+    """A prior whose numbers are arguments of compiled programs, while its function, if any, is part of them."""
     if not callable(prior):
         return np.asarray(prior, float)
     return prior if isinstance(prior, eqx.Module) else jax.tree_util.Partial(prior)
 
 
 def _normal(value: Float[Array, ""], mean: Float[Array, ""], deviation: Float[Array, ""]) -> Float[Array, ""]:
-    """Logarithm of the normal density. `jax.scipy.stats` has it too, and takes 0.15 s to import."""
+    """Logarithm of the normal density. `jax.scipy.stats` has it, too, but takes 0.15 s to import."""
     return -0.5 * ((value - mean) / deviation) ** 2 - jnp.log(deviation * math.sqrt(2.0 * math.pi))

@@ -1,4 +1,4 @@
-"""A model with its free parameters, and its predictions with their slopes, for many sets of parameters at once."""
+"""A model with its free parameters, and predictions with slopes, for many sets of parameters at once."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -20,8 +20,8 @@ class Problem(eqx.Module):
 
     - `model`: parameters, name -> (rows,), to predictions (rows, n).
     - `names`, `unknowns`: of the free parameters; `free` has both, as pairs.
-    - `step`: `None` for derivatives by automatic differentiation, forwards; otherwise the coordinates are moved by so much
-      either way, and the model need not be differentiable; nor traceable, if it has `on_host = True`.
+    - `step`: `None` for automatic differentiation in forward mode; otherwise the step of central differences in the
+      coordinates. The model then need not be differentiable, nor traceable if it has `on_host = True`.
     """
 
     model: Callable[[dict[str, Float[Array, " rows"]]], Float[Array, "rows n"]]
@@ -44,7 +44,7 @@ class Problem(eqx.Module):
         return jnp.stack([unknown.value(coordinates[..., k]) for k, unknown in enumerate(self.unknowns)], axis=-1)
 
     def predict(self, coordinates: Float[Array, "rows unknowns"]) -> Float[Array, "rows n"]:
-        """What the model predicts in every row."""
+        """The model's predictions in every row."""
         values = self.values(coordinates)
         return self.model({name: values[:, k] for k, name in enumerate(self.names)})
 
@@ -52,10 +52,10 @@ class Problem(eqx.Module):
 class Linearised(NamedTuple):
     """A model and its likelihood at a point of every row.
 
-    - `prediction`: (rows, n); `residual`: (rows, n), those of the data;
-    - `jacobian`: (rows, n, unknowns), their slopes along the coordinates;
+    - `prediction`: (rows, n); `residual`: (rows, n), of the data;
+    - `jacobian`: (rows, n, unknowns), slopes of the residuals with respect to the coordinates;
     - `information`: the same with the expected curvature of the likelihood (`Measurements.information`), for errors;
-    - `prior`, `prior_jacobian`: (rows, priors), (rows, priors, unknowns), those of the priors.
+    - `prior`, `prior_jacobian`: (rows, priors), (rows, priors, unknowns), of the priors.
     """
 
     prediction: Float[np.ndarray, "rows n"]
@@ -82,7 +82,7 @@ class Linearised(NamedTuple):
 
     @property
     def whole_information(self) -> Float[np.ndarray, "rows residuals unknowns"]:
-        """The slopes of data and priors that stand for the expected curvature."""
+        """The slopes of data and priors that represent the expected curvature."""
         return np.concatenate([self.information, self.prior_jacobian], axis=1)
 
 
@@ -90,9 +90,9 @@ class Linearised(NamedTuple):
 def _differentiated(
     problem: Problem, coordinates: Float[Array | np.ndarray, "rows unknowns"]
 ) -> tuple[Float[Array, "rows n"], Float[Array, "rows n unknowns"]]:
-    """Predictions and their slopes; rows do not influence one another, so a coordinate is moved in all of them at once.
+    """Predictions and their slopes; rows are independent, so a coordinate is moved in all of them at once.
 
-    Every evaluation of a model is made here, so that it is compiled once for every number of rows.
+    All evaluations of a model use this function, so that the model is compiled once per number of rows.
     """
 
     def along(direction):
@@ -106,7 +106,7 @@ _predicted = eqx.filter_jit(Problem.predict)
 
 
 def _differences(problem: Problem, step: float, coordinates: Rows) -> tuple[np.ndarray, np.ndarray]:
-    """Predictions and central differences; where a side has no prediction, its slope is 0."""
+    """Predictions and central differences; if a side has no prediction, its slope is 0."""
     rows, unknowns = coordinates.shape
     moves = step * np.concatenate([np.zeros((1, unknowns)), np.eye(unknowns), -np.eye(unknowns)])
     predict = Problem.predict if getattr(problem.model, "on_host", False) else _predicted
@@ -120,13 +120,13 @@ def _differences(problem: Problem, step: float, coordinates: Rows) -> tuple[np.n
 def predictions_and_slopes(problem: Problem, coordinates: Rows, asked: Any = None) -> tuple[np.ndarray, np.ndarray]:
     """Predictions and their slopes in every row.
 
-    **Arguments:** `coordinates`: (rows, unknowns); `asked`: (rows,), which of them are needed, by default all.
+    **Arguments:** `coordinates`: (rows, unknowns); `asked`: (rows,), which rows are needed, by default all.
 
-    **Returns:** (rows, n) and (rows, n, unknowns); NaN and 0 for rows that were not asked for.
+    **Returns:** (rows, n) and (rows, n, unknowns); NaN and 0 for rows that are not needed.
     """
     coordinates = np.asarray(coordinates, float)
     asked = np.ones(len(coordinates), bool) if asked is None else np.asarray(asked)
-    # The program is compiled for a number of rows; where a parameter is not a number, a run is not even begun.
+    # The program is compiled for a number of rows; runs with NaN parameters end at once.
     needed = np.where(asked[:, None], coordinates, np.nan)
     if problem.step is None:
         prediction, slopes = _differentiated(problem, needed)
@@ -145,7 +145,7 @@ def linearise(problem: Problem, coordinates: Any, measurements: Measurements, as
 
     **Returns:** a `Linearised`.
 
-    **Raises:** `ValueError` for a model that does not predict as many numbers as were measured.
+    **Raises:** `ValueError` if the model does not return one prediction per measurement.
     """
     prediction, slopes = predictions_and_slopes(problem, coordinates, asked)
     wanted = (len(coordinates), measurements.value.shape[-1])
@@ -162,14 +162,14 @@ def linearise(problem: Problem, coordinates: Any, measurements: Measurements, as
 def _residuals(
     measurements: Measurements, prediction: Float[Array | np.ndarray, "rows n"]
 ) -> tuple[Array, Array, Array]:
-    """Residuals, their slopes by the predictions, and the roots of the expected information."""
+    """Residuals, their slopes with respect to the predictions, and the roots of the expected information."""
     residual, slope = jax.jvp(measurements.residuals, (prediction,), (jnp.ones_like(prediction),))
     return residual, slope, measurements.information(prediction)
 
 
 @eqx.filter_jit
 def _priors(unknowns: tuple[Unknown, ...], coordinates: Float[Array, "rows unknowns"]) -> tuple[Array, Array]:
-    """Residuals of the priors, and their slopes by the coordinates."""
+    """Residuals of the priors, and their slopes with respect to the coordinates."""
 
     def of(row: Float[Array, " unknowns"]) -> Float[Array, " priors"]:
         priors = [

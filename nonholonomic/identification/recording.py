@@ -1,4 +1,4 @@
-"""Recorded runs: samples of some quantities at the readings of a clock, as measurements."""
+"""Recorded runs: samples of some quantities at the readings of a clock, converted to measurements."""
 
 import dataclasses
 import math
@@ -11,15 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..parameters import numbers, one_line
+from ..parameters import numbers, one_line, with_numbers
 from ..validation import as_number, as_number_or_none, require
 from ..xla_cpu import greatest
 from .likelihood import Measurements
 
-#: Model times of samples before the launch: so close to it, and to one another [s], that nothing moves.
+#: Spacing [s] of model times for samples before the launch: so small that nothing moves.
 INSTANT = 1e-9
 
-#: Between times that are added so that recordings are of one length [s].
+#: Spacing [s] of times that are added to give recordings the same length.
 AT_ONCE = 1e-6
 
 #: Parameters by name.
@@ -28,11 +28,11 @@ Values = dict[str, Float[Array, "..."]]
 
 @dataclasses.dataclass(frozen=True)
 class Quantities:
-    """What can be recorded of a run.
+    """The quantities that can be recorded of a run.
 
     - `columns`: name of a quantity -> names of its columns.
     - `units`: name of a column -> its SI unit.
-    - `angles`: columns that come back to where they were after a whole turn.
+    - `angles`: columns with a period of a whole turn.
     """
 
     columns: Mapping[str, tuple[str, ...]]
@@ -42,7 +42,7 @@ class Quantities:
     def of(self, quantity: Any) -> tuple[str, ...]:
         """The columns of a quantity, of a column, or of a tuple of them.
 
-        **Raises:** `ValueError` for an unknown one, or one that is named twice.
+        **Raises:** `ValueError` for an unknown column, or one that is named twice.
         """
         words = quantity if isinstance(quantity, tuple) else (quantity,)
         columns: list[str] = []
@@ -52,8 +52,15 @@ class Quantities:
                 raise ValueError(f"quantity = {word!r} must be one of {', '.join(map(repr, known))}")
             columns += known[word]
         if not columns or len(set(columns)) < len(columns):
-            raise ValueError(f"quantity = {quantity!r} must name at least one column, and each once")
+            raise ValueError(f"quantity = {quantity!r} must name at least one column, and each only once")
         return tuple(columns)
+
+    def samples(self, run: Any, column: str) -> Float[Array, " times"]:
+        """A column of a trajectory, which has the quantities as properties."""
+        for quantity, columns in self.columns.items():
+            if column in columns:
+                return getattr(run, quantity)[:, columns.index(column)]
+        return getattr(run, column)
 
 
 def as_quantity(words: Any) -> Any:
@@ -66,16 +73,16 @@ class AbstractRecording(eqx.Module):
 
     **Arguments:**
 
-    - `launch`: how the run began, every number a scalar.
+    - `launch`: the launch, every number a scalar.
     - `times`: (times,) [s], increasing.
     - `value`: (times,) for one column, (times, columns) for several; NaN where a sample is missing.
-    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: to be estimated for each column
-      from the scatter about the fit.
+    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: estimated for each column
+      from the residuals.
     - `quantity`: what was recorded: a quantity, a column, or a tuple of them.
     - `t0`: the clock's reading [s] at the launch.
     - `student`: degrees of freedom of Student's t distribution of the errors; `None`: Gaussian.
 
-    A model says in `quantities` what can be recorded of its runs.
+    The attribute `quantities` of a subclass lists what can be recorded.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
     """
@@ -119,17 +126,17 @@ class AbstractRecording(eqx.Module):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The names of what a sample consists of."""
+        """The names of a sample's columns."""
         return self.quantities.of(self.quantity)
 
     @property
     def size(self) -> int:
-        """How many numbers are predicted, missing samples included."""
+        """Number of predictions, including those of missing samples."""
         return np.size(self.value)
 
     @property
     def seen(self) -> np.ndarray:
-        """Where in the samples, a time after the other, there are numbers."""
+        """Mask of the samples that are not missing, ordered by time."""
         return np.flatnonzero(~np.isnan(np.asarray(self.value).reshape(-1)))
 
     @property
@@ -171,7 +178,7 @@ class AbstractRecording(eqx.Module):
 
 
 def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " columns"]:
-    """A first guess of the errors: the scatter of the second differences, or of the values where there are too few of them."""
+    """A first guess of the errors: the scatter of the second differences, or of the values if there are too few."""
 
     def of(column: np.ndarray) -> float:
         observed = column[np.isfinite(column)]
@@ -183,31 +190,32 @@ def noise(value: Float[np.ndarray, "times columns"]) -> Float[np.ndarray, " colu
 
 
 def model_times(times: Float[Array, " times"], t0: Float[Array, ""]) -> Float[Array, " times"]:
-    """The times of the samples since the launch [s]; those before it are moved to it."""
+    """The times of the samples since the launch [s]; samples before the launch get its time."""
     return greatest(times - t0, INSTANT * jnp.arange(times.shape[0]))
 
 
 def predicted(
+    scene: Any,
     recordings: Sequence[tuple[AbstractRecording, Values]],
     rows: int,
-    run: Callable[[Values, Float[Array, " times"]], Any],
-    column: Callable[[Any, str], Float[Array, " times"]],
+    run: Callable[[Any, Any, Float[Array, " times"]], Any],
 ) -> list[Float[Array, "rows samples"]]:
-    """What is recorded of several runs, in every row; all runs are lanes of one block.
+    """Predictions for several recordings, in every row; all runs are lanes of one ensemble.
 
     **Arguments:**
 
-    - `recordings`: each with its parameters, name -> (rows,), the same names for all; their launches hold the same numbers.
-    - `run`: parameters, name -> number, those of the launch among them, and times since the launch [s] -> a trajectory.
-    - `column`: (trajectory, name of a column) -> its samples.
+    - `scene`: the scene of all runs, before its parameters are replaced.
+    - `recordings`: each with its parameters, name -> (rows,), with the same names for all; their launches hold the same
+      numbers.
+    - `run`: from a scene, a launch and times since the launch [s] to a trajectory.
 
-    **Returns:** for each recording its samples, a time after the other, missing ones included; NaN after the end of a run.
+    **Returns:** for each recording its samples, ordered by time, including missing ones; NaN after the end of a run.
     """
-    longest = max(len(recording.times) for recording, _ in recordings)
+    first, longest = recordings[0][0], max(len(recording.times) for recording, _ in recordings)
     columns = tuple(dict.fromkeys(name for recording, _ in recordings for name in recording.columns))
 
     def lanes(of_each: list[Array]) -> Array:
-        """The numbers of all runs, one row after the other; each is a scalar or has one number a row."""
+        """The numbers of all runs, one row after the other; each is a scalar or has one number per row."""
         return jnp.stack([jnp.broadcast_to(number, (rows,)) for number in of_each], axis=1).reshape(-1)
 
     launches = [numbers("launch", recording.launch) for recording, _ in recordings]
@@ -215,13 +223,14 @@ def predicted(
     lane_numbers = {name: lanes([launch[name] for launch in launches]) for name in names}
     lane_numbers |= {"t0": lanes([recording.t0 for recording, _ in recordings])}
     lane_numbers |= {name: lanes([values[name] for _, values in recordings]) for name in recordings[0][1]}
-    # Shorter recordings go on for an instant, so that all have as many times.
+    # Shorter recordings are extended by an instant, so that all have the same number of times.
     clock = jnp.stack([_lengthened(recording.times, longest) for recording, _ in recordings])
 
     def samples_of_lane(lane: Values, times: Float[Array, " times"]) -> Float[Array, "times columns"]:
         values = {name: value for name, value in lane.items() if name != "t0"}
-        trajectory = run(values, model_times(times, lane["t0"]))
-        return jnp.stack([column(trajectory, name) for name in columns], axis=-1)
+        roots = with_numbers({"scene": scene, "launch": first.launch}, values)
+        trajectory = run(roots["scene"], roots["launch"], model_times(times, lane["t0"]))
+        return jnp.stack([first.quantities.samples(trajectory, name) for name in columns], axis=-1)
 
     predictions = jax.vmap(samples_of_lane)(lane_numbers, jnp.tile(clock, (rows, 1))).reshape(
         rows, len(recordings), longest, len(columns)
@@ -234,5 +243,5 @@ def predicted(
 
 
 def _lengthened(times: Float[Array, " times"], count: int) -> Float[Array, " count"]:
-    """The times, and after the last one others that follow at once."""
+    """The times, followed by additional times shortly after the last one."""
     return jnp.concatenate([times, times[-1] + AT_ONCE * jnp.arange(1, 1 + count - len(times))])

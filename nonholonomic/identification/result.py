@@ -1,4 +1,4 @@
-"""What a fit found: estimates, their errors, what the data do not determine, and how the fit went from every start."""
+"""The result of a fit: estimates, errors, undetermined combinations, and the outcome of every start."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -16,23 +16,23 @@ from .likelihood import Measurements
 from .problem import Linearised, Problem, linearise
 from .verdict import CLOSE, RIVAL, SAME, Verdict, judge
 
-#: Singular values below this fraction of the largest are those of a direction that the data do not determine at all.
+#: Singular values below this fraction of the largest belong to directions that the data do not determine at all.
 NO_SLOPE = 1e-7
 
 #: A combination of parameters counts as undetermined if its relative error exceeds this.
 UNSEEN = 1.0
 
-#: Rows of the residual table and unknowns of a combination that a summary shows.
+#: Number of rows of the residual table, and of unknowns of a combination, in a summary.
 MOST_ROWS, LEAST_SHARE = 24, 0.02
 
 
 class Profile(NamedTuple):
     """The profile likelihood of one parameter.
 
-    - `values`: (points,), at which it was held.
-    - `deviance`: (points,), -2 log likelihood, all other parameters fitted again, above its minimum.
-    - `estimates`: name -> (points,), the other parameters there.
-    - `converged`: (points,), whether these fits did.
+    - `values`: (points,), the values at which the parameter was held.
+    - `deviance`: (points,), -2 log likelihood above its minimum, with all other parameters fitted again.
+    - `estimates`: name -> (points,), estimates of the other parameters.
+    - `converged`: (points,), whether these fits converged.
     """
 
     values: Float[np.ndarray, " points"]
@@ -42,13 +42,16 @@ class Profile(NamedTuple):
 
 
 class Identifiability(NamedTuple):
-    """What the data determine and what not, to first order: singular values of the slopes of the residuals, priors left out.
+    """The combinations of parameters that the data determine and those that they do not, to first order, without
+    priors.
 
-    Slopes are by relative changes: of 1 in the logarithm of a parameter that cannot be negative, otherwise of `Free.unit`.
+    They come from the singular values of the slopes of the residuals with respect to relative changes: of 1 in the
+    logarithm of a parameter that cannot be negative, otherwise of `Free.unit`.
 
-    - `singular_values`: (unknowns,), falling; the inverse of one is the relative error of its combination of parameters.
-    - `directions`: (unknowns, unknowns), the combinations, one a row.
-    - `words`: the combinations as text: what changes together, and by how much.
+    - `singular_values`: (unknowns,), decreasing; the inverse of a value is the relative error of its combination of
+      parameters.
+    - `directions`: (unknowns, unknowns), the combinations, one per row.
+    - `words`: the combinations as text: which parameters change together, and by how much.
     """
 
     singular_values: Float[np.ndarray, " unknowns"]
@@ -63,8 +66,8 @@ class Identifiability(NamedTuple):
 
 
 class ResidualRow(NamedTuple):
-    """One measurement: what was measured, its error, what the fit predicts, its residual in units of the error, and the upper
-    limit, which is the value itself for what was measured and infinite for a lower limit."""
+    """One measurement: its value, its error, the prediction of the fit, the residual in units of the error, and the
+    upper limit (the value itself for a measured value, infinite for a lower limit)."""
 
     label: str
     value: float
@@ -75,12 +78,12 @@ class ResidualRow(NamedTuple):
 
     @property
     def censored(self) -> bool:
-        """Whether it is a limit, or a pair of them."""
+        """Whether the measurement is a limit, or a pair of limits."""
         return self.upper > self.value
 
     @property
     def measured(self) -> str:
-        """What was measured, as text."""
+        """The measured value or limits, as text."""
         if not self.censored:
             return f" {self.value:.6g} +- {self.error:.2g}"
         if np.isinf(self.upper):
@@ -93,12 +96,12 @@ class ResidualRow(NamedTuple):
 class Identification:
     """Parameters identified from measurements.
 
-    - `estimates`, `standard_errors`: name -> number. The errors are those of the Gauss-Newton matrix, of data and priors
-      together; infinite for a parameter that takes part in an undetermined direction.
+    - `estimates`, `standard_errors`: name -> number. The errors come from the Gauss-Newton matrix of data and priors;
+      they are infinite for a parameter that takes part in an undetermined direction.
     - `covariance`: (unknowns, unknowns), in the order of `estimates`. Parameters with infinite error have covariance 0.
     - `deviance`: -2 log likelihood of data and priors at the estimate, up to a constant: the sum of squared residuals.
     - `degrees`: measurements and priors less unknowns.
-    - `identifiability`: an `Identifiability`, `residuals`: a `ResidualRow` for every measurement.
+    - `identifiability`: an `Identifiability`; `residuals`: a `ResidualRow` for every measurement.
     - `status`: "converged" or why not; `starts`, `ends`: name -> (starts,), where each fit began and ended;
       `end_deviances`: (starts,); `statuses`: one of "converged", "not_converged", "failed" for each start.
     - `verdict`: a `Verdict`, whether the fit can be believed.
@@ -140,7 +143,8 @@ class Identification:
     def interval(self, name: str, deviations: float = 1.96) -> tuple[float, float]:
         """The confidence interval of a parameter, symmetric in its coordinate and so within its bounds.
 
-        **Arguments:** `name`: of the parameter, or its end; `deviations`: half its width in standard errors, 1.96 for 95 %.
+        **Arguments:** `name`: of the parameter, or the end of its name; `deviations`: half the width in standard
+        errors, 1.96 for 95 %.
 
         **Raises:** `ValueError` for a name that was not free.
         """
@@ -157,8 +161,8 @@ class Identification:
 
         **Arguments:**
 
-        - `name`: of the parameter, or its end.
-        - `values`: at which to hold it, by default 13 within three standard errors.
+        - `name`: of the parameter, or the end of its name.
+        - `values`: at which to hold the parameter, by default 13 within three standard errors.
 
         **Returns:** a `Profile`.
 
@@ -213,7 +217,7 @@ class Identification:
             f"Identification of {len(self.estimates)} numbers from {len(self.residuals)} measurements: {self.status}",
             f"  {self.statuses.count('converged')} of {len(self.statuses)} starts converged, {self.verdict.agree} ended here",
             f"  -2 log likelihood {self.deviance:.4g} at {self.degrees} degrees of freedom",
-            "whether it can be believed",
+            "verdict",
             str(self.verdict),
             "estimates, standard errors and 95 % intervals",
         ]
@@ -221,9 +225,9 @@ class Identification:
         for name, value in self.estimates.items():
             low, high = self.interval(name)
             lines.append(f"  {name:{width}}  {value:.6g} +- {self.standard_errors[name]:.2g}  ({low:.6g}, {high:.6g})")
-        lines.append("what the data fix, by the relative error of what moves together")
+        lines.append("combinations of parameters and their relative errors")
         for value, words in zip(self.identifiability.singular_values, self.identifiability.words, strict=True):
-            mark = "  NOT SEEN" if words in self.identifiability.unseen else ""
+            mark = "  UNDETERMINED" if words in self.identifiability.unseen else ""
             lines.append(f"  {1.0 / max(value, 1e-300):8.2g}  {words}{mark}")
         lines.append("measured, predicted, residual in units of the error")
         width = max(len(row.label) for row in self.residuals)
@@ -236,7 +240,7 @@ class Identification:
 
 
 def deviance_of(problem: Problem, coordinates: Any, measurements: Measurements) -> Float[np.ndarray, " rows"]:
-    """-2 log likelihood of every row; infinite where it would be NaN."""
+    """-2 log likelihood of every row; infinite instead of NaN."""
     deviance = linearise(problem, coordinates, measurements).deviance
     return np.where(np.isfinite(deviance), deviance, np.inf)
 
@@ -244,7 +248,7 @@ def deviance_of(problem: Problem, coordinates: Any, measurements: Measurements) 
 def coordinate_covariance(jacobian: Float[np.ndarray, "residuals unknowns"]) -> Float[np.ndarray, "unknowns unknowns"]:
     """The inverse of the Gauss-Newton matrix J^T J; infinite for unknowns that take part in an undetermined direction.
 
-    Directions are judged with every unknown in units of its own error, the others held.
+    Directions are judged with every unknown in units of its own error, with the other unknowns held.
     """
     norms = np.linalg.norm(jacobian, axis=0)
     norms = np.where(norms > 0.0, norms, 1.0)
@@ -258,17 +262,18 @@ def coordinate_covariance(jacobian: Float[np.ndarray, "residuals unknowns"]) -> 
 
 
 def _singular(slopes: Float[np.ndarray, "n unknowns"]) -> tuple[np.ndarray, np.ndarray]:
-    """Singular values and right singular vectors (a row each), as many as there are unknowns."""
+    """Singular values and right singular vectors (one per row), as many as there are unknowns."""
     unknowns = slopes.shape[1]
     _, values, directions = np.linalg.svd(slopes, full_matrices=len(slopes) < unknowns)
     return np.concatenate([values, np.zeros(unknowns - len(values))]), directions
 
 
 def identifiability(problem: Problem, estimates: Any, slopes: Any, jacobian: Any) -> Identifiability:
-    """Singular values of the slopes of the residuals by relative changes of the parameters, with their directions in words.
+    """Singular values of the slopes of the residuals with respect to relative changes of the parameters, with their
+    directions as text.
 
-    **Arguments:** `estimates`: (unknowns,); `slopes`: (unknowns,), of the parameters by their coordinates; `jacobian`: (n,
-    unknowns), of the residuals by the coordinates.
+    **Arguments:** `estimates`: (unknowns,); `slopes`: (unknowns,), of the parameters with respect to their coordinates;
+    `jacobian`: (n, unknowns), of the residuals with respect to the coordinates.
     """
     units = np.array(
         [abs(x) if unknown.positive else unknown.unit for x, unknown in zip(estimates, problem.unknowns, strict=True)]
@@ -280,7 +285,8 @@ def identifiability(problem: Problem, estimates: Any, slopes: Any, jacobian: Any
 
 
 def _in_words(problem: Problem, direction: Float[np.ndarray, " unknowns"]) -> str:
-    """What changes together: per cent of a parameter that cannot be negative, otherwise hundredths of its unit."""
+    """The parameters that change together: per cent of a parameter that cannot be negative, otherwise hundredths of its
+    unit."""
     most = np.argmax(np.abs(direction))
     parts = []
     for share, (name, free) in zip(direction / direction[most], problem.free, strict=True):
@@ -298,7 +304,7 @@ def summarise(
     converged: np.ndarray,
     at_ends: Linearised,
 ) -> Identification:
-    """The result of fits from several starts: that of the best of them, with the others on record."""
+    """The result of fits from several starts: that of the best one, with a record of the others."""
     known = np.any(np.isfinite(at_ends.prediction), axis=1) & np.all(np.isfinite(ends), axis=1)
     deviances = np.where(known & np.isfinite(at_ends.deviance), at_ends.deviance, np.inf)
     statuses = tuple(
@@ -361,11 +367,12 @@ def agreement(
     covariance: Float[np.ndarray, "unknowns unknowns"],
     best: int,
 ) -> tuple[int, int, int]:
-    """How many starts ended at the best minimum, how many elsewhere with nearly the same likelihood, and how many there are."""
+    """Numbers of starts that ended at the best minimum, of those elsewhere with nearly the same likelihood, and of
+    all."""
     errors = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore"):
         off = np.abs(ends - ends[best]) / errors
-    # A parameter of infinite error is the same wherever it is.
+    # Parameters of infinite error are ignored: their value does not matter.
     near = np.all(np.where(np.isfinite(errors), off, 0.0) < CLOSE, axis=1) | (deviances < deviances[best] + SAME)
     agree = near & (deviances < deviances[best] + 1.0)
     return int(np.sum(agree)), int(np.sum(~agree & (deviances < deviances[best] + RIVAL))), len(ends)

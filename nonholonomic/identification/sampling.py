@@ -1,13 +1,14 @@
-"""Draws from a posterior by the no-U-turn sampler of BlackJAX (the extra `bayes`), with few runs of the model.
+"""Draw from a posterior by the no-U-turn sampler of BlackJAX (the extra `bayes`), with few runs of the model.
 
-Walks are taken in a surrogate whose predictions are polynomials, learned from runs where the posterior is. Where a walk ends is
-proposed to the posterior itself, and accepted with the probability min(1, p(new) q(old) / (p(old) q(new))), p being the
-posterior and q the surrogate. Because walks of the sampler satisfy detailed balance with respect to q, the draws are from p,
-whatever q is like (surrogate transitions: J. S. Liu, Monte Carlo Strategies in Scientific Computing (2001), chapter 9; Christen
-and Fox, J. Comput. Graph. Stat. 14 (2005) 795). A bad surrogate shows in the share of proposals that are accepted.
+The sampler walks in a surrogate whose predictions are polynomials, fitted to runs in the region of the posterior. The
+end of each walk is proposed to the posterior itself, and accepted with the probability min(1, p(new) q(old) / (p(old)
+q(new))), where p is the posterior and q the surrogate. Because walks of the sampler satisfy detailed balance with
+respect to q, the draws are from p, whatever q is (surrogate transitions: J. S. Liu, Monte Carlo Strategies in
+Scientific Computing (2001), chapter 9; Christen and Fox, J. Comput. Graph. Stat. 14 (2005) 795). A bad surrogate lowers
+the fraction of accepted proposals.
 
-That is what event times ask for: they are rough on the scale of a nutation period, so slopes at a place say little of the next
-one, and walks that follow them take hundreds of steps.
+Event times need this method: they are rough on the scale of a nutation period, so a slope at one point says little
+about the next point, and walks that follow slopes take hundreds of steps.
 """
 
 from collections.abc import Callable
@@ -25,19 +26,19 @@ from ..validation import require_flag, require_package, require_whole
 from .posterior import LogDensity
 from .surrogate import Surrogate
 
-#: The share of accepted proposals that the length of the leaps is adapted to (Hoffman and Gelman, J. Mach. Learn. Res. 15
-#: (2014) 1593), and how often a walk doubles at most.
+#: Target fraction of accepted proposals, to which the length of the leaps is adapted (Hoffman and Gelman, J. Mach.
+#: Learn. Res. 15 (2014) 1593), and the largest number of doublings of a walk.
 ACCEPTED, DOUBLINGS = 0.8, 8
 
-#: How many draws of the surrogate a walk consists of, so that its end has forgotten its beginning.
+#: Number of draws of the surrogate in a walk, enough for its end to be independent of its start.
 MOVES = 16
 
-#: Powers of the surrogate in which it learns, and from which draws are proposed: a surrogate that falls off faster than the
-#: posterior would never propose, and never leave, its tails.
+#: Powers of the surrogate for learning and for proposals: a surrogate that decreases faster than the posterior would
+#: never propose its tails, and never leave them.
 LEARNING, PROPOSING = 0.35, 0.75
 
-#: Learning ends with the round whose runs the polynomials foretold to this standard deviation of the log density, so that
-#: nine tenths of the proposals would be accepted. Rounds are at least and at most so many.
+#: Learning ends with the round whose runs the polynomials predicted to this standard deviation of the log density, so
+#: that nine tenths of the proposals would be accepted; and the least and greatest number of rounds.
 FORETOLD, LEAST, ROUNDS = 0.3, 2, 6
 
 
@@ -48,7 +49,7 @@ class Draws(NamedTuple):
     - `r_hat`, `ess`: name -> number: the potential scale reduction, which should be below 1.01, and the effective number of
       independent draws.
     - `units`: name -> unit, of the unknown errors.
-    - `accepted`: which share of the proposals was accepted; `runs`: how many sets of numbers the model was run for.
+    - `accepted`: fraction of accepted proposals; `runs`: number of sets of parameters for which the model was run.
     """
 
     values: dict[str, Float[np.ndarray, "chains draws"]]
@@ -70,7 +71,7 @@ class Draws(NamedTuple):
         draws = map(
             np.asarray, (measure(coordinates) for measure in (potential_scale_reduction, effective_sample_size))
         )
-        # Of a single unknown they are numbers, not lists of one.
+        # For a single unknown, these are numbers instead of lists.
         named = (dict(zip(density.names, numbers.reshape(-1).tolist(), strict=True)) for numbers in draws)
         return cls(values, coordinates, *named, accepted=accepted, runs=runs, units=density.units)
 
@@ -97,16 +98,16 @@ def sample(
     seed: int = 0,
     progress: bool = True,
 ) -> Draws:
-    """Draw from a posterior, from where a fit has ended.
+    """Draw from a posterior, starting from the end of a fit.
 
     **Arguments:**
 
     - `density`: a `LogDensity`.
     - `centre`, `covariance`: (unknowns,), (unknowns, unknowns), of a fit in its coordinates: `Identification.coordinates` and
       `coordinate_covariance`. Unknown errors, which are not among the unknowns of a fit, start from their first guess.
-    - `chains`, `warmup`, `draws`: how many chains, at least 2, which R-hat compares; and draws of each, before those that are
-      kept and of those, at least 2. The chains start from draws of the surrogate.
-    - `seed`: of the draw; `progress`: whether to show it, on a terminal or in a notebook.
+    - `chains`, `warmup`, `draws`: number of chains, at least 2, which R-hat compares; number of draws of each chain to
+      discard; and number of draws to keep, at least 2. The chains start from draws of the surrogate.
+    - `seed`: of the draw; `progress`: whether to show progress, on a terminal or in a notebook.
 
     **Returns:** `Draws`.
 
@@ -139,18 +140,18 @@ def sample(
 
 
 class Walk(NamedTuple):
-    """Where the chains are in a surrogate, and the state of the adaptation of their leaps."""
+    """The positions of the chains in a surrogate, and the state of the adaptation of their leaps."""
 
     points: Float[Array, "chains unknowns"]
     adaptation: Any
 
 
 def learn(surrogate: Surrogate, chains: int, random: np.random.Generator) -> tuple[Surrogate, Walk, int]:
-    """Let a surrogate learn from runs where its own draws are.
+    """Fit a surrogate to runs at its own draws, in several rounds.
 
     The first runs are drawn from the fit's error ellipse.
 
-    **Returns:** the surrogate, a `Walk` in it whose leaps suit it, and how many runs it took.
+    **Returns:** the surrogate, a `Walk` in it with adapted leaps, and the number of runs.
     """
     from blackjax.adaptation.step_size import dual_averaging_adaptation
 
@@ -168,13 +169,13 @@ def learn(surrogate: Surrogate, chains: int, random: np.random.Generator) -> tup
         surrogate = surrogate.learned(*(np.concatenate(parts) for parts in zip(*pool, strict=True)))
         if turn > 0:
             surrogate, points = surrogate.among(drawn)
-        # As arrays: a Python number in it would be compiled in.
+        # As arrays: a Python number would be compiled in.
         adaptation = jax.tree.map(np.asarray, begin(1.0 / len(surrogate.centre) ** 0.25))
         walk, path = Walk(jnp.asarray(points[-chains:]), adaptation), []
         for _ in range(-(-2 * runs // chains)):
             walk = _walked(surrogate, _key(random), walk, jnp.asarray(True))
             path.append(np.asarray(surrogate.at(walk.points)))
-        # The first half is on its way.
+        # Discard the first half as warm-up.
         drawn = np.concatenate(path[len(path) // 2 :])
     return surrogate, walk, runs * (1 + turn)
 
@@ -187,14 +188,14 @@ def _key(random: np.random.Generator) -> Array:
 def _seen(
     surrogate: Surrogate, points: Float[Array, "chains unknowns"]
 ) -> tuple[Float[np.ndarray, "chains unknowns"], Float[np.ndarray, " chains"]]:
-    """The coordinates of some points, and there the log of the posterior over what the surrogate proposes from."""
+    """The coordinates of some points, and the log ratio of the posterior to the surrogate's proposal density there."""
     density, coordinates = surrogate.density, np.asarray(surrogate.at(points))
     true = _log_density(density, coordinates, _predicted(density, coordinates))
     foretold = _log_density(density, coordinates, _foretold(surrogate, coordinates))
     return coordinates, np.asarray(true - surrogate.power * foretold)
 
 
-# Compiled functions take NumPy's arrays too.
+# Compiled functions also accept NumPy arrays.
 _predicted: Callable[..., Array] = eqx.filter_jit(LogDensity.predict)
 _foretold: Callable[..., Array] = eqx.filter_jit(Surrogate.predict)
 
@@ -205,14 +206,14 @@ def _log_density(
     coordinates: Float[Array | np.ndarray, "rows unknowns"],
     predictions: Float[Array | np.ndarray, "rows n"],
 ) -> Float[Array, " rows"]:
-    """The log density of every row, given what is predicted there."""
+    """The log density of every row, for given predictions."""
     of_row: Callable[..., Array] = density.of_prediction
     return jax.vmap(of_row)(coordinates, predictions)
 
 
 @eqx.filter_jit
 def _walked(surrogate: Surrogate, key: Array, walk: Walk, adapting: Bool[Array, ""]) -> Walk:
-    """Where all chains are some draws later; with leaps that are adapted on the way, or as they have settled."""
+    """All chains after some draws; the leaps are adapted on the way, or keep their settled length."""
     import blackjax
     from blackjax.adaptation.step_size import dual_averaging_adaptation
 

@@ -11,25 +11,26 @@ from jaxtyping import Array, Float
 
 from .posterior import LogDensity
 
-#: Polynomials are of the first degree, but of 2 at least, and of a lower one where they would have more terms than the second.
+#: Highest degree of the polynomials, and their greatest number of terms, for which the degree is lowered, but not below
+#: 2.
 HIGHEST, MOST_TERMS = 4, 90
 
-#: The highest power by which points are bent.
+#: The highest power in the bends of points.
 BENT = 3
 
-#: Runs for every term of the polynomials, in each round of learning.
+#: Number of runs per term of the polynomials, in each round of learning.
 RUNS_PER_TERM = 2
 
 
 class Surrogate(eqx.Module):
     """A log density whose predictions are polynomials of the coordinates; priors and likelihood are those of the density.
 
-    It is a function of points: the coordinates of the density are `centre` + the sum of `bends[k]` point^(k + 1). Where the
-    data fix one combination far better than another, the posterior is a thin ridge, and bent; in points it is about round.
-    Along the axes of `among` the bends are triangular, so volumes differ by a factor only. An unknown error, which no
-    prediction depends on, is among the coordinates, too.
+    It is a function of points: the coordinates of the density are `centre` + the sum of `bends[k]` point^(k + 1). If
+    the data determine one combination far better than another, the posterior is a thin, bent ridge; in points it is
+    nearly round. Along the axes of `among` the bends are triangular, so volumes change only by a factor. An unknown
+    error, on which no prediction depends, is also one of the coordinates.
 
-    - `power`: which power of the density it is; less than 1 makes it wider.
+    - `power`: the power of the density; less than 1 makes it wider.
     - `origin`, `scale`: (numbers,), (numbers, numbers): the polynomials are in `scale` (coordinates - `origin`).
     - `coefficients`: (terms, n).
     """
@@ -44,7 +45,7 @@ class Surrogate(eqx.Module):
 
     @classmethod
     def around(cls, density: LogDensity, centre: Any, covariance: Any) -> "Surrogate":
-        """One that has learned nothing yet, with points in units of a fit's errors along its own directions.
+        """A surrogate before learning, with points in units of a fit's errors along its own directions.
 
         An unknown error of n values has the variance 1 / 2n.
         """
@@ -71,7 +72,7 @@ class Surrogate(eqx.Module):
 
     @property
     def runs_a_round(self) -> int:
-        """How many runs a round of learning takes."""
+        """Number of runs in a round of learning."""
         return RUNS_PER_TERM * len(self.coefficients)
 
     def at(self, point: Float[Array, "... unknowns"]) -> Float[Array, "... unknowns"]:
@@ -92,11 +93,12 @@ class Surrogate(eqx.Module):
         predictions: Float[np.ndarray, "runs n"],
         log_densities: Float[np.ndarray, " runs"],
     ) -> "Surrogate":
-        """The same with the polynomials that come closest to the predictions of some runs, most so to likely ones."""
+        """The surrogate with the polynomials that fit the predictions of some runs best, with more weight for likely
+        runs."""
         known = np.all(np.isfinite(predictions), axis=1)
         if not np.any(known):
-            raise ValueError("density: the model predicts nothing within the covariance around the centre")
-        # An angle that jumps by a turn is no polynomial.
+            raise ValueError("density: the model has no predictions within the covariance around the centre")
+        # An angle that jumps by a whole turn is not a polynomial.
         middle = predictions[np.argmax(np.where(known, log_densities, -np.inf))]
         predictions = predictions - np.asarray(self.density.measurements.whole_periods(predictions - middle))
         below = np.max(log_densities[known]) - log_densities[known]
@@ -108,9 +110,11 @@ class Surrogate(eqx.Module):
     def among(
         self, coordinates: Float[np.ndarray, "draws unknowns"]
     ) -> tuple["Surrogate", Float[np.ndarray, "draws unknowns"]]:
-        """The same with points in which some draws are about round, and these points.
+        """A surrogate whose points are adapted to some draws, which are nearly round in the new points; also returns
+        these points.
 
-        Along the principal axes of the draws, the widest first, what the powers of the points before foretell is taken away.
+        Along the principal axes of the draws, the widest first, the part that is predicted by powers of the earlier
+        points is subtracted.
         """
         centre = coordinates.mean(axis=0)
         axes = np.linalg.eigh(np.atleast_2d(np.cov(coordinates.T)))[1][:, ::-1]
@@ -131,7 +135,7 @@ class Surrogate(eqx.Module):
         ), points
 
     def to_power(self, power: float) -> "Surrogate":
-        """The same, but another power of the density."""
+        """The surrogate with another power of the density."""
         return eqx.tree_at(lambda surrogate: surrogate.power, self, jnp.asarray(power))
 
     def _terms(self, coordinates: Float[Array, "... unknowns"]) -> Float[Array, "... terms"]:
@@ -141,6 +145,6 @@ class Surrogate(eqx.Module):
 
 
 def _factors(numbers: int) -> np.ndarray:
-    """Which numbers the terms of a polynomial are products of, (terms, degree); 0 stands for a factor of 1."""
+    """The factors of each term of a polynomial as indices of numbers, (terms, degree); 0 stands for a factor of 1."""
     degree = next((d for d in range(HIGHEST, 2, -1) if math.comb(numbers + d, d) <= MOST_TERMS), 2)
     return np.array(list(itertools.combinations_with_replacement(range(numbers + 1), degree)))

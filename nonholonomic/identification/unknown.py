@@ -1,4 +1,4 @@
-"""Unknown parameters: where a fit starts, what values they may take, and the coordinate in which they are fitted."""
+"""Unknown parameters: start value, bounds, and the coordinate in which they are fitted."""
 
 import math
 from typing import Any, NamedTuple
@@ -15,8 +15,8 @@ from ..validation import require
 class Free(NamedTuple):
     """A parameter to be fitted.
 
-    With a lower bound it is fitted in the logarithm of its distance from it, so a positive one, `lower=0.0`, in its own
-    logarithm; between two bounds in the logit of its position between them; without bounds as it is.
+    With a lower bound, the fit uses the logarithm of the distance from it (for `lower=0.0`, the logarithm of the
+    parameter); between two bounds, the logit of the position between them; without bounds, the parameter itself.
 
     - `start`: value from which the fit starts, strictly within the bounds.
     - `lower`, `upper`: bounds, which a fit approaches but does not reach.
@@ -40,7 +40,8 @@ class Free(NamedTuple):
 
     @property
     def unit(self) -> float:
-        """What counts as a relative change of 1: e-fold for a parameter fitted in its logarithm, otherwise the start's size."""
+        """The relative change that counts as 1: e-fold for a parameter fitted in its logarithm, otherwise the start's
+        size."""
         return abs(self.start) or (self.prior[1] if self.prior else 1.0)
 
     @property
@@ -58,7 +59,7 @@ class Free(NamedTuple):
 
 
 class Unknown(eqx.Module):
-    """A `Free` as compiled programs take it: they depend on which bounds and prior it has, and are handed their numbers.
+    """A `Free` for compiled programs, which depend on which bounds and prior exist but take their numbers as arguments.
 
     - `start`, `unit`, `lower`, `upper`: as of the `Free`; `has_lower`, `has_upper`: which bounds are finite.
     - `prior`: mean and standard deviation, or `None`.
@@ -108,19 +109,19 @@ class Unknown(eqx.Module):
 
 
 def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]:
-    """Unknowns, checked.
+    """Unknowns as `Free`, checked.
 
     **Arguments:**
 
-    - `free`: name -> a `Free`, or only the value from which to start.
-    - `lower`: name -> lower bound of those given by a value only, or without any bounds.
+    - `free`: name -> a `Free`, or only the start value.
+    - `lower`: name -> lower bound for unknowns given by a value only, or without bounds.
 
     **Returns:** name -> `Free`.
 
-    **Raises:** `ValueError` that names the unknown and what is wrong with it.
+    **Raises:** `ValueError` that names the unknown and the problem.
     """
     if not isinstance(free, dict) or not free:
-        raise ValueError(f"free = {free!r} must be a non-empty dictionary, name of a number -> where to start")
+        raise ValueError(f"free = {free!r} must be a non-empty dictionary, name of a number -> start value")
     unknowns = {}
     for name, start in free.items():
         unknown = start if isinstance(start, Free) else Free(start)
@@ -144,8 +145,8 @@ def as_free(free: Any, lower: dict[str, float] | None = None) -> dict[str, Free]
 def draw_starts(free: dict[str, Free], count: int, spread: float, seed: int) -> Float[np.ndarray, "count unknowns"]:
     """Coordinates of several starts: the given one first, then others around it.
 
-    A parameter fitted in its logarithm is drawn uniformly in it, up to a factor `spread` either way; any other is drawn
-    within the distance by which that factor would change its start.
+    A parameter fitted in its logarithm is drawn uniformly in the logarithm, up to a factor `spread` in either
+    direction; any other is drawn within the distance by which that factor would change its start.
     """
     centre = np.array([float(unknown.coordinate(unknown.start)) for unknown in free.values()])
     reach = np.array(

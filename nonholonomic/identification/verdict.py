@@ -1,4 +1,4 @@
-"""Whether a fit can be believed: the size and order of its residuals, whether its starts agree, what the data leave open."""
+"""Judge a fit: the size and order of its residuals, the agreement of its starts, and the undetermined combinations."""
 
 import math
 from typing import NamedTuple
@@ -11,14 +11,15 @@ from .likelihood import Measurements
 #: A p-value below this is a poor fit.
 POOR = 0.01
 
-#: A measurement whose residual exceeds this cannot be explained.
+#: A measurement with a larger residual cannot be explained.
 FAR = 4.0
 
-#: Residuals all smaller than this are not noise, but round-off and the errors of integration, which may keep their sign.
+#: Residuals that are all smaller than this are not noise but round-off and integration errors, which may keep their
+#: sign.
 NEGLIGIBLE = 1e-3
 
-#: Ends whose -2 log likelihoods differ by less than this are the same minimum; another one within `RIVAL` of the best explains
-#: the data nearly as well, as a parameter two standard errors off does.
+#: Ends whose -2 log likelihoods differ by less than this are the same minimum. An end within `RIVAL` of the best
+#: explains the data nearly as well, like a parameter that is two standard errors off.
 SAME, RIVAL = 0.1, 4.0
 
 #: Starts agree on a minimum if all their parameters agree to this many standard errors.
@@ -26,9 +27,9 @@ CLOSE = 0.5
 
 
 class FitWarning(UserWarning):
-    """A fit that should not be believed as it stands.
+    """A fit that should not be believed without further checks.
 
-    **Example:** fits that must be good, or else fail.
+    **Example:** make doubtful fits fail.
 
     ```
     >>> import warnings
@@ -41,7 +42,7 @@ class FitWarning(UserWarning):
 
 
 class Series(NamedTuple):
-    """How the residuals of one series follow one another: their number, their runs of one sign, and the probability of so few
+    """The order of the residuals of one series: their number, their runs of one sign, and the probability of so few
     runs or fewer if signs were drawn at random."""
 
     count: int
@@ -53,11 +54,11 @@ class Verdict(NamedTuple):
     """Whether a fit can be believed.
 
     - `p_value`: probability of residuals this large or larger if the model and the errors are right (chi squared of the
-      measurements that are no limits); NaN where errors were estimated or no degree of freedom is left.
+      measurements that are not limits); NaN if errors were estimated or no degree of freedom is left.
     - `series`: a `Series` for each series of measurements.
-    - `agree`, `starts`: how many of the starts reached the same minimum.
+    - `agree`, `starts`: number of starts that reached the same minimum, and of all starts.
     - `undetermined`: the parameters that the data do not determine, in words.
-    - `concerns`: what is wrong, in words; empty for a fit without a flaw.
+    - `concerns`: the concerns, in words; empty for a flawless fit.
     """
 
     p_value: float
@@ -74,7 +75,7 @@ class Verdict(NamedTuple):
 
     def __str__(self) -> str:
         scatter = (
-            "the scatter says nothing of the fit: the errors were estimated from it, or no degree of freedom is left"
+            "the size of the residuals cannot test the fit: the errors were estimated from it, or no degree of freedom is left"
             if math.isnan(self.p_value)
             else f"residuals this large have a probability of {self.p_value:.2g}"
         )
@@ -94,12 +95,12 @@ def judge(
     undetermined: tuple[str, ...],
     status: str,
 ) -> Verdict:
-    """The verdict on a fit.
+    """Judge a fit.
 
     **Arguments:**
 
     - `measurements`, `prediction`, `residual`: (n,).
-    - `degrees`: measurements and priors less unknowns, limits left out.
+    - `degrees`: measurements and priors less unknowns, without limits.
     - `agreement`: starts that agree with the best, starts that ended elsewhere nearly as well, all starts.
     - `undetermined`: combinations of parameters, in words; `status`: of the fit.
 
@@ -142,7 +143,7 @@ def judge(
 
 
 def normal_scores(measurements: Measurements, prediction: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Residuals as numbers that are normal if the errors are what they are said to be; 0 for limits."""
+    """Residuals converted to numbers that are normal if the stated errors are right; 0 for limits."""
     from scipy.stats import norm, t
 
     z = np.asarray(measurements.standardised(np.asarray(prediction)))
@@ -161,7 +162,7 @@ def chi_squared_tail(value: float, degrees: int) -> float:
 def runs_of_signs(values: Float[np.ndarray, " n"]) -> Series:
     """Runs of one sign in a series, and the probability of so few (Wald and Wolfowitz, Ann. Math. Stat. 11 (1940) 147).
 
-    Given the numbers of both signs, the number of runs of either sign is hypergeometric; it is summed exactly.
+    Given the numbers of both signs, the number of runs of either sign is hypergeometric; the sum is exact.
     """
     from scipy.special import gammaln
 
@@ -169,7 +170,7 @@ def runs_of_signs(values: Float[np.ndarray, " n"]) -> Series:
     positive, negative = int(np.sum(signs > 0.0)), int(np.sum(signs < 0.0))
     runs = 1 + int(np.sum(signs[1:] != signs[:-1])) if len(signs) else 0
     if not positive or not negative:
-        # All of one sign: as improbable as a coin that shows one side only.
+        # All of one sign: as improbable as a coin that always shows the same side.
         return Series(len(signs), runs, min(1.0, 2.0 ** (1 - len(signs))) if len(signs) else 1.0)
 
     def log_choose(n: int, k: np.ndarray) -> np.ndarray:
@@ -177,7 +178,8 @@ def runs_of_signs(values: Float[np.ndarray, " n"]) -> Series:
         at = np.where(inside, k, 0)
         return np.where(inside, gammaln(n + 1.0) - gammaln(at + 1.0) - gammaln(n - at + 1.0), -np.inf)
 
-    # There are r runs where the positive and the negative signs are cut into r // 2 and r - r // 2 runs, either way round.
+    # For r runs, the positive signs are cut into r // 2 runs and the negative ones into r - r // 2, or the other way
+    # round.
     counts = np.arange(2, runs + 1)
     less, more = counts // 2 - 1, counts - counts // 2 - 1
     whole = log_choose(positive + negative, np.array(positive))

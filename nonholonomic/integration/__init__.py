@@ -41,6 +41,7 @@ from .settings import MOST_STEPS as MOST_STEPS
 from .settings import TIGHTEST as TIGHTEST
 from .settings import Settings as Settings
 from .settings import lanes_for as lanes_for
+from .settings import legal_run as legal_run
 from .settings import require_adaptive as require_adaptive
 from .settings import require_adjoint as require_adjoint
 from .settings import run_bounds as run_bounds

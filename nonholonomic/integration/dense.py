@@ -70,6 +70,15 @@ def _guard(problem: AbstractProblem, time: Float[Array, ""], state: Float[Array,
     return domain_margin
 
 
+@eqx.filter_jit
+def _start(
+    problem: AbstractProblem, time: Float[Array, ""]
+) -> tuple[Float[Array, " components"], Float[Array, " components"], Float[Array, ""] | None]:
+    """State, scales and domain margin at the start: one program, where JAX would compile each of their operations."""
+    state, scales = problem.start()
+    return jnp.asarray(state), jnp.asarray(scales), problem.domain_margin(time, state)
+
+
 def _control(settings: Settings, scales: Float[Array, " components"]) -> diffrax.PIDController:
     # The largest error counts, not the mean: passive cyclic coordinates must not dilute the errors of the others.
     atol = settings.absolute * settings.tolerance * jax.lax.stop_gradient(scales)
@@ -139,8 +148,7 @@ def follow(
     **Returns:** a `DenseSolution` with the accepted steps; it ends where the domain margin reaches zero, located on the
     dense output.
     """
-    state, scales = problem.start()
-    state, scales = jnp.asarray(state), jnp.asarray(scales)
+    state, scales, margin = _start(problem, jnp.asarray(t0, float))
     time = jnp.asarray(t0, state.dtype)
     times, states, segments = [np.full(1, t0)], [np.asarray(state)[:, None]], []
     accepted = rejected = 0
@@ -148,7 +156,6 @@ def follow(
     length = None if first is None else jnp.asarray(first, state.dtype)
     # The program is compiled for this number of steps, so it must not change with the number that is left.
     each = dataclasses.replace(settings, max_steps=min(PIECE, settings.max_steps))
-    margin = problem.domain_margin(time, state)
     if margin is not None and float(margin) <= 0.0:
         return DenseSolution(times[0], states[0], [], True, False, 0, 0)
     while float(time) < t1 and not (lost or failed):

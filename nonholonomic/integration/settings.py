@@ -6,9 +6,10 @@ from typing import Any, Self
 import diffrax
 import equinox as eqx
 import jax
-from jaxtyping import Array, Float
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ..validation import Bound, as_number
+from ..validation import Bound, as_number, legal
 from .oscillatory import Oscillatory8
 
 #: The absolute tolerance as a fraction of the relative one, in units of a problem's own magnitudes.
@@ -89,6 +90,22 @@ def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:
 def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
     """The range of the times of output [s]."""
     yield Bound(times, "times", at_least=0.0, at_most=t1)
+
+
+def legal_run(
+    others: Bool[ArrayLike, "..."], t1: Float[ArrayLike, "..."], tolerance: Float[ArrayLike, "..."], times: Any = None
+) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
+    """Whether the traced numbers of a run are legal, and its horizon and tolerance: if not, 0 and the loosest.
+
+    A run of illegal numbers might never reach its end, so it does not begin, and its tolerance is not that of its batch.
+
+    **Arguments:** `others`: whether all numbers are legal but `t1`, `tolerance` and the `times` of output (times,), which
+    must increase.
+    """
+    may = others & legal(run_bounds(t1, tolerance))
+    if times is not None:
+        may = jnp.all(may & jnp.all(legal(times_bounds(times, t1)))) & jnp.all(jnp.diff(times) > 0.0)
+    return may, jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
 
 
 def require_adaptive(solver: Any, others: str = "") -> None:

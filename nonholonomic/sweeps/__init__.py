@@ -14,4 +14,7 @@ from .processes import local_processes as local_processes
 from .running import chunk_for as chunk_for
 from .running import sweep as sweep
 from .table import Table as Table
+from .tabular import Quantity as Quantity
+from .tabular import Tabular as Tabular
+from .tabular import run_table as run_table
 from .tasks import versions as versions

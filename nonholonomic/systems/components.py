@@ -1,8 +1,8 @@
-"""Functions of small arrays, evaluated number by number, so that every number is a vector of lanes.
+"""Evaluate functions of small arrays number by number, so that every number is a vector of lanes.
 
-A user writes with small matrices. Mapped over lanes they are arrays with a short last axis, which compilers do not turn into
-vector instructions, and their zeros are multiplied like any other number. Here each element of each array is a number of its
-own: zeros and ones disappear, and what is computed twice is computed once.
+Users write functions of small matrices. Mapped over lanes, these are arrays with a short last axis, which compilers do
+not turn into vector instructions, and their zeros are multiplied like other numbers. Here each element of each array is
+a separate number: zeros and ones disappear, and repeated expressions are computed once.
 """
 
 import functools
@@ -28,32 +28,32 @@ BY_ELEMENT = """
     mul ne neg nextafter not or pow rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor
 """
 
-#: Those that take long enough to be computed once only, where XLA would compute them again for each result.
+#: Operations that are expensive enough to be computed once only; XLA would compute them again for each result.
 COSTLY = """
     acos acosh asin asinh atan atan2 atanh cbrt cos cosh erf exp exp2 expm1 log log1p logistic pow sin sinh tan tanh
 """
 
-#: A function of more operations on numbers than these is left in arrays: it would take long to compile.
+#: A function with more scalar operations than this is left in arrays: it would take long to compile.
 MOST_OPERATIONS = 1500
 
-#: Elements of an array: constants, which are NumPy's, or traced numbers, one for all lanes or one for each.
+#: Elements of an array: NumPy constants, or traced numbers, one for all lanes or one per lane.
 Elements = Any
 
 
 class TooLarge(Exception):
-    """A function with other operations, or too many."""
+    """The function has unsupported operations, or too many operations."""
 
 
 def by_components(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
-    """A function of numbers as one of vectors of lanes.
+    """Convert a function of numbers to a function of vectors of lanes.
 
     **Arguments:**
 
-    - `function`: of scalars, to scalars.
-    - `shapes`: those of its arguments, as for `jax.eval_shape`.
+    - `function`: takes and returns scalars.
+    - `shapes`: shapes of its arguments, as for `jax.eval_shape`.
 
-    **Returns:** the function, of arguments that are scalars or have one number per lane. It raises `TooLarge` for a function
-    that is better left in arrays.
+    **Returns:** the function, whose arguments are scalars or have one number per lane. It raises `TooLarge` for a
+    function that is better left in arrays.
     """
 
     def evaluated(*args: Any) -> Any:
@@ -73,7 +73,7 @@ def _elements(number: Array) -> Elements:
 
 
 def _constants(array: Any) -> Elements:
-    """The elements of an array that is known, or is traced outside of the function."""
+    """The elements of an array that is known, or that is traced outside the function."""
     elements = np.empty(np.shape(array), object)
     known = array if is_traced(array) else np.asarray(array)
     for index in np.ndindex(elements.shape):
@@ -82,11 +82,11 @@ def _constants(array: Any) -> Elements:
 
 
 class Evaluation:
-    """One evaluation: what was computed so far, by operation and operands."""
+    """An evaluation of a function: the results so far, by operation and operands."""
 
     def __init__(self):
         self.computed: dict[Any, Any] = {}
-        # Operands are told apart by their address, so none may be forgotten.
+        # Operands are identified by their address, so all of them must stay in memory.
         self.kept: list[Any] = []
 
     def of(self, jaxpr: Jaxpr, consts: Sequence[Elements], args: Sequence[Elements]) -> list[Elements]:
@@ -133,7 +133,7 @@ class Evaluation:
         return results
 
     def _number(self, name: str, operands: list[Any], equation: Any = None) -> Any:
-        """One operation on numbers: arithmetic, or that of an equation."""
+        """A scalar operation: arithmetic, or the operation of an equation."""
         simple = _simplified(name, operands)
         if simple is not None:
             return simple
@@ -153,7 +153,7 @@ class Evaluation:
                 FUNCTIONS[name] if name in FUNCTIONS else functools.partial(equation.primitive.bind, **equation.params)
             )
             result = bind(*full)
-            # Joined with what it is computed from: what stands alone is computed again all the same.
+            # Joined with its operands: XLA would compute a result that stands alone again.
             self.computed[key] = stored(result, full[0])[0] if name in COSTLY.split() else result
         return self.computed[key]
 
@@ -176,7 +176,7 @@ class Evaluation:
         free = [k for k in range(left.ndim) if k not in (*sums, *batch)]
         right_free = [k for k in range(right.ndim) if k not in (*right_sums, *right_batch)]
         shapes = [[left.shape[k] for k in batch], [left.shape[k] for k in free], [right.shape[k] for k in right_free]]
-        # There may be none: a system without constraints has arrays of no elements.
+        # There may be no elements: a system without constraints has empty arrays.
         count = math.prod(left.shape[k] for k in sums)
         rows = np.transpose(left, (*batch, *free, *sums)).reshape(*shapes[0], *shapes[1], count)
         others = np.transpose(right, (*right_batch, *right_free, *right_sums)).reshape(*shapes[0], *shapes[2], count)
@@ -193,7 +193,7 @@ def _is_constant(number: Any) -> bool:
 
 
 def _simplified(name: str, operands: list[Any]) -> Any:
-    """What an operation gives where it needs no computation; otherwise `None`."""
+    """The result of an operation that needs no computation; otherwise `None`."""
     if name == "select_n" and _is_constant(operands[0]):
         return operands[1 + int(operands[0])]
     if name in ("copy", "copy_p", "stop_gradient") and _is_constant(operands[0]):
@@ -211,14 +211,14 @@ def _simplified(name: str, operands: list[Any]) -> Any:
     if name == "sub":
         return operands[0] if right == 0.0 else None
     if name == "mul":
-        # The zeros of a matrix: what they are multiplied by is a number somewhere else too, or is not needed.
+        # The zeros of a matrix: the other factor is used elsewhere, too, or is not needed.
         if 0.0 in (left, right):
             return operands[0].dtype.type(0.0)
         return operands[1] if left == 1.0 else operands[0] if right == 1.0 else None
     return operands[0] if right == 1.0 else None
 
 
-#: What is done at once with constants.
+#: Operations that are applied to constants immediately.
 ARITHMETIC = {
     "add": operator.add,
     "add_any": operator.add,
@@ -228,7 +228,7 @@ ARITHMETIC = {
     "neg": operator.neg,
 }
 
-#: What sums and products are made of.
+#: Operations that make up sums and products.
 FUNCTIONS = {"add": jax.lax.add, "mul": jax.lax.mul, "max": jax.lax.max, "min": jax.lax.min}
 
 

@@ -1,8 +1,8 @@
 """A user's hybrid system as problems and batched modes of the engine.
 
-A user writes functions of one state. Here they are mapped over lanes component by component, so that what they compute is laid
-out as in equations written for the engine: components along the first axis, lanes last. Time is one more component of the
-state where a function depends on it.
+Users write functions of one state. Here they are mapped over lanes, component by component, so that they have the same
+layout as equations written for the engine: components along the first axis, lanes last. If a function depends on time,
+time is an additional component of the state.
 """
 
 import contextlib
@@ -22,18 +22,19 @@ from .form import Form, OfRun
 from .mode import State
 from .tracing import spelled_out
 
-#: A function counts as zero if changing every component of the state by this fraction of its size could make it so: at the end
-#: of a mode, which is located to 1e-10 of a step, so that a long step leaves an error to be taken out; and up to round-off.
+#: A function counts as zero if changing every component of the state by this fraction of its size could make it zero:
+#: first at the end of a mode, which is located to 1e-10 of a step, so that a long step leaves an error to be removed;
+#: then up to round-off.
 AT_END, ROUND_OFF = 1e-6, 1e-14
 
-#: The magnitude by which errors of the time are measured [s]: it has none, and no share in step control.
+#: Magnitude for errors of the time [s]: time has no error and no influence on step-size control.
 UNMEASURED = 1e9
 
 
 class ModeProblem(AbstractProblem):
     """The motion in one mode, up to the event or the end of the mode.
 
-    `numbers`: those of the system; `states`, `scales`: as `start` returns them.
+    `numbers`: the system's numbers; `states`, `scales`: as `start` returns them.
     """
 
     numbers: tuple[Float[Array, "..."], ...]
@@ -64,11 +65,11 @@ class ModeProblem(AbstractProblem):
     def domain_margin(self, time: Lanes, state: States) -> Lanes | None:
         if self.form.traits.ends[self.mode]:
             return self._over_lanes(self.form.function("margin", self.mode), state)
-        # What changes between modes asks for a domain margin in each.
+        # If some modes have a domain margin, all modes need one.
         return None if self.form.traits.smooth else jnp.ones_like(state[0])
 
     def _over_lanes(self, function: OfRun, state: States) -> Any:
-        """A user's function in every lane."""
+        """A user's function, evaluated in every lane."""
 
         def of_run(numbers: Sequence[Array], parts: tuple[Array, ...]) -> Any:
             return function(numbers, *time_and_state(self.form, parts))
@@ -86,14 +87,14 @@ class ModeProblem(AbstractProblem):
 
 
 def time_and_state(form: Form, parts: tuple[Array, ...]) -> tuple[Array, State]:
-    """Time and state of one run, from its components; a time that matters nowhere is no number."""
+    """Time and state of a run, from its components; the time is a placeholder if nothing depends on it."""
     if form.traits.timed:
         return parts[-1], jnp.stack(parts[:-1])
     return jnp.asarray(jnp.nan), jnp.stack(parts)
 
 
 class BatchedMode(AbstractBatchedMode):
-    """A user's mode as a mode of the engine, of cells with `numbers` and `scales` as in `ModeProblem`."""
+    """A user's mode as a mode of the engine, for cells with `numbers` and `scales` as in `ModeProblem`."""
 
     numbers: tuple[Float[Array, "..."], ...]
     scales: Float[Array, "components cells"]
@@ -104,10 +105,10 @@ class BatchedMode(AbstractBatchedMode):
         return ModeProblem(self.numbers, state, self.scales, self.form, self.mode)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """The reset, or the end of the run for a mode without one.
+        """The reset, or the end of the run if the mode has none.
 
-        An event at the end of the mode comes before the reset, and one that the reset jumps over is passed by it: the run then
-        has ended between two modes.
+        An event at the end of the mode comes before the reset. If the reset jumps over the zero of the event function,
+        the event happens at the reset: the run has then ended between two modes.
         """
         axes = tuple(0 if jnp.ndim(number) else None for number in self.numbers)
         return jax.vmap(self._reset_one, in_axes=(axes, 1, 1), out_axes=_TRANSITION_AXES)(
@@ -125,7 +126,7 @@ class BatchedMode(AbstractBatchedMode):
         )
         margin = _Watched(form, self.mode, function, numbers, scales)
         value, slope = margin.along(state)
-        # The end was located to a fraction of a step, not before the zero; the way back is known.
+        # The end was located to a fraction of a step and may lie after the zero; the way back is known.
         close = margin.is_near_zero(state, AT_END) & (slope < 0.0) & (value < 0.0)
         late = jnp.where(close, -value / jnp.where(close, slope, 1.0), 0.0)
         state = state + late * margin.rate(state)
@@ -155,13 +156,13 @@ class BatchedMode(AbstractBatchedMode):
         )
 
 
-#: Where the cells of a `Transition` are, for `vmap`.
+#: The axis of cells in a `Transition`, for `vmap`.
 _AXES: Any = (0, 1, 0, 0, 0, 1, None, None)
 _TRANSITION_AXES = Transition(*_AXES)
 
 
 class _Watched(eqx.Module):
-    """A function of one run that ends a mode or is timed: what it is for a state with its time."""
+    """A function that ends a mode or defines the event, for a single run: its value for a state with its time."""
 
     form: Form = eqx.field(static=True)
     mode: int = eqx.field(static=True)
@@ -178,7 +179,7 @@ class _Watched(eqx.Module):
         return jnp.concatenate([rate, jnp.ones(len(state) - self.form.size)])
 
     def along(self, state: Float[Array, " components"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Value and rate."""
+        """The value and its rate along the motion."""
         return jax.jvp(self.value, (state,), (self.rate(state),))
 
     def is_near_zero(self, state: Float[Array, " components"], fraction: float) -> Bool[Array, ""]:
@@ -196,9 +197,9 @@ class Cells(eqx.Module):
     form: Form = eqx.field(static=True)
 
     def states(self, cells: int | None) -> tuple[Float[Array, "components *cells"], Float[Array, "components *cells"]]:
-        """States at the start, with their time if it matters, and the magnitudes of their errors.
+        """States at the start, including time if a function depends on it, and the magnitudes for their errors.
 
-        The magnitudes are the largest component of a start, where that is not greater than 1, and 1 otherwise.
+        The magnitude is the largest component of a start if that is at most 1, otherwise 1.
         """
         shape = () if cells is None else (cells,)
         states = jnp.stack([jnp.broadcast_to(part, shape) for part in self.start])

@@ -11,7 +11,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from ..derivatives import (
     AbstractDifferentiableSolve,
     differentiable_solve,
-    in_groups,
     tangents_by,
     traced_solve_ensemble_with_tangents,
 )
@@ -19,16 +18,15 @@ from ..hybrid import HybridOutcome, traced_solve_hybrid, traced_solve_hybrid_wit
 from ..integration import (
     CROSSED,
     FAILED,
-    LOOSEST,
     UNRESOLVED,
     Outcome,
     Settings,
     explicit_tableau,
-    run_bounds,
+    legal_run,
     traced_solve_ensemble,
 )
 from ..progress import status_line
-from ..validation import as_number, legal
+from ..validation import as_number
 from .engine import Cells
 from .mode import Event
 from .system import System, check_run, run_of
@@ -45,30 +43,30 @@ def event_time(
 ) -> Float[Array, ""]:
     """Time of the first event of a run; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
 
-    The event is the first time after the start at which a function of time and state falls through zero, along the motion
-    or by a reset. Runs that start at the zero, or beyond it, are timed when they fall through it the next time. Under `vmap`
-    all runs are lanes of one batch.
+    The event is the first time after the start at which a function of time and state falls through zero, along the
+    motion or by a reset. For a run that starts at or below zero, the event is the next time at which the function falls
+    through zero. Under `vmap`, all runs are lanes of one batch.
 
-    Derivatives by the start, by every number of the system and of the event are exact: by the implicit function theorem at the
-    event and the saltation matrix at every reset (`nonholonomic/hybrid/saltation.py`). They are 0 where the time is
-    infinite.
+    Derivatives with respect to the start and every number of the system and of the event are exact: they use the
+    implicit function theorem at the event and the saltation matrix at every reset (`nonholonomic/hybrid/saltation.py`).
+    They are 0 if the time is infinite.
 
     **Arguments:**
 
     - `system`: a `Hybrid`, or an `AbstractSystem`.
     - `start`: state at time 0, (components,); of an `AbstractSystem`, the coordinates and their rates, (q, rate).
     - `t1`: horizon [s], positive.
-    - `event`: a function `event(t, y)` of time [s] and state; by default the system's own. The state of an `AbstractSystem` is
-      that of `Trajectory.state`: the coordinates, and behind them their rates.
-    - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2]. The absolute tolerance is a tenth of it, in units of
-      the largest component of the start where that is below 1.
+    - `event`: a function `event(t, y)` of time [s] and state; by default the system's own. The state of an
+      `AbstractSystem` is that of `Trajectory.state`: the coordinates, followed by their rates.
+    - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2]. The absolute tolerance is a tenth of it, in
+      units of the largest component of the start if that is below 1.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default `nonholonomic.integration.Oscillatory8()`.
 
-    **Returns:** the time [s]; infinite if there is no event by `t1`, or the run ends before; NaN if the integration failed or
-    resets follow one another without end, or if numbers inside a transformation are out of range. Where a mode may end or not
-    within the tolerance, because its margin only touches zero, derivatives are NaN.
+    **Returns:** the time [s]; infinite if there is no event by `t1` or if the run ends before; NaN if the integration
+    failed, if resets follow one another without end, or if numbers inside a transformation are out of range. If the
+    margin of a mode only touches zero, so that the mode may or may not end within the tolerance, derivatives are NaN.
 
-    **Raises:** `ValueError` for arguments out of range, functions that return something else than they should, and second
+    **Raises:** `ValueError` for arguments out of range, functions that return a wrong type or shape, and second
     derivatives through resets.
 
     **Example:** the fifth bounce of a ball.
@@ -106,7 +104,7 @@ def event_time(
     return _time(run.cells, as_number(t1), as_number(tolerance), solver)
 
 
-# Compiled as a whole, so that further calls with the same functions need no tracing.
+# Compile the whole, so that further calls with the same functions need no tracing.
 @eqx.filter_jit
 def _time(
     cells: Cells, t1: Float[Array, ""], tolerance: Float[Array, ""], solver: diffrax.AbstractERK | None
@@ -115,15 +113,14 @@ def _time(
     movable = [number for number in numbers if eqx.is_inexact_array(number)]
     others = [number for number in numbers if not eqx.is_inexact_array(number)]
     places = tuple(eqx.is_inexact_array(number) for number in numbers)
-    question = SmoothEvent if cells.form.traits.smooth else HybridEvent
-    return differentiable_solve(question(len(movable), structure, places, solver), *movable, *others, t1, tolerance)
+    solve = SmoothEvent if cells.form.traits.smooth else HybridEvent
+    return differentiable_solve(solve(len(movable), structure, places, solver), *movable, *others, t1, tolerance)
 
 
 class SmoothEvent(AbstractDifferentiableSolve):
-    """When the events of cells are whose runs are smooth.
+    """Event times of cells with smooth runs.
 
-    The leaves are the numbers of `Cells`, those that are floats first, the horizon and the tolerance.
-
+    The leaves are the numbers of `Cells`, floats first, the horizon and the tolerance.
 
     `structure`: of the `Cells`; `places`: which of its leaves are floats.
     """
@@ -143,14 +140,14 @@ class SmoothEvent(AbstractDifferentiableSolve):
         return jax.tree.unflatten(self.structure, [next(floats if is_float else others) for is_float in self.places])
 
     def permitted(self, leaves: tuple[Array, ...]) -> tuple[Bool[Array, "..."], Float[Array, "..."], Settings]:
-        """Which cells have a legal horizon, tolerance and start; the horizons, 0 for the others; and the settings.
+        """Which cells have a legal horizon, tolerance and start; their horizons (0 for the others); and the settings.
 
-        One tolerance serves a batch: the smallest.
+        A batch has one tolerance: the smallest.
         """
         *_, t1, tolerance = leaves
-        may = legal(run_bounds(t1, tolerance))
-        may = may & jnp.isfinite(jnp.asarray(sum(self.of_leaves(leaves).start)))
-        return may, jnp.where(may, t1, 0.0), Settings(jnp.min(jnp.where(may, tolerance, LOOSEST)), self.solver)
+        finite = jnp.isfinite(jnp.asarray(sum(self.of_leaves(leaves).start)))
+        may, t1, tolerance = legal_run(finite, t1, tolerance)
+        return may, t1, Settings(jnp.min(tolerance), self.solver)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, settings = self.permitted(leaves)
@@ -165,21 +162,21 @@ class SmoothEvent(AbstractDifferentiableSolve):
             return self.of_leaves((*movable, *leaves[self.movable :])).problem(cells)
 
         may, t1, settings = self.permitted(leaves)
-        problem, directions, gather = tangents_by(build, active, leaves[: self.movable], cells)
+        problem, tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
         outcome, slopes = traced_solve_ensemble_with_tangents(
-            problem, directions, t1, jnp.asarray(cells), settings, one_kernel=not again
+            problem, tangents, t1, jnp.asarray(cells), settings, one_kernel=not again
         )
         time = _named(may, outcome)
         return time, [jnp.where(jnp.isinf(time), 0.0, slope + 0.0 * time) for slope in gather(slopes)]
 
 
 class HybridEvent(SmoothEvent):
-    """When the events of cells are whose runs have resets."""
+    """Event times of cells whose runs have resets."""
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, settings = self.permitted(leaves)
-        phases, first, states = self.of_leaves(leaves).modes(cells)
-        return _named(may, traced_solve_hybrid(phases, first, states, t1, settings, counters=1))
+        modes, first, states = self.of_leaves(leaves).modes(cells)
+        return _named(may, traced_solve_hybrid(modes, first, states, t1, cells, settings, counters=1))
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
@@ -192,21 +189,18 @@ class HybridEvent(SmoothEvent):
             return self.of_leaves((*movable, *leaves[self.movable :])).modes(cells)
 
         may, t1, settings = self.permitted(leaves)
-        (phases, first, states), directions, gather = tangents_by(build, active, leaves[: self.movable], cells)
+        (modes, first, states), tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
 
-        def run(some: tuple[Any, ...]) -> tuple[tuple[HybridOutcome, Array], list[Float[Array, " cells"]]]:
-            moved = tuple((one[0], one[2]) for one in some)
-            journey, found = traced_solve_hybrid_with_tangents(phases, moved, first, states, t1, settings, counters=1)
-            return (journey, found.grazing), list(found.slopes)
-
-        (journey, grazing), slopes = in_groups(run, directions)
-        time = _named(may, journey)
-        slopes = [jnp.where(grazing, jnp.nan, slope) for slope in gather(slopes)]
-        return time, [jnp.where(jnp.isinf(time), 0.0, slope + 0.0 * time) for slope in slopes]
+        moved = tuple((tangent[0], tangent[2]) for tangent in tangents)
+        outcome, sensitivities = traced_solve_hybrid_with_tangents(
+            modes, moved, first, states, t1, cells, settings, counters=1
+        )
+        time = _named(may, outcome)
+        return time, [jnp.where(jnp.isinf(time), 0.0, slope + 0.0 * time) for slope in gather([*sensitivities.slopes])]
 
 
 def _named(may: Bool[Array, "..."], ended: Outcome | HybridOutcome) -> Float[Array, " cells"]:
-    """The times of the events: infinite where there is none, NaN where the run could not be finished."""
+    """The event times: infinite if there is no event, NaN if the run could not be finished."""
     time = jnp.where(ended.status == CROSSED, ended.crossing_time, jnp.inf)
     failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
     return jnp.where(may & ~failed, time, jnp.nan)

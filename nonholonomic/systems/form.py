@@ -1,4 +1,5 @@
-"""A user's hybrid system without its numbers: what JAX compiles a program for, and what tracing its functions shows."""
+"""A user's hybrid system without its numbers: the part for which JAX compiles a program, and the traits found by
+tracing."""
 
 import dataclasses
 import functools
@@ -26,12 +27,12 @@ def is_number(leaf: Any) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class Form:
-    """A hybrid system without its numbers, which are listed one by one, those of an array in its order.
+    """A hybrid system without its numbers, which are listed one by one, those of an array in order.
 
     - `structure`: of the tree of numbers; `kinds`: shape and type of each leaf.
-    - `rest`, `rest_structure`: the leaves that are no numbers.
-    - `modes`: how many there are; `first`: that in which runs start; `has_event`: whether there is an event.
-    - `size`: how many components the state has.
+    - `rest`, `rest_structure`: the leaves that are not numbers.
+    - `modes`: number of modes; `first`: mode in which runs start; `has_event`: whether there is an event.
+    - `size`: number of components of the state.
     """
 
     structure: Any
@@ -45,7 +46,7 @@ class Form:
 
     @classmethod
     def of(cls, hybrid: Hybrid, size: int) -> tuple["Form", tuple[Array, ...]]:
-        """The form of a system whose states have so many components, and its numbers."""
+        """The form of a system with states of the given size, and its numbers."""
         tree, others = eqx.partition(hybrid, is_number)
         leaves, structure = jax.tree.flatten(tree)
         arrays = [jnp.asarray(leaf) for leaf in leaves]
@@ -58,7 +59,7 @@ class Form:
         )
 
     def system(self, numbers: Sequence[Array]) -> Hybrid:
-        """The system with some numbers, each a scalar."""
+        """The system with the given numbers, each a scalar."""
         leaves, begin = [], 0
         for shape, _ in self.kinds:
             end = begin + math.prod(shape)
@@ -80,23 +81,23 @@ class Form:
 
     @property
     def arguments(self) -> tuple[Any, ...]:
-        """The shapes of what the functions take."""
+        """The shapes of the functions' arguments."""
         types = [jax.ShapeDtypeStruct((), kind) for shape, kind in self.kinds for _ in range(math.prod(shape))]
         real = jnp.result_type(float)
         return tuple(types), jax.ShapeDtypeStruct((), real), jax.ShapeDtypeStruct((self.size,), real)
 
     @property
     def traits(self) -> "Traits":
-        """What tracing the functions shows."""
+        """The traits found by tracing the functions."""
         return _traits(self)
 
 
 class Traits(NamedTuple):
-    """What tracing a hybrid system's functions shows.
+    """The traits of a hybrid system, found by tracing its functions.
 
-    - `timed`: whether a function depends on time, which then is one more component of the state.
-    - `elementary`: whether all that is asked within steps fits a single kernel.
-    - `ends`, `resets`: of each mode, whether it has a margin, and a reset too.
+    - `timed`: whether a function depends on time, which is then an additional component of the state.
+    - `elementary`: whether all functions that are evaluated within steps fit a single kernel.
+    - `ends`, `resets`: for each mode, whether it has a margin, and whether it also has a reset.
     """
 
     timed: bool
@@ -112,9 +113,9 @@ class Traits(NamedTuple):
 
 @functools.lru_cache(maxsize=256)
 def _traits(form: Form) -> Traits:
-    """The traits of a form, whose functions are checked by the way.
+    """The traits of a form; also checks its functions.
 
-    **Raises:** `ValueError` that names a function that returns something else than it should.
+    **Raises:** `ValueError` that names a function that returns a wrong type or shape.
     """
     ends, resets, within, others = [], [], [], []
     for k in range(form.modes):

@@ -1,4 +1,4 @@
-"""Numbers of a user's system from recorded runs."""
+"""Estimate numbers of a user's system from recorded runs."""
 
 import dataclasses
 import re
@@ -34,7 +34,7 @@ from .system import System, check_run
 
 @dataclasses.dataclass(frozen=True)
 class Components(Quantities):
-    """The components of a state, whatever their number: "y0" and so on, or "q0", "rate0" and so on."""
+    """The components of a state, in any number: "y0" and so on, or "q0", "rate0" and so on."""
 
     def of(self, quantity: Any) -> tuple[str, ...]:
         names = quantity if isinstance(quantity, tuple) else (quantity,)
@@ -54,9 +54,9 @@ class Recording(AbstractRecording):
     - `launch`: the start, as for `simulate`.
     - `times`: (times,), increasing.
     - `value`: (times,) for one component, (times, columns) for several; NaN where a sample is missing.
-    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: to be estimated for each column
-      from the scatter about the fit.
-    - `quantity`: what was recorded: the names of components, as in `Trajectory.names`, such as "y0" or ("q0", "q1").
+    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: estimated for each column
+      from the residuals.
+    - `quantity`: names of the recorded components, as in `Trajectory.names`, such as "y0" or ("q0", "q1").
     - `t0`: the clock's reading at the start.
     - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None`: Gaussian.
 
@@ -90,10 +90,10 @@ class SystemModel(AbstractDataModel):
     def predict(
         self, sources: list[tuple[Recording, dict[str, Array]]], rows: int
     ) -> list[Float[Array, "rows samples"]]:
-        return [jax.vmap(lambda row, one=one: self._predict(one, row))(values) for one, values in sources]
+        return [jax.vmap(lambda row, launch=launch: self._predict(launch, row))(values) for launch, values in sources]
 
     def _predict(self, recording: Recording, row: dict[str, Array]) -> Float[Array, " samples"]:
-        """What is recorded of one run, a time after the other."""
+        """Predictions for the recording of one run, ordered by time."""
         named = numbers_of(self.system, recording)
         tree = named.tree(named.replaced(row))
         times = model_times(recording.times, row.get("t0", recording.t0))
@@ -124,20 +124,20 @@ def identify(
     max_steps: int = 60,
     progress: bool = True,
 ) -> Identification:
-    """Numbers of a user's system and its starts from recorded runs, with their errors and with what is not determined.
+    """Estimate numbers of a user's system and its starts from recorded runs, with errors and undetermined combinations.
 
     **Arguments:**
 
-    - `system`: a `Hybrid`, or an `AbstractSystem`; what is not free is taken from it.
+    - `system`: a `Hybrid`, or an `AbstractSystem`, with the values of the numbers that are not free.
     - `data`: a `Recording`, or a list of several to be fitted together.
-    - `free`: full name of a number -> a `nonholonomic.identification.Free` or only the value from which to start:
-      `"system.modes[0].drag"`, or `"drag"` where nothing else ends so; `"start[0]"`, `"start.q[0]"`. A start, or `"t0"`, the
-      reading of a recording's clock at the start, is the same in all recordings; `"data[1].start[0]"` is that of the second,
-      and `"data[*].t0"` stands for one of each. Through resets `"t0"` cannot be free.
+    - `free`: full name of a number -> a `nonholonomic.identification.Free` or only the start value:
+      `"system.modes[0].drag"`, or `"drag"` if no other name ends so; `"start[0]"`, `"start.q[0]"`. A start, or `"t0"`,
+      the reading of a recording's clock at the start, is the same in all recordings; `"data[1].start[0]"` is that of
+      the second, and `"data[*].t0"` stands for one of each. In systems with resets, `"t0"` cannot be free.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `tolerance`: relative tolerance of the integration.
 
-    **Returns:** an `Identification`, with its `verdict`; of which it warns (`FitWarning`) if it is not good.
+    **Returns:** an `Identification` with its `verdict`; a doubtful fit gives a `FitWarning`.
 
     **Raises:** `ValueError` for arguments out of range or an unknown name.
 
@@ -160,12 +160,12 @@ def identify(
     """
     search = search_options(starts, spread, seed, max_steps, progress)
     data = as_sources(data, Recording, "a nonholonomic.Recording")
-    for one in data:
-        check_run(system, one.launch, one.times[-1], tolerance)
+    for recording in data:
+        check_run(system, recording.launch, recording.times[-1], tolerance)
     tolerance_bound(tolerance).require()
     if isinstance(system, Hybrid):
         system = dataclasses.replace(system, event=None)
-    named = [numbers_of(system, one) for one in data]
+    named = [numbers_of(system, recording) for recording in data]
     own = [[name for name in numbers.movable if name.startswith("start")] + ["t0"] for numbers in named]
     known = [name for name in named[0].movable if name.startswith("system")]
 

@@ -9,16 +9,16 @@ from jaxtyping import Array, Float
 
 State = Float[Array, " components"]
 
-#: A function of time [s] and state whose fall through zero is timed.
+#: The event function, of time [s] and state; the event happens when it falls through zero.
 Event = Callable[[Float[Array, ""], State], Float[Array, ""]]
 
 
 class AbstractMode(eqx.Module):
     """A mode of a hybrid system: its equations of motion, when it ends, and what follows.
 
-    Subclass it, declare the numbers of your model as fields, and write functions of one time and one state with `jax.numpy`.
-    Every field that is a float or an array can be swept, fitted and differentiated by. A mode that never ends needs `field`
-    alone.
+    Subclass it, declare the numbers of your model as fields, and write functions of one time and one state with
+    `jax.numpy`. You can sweep, fit and differentiate every field that is a float or an array. A mode that never ends
+    needs only `field`.
 
     **Example:** a ball that falls and bounces.
 
@@ -59,35 +59,35 @@ class AbstractMode(eqx.Module):
 
         **Arguments:** as for `field`.
 
-        **Returns:** a number, or `None`, the default, for a mode that never ends.
+        **Returns:** a number; `None`, the default, for a mode that never ends.
         """
         return None
 
     def reset(self, t: Float[Array, ""], y: State) -> tuple[State, Any] | None:
-        """What follows where the margin has fallen to zero.
+        """The state and mode that follow when the margin has fallen to zero.
 
-        A reset may leave the state at zero margin if the margin then rises, as that of a ball that has just bounced.
+        A reset may leave the state at zero margin if the margin then rises, as for a ball that has just bounced.
 
-        **Arguments:** as for `field`, where the mode ends.
+        **Arguments:** as for `field`, at the end of the mode.
 
-        **Returns:** the state with which the run goes on, (components,), and the number of the next mode in `Hybrid.modes`, a
-        whole number that may depend on the state; or `None`, the default, for a run that ends there.
+        **Returns:** the next state, (components,), and the index of the next mode in `Hybrid.modes`, a whole number
+        that may depend on the state; or `None`, the default, if the run ends here.
         """
         return None
 
 
 class Hybrid(eqx.Module):
-    """A hybrid system: modes of one state, and the event that is timed.
+    """A hybrid system: modes of one state, and the event to be timed.
 
     **Arguments:**
 
     - `modes`: the modes, whose states have the same components.
-    - `event`: a function of time [s] and state, `event(t, y)`, or `None`. The event is the first time after the start at which
-      the function falls through zero, along the motion or by a reset. A function that is an `equinox.Module` can have
-      numbers of its own.
-    - `first`: number of the mode in which runs start.
+    - `event`: a function of time [s] and state, `event(t, y)`, or `None`. The event is the first time after the start
+      at which the function falls through zero, along the motion or by a reset. An `equinox.Module` can have its own
+      numbers.
+    - `first`: index of the mode in which runs start.
 
-    **Raises:** `ValueError` for modes that are none, an event that is no function, and a first mode that does not exist.
+    **Raises:** `ValueError` for wrong modes, an event that is not a function, and a first mode that does not exist.
 
     **Example:** as for `AbstractMode`.
 

@@ -17,7 +17,7 @@ from .form import is_number
 class Named(NamedTuple):
     """The numbers of a tree, one by one, and the tree as a function of them.
 
-    `names` and `values` are those of the numbers, in one order; `shapes`: of the arrays that they are from.
+    `names` and `values` are those of the numbers, in the same order; `shapes`: of the arrays that contain them.
     """
 
     names: tuple[str, ...]
@@ -55,12 +55,12 @@ class Named(NamedTuple):
 
     @property
     def movable(self) -> list[str]:
-        """The names of those that are floats, which can be varied."""
+        """The names of the numbers that are floats, which can be varied."""
         return [name for name, value in zip(self.names, self.values, strict=True) if eqx.is_inexact_array(value)]
 
 
 def _name(path: KeyPath) -> str:
-    """A path as a user writes it."""
+    """A path in the user's notation."""
     parts = []
     for key in path:
         if isinstance(key, SequenceKey):
@@ -73,7 +73,7 @@ def _name(path: KeyPath) -> str:
 
 
 def short_names(names: list[str]) -> dict[str, str]:
-    """For each full name what follows its last dot, written as in `start_0`; the whole of it where several end alike."""
+    """For each full name, the part after its last dot, in the form `start_0`; the whole name if several end alike."""
     ends = [_plain(name.rsplit(".", 1)[-1]) for name in names]
     return {name: end if ends.count(end) == 1 else _plain(name) for name, end in zip(names, ends, strict=True)}
 
@@ -83,13 +83,13 @@ def _plain(name: str) -> str:
 
 
 def has_checks(tree: Any) -> bool:
-    """Whether a module of a user checks its numbers, so that every value of an axis must be looked at."""
+    """Whether a user's module checks its numbers, so that every value of an axis must be checked."""
     kinds = {kind for module in _modules(tree) for kind in type(module).__mro__ if "__check_init__" in vars(kind)}
     return any(not kind.__module__.startswith("nonholonomic.") for kind in kinds)
 
 
 def check_again(tree: Any) -> None:
-    """Have all modules of a tree check their numbers, as they do when they are made."""
+    """Check the numbers of all modules of a tree, as when they are created."""
     for module in _modules(tree):
         for kind in type(module).__mro__:
             if "__check_init__" in vars(kind):

@@ -1,4 +1,4 @@
-"""Follow one run of a user's system."""
+"""Simulate one run of a user's system."""
 
 import dataclasses
 from typing import Any
@@ -12,15 +12,15 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..derivatives import sampled_run
 from ..hybrid import AbstractBatchedMode, hybrid_samples
-from ..integration import FAILED, LOOSEST, Settings, explicit_tableau, run_bounds, times_bounds
+from ..integration import FAILED, Settings, explicit_tableau, legal_run, times_bounds
 from ..progress import status_line
-from ..validation import as_known, as_number, is_traced, legal, nan_unless, require_all, require_increasing
+from ..validation import as_known, as_number, is_traced, nan_unless, require_all, require_increasing
 from .engine import Cells, ModeProblem
 from .mode import Hybrid
 from .system import Run, System, check_run, run_of
 from .trajectory import Trajectory
 
-#: How many times are saved if none are asked for.
+#: Default number of times to report.
 DEFAULT_TIMES = 201
 
 
@@ -33,9 +33,9 @@ def simulate(
     tolerance: Float[ArrayLike, ""] = 1e-9,
     solver: diffrax.AbstractERK | None = None,
 ) -> Trajectory:
-    """Follow one run of a system to `t1`; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
+    """Simulate one run of a system to `t1`; works under `jit`, `vmap`, `grad`, `jvp`, `jacfwd` and their compositions.
 
-    A run goes on through all resets, and through the system's event. Derivatives go through resets by the saltation matrix.
+    A run continues through all resets and through the system's event. Derivatives use the saltation matrix at resets.
 
     **Arguments:**
 
@@ -45,8 +45,8 @@ def simulate(
 
     **Returns:** a `Trajectory`, whose `status` says how the run ended.
 
-    **Raises:** `ValueError` for arguments out of range, times that do not increase, functions that return something else than
-    they should, and second derivatives through resets.
+    **Raises:** `ValueError` for arguments out of range, times that do not increase, functions that return a wrong type
+    or shape, and second derivatives through resets.
 
     **Example:** a pendulum as an `AbstractSystem`.
 
@@ -89,29 +89,32 @@ def _sampled(
     tolerance: Float[Array, ""],
     solver: diffrax.AbstractERK | None,
 ) -> Trajectory:
-    """The run, or NaN and "failed" where a traced number is out of range."""
+    """The run, or NaN and "failed" if a traced number is out of range."""
     cells = run.cells
-    may = jnp.all(legal([*run_bounds(t1, tolerance), *times_bounds(times, t1)])) & jnp.all(jnp.diff(times) > 0.0)
-    settings = Settings(jnp.where(may, tolerance, LOOSEST), solver)
-    horizon, at = jnp.where(may, t1, 0.0), jnp.where(may, times, 0.0)
+    may, horizon, tolerance = legal_run(True, t1, tolerance, times)
+    settings, at = Settings(tolerance, solver), jnp.where(may, times, 0.0)
     if cells.form.traits.smooth:
-        found = sampled_run(_problem, cells, at, horizon, settings)
-        states, reached = found.states, jnp.all(jnp.isfinite(found.states), axis=1)
+        samples = sampled_run(_problem, cells, at, horizon, settings)
+        states, reached = samples.states, jnp.all(jnp.isfinite(samples.states), axis=1)
         mode, switches = jnp.where(reached, cells.form.first, -1), jnp.zeros(())
-        status, steps = found.status, found.accepted + found.rejected
+        status, steps = samples.status, samples.accepted + samples.rejected
     else:
-        found = hybrid_samples(_modes, cells, at, horizon, settings, 1)
-        states, mode, switches = found.shown.T, jnp.where(jnp.isnan(found.number), -1, found.number), found.counts[0]
-        status, steps = found.status, found.steps
+        samples = hybrid_samples(_modes, cells, at, horizon, settings, 1)
+        states, mode, switches = (
+            samples.shown.T,
+            jnp.where(jnp.isnan(samples.number), -1, samples.number),
+            samples.counts[0],
+        )
+        status, steps = samples.status, samples.steps
     states = jax.vmap(run.shown)(nan_unless(may, states))
     return Trajectory(
         t=times,
         state=states,
         mode=mode.astype(int),
-        end_time=nan_unless(may, found.end_time),
+        end_time=nan_unless(may, samples.end_time),
         switches=switches.astype(int),
         steps=steps.astype(int),
-        rejected=found.rejected.astype(int),
+        rejected=samples.rejected.astype(int),
         code=jnp.where(may, status, FAILED).astype(int),
         names=run.names,
     )
@@ -124,5 +127,5 @@ def _problem(cells: Cells, count: int | None) -> ModeProblem:
 def _modes(
     cells: Cells, tolerance: Array
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " 1"], Float[Array, "components 1"]]:
-    """The modes of one run, its first and its start."""
+    """The modes of one run, the index of its first mode, and its start."""
     return cells.modes(1)

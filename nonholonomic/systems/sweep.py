@@ -35,10 +35,11 @@ from .numbers import Named, check_again, has_checks, short_names
 from .system import Run, System, check_run, run_of
 from .tracing import dependent_outputs
 
-#: Cells in a block of a large grid at least: runs of small systems are short, and what is done once for a block counts.
-BLOCK = 1024
+#: Smallest number of cells in a chunk of a large grid: runs of small systems are short, so the overhead of a chunk
+#: counts.
+LEAST_CHUNK = 1024
 
-#: How a run can end, and the code of each word but the first.
+#: The words for how a run can end, and the code of each word but the first.
 WORDS = ("event", "completed", "stopped", "failed", "unresolved")
 CODES = {LEFT_DOMAIN: 2, FAILED: 3, UNRESOLVED: 4}
 
@@ -61,23 +62,24 @@ def sweep(
 
     **Arguments:**
 
-    - `system`, `start`, `event`, `tolerance`, `solver`: as for `event_time`. Without any event runs end at `t1`.
+    - `system`, `start`, `event`, `tolerance`, `solver`: as for `event_time`. Without an event, runs end at `t1`.
     - `t1`: horizon [s].
-    - `axes`: full name of a number -> values, such as `{"system.modes[0].drag": [0.1, 0.2], "start[1]": [0.0, 1.0]}`; the end
-      of a name will do where a single number has it. The start of an `AbstractSystem` has the names `"start.q[0]"` and
-      `"start.rate[0]"`, an event that is an `equinox.Module` those of its numbers, such as `"event.level"` or
-      `"system.event.level"`. The first axis varies slowest.
-    - `sensitivities`: names of numbers to differentiate the times by.
-    - `path`: HDF5 file to write, block by block. A call that was interrupted resumes from it.
-    - `progress`: whether to show it, on a terminal or in a notebook.
-    - `executor`: who computes: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes`; by default a
-      thread for each core. For other processes, classes and functions must be defined at the top of a module.
+    - `axes`: full name of a number -> values, such as `{"system.modes[0].drag": [0.1, 0.2], "start[1]": [0.0, 1.0]}`;
+      the end of a name is enough if only one number has it. The start of an `AbstractSystem` has the names
+      `"start.q[0]"` and `"start.rate[0]"`, an event that is an `equinox.Module` those of its numbers, such as
+      `"event.level"` or `"system.event.level"`. The first axis varies slowest.
+    - `sensitivities`: names of the numbers with respect to which the times are differentiated.
+    - `path`: HDF5 file to write, chunk by chunk. The same call resumes an interrupted sweep from it.
+    - `progress`: whether to show progress, on a terminal or in a notebook.
+    - `executor`: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes`; by default a thread
+      for each core. For other processes, define classes and functions at the top level of a module.
 
-    **Returns:** a `Table` with `time` [s] of the event, infinite without one; `status`: "event", "completed" where the run
-    reached `t1`, "stopped" where a mode without a reset ended, "failed" or "unresolved"; `end_time` [s]; the state at the end,
-    `y0` and so on, or `q0`, `rate0` and so on; `steps` and `rejected`; and for a system with resets `switches`, their number.
-    With `sensitivities` also the derivative of `time` by each number, `time_by_drag` for `"system.modes[0].drag"`, and for a
-    system with resets `grazes`: 1 where the derivative is NaN because the margin of a mode only touched zero.
+    **Returns:** a `Table` with `time` [s] of the event, infinite without one; `status`: "event", "completed" if the run
+    reached `t1`, "stopped" if a mode without a reset ended, "failed" or "unresolved"; `end_time` [s]; the state at the
+    end, `y0` and so on, or `q0`, `rate0` and so on; `steps` and `rejected`; and for a system with resets `switches`,
+    their number. With `sensitivities` also the derivative of `time` by each number, `time_by_drag` for
+    `"system.modes[0].drag"`, and for a system with resets `grazes`: 1 if the derivative is NaN because the margin of a
+    mode only touched zero.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
     `RuntimeError` for an executor that breaks down, or a worker with other versions.
@@ -112,9 +114,9 @@ def sweep(
     by = [full_name("sensitivities", name, named.movable) for name in sensitivities]
     shorts = short_names([*full, *(name for name in by if name not in full)])
     grid = [axis(shorts[name], name, "1", values) for name, values in full.items()]
-    for one in grid if has_checks(system) or has_checks(event) else ():
-        for value in one.values:
-            check_again(named.tree(named.replaced({one.number: jnp.asarray(value)})))
+    for grid_axis in grid if has_checks(system) or has_checks(event) else ():
+        for value in grid_axis.values:
+            check_again(named.tree(named.replaced({grid_axis.number: jnp.asarray(value)})))
     job = SweepJob(named, float(t1), float(tolerance), solver, tuple(by))
     run = _run(named.tree(named.values))
     if by and not run.cells.form.has_event:
@@ -132,7 +134,7 @@ def sweep(
         "solver": type(Settings(tolerance, solver).for_lanes).__name__,
     }
     cells = size_of(grid)
-    chunk = max(BLOCK, chunk_for(cells)) if cells > 4 * BLOCK else None
+    chunk = max(LEAST_CHUNK, chunk_for(cells)) if cells > 4 * LEAST_CHUNK else None
     options = {"chunk": chunk, "path": path, "progress": progress, "executor": executor}
     return computed(job, grid, job.variables(run, shorts), request, **options)
 
@@ -148,7 +150,7 @@ def _run(tree: dict[str, Any]) -> Run:
 
 
 class SweepJob(NamedTuple):
-    """What is asked of every cell, as data that can be sent to another process; see `sweep`."""
+    """The computation for every cell, as data that can be sent to another process; see `sweep`."""
 
     named: Named
     t1: float
@@ -162,29 +164,29 @@ class SweepJob(NamedTuple):
         return cls(Named.of(tree), *rest)
 
     def __reduce__(self) -> Any:
-        # The structure of a tree of a user's classes cannot be pickled; the tree can.
+        # The structure of a tree with a user's classes cannot be pickled, but the tree can.
         return SweepJob.of, (self.named.tree(self.named.values), *self[1:])
 
     def variables(self, run: Run, shorts: dict[str, str]) -> dict[str, Variable]:
         """The variables of the table."""
         event, smooth = run.cells.form.has_event, run.cells.form.traits.smooth
-        found = {"time": Variable("s", np.float64, long_name="time of the event")} if event else {}
-        found |= {"status": Variable("1", np.int8, WORDS, long_name="how the run ended")}
-        found |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
-        found |= {name: Variable("1", np.float64, long_name=f"{name} at the end") for name in run.names}
+        variables = {"time": Variable("s", np.float64, long_name="time of the event")} if event else {}
+        variables |= {"status": Variable("1", np.int8, WORDS, long_name="how the run ended")}
+        variables |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
+        variables |= {name: Variable("1", np.float64, long_name=f"{name} at the end") for name in run.names}
         counts = {"steps": "steps", "rejected": "rejected steps"} | ({} if smooth else {"switches": "resets"})
-        found |= {name: Variable("1", np.int64, long_name=words) for name, words in counts.items()}
-        found |= {f"time_by_{shorts[name]}": Variable("1", np.float64) for name in self.by}
+        variables |= {name: Variable("1", np.int64, long_name=words) for name, words in counts.items()}
+        variables |= {f"time_by_{shorts[name]}": Variable("1", np.float64) for name in self.by}
         if self.by and not smooth:
-            found |= {"grazes": Variable("1", np.int8, long_name="whether the end of a mode was grazing")}
-        return found
+            variables |= {"grazes": Variable("1", np.int8, long_name="whether the end of a mode was grazing")}
+        return variables
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
-        """The variables of some cells, of which the first `count` are to be run."""
+        """The variables of some cells, of which only the first `count` are run."""
         size = next((len(values) for values in columns.values()), 1)
         cells, begin, tangents, scales = _cells(self.named, columns, self.by, size)
         settings, t1 = Settings(np.asarray(self.tolerance), self.solver), np.asarray(self.t1)
-        grazing, slopes = None, []
+        grazing, slopes = np.zeros(size, bool), []
         if cells.form.traits.smooth:
             problem, counted = begin, np.asarray(count)
             if self.by:
@@ -195,44 +197,42 @@ class SweepJob(NamedTuple):
             modes, first, states = begin
             options = (np.asarray(first), np.asarray(states), t1, count, settings)
             if self.by:
-                outcome, found = solve_hybrid_with_tangents(modes, tangents, *options, counters=1)
-                slopes, grazing = found.slopes, np.asarray(found.grazing)
+                outcome, sensitivities = solve_hybrid_with_tangents(modes, tangents, *options, counters=1)
+                slopes, grazing = sensitivities.slopes, np.asarray(sensitivities.grazing)
             else:
                 outcome = solve_hybrid(modes, *options, counters=1)
         crossed = np.asarray(outcome.status) == CROSSED
         shorts = short_names([*columns, *(name for name in self.by if name not in columns)])
-        found = {
-            f"time_by_{shorts[name]}": np.asarray(slope) / np.asarray(scale)
-            for name, slope, scale in zip(self.by, slopes, scales, strict=True)
-        }
-        found = {name: np.where(crossed, slope, 0.0) for name, slope in found.items()}
-        if grazing is not None:
-            found = {name: np.where(crossed & grazing, np.nan, slope) for name, slope in found.items()}
-            found |= {"grazes": (crossed & grazing).astype(np.int8)}
-        return found | self._ends(cells, columns, outcome, crossed, size)
+        ends = self._ends(cells, columns, outcome, crossed, size)
+        for name, slope, scale in zip(self.by, slopes, scales, strict=True):
+            ends[f"time_by_{shorts[name]}"] = np.where(crossed, np.asarray(slope) / np.asarray(scale), 0.0)
+        if self.by and not cells.form.traits.smooth:
+            ends["grazes"] = (crossed & grazing).astype(np.int8)
+        return ends
 
     def _ends(
         self, cells: Cells, columns: dict[str, Any], outcome: Outcome | HybridOutcome, crossed: Any, size: int
     ) -> dict[str, Any]:
-        """What the table says of the ends of runs."""
+        """The variables of the table that describe the ends of runs."""
         status = np.asarray(outcome.status)
         words = np.select([crossed, *(status == code for code in CODES)], [0, *CODES.values()], 1)
-        found = {"time": np.where(crossed, outcome.crossing_time, np.inf)} if cells.form.has_event else {}
+        ends = {"time": np.where(crossed, outcome.crossing_time, np.inf)} if cells.form.has_event else {}
         if cells.form.has_event:
-            found["time"] = np.where(words >= CODES[FAILED], np.nan, found["time"])
+            ends["time"] = np.where(words >= CODES[FAILED], np.nan, ends["time"])
         counts = {"steps": outcome.steps, "rejected": outcome.rejected}
         if isinstance(outcome, HybridOutcome):
             counts |= {"switches": outcome.counts[0]}
         states = _shown(self.named, columns, jnp.asarray(outcome.state), size)
-        found |= {"status": words.astype(np.int8), "end_time": np.asarray(outcome.end_time)}
-        return found | {name: np.asarray(values) for name, values in (counts | states).items()}
+        ends |= {"status": words.astype(np.int8), "end_time": np.asarray(outcome.end_time)}
+        return ends | {name: np.asarray(values) for name, values in (counts | states).items()}
 
 
 @eqx.filter_jit
 def _cells(
     named: Named, columns: dict[str, Any], by: tuple[str, ...], size: int
 ) -> tuple[Cells, Any, Any, list[Array]]:
-    """The cells, what the engine runs them as, the tangents of that by some numbers, and by how much these move each."""
+    """The cells, their engine objects, the tangents of these with respect to some numbers, and the scales of the
+    tangents."""
     values = named.replaced({name: jnp.asarray(column) for name, column in columns.items()})
     varied = [k for k, name in enumerate(named.names) if name in columns or name in by]
 
@@ -271,7 +271,7 @@ def _cells(
 
 @eqx.filter_jit
 def _shown(named: Named, columns: dict[str, Any], states: Array, size: int) -> dict[str, Array]:
-    """The states as the user knows them, component by component."""
+    """The states in the user's components."""
     values = named.replaced({name: jnp.asarray(column) for name, column in columns.items()})
     axes = tuple(0 if name in columns else None for name in named.names)
 

@@ -1,4 +1,4 @@
-"""What can be run: a hybrid system, or a mechanical system, whose equations of motion make it one."""
+"""Systems that can be run: hybrid systems, and mechanical systems converted to hybrid ones."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -16,10 +16,10 @@ from .form import Form
 from .mode import AbstractMode, Event, Hybrid, State
 from .tracing import with_own_numbers
 
-#: How much of itself a start's velocity may violate the constraints by.
+#: Largest relative violation of the constraints by a start's velocity.
 VIOLATION = 1e-9
 
-#: What `simulate`, `event_time`, `sweep` and `identify` take.
+#: Argument type of `simulate`, `event_time`, `sweep` and `identify`.
 System = Hybrid | AbstractSystem
 
 
@@ -43,10 +43,10 @@ class MechanicalEvent(eqx.Module):
 
 
 def formulation_of(system: AbstractSystem) -> AbstractFormulation:
-    """The equations of motion that a mechanical system is run with.
+    """The equations of motion for a mechanical system.
 
-    They are in the quasi-velocities of its own frame, if it has one, which obey the constraints exactly, or if it writes its
-    own Lagrangian, which may have terms linear in the velocities; otherwise with Lagrange multipliers.
+    If the system has its own frame, or its own Lagrangian (which may have terms linear in the velocities), the
+    equations are in quasi-velocities, which obey the constraints exactly; otherwise they use Lagrange multipliers.
     """
     has_frame = type(system).frame is not AbstractSystem.frame
     has_lagrangian = type(system).lagrangian is not AbstractSystem.lagrangian
@@ -54,7 +54,8 @@ def formulation_of(system: AbstractSystem) -> AbstractFormulation:
 
 
 class Run(NamedTuple):
-    """A run as the engine takes it; `formulation`: of a mechanical system, whose state the engine's is; otherwise `None`."""
+    """A run in the form for the engine; `formulation`: that of a mechanical system, which defines its state, or
+    `None`."""
 
     cells: Cells
     formulation: AbstractFormulation | None
@@ -67,7 +68,7 @@ class Run(NamedTuple):
         return tuple(f"{name}{k}" for name in ("q", "rate") for k in range(self.formulation.system.dimension))
 
     def shown(self, state: Float[Array, " components"]) -> State:
-        """A state of the engine as the user knows it."""
+        """A state of the engine in the user's components."""
         state = state[: self.cells.form.size]
         return state if self.formulation is None else jnp.concatenate(self.formulation.split(state))
 

@@ -1,4 +1,4 @@
-"""What JAX sees of a user's functions: which of their arguments matter, and which operations they are made of."""
+"""What JAX knows about a user's functions: which arguments matter, and which operations they consist of."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -12,8 +12,8 @@ from jaxtyping import Array
 
 from ..validation import is_traced
 
-#: Operations that XLA compiles into a single kernel on a CPU, forwards and backwards. A function with any other, such as
-#: those of LAPACK, scatters and sorts, is compiled without that.
+#: Operations that XLA compiles into a single kernel on a CPU, forwards and backwards. A function with other operations,
+#: such as LAPACK calls, scatters and sorts, is compiled without a single kernel.
 ELEMENTARY = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh bessel_i0e bessel_i1e broadcast_in_dim cbrt ceil clamp
     concatenate convert_element_type copy copy_p cos cosh custom_jvp_call custom_vjp_call digamma div eq erf erf_inv erfc exp
@@ -23,14 +23,14 @@ ELEMENTARY = """
     tanh transpose unstack xor zeros_like
 """
 
-#: Products with at most this many terms are written as sums of products, which every compiler of XLA takes.
+#: Products with at most this many terms are written as sums of products, which all of XLA's compilers accept.
 MOST_TERMS = 1 << 12
 
 
 def spelled_out(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function with products of small matrices as sums.
+    """The function with products of small matrices written as sums.
 
-    XLA calls a library for a product, which costs more than the product and does not fit a single kernel.
+    For a product, XLA calls a library, which costs more than the product and does not fit a single kernel.
     """
 
     def evaluated(*args: Any) -> Any:
@@ -91,7 +91,7 @@ def is_elementary(function: Callable[..., Any], *args: Any) -> bool:
     try:
         closed = jax.make_jaxpr(pulled_back)(*args)
     except ValueError:
-        # A loop without a fixed number of rounds has no backward pass.
+        # A loop without a fixed number of iterations has no backward pass.
         return False
     return set(_operations(closed.jaxpr)) <= set(ELEMENTARY.split())
 
@@ -130,7 +130,7 @@ def _reached(jaxpr: Jaxpr, inputs: Sequence[Any]) -> list[bool]:
 
 
 def with_own_numbers(function: Callable[..., Any], *args: Any) -> Callable[..., Any]:
-    """The function itself, or where it closes over traced numbers, such as those of an enclosing `jax.grad`, a module that
-    holds them."""
+    """The function itself, or, if it closes over traced numbers (such as those of an enclosing `jax.grad`), a module
+    that holds them."""
     consts = jax.make_jaxpr(function)(*args).consts
     return eqx.filter_closure_convert(function, *args) if any(is_traced(const) for const in consts) else function

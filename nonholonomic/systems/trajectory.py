@@ -8,24 +8,24 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED
-from ..sweeps import Table
+from ..sweeps import Table, Tabular
 from ..validation import is_traced
 
-#: The words for how a run without an event ends, by its code.
+#: The words for how a run without an event ends, by code.
 WORDS = {REACHED_END: "completed", LEFT_DOMAIN: "stopped", FAILED: "failed", UNRESOLVED: "unresolved"}
 
 
-class Trajectory(eqx.Module):
-    """A run of a user's system at given times, which are the first axis of its arrays; a batch made by `jax.vmap` has one more.
+class Trajectory(Tabular, eqx.Module):
+    """A run of a user's system at given times, which are the first axis of its arrays; `jax.vmap` adds an axis.
 
     - `t`: times [s], (times,).
-    - `state`: (times, components), NaN after the end of the run; of an `AbstractSystem` the coordinates, and behind them their
-      rates. At the time of a reset it is the state before.
-    - `mode`: number of the mode, (times,), -1 after the end.
-    - `end_time`: when the run ended [s]; `switches`: how many resets there were.
-    - `steps`, `rejected`: steps of the integration, and how many of them were rejected.
-    - `code`: what `status` puts in words.
-    - `names`: of the components in tables.
+    - `state`: (times, components), NaN after the end of the run; for an `AbstractSystem` the coordinates, followed by
+      their rates. At the time of a reset, this is the state before the reset.
+    - `mode`: index of the mode, (times,), -1 after the end.
+    - `end_time`: time at which the run ended [s]; `switches`: number of resets.
+    - `steps`, `rejected`: numbers of integration steps and of rejected ones.
+    - `code`: code of `status`.
+    - `names`: names of the components in tables.
 
     **Example:**
 
@@ -56,15 +56,19 @@ class Trajectory(eqx.Module):
 
     @property
     def status(self) -> Any:
-        """How the run ended: "completed" at `t1`; "stopped" where a mode without a reset ended; "failed"; or "unresolved" where
-        resets followed one another without end.
+        """How the run ended: "completed" at `t1`; "stopped" if a mode without a reset ended; "failed"; or "unresolved"
+        if resets followed one another without end.
 
-        An array of words for a batch of runs; inside a transformation the code.
+        For a batch of runs, an array of words; inside a transformation, the code.
         """
         if is_traced(self.code):
             return self.code
         words = np.vectorize(WORDS.get, otypes=[object])(np.asarray(self.code))
         return str(words) if words.ndim == 0 else words.astype(str)
+
+    @property
+    def portrait_axes(self) -> tuple[str, str]:
+        return self.names[0], self.names[-1]
 
     def to_table(self) -> Table:
         """The run as a `Table` over its times.
@@ -72,34 +76,11 @@ class Trajectory(eqx.Module):
         **Raises:** `ValueError` for a batch of runs.
         """
         if np.ndim(self.t) != 1 or np.ndim(self.state) != 2:
-            raise ValueError("a batch of runs is no table of one: nonholonomic.sweep makes a table of many")
+            raise ValueError(
+                "this is a batch of runs, and to_table takes one run; nonholonomic.sweep makes a table of many"
+            )
         columns = dict(zip(self.names, np.asarray(self.state).T, strict=True)) | {"mode": np.asarray(self.mode)}
         return Table({"time": np.asarray(self.t)}, columns, {"time": "s"}, {"status": self.status})
-
-    def to_xarray(self) -> Any:
-        """The run as an `xarray.Dataset` over "time" (needs xarray).
-
-        **Raises:** `ValueError` for a batch of runs.
-        """
-        return self.to_table().to_xarray()
-
-    def save(self, path: Any) -> None:
-        """Write the run to an HDF5 file that `tippe.Table.load` and xarray (`engine="h5netcdf"`) read.
-
-        **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for a batch of runs.
-        """
-        self.to_table().save(path)
-
-    def portrait(self, x: str, y: str, ax: Any = None) -> Any:
-        """Draw one component over another, a phase portrait (needs matplotlib).
-
-        **Arguments:** `x`, `y`: names of components, such as "y0" and "y1"; `ax`: axes of matplotlib to draw in.
-
-        **Returns:** the matplotlib figure, or `ax`.
-        """
-        from ..views import draw_portrait
-
-        return draw_portrait(self.to_table(), x, y, ax)
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the components over time (needs matplotlib).
@@ -117,6 +98,6 @@ class Trajectory(eqx.Module):
         own.legend()
         return own if figure is None else figure
 
-    def __repr__(self) -> str:
+    def __str__(self) -> str:
         shape = "x".join(map(str, jnp.shape(self.state)))
         return f"Trajectory(status={self.status}, state of shape {shape}, {', '.join(self.names)})"

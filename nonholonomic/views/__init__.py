@@ -1,4 +1,4 @@
-"""Pictures, animations and pages of what the other rooms compute. No other room needs this one to compute anything."""
+"""Pictures, animations and pages of the results of other rooms. No other room needs this one to compute."""
 
 from .arena import arena as arena
 from .fit import draw_fit as draw_fit

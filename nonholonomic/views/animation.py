@@ -1,4 +1,4 @@
-"""What a page shows, drawn by matplotlib: an animation in a file, and the curves alone."""
+"""Draw the contents of a page with matplotlib: an animation in a file, and the curves."""
 
 from pathlib import Path
 from typing import Any
@@ -11,13 +11,13 @@ from .page import ANGLE, among, view_from
 from .plot import new_figure
 from .stage import Show, Stage, css, finite, matrices, nearest
 
-#: Pictures a second, how many of them by default, and their dots per inch.
+#: Frames per second, default number of frames, and dots per inch.
 RATE, FRAMES, DOTS = 25, 150, 80
 
-#: Where the light comes from, and how bright is what it does not reach.
+#: Direction of the light, and brightness of unlit faces.
 LIGHT, SHADE = np.array([0.3, -0.5, 0.81]), 0.55
 
-#: Range of the values of a panel, relative to them, below which they are drawn as constant.
+#: Relative range of values below which a panel draws them as constant.
 LEAST_RANGE = 1e-3
 
 Times = Float[np.ndarray, " frames"]
@@ -52,14 +52,14 @@ def _draw_curve(panel: Any, shows: list[Show], label: str) -> None:
     panel.margins(x=0.0)
     low, high = panel.get_ylim()
     middle = (low + high) / 2.0
-    # What is constant but for round-off is drawn as a constant.
+    # Draw values that are constant except for round-off as a constant.
     least = LEAST_RANGE * max(abs(low), abs(high))
     if high - low < least:
         panel.set_ylim(middle - least, middle + least)
 
 
 def write_animation(stages: list[Stage], path: Any, times: Times | None) -> None:
-    """Write an animation of stages beside each other, with their curves below.
+    """Write an animation of stages side by side, with their curves below.
 
     **Arguments:** as for `Viewable.animate`.
     """
@@ -98,7 +98,7 @@ def write_animation(stages: list[Stage], path: Any, times: Times | None) -> None
         clock.set_text(f"{times[frame]:.3f} s")
         return []
 
-    # Margins are found once: found anew for every picture they would shake.
+    # Compute the margins once: if they were computed for every frame, the picture would shake.
     update(0)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
@@ -106,7 +106,7 @@ def write_animation(stages: list[Stage], path: Any, times: Times | None) -> None
 
 
 class _Space:
-    """One stage in axes of matplotlib."""
+    """A stage in matplotlib axes."""
 
     def __init__(self, axes: Any, stage: Stage, times: Times):
         from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
@@ -125,7 +125,7 @@ class _Space:
         axes.set_title(f"{stage.title} ({stage.arena.spacing})", fontsize="medium")
         self.floor = axes.add_collection3d(Poly3DCollection([np.zeros((3, 3))], linewidths=0.3, zorder=0))
         mesh = stage.arena.mesh
-        # Every quarter of the mesh's lines, which is as fine as is seen.
+        # A quarter of the mesh's lines is fine enough.
         index = np.arange(len(mesh.vertices)).reshape(FINE, FINE)[::4, ::4]
         self.tiles = mesh.vertices[np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], axis=-1)]
         self.tiles = self.tiles.reshape(-1, 4, 3)
@@ -148,7 +148,7 @@ class _Space:
         self.solids = axes.add_collection3d(Poly3DCollection([np.zeros((3, 3))], linewidths=0.3, zorder=4))
 
     def draw(self, frame: int) -> None:
-        """The stage at one of its times."""
+        """Draw the stage at one of its times."""
         middle, reach = self.middle, self.reach
         if self.follow:
             shown = zip(self.stage.shows, self.frames, strict=True)
@@ -185,7 +185,7 @@ class _Space:
 
 
 def _pieces(line: np.ndarray, middle: np.ndarray, reach: float) -> list[np.ndarray]:
-    """The parts of a line that are within reach."""
+    """The parts of a line that are in view."""
     inside = np.linalg.norm(line - middle, axis=-1) < reach
     cuts = np.flatnonzero(np.diff(inside)) + 1
     return [
@@ -200,7 +200,7 @@ def _shaded(corners: Float[np.ndarray, "triangles 3 3"], colour: int) -> Float[n
 
 
 def _lit(across: Float[np.ndarray, "faces 3"], colour: int) -> Float[np.ndarray, "faces 3"]:
-    """A colour as bright as faces with these normals, of any length, are lit."""
+    """A colour with the brightness of faces with these normals (of any length) in the light."""
     across = across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-30)
     base = np.array([colour >> 16 & 255, colour >> 8 & 255, colour & 255]) / 255.0
     return base * (SHADE + (1.0 - SHADE) * np.clip(across @ LIGHT, 0.0, 1.0))[:, None]

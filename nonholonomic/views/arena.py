@@ -1,4 +1,4 @@
-"""The piece of a surface on which runs take place, from what every surface answers: its chart, or its nearest points."""
+"""The part of a surface on which runs take place, drawn from the surface's chart or from its nearest points."""
 
 import equinox as eqx
 import numpy as np
@@ -13,10 +13,10 @@ FINE = 97
 
 GREY = 0xEEF1F4
 
-#: Most lines in each direction.
+#: Greatest number of lines in each direction.
 MOST_LINES = 50
 
-#: Lines on the arena are that far apart: these numbers times a power of ten [m], or these [deg].
+#: Distances between lines on the arena: these numbers times a power of ten [m], or these numbers [deg].
 LENGTHS = (1.0, 2.0, 5.0, 10.0)
 DEGREES = (1.0, 2.0, 5.0, 10.0, 15.0, 30.0)
 
@@ -28,14 +28,15 @@ def arena(
     margin: float,
     spacing: float,
 ) -> Arena:
-    """The surface about some of its points.
+    """The part of a surface around the given points.
 
     **Arguments:**
 
     - `surface`: any surface.
-    - `points`: where something touches it [m], in the fixed frame.
-    - `normal`: into the room, somewhere on the run.
-    - `margin`: how far beyond them it is drawn [m]; `spacing`: of the lines on it [m], about.
+    - `points`: points [m] where bodies touch the surface, in the fixed frame.
+    - `normal`: towards the body, at one point of the run.
+    - `margin`: distance [m] by which the drawn part extends beyond the points; `spacing`: approximate distance of the
+      lines [m].
 
     **Returns:** an `Arena`.
     """
@@ -43,7 +44,7 @@ def arena(
     chart = _Patch(surface, points) if len(surface.coordinates) == 3 else _Chart(surface, points)
     (first, second), (step_1, step_2), words = chart.ranges(margin, spacing)
     mesh = chart.grid(*np.meshgrid(np.linspace(*first, FINE), np.linspace(*second, FINE), indexing="ij"))
-    # One grid for all lines: a surface is asked as rarely as can be.
+    # One grid for all lines: evaluating a surface is expensive.
     along = [(np.full(FINE, a), np.linspace(*second, FINE)) for a in marks(first, step_1)]
     along += [(np.linspace(*first, FINE), np.full(FINE, b)) for b in marks(second, step_2)]
     lines = chart.grid(*np.moveaxis(np.array(along), 1, 0)) if along else ()
@@ -52,14 +53,14 @@ def arena(
 
 
 def facing(mesh: Mesh, points: Float[np.ndarray, "points 3"], normal: Float[np.ndarray, " 3"]) -> Mesh:
-    """The mesh of a surface with its front towards the room, where `normal` points at the first of the points."""
+    """The mesh of a surface with its front on the side to which `normal` points at the first of the points."""
     corners = mesh.vertices[mesh.triangles]
     nearest = corners[np.argmin(np.linalg.norm(corners.mean(axis=1) - points[0], axis=-1))]
     front = np.cross(nearest[1] - nearest[0], nearest[2] - nearest[0]) @ normal
     return mesh if front > 0.0 else mesh._replace(triangles=mesh.triangles[:, ::-1])
 
 
-# Compiled as a whole: every operation by itself would be compiled for every shape.
+# Compile the whole: otherwise every operation would be compiled for every shape.
 @eqx.filter_jit
 def _charted(surface: AbstractSurface, place: tuple) -> tuple:
     return surface.chart(place)[0]
@@ -85,7 +86,7 @@ class _Chart:
         return fixed(self.surface, _charted(self.surface, (first, second)))
 
     def ranges(self, margin: float, spacing: float) -> tuple[list[tuple[float, float]], list[float], str]:
-        """The ranges of both numbers, the steps between lines, and what they are in words."""
+        """The ranges of both numbers, the steps between lines, and their descriptions."""
         lengths = [self._length(number) for number in (0, 1)]
         intervals, steps, words = [], [], []
         for number, angle in enumerate(self.angles):
@@ -103,12 +104,12 @@ class _Chart:
         return intervals, steps, "grid " + " x ".join(dict.fromkeys(words))
 
     def _length(self, number: int) -> float:
-        """Least length [m] along the surface for each unit of a number, at the run's places."""
+        """Least length [m] along the surface per unit of a number, at the run's places."""
         shifted = [place + 1e-6 * (k == number) for k, place in enumerate(self.places)]
         return float(np.min(np.linalg.norm(self.grid(*shifted) - self.grid(*self.places), axis=-1)) / 1e-6)
 
     def _legal(self, number: int, low: float, high: float) -> tuple[float, float]:
-        """The part of a range in which places are named by their own numbers: a latitude ends at the poles."""
+        """The part of a range in which numbers are legal: a latitude ends at the poles."""
         tried = np.linspace(low, high, 401)
         place = [np.full_like(tried, np.median(values)) for values in self.places]
         place[number] = tried
@@ -121,7 +122,7 @@ class _Chart:
 
 
 class _Patch:
-    """A surface whose places are positions: the nearest points to a piece of its tangent plane."""
+    """A surface whose places are positions: the nearest points to a part of its tangent plane."""
 
     def __init__(self, surface: AbstractSurface, points: Float[np.ndarray, "points 3"]):
         self.surface = surface
@@ -141,12 +142,12 @@ class _Patch:
 
 
 def own(surface: AbstractSurface, position: np.ndarray) -> tuple:
-    """A position (3, ...) in the fixed frame in the surface's axes, as surfaces take it."""
+    """A position (3, ...) in the fixed frame, converted to the surface's axes."""
     return surface.in_own_axes(vector_of(np.asarray(part, dtype=float) for part in position))
 
 
 def fixed(surface: AbstractSurface, vector: tuple) -> np.ndarray:
-    """A vector in the surface's axes in the fixed frame, (..., 3)."""
+    """A vector in the surface's axes, converted to the fixed frame, (..., 3)."""
     like = next(part for part in vector if part is not None)
     full = vector_of(
         np.zeros_like(np.asarray(like, dtype=float)) if part is None else np.asarray(part) for part in vector

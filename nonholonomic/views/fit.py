@@ -7,13 +7,13 @@ import numpy as np
 if TYPE_CHECKING:
     from ..identification import Identification
 
-#: Parameters whose profiles are drawn, and by how much -2 log likelihood rises to the end of a 95 % interval.
+#: Greatest number of drawn profiles, and the rise of -2 log likelihood at the end of a 95 % interval.
 MOST_PROFILES, INTERVAL = 6, 3.84
 
 
 def draw_fit(fit: "Identification") -> Any:
-    """Draw what was measured with what the fit predicts, the residuals in units of the errors, the profile likelihood of
-    every parameter that the data determine, with its parabola dashed, and the correlations.
+    """Draw a fit: measurements and predictions, residuals in units of the errors, profile likelihoods of the determined
+    parameters (with their parabolas dashed), and correlations.
 
     **Returns:** a matplotlib figure.
     """
@@ -34,13 +34,13 @@ def draw_fit(fit: "Identification") -> Any:
 
 
 def _series(fit: "Identification") -> list[np.ndarray]:
-    """The places of the measurements of each series."""
+    """The indices of the measurements of each series."""
     numbers = np.asarray(fit.measurements.series)
     return [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
 
 
 def _abscissa(fit: "Identification") -> tuple[np.ndarray, str]:
-    """Where to draw every measurement: at its time, where it has one."""
+    """The abscissa of every measurement: its time, if it has one."""
     times = np.asarray(fit.measurements.time)
     return (times, "time since the first sample [s]") if np.any(times) else (np.arange(len(times)), "measurement")
 
@@ -51,7 +51,7 @@ def _draw_data(fit: "Identification", axes: Any) -> None:
     value = np.array([row.value if np.isfinite(row.value) else row.upper for row in rows])
     errors, predicted = (np.array([getattr(row, name) for row in rows]) for name in ("error", "prediction"))
     censored = np.array([row.censored for row in rows])
-    # An angle is drawn on the turn on which the prediction is.
+    # Draw an angle on the same turn as its prediction.
     value = value + np.asarray(fit.measurements.whole_periods(predicted - value))
     for k, indices in enumerate(_series(fit)):
         colour, exact, limits = f"C{k}", indices[~censored[indices]], indices[censored[indices]]

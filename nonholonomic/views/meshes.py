@@ -5,12 +5,13 @@ from jaxtyping import Float
 
 from .stage import Mesh
 
-#: Corners of a circle.
+#: Number of corners of a circle.
 SEGMENTS = 48
 
 
 def revolved(profile: list[tuple[float, float]] | Float[np.ndarray, "points 2"], colour: int) -> Mesh:
-    """The solid that a profile sweeps out about the z axis: points (distance from it, z) [m], from the top downwards."""
+    """The solid of revolution of a profile about the z axis: points (distance from the axis, z) [m], from the top
+    downwards."""
     profile = np.asarray(profile, dtype=float)
     angle = np.linspace(0.0, 2.0 * np.pi, SEGMENTS + 1)
     radius, height = profile.T
@@ -26,20 +27,20 @@ def revolved(profile: list[tuple[float, float]] | Float[np.ndarray, "points 2"],
 
 
 def of_grid(rows: int, columns: int) -> np.ndarray:
-    """Triangles of a grid of vertices, whose rows are one after the other."""
+    """Triangles of a grid of vertices, given row by row."""
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
     return np.concatenate([np.stack([a, d, b], axis=-1), np.stack([b, d, c], axis=-1)])
 
 
 def ball(radius: float, colours: tuple[int, int]) -> tuple[Mesh, Mesh]:
-    """A ball about the origin, in sectors about the z axis that are of two colours in turn."""
+    """A ball about the origin, in sectors about the z axis with two alternating colours."""
     polar = np.linspace(0.0, np.pi, 25)
     return striped(radius * np.stack([np.sin(polar), np.cos(polar)], axis=-1), colours)
 
 
 def striped(profile: Float[np.ndarray, "points 2"], colours: tuple[int, int], sectors: int = 6) -> tuple[Mesh, Mesh]:
-    """What `revolved` makes of a profile, in sectors about the z axis that are of two colours in turn."""
+    """The solid of revolution of a profile, in sectors about the z axis with two alternating colours."""
     whole = revolved(profile, colours[0])
     middles = whole.vertices[whole.triangles].mean(axis=1)
     first = np.floor(np.arctan2(middles[:, 1], middles[:, 0]) / np.pi * sectors / 2.0).astype(int) % 2 == 0
@@ -77,7 +78,7 @@ def bar(begin: tuple[float, float, float], end: tuple[float, float, float], radi
 
 
 def wheel(radius: float, width: float, colours: tuple[int, int]) -> tuple[Mesh, ...]:
-    """A wheel about the y axis: a tyre, and spokes of another colour, by which one sees that it rolls."""
+    """A wheel about the y axis: a tyre, and spokes of another colour that show that it rolls."""
     half, inner = width / 2.0, 0.78 * radius
     edge = [(inner, half), (radius, half), (radius, -half), (inner, -half), (inner, half)]
     tyre = revolved(edge, colours[0])

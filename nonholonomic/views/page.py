@@ -1,7 +1,8 @@
-"""One page that holds everything: a view in three dimensions that moves, drawn by three.js, and strips of curves.
+"""A self-contained page: an animated 3D view drawn by three.js, and curves.
 
-The page is one HTML file without any request to a network. `page.html` is its frame; `stage.js` draws a stage, `strips.js` the
-curves, and `player.js` unpacks the data and sets the time. three.js comes from the package jupyter-threejs-sage.
+The page is one HTML file that makes no network requests. `page.html` is its frame; `stage.js` draws a stage,
+`strips.js` the curves, and `player.js` unpacks the data and sets the time. three.js comes from the package
+jupyter-threejs-sage.
 """
 
 import base64
@@ -19,13 +20,13 @@ from jaxtyping import Float
 
 from .stage import Mesh, Show, Stage, css, finite
 
-#: How fast time may run.
+#: Selectable speeds of time.
 SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 
-#: What a page without motion says.
+#: Text of a page without motion.
 NO_VIEW = "The page is without motion: jupyter-threejs-sage is not installed (pip install 'nonholonomic[view]')."
 
-#: Where three.js lies in its package.
+#: Path of three.js in its package.
 PACKAGE, LIBRARY = "jupyter_threejs_sage", ("static", "r130", "three.min.js")
 
 SCRIPTS = ("stage.js", "strips.js", "player.js")
@@ -33,12 +34,12 @@ SCRIPTS = ("stage.js", "strips.js", "player.js")
 LINES = 0x7C8896
 BACKGROUND = 0xFBFBFA
 
-#: Opening angle of the camera [deg], and how high it stands over the ground, in units of its distance along it.
+#: Opening angle of the camera [deg], and its height above the ground in units of its distance along the ground.
 ANGLE, RISE = 35.0, 0.30
 
 
 class Page(NamedTuple):
-    """A page of its own: its HTML. A notebook shows it."""
+    """A self-contained page as HTML. A notebook shows it."""
 
     html: str
 
@@ -72,16 +73,16 @@ def page(
     scripts: Sequence[str] = (),
     autoplay: bool = True,
 ) -> Page:
-    """A page with some stages beside each other, whose times run together.
+    """A page with stages side by side, in synchronised motion.
 
     **Arguments:**
 
-    - `stages`: what is shown; none gives a page of words.
+    - `stages`: the stages to show; without any, the page has text only.
     - `title`: of the page; `above`, `below`: HTML around the view.
-    - `speed`: how fast time runs at first, one of `SPEEDS`.
+    - `speed`: speed of time at the start, one of `SPEEDS`.
     - `height`: of each stage in pixels.
-    - `scripts`: HTML of more scripts, put in after those of the page, such as `script` makes.
-    - `autoplay`: whether the page plays once when it is first seen.
+    - `scripts`: HTML of additional scripts, such as `script` returns, inserted after those of the page.
+    - `autoplay`: whether the page plays once when it first becomes visible.
 
     **Raises:** `ModuleNotFoundError` if there are stages and jupyter-threejs-sage is not installed.
     """
@@ -95,7 +96,7 @@ def page(
 
 
 def table_as_html(rows: list[list[str]], heads: int) -> str:
-    """Rows of entries as an HTML table, of which the first ones are headings."""
+    """Rows of entries as an HTML table; the first entry of each row is a heading."""
     parts = []
     for number, row in enumerate(rows):
         kind = "th" if number < heads else "td"
@@ -104,27 +105,27 @@ def table_as_html(rows: list[list[str]], heads: int) -> str:
 
 
 def picture_as_html(path: Path) -> str:
-    """A PNG file as an HTML image that carries its data."""
+    """A PNG file as an HTML image with embedded data."""
     return f'<img style="max-width:100%" alt="" src="data:image/png;base64,{_coded(path.read_bytes())}">'
 
 
 def script(text: str) -> str:
-    """JavaScript as an HTML script."""
+    """JavaScript as an HTML script element."""
     return f"<script>{_safe(text)}</script>"
 
 
 def data_script(name: str, data: bytes) -> str:
-    """Bytes as an HTML script that is only read, by its id: deflated, in base64."""
+    """Bytes as an HTML script element for data, read by its id: deflated, in base64."""
     return f'<script type="text/plain" id="{name}">{_coded(zlib.compress(data, 9))}</script>'
 
 
 def json_script(name: str, value: Any) -> str:
-    """A value as an HTML script that is only read, by its id: JSON."""
+    """A value as an HTML script element for data, read by its id: JSON."""
     return f'<script type="application/json" id="{name}">{_safe(json.dumps(value))}</script>'
 
 
 def _safe(text: str) -> str:
-    # A browser takes "</script>" for the end of a script wherever it stands, even in data.
+    # Browsers take "</script>" for the end of a script anywhere, even in data.
     return text.replace("</", "<\\/")
 
 
@@ -158,9 +159,11 @@ def _view(stages: list[Stage], speed: float, autoplay: bool) -> str:
 
 
 class _Numbers:
-    """Arrays one after the other, floats and whole numbers; each array is known by its beginning and its length.
+    """Arrays of floats and whole numbers, stored one after the other; each array is identified by its start and its
+    length.
 
-    Floats are kept byte plane by byte plane and whole numbers as differences, which compress better, and equal arrays once.
+    Floats are stored byte plane by byte plane and whole numbers as differences, which compress better. Equal arrays are
+    stored once.
     """
 
     def __init__(self):
@@ -195,7 +198,7 @@ class _Numbers:
 
 
 def _stage(stage: Stage, numbers: _Numbers) -> dict[str, Any]:
-    """What the script needs to know of a stage."""
+    """The data of a stage for the script."""
     camera, follow = view_from(stage)
     keys = [(stage.arena.spacing, "")]
     if len(stage.shows) > 1:
@@ -265,13 +268,14 @@ def _size(stage: Stage) -> float:
 
 
 def among(points: Float[np.ndarray, "points 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
-    """The middle of some points, and how far they are from it."""
+    """The centre of some points, and their distance from it."""
     middle = points.mean(axis=0)
     return middle, float(np.linalg.norm(points - middle, axis=-1).max())
 
 
 def view_from(stage: Stage) -> tuple[list[float], bool]:
-    """Camera (its place, what it looks at, up), and whether it has to follow, as the body is small against its path."""
+    """The camera (position, target, up), and whether it must follow the body, because the body is small compared with
+    its path."""
     paths = [finite(show.bodies[0].position) for show in stage.shows]
     size = _size(stage)
     points = np.concatenate(paths)

@@ -1,4 +1,4 @@
-"""Pictures of tables (needs matplotlib)."""
+"""Plots of tables (needs matplotlib)."""
 
 import functools
 import io
@@ -11,13 +11,13 @@ from ..parameters import likely, readable_unit
 if TYPE_CHECKING:
     from ..sweeps import Table
 
-#: Colours of the cells of a map that have no finite value, one for each word of their status.
+#: Colours of map cells without a finite value, one for each status.
 GREYS = ("0.85", "0.7", "0.55", "0.4", "0.25")
 
-#: The quantiles of the values between which the colours of a map lie.
+#: The quantiles of the values at the ends of a map's colour scale.
 QUANTILES = (0.02, 0.98)
 
-#: An axis of at most so many values is drawn as a line for each.
+#: An axis with at most this many values is drawn as one line per value.
 MOST_LINES = 8
 
 
@@ -26,7 +26,7 @@ def _kind_of_figure() -> Any:
     from matplotlib.figure import Figure
 
     class Picture(Figure):
-        """A figure that a notebook shows even if nobody has told it to show figures."""
+        """A figure that a notebook shows even if figures are not displayed automatically."""
 
         def _repr_png_(self) -> bytes:
             image = io.BytesIO()
@@ -37,12 +37,12 @@ def _kind_of_figure() -> Any:
 
 
 def new_figure(width: float = 7.0, height: float = 4.5) -> Any:
-    """An empty matplotlib figure of a size in inches that a notebook shows by itself."""
+    """An empty matplotlib figure of a size in inches, which a notebook shows."""
     return _kind_of_figure()(figsize=(width, height), layout="constrained")
 
 
 def _drawing(ax: Any, *size: float) -> tuple[Any, Any]:
-    """A new figure with axes to draw in; or `None`, and the given axes."""
+    """A new figure with axes, or `None` and the given axes."""
     if ax is not None:
         return None, ax
     figure = new_figure(*size)
@@ -100,7 +100,7 @@ def _first_number(table: "Table") -> str:
 
 
 def _drawn(table: "Table", variable: str, at: dict[str, float]) -> tuple[list[str], dict[str, int]]:
-    """The one or two dimensions to draw over, and the places at which the others are cut."""
+    """The one or two dimensions to draw over, and the indices at which the others are cut."""
     dims = table.dims(variable)
     cut = {}
     for name, value in at.items():
@@ -114,7 +114,7 @@ def _drawn(table: "Table", variable: str, at: dict[str, float]) -> tuple[list[st
         else:
             cut[name] = int(np.argmin(np.abs(known - value)))
     cells = len(table.shape)
-    # What runs along a dimension of its own, such as time, is drawn over that.
+    # A quantity with its own dimension, such as time, is drawn over that dimension.
     left = [name for name in (*dims[cells:], *dims[:cells]) if name not in cut]
     if not left:
         raise ValueError(f"at = {at!r} leaves no axis to draw over")
@@ -122,7 +122,7 @@ def _drawn(table: "Table", variable: str, at: dict[str, float]) -> tuple[list[st
 
 
 def _slice(values: Any, dims: tuple[str, ...], names: list[str], cut: dict[str, int]) -> Any:
-    """The values over the dimensions that are drawn, in their order."""
+    """The values over the drawn dimensions, in their order."""
     left = [name for name in dims if name not in cut]
     return values[tuple(cut.get(name, slice(None)) for name in dims)].transpose([left.index(name) for name in names])
 
@@ -159,7 +159,7 @@ def _draw_map(drawing: Any, table: "Table", names: list[str], shown: Any, label:
 
 
 def _plain_numbers(axis: Any) -> None:
-    """Write the numbers of a logarithmic axis as 12.5, not as 1.25 x 10^1, if none is very large or small."""
+    """Write the labels of a logarithmic axis as 12.5, not as 1.25 x 10^1, if none is very large or small."""
     low, high = axis.get_view_interval()
     if low >= 1e-4 and high <= 1e5:
         axis.set_major_formatter("{x:g}")
@@ -167,7 +167,7 @@ def _plain_numbers(axis: Any) -> None:
 
 
 def _mark_words(drawing: Any, table: "Table", names: list[str], words: Any) -> None:
-    """Paint the cells that have a word in the grey of that word."""
+    """Paint cells without a value in the grey of their status."""
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
@@ -188,8 +188,8 @@ def draw_portrait(table: "Table", x: str, y: str, ax: Any = None) -> Any:
     **Arguments:**
 
     - `table`: a `Table` over "time".
-    - `x`, `y`: names of variables, of a component as "position.x".
-    - `ax`: axes of matplotlib to draw in, instead of a new figure.
+    - `x`, `y`: names of variables; for a component, such as "position.x".
+    - `ax`: matplotlib axes to draw in, instead of a new figure.
 
     **Returns:** a matplotlib figure, or `ax`.
 
@@ -202,7 +202,7 @@ def draw_portrait(table: "Table", x: str, y: str, ax: Any = None) -> Any:
     drawing.set_xlabel(across_label)
     drawing.set_ylabel(up_label)
     if {x, y} == {"position.x", "position.y"}:
-        # A path, as it is from above.
+        # A path, seen from above.
         drawing.set_aspect("equal", adjustable="datalim")
     return drawing if figure is None else figure
 

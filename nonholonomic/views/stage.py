@@ -1,6 +1,7 @@
-"""What a page and an animation draw: bodies that move, traces, arrows and curves, on stages with an arena each.
+"""The contents of pages and animations: bodies that move, traces, arrows and curves, on stages with one arena each.
 
-Nothing here knows a top or a stroller. Lengths are in metres in the fixed frame (x, y, z), z up; times in seconds.
+This module does not depend on tops or strollers. Lengths are in metres in the fixed frame (x, y, z), z up; times in
+seconds.
 """
 
 from typing import NamedTuple
@@ -12,7 +13,7 @@ Points = Float[np.ndarray, "times 3"]
 
 
 class Mesh(NamedTuple):
-    """Triangles of one colour, 0xrrggbb, in the axes of the body that they belong to."""
+    """Triangles of one colour, 0xrrggbb, in the axes of their body."""
 
     vertices: Float[np.ndarray, "vertices 3"]
     triangles: Int[np.ndarray, "triangles 3"]
@@ -20,7 +21,7 @@ class Mesh(NamedTuple):
 
 
 class Body(NamedTuple):
-    """A rigid body: where its origin is, how it is turned, a quaternion (x, y, z, w) for each time, and its meshes."""
+    """A rigid body: position of its origin, rotation as a quaternion (x, y, z, w) for each time, and meshes."""
 
     name: str
     position: Points
@@ -29,9 +30,9 @@ class Body(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """A line that grows as time goes on; `about`, if any, is a moving point to which its points are relative.
+    """A line that grows over time, relative to the moving point `about` if there is one.
 
-    `shown`: whether a page shows it before somebody switches it on.
+    `shown`: whether a page shows it at first.
     """
 
     name: str
@@ -43,10 +44,10 @@ class Trace(NamedTuple):
 
 
 class Arrow(NamedTuple):
-    """A vector that changes: where it starts, and its components in `unit`.
+    """A vector that changes over time: its start, and its components in `unit`.
 
-    It is drawn `scale` metres long for each unit, and no longer than `limit` [m]. Where `through`, it is seen through the body
-    and has a ball at its start; `shown`: whether a page shows it before somebody switches it on.
+    It is drawn `scale` metres long per unit, and no longer than `limit` [m]. With `through`, it is visible through the
+    body and has a ball at its start. `shown`: whether a page shows it at first.
     """
 
     name: str
@@ -62,7 +63,7 @@ class Arrow(NamedTuple):
 
     @property
     def drawn(self) -> Points:
-        """The vectors as long as they are drawn [m]."""
+        """The vectors with their drawn lengths [m]."""
         lengths = self.scale * np.linalg.norm(self.vector, axis=-1, keepdims=True)
         longest = lengths if self.limit is None else np.minimum(lengths, self.limit)
         return self.scale * self.vector * np.divide(longest, lengths, out=np.ones_like(lengths), where=lengths > 0.0)
@@ -76,9 +77,9 @@ class Curve(NamedTuple):
 
 
 class Show(NamedTuple):
-    """One run as it is drawn: `size` is a length [m] of the body, `colour` that of its curves.
+    """The drawing of one run: `size` is a length [m] of the body, `colour` that of its curves.
 
-    `normal` is the arena's unit normal where the body is, into the room; `note` warns of what the model leaves out.
+    `normal` is the arena's unit normal at the body, towards the body; `note` says what the model leaves out.
     """
 
     name: str
@@ -94,7 +95,7 @@ class Show(NamedTuple):
 
 
 class Arena(NamedTuple):
-    """A piece of a surface: its mesh, the lines drawn on it, how far apart they are, in words, and a normal into the room."""
+    """A part of a surface: its mesh, the lines on it and their spacing as text, and a normal towards the body."""
 
     mesh: Mesh
     lines: tuple[Float[np.ndarray, "points 3"], ...]
@@ -110,16 +111,16 @@ class Stage(NamedTuple):
     shows: tuple[Show, ...]
 
 
-#: Colours of the runs of a page, none of them an arrow's: that of a run's curves, and of one half of its body.
+#: Colours of a page's runs, for the curves and one half of the body; arrows have other colours.
 COLOURS = (0xC8412B, 0x2A6FB0, 0x2E8B57, 0x8C5A3C, 0xD0679D, 0x3B9AA8)
 
-#: Colour of the other half.
+#: Colour of the other half of the body.
 PALE = 0xF4E9D2
 DARK = 0x3A3A3E
 
 
 def distinguished_by_colour(shows: tuple[Show, ...]) -> tuple[Show, ...]:
-    """The shows of one stage: where there are several, the traces of each have its colour."""
+    """The shows of a stage; if there are several, the traces of each get its colour."""
     if len(shows) == 1:
         return shows
     return tuple(
@@ -128,14 +129,14 @@ def distinguished_by_colour(shows: tuple[Show, ...]) -> tuple[Show, ...]:
 
 
 def finite(points: Points) -> Points:
-    """Points, those that are not numbers replaced by the last before them."""
+    """Points, with NaN replaced by the last finite point before."""
     good = np.all(np.isfinite(points), axis=-1)
     last = np.maximum.accumulate(np.where(good, np.arange(len(points)), 0))
     return np.nan_to_num(points[last])
 
 
 def css(colour: int) -> str:
-    """A colour as CSS and matplotlib write it."""
+    """A colour in the notation of CSS and matplotlib."""
     return f"#{colour:06x}"
 
 
@@ -143,7 +144,7 @@ def turned(rotation: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "times
     """Quaternions (x, y, z, w) of rotation matrices."""
     m = np.asarray(rotation, dtype=float)
     trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
-    # Four times the products of the quaternion's components; the column of its largest component has no cancellation.
+    # Four times the products of the quaternion's components; the column of the largest component has no cancellation.
     products = np.empty((len(m), 4, 4))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         products[:, i, i] = 1.0 - trace + 2.0 * m[:, i, i]
@@ -167,6 +168,6 @@ def matrices(turning: Float[np.ndarray, "times 4"]) -> Float[np.ndarray, "times 
 
 
 def nearest(times: Float[np.ndarray, " times"], at: Float[np.ndarray, " frames"]) -> Int[np.ndarray, " frames"]:
-    """The numbers of the times that are nearest to given ones."""
+    """The indices of the times that are nearest to the given ones."""
     after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
     return after - (at - times[after - 1] < times[after] - at)

@@ -1,4 +1,4 @@
-"""The ways in which a run can be shown: a page, an animation, a picture of its curves."""
+"""Views of a run: a page, an animation, a plot of its curves."""
 
 import abc
 from collections.abc import Sequence
@@ -18,24 +18,24 @@ class Viewable(abc.ABC):
 
     @abc.abstractmethod
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
-        """This run and others as they are drawn: each in its own place, or all in that of the first."""
+        """This run and others as stages: each on its own stage, or all on that of the first."""
 
     @status_line("drawing")
     def view(self, path: Any = None, others: Sequence[Any] = (), overlaid: bool = False) -> Page:
-        """A page in which the run moves: body, arena, traces, arrows, and curves over time (needs jupyter-threejs-sage).
+        """An animated page of the run: body, arena, traces, arrows, and curves over time (needs jupyter-threejs-sage).
 
-        It is one file that needs no network; a notebook shows what is returned.
+        The page is one file that needs no network; a notebook shows the returned page.
 
         **Arguments:**
 
-        - `path`: file to write the page to, whose name ends in .html, or `None`.
-        - `others`: more runs to be shown, whose time runs along.
-        - `overlaid`: whether all are drawn in the arena of the first, otherwise side by side.
+        - `path`: file for the page, with a name that ends in .html, or `None`.
+        - `others`: other runs to show at the same time.
+        - `overlaid`: whether to draw all runs in the arena of the first, instead of side by side.
 
         **Returns:** a `Page`, with its `html`.
 
-        **Raises:** before anything is drawn: `ModuleNotFoundError` if jupyter-threejs-sage is not installed, `OSError` if the
-        file cannot be written, `ValueError` for a file of another kind or a batch of runs.
+        **Raises:** before anything is drawn: `ModuleNotFoundError` if jupyter-threejs-sage is not installed, `OSError`
+        if the file cannot be written, `ValueError` for another file type or a batch of runs.
 
         **Example:** `examples/a_page.py`.
         """
@@ -50,15 +50,15 @@ class Viewable(abc.ABC):
 
     @status_line("drawing")
     def animate(self, path: Any, times: Any = None, others: Sequence[Any] = (), overlaid: bool = False) -> None:
-        """Write an animation for slides, 25 pictures a second (needs matplotlib).
+        """Write an animation for slides, with 25 frames per second (needs matplotlib).
 
         **Arguments:**
 
-        - `path`: a file whose name ends in .gif, or in .mp4 where ffmpeg is installed.
-        - `times`: time [s] of each picture; by default 150 over the whole run.
+        - `path`: file with a name that ends in .gif, or in .mp4 if ffmpeg is installed.
+        - `times`: time [s] of each frame; by default 150 over the whole run.
         - `others`, `overlaid`: as for `view`.
 
-        **Raises:** `ValueError` for a file of another kind, or a batch of runs; `OSError` if it cannot be written.
+        **Raises:** `ValueError` for another file type or a batch of runs; `OSError` if the file cannot be written.
 
         **Example:** `examples/a_page.py`.
         """

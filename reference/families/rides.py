@@ -40,12 +40,12 @@ def ground(random: np.random.Generator, shape: str) -> tuple[dict[str, Any], Lev
         return {"shape": "paraboloid", "radius": radius}, level, np.array((x, y, (x * x + y * y) / (2.0 * radius))), 1.0
     if shape == "waves":
         numbers = [
-            [float(f"{one:.4g}") for one in random.uniform((0.05, -1.5, -1.5, 0.0), (0.2, 1.5, 1.5, 6.0))]
+            [float(f"{value:.4g}") for value in random.uniform((0.05, -1.5, -1.5, 0.0), (0.2, 1.5, 1.5, 6.0))]
             for _ in range(3)
         ]
         return {"shape": "waves", "waves": numbers}, waves(numbers), np.array((x, y, height_of(numbers, x, y))), 1.0
     if shape == "torus":
-        ring, tube = (float(f"{one:.4g}") for one in random.uniform((2.5, 0.8), (4.0, 1.5)))
+        ring, tube = (float(f"{value:.4g}") for value in random.uniform((2.5, 0.8), (4.0, 1.5)))
         angle, lift = random.uniform(-3.0, 3.0), random.uniform(-2.0, -1.0)
         rho = ring + tube * cos(lift)
         place = np.array((rho * cos(angle), rho * sin(angle), tube * sin(lift)))
@@ -79,8 +79,8 @@ def strollers() -> Iterator[Scene]:
     for number, shape in enumerate(RIDES):
         described, level, place, side = ground(random, shape)
         mass, wheelbase, inertia, fork, spring, *damping = (
-            float(f"{one:.4g}")
-            for one in random.uniform(
+            float(f"{value:.4g}")
+            for value in random.uniform(
                 (1.0, 0.2, 0.2, 0.02, 0.1, 0.1, 0.1, 0.05, 0.02), (3.0, 0.5, 0.6, 0.08, 0.3, 0.5, 0.4, 0.2, 0.1)
             )
         )
@@ -94,7 +94,7 @@ def strollers() -> Iterator[Scene]:
         e = random.normal(size=3)
         e -= (e @ n) * n
         e /= np.linalg.norm(e)
-        speed, phi, rate = (float(f"{one:.4g}") for one in random.uniform((0.3, -0.4, -0.3), (1.2, 0.4, 0.3)))
+        speed, phi, rate = (float(f"{value:.4g}") for value in random.uniform((0.3, -0.4, -0.3), (1.2, 0.4, 0.3)))
         y = stroller_reference.started(level, place, e, side, wheelbase, speed, phi, rate)
         times = [0.5, 1.0, 2.0, 3.0]
         runs = [exported_ride(level, vehicle, y, times, rtol) for rtol in (FINE, COARSE)]
@@ -134,7 +134,7 @@ def strollers() -> Iterator[Scene]:
 def pushed(force: dict[str, float], torque: dict[str, float]) -> Callable[[float], tuple[float, float]]:
     def at(t: float) -> tuple[float, float]:
         return tuple(
-            one["mean"] + one["amplitude"] * sin(one["frequency"] * t + one["phase"]) for one in (force, torque)
+            wave["mean"] + wave["amplitude"] * sin(wave["frequency"] * t + wave["phase"]) for wave in (force, torque)
         )
 
     return at
@@ -143,7 +143,7 @@ def pushed(force: dict[str, float], torque: dict[str, float]) -> Callable[[float
 def exported_ride(level: Level, vehicle: Any, y: Array, times: Sequence[float], rtol: float) -> dict[str, Array]:
     """The states of a ride, and the forces on its wheels."""
     states = states_at(lambda t, y: stroller_reference.instant(level, vehicle, t, y).rate, y, times, rtol, 0.1 * rtol)
-    known = [stroller_reference.instant(level, vehicle, t, one) for t, one in zip(times, states, strict=True)]
+    known = [stroller_reference.instant(level, vehicle, t, moment) for t, moment in zip(times, states, strict=True)]
     return {
         "position": states[:, :3],
         "direction": states[:, 6:9],
@@ -151,6 +151,6 @@ def exported_ride(level: Level, vehicle: Any, y: Array, times: Sequence[float], 
         "yaw_rate": states[:, 9],
         "steering": states[:, 10],
         "steering_rate": states[:, 11],
-        "normal_force": np.array([one.normal_force for one in known]),
-        "side_force": np.array([(one.rear, one.front) for one in known]),
+        "normal_force": np.array([moment.normal_force for moment in known]),
+        "side_force": np.array([(moment.rear, moment.front) for moment in known]),
     }

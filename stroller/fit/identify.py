@@ -18,10 +18,11 @@ from nonholonomic.identification import (
     search_options,
 )
 from nonholonomic.integration import tolerance_bound
-from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.parameters import numbers
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, require_kind
 
+from ..model.launch import Launch
 from ..model.scene import Scene
 from ..runs.simulate import simulate
 from .recording import Recording
@@ -41,14 +42,10 @@ class SceneModel(AbstractDataModel):
     def predict(self, sources: list[tuple[Recording, Any]], rows: int) -> list[Float[Array, "rows samples"]]:
         first = sources[0][0]
 
-        def run(lane: dict[str, Array], times: Float[Array, " times"]) -> Any:
-            roots = with_numbers({"scene": self.scene, "launch": first.launch}, lane)
-            return simulate(roots["scene"], roots["launch"], times[-1], first.input, times, self.tolerance)
+        def run(scene: Scene, launch: Launch, times: Float[Array, " times"]) -> Any:
+            return simulate(scene, launch, times[-1], first.input, times, self.tolerance)
 
-        def column(run: Any, name: str) -> Float[Array, " times"]:
-            return run.position[:, "xyz".index(name)] if name in ("x", "y", "z") else getattr(run, name)
-
-        return predicted(sources, rows, run, column)
+        return predicted(self.scene, sources, rows, run)
 
 
 def identify(

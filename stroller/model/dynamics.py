@@ -1,13 +1,16 @@
-"""The equations of motion of the stroller in the P-form (`stroller.md`, section 5): no pole, no tan(phi).
+"""The equations of motion of the stroller in the P-form (`stroller.md`, section 5), without singular angles or
+tan(phi).
 
-State, vectors in the ground's axes: position r of the rear axle, heading e, steering angle phi, quasi-momentum
-P = w sqrt(M_w) with w the speed of the front wheel and M_w its reduced mass, and the rate sg of the fork, phi' or, with
-a fork that turns with the frame, phi' + Omega. Then sin(phi) and cos(phi), on which the field would otherwise spend four
-fifths of its time; phi itself is for the spring, for inputs and for output, and may exceed pi. Then the work
-[J] done so far by the inputs and by friction, where there are any. The energy P^2/2 + J_f sg^2/2 + V is quadratic in the
-state, V linear except for the spring, so the implicit midpoint rule keeps its balance exactly, and sin^2 + cos^2 too.
-Elsewhere that sum drifts with the errors of the steps. The velocities do not depend on it, except for the speed of the
-front wheel, so it is corrected where a state is read off (`righted`), and not in the field.
+The state, with vectors in the ground's axes, contains the position r of the rear axle, the heading e, the steering
+angle phi, the quasi-momentum P = w sqrt(M_w), where w is the speed of the front wheel and M_w its reduced mass, and the
+rate sg of the fork: phi', or phi' + Omega for a fork that turns with the frame. It also contains sin(phi) and cos(phi),
+which would otherwise take four fifths of the field's time; phi itself is for the spring, for inputs and for output, and
+may exceed pi. The last components are the work [J] done so far by the inputs and by friction, if there are any.
+
+The energy P^2/2 + J_f sg^2/2 + V is quadratic in the state, with V linear except for the spring, so the implicit
+midpoint rule keeps its balance exactly, and sin^2 + cos^2, too. With other solvers, this sum drifts with the errors of
+the steps. The velocities do not depend on it, except for the speed of the front wheel, so it is corrected when a state
+is read (`righted`), and not in the field.
 """
 
 from typing import NamedTuple
@@ -39,7 +42,7 @@ State = Float[Array, "components ..."]
 
 
 class Geometry(NamedTuple):
-    """Position and motion of a state, before any force is known."""
+    """Position and motion of a state, before any force is computed."""
 
     motion: Motion
     momentum: Float[Array, "..."]
@@ -79,8 +82,8 @@ class Power(NamedTuple):
 class Dynamics(eqx.Module):
     """A scene with its choices resolved.
 
-    `up` has the components of the upward vertical in the ground's axes; `side` is 1 outside and -1 inside; `absolute` is 1
-    where the fork turns with the frame and `None` where it does not.
+    `up` has the components of the upward vertical in the ground's axes; `side` is 1 outside and -1 inside; `absolute`
+    is 1 if the fork turns with the frame, otherwise `None`.
     """
 
     body: Stroller
@@ -93,7 +96,7 @@ class Dynamics(eqx.Module):
     absolute: float | None = eqx.field(static=True)
 
     def unpack(self, state: State) -> tuple[Vector, Vector, State]:
-        """Position, heading and the rest of a state."""
+        """Position, heading and the other components of a state."""
         place, turned = self.surface.axes, self.surface.axes + self.heading.axes(self.surface)
         return padded(state[:place]), padded(state[place:turned]), state[turned:]
 
@@ -152,12 +155,12 @@ class Dynamics(eqx.Module):
         )
 
     def normal_force(self, normal: Vector, turning: Vector, velocity: Vector) -> Component:
-        """Force [N] of the ground along its normal: it carries the weight and bends the path."""
+        """Normal force [N] of the ground, which carries the weight and bends the path."""
         weight = multiply(self.side, self.body.mass * self.gravity, dot(normal, self.up))
         return subtract(weight, multiply(self.side, self.body.mass, dot(turning, velocity)))
 
     def forces(self, t: Float[Array, "..."], geometry: Geometry, controls: Input | None) -> Forces:
-        """The forces of input and friction at a time [s]."""
+        """The forces of the input and of friction at a time [s]."""
         motion = geometry.motion
         drive, torque = (None, None) if controls is None else controls(t, motion)
         rear_load = subtract(geometry.normal_force, geometry.front_load)
@@ -165,7 +168,7 @@ class Dynamics(eqx.Module):
         return Forces(drive, torque, self.friction.drag(WheelMotion(*speeds, rear_load, geometry.front_load)))
 
     def fork_torque(self, geometry: Geometry, forces: Forces) -> Component:
-        """All torque [N m] about the steering axis."""
+        """Total torque [N m] about the steering axis."""
         spring = multiply(self.body.steering_spring, geometry.motion.steering)
         return subtract(add(forces.torque, forces.drag.steering), spring)
 
@@ -188,7 +191,8 @@ class Dynamics(eqx.Module):
         drag, torque = forces.drag, self.fork_torque(g, forces)
         arm = g.sine / body.wheelbase
         weight = body.mass * self.gravity
-        # The centre of mass ahead of the axle swings with the yaw; its weight then has a moment about the normal.
+        # If the centre of mass is ahead of the axle, it swings with the yaw, and its weight has a moment about the
+        # normal.
         across = cross(g.normal, e)
         swing = multiply(weight, body.centre, self.side, dot(across, self.up))
         turning = subtract(drag.yaw, add(multiply(self.absolute, torque), swing))
@@ -213,7 +217,7 @@ class Dynamics(eqx.Module):
         )
 
     def energy(self, state: State) -> Float[Array, "..."]:
-        """Energy H = P^2/2 + J_f sg^2/2 + m g z + k phi^2/2 [J], z the height of the centre of mass."""
+        """Energy H = P^2/2 + J_f sg^2/2 + m g z + k phi^2/2 [J], where z is the height of the centre of mass."""
         r, e, (phi, P, fork_rate) = (*self.unpack(state)[:2], self.unpack(state)[2][:3])
         body = self.body
         height = add(self.surface.elevation(r), multiply(body.centre, dot(e, self.up)))
@@ -226,11 +230,11 @@ class Dynamics(eqx.Module):
         return 1.0 / (whole * self.geometry(state).gauge ** 2)
 
     def contact(self, state: State) -> Float[Array, "..."]:
-        """Force of the ground on the stroller along its normal [N]; negative where the ground would have to pull."""
+        """Normal force [N] of the ground on the stroller; negative where the ground would have to pull."""
         return jnp.broadcast_to(multiply(1.0, self.geometry(state).normal_force), state[0].shape)
 
     def contact_along(self, state: State, rate: State) -> Float[Array, "..."]:
-        """As `contact`, where the field is known: the velocity is part of it, and costs most."""
+        """Like `contact`, if the field is known: it contains the velocity, which is expensive."""
         place, velocity = padded(state[: self.surface.axes]), padded(rate[: self.surface.axes])
         normal = self.surface.normal(place)
         force = self.normal_force(normal, self.surface.normal_rate(place, velocity), velocity)
@@ -241,8 +245,8 @@ class Dynamics(eqx.Module):
     ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Side forces [N] of the ground on the rear axle and on the front wheel, to the left of each.
 
-        From the balance of momentum across and of spin about the normal (`stroller.md`, section 4), solved without
-        dividing by cos(phi). They hold for the intrinsic heading.
+        From the balance of momentum across the heading and of spin about the normal (`stroller.md`, section 4), solved
+        without dividing by cos(phi). They hold for the intrinsic heading.
         """
         body = self.body
 
@@ -267,7 +271,7 @@ class Dynamics(eqx.Module):
             subtract(None, forces.drag.yaw),
         )
         front = g.cosine * spin / body.wheelbase - g.sine * along
-        # Curvature turns the frame as it moves, and its spin reacts with a force across.
+        # Curvature turns the frame as it moves, and the spin of the frame reacts with a sideways force.
         carried = add(body.inertia * yaw, multiply(self.absolute, body.steering_inertia, g.fork_rate))
         gyration = multiply(self.surface.gaussian_curvature(g.motion.position), carried, v)
         across = subtract(add(body.mass * centre_across, bank), add(gyration, multiply(forces.drag.front, g.sine)))
@@ -276,10 +280,10 @@ class Dynamics(eqx.Module):
     def projected_side_force(
         self, t: Float[Array, "..."], state: State, controls: Input | None
     ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Side forces [N] as `side_force`, for the projected heading on a curved ground: they act along the horizontal.
+        """Side forces [N] like `side_force`, for the projected heading on curved ground: they act horizontally.
 
-        The missing momentum along d is -sin(phi) nu times the front force, the missing spin cos(phi) l times it; together
-        they give that force without dividing by cos(phi). The rear force follows from the momentum across.
+        The missing momentum along d is -sin(phi) nu times the front force, the missing spin cos(phi) l times it;
+        together they give this force without dividing by cos(phi). The rear force follows from the sideways momentum.
         """
         body = self.body
 
@@ -307,12 +311,12 @@ class Dynamics(eqx.Module):
 
 
 def padded(components: State) -> Vector:
-    """Components as a vector; missing last ones vanish identically."""
+    """Components as a vector; missing last components vanish identically."""
     vector = (*components, None, None)
     return vector[0], vector[1], vector[2]
 
 
 def stacked(rates: tuple[Component, ...], state: State) -> State:
-    """Stack components along axis 0, with zeros where one vanishes identically."""
+    """Stack components along axis 0, with zeros for those that vanish identically."""
     zero = jnp.zeros_like(state[0])
     return jnp.stack([zero if rate is None else jnp.broadcast_to(rate, zero.shape) for rate in rates])

@@ -1,4 +1,4 @@
-"""Friction of the wheels and of the fork, along the velocities that the constraints leave free. A law is one class."""
+"""Friction of the wheels and of the fork, along the velocities that the constraints allow. Each law is a class."""
 
 import abc
 from collections.abc import Iterator
@@ -14,7 +14,8 @@ from nonholonomic.xla_cpu import greatest
 
 
 class WheelMotion(NamedTuple):
-    """How the stroller moves: speeds [m/s] at which the wheels roll, rates [rad/s], loads [N] on the axles.
+    """The motion of the stroller for friction: rolling speeds of the wheels [m/s], rates [rad/s], loads [N] on the
+    axles.
 
     A load is `None` where it is exactly zero, as on the front axle with the centre of mass on the rear one.
     """
@@ -28,7 +29,7 @@ class WheelMotion(NamedTuple):
 
 
 class Drag(NamedTuple):
-    """What friction does: forces [N] along the wheels, torques [N m] about the normal and the steering axis."""
+    """The effect of friction: forces [N] along the wheels, torques [N m] about the normal and the steering axis."""
 
     rear: Component = None
     front: Component = None
@@ -55,7 +56,7 @@ class AbstractFriction(Bounded):
     ```
     """
 
-    #: Whether the law can dissipate energy; the work of one that cannot is not recorded.
+    #: Whether the law can dissipate energy; if not, its work is not recorded.
     dissipates: ClassVar[bool] = True
 
     @abc.abstractmethod
@@ -132,8 +133,8 @@ class Damping(AbstractFriction):
 class RollingResistance(AbstractFriction):
     """Rolling resistance F = -c N tanh(v / v_s) of each axle under its load N (`stroller.md`, section 7).
 
-    The regularisation creeps: a stroller on a slope too gentle to overcome the resistance does not stop but goes on at
-    a speed of the order of v_s. An axle off the ground has no resistance.
+    The regularised law creeps: a stroller on a slope too gentle to overcome the resistance does not stop, but keeps
+    rolling at a speed of the order of v_s. An axle off the ground has no resistance.
 
     **Arguments:**
 

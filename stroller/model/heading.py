@@ -1,8 +1,7 @@
-"""Two readings of "the wheels do not slip sideways" on a curved ground; on a plane they are the same.
+"""Two meanings of "the wheels do not slip sideways" on curved ground; on a plane they are equal.
 
-Both say that the rear axle moves with the velocity w cos(phi) d and that the heading turns at the rate
-w nu sin(phi) / l, with w the one free speed of the motion. They differ in the direction d, in the factor nu, and in
-what turns.
+In both, the rear axle moves with the velocity w cos(phi) d and the heading turns at the rate w nu sin(phi) / l, where w
+is the one free speed of the motion. They differ in the direction d, in the factor nu, and in the vector that turns.
 """
 
 import abc
@@ -17,22 +16,22 @@ VERTICAL: Vector = (None, None, 1.0)
 
 
 class AbstractHeading(eqx.Module):
-    """What a heading is, and how it directs and turns the stroller. Vectors are in the ground's axes."""
+    """The heading, and how it directs and turns the stroller. Vectors are in the ground's axes."""
 
     @abc.abstractmethod
     def axes(self, ground: AbstractSurface) -> int:
-        """How many components of the heading do not vanish identically."""
+        """Number of components of the heading that do not vanish identically."""
 
     @abc.abstractmethod
     def unit(self, heading: Vector, normal: Vector) -> Vector:
-        """The heading corrected for a drift off the ground or off unit length.
+        """The heading, corrected for a drift off the ground or off unit length.
 
-        An exact one stays as it is, and so does the rate at which it turns.
+        An exact heading is unchanged, and so is its rate.
         """
 
     @abc.abstractmethod
     def direction(self, heading: Vector, normal: Vector, side: float) -> Vector:
-        """The vector d along the ground, given the outward normal, and 1 for a stroller outside or -1 inside."""
+        """The vector d along the ground, from the outward normal and the side: 1 outside, -1 inside."""
 
     @abc.abstractmethod
     def square(self, direction: Vector) -> Component:

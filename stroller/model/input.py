@@ -1,7 +1,7 @@
-"""What drives the stroller: a function of time and motion that gives the drive force and the steering torque.
+"""Inputs of the stroller: functions of time and motion that return the drive force and the steering torque.
 
 Any function `(t, motion) -> (force, torque)` will do. It is called with arrays of any shape, one number per lane, so
-write it with `jax.numpy` and without `if`. An `equinox.Module` may hold numbers to differentiate by.
+write it with `jax.numpy` and without `if`. Use an `equinox.Module` for parameters to sweep or differentiate.
 """
 
 import inspect
@@ -20,7 +20,7 @@ from nonholonomic.validation import Bound, Bounded, as_number, is_traced
 
 
 class Motion(NamedTuple):
-    """What an input may use of the stroller's state.
+    """The parts of the stroller's state that an input can use.
 
     `position` [m] of the rear axle and `heading` [1], a unit vector, are tuples of components in the ground's axes, the
     third `None` on a plane; `steering` [rad], `speed` [m/s] of the rear axle, `front_speed` [m/s] at which the front
@@ -86,13 +86,13 @@ class Steady(Bounded):
         return self.force, self.torque
 
 
-#: What an input has to be.
+#: Description of an input for messages.
 WANTED = "a function (t, motion) -> (drive force [N], steering torque [N m])"
 
 
 @eqx.filter_jit
 def at_start(scene: Any, launch: Any) -> tuple[Float[Array, ""], Motion]:
-    """What an input is called with at the start of a ride: a time and a motion."""
+    """Arguments of an input at the start of a ride: a time and a motion."""
     state = scene.state(launch, True)
     return jnp.zeros(()), scene.dynamics.geometry(state).motion
 
@@ -103,7 +103,7 @@ def check_input(controls: Any, scene: Any, launch: Any) -> None:
     **Arguments:**
 
     - `controls`: an input, or `None`.
-    - `scene`, `launch`: where it is used, their numbers concrete or traced.
+    - `scene`, `launch`: scene and launch of the ride, with concrete or traced numbers.
     """
     if controls is None:
         return
@@ -138,7 +138,7 @@ def _first_line(error: Exception) -> str:
 
 
 class Program:
-    """The operations of a function; two programs are equal if they read the same, so that neither is compiled twice."""
+    """The operations of a function; two programs with equal text are equal, so the second is not compiled again."""
 
     def __init__(self, jaxpr: Any):
         self.jaxpr = jaxpr
@@ -152,9 +152,9 @@ class Program:
 
 
 class Formula(eqx.Module):
-    """A function as an input that is a module: the arrays it holds are leaves, and its operations are compared as such.
+    """A function as an input module: the arrays in it are leaves, and its operations are compared by their text.
 
-    So a function that is defined again, as in a notebook's cell, does not compile again.
+    So redefining a function, as in a notebook's cell, does not compile it again.
     """
 
     held: tuple[Array, ...]
@@ -162,7 +162,7 @@ class Formula(eqx.Module):
 
     @classmethod
     def of(cls, controls: Input, t: Any, motion: Any) -> "Formula":
-        """The formula of a function that can be called with scalars such as these, of which only the types count."""
+        """The formula of a function that takes scalars of these types; their values do not matter."""
         closed = jax.make_jaxpr(lambda *at: tuple(map(as_number, controls(*at))))(t, motion)
         return cls(tuple(closed.consts), Program(closed.jaxpr))
 

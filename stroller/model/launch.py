@@ -1,4 +1,4 @@
-"""How a run starts."""
+"""Launches: how a ride starts."""
 
 from collections.abc import Iterator
 from typing import Any, ClassVar
@@ -10,7 +10,7 @@ from nonholonomic.validation import Bound, Bounded, as_number, shown
 
 
 def as_place(value: Any) -> Any:
-    """Two or three numbers as a tuple of arrays; anything else is left for the check."""
+    """Two or three numbers as a tuple of arrays; anything else is left for later checks."""
     try:
         numbers = tuple(value)
     except TypeError:
@@ -19,15 +19,15 @@ def as_place(value: Any) -> Any:
 
 
 class Launch(Bounded):
-    """A start: where the rear axle is, where the stroller heads, how fast it rolls and steers.
+    """A launch: position of the rear axle, heading, speed and steering.
 
     **Arguments:**
 
     - `place`: (x, y) [m] on a plane (along it), paraboloid or graph; (mu, eta) [rad], azimuth and reduced latitude, on a
       sphere or spheroid, azimuth and angle about the tube on a torus; (y, eta), along the axis [m] and from the lowest line
       [rad], on a cylinder. On any surface also (x, y, z) [m] in the fixed frame.
-    - `heading`: angle psi [rad] of the heading from east towards north as the surface has them: from x towards y on a plane;
-      the paper's projected heading is the angle theta [rad] of its horizontal projection from x towards y.
+    - `heading`: angle psi [rad] of the heading from the surface's east towards its north: from x towards y on a plane.
+      The projected heading of the paper is the angle theta [rad] of its horizontal projection from x towards y.
     - `speed`: speed v [m/s] of the rear axle along the heading, negative in reverse; the horizontal speed where the
       heading is projected.
     - `steering`: angle phi [rad] of the front wheel, positive to the driver's left.

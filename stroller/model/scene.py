@@ -1,4 +1,4 @@
-"""The scene: what rolls, on what ground, with what friction, under what gravity."""
+"""The scene: vehicle, ground, friction and gravity."""
 
 from collections.abc import Iterator
 from typing import Any, ClassVar
@@ -27,7 +27,7 @@ from .heading import Intrinsic, Projected
 from .launch import Launch
 from .stroller import Stroller
 
-#: The side of a closed surface on which a stroller drives if nothing is said.
+#: The default side of a closed surface.
 DRIVES = "outside"
 FORKS = {"relative": None, "absolute": 1.0}
 HEADINGS = {"intrinsic": Intrinsic(), "projected": Projected()}
@@ -37,7 +37,7 @@ RIGHT_ANGLE = 1e-9
 
 
 def require_word(word: Any, name: str, words: dict[str, Any]) -> None:
-    """Raise `ValueError` unless `word` is one of the words."""
+    """Raise `ValueError` unless `word` is one of the allowed words."""
     if not isinstance(word, str) or word not in words:
         raise ValueError(f"{name} = {word!r} must be one of {', '.join(map(repr, words))}")
 
@@ -50,7 +50,7 @@ def _holds_somewhere(condition: Any) -> bool:
 class Scene(Bounded):
     """A stroller on a ground.
 
-    Every number in it is a leaf of a pytree: it can be swept, traced and differentiated.
+    Every number in it is a leaf of a pytree: you can sweep, trace and differentiate it.
 
     **Arguments:**
 
@@ -60,14 +60,14 @@ class Scene(Bounded):
     - `friction`: `Frictionless()`, `Damping(rolling, front, scrub, steering)` or
       `RollingResistance(coefficient, speed)`.
     - `gravity`: acceleration of free fall [m/s^2], at least 0.
-    - `side`: "outside", as if nothing is said, or "inside" of a cylinder, sphere, spheroid or torus, "above" a plane,
-      paraboloid or graph, on the "positive" side of an implicit surface.
-    - `fork`: "relative" if the fork's inertia resists the steering rate phi' alone, "absolute" if it resists its whole
+    - `side`: "outside" (the default) or "inside" of a cylinder, sphere, spheroid or torus, "above" a plane, paraboloid
+      or graph, on the "positive" side of an implicit surface.
+    - `fork`: "relative" if the fork's inertia resists only the steering rate phi', "absolute" if it resists its whole
       rate phi' + Omega about the steering axis, as a rigid fork does.
     - `heading`: "intrinsic", or "projected" to reproduce the paper on a plane, sphere or spheroid, which constrains the
       horizontal projection of the velocities (`stroller.md`, section 3, says why that is not the default).
 
-    **Raises:** `ValueError` if a part is of the wrong kind, a word is not one of these, or a number is out of range.
+    **Raises:** `ValueError` if a part is of the wrong kind, a word is unknown, or a number is out of range.
 
     **Example:**
 
@@ -129,23 +129,23 @@ class Scene(Bounded):
         )
 
     def check(self, launch: Launch) -> None:
-        """Raise `ValueError` if the scene cannot start as the launch says."""
+        """Raise `ValueError` if the scene cannot start with the launch."""
         if not isinstance(launch, Launch):
             raise ValueError(f"launch = {launch!r} must be a Launch")
         require_all(self.start_bounds(launch))
         if _holds_somewhere(self.sideways(launch)):
             raise ValueError(
                 f"steering = {shown(launch.steering)} must differ from a right angle for speed = {shown(launch.speed)}: "
-                "the rear axle stands still when the front wheel stands across"
+                "the rear axle cannot move while the front wheel is at a right angle"
             )
         if _holds_somewhere(self.level(launch)):
             raise ValueError(
-                f"place[1] = {shown(launch.place[1])} must differ from 0 for heading = 'projected': on the equator no "
-                "horizontal speed belongs to a motion along the ground, and the constraints may lose rank"
+                f"place[1] = {shown(launch.place[1])} must differ from 0 for heading = 'projected': on the equator, motion "
+                "along the ground has no horizontal speed, and the constraints may lose rank"
             )
 
     def start_bounds(self, launch: Launch) -> Iterator[Bound]:
-        """The ranges that the scene sets for a launch."""
+        """The ranges of a launch's numbers in this scene."""
         yield from self.surface.place_bounds(launch.place, self.body.wheelbase)
 
     def sideways(self, launch: Launch) -> Any:
@@ -164,7 +164,8 @@ class Scene(Bounded):
         return of.abs(sine) < RIGHT_ANGLE
 
     def may_start(self, launch: Launch, *others: Any) -> Bool[Array, ""]:
-        """Whether the numbers of the scene, a launch and other modules are legal, for those that `check` could not see."""
+        """Whether the numbers of the scene, a launch and other modules are legal, for numbers that `check` could not
+        see."""
         own = [bound for module in (self, launch, *others) for bound in all_bounds(module)]
         stuck = jnp.asarray(self.sideways(launch) | self.level(launch))
         return jnp.all(legal([*own, *self.start_bounds(launch)]) & ~stuck)
@@ -175,7 +176,7 @@ class Scene(Bounded):
         **Arguments:**
 
         - `launch`: a `Launch` whose numbers, like the scene's, are scalars or one per lane.
-        - `driven`: whether there is an input, whose work the state then records.
+        - `driven`: whether there is an input; the state then records its work.
 
         **Returns:** an array (components, ...) in SI units.
         """
@@ -198,10 +199,10 @@ class Scene(Bounded):
         return stacked(start, shape[None])
 
     def scales(self, launch: Launch, driven: bool = False) -> State:
-        """Magnitudes by which absolute errors of the state are measured, component by component.
+        """Scales of absolute errors of the state, component by component.
 
-        Positions count in wheelbases, directions and angles in units of 1, the rest in units of the launch's own speeds
-        or of a fall through a wheelbase, whichever is more.
+        Positions are measured in wheelbases, directions and angles in units of 1, the rest in units of the launch's own
+        speeds or of a fall through a wheelbase, whichever is greater.
 
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
@@ -220,7 +221,7 @@ class Scene(Bounded):
         return self.dynamics.energy(state)
 
     def work(self, state: State) -> Float[Array, "..."]:
-        """Work [J] done on the stroller so far by its inputs and by friction, negative where they took energy."""
+        """Work [J] done on the stroller so far by its inputs and by friction; negative if they took energy."""
         first = self.surface.axes + self.dynamics.heading.axes(self.surface) + 5
         return jnp.sum(state[first:], axis=0)
 
@@ -229,5 +230,5 @@ class Scene(Bounded):
         return self.dynamics.rank(state)
 
     def contact(self, state: State) -> Float[Array, "..."]:
-        """Force of the ground on the stroller along its normal [N]; negative where the ground would have to pull."""
+        """Normal force [N] of the ground on the stroller; negative where the ground would have to pull."""
         return self.dynamics.contact(state)

@@ -20,8 +20,8 @@ class Stroller(Bounded):
     - `inertia`: moment of inertia J [kg m^2] in yaw about the middle of the rear axle, positive.
     - `steering_inertia`: moment of inertia J_f [kg m^2] of the fork about the steering axis, positive.
     - `steering_spring`: stiffness [N m/rad] of a spring that pulls the fork straight, at least 0.
-    - `centre`: distance b [m] of the centre of mass ahead of the rear axle, in [0, `wheelbase`]; `inertia` is at least
-      `mass` b^2. It puts load on the front wheel. The equations hold for b > 0 on a plane.
+    - `centre`: distance b [m] of the centre of mass ahead of the rear axle, in [0, `wheelbase`], which loads the front
+      wheel. `inertia` must be at least `mass` b^2. The equations hold for b > 0 on a plane.
 
     **Raises:** `ValueError` for numbers outside these ranges.
 

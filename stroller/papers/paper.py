@@ -1,4 +1,4 @@
-"""The paper's equations in its own coordinates, corrected, and the table of what is printed and what is right.
+"""The paper's equations in its own coordinates, corrected, and a table of the printed and the correct forms.
 
 The paper: "Vector Fields of the Dynamics of Non-Holonomic Constraint System With Elliptical Configuration Space". Its
 coordinates are q = (x, y, theta, phi) on the plane and (eta, mu, theta, phi) on the spheroid of constant xi, with theta
@@ -43,7 +43,7 @@ def position(p: Parameters, eta: Float[Array, ""], mu: Float[Array, ""]) -> Floa
 
 
 def differentials(p: Parameters, eta: Float[Array, ""], mu: Float[Array, ""]) -> Float[Array, "2 2"]:
-    """(5) and (6): dx and dy at constant xi, a row each, in terms of (d eta, d mu)."""
+    """(5) and (6): dx and dy at constant xi, one per row, in terms of (d eta, d mu)."""
     A = p.a * jnp.cosh(p.xi)
     dx = [-A * jnp.sin(eta) * jnp.cos(mu), -A * jnp.cos(eta) * jnp.sin(mu)]
     dy = [-A * jnp.sin(eta) * jnp.sin(mu), A * jnp.cos(eta) * jnp.cos(mu)]
@@ -92,7 +92,7 @@ def constraint_momenta(p: Parameters, q: Four, momentum: Four) -> Float[Array, "
 
 
 def fields_plane(p: Parameters, q: Four) -> Float[Array, "4 2"]:
-    """(13): the fields X1 = l cos(theta) d_x + l sin(theta) d_y + tan(phi) d_theta and X2 = d_phi, a column each."""
+    """(13): the fields X1 = l cos(theta) d_x + l sin(theta) d_y + tan(phi) d_theta and X2 = d_phi, one per column."""
     _, _, theta, phi = q
     zero = jnp.zeros(())
     rolling = jnp.stack([p.l * jnp.cos(theta), p.l * jnp.sin(theta), jnp.tan(phi), zero])
@@ -101,7 +101,7 @@ def fields_plane(p: Parameters, q: Four) -> Float[Array, "4 2"]:
 
 def fields_spheroid(p: Parameters, q: Four) -> Float[Array, "4 2"]:
     """(14): X1 = l cos(eta) cos(theta - mu) d_eta - l sin(eta) sin(theta - mu) d_mu
-    - a cosh(xi) sin(eta) cos(eta) tan(phi) d_theta and X2 = d_phi, a column each."""
+    - a cosh(xi) sin(eta) cos(eta) tan(phi) d_theta and X2 = d_phi, one per column."""
     eta, mu, theta, phi = q
     turning = -p.a * jnp.cosh(p.xi) * jnp.sin(eta) * jnp.cos(eta) * jnp.tan(phi)
     along_mu = -p.l * jnp.sin(eta) * jnp.sin(theta - mu)
@@ -151,7 +151,7 @@ def output_spheroid(p: Parameters, q: Four, momentum: Four) -> Float[Array, ""]:
 
 
 class Equation(NamedTuple):
-    """A numbered equation: as printed, whether it is right, what is right, and the test that shows it."""
+    """A numbered equation: as printed, the verdict, the correct form, and the test that shows it."""
 
     number: str
     printed: str
@@ -314,7 +314,7 @@ EQUATIONS = (
 
 
 def render() -> str:
-    """The audit as a page of Markdown, which `docs/development/stroller_paper.md` is."""
+    """The audit as a Markdown page, the content of `docs/development/stroller_paper.md`."""
     lines = [
         "# The stroller's paper, equation by equation",
         "",
@@ -323,10 +323,6 @@ def render() -> str:
         "functions are in `stroller/papers/paper.py`, the tests in `tests/stroller/papers/test_stroller_paper.py`. Each",
         "test derives the corrected form from the position on the spheroid and shows that a wrong printed form does not",
         "follow. `stroller.papers.paper.render()` returns this page.",
-        "",
-        "The paper announces friction, a constrained Levi-Civita connection, Poincare's equations and graphs, but",
-        "contains none. This package has them (`stroller/model/friction.py`, `nonholonomic/formulations/formulation.py`,",
-        "`python -m stroller`).",
         "",
         'The paper constrains the horizontal projections of the wheels\' velocities: `heading="projected"`. On a slope',
         'this is not a vehicle with a rigid frame, so `heading="intrinsic"` is the default.',

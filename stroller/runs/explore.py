@@ -44,7 +44,7 @@ TOLERANCE = 1e-7
 DRAWN = 1e-5
 
 #: Steps after which a run in the page is given up: some hundred milliseconds.
-MOST_STEPS = 50_000
+MOST_STEPS_OF_A_PAGE = 50_000
 
 
 @status_line("writing a page")
@@ -104,7 +104,7 @@ def explore(
 
 def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input: Any) -> LiveRun:
     """What the page shows of a scene, a launch and an input, `roots`, some of whose numbers are those of sliders."""
-    settings = Settings(TOLERANCE, max_steps=MOST_STEPS)
+    settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
     controls = as_module(input, roots["scene"], roots["launch"])
 
     def modules(values: Numbers) -> tuple[Scene, Launch, Input | None]:

@@ -1,45 +1,33 @@
-"""What is read off a run of the stroller, with units and names, and the labelled table of it."""
+"""The quantities of a run of the stroller, with units and names, and the table of a run."""
 
-import json
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from nonholonomic.geometry import Plane
 from nonholonomic.parameters import description
-from nonholonomic.sweeps import Table, versions
+from nonholonomic.sweeps import Quantity, Table, run_table
 from nonholonomic.validation import require_one_run
 
-
-class Quantity(NamedTuple):
-    """What can be read off a run: its unit, what it is in words, how to read it, and the dimension of a vector's components."""
-
-    unit: str
-    long_name: str
-    read: Callable[[Any], Any]
-    components: str | None = None
-
-
 QUANTITIES = {
-    "place": Quantity("m or rad", "place", lambda run: run.place, "coordinate"),
-    "position": Quantity("m", "position of the rear axle", lambda run: run.position, "component"),
-    "direction": Quantity("1", "direction of the heading", lambda run: run.direction, "component"),
-    "heading": Quantity("rad", "heading ψ", lambda run: run.heading),
-    "steering": Quantity("rad", "steering angle φ", lambda run: run.steering),
-    "steering_rate": Quantity("rad s-1", "φ'", lambda run: run.steering_rate),
-    "speed": Quantity("m s-1", "speed v", lambda run: run.speed),
-    "front_speed": Quantity("m s-1", "speed of the front wheel", lambda run: run.front_speed),
-    "yaw_rate": Quantity("rad s-1", "yaw rate", lambda run: run.yaw_rate),
-    "energy": Quantity("J", "energy", lambda run: run.energy),
-    "work": Quantity("J", "work of inputs and friction", lambda run: run.work),
-    "drive_power": Quantity("W", "power of the drive", lambda run: run.power.drive),
-    "steering_power": Quantity("W", "power of the steering", lambda run: run.power.steering),
-    "friction_power": Quantity("W", "power of friction", lambda run: sum(run.power[2:])),
-    "side_force": Quantity("N", "side force", lambda run: run.side_force, "axle"),
-    "grip": Quantity("1", "friction that the tyres need", lambda run: run.grip(), "axle"),
-    "load": Quantity("N", "load", lambda run: run.load, "axle"),
-    "normal_force": Quantity("N", "normal force", lambda run: run.normal_force),
+    "place": Quantity("m or rad", "place", "coordinate"),
+    "position": Quantity("m", "position of the rear axle", "component"),
+    "direction": Quantity("1", "direction of the heading", "component"),
+    "heading": Quantity("rad", "heading ψ"),
+    "steering": Quantity("rad", "steering angle φ"),
+    "steering_rate": Quantity("rad s-1", "φ'"),
+    "speed": Quantity("m s-1", "speed v"),
+    "front_speed": Quantity("m s-1", "speed of the front wheel"),
+    "yaw_rate": Quantity("rad s-1", "yaw rate"),
+    "energy": Quantity("J", "energy"),
+    "work": Quantity("J", "work of inputs and friction"),
+    "drive_power": Quantity("W", "power of the drive", read=lambda run: run.power.drive),
+    "steering_power": Quantity("W", "power of the steering", read=lambda run: run.power.steering),
+    "friction_power": Quantity("W", "power of friction", read=lambda run: sum(run.power[2:])),
+    "side_force": Quantity("N", "side force", "axle"),
+    "grip": Quantity("1", "friction that the tyres need", "axle", read=lambda run: run.grip()),
+    "load": Quantity("N", "load", "axle"),
+    "normal_force": Quantity("N", "normal force"),
 }
 
 
@@ -59,25 +47,10 @@ def table_of(runs: list[Any], names: list[str], request: dict[str, Any]) -> Tabl
     coords = {"ride": np.array(names)} if names else {}
     coords |= {"time": np.asarray(runs[0].t), "coordinate": np.array(places)}
     coords |= {"component": np.array(("x", "y", "z")), "axle": np.array(("rear", "front"))}
-    values_by_name = {name: [np.asarray(quantity.read(run)) for run in runs] for name, quantity in QUANTITIES.items()}
-    units = {"time": "s"} | {name: quantity.unit for name, quantity in QUANTITIES.items()}
-    units["place"] = unit
-    long_names = {"time": "time"} | {name: quantity.long_name for name, quantity in QUANTITIES.items()}
-    attributes = {
-        "request": json.dumps(request, default=repr),
-        "axes": json.dumps([*(["ride"] if names else []), "time"]),
-        "versions": json.dumps(versions()),
-        "long_names": json.dumps(long_names, sort_keys=True),
-    }
-    return Table(
-        coords,
-        {name: np.stack(values) if names else values[0] for name, values in values_by_name.items()},
-        units,
-        attributes,
-        inner={
-            name: (quantity.components,) for name, quantity in QUANTITIES.items() if quantity.components is not None
-        },
-    )
+    quantities = QUANTITIES | {"place": QUANTITIES["place"]._replace(unit=unit)}
+    of_runs = {name: [np.asarray(quantity.of(name, run)) for run in runs] for name, quantity in quantities.items()}
+    values = {name: np.stack(of_each) if names else of_each[0] for name, of_each in of_runs.items()}
+    return run_table(quantities, coords, values, [*(["ride"] if names else []), "time"], request)
 
 
 def table_of_one(run: Any) -> Table:

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.integration import LOOSEST, ImplicitMidpoint, Settings, run_bounds, times_bounds
+from nonholonomic.integration import ImplicitMidpoint, Settings, legal_run
 from nonholonomic.progress import status_line
-from nonholonomic.validation import as_known, is_traced, legal, nan_unless
+from nonholonomic.validation import as_known, is_traced, nan_unless
 
 from ..model.input import Input
 from ..model.launch import Launch
@@ -113,14 +113,11 @@ _sampled = eqx.filter_jit(functools.partial(traced_ride, adjoint=None))
 @eqx.filter_jit
 def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
     """The run, or NaN and `finished` false where a traced number is out of range."""
-    bounds = [*run_bounds(ride.t1, ride.settings.tolerance), *times_bounds(times, ride.t1)]
-    may = ride.scene.may_start(ride.launch, ride.input) & jnp.all(legal(bounds)) & jnp.all(jnp.diff(times) > 0.0)
-    # A run of illegal numbers might never reach its end, so it is not begun, unless its steps have a given length.
-    begins = may if ride.grid is None else True
-    run_times = jnp.where(begins, times, 0.0)
-    # Nor is its tolerance that of its block.
-    settings = ride.settings.with_tolerance(jnp.where(may, ride.settings.tolerance, LOOSEST))
-    begun = ride._replace(t1=jnp.where(begins, ride.t1, 0.0), settings=settings)
+    starts = ride.scene.may_start(ride.launch, ride.input)
+    may, t1, tolerance = legal_run(starts, ride.t1, ride.settings.tolerance, times)
+    begun, run_times = ride._replace(settings=ride.settings.with_tolerance(tolerance)), times
+    if ride.grid is None:
+        begun, run_times = begun._replace(t1=t1), jnp.where(may, times, 0.0)
     if adjoint is not None:
         # Diffrax would differentiate the run that is not begun.
         begun = begun._replace(**nan_unless(may, {"scene": ride.scene, "launch": ride.launch, "input": ride.input}))

@@ -97,7 +97,7 @@ def sweep(
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`.
-    - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
+    - `path`: HDF5 file to write, chunk by chunk. A run that was interrupted resumes from it.
     - `progress`: whether to show it, on a terminal or in a notebook.
     - `executor`: who computes: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a
       Dask client, to which blocks are handed as its workers become free; by default a thread for each core. The numbers

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -11,11 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Component, Plane, dot, multiply, scale, sum_vectors
-from nonholonomic.parameters import likely, text_as_html
 from nonholonomic.progress import status_line
-from nonholonomic.sweeps import Table
-from nonholonomic.validation import is_traced, require_package
-from nonholonomic.views import Stage, Viewable, draw_portrait
+from nonholonomic.sweeps import Table, Tabular
+from nonholonomic.validation import is_traced
+from nonholonomic.views import Stage, Viewable
 
 from ..model.dynamics import Power, State, padded
 from ..model.input import Input
@@ -27,7 +26,7 @@ from .steps import Steps, followed
 from .view import as_stages
 
 
-class Trajectory(eqx.Module, Viewable):
+class Trajectory(Viewable, Tabular, eqx.Module):
     """A run at the given times. Times are the first axis of every array.
 
     - `t` [s]; `place`, as the surface names it (see `Launch`), (times, 2), or (times, 3) on an implicit surface; `position`
@@ -82,11 +81,11 @@ class Trajectory(eqx.Module, Viewable):
     spec: RideSpec
     steps: Steps | None
 
-    def __getattr__(self, name: str) -> Any:
-        # Reached for unknown names, and where reading a known one has raised this kind of error: it raises it again.
-        if name.startswith("_") or hasattr(type(self), name):
-            return object.__getattribute__(self, name)
-        raise AttributeError(f"the run has no {name!r}{likely(name, QUANTITIES)} It has {', '.join(QUANTITIES)}")
+    readable: ClassVar[tuple[str, ...]] = tuple(QUANTITIES)
+
+    @property
+    def portrait_axes(self) -> tuple[str, str]:
+        return "steering", "yaw_rate"
 
     @property
     def energy_residual(self) -> Float[Array, " times"]:
@@ -175,50 +174,10 @@ class Trajectory(eqx.Module, Viewable):
 
     @status_line("reading off")
     def to_table(self) -> Table:
-        """All that can be read off the run, as a `Table` over its times.
-
-        **Raises:** `ValueError` for a batch of runs.
-        """
         return table_of_one(self)
-
-    def to_xarray(self) -> Any:
-        """The run as an `xarray.Dataset` over "time" (needs xarray), with units and names.
-
-        **Raises:** `ValueError` for a batch of runs.
-        """
-        require_package("xarray", "xarray", "to_xarray")
-        return self.to_table().to_xarray()
-
-    def save(self, path: Any) -> None:
-        """Write the run to an HDF5 file that `stroller.Table.load` and xarray (`engine="h5netcdf"`) read.
-
-        **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for a batch of runs.
-        """
-        self.to_table().save(path)
-
-    def portrait(self, x: str = "steering", y: str = "yaw_rate", ax: Any = None) -> Any:
-        """Draw one quantity over another, a phase portrait (needs matplotlib).
-
-        **Arguments:**
-
-        - `x`, `y`: variables of `to_table()`, such as "steering", or one component, such as "position.x".
-        - `ax`: axes of matplotlib to draw in, instead of a new figure.
-
-        **Returns:** the matplotlib figure, or `ax`.
-
-        **Raises:** `ValueError` for an unknown variable.
-        """
-        require_package("matplotlib", "plot", "portrait")
-        return draw_portrait(self.to_table(), x, y, ax)
 
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
         return as_stages([self, *others], overlaid)
-
-    def __repr__(self) -> str:
-        return str(self)
-
-    def _repr_html_(self) -> str:
-        return text_as_html(str(self))
 
     @status_line("reading off")
     def __str__(self) -> str:

@@ -1,1 +1,2 @@
-"""The stroller in coordinates: an independent description, with poles, of what the vector form has without them."""
+"""The stroller in coordinates: an independent description, with coordinate singularities that the vector form does not
+have."""

@@ -1,8 +1,9 @@
 """The stroller in coordinates, as data for the formulations of `nonholonomic/formulations/formulation.py`.
 
-Coordinates: q = (x, y, theta, phi) on a plane and (eta, mu, psi, phi), reduced latitude first as in the paper, on a
-sphere or spheroid, psi being the paper's theta where the heading is projected. They have poles, unlike the P-form;
-they are the independent check of it (`stroller.md`, sections 2 to 4 and 6), and the paper's own form.
+The coordinates are q = (x, y, theta, phi) on a plane and (eta, mu, psi, phi), reduced latitude first as in the paper,
+on a sphere or spheroid, where psi is the paper's theta if the heading is projected. Unlike the P-form they are singular
+at the poles. They are an independent check of the P-form (`stroller.md`, sections 2 to 4 and 6), and the paper's own
+form.
 """
 
 import jax
@@ -51,7 +52,8 @@ class Chart(AbstractSystem):
         return jnp.array([(equatorial * sine) ** 2 + (polar * cosine) ** 2, (equatorial * cosine) ** 2])
 
     def forms(self, q: Coordinates) -> Float[Array, "3 4"]:
-        """The one-forms long, lat and yaw, a row each: what the rear axle rolls, slips to the left, and turns left."""
+        """The one-forms long, lat and yaw, one per row: the rear axle's rolling, its slip to the left, and its turn to
+        the left."""
         zero, unit = jnp.zeros(()), jnp.ones(())
         sine, cosine = jnp.sin(q[2]), jnp.cos(q[2])
         if self.quadric is None:
@@ -77,7 +79,7 @@ class Chart(AbstractSystem):
         G = body.mass * jnp.diag(jnp.concatenate([self.ground_metric(q), jnp.zeros(2)]))
         G = G + body.inertia * jnp.outer(yaw, yaw) + body.steering_inertia * jnp.outer(fork, fork)
         if body.centre is not None:
-            # The centre of mass moves across at b Omega besides; the inertia is about the axle and has m b^2 already.
+            # The centre of mass also moves sideways at b Omega; the inertia is about the axle and includes m b^2.
             across = jnp.outer(lat, yaw)
             G = G + body.mass * body.centre * (across + across.T)
         return G
@@ -102,7 +104,7 @@ class Chart(AbstractSystem):
     def frame(self, q: Coordinates) -> Float[Array, "4 4"]:
         sine, cosine, length = jnp.sin(q[3]), jnp.cos(q[3]), self.scene.body.wheelbase
         forms = self.forms(q)
-        # Long and lat have no part along the turn of the heading, and nothing but steering has one along phi.
+        # Long and lat do not depend on the turn of the heading, and only steering changes phi.
         across = inverse(forms[:2, :2])
         level = jnp.concatenate([across, -forms[2:, :2] @ across / forms[2, 2], jnp.zeros((1, 2))])
         (long, lat), yaw, steering = level.T, jnp.zeros(4).at[2].set(1.0 / forms[2, 2]), jnp.zeros(4).at[3].set(1.0)
@@ -133,7 +135,7 @@ class Chart(AbstractSystem):
         return scene.dynamics.side * (weight * equatorial * jnp.sin(q[0]) / h_eta - bend)
 
     def motion(self, q: Coordinates, wheels: WheelMotion) -> Motion:
-        """The motion that an input gets."""
+        """The motion for an input."""
         place = (q[0], q[1]) if self.quadric is None else (q[1], q[0])
         position, east, north = self.scene.surface.chart(place)
         heading = self.scene.dynamics.heading.at_angle(q[2], east, north)

@@ -163,7 +163,7 @@ def test_a_full_disk_is_told_and_still_read(unset, tmp_path, caplog):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     (said,) = caplog.messages
-    assert said.startswith(f"no more compiled programs are kept in {tmp_path}")
+    assert said.startswith(f"compiled programs can no longer be stored in {tmp_path}")
     assert not list((tmp_path / environment_name()).iterdir())
 
 

@@ -54,7 +54,7 @@ def test_much_memory_or_many_mappings_forget_all_programs_with_one_line(why, pro
     assert double(3.0) == 6.0
     assert len(traced) == 2
     (said,) = caplog.messages
-    assert said.endswith("memory mappings and are forgotten; the next calls compile again")
+    assert said.endswith("memory mappings and were cleared; the next calls compile again")
     assert "\n" not in said
 
 

@@ -119,7 +119,7 @@ def instant(level: Level, vehicle: Vehicle, t: float, y: Array) -> Instant:
     A[7, :3], A[7, 3] = across, length * cosine
     b[7] = steering * w - cosine * (left_rate @ velocity) + sine * (e_rate @ velocity)
     x = np.linalg.solve(A, b)
-    # The spin about the normal reacts on a frame that the curvature turns (`stroller.md`, sections 4 and 12).
+    # The spin about the normal reacts on a frame that the curvature turns (`stroller.md`, section 4).
     spin = J * yaw + (Jf * (steering + yaw) if vehicle.absolute else 0.0)
     rear = x[6] - level.curvature(r) * spin * v
     return Instant(np.concatenate([velocity, x[:3], e_rate, [x[3], steering, x[4]]]), x[5], rear, x[7])

@@ -22,7 +22,7 @@ def relative_errors(family: str, tolerance: float) -> np.ndarray:
     names = list(MOVED.values())
     options = {"count": len(rows), "size": len(rows), "last": False}
     settings = Settings(tolerance, Oscillatory8())
-    _, found = sensitivities_of_cells(roots_of(rows[0]), columns_of(rows), names, ANGLE, 8.0, settings, **options)
+    _, found, _ = sensitivities_of_cells(roots_of(rows[0]), columns_of(rows), names, ANGLE, 8.0, settings, **options)
     expected = np.array([[float(row[f"by_{name}"]) for row in rows] for name in MOVED])
     return np.abs(np.stack(list(found.values())) / expected - 1.0)
 

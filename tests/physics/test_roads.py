@@ -9,7 +9,8 @@ from random_scenes import SMOOTH, Batch, batch
 
 import tippe
 from nonholonomic.parameters import with_numbers
-from tippe.runs.cells import InversionRuns, run_kind_of
+from tippe.runs.cells import InversionRuns
+from tippe.runs.run_kind import run_kind_of
 from tippe.runs.time_error import errors_of, second_tolerance
 
 ANGLE, TOLERANCE, T1 = 0.95 * np.pi, 1e-9, 8.0

@@ -26,7 +26,7 @@ BOTH = tippe.Rolling(2e-3, 3.0, tippe.Contensou(0.4, 4e-3, 0.1))
     ],
 )
 def test_contensou_has_the_values_of_the_disc_and_of_the_ellipsoid(ratio, exact, ellipsoid):
-    """Force and torque at three ratios of sliding to drilling, to the printed digits (`tippe.md`, section 3)."""
+    """Force and torque at three ratios of sliding to drilling, to four digits (`tippe.md`, section 3)."""
     radius = 1e-3
     load = tippe.Contensou(1.0, radius, 1e-12).per_normal_force(Slip(ratio * radius, 0.0, (0.0, 0.0, 1.0)))
     assert_close([-load.force[0], -load.torque[2] / radius], ellipsoid, atol=5e-5)

@@ -52,7 +52,7 @@ def test_impossible_tops_are_refused(change, message):
         (lambda: tippe.Rolling(1e-4, 1.0, 0.3), "sliding = 0.3 must be a Friction"),
         (
             lambda: tippe.Rolling(0.0, 1.0, tippe.Rolling(0.0, 1.0, tippe.Viscous(0.3))),
-            "must be a law of sliding that has a force",
+            "must be a sliding law with a force",
         ),
         (lambda: tippe.Cylinder(0.0), "surface radius = 0.0 must be greater than 0.0"),
         (lambda: tippe.Scene(rutstam_top(), tippe.Cylinder(0.02)), "surface radius = 0.02 must be greater than 0.02"),
@@ -76,7 +76,7 @@ def test_impossible_tops_are_refused(change, message):
         (lambda: tippe.Scene(tippe.SpheroidBody(**EGG), contact="hybrid"), "must be 'stop' for a SpheroidBody"),
         (
             lambda: tippe.Scene(tippe.SpheroidBody(**EGG), friction=tippe.SetValuedCoulomb(0.3)),
-            r"friction = SetValuedCoulomb\(mu=0.3\) must be a law without phases for a SpheroidBody",
+            r"friction = SetValuedCoulomb\(mu=0.3\) must be a law with a single mode for a SpheroidBody",
         ),
         (lambda: tippe.steady.jellett_thresholds(tippe.Scene(tippe.SpheroidBody(**EGG))), "must be a Top"),
         (lambda: tippe.Launch(-0.1, 100.0), "theta = -0.1 must be at least 0.0"),

@@ -10,7 +10,8 @@ from tops import rutstam_top
 import tippe
 from nonholonomic.sweeps.digits import concise, concise_strings
 from tippe import steady
-from tippe.runs.cells import InversionRuns, run_kind_of
+from tippe.runs.cells import InversionRuns
+from tippe.runs.run_kind import run_kind_of
 from tippe.runs.table import InversionJob
 from tippe.runs.time_error import FINER, SAFETY, SAFETY_OF_HISTORIES, error_bound, errors_of, second_tolerance
 

@@ -9,17 +9,19 @@ from nonholonomic.identification import of_data
 from nonholonomic.parameters import numbers, with_numbers
 
 from ..model.scene import Scene
-from ..runs.cells import InversionRuns, run_kind_of
+from ..runs.cells import InversionRuns
 from ..runs.extended_times import LEAST_ANGLE
+from ..runs.run_kind import run_kind_of
 from ..runs.trajectory import simulate
-from .data import InversionTimes, Recording, column_of
+from .inversion_times import InversionTimes
+from .recording import Recording
 
 
 class HybridModel(NamedTuple):
     """Predictions of all data of a scene with flights, impacts, stick and slip, as `SceneModel` gives them for one without.
 
-    Times are found as in tables, all in one block; recordings are followed one by one. Parameters that the scene refuses have
-    no predictions.
+    Times are computed as in tables, in one ensemble; recordings are simulated one by one. Parameters that the scene refuses
+    have no predictions.
     """
 
     scene: Scene
@@ -38,16 +40,16 @@ class HybridModel(NamedTuple):
 
     def _of(self, k: int, rows: list[dict[str, float]]) -> Float[np.ndarray, "rows size"]:
         """The predictions of one set of data in every row."""
-        data, found = self.data[k], np.full((len(rows), self.data[k].size), np.nan)
+        data, predictions = self.data[k], np.full((len(rows), self.data[k].size), np.nan)
         allowed = [i for i, row in enumerate(rows) if self._allows(data, row)]
         if allowed and isinstance(data, InversionTimes):
-            # Others are run in their place, so that every block has the same size and is compiled once.
+            # Others are run in their place, so that every call has the same number of cells and is compiled once.
             every = [rows[i] if i in allowed else rows[allowed[0]] for i in range(len(rows))]
-            found[allowed] = self._times(data, every)[allowed]
+            predictions[allowed] = self._times(data, every)[allowed]
         elif allowed:
             for i in allowed:
-                found[i] = self._samples(data, rows[i])
-        return found
+                predictions[i] = self._samples(data, rows[i])
+        return predictions
 
     def _allows(self, data: Any, row: dict[str, float]) -> bool:
         try:
@@ -72,11 +74,11 @@ class HybridModel(NamedTuple):
         t1, angle = float(data.t1), float(data.angle)
         runs = InversionRuns(run_kind_of(self.scene), t1, angle, "first", None, "ensemble", [])
         count = launches * len(rows)
-        found = runs.results({"scene": self.scene, "launch": data.launch}, columns, self.tolerance, count)
-        missing = np.log(angle / np.clip(np.asarray(found["end_theta"]), LEAST_ANGLE, angle))
+        variables = runs.results({"scene": self.scene, "launch": data.launch}, columns, self.tolerance, count)
+        missing = np.log(angle / np.clip(np.asarray(variables["end_theta"]), LEAST_ANGLE, angle))
         whole = np.maximum(np.log(angle / np.clip(columns["launch.theta"], LEAST_ANGLE, angle)), 1.0)
-        time = np.where(np.isfinite(found["time"]), found["time"], t1 * (1.0 + missing / whole))
-        failed = np.asarray(found["status"]) == runs.run_kind.words.index("failed")
+        time = np.where(np.isfinite(variables["time"]), variables["time"], t1 * (1.0 + missing / whole))
+        failed = np.asarray(variables["status"]) == runs.run_kind.words.index("failed")
         return np.where(failed, np.nan, time).reshape(len(rows), launches)
 
     def _samples(self, data: Recording, row: dict[str, float]) -> Float[np.ndarray, " size"]:
@@ -88,7 +90,9 @@ class HybridModel(NamedTuple):
         reached = at[at <= float(run.end_time)]
         samples = np.full((len(at), len(data.columns)), np.nan)
         shown = run.at(reached)
-        samples[: len(reached)] = np.stack([np.asarray(column_of(shown, name)) for name in data.columns], axis=-1)
+        samples[: len(reached)] = np.stack(
+            [np.asarray(data.quantities.samples(shown, name)) for name in data.columns], axis=-1
+        )
         return samples[where].reshape(-1)
 
 

@@ -13,6 +13,7 @@ from nonholonomic.identification import (
     Identification,
     as_sources,
     fit_data,
+    predicted,
     scene_unknowns,
     search_options,
 )
@@ -22,11 +23,13 @@ from nonholonomic.validation import as_number, require_kind
 
 from ..model.launch import Launch
 from ..model.scene import Scene
-from ..runs.cells import run_kind_of
-from ..runs.inversion import check_run, check_smooth
+from ..runs.checks import check_run, check_smooth
 from ..runs.launches import variable_numbers
-from .data import InversionTimes, Recording, Values, predict_recordings
+from ..runs.run_kind import run_kind_of
+from ..runs.trajectory import simulate
 from .hybrid_fit import HybridModel
+from .inversion_times import InversionTimes, Values
+from .recording import Recording
 
 
 class SceneModel(AbstractDataModel):
@@ -44,8 +47,11 @@ class SceneModel(AbstractDataModel):
         return names, tuple(values)
 
     def predict(self, sources: list[tuple[Any, Values]], rows: int) -> list[Float[Array, "rows size"]]:
+        def run(scene: Scene, launch: Launch, times: Float[Array, " times"]) -> Any:
+            return simulate(scene, launch, times[-1], times, self.tolerance)
+
         if isinstance(sources[0][0], Recording):
-            return predict_recordings(self.scene, sources, rows, self.tolerance)
+            return predicted(self.scene, sources, rows, run)
         return [times.predict(self.scene, values, rows, self.tolerance) for times, values in sources]
 
 

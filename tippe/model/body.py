@@ -1,11 +1,12 @@
-"""What a body of revolution says of itself: its inertia, and where it touches the arena.
+"""The interface of bodies of revolution: inertia, and the contact point on the arena.
 
-A convex body touches at the point that is farthest down the arena's normal n. Seen from the centre of mass the height above the
-arena is a function H of c = cos(theta) = e.n alone, the support function, and the contact is at
+A convex body touches the arena at the point that is farthest down along the arena's normal n. The height of the centre
+of mass above the arena is a function H of c = cos(theta) = e.n alone, the support function, and the contact point is at
 
-    r = A e - B n,   A(c) = -H'(c),   B(c) = H(c) - c H'(c).
+r = A e - B n,   A(c) = -H'(c),   B(c) = H(c) - c H'(c)
 
-A sphere has H = R - a c, so A and B are its offset and radius; on any other body they change as it leans.
+from the centre of mass. A sphere has H = R - a c, so A and B are its offset and radius; for other bodies they depend on
+c.
 """
 
 import abc
@@ -20,11 +21,11 @@ from nonholonomic.validation import Bound, Bounded
 
 
 class ContactGeometry(NamedTuple):
-    """Where a body touches: the contact is at r = offset e - radius n from the centre of mass.
+    """The contact point: it is at r = offset e - radius n from the centre of mass.
 
     - `offset`, `radius`: A and B [m].
     - `coupling`: m A / I1 [1/m], which the equation of the normal force needs.
-    - `growth`: A'(c) [m]; `None` on a sphere, where it vanishes.
+    - `growth`: A'(c) [m]; `None` for a sphere, where it vanishes.
     """
 
     offset: Float[Array, "..."]
@@ -39,15 +40,16 @@ class ContactGeometry(NamedTuple):
 
 
 class AbstractMeridian(eqx.Module):
-    """The meridian of a body, as the equations of motion ask for it."""
+    """The meridian of a body, in the form that the equations of motion use."""
 
     @abc.abstractmethod
     def at(self, cosine: Float[Array, "..."]) -> ContactGeometry:
-        """The lever at cos(theta)."""
+        """The contact geometry at cos(theta)."""
 
 
 class Round(AbstractMeridian):
-    """A sphere, which touches on the same lever however it leans; the fields are those of `ContactGeometry`."""
+    """A sphere, whose contact geometry does not depend on the inclination; the fields are those of
+    `ContactGeometry`."""
 
     offset: Float[Array, "..."]
     radius: Float[Array, "..."]
@@ -62,8 +64,8 @@ class AbstractBody(Bounded):
 
     `mass` [kg]; `I1`, `I3`: moments of inertia about the centre of mass, across and along the axis [kg m^2].
 
-    The arena's frame carries the point along that is `size` above the contact. What is reported of the motion is the path of
-    one of the body's points on its axis: by default the centre of mass.
+    The arena's frame moves with the point that is `size` above the contact. Runs report the path of a point on the
+    body's axis: by default the centre of mass.
     """
 
     mass: eqx.AbstractVar[Float[Array, "..."]]
@@ -73,25 +75,26 @@ class AbstractBody(Bounded):
     @property
     @abc.abstractmethod
     def meridian(self) -> AbstractMeridian:
-        """Where it touches."""
+        """The body's meridian."""
 
     @property
     @abc.abstractmethod
     def size(self) -> Float[Array, "..."]:
-        """A length of it [m], by which places and velocities are measured: of a sphere the radius."""
+        """A length of the body [m], the unit for places and velocities: for a sphere the radius."""
 
     @property
     def offset_of_path(self) -> Component:
-        """How far along e from the centre of mass the point is whose path is reported [m]; `None`: not at all."""
+        """Distance along e from the centre of mass to the point whose path is reported [m]; `None` for the centre of
+        mass."""
         return None
 
     def mass_from_frame(self, axis: Vector) -> Vector:
-        """From the point that the frame carries to the centre of mass [m], in (t1, t2, n)."""
+        """Vector from the point with which the frame moves to the centre of mass [m], in (t1, t2, n)."""
         r1, r2, r3 = self.meridian.at(axis[2]).contact(axis)
         return (-r1, -r2, -r3 - self.size)
 
     def path_from_frame(self, axis: Vector) -> Vector:
-        """From the point that the frame carries to the one whose path is reported [m]."""
+        """Vector from the point with which the frame moves to the point whose path is reported [m]."""
         return self.mass_from_frame(axis)
 
     def inertia_bounds(self) -> Iterator[Bound]:

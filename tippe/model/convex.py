@@ -1,4 +1,4 @@
-"""Bodies of revolution that are no spheres: the spheroid, and any that a support function describes.
+"""Bodies of revolution other than spheres: the spheroid, and any that a support function describes.
 
 Source of the support function: Bonnesen and Fenchel, Theorie der konvexen Koerper (1934), section 15; of the motion on a plane:
 Moffatt and Shimomura, Nature 416 (2002) 385, and Moffatt, Shimomura and Branicki, Proc. R. Soc. A 460 (2004) 3643.
@@ -17,22 +17,22 @@ from nonholonomic.validation import Bound, as_number
 
 from .body import AbstractBody, AbstractMeridian, ContactGeometry
 
-#: Inclinations at which a support function is looked at for whether it is that of a convex body.
+#: Number of inclinations at which a support function is checked for convexity.
 SAMPLES = 65
 
 
 class SpheroidBody(AbstractBody):
     """A spheroid: prolate like an egg if `polar` exceeds `equatorial`, oblate like a pebble if it is less.
 
-    On its equator it lies at theta = pi/2; at 0 and pi it stands on a pole. It runs on a plane, level or tilted, under laws of
-    friction that have a force at every slip.
+    At theta = pi/2 it lies on its equator; at 0 and pi it stands on a pole. It runs on a level or tilted plane, with
+    every friction law except `SetValuedCoulomb`.
 
     **Arguments:**
 
     - `mass`: mass [kg], positive.
     - `equatorial`, `polar`: half axes [m], across the axis e and along it, positive.
-    - `I1`, `I3`: moments of inertia about the centre of mass [kg m^2], across the axis and along it, positive, I3 <= 2 I1. If
-      the spheroid is homogeneous they are m (equatorial^2 + polar^2) / 5 and 2/5 m equatorial^2.
+    - `I1`, `I3`: moments of inertia about the centre of mass [kg m^2], across the axis and along it, positive, I3 <= 2
+      I1. For a homogeneous spheroid they are m (equatorial^2 + polar^2) / 5 and 2/5 m equatorial^2.
     - `offset`: distance of the centre of mass from the centre, against e [m], at least 0 and less than `polar`.
 
     **Raises:** `ValueError` for numbers outside these ranges.
@@ -104,21 +104,21 @@ class SpheroidMeridian(AbstractMeridian):
 class ConvexBody(AbstractBody):
     """A convex body of revolution, given by its support function.
 
-    It runs where a `SpheroidBody` does.
+    It runs in the same scenes as a `SpheroidBody`.
 
     **Arguments:**
 
     - `mass`: mass [kg], positive.
-    - `support`: function of c = cos(theta), the height [m] of the centre of mass above a plane that the body touches while its
-      axis is inclined by theta: R - a c for a sphere, sqrt(b^2 + (p^2 - b^2) c^2) for a spheroid. It is written with
-      `jax.numpy`, twice differentiable, positive, and convex: both its radii of curvature, H - c H' and
-      H - c H' + (1 - c^2) H'', are positive; it is looked at at 65 inclinations. The numbers of an `equinox.Module` are
-      numbers of the scene.
+    - `support`: function of c = cos(theta), the height [m] of the centre of mass above a plane that the body touches
+      while its axis is inclined by theta: R - a c for a sphere, sqrt(b^2 + (p^2 - b^2) c^2) for a spheroid. Write it
+      with `jax.numpy`, twice differentiable, positive, and convex: both radii of curvature, H - c H' and H - c H' + (1
+      - c^2) H'', must be positive, which is checked at 65 inclinations. If it is an `equinox.Module`, its numbers are
+      parameters of the scene.
     - `I1`, `I3`: moments of inertia about the centre of mass [kg m^2], across the axis and along it, positive, I3 <= 2 I1.
 
-    **Raises:** `ValueError` for numbers outside these ranges, and for a support function of another kind.
+    **Raises:** `ValueError` for numbers outside these ranges, or an illegal support function.
 
-    **Example:** an egg, blunt where its axis points down at theta = 0.
+    **Example:** an egg whose blunt end points down at theta = 0.
 
     ```
     >>> import jax.numpy as jnp, tippe
@@ -147,7 +147,7 @@ class ConvexBody(AbstractBody):
             yield Bound(least, "least radius of curvature by support", above=0.0, why="the body is convex")
 
     def _samples(self) -> tuple[Float[Array, "samples ..."], ...]:
-        """Height and the two radii of curvature over the inclinations [m]."""
+        """Height and the two radii of curvature at the checked inclinations [m]."""
 
         def sample(cosine: Float[Array, ""]) -> tuple[Float[Array, "..."], ...]:
             lever = self.meridian.at(cosine)
@@ -165,7 +165,7 @@ class ConvexBody(AbstractBody):
 
 
 class SupportMeridian(AbstractMeridian):
-    """The lever by differentiation of the support function; `per_inertia`: m / I1 [1/m^2]."""
+    """The contact geometry by differentiation of the support function; `per_inertia`: m / I1 [1/m^2]."""
 
     support: Any
     per_inertia: Float[Array, "..."]

@@ -33,32 +33,36 @@ from .body import AbstractBody, AbstractMeridian
 from .friction import AbstractFriction, ContactLoad, Slip
 from .state import parts
 
-#: No angle has this cosine: it stands for the angle of runs that go on through all of them.
+#: The cosine of no angle, for runs without a target angle.
 NO_COSINE = -2.0
 
-#: Stiffness (`Motion.stiffness`) at which a contact counts as jammed. N grows as its inverse while it falls to zero as the root
-#: of the time left, so a run ends too early by the square of this in units of 1e-4 s or so: by 1e-12 s, and 100 times as much
-#: with ten times the value, in `tests/physics/test_strong_friction.py`; theta errs by 5e-13 there, velocities by 1e-4.
+#: Value of `Motion.painleve_factor` at which a contact counts as jammed. N grows as its inverse, and the factor falls
+#: to zero as the square root of the remaining time, so a run ends too early by the square of this value in units of
+#: about 1e-4 s: by 1e-12 s, and 100 times as much with ten times the value, in `tests/physics/test_strong_friction.py`;
+#: theta errs by 5e-13 there, velocities by 1e-4.
 JAMMED = 1e-4
 
-#: Room (`Motion.room`) at which the ball no longer fits: a curvature of the arena has reached 1/R. The foot runs away there as
-#: the root of the time left, so a run ends too early by the square of this in units of 0.1 s or so.
+#: Value of `Motion.room` at which the ball no longer fits, because a curvature of the arena reaches 1/R. There the foot
+#: moves as the square root of the remaining time, so a run ends too early by the square of this value in units of about
+#: 0.1 s.
 FITS = 1e-4
 
-#: Rate of a frame that turns with a top that inverts, as a fraction of L_n / I1 (`Dynamics.turning`). Of 0.5, 0.7, 0.85 and 1
-#: it is the fastest at equal error, or as fast as the fastest, in five scenes on the plane: 1 to 2.6 times as fast as at rest.
+#: Rate of a frame that turns with an inverting top, as a fraction of L_n / I1 (`Dynamics.turning`). Among 0.5, 0.7,
+#: 0.85 and 1, this is the fastest at equal error, or close to it, in five scenes on the plane: 1 to 2.6 times as fast
+#: as a frame at rest.
 TURNING = 0.7
 
-#: How a contact can end; the index stands for the word.
+#: The ways in which a contact can end; the index is the code of the word.
 LOSSES = (Status.CONTACT_LOST, Status.JAMMED, Status.DOES_NOT_FIT)
 
 
 class Motion(NamedTuple):
-    """What the equations of motion give for one state, every vector in the moving frame.
+    """The result of the equations of motion for one state, with all vectors in the moving frame.
 
-    `painleve_factor` is the factor of N in its equation, 1 + m a A in `tippe.md`, section 2: 1 without an offset, and zero
-    if the friction due to each newton of N pulls the top down as hard as that newton pushes it up. `velocity` is that of
-    the point that the frame carries along. `room` is positive where the ball fits, `None` where it does everywhere.
+    `painleve_factor` is the factor of N in its equation, 1 + m a A in `tippe.md`, section 2: 1 without an offset, and
+    zero if the friction due to each newton of N pulls the top down as strongly as that newton pushes it up. `velocity`
+    is that of the point with which the frame moves. `room` is positive where the ball fits, `None` if it fits
+    everywhere.
     """
 
     rate: tuple[Component, ...]
@@ -80,7 +84,7 @@ class Motion(NamedTuple):
 class Dynamics(eqx.Module):
     """A scene with the combinations of its numbers that every evaluation needs, computed once.
 
-    `turns` is the rate at which the frame turns about n besides, as a fraction of L_n / I1; `None` if it does not.
+    `turns` is the additional rate of the frame about n, as a fraction of L_n / I1; `None` if there is none.
     """
 
     frame: AbstractFrame
@@ -99,7 +103,7 @@ class Dynamics(eqx.Module):
     ) -> "Dynamics":
         """The equations for a body on an arena.
 
-        **Arguments:** `frame`: that of the body on the arena; the others as for `Scene`.
+        **Arguments:** `frame`: the frame of the body on the arena; the others as for `Scene`.
         """
         return cls(
             frame=frame,
@@ -113,28 +117,32 @@ class Dynamics(eqx.Module):
         )
 
     def turning(self, turns: Float[Array, "..."]) -> Self:
-        """The same equations in a frame that turns about n, for an arena on which all directions across n are alike.
+        """The same equations in a frame that turns about n, for an arena on which all directions across n are
+        equivalent.
 
-        While a top inverts, L keeps its direction almost in a frame at rest, and the axis runs around it at L / I1. In this
-        frame each turns at a part of that rate: steps are longer, and errors, which no longer add up along a circle, smaller.
+        While a top inverts, L keeps its direction nearly constant in a frame at rest, and the axis turns about it at L
+        / I1. In the turning frame, each turns at a fraction of this rate: steps are longer, and errors are smaller,
+        because they no longer add up along a circle.
         """
         return dataclasses.replace(self, turns=turns)
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
-        """Evaluate the equations of motion, with the normal force solved for including friction.
+        """Evaluate the equations of motion, solving for the normal force with friction included.
 
         **Arguments:**
 
         - `state`: (8 + the arena's place, ...) as `state.py` describes it.
 
-        **Returns:** a `Motion`; `rate` is (m/s^2, 1/s, N m, 1/s). Source: `tippe.md`, section 2 (i)-(iii); with the lever of
-        `body.py` in place of a and R, on the plane, the height's second rate H' c'' + H'' c'^2 in N.
+        **Returns:** a `Motion`; `rate` is (m/s^2, 1/s, N m, 1/s). Source: `tippe.md`, section 2 (i)-(iii); for other
+        bodies on the plane with the A and B of `body.py` for a and R, and the height's second rate H' c'' + H'' c'^2 in
+        N.
         """
         (u1, u2), e, L, place = parts(state)
         a, R, coupling, growth = self.meridian.at(e[2])
 
-        # The axis turns with the body; V is the velocity of the centre of the sphere that touches as the body does, o the rate
-        # at which the frame turns. The frame carries that centre, or what is below it if the sphere is another at each moment.
+        # The axis turns with the body. V is the velocity of the centre of the sphere that touches as the body does, o
+        # the rate at which the frame turns. The frame moves with this centre, or, if the sphere changes, with the point
+        # below it.
         e_dot = scale(self.per_transverse, cross(L, e))
         V = (u1 + a * e_dot[0], u2 + a * e_dot[1])
         changing = multiply(growth, e_dot[2])
@@ -160,7 +168,7 @@ class Dynamics(eqx.Module):
 
         M1, M2, M3 = stored(M1, M2, M3)
 
-        # n . acceleration of the centre = centripetal; N is on both sides through M.
+        # n . acceleration of the centre = centripetal; N occurs on both sides through M.
         centripetal = dot(V, o)
         pull = add(multiply(self.gravity, up[2]), centripetal)
         load = self.mass * pull - coupling * (L[0] * e_dot[1] - L[1] * e_dot[0])
@@ -186,29 +194,31 @@ class Dynamics(eqx.Module):
         return stacked(self.motion(state).rate, state)
 
     def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Positive while the contact persists and Coulomb's law has an answer: the least of `margins`."""
+        """Positive while the contact persists and Coulomb's law has a solution: the least of `margins`."""
         return least(*self.margins(state))
 
     def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-        """How a contact has ended whose margin is zero: a code in `LOSSES`."""
+        """How a contact with zero margin has ended: a code in `LOSSES`."""
         lost, *others = self.margins(state)
-        # At the located end a margin is round-off of either sign; where another has vanished N is many times the weight.
+        # At the located end, the margin is round-off of either sign; if another margin has vanished, N is many times
+        # the weight.
         return len(others) - jnp.argmin(jnp.stack([*others[::-1], jnp.maximum(lost, 0.0)]), axis=0)
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
-        """For each of `LOSSES` what is left: the normal force as a fraction of the weight, plus a round-off allowance for a
-        start with N = 0; the excess of the stiffness over `JAMMED`; that of the room over `FITS`, if the room may end."""
+        """The margin for each of `LOSSES`: the normal force as a fraction of the weight, plus a round-off allowance for
+        a start with N = 0; the excess of the Painlevé factor over `JAMMED`; the excess of the room over `FITS`, if it
+        can end."""
         motion = self.motion(state)
         lost, jammed = motion.normal_force / (self.mass * self.gravity) + 1e-12, motion.painleve_factor - JAMMED
         return (lost, jammed) if motion.room is None else (lost, jammed, motion.room - FITS)
 
 
 def turned(vector: Vector, rate: Float[Array, "..."]) -> Vector:
-    """Rate of the components of a fixed vector in a frame that turns about n at some rate [rad/s]."""
+    """Rate of the components of a fixed vector in a frame that turns about n at a given rate [rad/s]."""
     return rate * vector[1], -(rate * vector[0]), None
 
 
 def stacked(rate: tuple[Component, ...], state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-    """Stack components along axis 0, with zeros where one vanishes identically."""
+    """Stack components along axis 0, with zeros for those that vanish identically."""
     zero = jnp.zeros_like(state[0])
     return jnp.stack([zero if component is None else jnp.broadcast_to(component, zero.shape) for component in rate])

@@ -1,4 +1,4 @@
-"""Friction at the contact, per unit normal force. A new law is one new class."""
+"""Friction at the contact, per unit normal force. Each law is a class."""
 
 import abc
 import math
@@ -14,7 +14,7 @@ from nonholonomic.validation import Bound, Bounded, as_number, require_kind
 
 
 class Slip(NamedTuple):
-    """How the body moves on the arena at the contact, in the moving frame (t1, t2, n).
+    """The motion of the body at the contact, in the moving frame (t1, t2, n).
 
     - `x`, `y`: velocity of the material contact point along the arena [m/s].
     - `turning`: angular velocity of the body [rad/s]; its component along n, the drilling, is `None` unless the law
@@ -27,7 +27,7 @@ class Slip(NamedTuple):
 
 
 class ContactLoad(NamedTuple):
-    """What friction does at the contact per unit normal force, in the moving frame.
+    """The effect of friction at the contact per unit normal force, in the moving frame.
 
     - `force`: the tangential force [1].
     - `torque`: the torque about the contact point [m].
@@ -43,15 +43,14 @@ class ContactLoad(NamedTuple):
         return add(dot(self.force, (slip.x, slip.y)), dot(self.torque, slip.turning))
 
 
-#: What the message about something that is no friction law adds.
+#: Addition to the message about an object that is not a friction law.
 A_LAW = " law, such as tippe.Viscous(0.3) or tippe.Coulomb(mu=0.3, slip_speed=0.01)"
 
 
 class AbstractFriction(Bounded):
     """A friction law whose force and torque are proportional to the normal force.
 
-    That is what makes it a law for impacts too: force and torque act during the normal impulse as they do under the normal
-    force.
+    This makes it a law for impacts, too: force and torque act during the normal impulse as under the normal force.
 
     **Example:**
 
@@ -72,12 +71,12 @@ class AbstractFriction(Bounded):
 
     def __init_subclass__(cls, **options: Any):
         super().__init_subclass__(**options)
-        # A law made from another must say it anew.
+        # A law derived from another one must declare this again.
         if "per_normal_force" in cls.__dict__ and "isotropic" not in cls.__dict__:
-            # The types see the property of the base class only.
+            # The types only know the property of the base class.
             cls.isotropic = property(lambda self: False)  # pyright: ignore[reportAttributeAccessIssue]
 
-    #: Whether the force of a contact at rest is whatever keeps it at rest, within limits.
+    #: Whether friction on a contact at rest takes whatever value keeps it at rest, within limits.
     set_valued: ClassVar[bool] = False
 
     @property
@@ -87,8 +86,9 @@ class AbstractFriction(Bounded):
 
     @property
     def isotropic(self) -> bool:
-        """Whether the law is the same in all directions along the arena: tables on the level plane are then faster and more
-        accurate (`Scene.turning_dynamics`). A law that claims this wrongly gives wrong tables."""
+        """Whether the law is the same in all directions along the arena; tables on the level plane are then faster and
+        more accurate (`Scene.turning_dynamics`). If this is `True` for a law that is not isotropic, tables are
+        wrong."""
         return False
 
     @abc.abstractmethod
@@ -104,7 +104,7 @@ class AbstractFriction(Bounded):
 
 
 class Frictionless(AbstractFriction):
-    """No friction: the arena pushes along its normal only.
+    """No friction: the arena pushes only along its normal.
 
     **Example:**
 
@@ -162,11 +162,11 @@ class Viscous(AbstractFriction):
 class Coulomb(AbstractFriction):
     """Regularised Coulomb friction, F = -mu N v_s / sqrt(v_s^2 + slip_speed^2) (`tippe.md`, section 3).
 
-    The regularisation creeps: below the slip speed the law is viscous with the coefficient mu / slip_speed, and a top
-    that would stick and roll under exact Coulomb friction may still turn over, in a time that grows as 1 / slip_speed.
-    Cohen's top (Am. J. Phys. 45 (1977) 12) takes 1.8, 5.9 and 50 s at 0.1, 0.01 and 0.001 m/s, and never turns over under
-    `SetValuedCoulomb`, the limit. Quote a result only together with its slip speed. The number of explicit steps grows as
-    1 / slip_speed too; from 1e-4 m/s down an implicit solver is cheaper (`benchmarks/hard/sticking.py`).
+    The regularised law creeps: below the slip speed it is viscous with the coefficient mu / slip_speed, and a top that
+    would stick and roll under exact Coulomb friction may still turn over, after a time that grows as 1 / slip_speed.
+    Cohen's top (Am. J. Phys. 45 (1977) 12) takes 1.8, 5.9 and 50 s at 0.1, 0.01 and 0.001 m/s, and never turns over
+    under `SetValuedCoulomb`, the limit. Always report the slip speed with a result. The number of explicit steps also
+    grows as 1 / slip_speed; at 1e-4 m/s and below, an implicit solver is cheaper (`benchmarks/hard/sticking.py`).
 
     **Arguments:**
 
@@ -209,9 +209,9 @@ class Contensou(AbstractFriction):
 
     F = -mu N v_s / Q and the torque -mu N Rb^2 w_n n / Q with Q = sqrt(v_s^2 + Rb^2 w_n^2 + slip_speed^2) and
     Rb = 3 pi / 16 contact_radius. The load is the gradient of the potential mu N Q, an ellipsoid that has the limits of
-    the disc under Hertz' pressure for pure sliding and for pure drilling. In between it departs from the disc's exact
-    force by at most 0.12 mu N and from its torque by at most 0.09 mu N contact_radius. As the radius tends to 0 it is
-    `Coulomb`.
+    the disc under Hertz' pressure for pure sliding and for pure drilling. Between these limits it differs from the
+    disc's exact force by at most 0.12 mu N and from its torque by at most 0.09 mu N contact_radius. As the radius tends
+    to 0, the law tends to `Coulomb`.
 
     **Arguments:**
 
@@ -260,10 +260,11 @@ class Contensou(AbstractFriction):
 
 
 class Rolling(AbstractFriction):
-    """Rolling resistance on top of a sliding law: a torque N resistance against the rolling (`tippe.md`, section 3).
+    """Rolling resistance in addition to a sliding law: a torque N resistance against the rolling (`tippe.md`, section
+    3).
 
     The torque is -N resistance w_t / sqrt(w_t^2 + turning_speed^2), with w_t the angular velocity without its component
-    along n: the normal force acts ahead of the contact point by the lever `resistance`.
+    along n: the normal force acts ahead of the contact point, at the distance `resistance`.
 
     **Arguments:**
 
@@ -291,9 +292,7 @@ class Rolling(AbstractFriction):
     def __check_init__(self):
         require_kind(self.sliding, "sliding", AbstractFriction, A_LAW)
         if isinstance(self.sliding, Rolling | NoSlip) or self.sliding.set_valued:
-            raise ValueError(
-                f"sliding = {self.sliding!r} must be a law of sliding that has a force at every slip velocity"
-            )
+            raise ValueError(f"sliding = {self.sliding!r} must be a sliding law with a force at every slip velocity")
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.resistance, "resistance", at_least=0.0)
@@ -346,13 +345,13 @@ class NoSlip(AbstractFriction):
 
 
 class SetValuedCoulomb(AbstractFriction):
-    """Exact Coulomb friction, without a slip speed: F = -mu N v_s / |v_s| while the contact slips, and any force
-    along the arena up to mu N while it does not (`tippe.md`, section 3).
+    """Exact Coulomb friction without a slip speed: F = -mu N v_s / |v_s| while the contact slips, and any force along
+    the arena up to mu N while it sticks (`tippe.md`, section 3).
 
-    The run is made of modes. In a slip the force has its full size; a slip that stops turns into rolling, with the
-    equations of `tippe/model/rolling.py`, if the force needed for that is within the friction cone; the top slips again as soon
-    as it is not. While it rolls the energy is constant. With `contact="hybrid"` a top without a stem flies on where contact is
-    lost, and slips, rolls or rebounds behind an impact (`tippe/modes/airborne_stick_slip.py`).
+    A run consists of modes. During a slip, the force has its full size. When the slip stops, the top rolls, with the
+    equations of `tippe/model/rolling.py`, if the required force is within the friction cone; the top slips again when
+    it no longer is. Rolling keeps the energy constant. With `contact="hybrid"`, a top without a stem flies when contact
+    is lost, and slips, rolls or rebounds after an impact (`tippe/modes/airborne_stick_slip.py`).
 
     **Arguments:**
 
@@ -379,14 +378,14 @@ class SetValuedCoulomb(AbstractFriction):
         yield Bound(self.mu, "mu", at_least=0.0)
 
     def per_normal_force(self, slip: Slip) -> ContactLoad:
-        """The load of a contact that slips; where it does not slip, the law does not define it, and the load is 0."""
+        """The load of a slipping contact; at zero slip, where the law does not define it, the load is 0."""
         speed = length(slip.x, slip.y)
         factor = -self.mu / jnp.where(speed > 0.0, speed, 1.0)
         return ContactLoad(force=(factor * slip.x, factor * slip.y))
 
 
 def length(x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Length of a vector of two components, its derivative 0 where it vanishes."""
+    """Length of a vector of two components, with derivative 0 where it vanishes."""
     square = x * x + y * y
     moving = square > 0.0
     return jnp.where(moving, jnp.sqrt(jnp.where(moving, square, 1.0)), 0.0)

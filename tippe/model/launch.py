@@ -1,4 +1,4 @@
-"""How a run starts."""
+"""Launches: how a run starts."""
 
 import math
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from nonholonomic.validation import Bound, Bounded, as_number, is_traced, requir
 
 
 def as_numbers(value: Any) -> Any:
-    """Several numbers as a tuple of arrays; `None`, and what is not several, is left for the check."""
+    """Several numbers as a tuple of arrays; `None` and single values are left for later checks."""
     if value is None or isinstance(value, str) or getattr(value, "ndim", 1) == 0:
         return value
     try:
@@ -23,34 +23,34 @@ def as_numbers(value: Any) -> Any:
         return value
 
 
-#: Spins above this [rad/s] make one suspect revolutions a minute: by hand a top gets 100 to 300 rad/s, 1000 to 3000 rpm.
+#: Spins above this [rad/s] suggest revolutions per minute: by hand a top gets 100 to 300 rad/s, 1000 to 3000 rpm.
 FASTEST = 1000.0
 
 
 class Launch(Bounded):
-    """A start: where the top stands on the arena, how it leans, how it spins and moves.
+    """A launch: position on the arena, inclination, spin and velocity of the top.
 
-    The axis is e = cos(theta) n + sin(theta) (cos(azimuth) t1 + sin(azimuth) t2), with n the arena's normal into the room where
-    the top is. In a cylinder t1 points along growing eta and t2 along y. On other arenas t1 is the projection of the x axis
-    onto the tangent plane, of the y axis where n is along x, and t2 = n x t1; inside a sphere, where the place is given by
-    `eta`, t1 points along growing eta.
+    The axis is e = cos(theta) n + sin(theta) (cos(azimuth) t1 + sin(azimuth) t2), with n the arena's normal towards the
+    top. In a cylinder, t1 points along growing eta and t2 along y. On other arenas, t1 is the projection of the x axis
+    onto the tangent plane (of the y axis where n is along x), and t2 = n x t1; inside a sphere, if the place is given
+    by `eta`, t1 points along growing eta.
 
     **Arguments:**
 
     - `theta`: angle [rad] from the arena's normal to the axis, in [0, pi]; 0 is stem out, pi is stem in.
     - `spin`: angular velocity about the axis [rad/s].
-    - `eta`: angle [rad] of the place from the arena's lowest point, in [-pi, pi]; on arenas that count no such angle, 0.
+    - `eta`: angle [rad] of the place from the arena's lowest point, in [-pi, pi]; 0 on arenas without such an angle.
     - `azimuth`: direction [rad] in which the axis leans, from t1 towards t2.
-    - `place`: where the top touches the arena, instead of `eta`: (x, y) [m] on a plane, along it, a paraboloid and a graph;
-      (y, eta) on a cylinder; (mu, eta) [rad], azimuth and angle from the lowest point, on a sphere, spheroid or torus;
-      or (x, y, z) [m], a point of the arena but for round-off.
-    - `velocity`: (2,) [m/s] of the sphere's centre, of other bodies of the centre of mass, along (t1, t2); at rest by
-      default.
-    - `angular_velocity`: (3,) [rad/s] in (t1, t2, n), besides the spin about the axis; none by default.
+    - `place`: where the top touches the arena, instead of `eta`: (x, y) [m] on a plane, along it, a paraboloid and a
+      graph; (y, eta) on a cylinder; (mu, eta) [rad], azimuth and angle from the lowest point, on a sphere, spheroid or
+      torus; or (x, y, z) [m], a point of the arena up to round-off.
+    - `velocity`: (2,) [m/s] along (t1, t2), of the sphere's centre, or of the centre of mass for other bodies; at rest
+      by default.
+    - `angular_velocity`: (3,) [rad/s] in (t1, t2, n), in addition to the spin about the axis; zero by default.
 
     **Raises:** `ValueError` for numbers outside these ranges.
 
-    **Example:** half a metre up the x side of a bowl, moving across at 0.2 m/s.
+    **Example:** half a metre up the x side of a bowl, moving sideways at 0.2 m/s.
 
     ```
     >>> import tippe
@@ -79,7 +79,7 @@ class Launch(Bounded):
 
     @classmethod
     def degrees(cls, theta: Any, rpm: Any, *, eta: Any = 0.0, azimuth: Any = 0.0, **others: Any) -> "Launch":
-        """A start in degrees and revolutions per minute.
+        """A launch in degrees and revolutions per minute.
 
         **Arguments:**
 
@@ -88,7 +88,7 @@ class Launch(Bounded):
         - `eta`, `azimuth`: as for `Launch`, in degrees.
         - `others`: `place`, `velocity` and `angular_velocity`, as for `Launch`, in SI units.
 
-        **Returns:** a `Launch`, whose numbers are in SI units.
+        **Returns:** a `Launch` with numbers in SI units.
 
         **Raises:** `ValueError` for numbers outside these ranges.
 

@@ -2,7 +2,7 @@
 
 The state has the layout of `dynamics.py`, so that a run can slip and roll in turn. While the top rolls, its velocity
 follows from axis and angular momentum, u = r x w with r = a e - R n from the centre of mass to the contact; the two
-components in the state are carried along but not used.
+velocity components of the state are integrated but not used.
 """
 
 import equinox as eqx
@@ -34,7 +34,7 @@ from .top import Top
 class RollingDynamics(eqx.Module):
     """The equations of motion of a body whose contact point is at rest on the arena.
 
-    Friction is whatever force that takes; whether the law in force allows it is for the caller to see
+    Friction is the force that rolling requires; the caller must check whether the friction law allows it
     (`RollingDynamics.grip`).
     """
 
@@ -70,11 +70,12 @@ class RollingDynamics(eqx.Module):
         return stacked(self.motion(state).rate, state)
 
     def reaction(self, state: Float[Array, "components ..."]) -> Vector:
-        """Force of the arena on the top [N] in the moving frame: along it, and the normal force."""
+        """Force of the arena on the top [N] in the moving frame: the components along the arena, and the normal
+        force."""
         return self._evaluate(state)[1]
 
     def grip(self, state: Float[Array, "components ..."], mu: Float[Array, "..."]) -> Float[Array, "..."]:
-        """What friction has in reserve, mu N - |F_t|, as a fraction of the weight; negative where the top must slip.
+        """Reserve of friction, mu N - |F_t|, as a fraction of the weight; negative where the top must slip.
 
         **Arguments:**
 
@@ -85,7 +86,7 @@ class RollingDynamics(eqx.Module):
         return (mu * N - length(F1, F2)) / (self.mass * self.gravity)
 
     def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """The state with the velocity that axis and angular momentum give the rolling top."""
+        """The state with the velocity that follows from axis and angular momentum of the rolling top."""
         _, e, L, place = parts(state)
         u = cross(self._contact(e), angular_velocity(self, e, L))
         return joined(u[:2], e, L, place)
@@ -125,16 +126,16 @@ class RollingDynamics(eqx.Module):
         return Motion(rate, F[2], load, slip, V, o, dot(L, e), 1.0 + still, room), F
 
     def with_slip(self, state: Float[Array, "components ..."], slip: Slip) -> Float[Array, "components ..."]:
-        """The state after the blow at the contact that gives the contact point the stated velocity along the arena.
+        """The state after an impulse at the contact that gives the contact point the given velocity along the arena.
 
-        The angular momentum about the contact, K = L - m r x u, does not see the blow: w solves
-        (J + m (r^2 - r r^T)) w = K + m r x v, and u = r x w + v. Jellett's quantity is kept, and a blow that stops the slip
-        takes the energy of v in the metric of the contact's inertia.
+        The angular momentum about the contact, K = L - m r x u, does not change in the impulse: w solves (J + m (r^2 -
+        r r^T)) w = K + m r x v, and u = r x w + v. Jellett's quantity is constant, and an impulse that stops the slip
+        dissipates the energy of v in the metric of the contact's inertia.
 
         **Arguments:**
 
         - `state`: (8 + the arena's place, ...).
-        - `slip`: velocity v of the contact point after the blow [m/s].
+        - `slip`: velocity v of the contact point after the impulse [m/s].
 
         **Returns:** the state, of the same shape.
         """
@@ -151,7 +152,8 @@ class RollingDynamics(eqx.Module):
         return joined(u[:2], e, L, place)
 
     def blow(self, state: Float[Array, "components ..."], axis: int) -> tuple[Component, ...]:
-        """The blow at the contact that changes the velocity of the contact point by 1 m/s along an axis of the arena [N s].
+        """The impulse at the contact that changes the velocity of the contact point by 1 m/s along an axis of the arena
+        [N s].
 
         **Arguments:**
 

@@ -1,4 +1,4 @@
-"""The scene: what moves, on what arena, with what friction, under what gravity."""
+"""The scene: body, arena, friction and gravity."""
 
 import math
 from collections.abc import Iterator
@@ -42,24 +42,24 @@ from .state import angular_velocity, inclination, joined, parts
 from .stick_slip import StickSlip
 from .top import Top
 
-#: The body's class: what only a sphere can do takes a `Scene[Top]`.
+#: The body's class: code that needs a sphere takes a `Scene[Top]`.
 Body = TypeVar("Body", bound=AbstractBody | AbstractRigidBody)
 
-#: Tilt [rad] of a launch below which errors across the normal are measured in proportion to it.
+#: Tilt [rad] of a launch below which errors across the normal are measured in proportion to the tilt.
 NEARLY_UPRIGHT = 1e-2
 
-#: How fast the foot of a top on a general arena is drawn back to it, over sqrt(g / R); `tippe.md` has the drift.
+#: Rate at which the foot of a top on a general arena is pulled back to the arena, over sqrt(g / R).
 PULL = 1.0
 
 
-#: Arenas with a number above this [m] make one suspect another unit.
+#: Arenas with a number above this [m] suggest another unit.
 LARGEST_ARENA = 20.0
 
 
 class Scene(Bounded, Generic[Body]):
     """A tippe top on an arena.
 
-    Every number in it is a leaf of a pytree: it can be swept, traced and differentiated.
+    Every number in it is a leaf of a pytree: you can sweep, trace and differentiate it.
 
     **Arguments:**
 
@@ -71,13 +71,12 @@ class Scene(Bounded, Generic[Body]):
       or `Rolling(resistance, turning_speed, sliding)` with one of them; for a top without a stem also
       `SetValuedCoulomb(mu)`, for an `Ellipsoid` or a `RigidBody` also `NoSlip()`.
     - `gravity`: acceleration of free fall [m/s^2], positive.
-    - `contact`: "stop": a run ends where the contact is lost; "hybrid": it goes on through flights, impacts, and changes to
-      the stem and back (`modes/`). "stop" is the default, because the published models assume contact, because it holds for
-      every body and law, and because it compiles several times faster; a run that loses contact says how it ended, and that
-      "hybrid" follows the flight. A top with a stem needs "hybrid". One that comes to rest on its sphere and its stem at
-      once leans on both on the level plane; on any other arena its run ends there as "unresolved".
+    - `contact`: "stop" (the default): a run ends where the contact is lost; "hybrid": it continues through flights,
+      impacts, and changes to the stem and back (`modes/`). "stop" is faster to compile and works for every body and
+      law; a run that loses contact says so. A top with a stem needs "hybrid". If it comes to rest on its sphere and its
+      stem at once, it leans on both on the level plane; on any other arena its run ends there as "unresolved".
     - `restitution`: Newton's coefficient e_N of impacts [1], in [0, 1], for "hybrid" only; `None` is 0.
-    - `side`: "inside" or "outside" of a closed surface, "above" an open one; `None` is inside, or above.
+    - `side`: "inside" or "outside" of a closed surface, "above" an open one; `None` means inside, or above.
 
     **Raises:** `ValueError` if a part is of the wrong kind, if the top does not fit into the arena, if gravity is not
     positive, or if the arena, the body or the friction does not allow the contact.
@@ -115,12 +114,12 @@ class Scene(Bounded, Generic[Body]):
             raise ValueError(f"body = {self.body!r} must be {kinds}")
         require_kind(self.surface, "surface", AbstractSurface, ", such as tippe.Plane() or tippe.Cylinder(0.3)")
         require_kind(self.friction, "friction", AbstractFriction, A_LAW)
-        # This raises if the surface has no such side.
+        # This raises an error if the surface has no such side.
         self.surface.sign(self.side, "inside")
         if self.contact not in ("stop", "hybrid"):
             raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
         if self.restitution is not None and self.contact == "stop":
-            raise ValueError(f"restitution = {self.restitution!r} must be left out where contact = 'stop'")
+            raise ValueError(f"restitution = {self.restitution!r} must be omitted for contact = 'stop'")
         if isinstance(self.friction, NoSlip) and not isinstance(self.body, AbstractRigidBody):
             raise ValueError(
                 f"friction = NoSlip() must be another law for a {type(self.body).__name__}, such as Coulomb; describe the body "
@@ -131,22 +130,24 @@ class Scene(Bounded, Generic[Body]):
             return
         if self.friction.set_valued and self.body.stem is not None:
             raise ValueError(
-                f"friction = {self.friction!r} must be a law without phases for a top with a stem, such as Coulomb: which of "
-                "two contacts sticks and which slips has no single answer"
+                f"friction = {self.friction!r} must be a law with a single mode for a top with a stem, such as Coulomb: "
+                "with two contacts it is undetermined which one sticks"
             )
         if self.contact == "stop" and self.body.stem is not None:
             raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
 
     def _check_convex(self) -> None:
-        """Raise `ValueError` for what only a sphere can: its contact follows from the place of its centre."""
+        """Raise `ValueError` for options that need a sphere, whose contact follows from the place of its centre."""
         kind = type(self.body).__name__
         kind = f"an {kind}" if kind[0] in "AEIOU" else f"a {kind}"
         if not isinstance(self.surface, Plane):
             raise ValueError(f"surface = {self.surface!r} must be a Plane for {kind}; a Top runs on any arena")
         if self.contact != "stop":
-            raise ValueError(f"contact = {self.contact!r} must be 'stop' for {kind}; a Top flies on")
+            raise ValueError(f"contact = {self.contact!r} must be 'stop' for {kind}; only a Top can fly")
         if self.friction.set_valued:
-            raise ValueError(f"friction = {self.friction!r} must be a law without phases for {kind}, such as Coulomb")
+            raise ValueError(
+                f"friction = {self.friction!r} must be a law with a single mode for {kind}, such as Coulomb"
+            )
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.gravity, "gravity", above=0.0)
@@ -173,7 +174,7 @@ class Scene(Bounded, Generic[Body]):
         """The moving frame of the body on the arena."""
         side, pull = self.surface.sign(self.side, "inside"), PULL * jnp.sqrt(self.gravity / self.body.size)
         if self.contact == "hybrid" and not self.flies_in_closed_form:
-            # A flight takes the top anywhere: the frame that knows where it is.
+            # A flight can take the top anywhere, so use the frame that stores its position.
             return CarriedFrame.of(self.surface, self.body.size, pull, side)
         return frame_of(self.surface, side, self.body.size, pull)
 
@@ -184,12 +185,13 @@ class Scene(Bounded, Generic[Body]):
 
     @property
     def flies_in_closed_form(self) -> bool:
-        """Whether flights of a hybrid scene need no integration: over a level plane, under a law with a single mode."""
+        """Whether flights of a hybrid scene need no integration: above a level plane, under a law with a single
+        mode."""
         return self.level and not self.friction.set_valued
 
     @property
     def dynamics(self) -> Dynamics | StickSlip | AbstractRigidDynamics:
-        """The equations of motion, with the combinations of the scene's numbers that they need."""
+        """The equations of motion, with the precomputed combinations of the scene's numbers."""
         numbers = (self.frame, self.friction, self.gravity)
         if isinstance(self.body, AbstractRigidBody):
             return rigid_dynamics(self.body, *numbers)
@@ -199,15 +201,16 @@ class Scene(Bounded, Generic[Body]):
 
     @property
     def turning_dynamics(self) -> Dynamics | StickSlip | AbstractRigidDynamics:
-        """The equations of motion for questions about angles, times, energies or forces, whose answers are cheaper so.
+        """The equations of motion for angles, times, energies and forces, which are cheaper in a turning frame.
 
-        On a level plane under an isotropic law the frame turns with the top, and how far it has turned is not known afterwards.
+        On a level plane under an isotropic law, the frame turns with the top; its direction is not known afterwards.
         """
         equations, body = self.dynamics, self.body
         alike = self.level and self.friction.isotropic
         if not (isinstance(equations, Dynamics) and isinstance(body, Top)) or not alike:
             return equations
-        # The other tops, of group I (`steady.py`), soon stand upright with their axis beside L: turning would move both.
+        # The other tops, of group I (`steady.py`), soon stand upright with their axis beside L; a turning frame would
+        # move both.
         may_invert = 1.0 - body.offset / body.radius < body.I1 / body.I3
         return equations.turning(jax.lax.stop_gradient(jnp.where(may_invert, TURNING, 0.0)))
 
@@ -216,7 +219,7 @@ class Scene(Bounded, Generic[Body]):
         require_all(self.start_bounds(launch))
 
     def start_bounds(self, launch: Launch) -> Iterator[Bound]:
-        """The ranges that the arena sets for a launch.
+        """The ranges of a launch's numbers on this arena.
 
         **Raises:** `ValueError` for a place with the wrong number of numbers.
         """
@@ -228,7 +231,7 @@ class Scene(Bounded, Generic[Body]):
         names, kind = [name for name, _ in surface.coordinates], type(surface).__name__
         if launch.place is None:
             if len(names) == 3:
-                raise ValueError(f"place = None must be (x, y, z) on a {kind}, which names no place by eta")
+                raise ValueError(f"place = None must be (x, y, z) on a {kind}, which has no places by eta")
             if "eta" not in names and not isinstance(self.frame, PlaneFrame):
                 yield Bound(launch.eta, "eta", at_least=0.0, at_most=0.0, why=f"a place on a {kind} is given by place")
             return
@@ -271,11 +274,12 @@ class Scene(Bounded, Generic[Body]):
         return joined(u, e, L, self.start(launch)[0])
 
     def scales(self, launch: Launch) -> Float[Array, "components ..."]:
-        """Magnitudes by which absolute errors of the state are measured, component by component.
+        """Scales of absolute errors of the state, component by component.
 
-        Velocities count in units of sqrt(g R) with the body's size R, directions in units of 1, angular momenta in units of the
-        launch's own, or of I1 sqrt(g / R) where that is more. For a launch within `NEARLY_UPRIGHT` of the normal, what vanishes
-        with the tilt counts in proportion to it; otherwise errors would hide its growth, which decides when the top turns over.
+        Velocities are measured in units of sqrt(g R) with the body's size R, directions in units of 1, angular momenta
+        in units of the launch's own, or of I1 sqrt(g / R) if that is more. For a launch within `NEARLY_UPRIGHT` of the
+        normal, components that vanish with the tilt are measured in proportion to it; otherwise errors would hide their
+        growth, which decides when the top turns over.
 
         **Arguments:** as for `state`. **Returns:** an array (components, ...) in SI units.
         """
@@ -336,11 +340,11 @@ class Scene(Bounded, Generic[Body]):
         return 0.5 * body.mass * speed2 + rotation + body.mass * self.gravity * height
 
     def jellett(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Jellett's quantity L.(R n - a e) [kg m^3/s]: for a sphere constant on the plane under every friction at the contact
-        point. Of other bodies -L.r, which is constant only nearly, and while they spin fast.
+        """Jellett's quantity L.(R n - a e) [kg m^3/s]: for a sphere on the plane, constant under every friction at the
+        contact point. For other bodies -L.r, which is nearly constant while they spin fast.
 
-        On a curved arena it changes at the rate R L.n', and a contact torque N tau changes it at the rate
-        N tau.(R n - a e) (`tippe.md`, section 2).
+        On a curved arena it changes at the rate R L.n', and a contact torque N tau changes it at the rate N tau.(R n -
+        a e) (`tippe.md`, section 2).
         """
         _, e, L, _ = parts(state)
         if isinstance(self.body, AbstractRigidBody):

@@ -1,19 +1,19 @@
-"""The onset of a slip: one implicit step from a contact at rest to one that slips, as long as the tolerance lets it be.
+"""The onset of a slip: one implicit step from a contact at rest to a slipping one, as long as the tolerance allows.
 
-With G what friction lacks of the force that rolling takes, the slip velocity v changes as v' = M G, M the contact's inverse
-mass along the arena. Where rolling leaves the friction cone G = 0, and so the slip's acceleration; both grow in proportion to
-the time t since. Of all solutions that begin there one alone is smooth: v = c t^2 d + O(t^3), with d against the force
-of rolling and
+Let G be the force that rolling requires beyond the friction cone. The slip velocity v changes as v' = M G, where M is
+the contact's inverse mass along the arena. Where rolling leaves the cone, G = 0, and so is the slip's acceleration;
+both grow in proportion to the time t since then. Of all solutions that begin there, only one is smooth: v = c t^2 d +
+O(t^3), with d against the force of rolling and
 
-    c = -m' / (2 (d . P_t + mu P_n)),   m = mu N - |F_t| of rolling, P the blow that gives the contact the velocity d;
+c = -m' / (2 (d . P_t + mu P_n)),   m = mu N - |F_t| of rolling, P the impulse that gives the contact the velocity d.
 
-a deviation of the slip's direction decays as exp(k / t), faster than any power, so no other is found by going forward,
-and no explicit method can begin there. A collocation method can: it asks nothing of the point t = 0 but the state, and the
-smooth solution's polynomial satisfies the equations wherever it is asked. This is one step of Radau IIA (Hairer and Wanner,
-Solving ODEs II, section IV.5), its equations solved by Newton's method in the slip velocity, which alone is stiff, and by
-iteration in the rest. A contact at rest whose rolling force is beyond the cone from the first begins with v = b t d +
-O(t^2), d the direction in which friction that opposes it lets it grow, near that against the force of rolling; the same step
-serves it.
+A deviation of the slip's direction decays as exp(k / t), faster than any power, so an explicit method cannot begin
+there. A collocation method can: it needs only the state at t = 0, and the polynomial of the smooth solution satisfies
+the equations at all nodes. This module takes one step of Radau IIA (Hairer and Wanner, Solving ODEs II, section IV.5).
+It solves the equations by Newton's method in the slip velocity, which alone is stiff, and by iteration in the other
+components. If the force of rolling is beyond the cone from the start, the contact begins with v = b t d + O(t^2), where
+d is the direction in which opposing friction lets the slip grow, close to that against the force of rolling; the same
+step applies.
 """
 
 from collections.abc import Callable
@@ -31,25 +31,25 @@ from .dynamics import Dynamics
 from .friction import Slip, length
 from .rolling import RollingDynamics
 
-#: Stages of the step. Its error falls as the power of this plus one of its length, its estimate as this power.
+#: Stages of the step. Its error is of the order of this plus one in its length, its estimate of this order.
 STAGES = 6
 
-#: Length of the first trial over tolerance^(1 / STAGES), in units of the shorter of sqrt(R / g) and the time for a radian. No
-#: error depends on it: a step whose estimate is too great is tried again, shorter.
+#: Length of the first trial over tolerance^(1 / STAGES), in units of the shorter of sqrt(R / g) and the time for a
+#: radian. It does not affect the error: a step with too large an estimate is repeated with a shorter length.
 FIRST = 5.0
 
-#: Estimates below this are round-off: where a slip of 1e-7 m/s begins, its direction has nine digits. The step's length
-#: follows the tolerance below this too; steps with an estimate of 1e-11 were found to err by 1e-13.
+#: Estimates below this are round-off: where a slip of 1e-7 m/s begins, its direction has nine digits. Below it, the
+#: step's length still follows the tolerance; steps with an estimate of 1e-11 were found to err by 1e-13.
 ROUNDING = 1e-10
 
-#: Trials of the length, and iterations for each; where they are not enough, the run has failed (none of 256 tops that slip and
+#: Trials of the length, and iterations for each; if they are not enough, the run fails (none of 256 tops that slip and
 #: stick for 4 s in a sphere).
 TRIALS, ITERATIONS = 10, 10
 
 
 def _radau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The nodes in (0, 1], what the integrals up to `x` are made of (coefficients of x, stage), and the row of the highest
-    Legendre coefficient."""
+    """The nodes in (0, 1], the coefficients of the integrals up to `x` (coefficients of x, stage), and the row of the
+    highest Legendre coefficient."""
     # The roots are real, but since NumPy 2.5 their type is complex.
     nodes = (np.sort(legendre.legroots([0.0] * (STAGES - 1) + [-1.0, 1.0]).real) + 1.0) / 2.0
     nodes[-1] = 1.0
@@ -69,9 +69,9 @@ WEIGHTS = np.vander(NODES, STAGES + 1, increasing=True) @ INTEGRALS
 class Onset(eqx.Module):
     """The beginning of a slip.
 
-    - `start`: the state at its onset, (components, ...); `length`: how long it is [s].
+    - `start`: the state at the onset, (components, ...); `length`: its duration [s].
     - `rates`: of the state at the step's stages, (components, stages, ...).
-    - `found`: whether it was found to the tolerance.
+    - `found`: whether the step reached the tolerance.
     """
 
     start: Float[Array, "components ..."]
@@ -85,7 +85,8 @@ class Onset(eqx.Module):
         return self.start + self.length * jnp.einsum("ps,p...,cs...->c...", INTEGRALS, powers, self.rates)
 
     def falls_to(self, component: int, value: Float[Array, "..."], first: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The fraction of the step, after `first`, at which a component of the state has fallen to a value; 1 if nowhere."""
+        """The fraction of the step, after `first`, at which a component of the state has fallen to a value; 1 if it
+        does not."""
         onset = Onset(
             self.start[component : component + 1], self.length, self.rates[component : component + 1], self.found
         )
@@ -97,7 +98,7 @@ class Onset(eqx.Module):
             return jnp.where(above, middle, low), jnp.where(above, high, middle)
 
         fraction = jax.lax.stop_gradient(jax.lax.fori_loop(0, 52, halved, (first, jnp.ones_like(first)))[1])
-        # Halving has no derivative: that is by the implicit function theorem.
+        # Halving has no derivative; the implicit function theorem gives it.
         height, rise = jax.jvp(lambda at: onset.at(at)[0], (fraction,), (jnp.ones_like(fraction),))
         missing = height - value
         inside = (fraction < 1.0) & (rise != 0.0)
@@ -106,7 +107,7 @@ class Onset(eqx.Module):
 
     @property
     def end(self) -> Float[Array, "components ..."]:
-        """The state at the end of the step, not a number where none was found."""
+        """The state at the end of the step, NaN if no step was found."""
         moved = self.start + self.length * jnp.einsum("s,cs...->c...", WEIGHTS[-1], self.rates)
         return jnp.where(self.found, moved, jnp.nan)
 
@@ -122,14 +123,14 @@ def begin(
     most: Float[Array, "..."],
     tolerance: Float[Array, ""],
 ) -> Onset:
-    """The beginning of a slip from a contact at rest.
+    """Compute the beginning of a slip from a contact at rest.
 
     **Arguments:**
 
     - `slipping`, `rolling`: the equations with slip and without; `mu`: coefficient of friction [1].
-    - `field`: rate of the slipping state, with what else is integrated.
-    - `state`: at rest, (components, ...), the first `size` of which the equations know; `scales`: their magnitudes.
-    - `most`: how long it may be at most [s]; `tolerance`: of its estimated error, relative to the magnitudes.
+    - `field`: rate of the slipping state, including other integrated components.
+    - `state`: at rest, (components, ...), of which the equations use the first `size`; `scales`: their magnitudes.
+    - `most`: longest duration [s]; `tolerance`: of the estimated error, relative to the magnitudes.
 
     **Returns:** an `Onset`.
     """
@@ -140,7 +141,7 @@ def begin(
     scales = scales.reshape(scales.shape[:1] + (1,) * (state.ndim - scales.ndim) + scales.shape[1:])
 
     def iterated(age, times):
-        """Slip velocities and rates at the stages: one loop, so that the equations are compiled once."""
+        """Slip velocities and rates at the stages, in one loop, so that the equations are compiled once."""
 
         def newton(_, carry):
             v, moved, _, _ = carry
@@ -151,7 +152,7 @@ def begin(
             change = contact.correction(age, v, jnp.stack([slip.x, slip.y]) - v)
             return v + change, moved, change, rates
 
-        # The force of rolling must have changed as it does, or Newton's first correction would stop the slip.
+        # The force of rolling must have changed accordingly, or Newton's first correction would stop the slip.
         rolled = state[:, None] + times * rolls[:, None]
         v = contact.first_guess(times)
         return jax.lax.fori_loop(0, ITERATIONS, newton, (v, rolled, v, jnp.zeros_like(rolled)))
@@ -162,10 +163,10 @@ def begin(
         _, moved, change, rates = iterated(age, times)
         unsettled = jnp.max(length(*change), axis=0) / contact.speed
         highest = age * jnp.abs(jnp.einsum("s,cs...->c...", HIGHEST, rates))
-        # The scales of a launch that stands upright but for round-off are next to nothing.
+        # The scales of a launch that is upright up to round-off are nearly zero.
         sizes = jnp.maximum(scales, jnp.max(jnp.abs(moved), axis=1))
         error = jnp.maximum(jnp.max((highest / sizes)[:size], axis=0), unsettled)
-        # The contact must persist, or the slip would pass by its loss.
+        # The contact must persist, or the slip would miss its loss.
         lost = jnp.min(slipping.contact_margin(moved[:size]), axis=0) <= 0.0
         error = jnp.where(jnp.isfinite(error) & ~lost, error, jnp.inf)
         converged = error <= jnp.maximum(tolerance, ROUNDING)
@@ -183,11 +184,12 @@ def begin(
 
 
 class _Contact(eqx.Module):
-    """What decides how a contact at rest begins to slip.
+    """The quantities that decide how a contact at rest begins to slip.
 
-    - `direction`: against the force of rolling; `rise`: the slip's acceleration [m/s^2] and half its rate [m/s^3] at once.
+    - `direction`: against the force of rolling; `rise`: the slip's acceleration [m/s^2] and half its rate [m/s^3] at
+      the start.
     - `inverse_mass`: M [1/kg] as (M11, M12, M22); `lifted`: n, the change of N by the force along the arena.
-    - `mu`; `unloaded`: N if there were no force along the arena [N]; `speed`: sqrt(g R) [m/s]; `unit`: of time [s].
+    - `mu`; `unloaded`: N without a force along the arena [N]; `speed`: sqrt(g R) [m/s]; `unit`: of time [s].
     """
 
     direction: Float[Array, "2 ..."]
@@ -214,7 +216,7 @@ class _Contact(eqx.Module):
         force = jnp.where(force > 0.0, force, 1.0)
         d = jnp.stack([-F1 / force, -F2 / force])
 
-        # The blows that give the contact unit velocities: P_t = M^-1 v and P_n = -n . P_t.
+        # The impulses that give the contact unit velocities: P_t = M^-1 v and P_n = -n . P_t.
         (a, b, f), (_, c, h) = rolling.blow(state, 0), rolling.blow(state, 1)
         determinant = a * c - b * b
         lifted = jnp.stack([b * h - c * f, b * f - a * h]) / determinant
@@ -227,16 +229,17 @@ class _Contact(eqx.Module):
         return cls(d, rise, inverse_mass, lifted, mu, N + lifted[0] * F1 + lifted[1] * F2, speed, unit)
 
     def first_guess(self, times: Float[Array, "stages ..."]) -> Float[Array, "2 stages ..."]:
-        """The slip velocity that the limit of the equations says [m/s]."""
+        """The slip velocity in the limit of small times [m/s]."""
         return self.direction[:, None] * (self.rise[0] + self.rise[1] * times) * times
 
     def correction(
         self, age: Float[Array, "..."], v: Float[Array, "2 stages ..."], missing: Float[Array, "2 stages ..."]
     ) -> Float[Array, "2 stages ..."]:
-        """Newton's correction of the slip velocities: only the slip's direction makes the equations stiff.
+        """Newton's correction of the slip velocities; only the slip's direction makes the equations stiff.
 
-        With F = -mu N d along the arena and N = N0 - n . F, so that N = N0 / (1 - mu n . d), a turn of d by eta changes the
-        acceleration by -eta mu N M (1 - mu d n^T)^-1 d', d' across d. Beyond the cone that N is not the one of rolling.
+        With F = -mu N d along the arena and N = N0 - n . F, so that N = N0 / (1 - mu n . d), a turn of d by eta changes
+        the acceleration by -eta mu N M (1 - mu d n^T)^-1 d', with d' across d. Beyond the cone, this N is not that of
+        rolling.
         """
         size = length(v[0], v[1])
         size = jnp.where(size > 0.0, size, 1.0)
@@ -252,8 +255,9 @@ class _Contact(eqx.Module):
         matrix = matrix + jnp.eye(STAGES).reshape((STAGES, STAGES) + (1,) * (size.ndim - 1)) * size
         turn = _solved(matrix, across[0] * missing[0] + across[1] * missing[1])
         change = missing - age * jnp.einsum("js,is...->ij...", WEIGHTS, pull * turn)
-        # The force asks for a slip's direction alone, and where a slip begins v is far less than what a small turn of the force
-        # makes of it. So the direction turns by what the equations say, and not to where v points; v is not turned round.
+        # The force depends only on the slip's direction, and where a slip begins, v is much smaller than the change of
+        # v by a small turn of the force. So the direction turns as the equations require, and not to where v points; v
+        # is not turned round.
         turned = along + turn * across
         longer = greatest(size + change[0] * along[0] + change[1] * along[1], 0.2 * size)
         return longer / length(turned[0], turned[1]) * turned - v

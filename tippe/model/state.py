@@ -1,7 +1,8 @@
 """The state of a top in contact, and its parts by name.
 
-In the arena's moving frame (t1, t2, n): velocity (u1, u2) of the centre of mass along the arena [m/s], axis (e1, e2, e3) [1],
-angular momentum (L1, L2, L3) about the centre of mass [kg m^2/s], then the arena's place. The components stand along axis 0.
+In the arena's moving frame (t1, t2, n): velocity (u1, u2) of the centre of mass along the arena [m/s], axis (e1, e2,
+e3) [1], angular momentum (L1, L2, L3) about the centre of mass [kg m^2/s], then the arena's place. The components are
+along axis 0.
 """
 
 from typing import Any, NamedTuple
@@ -11,15 +12,15 @@ from jaxtyping import Array, Float
 
 from nonholonomic.geometry import Component, Tangent, Vector, dot, planar_length, scale, sum_vectors
 
-#: Where the parts stand in a state.
+#: Indices of the parts in a state.
 VELOCITY, AXIS, MOMENTUM, PLACE = slice(0, 2), slice(2, 5), slice(5, 8), slice(8, None)
 
-#: Where the component of the axis along n stands: cos(theta).
+#: Index of the component of the axis along n, cos(theta).
 COS_THETA = 4
 
 
 class Parts(NamedTuple):
-    """A state, taken apart."""
+    """The parts of a state."""
 
     velocity: Tangent
     axis: Vector
@@ -28,13 +29,13 @@ class Parts(NamedTuple):
 
 
 def parts(state: Float[Array, "components ..."]) -> Parts:
-    """The components of a state, part by part."""
+    """Split a state into its parts."""
     u1, u2, e1, e2, e3, L1, L2, L3, *place = (state[k] for k in range(len(state)))
     return Parts((u1, u2), (e1, e2, e3), (L1, L2, L3), tuple(place))
 
 
 def joined(*vectors: tuple[Component, ...]) -> Float[Array, "components ..."]:
-    """The state made of its parts, in order; a component is a scalar or one per lane."""
+    """The state made of its parts, in order; a component is a scalar or has one number per lane."""
     return jnp.stack(jnp.broadcast_arrays(*(component for part in vectors for component in part)))
 
 

@@ -1,11 +1,11 @@
-"""Stick and slip under Coulomb's law as it stands: the two kinds of motion, when each ends, and what follows.
+"""Stick and slip under exact Coulomb friction: the two kinds of motion, when each ends, and what follows.
 
-Within the friction cone rolling is the only motion near zero slip, and a slip reaches zero in finite time. The direction of
-a slip has no limit there, and steps shrink with its speed; so the slip is stopped by a blow where the way that is left to
-slide, v^2 / (2 |v'|), is `LEFT` times the tolerance in units of R. Friction would have taken the same momentum in the time
-that was left, so the state errs by that way, in proportion to the tolerance. Rolling ends where mu N = |F_t|; from there the
-slip is begun by a step of its own (`slip_onset.py`), whose estimated error is within the tolerance
-(`tests/physics/test_stick_slip.py` has the figures).
+Within the friction cone, rolling is the only motion near zero slip, and a slip reaches zero in finite time. There the
+direction of the slip has no limit, and steps shrink with its speed. Therefore an impulse stops the slip when the
+remaining sliding distance, v^2 / (2 |v'|), is `LEFT` times the tolerance in units of R. Friction would have given the
+same impulse in the remaining time, so the state errs by this distance, in proportion to the tolerance. Rolling ends
+where mu N = |F_t|; there a separate step begins the slip (`slip_onset.py`), with an estimated error within the
+tolerance (`tests/physics/test_stick_slip.py` has the figures).
 """
 
 import dataclasses
@@ -26,25 +26,25 @@ from .rolling import RollingDynamics
 from .slip_onset import Onset, begin
 from .top import Top
 
-#: The way that is left to slide where a slip is stopped, over the tolerance and the radius. The state errs by a tenth of the
-#: tolerance at most, and falls with it; the time of the blow is early by the speed over the deceleration, 8e-8 s at 1e-11.
+#: The remaining sliding distance at which a slip is stopped, over the tolerance and the radius. The state errs by at
+#: most a tenth of the tolerance; the impulse is early by the speed over the deceleration, 8e-8 s at 1e-11.
 LEFT = 0.1
 
-#: Slip speed, in units of sqrt(g R), below which a state counts as rolling: rounding leaves less. No run's course depends on
-#: it; where a slip begins the forces of the two kinds are the same in the limit.
+#: Slip speed, in units of sqrt(g R), below which a state counts as rolling: rounding leaves less. No run depends on it;
+#: where a slip begins, the forces of both kinds of motion are equal in the limit.
 AT_REST = 1e-10
 
-#: The round-off that rolling is allowed in its grip: a top that stands upright needs none. It delays a slip by this over the
-#: rate of the grip, about 1e-14 s.
+#: Round-off allowed in the grip of rolling: a top that stands upright needs no grip. It delays a slip by this value
+#: over the rate of the grip, about 1e-14 s.
 ROUNDING = 1e-13
 
 
 class StickSlip(eqx.Module):
     """The equations of motion of a scene with `SetValuedCoulomb`, in place of `Dynamics`.
 
-    A state whose contact is at rest rolls, any other slips.
+    A state whose contact is at rest rolls; any other state slips.
 
-    - `slipping`: the equations of motion under the full force; `rolling`: those without slip.
+    - `slipping`: the equations of motion under the full force; `rolling`: the equations without slip.
     - `mu`: coefficient of friction [1].
     """
 
@@ -80,7 +80,7 @@ class StickSlip(eqx.Module):
         return self.slipping.per_transverse
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
-        """Evaluate the equations of the kind of motion that the state is in.
+        """Evaluate the equations of motion for the state's kind of motion.
 
         **Arguments:**
 
@@ -101,14 +101,14 @@ class StickSlip(eqx.Module):
         return least(*self.margins(state))
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
-        """Normal force as a fraction of the weight, plus the round-off that a start with N = 0 exactly is allowed; and the
-        room that is left, if it may end."""
+        """Normal force as a fraction of the weight, plus a round-off allowance for a start with N = 0 exactly; and the
+        remaining room, if it can end."""
         motion = self.motion(state)
         margin = motion.normal_force / (self.slipping.mass * self.slipping.gravity) + 1e-12
         return (margin,) if motion.room is None else (margin, motion.room - FITS)
 
     def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-        """How a contact has ended whose margin is zero: a code in `LOSSES`. Only one that slips can jam."""
+        """How a contact with zero margin has ended: a code in `LOSSES`. Only a slipping contact can jam."""
         return self.slipping.loss(state)
 
     def slip_speed(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
@@ -117,10 +117,10 @@ class StickSlip(eqx.Module):
         return length(slip.x, slip.y)
 
     def stopped(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """The state after the blow that stops the slip, its axis at unit length.
+        """The state after the impulse that stops the slip, with the axis at unit length.
 
-        Errors of the steps take the axis off that, and the slip that a blow leaves is only as small as they are: where a slip
-        begins, round-off is all that its direction can bear.
+        Step errors change the length of the axis, and the slip after the impulse is only as small as these errors;
+        where a slip begins, its direction tolerates only round-off.
         """
         nothing = jnp.zeros_like(state[0])
         axis = state[2:5]
@@ -128,23 +128,25 @@ class StickSlip(eqx.Module):
         return self.rolling.with_slip(state, Slip(nothing, nothing))
 
     def lifts_off(self, state: Float[Array, "components ..."]) -> Bool[Array, "..."]:
-        """Where a contact at rest parts at once: without a force at the contact point, the arena need not push.
+        """Whether a contact at rest separates at once: without a force at the contact point, the arena would have to
+        pull.
 
-        Unless the contact jams, the normal force of rolling's end, of the slip that follows and of no friction have one sign.
+        Unless the contact jams, the normal forces of ending rolling, of the following slip and of no friction have the
+        same sign.
         """
         return dataclasses.replace(self.slipping, friction=Frictionless()).motion(state).normal_force <= 0.0
 
     def grip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """What a rolling top has left before it slips, as a fraction of the weight."""
+        """The reserve of a rolling top before it slips, as a fraction of the weight."""
         return self.rolling.grip(state, self.mu) + ROUNDING
 
 
 class Change(NamedTuple):
-    """What follows the end of a mode.
+    """The change at the end of a mode.
 
-    - `state`: from which the motion goes on, and whether it `rolls` then; `lost`: whether the contact is lost instead.
-    - `onset`: the beginning of the slip where it does not roll; it starts `wait` [s] after the mode has ended.
-    - `elapsed`: until the motion goes on [s].
+    - `state`: the state that follows, and whether it `rolls`; `lost`: whether the contact is lost instead.
+    - `onset`: the beginning of the slip if the top does not roll; it starts `wait` [s] after the mode has ended.
+    - `elapsed`: time until the motion continues [s].
     """
 
     state: Float[Array, "components ..."]
@@ -156,10 +158,11 @@ class Change(NamedTuple):
 
 
 class ContactMode(eqx.Module):
-    """One of the two kinds of motion of a `StickSlip`, in place of `Dynamics`: its contact margin is what ends it.
+    """One of the two kinds of motion of a `StickSlip`, in place of `Dynamics`; its contact margin falls to zero at its
+    end.
 
-    - `both`: the scene's equations; `tolerance`: relative, of the integration.
-    - `rolls`: which of the two.
+    - `both`: the scene's equations; `tolerance`: relative tolerance of the integration.
+    - `rolls`: whether the top rolls or slips.
     """
 
     both: StickSlip
@@ -185,18 +188,19 @@ class ContactMode(eqx.Module):
         return stacked(self.motion(state).rate, state)
 
     def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Positive while this kind of motion lasts. Rolling leaves the friction cone before the normal force is zero."""
+        """Positive while this kind of motion lasts. Rolling leaves the friction cone before the normal force
+        vanishes."""
         return least(*self.margins(state))
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
-        """The smooth functions of which the contact margin is the least."""
+        """The smooth functions whose least value is the contact margin."""
         if self.rolls:
             grip, room = self.both.grip_left(state), self.both.rolling.motion(state).room
             return (grip,) if room is None else (grip, room - FITS)
         return (*self.both.slipping.margins(state), self.slip_left(state))
 
     def slip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Slip speed above that at which a slip is over, in units of sqrt(g R). A slip that grows is never over."""
+        """Slip speed above that at which a slip ends, in units of sqrt(g R). A slip that grows does not end."""
         speed, change = self._slowing(state)
         way = LEFT * self.tolerance * self.both.rolling.radius
         return (speed - jnp.sqrt(2.0 * way * greatest(-change, 0.0))) / self.both.speed
@@ -206,7 +210,7 @@ class ContactMode(eqx.Module):
         return jax.jvp(self.both.slip_speed, (state,), (self.both.slipping.field(state),))
 
     def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-        """How a contact has ended whose margin is zero: a code in `LOSSES`."""
+        """How a contact with zero margin has ended: a code in `LOSSES`."""
         return self.both.loss(state)
 
     def ended(
@@ -217,27 +221,27 @@ class ContactMode(eqx.Module):
         scales: Float[Array, "components ..."],
         left: Float[Array, "..."],
     ) -> Change:
-        """What follows where this kind of motion has ended.
+        """The change that follows the end of this kind of motion.
 
         **Arguments:**
 
-        - `state`: (components, ...), where the margin is 0; the equations know the first `size` components.
-        - `slipping`: rate of the whole state while it slips; `scales`: its magnitudes.
-        - `left`: time [s] to the horizon, which a slip's beginning does not pass.
+        - `state`: (components, ...), at zero margin; the equations use the first `size` components.
+        - `slipping`: rate of the whole state during slip; `scales`: its magnitudes.
+        - `left`: time [s] to the horizon, which the beginning of a slip does not exceed.
         """
         both, own, rest = self.both, state[:size], state[size:]
         still = both.stopped(own)
         nothing = jnp.zeros_like(own[0])
         if self.rolls:
             holds = nothing > 0.0
-            # What ended is either the grip or the room; or there was no contact to begin with, as behind an impact.
+            # The mode ended because of the grip or the room, or there was no contact to begin with, as after an impact.
             room, lost = both.rolling.motion(own).room, both.lifts_off(still)
             lost = lost if room is None else lost | (room - FITS <= both.grip_left(own))
             wait = nothing
         else:
             holds = both.rolling.grip(still, both.mu) >= 0.0
             lost = both.slipping.contact_margin(own) <= self.slip_left(own)
-            # A slip that only turns round goes on through zero, which it reaches in the time that is left of it.
+            # A slip that only reverses continues through zero, which it reaches in its remaining time.
             speed, change = self._slowing(own)
             slows = change < 0.0
             wait = jnp.where(slows & ~holds & ~lost, -speed / jnp.where(slows, change, 1.0), 0.0)

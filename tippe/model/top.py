@@ -15,16 +15,16 @@ from nonholonomic.validation import Bound, Bounded, as_number, is_traced, requir
 from .body import AbstractBody, Round
 from .turned import Shape
 
-#: Units in which moments of inertia are given by mistake, in kg m^2.
+#: Units that are often used for moments of inertia by mistake, in kg m^2.
 INERTIAS = {"kg cm^2": 1e-4, "kg mm^2": 1e-6, "g cm^2": 1e-7, "g mm^2": 1e-9}
 
-#: The radius [m] above which another unit is suspected, and the range of I1 / (m R^2) outside of which one is.
+#: The radius [m] above which another unit is suspected, and the plausible range of I1 / (m R^2).
 GREATEST_RADIUS = 1.0
 RATIOS = (0.1, 2.0)
 
 
 class Stem(Bounded):
-    """The rounded end of a stem: a second sphere with which a top can touch the plane (`tippe.md`, section 4).
+    """The rounded end of a stem: a second sphere on which a top can touch the plane (`tippe.md`, section 4).
 
     **Arguments:**
 
@@ -56,9 +56,9 @@ class Stem(Bounded):
 
 
 class Top(AbstractBody):
-    """A tippe top: a sphere with the centre of mass off its centre, symmetric about the axis e, and the stem's end if any.
+    """A tippe top: a sphere with its centre of mass off its centre, symmetric about the axis e, with or without a stem.
 
-    The centre of mass lies at -`offset` e from the sphere's centre, e being the direction of the stem.
+    The centre of mass lies at -`offset` e from the sphere's centre, where e is the direction of the stem.
 
     **Arguments:**
 
@@ -105,24 +105,26 @@ class Top(AbstractBody):
         hole_radius: Any = 0.0,
         hole_depth: Any = 0.0,
     ) -> "Top":
-        """A top turned from one material: a sphere with its cap cut off, a cylindrical stem, and a hole around the stem if any.
+        """A top turned from one material: a sphere with its cap cut off, a cylindrical stem, and optionally a hole
+        around the stem.
 
-        Mass, offset, I1, I3 and the stem follow from the shape in closed form, and can be differentiated by it. The top
-        touches with its sphere or with the half ball at the stem's end. `tippe.steady.group` says whether it turns over.
+        Mass, offset, I1, I3 and the stem follow from the shape in closed form, and you can differentiate them. The top
+        touches with its sphere or with the half ball at the stem's end. `tippe.steady.group` says whether it turns
+        over.
 
         **Arguments:** (lengths in metres)
 
         - `radius`: radius of the sphere.
         - `density`: density of the material [kg/m^3]: beech 700, acrylic 1180, aluminium 2700.
-        - `cut`: height of the flat above the centre of the sphere, less than `radius`: what lies above it is cut off.
+        - `cut`: height of the flat above the centre of the sphere, less than `radius`; everything above it is cut off.
         - `stem_radius`: radius of the stem, which is a cylinder that ends in a half ball.
-        - `stem_length`: how far the stem stands out above the flat.
-        - `hole_radius`, `hole_depth`: a hole drilled from the flat around the stem, which stands on its bottom.
+        - `stem_length`: length of the stem above the flat.
+        - `hole_radius`, `hole_depth`: a hole drilled from the flat around the stem; the stem stands on its bottom.
 
         **Returns:** a `Top`.
 
-        **Raises:** `ValueError` for a shape that cannot be turned, whose centre of mass lies above the centre of the sphere, or
-        whose rim would touch the table before its stem.
+        **Raises:** `ValueError` for a shape that cannot be turned, whose centre of mass lies above the centre of the
+        sphere, or whose rim would touch the table before its stem.
 
         The formulas are the integrals over thin discs (Landau and Lifshitz, Mechanics, section 32), in `tippe/model/turned.py`.
 
@@ -181,7 +183,7 @@ class Top(AbstractBody):
         return (-self.offset * axis[0], -self.offset * axis[1], -self.offset * axis[2])
 
     def path_from_frame(self, axis: Vector) -> Vector:
-        # The frame carries the centre of the sphere along, whose path is reported too.
+        # The frame moves with the centre of the sphere, whose path is also reported.
         return (None, None, None)
 
     def suspicion(self) -> str | None:

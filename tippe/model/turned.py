@@ -1,8 +1,9 @@
 """Mass, centre of mass and moments of inertia of a top turned from one material, in closed form.
 
-Every part is a homogeneous solid of revolution about the z axis with density 1. A slice of radius r and thickness dz at height
-z adds pi r^2 to the volume, pi r^2 z to the first moment, pi r^4 / 2 to the moment of inertia about the axis, and
-pi r^4 / 4 + pi r^2 z^2 to that about a transverse axis through the origin (the moment of inertia of a thin disc and the
+Every part is a homogeneous solid of revolution about the z axis with density 1. A slice of radius r and thickness dz at
+height z contributes pi r^2 to the volume, pi r^2 z to the first moment, pi r^4 / 2 to the moment of inertia about the
+axis, and pi r^4 / 4 + pi r^2 z^2 to that about a transverse axis through the origin (the moment of inertia of a thin
+disc and the
 parallel-axis theorem; Landau and Lifshitz, Mechanics, section 32). The integrals over z are below; volume and first moment of
 the truncated ball are those of a spherical segment (Harris and Stocker, Handbook of Mathematics and Computational Science,
 1998, section 4.8.4).
@@ -27,12 +28,12 @@ class Moments(NamedTuple):
     transverse: Number
 
     def plus(self, other: "Moments", sign: float = 1.0) -> "Moments":
-        """Both solids together, or with `sign` -1 the first without the second."""
+        """Both solids together, or, with `sign` -1, the first without the second."""
         return Moments(*(a + sign * b for a, b in zip(self, other, strict=True)))
 
 
 def truncated_ball(radius: Number, cut: Number) -> Moments:
-    """A ball about the origin without its part above z = `cut`: r^2 = radius^2 - z^2 from -radius to `cut`."""
+    """A ball about the origin without the part above z = `cut`: r^2 = radius^2 - z^2 from -radius to `cut`."""
 
     def axial(z):
         return radius**4 * z - 2.0 * radius**2 * z**3 / 3.0 + z**5 / 5.0
@@ -62,7 +63,7 @@ def cylinder(radius: Number, low: Number, high: Number) -> Moments:
 
 
 def half_ball(radius: Number, centre: Number) -> Moments:
-    """The upper half of a ball about a point of the axis."""
+    """The upper half of a ball about a point on the axis."""
     volume, above = 2.0 * jnp.pi * radius**3 / 3.0, jnp.pi * radius**4 / 4.0
     second = 2.0 * volume * radius**2 / 5.0
     return Moments(
@@ -74,7 +75,7 @@ def half_ball(radius: Number, centre: Number) -> Moments:
 
 
 class Shape(NamedTuple):
-    """What a turned top looks like: lengths [m], heights above the centre of its sphere along the stem."""
+    """The shape of a turned top: lengths [m], with heights above the centre of its sphere along the stem."""
 
     radius: Number
     cut: Number
@@ -87,7 +88,7 @@ class Shape(NamedTuple):
     def checked(cls, lengths: dict[str, Any]) -> "Shape":
         """A shape from numbers.
 
-        **Raises:** `ValueError` for numbers that no such top has.
+        **Raises:** `ValueError` for numbers that are impossible for such a top.
         """
         for name, length in lengths.items():
             if name.startswith("hole"):
@@ -117,7 +118,7 @@ class Shape(NamedTuple):
 
     @property
     def moments(self) -> Moments:
-        """Of the whole top with density 1, about the centre of the sphere."""
+        """Moments of the whole top with density 1, about the centre of the sphere."""
         bottom = self.cut - self.hole_depth
         return (
             truncated_ball(self.radius, self.cut)

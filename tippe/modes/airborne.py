@@ -5,8 +5,8 @@ In contact the state is that of `tippe/model/state.py` with a `CarriedFrame`, 14
 surface's axes, the position of the centre of mass [m], its velocity [m/s], the axis, the angular momentum about it, and
 two zeros. A flight ends where the distance of the centre of a sphere from the arena equals its radius again; then that
 sphere strikes the tangent plane there (`impact.py`). theta counts from the normal below the top's own sphere, whichever
-touches.
-
+sphere strikes the tangent plane there (`impact.py`). theta is measured from the normal below the top's own sphere,
+whichever sphere touches.
 A single run whose path is kept has five more components: the vector c of `trajectory_problem.py`, in the frame in
 contact, in the surface's axes in flight; the rotation angle of the top about its axis [rad]; and the work of friction
 and impacts [J].
@@ -256,7 +256,7 @@ class Slide(AbstractFlyingMode):
         return jnp.concatenate([state, jnp.zeros_like(state[:2])])
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """Fly where the contact is lost, end where it jams or the ball does not fit. Counts the flights."""
+        """Fly if the contact is lost; end if it jams or the ball does not fit. Counts the flights."""
         ends, zero = self.scene.dynamics.loss(state[:OWN]) > 0, jnp.zeros_like(state[0])
         return Transition(
             mode=jnp.where(ends, SLIDING, FLYING),
@@ -277,7 +277,7 @@ def lift_off(
     """
     body, frame, (u, e, L, place) = scene.body, carried_frame(scene), parts(state[:OWN])
     ball = balls(body)[0] if ball is None else ball
-    # Step errors move the foot off the arena: a flight that began below it would end where it begins.
+    # Step errors move the foot off the arena; a flight that began below the arena would end where it begins.
     place = (*scene.surface.onto(place[:3]), *place[3:])
     axes = frame.own_axes(place)
     velocity = (*u, -ball.offset * axis_rate(body, e, L)[2])
@@ -315,7 +315,7 @@ class Fly(AbstractFlyingMode):
         return jnp.concatenate([in_contact(ground, free), *rows])
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """Strike the arena; rebound, or slide on where the rebound would be slow. Counts the flights that begin."""
+        """Strike the arena; rebound, or slide if the rebound would be slow. Counts the flights that begin."""
         scene, flying, ball = self.scene, flight_state(state), balls(self.scene.body)[0]
         ground = landing_site(scene, flying, ball)
         free, zero = as_free_body(scene, flying, ground), jnp.zeros_like(state[0])
@@ -327,7 +327,7 @@ class Fly(AbstractFlyingMode):
             struck, fails = resolve_coulomb_impact(scene.body, scene.friction, ball, free, bounce)
         else:
             struck, fails = resolve_impact(scene.body, scene.friction, ball, free, bounce)
-        # Where the landing was located slightly below the arena, the next flight would end where it begins.
+        # If the landing was located slightly below the arena, the next flight would end where it begins.
         lifted = vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2])))
         after = jnp.where(rebounds, in_flight(lifted, ground.axes, struck), in_contact(ground, struck))
         if self.with_quadratures:
@@ -348,7 +348,7 @@ class Fly(AbstractFlyingMode):
 def modes(
     scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
-    """The modes of runs, and the number of the mode in which each starts. **Arguments:** as for those of `sliding.py`."""
+    """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `sliding.modes`."""
     arguments = (scene, problem.scales, problem.cos_angle, with_quadratures)
     return (Slide(*arguments), Fly(*arguments)), jnp.zeros(problem.states.shape[1:], int)
 

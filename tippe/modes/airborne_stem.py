@@ -1,10 +1,10 @@
 """Contact lost and regained on any arena by a top with a stem: sliding on either sphere, flights, and the impacts of
 both.
 
-States are those of `airborne.py`. A top that slides on its stem has a frame of its own, carried along by the stem's
-sphere: its origin is the foot below that sphere. On a curved arena the feet of the two spheres differ and so do the
-normals there: each sphere strikes the tangent plane at its own foot. A top that comes to rest on both ends there as
-`UNRESOLVED`, because the equations of leaning are those of the plane (`leaning.py`).
+States are those of `airborne.py`. A top that slides on its stem has a separate frame, which moves with the stem's
+sphere: its origin is the foot below that sphere. On a curved arena, the two spheres have different feet with different
+normals, and each sphere strikes the tangent plane at its own foot. If a top comes to rest on both spheres, the run ends
+as `UNRESOLVED`, because the equations of leaning are those of the plane (`leaning.py`).
 """
 
 import functools
@@ -117,8 +117,8 @@ class SlideOnOne(AbstractFlyingMode):
         return jnp.where(self.number == 1, beside, jnp.concatenate([state, jnp.zeros_like(state[:2])]))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """Fly where the contact is lost, strike with the other sphere where that is at the arena, end where the contact
-        jams or the sphere does not fit. Counts the flights.
+        """Fly if the contact is lost, strike with the other sphere if that is at the arena, end if the contact jams or
+        the sphere does not fit. Counts the flights.
         """
         own, other = self.spheres
         dynamics, zero = standing(self.scene, own), jnp.zeros_like(state[0])
@@ -168,9 +168,11 @@ class FlyBoth(Fly):
         return FlightToBlow(self.flight(state), self.strikes)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """Strike the arena with the sphere that is there; rebound, or slide on it where the rebound would be slow.
+        """Strike the arena with the sphere that is there; rebound, or slide on that sphere if the rebound would be
+        slow.
 
-        If the impact throws the other sphere into the arena, that strikes next. Counts the flights that begin.
+        If the impact throws the other sphere into the arena, the other sphere strikes next. Counts the flights that
+        begin.
         """
         scene, flying, zero = self.scene, flight_state(state), jnp.zeros_like(state[0])
         main, stem = (gap_margin(scene, flying, ball) for ball in balls(scene.body))
@@ -178,7 +180,7 @@ class FlyBoth(Fly):
         own, other = own_and_other(scene, number)
         ground = landing_site(scene, flying, own)
         astray = missed(scene, ground, own)
-        # Where the landing was located slightly below the arena, the next mode would end where it begins.
+        # If the landing was located slightly below the arena, the next mode would end where it begins.
         flying = flying._replace(place=vector_of(sum_vectors(flying.place, scale(-ground.gap, ground.axes[2]))))
         ground = ground._replace(gap=zero)
         impact = resolve_arena_impact(scene, flying, ground, own, other)
@@ -250,9 +252,9 @@ def own_and_other(scene: Scene[Top], number: Int[Array, "..."]) -> tuple[Ball, B
 def modes(
     scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
-    """The modes of runs, and the number of the mode in which each starts. **Arguments:** as for those of `sliding.py`.
+    """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `sliding.modes`.
 
-    A launch in which the stem would be in the arena starts on the stem: its place and its theta are those of the stem's
+    If the stem would be in the arena at launch, the top starts on the stem: place and theta then refer to the stem's
     foot.
     """
     arguments, (main, stem) = (scene, problem.scales, problem.cos_angle, with_quadratures), balls(scene.body)

@@ -78,7 +78,7 @@ class Land(Fly):
 def modes(
     scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
-    """The modes of runs, and the number of the mode in which each starts. **Arguments:** as for those of `sliding.py`."""
+    """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `sliding.modes`."""
     both, arguments = problem.dynamics, (scene, problem.scales, problem.cos_angle, with_quadratures)
     assert isinstance(both, StickSlip)
     slips, rolls = (

@@ -5,10 +5,10 @@ the contact slips, the tangential impulse grows by -mu v / |v|, whose direction 
 the slip distance s as the independent variable, ds = dp / |v|, nothing is singular, v' = |v| W_n - mu W_t v, and a slip
 that stops does so exponentially in s.
 
-After a stop the tangential impulse per p is, of all f with |f| <= mu, the one with the least f.W_tt f / 2 + f.W_tn: v
-then grows along -f if |f| = mu, and stays zero if |f| < mu. W_tt being positive definite, there is one such f, (W_tt +
-k) f = -W_tn with k >= 0: the solution after the stop is unique, straight, and lasts to the end. The normal velocity
-grows along it.
+After a stop, the tangential impulse per p is the f with |f| <= mu that minimises f.W_tt f / 2 + f.W_tn: v then grows
+along -f if |f| = mu, and stays zero if |f| < mu. Because W_tt is positive definite, there is one such f, (W_tt + k) f =
+-W_tn with k >= 0: the solution after the stop is unique, straight, and lasts to the end. The normal velocity grows
+along it.
 """
 
 import diffrax
@@ -27,8 +27,8 @@ from .impact import LARGEST, TOLERANCE, ContactImpulse, Impact, apply_impulse, a
 
 Cells = Float[Array, " cells"]
 
-#: A slip has stopped where its speed is this fraction of the sphere's speed of arrival. The impulse errs by as much at
-#: most. Integration errors, a tenth of the tolerance, must be smaller.
+#: A slip has stopped when its speed is this fraction of the sphere's speed of arrival. The error of the impulse is at
+#: most this fraction. Integration errors, a tenth of the tolerance, must be smaller.
 STOPS = 1e-11
 
 #: Newton iterations for the force after a stop. They converge from one side, in about six.
@@ -38,7 +38,8 @@ ITERATIONS = 30
 class Skid(AbstractProblem):
     """The slipping part of impacts: tangential and normal impulse as the state, the slip distance as the time.
 
-    - `impact`: the impacts, in whose units the impulses are; `pace`: the speed with which the sphere arrives [m/s].
+    - `impact`: the impacts, which define the units of the impulses; `pace`: the speed with which the sphere arrives
+      [m/s].
     """
 
     impact: Impact
@@ -73,10 +74,9 @@ class Skid(AbstractProblem):
 def resolve_coulomb_impact(
     body: Top, friction: SetValuedCoulomb, ball: Ball, free: FreeBody, restitution: Cells
 ) -> tuple[FreeBody, Bool[Array, " cells"]]:
-    """The body after one of its spheres has struck the plane; where the contact sticks, its slip is zero up to
-    round-off.
+    """The body after one of its spheres has struck the plane; if the contact sticks, its slip is zero up to round-off.
 
-    **Arguments, returns:** as for `resolve_impact`, of which it is the limit for a slip speed of 0.
+    **Arguments, returns:** as for `resolve_impact`; this is its limit for a slip speed of 0.
     """
     meets = approach(body, ball, free)
     impact = Impact(body, friction, meets, ball.radius, (1.0 + restitution) * greatest(-meets.velocity[2], 0.0))
@@ -129,9 +129,9 @@ def _onward(impact: Impact, mu: Float[Array, "..."], blow: Vector) -> Vector:
 def sticking_force(
     matrix: tuple[Cells, Cells, Cells], lifted: tuple[Cells, Cells], mu: Float[Array, "..."]
 ) -> tuple[Cells, Cells]:
-    """The f of least f.A f / 2 + f.b with |f| <= mu, for A = (A11, A12, A22) positive definite.
+    """The f with |f| <= mu that minimises f.A f / 2 + f.b, for A = (A11, A12, A22) positive definite.
 
-    (A + k) f = -b, and 1 / |f| grows with k and is concave, so that Newton's method finds |f| = mu from k = 0 on.
+    (A + k) f = -b, and 1 / |f| grows with k and is concave, so Newton's method finds |f| = mu from k = 0 on.
     """
     a, b, c = matrix
 

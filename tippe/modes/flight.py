@@ -1,9 +1,9 @@
 """Flight in closed form: the centre of mass on a parabola, the axis on a cone about the angular momentum.
 
-Between two contacts L is constant and e turns about it at the rate |L| / I1 (`tippe.md`, section 3). So the distance of
-a sphere from the plane is a parabola plus a cosine. Between inflections, which are known, its slope is monotone: each
-interval has at most one minimum, and one root or none between points of different sign. That makes the search for the
-landing complete.
+Between two contacts, L is constant and e turns about it at the rate |L| / I1 (`tippe.md`, section 3). The distance of a
+sphere from the plane is therefore a parabola plus a cosine. Between inflections, which are known, its slope is
+monotone: each interval has at most one minimum, and at most one root between points of different sign. The search for
+the landing is therefore complete.
 """
 
 from typing import NamedTuple
@@ -27,7 +27,7 @@ MOST_STRETCHES = 20_000
 
 
 class Cone(NamedTuple):
-    """Motion of the axis: e(t) = `along` + `across` cos(W t) + `ahead` sin(W t), W being `rate` [rad/s]."""
+    """Motion of the axis: e(t) = `along` + `across` cos(W t) + `ahead` sin(W t), where W is `rate` [rad/s]."""
 
     rate: Float[Array, "..."]
     along: Vector
@@ -128,15 +128,15 @@ def fly(
     rising: Bool[Array, " cells"],
     most: Cells,
 ) -> Flight:
-    """Fly until a sphere lands, for some time at most.
+    """Fly until a sphere lands, for a limited time.
 
     **Arguments:**
 
     - `spheres`: those that can land.
     - `free`: the body at the start.
-    - `parted`: the number of the sphere that has just left the plane.
-    - `rising`: where that sphere leaves with a speed, as after an impact; elsewhere it is at rest and its normal force
-      has vanished, so that its distance grows with the third power of time.
+    - `parted`: index of the sphere that has just left the plane.
+    - `rising`: whether that sphere leaves with a speed, as after an impact; otherwise it is at rest and its normal
+      force has vanished, so its distance grows with the third power of time.
     - `most`: time [s] at which the flight is cut off.
 
     **Returns:** a `Flight`.
@@ -172,7 +172,7 @@ def _descent(
     speed = gap_rate(body, ball, free)
     speed = jnp.where(at_rest, 0.0, jnp.where(touching, greatest(speed, 0.0), speed))
     cosine, sine = ball.offset * turning.across[2], ball.offset * turning.ahead[2]
-    # Where the normal force vanishes the distance has no curvature: the remainder, round-off, may only rise.
+    # Where the normal force vanishes, the distance has no curvature: the remainder is round-off, and may only rise.
     unbent = -gravity / jnp.maximum(turning.rate**2, jnp.finfo(cosine.dtype).tiny)
     cosine = jnp.where(at_rest, jnp.minimum(cosine, unbent), cosine)
     gravity = jnp.broadcast_to(gravity, start.shape)
@@ -184,7 +184,7 @@ def landing(descent: Descent, most: Cells) -> tuple[Cells, Bool[Array, " cells"]
 
     **Arguments:** `most`: time [s] to search.
 
-    **Returns:** the time [s], infinite where it is more than `most`; and where the search failed.
+    **Returns:** the time [s], infinite if it is more than `most`; and whether the search failed.
     """
     g, rate, amplitude = descent.gravity, descent.rate, jnp.hypot(descent.cosine, descent.sine)
     # The distance lies between two parabolas, mean +- amplitude.
@@ -223,7 +223,7 @@ def landing(descent: Descent, most: Cells) -> tuple[Cells, Bool[Array, " cells"]
 
     zero, no = jnp.zeros_like(end), jnp.zeros(end.shape, bool)
     low, high, located, over, _ = jax.lax.while_loop(searching, search, (zero, zero, no, no, 0))
-    # At the very start the distance is zero: it must have been positive since.
+    # At the very start, the distance is zero: it must have been positive since.
     time = halved(lambda t: descent.value(t) >= 0.0, low, high)[1]
     return jnp.where(located, time, jnp.inf), ~located & ~over
 
@@ -236,7 +236,7 @@ def landed_at(descent: Descent, time: Cells) -> Cells:
 
 
 def _roots(height: Cells, speed: Cells, gravity: Cells) -> tuple[Cells, Cells]:
-    """Times between which a body thrown from a height is above zero; infinite, and so never, if it is not."""
+    """Times between which a body thrown from a height is above zero; infinite if it never is."""
     square = speed**2 + 2.0 * gravity * height
     root = jnp.sqrt(greatest(square, 0.0))
     never = square <= 0.0

@@ -18,8 +18,8 @@ from ..model.state import joined, parts
 from ..model.stick_slip import StickSlip
 from ..model.top import Top
 
-#: Round-off allowed to a sphere that has just left the arena, as a fraction of R. None is allowed to a sphere that
-#: comes back, so ten times the value and a tenth of it move no landing.
+#: Round-off allowed for a sphere that has just left the arena, as a fraction of R. A sphere that returns gets no
+#: allowance, so a tenfold or a tenth of this value changes no landing.
 ROUNDING = 1e-12
 
 #: A sphere comes back if its speed is more than this fraction of sqrt(g R). Until then it sinks by half the square, in
@@ -110,9 +110,9 @@ def gap_rate(body: Top, ball: Ball, free: FreeBody) -> Float[Array, "..."]:
 def still_parting(
     rate: Float[Array, "..."], gravity: Float[Array, "..."], radius: Float[Array, "..."], rounding: Any = 0.0
 ) -> Float[Array, "..."]:
-    """The round-off allowed to the distance of a sphere, as a fraction of R.
+    """The round-off allowed for the distance of a sphere, as a fraction of R.
 
-    The full allowance holds while the sphere lifts off, and none when it comes back: that would delay the landing.
+    The full allowance holds while the sphere lifts off. When it returns there is none, which would delay the landing.
 
     **Arguments:** `rate`: of the distance [m/s]; `rounding`: an allowance in addition to `ROUNDING`.
     """

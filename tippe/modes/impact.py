@@ -1,20 +1,20 @@
 """Impact of a sphere of the top on the plane, with the scene's own friction, torque included (Routh's incremental
 method).
 
-During an impact the configuration is fixed and the contact load acts as in contact, f and tau being the scene's
-friction force and torque per unit normal force: with the normal impulse p in place of time, d(tangential impulse)/dp =
-f and d(impulse of the torque)/dp = tau, slip and angular velocity changing with the impulses (Routh, Dynamics of a
+During an impact, the configuration is fixed and the contact load acts as in contact, where f and tau are the scene's
+friction force and torque per unit normal force. With the normal impulse p in place of time, d(tangential impulse)/dp =
+f and d(impulse of the torque)/dp = tau, and slip and angular velocity change with the impulses (Routh, Dynamics of a
 System of Rigid Bodies, 1905, art. 198; Stronge, Impact Mechanics, ch. 4). This is the limit of a stiff contact with the
-same law, and so needs no law of its own: a stop of the slip, a reversal, and friction that depends on the speed all
-follow from it. Newton's restitution e_N determines the end: the velocity along the normal is e_N times the speed of
-approach. With friction Newton's rule may require more energy than there was (Stronge, section 3.3); the impact then
-ends earlier, where the kinetic energy equals that before the impact.
+same law, so it needs no separate law: a stop of the slip, a reversal, and friction that depends on the speed all follow
+from it. Newton's restitution e_N determines the end: the velocity along the normal is e_N times the speed of approach.
+With friction, Newton's rule may require more energy than there was (Stronge, section 3.3); the impact then ends
+earlier, when the kinetic energy equals that before the impact.
 
 There is always an end. Strong friction can pull the sphere into the plane faster than the impulse pushes it out (a
-jam), so the velocity along the normal is not monotone. But friction only takes energy, the slip comes to an end, and a
-contact that does not slip is pushed out, because the response to an impulse is positive definite. The same holds with a
-torque, which only takes energy too: velocity and angular velocity of the contact respond to force and torque by a
-positive definite matrix.
+jam), so the velocity along the normal is not monotone. But friction only dissipates energy, so the slip comes to an
+end, and a contact that does not slip is pushed out, because the response to an impulse is positive definite. The same
+holds with a torque, which also only dissipates energy: velocity and angular velocity of the contact respond to force
+and torque by a positive definite matrix.
 """
 
 from typing import NamedTuple
@@ -35,28 +35,29 @@ from .free_body import Ball, FreeBody
 
 Cells = Float[Array, " cells"]
 
-#: Relative tolerance of an impact's integration: impacts are rare, so this cost is small. Ten times the value moves
+#: Relative tolerance of an impact's integration: impacts are rare, so this cost is small. A tenfold value changes
 #: inversion times after hundreds of impacts by 1e-14.
 TOLERANCE = 1e-12
 
 #: An impact has failed if it takes this many times the normal impulse that would stop the sphere without friction.
 LARGEST = 1e9
 
-#: A rebound slower than this fraction of sqrt(g R) closes the contact. In the time T that the remaining bounces would
-#: take, the sliding top gets the impulse that they would give it, so the error is of the order of the square. On the
-#: plane ten times the value moves inversion times by a relative 3e-12 where a top bounces, and by 4e-11 where it rocks
-#: from sphere to sphere, ever less, until it leans on both (`LeaningDynamics.stopped`); the value itself errs by 3e-13.
-#: On other arenas ten times the value moves positions and axes after the last bounce by 5e-13, inversion times after
+#: A rebound slower than this fraction of sqrt(g R) closes the contact. During the time T of the remaining bounces, the
+#: sliding top gets the impulse that they would give it, so the error is of the order of the square. On the plane, a
+#: tenfold value changes inversion times by a relative 3e-12 if a top bounces, and by 4e-11 if it rocks from sphere to
+#: sphere with decreasing amplitude until it leans on both (`LeaningDynamics.stopped`); the value itself errs by 3e-13.
+#: On other arenas, a tenfold value changes positions and axes after the last bounce by 5e-13, and inversion times after
 #: 270 flights in a bowl by a relative 3e-13. Contact begins too early by T.
 CLOSING_SPEED = 1e-5
 
-#: Two spheres touch the arena together if neither is farther from it than this fraction of R. On the plane ten times
-#: the value and a tenth of it change no bit of a time.
+#: Two spheres touch the arena together if neither is farther from it than this fraction of R. On the plane, a tenfold
+#: or a tenth of this value does not change a time at all.
 TOUCHING = 1e-9
 
 
 class Approach(NamedTuple):
-    """A sphere about to strike: from the centre of mass to the contact point [m], velocity of that point [m/s].
+    """A sphere about to strike: vector from the centre of mass to the contact point [m], and velocity of that point
+    [m/s].
 
     `response` is the symmetric matrix W with (change of that velocity) = W (impulse) [1/kg], as three columns. `axis`
     is that of the body; `turning` its angular velocity [rad/s].
@@ -77,11 +78,11 @@ class ContactImpulse(NamedTuple):
 
 
 class Impact(AbstractProblem):
-    """Impacts, with the normal impulse as the time; the state is the tangential impulse and, where there is one, that
-    of the torque.
+    """Impacts, with the normal impulse as the time; the state is the tangential impulse and, if the law has a torque,
+    the impulse of the torque.
 
-    Both are in units of the impulse that would stop the sphere without friction, and of that times the sphere's radius.
-    `gained` is the velocity along the normal [m/s] at which the impact ends.
+    The impulses are in units of the impulse that would stop the sphere without friction, and of this times the sphere's
+    radius. `gained` is the velocity along the normal [m/s] at which the impact ends.
     """
 
     body: Top
@@ -92,8 +93,8 @@ class Impact(AbstractProblem):
 
     @property
     def speed(self) -> Cells:
-        """Speed along the normal before the impact [m/s]; positive, because the impulse of a sphere at rest has no
-        unit.
+        """Speed along the normal before the impact [m/s]; positive, because a sphere at rest would give no unit for
+        impulses.
         """
         return greatest(jnp.abs(self.approach.velocity[2]), 1e-12)
 
@@ -137,8 +138,8 @@ class Impact(AbstractProblem):
         blow, response = self.blow(time, state), self.approach.response
         change, turned = self.changes(blow)
         missing = (self.gained - change[2]) / self.speed
-        # In compression the sphere still approaches; in restitution the margin is the lost energy that is not to be
-        # returned.
+        # In compression, the sphere still approaches; in restitution, the margin is the dissipated energy that need not
+        # be returned.
         approaches = -(self.approach.velocity[2] + change[2]) / self.speed
         gain = dot(blow.force, self.approach.velocity) + 0.5 * dot(blow.force, change)
         if blow.torque is not None:
@@ -182,7 +183,7 @@ def approach(body: Top, ball: Ball, free: FreeBody) -> Approach:
 def resolve_impact(
     body: Top, friction: AbstractFriction, ball: Ball, free: FreeBody, restitution: Cells
 ) -> tuple[FreeBody, Bool[Array, " cells"]]:
-    """The body after one of its spheres has struck the plane; unchanged where the sphere does not approach the plane.
+    """The body after one of its spheres has struck the plane; unchanged if the sphere does not approach the plane.
 
     An impulse at the contact point leaves Jellett's quantity of that sphere unchanged; an impulse of a torque changes
     it.
@@ -191,9 +192,9 @@ def resolve_impact(
 
     - `friction`: the scene's law.
     - `free`: the body before the impact.
-    - `restitution`: Newton's coefficient e_N [1]; the rebound is slower where it would create energy.
+    - `restitution`: Newton's coefficient e_N [1]; the rebound is slower if it would otherwise create energy.
 
-    **Returns:** the body after the impact; and where the impact could not be computed (`MOST_STEPS`, `LARGEST`).
+    **Returns:** the body after the impact; and whether the impact could not be computed (`MOST_STEPS`, `LARGEST`).
     """
     meets = approach(body, ball, free)
     gained = (1.0 + restitution) * greatest(-meets.velocity[2], 0.0)

@@ -36,7 +36,7 @@ class InversionProblem(AbstractProblem):
     ) -> "InversionProblem":
         """The problem of the given number of cells; the numbers of scene and launch are scalars or one per cell.
 
-        Its frame is that of `Scene.turning_dynamics`: directions cannot be read off its final states.
+        Its frame is that of `Scene.turning_dynamics`: its final states do not give directions.
         """
         return _problem(scene, launch, None if angle is None else jnp.asarray(angle), cells)
 

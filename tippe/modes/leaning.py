@@ -14,7 +14,7 @@ own slip, the vertical force on the centre of mass and the torque that raises th
 with tau_j the torque per unit normal force of a law that has one. Then m u' = N_0 f_0 + N_1 f_1, and with
 t_j = f_j.(n x e) the momenta change by p' = sum N_j (a_j t_j + tau_j.n) and b' = sum N_j (R_j t_j + tau_j.e).
 
-The slips differ across the direction of leaning only. So m_1 - m_0 is (a_1 - a_0) (1 - c^2) without friction and with
+The slips differ only across the direction of leaning. So m_1 - m_0 is (a_1 - a_0) (1 - c^2) without friction and with
 viscous friction; Coulomb's law can make it vanish if mu h is more than (a_1 - a_0) sin theta. The first of two normal
 forces vanishes before that.
 """
@@ -38,10 +38,10 @@ from .impact import approach
 #: The number of this contact mode, next to those of the spheres, 0 and 1.
 BOTH = 2
 
-#: A contact ends where its normal force is below minus this fraction of the weight. A top that begins to roll on its
-#: sphere presses its stem ever less, and never lifts it; step lengths would follow the errors of a nearly zero force.
-#: Ending the contact so late changes velocities by the square of this: ten times the value and a tenth of it move an
-#: inversion time by 4e-16.
+#: A contact ends when its normal force is below minus this fraction of the weight. A top that begins to roll on its
+#: sphere presses its stem less and less, but never lifts it; without this margin, errors of a nearly zero force would
+#: determine the step lengths. Ending the contact late changes velocities by the square of this: a tenfold or a tenth of
+#: the value changes an inversion time by 4e-16.
 HOLDS = 1e-8
 
 #: Where m_1 - m_0 is less than this fraction of its value without friction, rigid-body mechanics does not determine the
@@ -124,7 +124,7 @@ class LeaningDynamics(eqx.Module):
         return stacked(self.motion(state).rate, state)
 
     def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """The lesser of `margins`."""
+        """The smaller of `margins`."""
         return least(*self.margins(state))
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
@@ -140,13 +140,15 @@ class LeaningDynamics(eqx.Module):
     def stopped(self, free: FreeBody) -> tuple[FreeBody, Bool[Array, "..."]]:
         """The end of rocking: the total effect of all remaining impacts on a top whose spheres are both at the plane.
 
-        The top rocks from sphere to sphere, ever less, and infinitely many impacts take a finite time T. Sphere j gets
-        the impulse P_j (f_j, 1), and P_j tau_j where the law has a torque, more than while it leans for T, and the sum
-        stops both speeds along the normal, g + G P = 0. In T both slips change by as little as the speeds g, so that
+        The top rocks from sphere to sphere with decreasing amplitude, and infinitely many impacts take a finite time T.
+        Sphere j gets the impulse P_j (f_j, 1), and P_j tau_j if the law has a torque, in addition to those of leaning
+        for T, and the sum stops both speeds along the normal, g + G P = 0. During T, both slips change only by the
+        order of the speeds g, so the error is of the order of their square.
         this errs by their square.
 
-        **Returns:** the body after these impulses, before `at_rest`; and whether their friction takes energy. One P_j
-        is negative, the reduction of that sphere's load in T; if its friction adds energy now, it takes some after the
+        **Returns:** the body after these impulses, before `at_rest`; and whether their friction dissipates energy. One
+        P_j is negative, the reduction of that sphere's load in T; if its friction adds energy now, it dissipates some
+        after the
         impact of the other sphere (det G > 0).
         """
         spheres, zero = balls(self.body), jnp.zeros_like(free.height)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nonholonomic.geometry import dot, multiply, scale
 from nonholonomic.hybrid import Transition, TransitionPath
 from nonholonomic.integration import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED, AbstractProblem
-from nonholonomic.xla_cpu import greatest, least
+from nonholonomic.xla_cpu import compiled_setup, greatest, least
 
 from ..model.dynamics import Dynamics, stacked
 from ..model.scene import Scene
@@ -43,7 +43,7 @@ from .leaning import LeaningDynamics, at_rest
 
 Cells = Float[Array, " cells"]
 
-#: Most bounces in a row before a run fails.
+#: Most consecutive bounces before a run fails.
 MOST_BOUNCES = 10_000
 
 #: Components of a state, behind which passive quadratures may follow.
@@ -133,7 +133,7 @@ class Slide(AbstractFlyingMode):
         return shown(self.scene.body, later, _carried(self.scene.body, free, quadratures, passed))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Cells) -> Transition:
-        """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land where that one touches.
+        """Fly, and bounce, until a sphere stays on the plane; or let the other sphere land if it touches the plane.
 
         Counts the flights.
         """
@@ -185,12 +185,12 @@ class Lean(AbstractFlyingMode):
 def modes(
     scene: Scene[Top], problem: InversionProblem, tolerance: float, last: bool, with_quadratures: bool = False
 ) -> tuple[tuple[AbstractFlyingMode, ...], Int[Array, " cells"]]:
-    """The modes of runs, sliding on each sphere and on both if there are two; and the number of the mode in which each
+    """The modes of runs, sliding on each sphere and on both if there are two; and the index of the mode in which each
     starts.
 
     **Arguments:**
 
-    - `scene`: with `contact="hybrid"`; `problem`: of its launches, which stand on their lower sphere.
+    - `scene`: with `contact="hybrid"`; `problem`: the problem of its launches, which stand on their lower sphere.
     - `tolerance`: unused by these modes; `last`: whether the last crossing counts; `with_quadratures`: as for
       `AbstractFlyingMode`.
     """
@@ -198,8 +198,14 @@ def modes(
     slides = tuple(Slide(*arguments, jnp.asarray(number), last) for number in range(len(spheres)))
     if len(spheres) == 1:
         return slides, jnp.zeros(problem.states.shape[1:], int)
-    main, stem = spheres
-    return (*slides, Lean(*arguments)), (height(main, stem, problem.states) < 0.0).astype(int)
+    return (*slides, Lean(*arguments)), _first_mode(scene.body, problem.states)
+
+
+@compiled_setup
+def _first_mode(body: Top, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
+    """The number of the lower of the two spheres."""
+    main, stem = balls(body)
+    return (height(main, stem, states) < 0.0).astype(int)
 
 
 def leaning(scene: Scene[Top]) -> LeaningDynamics:
@@ -212,7 +218,7 @@ class Air(NamedTuple):
 
     - `free`, `elapsed` [s]: the body and the time since the contact was lost.
     - `ball`: the sphere that touched last; `rising`: whether it left with a speed; `falls`: whether, without a flight,
-      it is about to strike the plane, `None` for a top without stem. Once the contact is closed, `ball` is the number
+      it is about to strike the plane, `None` for a top without a stem. Once the contact is closed, `ball` is the index
       of the mode.
     - `status`: `RUNNING`, or how the run ended, `LEFT_DOMAIN` if it has jammed; `crossing_time` [s] of the event,
       infinite if there was none.
@@ -235,8 +241,8 @@ class Air(NamedTuple):
 
 
 def lost_contact(scene: Scene[Top], number: Int[Array, ""], state: Float[Array, "components cells"]) -> Air:
-    """The top at the end of sliding on the numbered sphere: its contact is lost or jams, or the other sphere is at the
-    plane.
+    """The top at the end of sliding on the sphere with the given number: its contact is lost or jams, or the other
+    sphere is at the plane.
     """
     own, other = _own_and_other(balls(scene.body), number)
     zero = jnp.zeros_like(state[0])
@@ -262,9 +268,10 @@ def lost_contact(scene: Scene[Top], number: Int[Array, ""], state: Float[Array, 
 def take_flight(
     scene: Scene[Top], air: Air, cos_angle: Float[Array, "..."], left: Cells, last: bool
 ) -> tuple[Air, Bool[Array, " cells"]]:
-    """One flight, until a sphere reaches the plane, theta the angle (unless `last`), or the time from the loss `left` [s].
+    """One flight, until a sphere reaches the plane, theta reaches the angle (unless `last`), or the time since the loss
+    of contact reaches `left` [s].
 
-    **Returns:** the top at its end; and where a sphere has reached the plane.
+    **Returns:** the top at the end of the flight; and whether a sphere has reached the plane.
     """
     body, gravity = scene.body, scene.gravity
     flight = fly(body, gravity, balls(body), air.free, air.ball, air.rising, greatest(left - air.elapsed, 0.0))
@@ -312,7 +319,7 @@ def land(scene: Scene[Top], air: Air) -> Air:
 def _with_other(
     scene: Scene[Top], air: Air, struck: Air, other: Ball, slow: Bool[Array, " cells"], closing: Cells
 ) -> Air:
-    """Effect of an impact on the other sphere if that is at the plane: it strikes too, or the top comes to rest on
+    """Effect of an impact on the other sphere if that is at the plane: it also strikes, or the top comes to rest on
     both.
 
     **Arguments:** `air`: before the impact; `struck`: after it; `slow`: where it is so slow that it may be the last.
@@ -354,7 +361,7 @@ def _no_flights(start: Air) -> TransitionPath:
 
 
 def _with_flight(body: Top, record: TransitionPath | None, before: Air, after: Air) -> TransitionPath | None:
-    """The record, if one is kept, with the flight between two states of a single run, if it flew."""
+    """The record, if one is kept, with the flight of a single run between two states added, if it flew."""
     if record is None:
         return None
     place, flew = before.flights[0], after.flights > before.flights

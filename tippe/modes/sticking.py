@@ -25,7 +25,7 @@ SLIPPING, ROLLING = range(2)
 
 
 class StickSlipMode(AbstractBatchedMode):
-    """Slipping or rolling up to an angle of theta; with `last` the last crossing of it counts.
+    """Slipping or rolling until theta reaches an angle; with `last`, the last crossing counts.
 
     For a single run whose path is kept, the passive quadratures of a `TrajectoryProblem` follow the first `size`
     components: `axial` is then the moment of inertia about the axis [kg m^2]. For the cells of a table both are `None`.
@@ -42,7 +42,7 @@ class StickSlipMode(AbstractBatchedMode):
         return self._under(self.kind, state)
 
     def shown(self, state: Float[Array, "components times"]) -> Float[Array, "components times"]:
-        """The velocity of a rolling top follows from the rest of its state."""
+        """The velocity of a rolling top follows from the other components of its state."""
         if not self.kind.rolls:
             return state
         own = self.kind.both.rolling.carried_along(state[: self._size(state)])
@@ -53,7 +53,7 @@ class StickSlipMode(AbstractBatchedMode):
         return onset.at((passed - wait) / jnp.where(onset.length > 0.0, onset.length, 1.0))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """Stick, slip, or end where the contact is lost. Counts the changes from slip to rolling."""
+        """Stick, slip, or end if the contact is lost. Counts the changes from slip to rolling."""
         slipping = self._under(self.kind.both.slipping, state)
         change = self.kind.ended(state, self._size(state), lambda at: slipping.field(left, at), self.scales, left)
         onset, length = change.onset, change.onset.length
@@ -88,7 +88,7 @@ class StickSlipMode(AbstractBatchedMode):
 
 
 def _recorded(change: Change) -> TransitionPath:
-    """The beginning of a slip, where there is one."""
+    """The beginning of a slip, if there is one."""
     ends = jnp.where(change.rolls | change.lost, jnp.inf, change.elapsed)
     motions = jax.tree.map(lambda leaf: leaf[None], (change.onset, change.wait))
     return TransitionPath(ends[None], motions, jnp.ones((1, len(ends)), int))
@@ -102,12 +102,12 @@ def modes(
     axial: Float[Array, ""] | None = None,
     size: int | None = None,
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]:
-    """The modes of runs, and the number of the mode in which each starts.
+    """The modes of runs, and the index of the mode in which each starts.
 
     **Arguments:**
 
-    - `problem`: of a scene with `SetValuedCoulomb` and its launches; it holds all that is needed of the scene.
-    - `tolerance`: relative, of the integration; `last`: whether the last crossing counts.
+    - `problem`: of launches in a scene with `SetValuedCoulomb`; contains everything needed of the scene.
+    - `tolerance`: relative tolerance of the integration; `last`: whether the last crossing counts.
     - `axial`, `size`: as for `StickSlipMode`.
     """
     both = problem.dynamics
@@ -119,14 +119,14 @@ def modes(
 
 @compiled_setup
 def _first_mode(both: StickSlip, states: Float[Array, "components cells"]) -> Int[Array, " cells"]:
-    """The number of the mode in which each cell starts."""
+    """The index of the mode in which each cell starts."""
     return jnp.where(both.slip_speed(states) <= AT_REST * both.speed, ROLLING, SLIPPING)
 
 
 def contact_modes(
     run: TrajectoryProblem, tolerance: Any
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]:
-    """The modes of one run whose path is kept, the number of the first mode, and the initial state.
+    """The modes of one run whose path is kept, the index of the first mode, and the initial state.
 
     **Arguments:** `run`: of a scene with `SetValuedCoulomb`; `tolerance`: relative, of the integration.
     """

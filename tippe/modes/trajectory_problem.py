@@ -22,9 +22,9 @@ from ..model.top import Top
 class TrajectoryProblem(AbstractProblem):
     """Launches with their cyclic coordinates: the state, the arena's path, the spin angle and the work of friction.
 
-    Behind the coordinates of the arena's frame stand the three components of a unit vector c across the axis, carried
-    with the axis without rotation about it, c' = (e x e') x c. The body's first axis is c turned about e by the spin
-    angle: so every integrated component changes as slowly as the axis does.
+    The coordinates of the arena's frame are followed by the three components of a unit vector c across the axis, which
+    moves with the axis without rotation about it, c' = (e x e') x c. The body's first axis is c turned about e by the
+    spin angle, so every integrated component changes as slowly as the axis.
 
     `rest` are spin angle and work at the start, `None` where both are 0.
     """

@@ -1,4 +1,4 @@
-r"""Every numbered equation of the paper: as printed, the verdict, the correct form, and the tests that show it.
+r"""Audit of the paper: each numbered equation as printed, the verdict, the correct form, and the tests that show it.
 
 `python -m tippe.papers.audit` prints the page `docs/development/tippe_paper.md`. In its formulas eta is the angle of the
 position from the lowest line, r the arena's radius, rho = r - R the radius of the centre's path, and phi the direction of the
@@ -10,14 +10,14 @@ from typing import NamedTuple
 
 
 class Equation(NamedTuple):
-    """What became of one of the paper's statements.
+    """The verdict on one of the paper's statements.
 
     - `number`: as the paper numbers it.
-    - `subject`: what it is meant to be.
+    - `subject`: what the statement is about.
     - `printed`: as printed, in TeX.
     - `verdict`: right, right on the plane, misprint, incomplete, wrong, meaningless or lost.
     - `reason`: why, in a few sentences.
-    - `correct`: as it should read, in TeX, a string for each formula; empty where nothing can be said.
+    - `correct`: the correct formulas, in TeX; empty where there are none.
     - `code`: the functions that compute the correct form.
     - `tests`: the tests that show verdict and correct form, as pytest names them.
     """
@@ -90,9 +90,9 @@ AUDIT = (
         r"R_\phi = \partial_\eta,\quad "
         r"R_\psi = -y\sin\eta\,\partial_r - \tfrac yr\cos\eta\,\partial_\eta + r\sin\eta\,\partial_y",
         verdict="right",
-        reason="The last lines hold for x = r sin(eta), z = r cos(eta), with eta = 0 at the top; from the lowest line, z = "
-        "-r cos(eta). The first line of (5) has phi and theta instead of eta and y. Only the second field and d/dy "
-        "are tangent to the cylinder. The model needs none of the others.",
+        reason="The last lines hold for x = r sin(eta), z = r cos(eta), with eta = 0 at the top; if eta counts from the "
+        "lowest line, z = -r cos(eta). The first line of (5) has phi and theta instead of eta and y. Only the "
+        "second field and d/dy are tangent to the cylinder. The model needs none of the others.",
         correct=(r"[R_x, R_y] = -R_z,\qquad [R_y, R_z] = -R_x,\qquad [R_z, R_x] = -R_y",),
         code=("tippe.papers.paper.rotation_generators",),
         tests=(
@@ -106,10 +106,9 @@ AUDIT = (
         printed=r"L' = \tfrac12\left(m(\dot x^2+\dot y^2) + I\dot\theta^2 + I\sin^2\theta\,\dot\phi^2 "
         r"+ I_3(\dot\psi+\dot\phi\cos\theta)^2\right) - mg(R-a\cos\theta)",
         verdict="incomplete",
-        reason="The Lagrangian is for the plane. If x and y are those of the centre of mass, its vertical motion is missing; "
-        "if they are those of the sphere's centre, all terms that couple translation and rotation are missing. The "
-        "first correct formula is for the plane, in coordinates of the centre of mass; the second is for the "
-        "cylinder, with the height z of that centre.",
+        reason="The Lagrangian is for the plane, and lacks the vertical motion of the centre of mass. The first correct "
+        "formula is for the plane, in coordinates of the centre of mass; the second is for the cylinder, with the height z of "
+        "that centre.",
         correct=(
             r"L = L' + \tfrac12 ma^2\dot\theta^2\sin^2\theta",
             r"L = \tfrac12 m|\dot{\mathbf O} - a\dot{\mathbf e}|^2 + \tfrac12I_1(p^2+q^2) "
@@ -172,10 +171,9 @@ AUDIT = (
         subject="equations of motion in the cylinder",
         printed=r"(\ddot\eta,\ \ddot\phi,\ \ddot\theta,\ \ddot{\ },\ \ddot x)^T = (\ldots)",
         verdict="meaningless",
-        reason="One symbol on the left is lost. The right sides mix forces times lengths with accelerations, the first row "
-        "is repeated in the last, S_phi is not defined, and mu does not occur. The correct equations follow. M is the "
-        "moment of the contact forces about the centre of mass per unit of N, and p, q, sigma are the components of "
-        "the angular velocity of the axes e1, e2, e.",
+        reason="One symbol on the left is lost. The right sides mix forces times lengths with accelerations, and mu does not "
+        "occur. In the correct equations, M is the moment of the contact forces about the centre of mass per unit of N, "
+        "and p, q, sigma are the components of the angular velocity of the axes e1, e2, e.",
         correct=(
             r"m(\ddot{\mathbf O} - a\ddot{\mathbf e}) = N(\mathbf f + \mathbf n) - mg\mathbf z",
             r"I_1\dot p + I_3\omega_3q - I_1q\sigma = N\mathbf M\cdot\mathbf e_1,\qquad "
@@ -224,9 +222,8 @@ AUDIT = (
         r"\dot\theta=\dot\phi=\dot\psi=\dot\eta=\dot X=0",
         verdict="wrong",
         reason="In the unit of the header, a top of ordinary size would spin at more than 1e5 rad/s. Zero rates contradict "
-        "beta1: such a top never rises. We take beta1 as 2500 g cm^2/s, which gives the initial spin. The friction "
-        "law for mu = 0.3 is not stated, and the text gives two different limits of the inclination for the same "
-        "start.",
+        "beta1: such a top never rises. We take beta1 as 2500 g cm^2/s, which gives the initial spin. The paper does "
+        "not state the friction law for mu = 0.3.",
         correct=(r"\omega_3(0) = \beta_1/I_3,\qquad \beta_1 = 2.5\cdot10^{-4}\ \mathrm{kg\,m^2/s}",),
         code=("tippe.papers.paper.launch",),
         tests=(
@@ -240,10 +237,9 @@ TITLE = "# The paper on the tippe top in the cylinder, equation by equation"
 
 PREFACE = """
 This page lists which equations of *Modeling of Dynamics Object with Non-Holonomic Constraints Based on Maple in
-Cylinder Coordinate* hold, the corrected form of the others, the function that computes it and the test that checks it.
+Cylinder Coordinate* hold, the corrected form of the others, and the code and tests.
 
 * With sliding friction the top has **no nonholonomic constraint**: the contact is holonomic, and friction is a force.
-  Only rolling without slip is nonholonomic; the energy is then constant, and the top cannot turn over.
 * Jellett's quantity is constant on a plane, but **not in the cylinder**, where the paper uses it in place of an
   equation of motion.
 * Friction changes the momentum β₁. Either β₁ or Jellett's quantity is constant, never both.
@@ -256,34 +252,19 @@ Cylinder Coordinate* hold, the corrected form of the others, the function that c
 TABLES = """
 ## What Tables 2 and 3 say about the lost Table 1
 
-The tables determine little: six times and eighteen answers yes or no depend on eight unknown parameters and on an
-unknown friction law. This scan draws tops of 5 to 50 g and 1.5 to 3 cm with beta1 = 2500 g cm^2/s, the centre at rest
-and mu = 0.3, viscous (s/m) or Coulomb. A top counts as reversed at 0.95 pi, within 40 s:
+Tables 2 and 3 contain six times and eighteen answers yes or no. They depend on eight unknown parameters and an unknown
+friction law. Here a top counts as reversed when it reaches 0.95 pi within 40 s.
 
-    python benchmarks/paper_tables_scan.py --table 2 --law viscous --sets 20000 --rounds 25
+* **Table 2 alone** (`python benchmarks/paper_tables_scan.py`). Of 20 000 random tops under viscous friction, 293 reverse in
+  the printed rows; after variation, the best of them misses the times by 1.25 s.
+* **Table 3 alone** (the same program). No top was found: those that keep contact reverse after 3 to 30 s in another order.
+* **Both tables with one top** (`python benchmarks/paper_tables_joint.py --law viscous`). With an error of 1 s in each row,
+  the smallest -2 log likelihood is 29.6 at 11 degrees of freedom, for m = 11.573 g, R = 27.474 mm, a / R = 0.086495, I1 /
+  I3 = 1.0533, I3 / m R^2 = 0.4075, a cylinder of 84.428 R, azimuth 1.7971, mu = 0.32573 s/m. From the wall this top
+  reverses at 22.6, 19.3, 19.9 and 22.4 s (printed 23, 19, 20, 22), and from the lowest line at 26.3, 26.3, 28.2 and 30.3 s
+  (printed 25, 22, not, not). Other tops do as well (`examples/lost_numbers.py`).
 
-| table, law | sets drawn | with the pattern | and contact in all rows | largest error drawn | after variation |
-|---|---|---|---|---|---|
-| 2, viscous | 20000 | 293 | 291 | 3.15 s | 1.25 s |
-| 2, Coulomb | 2000 | 11 | 9 | 5.87 s | 2.57 s |
-| 3, viscous | 20000 | 185 | 12 | 20.1 s | 18.9 s |
-| 3, Coulomb | 2000 | 12 | 6 | 17.7 s | 8.6 s |
-
-The pattern is which rows reverse. Errors refer to the sets that keep contact in all rows. The last column gives the error
-after 25 rounds (Coulomb 15) in which the best sets are varied.
-
-* **Table 2 alone: about 1 s, with different tops.** A viscous top with m = 49.8 g, R = 15.0 mm, a / R = 0.1692, I1 / I3 =
-  0.9162, I3 / m R^2 = 0.3716 in a cylinder of 7.741 R, azimuth 1.836, reverses at 23.74 and 23.18 s from 0.1 and 0.2 rad
-  and from no other row within 40 s; from 0.3 rad it reverses at 45 s.
-* **Table 3 alone: not found by this scan.** Sets with contact in all rows reverse after 3 to 30 s in another order.
-* **Both tables with one top: 1.6 s** (`python benchmarks/paper_tables_joint.py --law viscous`). The smallest -2 log
-  likelihood is 29.6 at 11 degrees of freedom: m = 11.573 g, R = 27.474 mm, a / R = 0.086495, I1 / I3 = 1.0533, I3 / m R^2 =
-  0.4075, a cylinder of 84.428 R, azimuth 1.7971, mu = 0.32573 s/m. From the wall it reverses at 22.6, 19.3, 19.9 and
-  22.4 s (printed 23, 19, 20, 22), and from the lowest line at 26.3, 26.3, 28.2 and 30.3 s (printed 25, 22, not, not). Other
-  tops do as well (`examples/lost_numbers.py`): I1 / I3 from 1.035 to 1.053, a / R from 0.072 to 0.087, spins of 65 to 79 rad/s,
-  masses of 11 to 16 g and any azimuth. No set within 1 s was found.
-
-So some tops reproduce both tables, but the tables do not determine Table 1.
+So the tables do not determine Table 1.
 """
 
 

@@ -1,7 +1,7 @@
-"""The paper this model answers, as data: its units, tables, rotation generators and the formulas that it misprints.
+"""The paper on the top in the cylinder, as data: its units, tables, rotation generators and misprinted formulas.
 
 "Modeling of Dynamics Object with Non-Holonomic Constraints Based on Maple in Cylinder Coordinate R x S^1 x SO(3)". Its
-numbers are in g, cm and s; they are converted here and nowhere else. What became of each equation stands in `audit.py`.
+numbers are in g, cm and s and are converted here only. `audit.py` has the verdict on each equation.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ GRAM, CENTIMETRE = 1e-3, 1e-2
 
 #: beta1 of Tables 2 and 3 [kg m^2/s], its "2,500 g m^2 rad/s" read as 2500 g cm^2/s.
 BETA1 = 2500.0 * GRAM * CENTIMETRE**2
-#: The same with the header taken at its word [kg m^2/s].
+#: The same with the unit of the table's header [kg m^2/s].
 BETA1_AS_PRINTED = 2500.0 * GRAM
 
 
@@ -27,7 +27,7 @@ class Row(NamedTuple):
     """One row of Table 2 or 3.
 
     - `theta`: inclination at the start [rad].
-    - `time`: time at which the paper has the top reversed [s]; None for "Not reversed".
+    - `time`: time at which the top is reversed [s]; None for "Not reversed".
     """
 
     theta: float
@@ -35,7 +35,7 @@ class Row(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Table 2 or 3, whose rows share all but the inclination.
+    """Table 2 or 3, whose rows differ only in the inclination.
 
     - `eta`: place at the start [rad].
     - `mu`: coefficient of friction, of a law that the paper does not state.
@@ -53,7 +53,7 @@ TABLE_3 = Table(float(jnp.pi) / 2.0, 0.3, tuple(map(Row, THETAS, (23.0, 19.0, 20
 
 
 def launch(table: Table, row: Row, body: Top) -> Launch:
-    """The start of a row, its beta1 = I3 omega3 read as the spin at t = 0, everything else at rest."""
+    """The launch of a row, with the spin from beta1 = I3 omega3 at t = 0 and everything else at rest."""
     return Launch(row.theta, BETA1 / body.I3, eta=table.eta)
 
 

@@ -1,7 +1,7 @@
 """The papers' two inversion tables beside computed times: `python -m tippe --paper`.
 
-The printed times and the computed ones have different trends: the paper lost the numbers of its top, and its own equations of
-motion are not those of a top (`docs/development/tippe_paper.md`). The same launches run on the plane, too.
+The printed and the computed times have different trends: the numbers of the paper's top are lost, and its equations of
+motion are not those of a top (`docs/development/tippe_paper.md`). The same launches also run on the plane.
 """
 
 import argparse
@@ -36,7 +36,7 @@ from ..runs.trajectory import simulate
 from ..runs.view import Motion, stages
 from . import paper
 
-#: The arenas that have names, and what their numbers are.
+#: The arenas by name, and their numbers.
 SURFACES = {
     "sphere RADIUS": Sphere,
     "spheroid EQUATORIAL POLAR": Spheroid,
@@ -50,7 +50,7 @@ SAMPLES = 3000
 
 
 class Help(argparse.ArgumentDefaultsHelpFormatter):
-    """Shows the default of every option that has one."""
+    """Show the default of every option that has one."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         return action.help if action.default is None else super()._get_help_string(action)
@@ -107,7 +107,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def scenes(options: argparse.Namespace) -> dict[str, Scene]:
-    """The two arenas with the declared top, and the one that is asked for."""
+    """The two arenas with the declared top, and the requested one."""
     inertia = options.mass * options.radius**2
     I1 = 131.0 / 350.0 * inertia if options.I1 is None else options.I1
     I3 = 0.4 * inertia if options.I3 is None else options.I3
@@ -124,7 +124,7 @@ def scenes(options: argparse.Namespace) -> dict[str, Scene]:
 def surface_of(words: list[str]) -> AbstractSurface:
     """An arena by its name and numbers.
 
-    **Raises:** `ValueError` for a name or numbers that no arena has.
+    **Raises:** `ValueError` for an unknown name or illegal numbers.
     """
     name, *numbers = words
     for known, kind in SURFACES.items():
@@ -138,7 +138,7 @@ def surface_of(words: list[str]) -> AbstractSurface:
 
 
 def shown_name(options: argparse.Namespace, arena: str) -> str:
-    """What an arena is called where it is shown."""
+    """The name of an arena in the report."""
     return " ".join(options.surface) if arena == "surface" else arena
 
 
@@ -172,7 +172,7 @@ def tables(options: argparse.Namespace) -> dict[str, Table]:
 
 
 def printed_times(options: argparse.Namespace, eta: float) -> list[str] | None:
-    """The paper's column for a place, if these are its launches."""
+    """The paper's column for a place, if the launches are the paper's."""
     for table in (paper.TABLE_2, paper.TABLE_3):
         if list(options.theta) == [row.theta for row in table.rows] and math.isclose(eta, table.eta):
             return ["-" if row.time is None else f"{row.time:g}" for row in table.rows]
@@ -217,7 +217,7 @@ def report(options: argparse.Namespace, by_arena: dict[str, Table]) -> str:
 
 
 def described(options: argparse.Namespace) -> list[str]:
-    """What the report is about, in some lines."""
+    """The lines above the report."""
     scene = scenes(options)["cylinder"]
     body = scene.body
     return [
@@ -240,15 +240,15 @@ def _friction(law: AbstractFriction) -> str:
 
 @compiled_quickly
 def moving(scene: Scene[Top], launches: Launch, times: Any, tolerance: Any) -> Motion:
-    """What is drawn of every launch until the last of the times, in one batched run."""
+    """The drawn quantities of every launch up to the last of the times, in one batched run."""
     return jax.vmap(lambda launch: Motion.of(simulate(scene, launch, times[-1], times, tolerance)))(launches)
 
 
 def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, Motion]]:
-    """The times that are drawn, up to `t1` [s], and what is drawn of every launch in each arena.
+    """The times of the plot, up to `t1` [s], and the drawn quantities of every launch in each arena.
 
-    All numbers are arrays: a program is compiled anew for another Python number, so the picture and the page would not share
-    theirs. The arenas' programs are compiled side by side, for the compiler uses little more than one core.
+    All numbers are arrays: another Python number would compile a new program, so the picture and the page could not
+    share programs. The arenas' programs are compiled in parallel, because the compiler uses little more than one core.
     """
     arenas, times = scenes(options), np.linspace(0.0, t1, SAMPLES)
     tolerance = np.asarray(options.tolerance)
@@ -258,7 +258,7 @@ def drawn(options: argparse.Namespace, t1: float) -> tuple[Any, dict[str, Motion
 
 
 def starts(options: argparse.Namespace, scene: Scene[Top]) -> tuple[list[float], Launch]:
-    """The places eta(0) of an arena, and the launches from all of them, place after place."""
+    """The places eta(0) of an arena, and the launches from all of them."""
     etas = options.eta if counts_eta(scene) else [0.0]
     eta, theta = (values.ravel() for values in np.meshgrid(etas, options.theta, indexing="ij"))
     return etas, Launch(theta, np.full_like(theta, spin_of(options, scene)), eta, np.zeros_like(theta))
@@ -280,9 +280,9 @@ def picture(options: argparse.Namespace, by_arena: dict[str, Table]) -> Any:
 
 
 def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[Stage]:
-    """The most upright launch that turns over while it can be followed, or else the first to turn over, in both arenas."""
+    """The most upright launch that turns over and can be followed, or else the first to turn over, in both arenas."""
     ends = np.stack([table.last_time.reshape(len(options.theta), -1)[:, 0] for table in by_arena.values()]).max(axis=0)
-    # No longer than the spin can be followed from one sample to the next.
+    # No longer than the spin can be followed from sample to sample.
     longest = SAMPLES / max(abs(spin_of(options, scene)) for scene in scenes(options).values())
     tilt = np.where(ends + 0.5 <= longest, options.theta, np.inf)
     row = int(np.argmin(tilt if np.isfinite(tilt).any() else ends))
@@ -295,7 +295,7 @@ def motions(options: argparse.Namespace, by_arena: dict[str, Table]) -> list[Sta
 
 
 def write_page(options: argparse.Namespace, by_arena: dict[str, Table], drawing: Path | None) -> Path:
-    """The page of the main job: two tops in motion where three.js is installed, the tables, and the picture if there is one."""
+    """Write the page: two moving tops if three.js is installed, the tables, and the picture if there is one."""
     intro, rows = (
         described(options),
         [list(row) for row in zip(*(heading.split("|") for heading, _ in columns(options, by_arena)), strict=True)],

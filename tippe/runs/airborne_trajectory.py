@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from nonholonomic.geometry import scale, sum_vectors, vector_of
 from nonholonomic.hybrid import BETWEEN, Segment, hybrid_samples, solve_hybrid_dense
 from nonholonomic.integration import Settings, Status
+from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import LOSSES, NO_COSINE, Motion
 from ..model.launch import Launch
@@ -140,13 +141,18 @@ def arena_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int
 
     **Arguments:** `modules`: scene and launch; `tolerance`: relative, of the integration.
     """
-    run = TrajectoryProblem.of(*modules)
-    state, scales = run.start()
-    problem = InversionProblem(modules[0].dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
+    problem = _start(*modules)
     modes = airborne.modes if modules[0].body.stem is None else airborne_stem.modes
     if modules[0].friction.set_valued:
         modes = stick_slip_modes
-    return (*modes(modules[0], problem, tolerance, last=False, with_quadratures=True), state[:, None])
+    return (*modes(modules[0], problem, tolerance, last=False, with_quadratures=True), problem.states)
+
+
+@compiled_setup
+def _start(scene: Scene[Top], launch: Launch) -> InversionProblem:
+    """The launch as one cell, with the passive quadratures."""
+    state, scales = TrajectoryProblem.of(scene, launch).start()
+    return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
 
 
 def simulate_airborne(
@@ -160,13 +166,14 @@ def simulate_airborne(
     """Run one launch of a hybrid scene whose flights are integrated. **Arguments:** as for `simulate`, checked."""
     batched_modes, first, state = arena_modes((scene, launch), tolerance)
     exact = scene.friction.set_valued
-    path = solve_hybrid_dense(
-        batched_modes, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), counters=1 + exact
-    )
+    start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
+    path = solve_hybrid_dense(batched_modes, *start, t1, Settings(tolerance, solver), counters=1 + exact)
     status = STATUS[path.status]
     if status == Status.JAMMED:
         status = LOSSES[int(loss(scene, jnp.asarray(path.state)))]
-    hops = np.array([(one.begin, one.end) for one in path.mode_segments if one.number == FLYING]).reshape(-1, 2)
+    hops = np.array(
+        [(segment.begin, segment.end) for segment in path.mode_segments if segment.number == FLYING]
+    ).reshape(-1, 2)
     run = flights_of(
         StickSlipArenaTrajectory if exact else ArenaTrajectory, scene, path, status.word, hops, times, tolerance
     )
@@ -177,6 +184,6 @@ def simulate_airborne(
 
 def sampled_airborne(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:
     """Run one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, checked."""
-    found = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, counters=1)
+    samples = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, counters=1)
     codes = jnp.array([int(status) for status in LOSSES])
-    return sampled_flights(ArenaTrajectory, scene, times, found, codes[loss(scene, found.end_state)])
+    return sampled_flights(ArenaTrajectory, scene, times, samples, codes[loss(scene, samples.end_state)])

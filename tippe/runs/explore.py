@@ -39,7 +39,7 @@ from ..model.scene import Scene
 from ..model.top import Top
 from ..modes.inversion_problem import InversionProblem
 from ..modes.trajectory_problem import TrajectoryProblem
-from .inversion import check_revolution, check_run
+from .checks import check_revolution, check_run
 from .launches import LONG_NAMES, UNITS
 from .trajectory import Trajectory, simulate
 from .view import AXIS, BESIDE, Motion, aside
@@ -54,7 +54,7 @@ TOLERANCE = 1e-7
 DRAWN = 1e-5
 
 #: Steps after which a run in the page is given up: some hundred milliseconds.
-MOST_STEPS = 50_000
+MOST_STEPS_OF_A_PAGE = 50_000
 
 
 @status_line("writing a page")
@@ -127,7 +127,7 @@ def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float) -> Liv
     def moment(values: Numbers, problem: TrajectoryProblem, lane: LaneState) -> Frame:
         return frame(modules(values)[0], problem, lane)
 
-    settings = Settings(TOLERANCE, max_steps=MOST_STEPS)
+    settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
     asked = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
     launched = Simulator(lambda values: InversionProblem.of(*modules(values), ANGLE, 1), t1, settings, asked)
     return LiveRun(

@@ -24,7 +24,7 @@ from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import inclination, parts
 from ..modes.inversion_problem import InversionProblem
-from .inversion import check_event, check_run, check_smooth, nan_if_illegal, permitted
+from .checks import check_event, check_run, check_smooth, nan_if_illegal, permitted
 
 #: The least angle [rad] distinguished from 0 in the penalty for a top that does not invert.
 LEAST_ANGLE = 1e-6
@@ -87,7 +87,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         return jnp.zeros(jnp.shape(value), bool)
 
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
-        return self._found((), self._problem(leaves[: self.movable], cells), leaves, cells)[0]
+        return self._extended((), self._problem(leaves[: self.movable], cells), leaves, cells)[0]
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
@@ -95,7 +95,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         problem, tangents, gather = tangents_by(self._problem, active, leaves[: self.movable], cells)
 
         def run(group: tuple[Any, ...]) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-            return self._found(group, problem, leaves, cells, again)
+            return self._extended(group, problem, leaves, cells, again)
 
         times, slopes = in_groups(run, tangents)
         return times, gather(slopes)
@@ -106,7 +106,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         scene, launch, angle, *_ = jax.tree.unflatten(self.structure, (*leaves, None, None))
         return InversionProblem.of(scene, launch, angle, cells)
 
-    def _found(
+    def _extended(
         self,
         tangents: tuple[Any, ...],
         problem: InversionProblem,

@@ -19,6 +19,7 @@ from nonholonomic.hybrid import (
     solve_hybrid_dense,
 )
 from nonholonomic.integration import FAILED, LEFT_DOMAIN, REACHED_END, UNRESOLVED, Settings, Status
+from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch
@@ -190,12 +191,16 @@ def level_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int
 
     **Arguments:** `modules`: scene and launch; `tolerance`: no mode needs it.
     """
-    scene = modules[0]
-    state, scales = TrajectoryProblem.of(*modules).start()
-    # The place is that of the centre of mass.
+    problem = _start(*modules)
+    return (*modes(modules[0], problem, tolerance, last=False, with_quadratures=True), problem.states)
+
+
+@compiled_setup
+def _start(scene: Scene[Top], launch: Launch) -> InversionProblem:
+    """The launch as one cell, with the passive quadratures; their place is that of the centre of mass."""
+    state, scales = TrajectoryProblem.of(scene, launch).start()
     state = state.at[8:10].add(-scene.body.offset * state[2:4])
-    problem = InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
-    return (*modes(scene, problem, tolerance, last=False, with_quadratures=True), state[:, None])
+    return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
 
 
 def simulate_hybrid(
@@ -208,7 +213,8 @@ def simulate_hybrid(
 ) -> HybridTrajectory:
     """Run one launch of a hybrid scene until `t1`. **Arguments:** as for `simulate`, checked."""
     batched_modes, first, state = level_modes((scene, launch), tolerance)
-    path = solve_hybrid_dense(batched_modes, int(first[0]), state[:, 0], t1, Settings(tolerance, solver), counters=1)
+    start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
+    path = solve_hybrid_dense(batched_modes, *start, t1, Settings(tolerance, solver), counters=1)
     flights = [(segment.begin, segment.end) for segment in path.segments if segment.number == BETWEEN]
     hops = np.array(flights).reshape(-1, 2)
     return flights_of(HybridTrajectory, scene, path, STATUS[path.status].word, hops, times, tolerance)

@@ -1,71 +1,131 @@
-"""Inversion: launches that end when the axis reaches an angle, and the checks of their arguments."""
+"""Inversions of many launches: whether and when each top turns over, and the derivatives of that time.
 
-import math
-import warnings
-from collections.abc import Iterator, Sequence
-from typing import Any
+Tables solve launches with concrete numbers (`ON_HOST`); functions that run inside `jit`, `vmap` and `grad` solve them with
+traced numbers (`traced`). Runs are one smooth motion, or go through the modes of their `RunKind`.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Int
 
-from nonholonomic.hybrid import HybridOutcome
-from nonholonomic.integration import CROSSED, LOOSEST, REACHED_END, Outcome, run_bounds
-from nonholonomic.parameters import numbers
-from nonholonomic.validation import (
-    Bound,
-    all_bounds,
-    is_traced,
-    legal,
-    nan_unless,
-    require_all,
-    require_kind,
-    require_scalars,
+from nonholonomic.derivatives import solve_ensemble_with_tangents, traced_solve_ensemble_with_tangents
+from nonholonomic.hybrid import (
+    AbstractBatchedMode,
+    HybridOutcome,
+    solve_hybrid,
+    solve_hybrid_with_tangents,
+    traced_solve_hybrid,
+    traced_solve_hybrid_with_tangents,
 )
-from nonholonomic.xla_cpu import compiled_setup
+from nonholonomic.integration import CROSSED, REACHED_END, Outcome, Settings, solve_ensemble, traced_solve_ensemble
 
-from ..model.friction import Frictionless
-from ..model.launch import Launch
-from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
+from ..modes import airborne
 from ..modes.inversion_problem import InversionProblem
+from .run_kind import RunKind, run_kind_of
 
 
-@eqx.filter_jit
-def permitted(
-    structure: Any, unchecked: bool, leaves: Sequence[Float[Array, "..."]]
-) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, ""]]:
-    """Which cells have legal numbers; the horizons, 0 for the others; and the tolerance of the ensemble.
+class Solvers(NamedTuple):
+    """The functions that solve ensembles, for concrete or for traced numbers; `xp` is `numpy` or `jax.numpy`."""
 
-    One tolerance serves the whole ensemble: the smallest of a batch.
+    xp: Any
+    ensemble: Callable[..., Any]
+    ensemble_with_tangents: Callable[..., Any]
+    hybrid: Callable[..., Any]
+    hybrid_with_tangents: Callable[..., Any]
 
-    **Arguments:** `structure`, `leaves`: of scene, launch, angle, horizon and tolerance; `unchecked`: whether some of
-    them were traced when they were checked.
+
+ON_HOST = Solvers(np, solve_ensemble, solve_ensemble_with_tangents, solve_hybrid, solve_hybrid_with_tangents)
+
+
+def traced(one_kernel: bool = True) -> Solvers:
+    """The functions for traced numbers. **Arguments:** `one_kernel`: not for programs that are differentiated again."""
+    return Solvers(
+        jnp,
+        functools.partial(traced_solve_ensemble, one_kernel=one_kernel),
+        functools.partial(traced_solve_ensemble_with_tangents, one_kernel=one_kernel),
+        traced_solve_hybrid,
+        traced_solve_hybrid_with_tangents,
+    )
+
+
+class Inversions(eqx.Module):
+    """Launches in many cells, to be run until theta reaches an angle.
+
+    - `problem`: the smooth motion, and the initial states of all cells.
+    - `modes`, `first`: the modes of a hybrid run, and the number of each cell's first mode; `None` for smooth runs.
+    - `last`: whether a run continues through the angle: where it ends above it, the last crossing counts.
     """
-    scene, launch, angle, t1, tolerance = jax.tree.unflatten(structure, leaves)
-    may = jnp.asarray(True)
-    if unchecked:
-        bounds = (
-            *all_bounds(scene),
-            *all_bounds(launch),
-            *scene.start_bounds(launch),
-            *(() if angle is None else event_bounds(angle)),
-            *run_bounds(t1, tolerance),
+
+    problem: InversionProblem
+    modes: tuple[AbstractBatchedMode, ...] | None
+    first: Int[Array, " cells"] | None
+    kind: RunKind = eqx.field(static=True)
+    last: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, scene: Scene[Any], problem: InversionProblem, tolerance: Any, last: bool) -> "Inversions":
+        """The launches of a problem of this scene, to be run at a tolerance."""
+        kind = run_kind_of(scene)
+        modes, first = (None, None) if kind.modes is None else kind.modes(scene, problem, tolerance, last)
+        return cls(problem, modes, first, kind, last)
+
+    def solve(self, t1: Any, cells: int, settings: Settings, solvers: Solvers = ON_HOST) -> Outcome | HybridOutcome:
+        """How the runs end. **Arguments:** `t1`: horizon [s]; `cells`: how many cells to run, the rest is padding."""
+        if self.modes is None:
+            horizon = (jnp.asarray(t1), jnp.asarray(cells))
+            return solvers.ensemble(self.problem, *horizon, settings, nonterminal=self.last)[0]
+        start, counters = self._start(solvers.xp), len(self.kind.counts)
+        return solvers.hybrid(self.modes, *start, t1, cells, settings, counters=counters, nonterminal=self.last)
+
+    def solve_with_tangents(
+        self,
+        tangents: tuple["Inversions", ...],
+        t1: Any,
+        cells: int,
+        settings: Settings,
+        solvers: Solvers = ON_HOST,
+    ) -> tuple[Outcome | HybridOutcome, Sequence[Any], Any]:
+        """How the runs end, and the derivatives of their crossing times along some tangents.
+
+        **Returns:** the outcome; for each tangent the derivative in every cell, 0 where there is no crossing or it is at the
+        start; and where the derivative is NaN because an event on the way was grazing.
+        """
+        if self.modes is None:
+            arguments = (tuple(tangent.problem for tangent in tangents), jnp.asarray(t1), jnp.asarray(cells), settings)
+            outcome, slopes = solvers.ensemble_with_tangents(self.problem, *arguments, nonterminal=self.last)
+            return outcome, slopes, False
+        outcome, xp = None, solvers.xp
+        if self.last:
+            # The derivatives need the run only up to the event, whose time is then known.
+            outcome = self.solve(t1, cells, settings, solvers)
+            t1 = xp.where(xp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
+        moved = tuple((tangent.modes, tangent.problem.states) for tangent in tangents)
+        arguments = (self.modes, moved, *self._start(xp), t1, cells, settings)
+        run, sensitivities = solvers.hybrid_with_tangents(
+            *arguments, counters=len(self.kind.counts), ends_on_event=not self.last
         )
-        may = legal(bounds)
-        if angle is None:
-            may = may & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0)
-        t1, tolerance = jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
-    return may, t1, jnp.min(tolerance)
+        return run if outcome is None else outcome, sensitivities.slopes, sensitivities.grazing
+
+    def _start(self, xp: Any) -> tuple[Any, Any]:
+        """The number of each cell's first mode, and its initial state."""
+        return xp.asarray(self.first), xp.asarray(self.problem.states)
 
 
-# One program where the function is called on its own, not one for every comparison.
-@compiled_setup
-def nan_if_illegal(found: Float[Array, ""], structure: Any, unchecked: bool, leaves: list[Any]) -> Float[Array, ""]:
-    """The result, or NaN with NaN derivatives where numbers are not legal. **Arguments:** as for `permitted`."""
-    return nan_unless(permitted(structure, unchecked, leaves)[0], found) if unchecked else found
+# Compiled once for all chunks.
+_on_the_ground = eqx.filter_jit(airborne.on_the_ground)
+
+
+def with_contact_state(scene: Scene[Any], outcome: Outcome | HybridOutcome) -> Outcome | HybridOutcome:
+    """The outcome with all states in the layout of a contact, those of flight too."""
+    if not isinstance(outcome, HybridOutcome) or not run_kind_of(scene).flight_state:
+        return outcome
+    return outcome._replace(state=_on_the_ground(scene, outcome.state, outcome.mode))
 
 
 def is_inverted(outcome: Outcome | HybridOutcome, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:
@@ -74,93 +134,3 @@ def is_inverted(outcome: Outcome | HybridOutcome, problem: InversionProblem, las
         return outcome.status == CROSSED
     above = problem.event_function(jnp.asarray(outcome.state)) <= 0.0
     return (outcome.status == REACHED_END) & above & jnp.isfinite(outcome.crossing_time)
-
-
-#: Advice in messages about lists, where a table is the better choice.
-LISTS = "inversion_table takes lists, and jax.vmap maps over them"
-
-
-def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LISTS) -> None:
-    """Raise `ValueError` unless these are a scene, a launch with a place on it, a positive horizon and a tolerance in range.
-
-    **Arguments:** as for `check_numbers`.
-    """
-    check_numbers(scene, launch, t1, tolerance, lists)
-    scene.check_start(launch)
-
-
-def check_numbers(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LISTS) -> None:
-    """Raise `ValueError` unless these are a scene, a launch, a positive horizon and a tolerance in range, each by
-    itself.
-
-    **Arguments:** as for `inversion_time`; `lists`: which functions accept lists instead of single numbers. The
-    parameters of a function, such as that of a `Graph`, may be lists.
-    """
-    require_kind(scene, "scene", Scene)
-    require_kind(launch, "launch", Launch)
-    require_all(run_bounds(t1, tolerance))
-    values = numbers("scene", scene, functions=False) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
-    require_scalars(values, lists)
-
-
-def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any) -> None:
-    """Warn of a scene without friction, and of a top that stands exactly upright on a level plane.
-
-    **Arguments:** `launch`: its theta is ignored; `theta`: one angle or several [rad].
-    """
-    if isinstance(scene.friction, Frictionless):
-        warnings.warn(
-            "friction = Frictionless(): without friction no top turns over; give the scene a law, such as "
-            "tippe.Scene(top, friction=tippe.Viscous(0.3))",
-            UserWarning,
-            stacklevel=4,
-        )
-    if isinstance(scene.body, AbstractRigidBody):
-        return
-    at_rest = launch.velocity is None and launch.angular_velocity is None
-    if scene.level and at_rest and not is_traced(theta) and np.any(np.asarray(theta) == 0.0):
-        warnings.warn(
-            "theta = 0.0 is exactly upright, where a top stays for ever: launch it at a small angle, such as 0.01 rad",
-            UserWarning,
-            stacklevel=4,
-        )
-
-
-def event_bounds(angle: Any) -> Iterator[Bound]:
-    """The range of the angle [rad] to be reached."""
-    yield Bound(angle, "angle", above=0.0, at_most=math.pi, unit="rad")
-
-
-def check_smooth(scene: Scene, caller: str) -> None:
-    """Raise `ValueError` for a scene with hybrid runs, which do not support derivatives here."""
-    if scene.contact == "hybrid":
-        raise ValueError(f"contact = 'hybrid' must be 'stop' for {caller}; inversion_table goes through flights")
-    if scene.friction.set_valued:
-        kind = type(scene.friction).__name__
-        raise ValueError(f"friction = {kind} must be a law without phases for {caller}; inversion_table has them")
-
-
-def check_reversible(launch: Launch, values: dict[str, Any]) -> None:
-    """Raise `ValueError` for a launch without spin, which has none to reverse.
-
-    **Arguments:** `values`: full name of a number -> values in place of the launch's own.
-    """
-    spin = values.get("launch.spin", launch.spin)
-    if launch.angular_velocity is None and not is_traced(spin) and np.any(np.asarray(spin) == 0.0):
-        raise ValueError("spin = 0.0 must not be zero: the time of reversal is that of a spin that changes its sign")
-
-
-def check_revolution(scene: Scene, caller: str) -> None:
-    """Raise `ValueError` for a body of any shape and inertia, for what needs a body of revolution."""
-    if isinstance(scene.body, AbstractRigidBody):
-        kind = type(scene.body).__name__
-        raise ValueError(f"body = {kind} must be a body of revolution, such as a Top, for {caller}")
-
-
-def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:
-    """Raise `ValueError` unless the angle is in (0, pi] and the crossing one of the known words."""
-    require_all(event_bounds(angle))
-    if np.ndim(angle) != 0:
-        raise ValueError(f"angle must be one number, not of shape {np.shape(angle)}")
-    if crossing not in known:
-        raise ValueError(f"crossing = {crossing!r} must be {' or '.join(map(repr, known))}")

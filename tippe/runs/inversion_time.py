@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import diffrax
@@ -9,39 +10,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
-from nonholonomic.derivatives import (
-    AbstractDifferentiableSolve,
-    differentiable_solve,
-    in_groups,
-    tangents_by,
-    traced_solve_ensemble_with_tangents,
-)
-from nonholonomic.hybrid import (
-    AbstractBatchedMode,
-    HybridOutcome,
-    traced_solve_hybrid,
-    traced_solve_hybrid_with_tangents,
-)
-from nonholonomic.integration import (
-    CROSSED,
-    FAILED,
-    REACHED_END,
-    UNRESOLVED,
-    Settings,
-    explicit_tableau,
-    traced_solve_ensemble,
-)
+from nonholonomic.derivatives import AbstractDifferentiableSolve, differentiable_solve, tangents_by
+from nonholonomic.hybrid import HybridOutcome
+from nonholonomic.integration import FAILED, UNRESOLVED, Outcome, Settings, explicit_tableau
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, is_traced
 
 from ..model.launch import Launch
 from ..model.scene import Scene
-from ..modes.airborne import on_the_ground
 from ..modes.inversion_problem import InversionProblem
-from .cells import InversionRuns, check_differentiable, run_kind_of, too_many_steps
-from .inversion import check_event, check_run, is_inverted, nan_if_illegal, permitted, warn_if_it_cannot_invert
+from .cells import InversionRuns, too_many_steps
+from .checks import check_event, check_run, nan_if_illegal, permitted, warn_if_it_cannot_invert
+from .inversion import Inversions, is_inverted, traced, with_contact_state
+from .run_kind import check_differentiable, run_kind_of
 
 
 @status_line("simulating")
@@ -117,13 +100,13 @@ def first_or_last_time(
     """
     leaves, structure = jax.tree.flatten((scene, launch, angle, as_number(t1), as_number(tolerance)))
     unchecked = any(is_traced(leaf) for leaf in leaves)
-    question = InversionSolve if run_kind_of(scene).smooth else HybridInversionSolve
     # The last two leaves, horizon and tolerance, do not move the event.
-    found = differentiable_solve(question(len(leaves) - 2, structure, method, crossing == "last", unchecked), *leaves)
-    if not is_traced(found) and not unchecked and np.isnan(found):
+    solve = InversionSolve(len(leaves) - 2, structure, method, crossing == "last", unchecked)
+    time = differentiable_solve(solve, *leaves)
+    if not is_traced(time) and not unchecked and np.isnan(time):
         known = None if angle is None else np.asarray(angle).item()
         explain_failure(scene, launch, float(t1), known, float(tolerance), crossing, method)
-    return nan_if_illegal(found, structure, unchecked, leaves)
+    return nan_if_illegal(time, structure, unchecked, leaves)
 
 
 def explain_failure(
@@ -170,117 +153,51 @@ class InversionSolve(AbstractDifferentiableSolve):
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isinf(value)
 
-    def problem(self, leaves: tuple[Array, ...], cells: int | None) -> InversionProblem:
-        """The launches of some cells."""
-        # The leaves that do not move the event are not needed here.
-        unused = (None,) * (self.structure.num_leaves - len(leaves))
-        scene, launch, angle, *_ = jax.tree.unflatten(self.structure, (*leaves, *unused))
-        assert cells is not None
-        return InversionProblem.of(scene, launch, angle, cells)
-
     def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
-        problem = self.problem(leaves[: self.movable], cells)
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
-        outcome, _ = traced_solve_ensemble(
-            problem,
-            t1,
-            jnp.asarray(cells),
-            Settings(tolerance, self.solver),
-            nonterminal=self.last,
-            one_kernel=True,
-        )
-        time = jnp.where(is_inverted(outcome, problem, self.last), outcome.crossing_time, jnp.inf)
-        return jnp.where(may & (outcome.status != FAILED), time, jnp.nan)
+        inversions = self._inversions((*leaves[: self.movable], tolerance), cells)
+        outcome = inversions.solve(t1, cells, Settings(tolerance, self.solver), traced())
+        return self._times(leaves, may, inversions, outcome, [])[0]
 
     def with_slopes(
         self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
+        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         # Cells are independent, so varying a parameter in all of them at once gives each its own derivative.
-        problem, tangents, gather = tangents_by(self.problem, active, leaves[: self.movable], cells)
-        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
-        outcome, slopes = traced_solve_ensemble_with_tangents(
-            problem,
-            tangents,
-            t1,
-            jnp.asarray(cells),
-            Settings(tolerance, self.solver),
-            nonterminal=self.last,
-            one_kernel=not again,
-        )
-        inverted, good = is_inverted(outcome, problem, self.last), may & (outcome.status != FAILED)
-        time = jnp.where(good, jnp.where(inverted, outcome.crossing_time, jnp.inf), jnp.nan)
-        return time, [jnp.where(good, jnp.where(inverted, slope, 0.0), jnp.nan) for slope in gather(slopes)]
-
-
-class HybridInversionSolve(InversionSolve):
-    """Inversion times of cells with hybrid runs; the leaves are those of `InversionSolve`."""
-
-    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
-        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
-        modes, first, problem, scene = self.hybrid((*leaves[: self.movable], tolerance), cells)
-        return self.named(may, self.hybrid_outcome(modes, first, problem, scene, t1, tolerance), problem, scene)
-
-    def with_slopes(
-        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
-    ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-        if again:
+        moving = (*leaves[: self.movable], tolerance)
+        inversions, tangents, gather = tangents_by(self._inversions, active, moving, cells)
+        check_differentiable(self._modules(leaves)[0])
+        if again and not inversions.kind.smooth:
             raise ValueError(
                 "second derivatives do not go through changes of phase: contact = 'hybrid', SetValuedCoulomb"
             )
-        may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
-        built = tangents_by(self.hybrid, active, (*leaves[: self.movable], tolerance), cells)
-        (modes, first, problem, scene), tangents, gather = built
-        check_differentiable(scene)
-        if self.last:
-            # The derivatives need the run only up to the event, whose time is then known.
-            whole = self.hybrid_outcome(modes, first, problem, scene, t1, tolerance)
-            t1 = jnp.where(jnp.isfinite(whole.crossing_time), whole.crossing_time, 0.0)
-        settings = Settings(tolerance, self.solver)
+        settings, solvers = Settings(tolerance, self.solver), traced(one_kernel=not again)
+        outcome, slopes, _ = inversions.solve_with_tangents(tangents, t1, cells, settings, solvers)
+        return self._times(leaves, may, inversions, outcome, gather([*slopes]))
 
-        def run(some: tuple[Any, ...]) -> tuple[tuple[HybridOutcome, Array], list[Float[Array, " cells"]]]:
-            moved = tuple((one[0], one[2].states) for one in some)
-            given = (modes, moved, first, problem.states, t1, settings)
-            counters = len(run_kind_of(scene).counts)
-            hybrid_outcome, found = traced_solve_hybrid_with_tangents(
-                *given, counters=counters, ends_on_event=not self.last
-            )
-            return (hybrid_outcome, found.grazing), list(found.slopes)
+    def _modules(self, leaves: Sequence[Array]) -> Any:
+        """Scene, launch, angle, horizon and tolerance; `None` in place of leaves that are left out at the end."""
+        unused = (None,) * (self.structure.num_leaves - len(leaves))
+        return jax.tree.unflatten(self.structure, (*leaves, *unused))
 
-        (hybrid_outcome, grazing), slopes = in_groups(run, tangents)
-        time = self.named(may, whole if self.last else hybrid_outcome, problem, scene)
-        ended = hybrid_outcome.status == (REACHED_END if self.last else CROSSED)
-        digits = ended & ~grazing
-        # An event at the start has a fixed time, whatever the tangent.
-        happened = jnp.isfinite(time) & (time > 0.0)
-        return time, [jnp.where(happened, jnp.where(digits, slope, jnp.nan), 0.0 * time) for slope in gather(slopes)]
+    def _inversions(self, leaves: tuple[Array, ...], cells: int | None) -> Inversions:
+        """The launches of some cells, from the leaves that move the event, and the tolerance."""
+        *movable, tolerance = leaves
+        scene, launch, angle, *_ = self._modules(movable)
+        assert cells is not None
+        return Inversions.of(scene, InversionProblem.of(scene, launch, angle, cells), tolerance, self.last)
 
-    def hybrid(self, leaves: tuple[Array, ...], cells: int | None) -> Any:
-        """The modes of some cells, the number of each one's first, problem and scene; the last leaf is the tolerance."""
-        *own, tolerance = leaves
-        scene, *_ = jax.tree.unflatten(self.structure, (*own, *(None,) * (self.structure.num_leaves - len(own))))
-        problem, modes_of = self.problem(tuple(own), cells), run_kind_of(scene).modes
-        assert modes_of is not None
-        return (*modes_of(scene, problem, tolerance, self.last), problem, scene)
-
-    def hybrid_outcome(
+    def _times(
         self,
-        modes: tuple[AbstractBatchedMode, ...],
-        first: Int[Array, " cells"],
-        problem: InversionProblem,
-        scene: Scene,
-        t1: Float[Array, "..."],
-        tolerance: Float[Array, ""],
-    ) -> HybridOutcome:
-        """The hybrid runs of cells."""
-        settings, counters = Settings(tolerance, self.solver), len(run_kind_of(scene).counts)
-        return traced_solve_hybrid(modes, first, problem.states, t1, settings, counters=counters, nonterminal=self.last)
-
-    def named(
-        self, may: Bool[Array, "..."], ended: HybridOutcome, problem: InversionProblem, scene: Scene
-    ) -> Float[Array, " cells"]:
-        """The times of inversion."""
-        if run_kind_of(scene).flight_state:
-            ended = ended._replace(state=on_the_ground(scene, ended.state, ended.mode))
-        time = jnp.where(is_inverted(ended, problem, self.last), ended.crossing_time, jnp.inf)
-        failed = (ended.status == FAILED) | (ended.status == UNRESOLVED)
-        return jnp.where(may & ~failed, time, jnp.nan)
+        leaves: Sequence[Array],
+        may: Bool[Array, "..."],
+        inversions: Inversions,
+        outcome: Outcome | HybridOutcome,
+        slopes: list[Float[Array, " cells"]],
+    ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
+        """The times of inversion and their derivatives: infinite and 0 where there is none, NaN where the run failed."""
+        outcome = with_contact_state(self._modules(leaves)[0], outcome)
+        inverted = is_inverted(outcome, inversions.problem, self.last)
+        good = may & (outcome.status != FAILED) & (outcome.status != UNRESOLVED)
+        time = jnp.where(good, jnp.where(inverted, outcome.crossing_time, jnp.inf), jnp.nan)
+        return time, [jnp.where(good, jnp.where(inverted, slope, 0.0), jnp.nan) for slope in slopes]

@@ -13,7 +13,7 @@ from nonholonomic.validation import require_kind
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.top import Top
-from .inversion import check_numbers
+from .checks import check_numbers
 
 UNITS = Top.units | Scene.units | Launch.units
 
@@ -53,13 +53,13 @@ NUMBERS_OF_A_LAUNCH += [
 
 def variable_numbers(scene: Scene) -> list[str]:
     """The full names of what can be varied of a scene: single numbers, those that are left out for 0 among them."""
-    found = [name for name, value in numbers("scene", scene).items() if np.ndim(value) == 0]
-    return [name for name in found if name != "scene.restitution" or scene.contact == "hybrid"]
+    names = [name for name, value in numbers("scene", scene).items() if np.ndim(value) == 0]
+    return [name for name in names if name != "scene.restitution" or scene.contact == "hybrid"]
 
 
 def launches(
     scene: Any,
-    given: dict[str, Any],
+    launch_values: dict[str, Any],
     axes: Any,
     t1: Any,
     tolerance: Any,
@@ -71,7 +71,7 @@ def launches(
     **Arguments:**
 
     - `scene`: the scene, every number a scalar.
-    - `given`: number of the launch, or "mu" for the scene's friction, its own if `None` -> a number or a list.
+    - `launch_values`: number of the launch, or "mu" for the scene's friction, its own if `None` -> a number or a list.
     - `axes`: path of a number, or the end of it that means one only -> values, or `None`; those of a launch's several numbers
       are `"launch.place[0]"` and so on, and what is left out of them is 0.
     - `t1`, `tolerance`: as for `inversion_table`.
@@ -89,8 +89,8 @@ def launches(
     axes = full_axes(axes or {}, [*variable_numbers(scene), *NUMBERS_OF_A_LAUNCH])
     known = numbers("scene.friction", scene.friction)
     of_mu = next((number for number in known if number.endswith(".mu")), "scene.friction.mu")
-    paths = {name: of_mu if name == "mu" else f"launch.{name}" for name in given}
-    values = {paths[name]: value for name, value in given.items() if name != "mu" or value is not None}
+    paths = {name: of_mu if name == "mu" else f"launch.{name}" for name in launch_values}
+    values = {paths[name]: value for name, value in launch_values.items() if name != "mu" or value is not None}
     for number in values:
         if number in axes:
             raise ValueError(f"axes: {number!r} is an argument of its own")
@@ -122,29 +122,29 @@ def rows(lists: list[Axis]) -> dict[str, Any]:
 
     **Raises:** `ValueError` unless there are lists, all of one length.
     """
-    lengths = {one.name: len(one.values) for one in lists}
+    lengths = {grid_axis.name: len(grid_axis.values) for grid_axis in lists}
     if len(set(lengths.values())) != 1:
         shown = ", ".join(f"{name} of {length}" for name, length in lengths.items()) or "none"
         raise ValueError(f"scattered = True takes lists of one length, not {shown}; the other numbers are scalars")
-    return {one.number: one.values for one in lists}
+    return {grid_axis.number: grid_axis.values for grid_axis in lists}
 
 
 def _with_room(scene: Scene, values: Collection[str]) -> tuple[Launch, dict[str, tuple[str, str]]]:
     """A launch with room for all numbers that are given, and the name and unit of each that is one of several."""
-    found: dict[str, tuple[str, str]] = {}
+    components: dict[str, tuple[str, str]] = {}
     parts: dict[str, Any] = {}
     coordinates = list(scene.surface.coordinates)
     if "launch.place[2]" in values and len(coordinates) == 2:
         coordinates = [("x", "m"), ("y", "m"), ("z", "m")]
     for name, labels in {"place": coordinates, **SEVERAL}.items():
-        here = {f"launch.{name}[{k}]": label for k, label in enumerate(labels)}
-        if not here.keys().isdisjoint(values):
+        labelled = {f"launch.{name}[{k}]": label for k, label in enumerate(labels)}
+        if not labelled.keys().isdisjoint(values):
             parts[name] = (0.0,) * len(labels)
-            found |= here
-    return Launch(theta=0.0, spin=0.0, **parts), found
+            components |= labelled
+    return Launch(theta=0.0, spin=0.0, **parts), components
 
 
 def described(roots: dict[str, Any], grid: list[Axis]) -> dict[str, Any]:
     """What is asked of which scene and launch, as plain data; the values of axes stand elsewhere."""
-    found = {path: value for name, root in roots.items() for path, value in description(name, root).items()}
-    return found | {one.number: "an axis" for one in grid}
+    texts = {path: value for name, root in roots.items() for path, value in description(name, root).items()}
+    return texts | {grid_axis.number: "an axis" for grid_axis in grid}

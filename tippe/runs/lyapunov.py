@@ -20,8 +20,8 @@ from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import joined, parts
 from ..modes.inversion_problem import InversionProblem
-from .cells import run_kind_of
-from .inversion import check_revolution
+from .checks import check_revolution
+from .run_kind import run_kind_of
 
 #: Stretches of time whose growth is recorded; half of them give the exponent and its scatter.
 STRETCHES = 32

@@ -15,11 +15,10 @@ from jaxtyping import Array, ArrayLike, Float
 from nonholonomic.geometry import Component, Vector, dot, scale, sum_vectors
 from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import DenseSolution, Status, few_trials, padded
-from nonholonomic.parameters import likely, text_as_html
 from nonholonomic.progress import status_line
-from nonholonomic.sweeps import Table
-from nonholonomic.validation import is_traced, require, require_increasing, require_package
-from nonholonomic.views import Stage, Viewable, draw_portrait
+from nonholonomic.sweeps import Table, Tabular
+from nonholonomic.validation import is_traced, require, require_increasing
+from nonholonomic.views import Stage, Viewable
 
 from ..model.dynamics import stacked
 from ..model.rigid_body import AbstractRigidBody
@@ -58,7 +57,7 @@ def unit(vectors: Float[Array, "times 3"]) -> Float[Array, "times 3"]:
     return vectors / jnp.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-class AbstractTrajectory(eqx.Module, Viewable):
+class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     """A run at its times `t`: states as in `tippe/model/dynamics.py`, the path on the arena, spin angle [rad] and work [J].
 
     Vectors are arrays (times, 3) in the fixed frame (x, y, z); `Trajectory` says more.
@@ -81,12 +80,11 @@ class AbstractTrajectory(eqx.Module, Viewable):
     #: The fields with a value for each time, along the last axis.
     by_time: ClassVar[tuple[str, ...]] = ("t", "states", "cyclic", "spin_angle", "work")
 
-    def __getattr__(self, name: str) -> Any:
-        # Reached for unknown names, and where reading a known one has raised this kind of error: it raises it again.
-        if name.startswith("_") or hasattr(type(self), name):
-            return object.__getattribute__(self, name)
-        known = [*QUANTITIES, *OF_ONE_RUN]
-        raise AttributeError(f"the run has no {name!r}{likely(name, known)} It has {', '.join(known)}")
+    readable: ClassVar[tuple[str, ...]] = (*QUANTITIES, *OF_ONE_RUN)
+
+    @property
+    def portrait_axes(self) -> tuple[str, str]:
+        return "theta", "theta_rate"
 
     def padded(self) -> Self:
         """The run with the last of its times repeated, up to a power of two; without what observables do not need."""
@@ -189,8 +187,8 @@ class AbstractTrajectory(eqx.Module, Viewable):
         frame, where = self.scene.frame, (self._place, self._path)
         centre = sum_vectors(frame.position(*where), scale(self.above[0], frame.axes(*where)[2]))
         beside = self.scene.path_from_frame(self.states)
-        found = jnp.stack(centre, axis=-1)
-        return found if beside == (None, None, None) else found + self._fixed(beside)
+        point = jnp.stack(centre, axis=-1)
+        return point if beside == (None, None, None) else point + self._fixed(beside)
 
     @of_each_run
     def jellett(self) -> Float[Array, " times"]:
@@ -214,41 +212,7 @@ class AbstractTrajectory(eqx.Module, Viewable):
 
     @status_line("reading off")
     def to_table(self) -> Table:
-        """All that can be read off the run, as a `Table` over its times.
-
-        **Raises:** `ValueError` for a batch of runs.
-        """
         return table_of(self)
-
-    def to_xarray(self) -> Any:
-        """The run as an `xarray.Dataset` over "time" (needs xarray), with units and names.
-
-        **Raises:** `ValueError` for a batch of runs.
-        """
-        require_package("xarray", "xarray", "to_xarray")
-        return self.to_table().to_xarray()
-
-    def save(self, path: Any) -> None:
-        """Write the run to an HDF5 file that `tippe.Table.load` and xarray (`engine="h5netcdf"`) read.
-
-        **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for a batch of runs.
-        """
-        self.to_table().save(path)
-
-    def portrait(self, x: str = "theta", y: str = "theta_rate", ax: Any = None) -> Any:
-        """Draw one quantity over another, a phase portrait (needs matplotlib).
-
-        **Arguments:**
-
-        - `x`, `y`: variables of `to_table()`, such as "theta", or one component, such as "position.x".
-        - `ax`: axes of matplotlib to draw in, instead of a new figure.
-
-        **Returns:** the matplotlib figure, or `ax`.
-
-        **Raises:** `ValueError` for an unknown variable.
-        """
-        require_package("matplotlib", "plot", "portrait")
-        return draw_portrait(self.to_table(), x, y, ax)
 
     def stages(self, others: Sequence[Any] = (), overlaid: bool = False) -> list[Stage]:
         return as_stages([self, *others], overlaid)
@@ -262,7 +226,7 @@ class AbstractTrajectory(eqx.Module, Viewable):
             "axis_drift": float(np.max(np.abs(np.linalg.norm(np.asarray(self.states)[2:5], axis=0) - 1.0))),
             "energy_residual": float(np.max(np.abs(energy - energy[0] - work))),
         }
-        return eqx.tree_at(lambda one: one.stats, self, stats | more)
+        return eqx.tree_at(lambda run: run.stats, self, stats | more)
 
     @of_each_run
     def normal(self) -> Float[Array, "times 3"]:
@@ -320,9 +284,3 @@ class AbstractTrajectory(eqx.Module, Viewable):
             lines.append(f"  drift of |e|: {self.stats['axis_drift']:.1e}")
             lines.append(f"  energy residual: {self.stats['energy_residual']:.1e} J of {float(self.energy[0]):.4g} J")
         return "\n".join(lines)
-
-    def __repr__(self) -> str:
-        return str(self)
-
-    def _repr_html_(self) -> str:
-        return text_as_html(str(self))

@@ -15,7 +15,7 @@ from nonholonomic.validation import require_flag, require_kind, require_outside
 from ..model.launch import Launch
 from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
-from .inversion import check_reversible, check_run
+from .checks import check_reversible, check_run
 from .inversion_time import first_or_last_time
 from .table import event_table
 

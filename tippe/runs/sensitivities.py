@@ -1,21 +1,20 @@
 """Derivatives of the inversion times of a table's cells with respect to parameters of the scene and the launch."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from nonholonomic.derivatives import solve_ensemble_with_tangents, tangent_scale, tangents_of
-from nonholonomic.hybrid import HybridOutcome, solve_hybrid_with_tangents
+from nonholonomic.derivatives import tangent_scale, tangents_of
+from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import Outcome, Settings
 from nonholonomic.parameters import full_name, numbers, with_numbers
 from nonholonomic.sweeps import Variable
 
 from ..modes.inversion_problem import InversionProblem
-from .inversion import is_inverted
+from .inversion import Inversions
 
 
 def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
@@ -28,10 +27,10 @@ def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"sensitivities = {names!r} must be a list of names, such as ['scene.friction.mu']")
     known = [name for root, tree in roots.items() for name, value in numbers(root, tree).items() if value is not None]
-    found = [full_name("sensitivities", name, known) for name in names]
-    if len(set(found)) < len(found):
+    full_names = [full_name("sensitivities", name, known) for name in names]
+    if len(set(full_names)) < len(full_names):
         raise ValueError(f"sensitivities = {names!r} must name every number once")
-    return found
+    return full_names
 
 
 def sensitivity_columns(names: list[str]) -> list[str]:
@@ -67,111 +66,47 @@ def sensitivities_of_cells(
     count: int,
     size: int,
     last: bool,
-) -> tuple[Outcome, dict[str, Any]]:
-    """How every cell ended, and the derivative of its inversion time by every number, 0 where the top did not invert.
+) -> tuple[Outcome | HybridOutcome, dict[str, Any], Any]:
+    """How every cell ended, and the derivative of its crossing time by every number, 0 where there is no crossing.
 
     **Arguments:** as for `inversion_table`, and
 
     - `columns`: full name of a parameter -> its value in every cell; `count` of the `size` cells are to be run.
     - `names`: full names of the numbers to differentiate by.
 
-    **Returns:** the `Outcome`, and name of the variable -> derivatives (size,). Source: implicit function theorem at
-    the event.
+    **Returns:** the outcome; name of the variable -> derivatives (size,); and where these are NaN, because an event on the
+    way was grazing.
     """
-    number = None if angle is None else jnp.asarray(angle, float)
-    problem, tangents, sizes = _problem_and_tangents(roots, columns, names, number, size)
-    outcome, slopes = solve_ensemble_with_tangents(
-        problem,
-        tangents,
-        jnp.asarray(t1, float),
-        jnp.asarray(count),
-        settings,
-        nonterminal=last,
-    )
-    inverted = is_inverted(outcome, problem, last)
-    found = [np.where(inverted, slope / moved, 0.0) for slope, moved in zip(slopes, sizes, strict=True)]
-    return outcome, dict(zip(sensitivity_columns(names), found, strict=True))
+    numbers = (None if angle is None else jnp.asarray(angle, float), settings.tolerance)
+    inversions, tangents, scales = _with_tangents(roots, columns, names, *numbers, size, last)
+    outcome, slopes, grazing = inversions.solve_with_tangents(tangents, t1, count, settings)
+    by_number = [np.asarray(slope) / np.asarray(scale) for slope, scale in zip(slopes, scales, strict=True)]
+    return outcome, dict(zip(sensitivity_columns(names), by_number, strict=True)), grazing
 
 
 @eqx.filter_jit
-def _problem_and_tangents(
-    roots: dict[str, Any], columns: dict[str, Any], names: list[str], angle: Float[Array, ""] | None, size: int
-) -> tuple[InversionProblem, tuple[Any, ...], list[Float[Array, "..."]]]:
-    """The problem of the cells, its tangents along the numbers to differentiate by, and the scale of each tangent."""
-
-    def build(*moving: Any) -> InversionProblem:
-        cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))
-        return InversionProblem.of(cells["scene"], cells["launch"], angle, size)
-
-    return _with_tangents(build, roots, columns, names)
-
-
-def hybrid_sensitivities_of_cells(
-    modes_of: Callable[..., Any],
+def _with_tangents(
     roots: dict[str, Any],
     columns: dict[str, Any],
     names: list[str],
-    angle: float,
-    t1: float | Float[np.ndarray, " cells"],
-    settings: Settings,
-    *,
-    count: int,
-    size: int,
-    last: bool,
-    counters: int,
-) -> tuple[HybridOutcome, dict[str, Any], Bool[np.ndarray, " size"]]:
-    """`sensitivities_of_cells` for hybrid runs.
-
-    **Arguments:** as there, and
-
-    - `modes_of`: returns the modes, as in `RunKind`.
-    - `t1`: horizon [s]; where the `last` crossing counts, its time in every cell, at which the runs end.
-    - `counters`: number of counters.
-
-    **Returns:** the `HybridOutcome`; name of the variable -> derivatives (size,); and where these have no correct
-    digits, because an event on the way was grazing. Source: saltation at every change of mode
-    (`nonholonomic/hybrid/saltation.py`).
-    """
-    numbers = (jnp.asarray(angle, float), settings.tolerance)
-    built = _modes_and_tangents(modes_of, roots, columns, names, *numbers, size, last)
-    (modes, first, states), tangents, sizes = built
-    tangents = tuple((one[0], one[2]) for one in tangents)
-    given = (tangents, np.asarray(first), np.asarray(states), t1, count, settings)
-    hybrid_outcome, found = solve_hybrid_with_tangents(modes, *given, counters=counters, ends_on_event=not last)
-    slopes = [slope / np.asarray(moved) for slope, moved in zip(found.slopes, sizes, strict=True)]
-    return hybrid_outcome, dict(zip(sensitivity_columns(names), slopes, strict=True)), found.grazing
-
-
-@eqx.filter_jit
-def _modes_and_tangents(
-    modes_of: Callable[..., Any],
-    roots: dict[str, Any],
-    columns: dict[str, Any],
-    names: list[str],
-    angle: Float[Array, ""],
+    angle: Float[Array, ""] | None,
     tolerance: Float[Array, ""],
     size: int,
     last: bool,
-) -> tuple[Any, tuple[Any, ...], list[Float[Array, "..."]]]:
-    """The modes of the cells, the number of each one's first and its state there; tangents and scales as above."""
+) -> tuple[Inversions, tuple[Any, ...], list[Float[Array, "..."]]]:
+    """The launches of all cells, their tangents along the numbers to differentiate by, and the scale of each tangent."""
 
-    def build(*moving: Any) -> Any:
+    def build(*moving: Any) -> Inversions:
         cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))
         problem = InversionProblem.of(cells["scene"], cells["launch"], angle, size)
-        return (*modes_of(cells["scene"], problem, tolerance, last), problem.states)
+        return Inversions.of(cells["scene"], problem, tolerance, last)
 
-    return _with_tangents(build, roots, columns, names)
-
-
-def _with_tangents(
-    build: Callable[..., Any], roots: dict[str, Any], columns: dict[str, Any], names: list[str]
-) -> tuple[Any, tuple[Any, ...], list[Float[Array, "..."]]]:
-    """Build an object from the numbers to differentiate by; also return its tangents along them and the scale of each."""
     cells = with_numbers(roots, columns)
     values = {name: value for root, tree in cells.items() for name, value in numbers(root, tree).items()}
     point = tuple(jnp.asarray(values[name], float) for name in names)
-    sizes = [tangent_scale(value) for value in point]
+    scales = [tangent_scale(value) for value in point]
     tangents = [
-        tuple(size if row == k else jnp.zeros_like(size) for k, size in enumerate(sizes)) for row in range(len(names))
+        tuple(scale if row == k else jnp.zeros_like(scale) for k, scale in enumerate(scales))
+        for row in range(len(names))
     ]
-    return build(*point), tangents_of(build, point, tangents), sizes
+    return build(*point), tangents_of(build, point, tangents), scales

@@ -15,9 +15,10 @@ from nonholonomic.sweeps import Axis, Table, Variable, sweep
 from nonholonomic.validation import require_flag, require_outside, require_whole
 
 from ..model.scene import Scene
-from .cells import REVERSAL, InversionRuns, check_differentiable, run_kind_of, too_many_steps
-from .inversion import check_event, check_reversible, warn_if_it_cannot_invert
+from .cells import InversionRuns, too_many_steps
+from .checks import check_event, check_reversible, warn_if_it_cannot_invert
 from .launches import described, launches, rows
+from .run_kind import REVERSAL, check_differentiable, run_kind_of
 from .sensitivities import sensitivity_names, sensitivity_variables
 from .time_error import errors_of, second_tolerance
 
@@ -59,7 +60,7 @@ def inversion_table(
     - `crossing`: "first" for the first time theta reaches the angle; "last" for the up-crossing after which theta stays
       above it until `t1` (first crossings are ill-conditioned where theta oscillates about the angle); "both" for the two from
       one run, in the variables `first_time` and `last_time` in place of `time`, the status being that of the last.
-    - `path`: HDF5 file to write, block by block. A run that was interrupted resumes from it.
+    - `path`: HDF5 file to write, chunk by chunk. A run that was interrupted resumes from it.
     - `axes`: further axes, full name of a parameter, or the end of it that means one only -> values, such as
       `{"offset": [0.005, 0.006]}` for `"scene.body.offset"`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
@@ -128,14 +129,14 @@ def inversion_table(
         raise ValueError("crossing = 'both' must be 'first' or 'last' for sensitivities, which are of one time")
     if method == "diffrax" and crossing != "first":
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
-    given = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
+    launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
     options = (solver, method, scattered, errors, sensitivities, path, progress, executor, max_steps)
-    return event_table(scene, given, axes, t1, angle, tolerance, crossing, *options)
+    return event_table(scene, launch_values, axes, t1, angle, tolerance, crossing, *options)
 
 
 def event_table(
     scene: Scene,
-    given: dict[str, Any],
+    launch_values: dict[str, Any],
     axes: dict[str, Any] | None,
     t1: float,
     angle: float | None,
@@ -153,9 +154,9 @@ def event_table(
 ) -> Table:
     """The table of the times at which theta reaches an angle, or, without one, the spin about the normal reverses.
 
-    **Arguments:** as for `inversion_table`; `given`: number of the launch, or "mu" -> a number or a list.
+    **Arguments:** as for `inversion_table`; `launch_values`: number of the launch, or "mu" -> a number or a list.
     """
-    roots, grid, units = launches(scene, given, axes, t1, tolerance, scattered=scattered)
+    roots, grid, units = launches(scene, launch_values, axes, t1, tolerance, scattered=scattered)
     require_whole(max_steps, "max_steps", 1)
     settings = Settings(tolerance, solver)
     integrator = settings.for_single_runs if method == "diffrax" else settings.for_lanes
@@ -166,7 +167,7 @@ def event_table(
         check_differentiable(scene)
     if not run_kind.smooth and method == "diffrax":
         raise ValueError("method = 'diffrax' is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
-    looked_at = {one.number: one.values for one in grid}
+    looked_at = {axis.number: axis.values for axis in grid}
     if angle is None:
         check_reversible(roots["launch"], looked_at)
     else:
@@ -190,8 +191,8 @@ def event_table(
     if scattered:
         columns = rows(grid)
         request |= {"cells": digest(columns)}
-        variables = {one.name: Variable(one.unit, np.float64, long_name=one.long_name) for one in grid} | variables
-        job = ScatteredJob(job, columns, {one.number: one.name for one in grid})
+        variables = {axis.name: Variable(axis.unit, np.float64, long_name=axis.long_name) for axis in grid} | variables
+        job = ScatteredJob(job, columns, {axis.number: axis.name for axis in grid})
         grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
     table = sweep(job, grid, variables, request, path=path, progress=progress, executor=executor)
     warn_of_long_runs(table, float(t1), max_steps)
@@ -227,12 +228,12 @@ class InversionJob(NamedTuple):
         if runs.method == "diffrax" and count == 0:
             # The reference runs whole blocks: a call that is only meant to compile would compute the first one twice.
             return {}
-        found = runs.results(self.roots, columns, self.tolerance, count)
+        variables = runs.results(self.roots, columns, self.tolerance, count)
         if self.errors:
             second = runs._replace(slopes_by=[]).results(self.roots, columns, second_tolerance(self.tolerance), count)
             silent = tuple(words.index(word) for word in ("failed", "unresolved") if word in words)
-            found |= errors_of(found, second, runs.times, runs.run_kind.counts, silent)
-        return found
+            variables |= errors_of(variables, second, runs.times, runs.run_kind.counts, silent)
+        return variables
 
 
 class ScatteredJob(NamedTuple):

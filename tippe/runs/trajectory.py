@@ -12,15 +12,14 @@ from jaxtyping import Array, Float
 from nonholonomic.geometry import scale, sum_vectors
 from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import (
-    LOOSEST,
     DenseSolution,
     Settings,
     Status,
     explicit_tableau,
     follow,
+    legal_run,
     require_adaptive,
     require_adjoint,
-    run_bounds,
     times_bounds,
 )
 from nonholonomic.progress import status_line
@@ -41,8 +40,8 @@ from ..model.launch import Launch
 from ..model.scene import Scene
 from ..modes.trajectory_problem import TrajectoryProblem
 from .airborne_trajectory import sampled_airborne, simulate_airborne
+from .checks import check_run
 from .flight_trajectory import HybridTrajectory, sampled_hybrid, simulate_hybrid
-from .inversion import check_run
 from .observables import AbstractTrajectory, of_each_run
 from .sampled import ended, sampled
 from .stick_slip_trajectory import solve_stick_slip_dense
@@ -234,16 +233,8 @@ def _legal_or_nan(
     if times is None:
         # It raises the error that says so.
         return _traced(scene, launch, times, t1, tolerance, solver, adjoint)
-    bounds = (
-        *all_bounds(scene),
-        *all_bounds(launch),
-        *scene.start_bounds(launch),
-        *run_bounds(t1, tolerance),
-        *times_bounds(times, t1),
-    )
-    may = jnp.all(legal(bounds)) & jnp.all(jnp.diff(times) > 0.0)
-    # A run of illegal numbers might never reach its end, so it is given the horizon 0, and its tolerance is not its block's.
-    t1, tolerance = jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
+    bounds = (*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch))
+    may, t1, tolerance = legal_run(legal(bounds), t1, tolerance, times)
     if adjoint is not None:
         # Diffrax would differentiate the run of no length.
         scene, launch = nan_unless(may, (scene, launch))

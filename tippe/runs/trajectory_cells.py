@@ -49,18 +49,18 @@ def _read(
     """A quantity at every sample, not a number after the end of a run."""
     quadratures = len(run.state) + len(run.cyclic) - samples.shape[-1]
 
-    def one(scene: Scene, states: Float[Array, "times components"]) -> Float[Array, "times ..."]:
+    def read_cell(scene: Scene, states: Float[Array, "times components"]) -> Float[Array, "times ..."]:
         nothing = jnp.zeros(len(times))
         state, cyclic = jnp.split(jnp.pad(states.T, ((0, quadratures), (0, 0))), [len(run.state)])
         values = getattr(Trajectory(times, scene, state, cyclic, nothing, nothing, None, times[-1], {}, None), name)
         # What does not depend on the state would be a number after the end too.
-        there = jnp.isfinite(states[:, 0]).reshape(-1, *[1] * (values.ndim - 1))
-        return jnp.where(there, values, jnp.nan)
+        reached = jnp.isfinite(states[:, 0]).reshape(-1, *[1] * (values.ndim - 1))
+        return jnp.where(reached, values, jnp.nan)
 
     def cell_axis(leaf: Any) -> int | None:
         return 0 if eqx.is_array(leaf) and leaf.ndim else None
 
-    return eqx.filter_vmap(one, in_axes=(cell_axis, 0))(scene, samples)
+    return eqx.filter_vmap(read_cell, in_axes=(cell_axis, 0))(scene, samples)
 
 
 # On its own, not inside other transformed functions: only so does it get the compiler's options.

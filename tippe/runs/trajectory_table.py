@@ -13,9 +13,9 @@ from nonholonomic.sweeps import Axis, Table, Variable, axis, sweep
 from nonholonomic.validation import as_number, require, require_all, require_increasing, require_outside, require_whole
 
 from ..model.scene import Scene
-from .cells import COUNTED
 from .launches import described, launches
 from .quantities import COMPONENTS, QUANTITIES
+from .run_kind import COUNTED
 from .trajectory_cells import solve_cells
 
 #: How a run may end, in the order of `Status`.
@@ -59,7 +59,7 @@ def trajectory_table(
       "jellett" [kg m^3/s], "normal_force" [N], and the vectors "axis" [1], "position" [m], "velocity" [m/s], "angular_momentum"
       [kg m^2/s] and "slip" [m/s]; all as in `Trajectory`.
     - `tolerance`: relative tolerance of the integration.
-    - `path`: HDF5 file to write, block by block. A call that was interrupted resumes from it.
+    - `path`: HDF5 file to write, chunk by chunk. A call that was interrupted resumes from it.
     - `progress`, `executor`: as for `inversion_table`.
     - `max_steps`: a run that needs more steps, rejected ones included, has failed; at least 1.
 
@@ -94,8 +94,8 @@ def trajectory_table(
     require_increasing(times, "times")
     times = np.asarray(times, dtype=float)
     require(times[-1], "times[-1]", above=0.0, why="it is the horizon")
-    given = {"theta": theta, "eta": eta, "mu": mu, "spin": spin}
-    roots, grid, _ = launches(scene, given, axes, times[-1], tolerance, taken=QUANTITIES)
+    launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin}
+    roots, grid, _ = launches(scene, launch_values, axes, times[-1], tolerance, taken=QUANTITIES)
     why = "for trajectory_table: runs with phases are sampled one by one, by simulate"
     if scene.contact == "hybrid":
         raise ValueError(f"contact = 'hybrid' must be 'stop' {why}")
@@ -105,7 +105,7 @@ def trajectory_table(
     inner = [axis("time", "time", "s", times, "time")]
     variables = {}
     for name in names:
-        unit, components, long_name = QUANTITIES[name]
+        unit, long_name, components, _ = QUANTITIES[name]
         dims = ("time",) if components is None else ("time", components)
         variables[name] = Variable(unit, np.float64, inner=dims, long_name=long_name)
     for dim in dict.fromkeys(QUANTITIES[name].components for name in names):
@@ -138,8 +138,8 @@ class SamplingJob(NamedTuple):
         cells = with_numbers(self.roots, columns)
         size = next((len(values) for values in columns.values()), 1)
         settings = Settings(self.tolerance, max_steps=self.max_steps)
-        found = solve_cells(cells["scene"], cells["launch"], size, self.times, settings, self.names, count)
-        return {name: np.asarray(values, np.int8 if name == "status" else None) for name, values in found.items()}
+        variables = solve_cells(cells["scene"], cells["launch"], size, self.times, settings, self.names, count)
+        return {name: np.asarray(values, np.int8 if name == "status" else None) for name, values in variables.items()}
 
 
 def _names(quantities: Any) -> tuple[str, ...]:

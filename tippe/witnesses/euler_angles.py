@@ -1,11 +1,12 @@
-"""The tippe top in Euler angles, by Lagrange's equations, on plane and cylinder: witnesses of the vector form.
+"""The tippe top in Euler angles, by Lagrange's equations, on plane and cylinder: an independent check of the vector
+form.
 
-Coordinates q = (eta, y, theta, phi, psi), those of the paper (its x is y here): the place across the arena (eta [rad]
-from the lowest line of a cylinder, or x [m] on a plane), the place y [m] along it, and Euler angles in the arena's
-moving frame (t1, t2, n), in which the axis is e = sin(theta) (cos(phi) t1 + sin(phi) t2) + cos(theta) n. The state is
-(eta, theta, phi, eta', y', theta', phi', psi'); y and psi are cyclic.
+The coordinates are those of the paper, q = (eta, y, theta, phi, psi) (the paper's x is y here): the place across the
+arena (eta [rad] from the lowest line of a cylinder, or x [m] on a plane), the place y [m] along it, and Euler angles in
+the arena's moving frame (t1, t2, n), in which the axis is e = sin(theta) (cos(phi) t1 + sin(phi) t2) + cos(theta) n.
+The state is (eta, theta, phi, eta', y', theta', phi', psi'); y and psi are cyclic.
 
-The chart is singular where sin(theta) = 0. The vector form has no such place; this one is for comparison only.
+Unlike the vector form, these coordinates are singular where sin(theta) = 0; they are for comparison only.
 """
 
 from typing import NamedTuple
@@ -24,7 +25,7 @@ from ..model.top import Top
 
 
 class Across(NamedTuple):
-    """The coordinate across the arena: length [m] per unit of it, and turning [rad] of the frame per unit of it."""
+    """The coordinate across the arena: length [m] per unit, and turning angle [rad] of the frame per unit."""
 
     metric: Float[Array, ""] | float
     turning: float
@@ -76,7 +77,7 @@ def from_vector_state(scene: Scene[Top], state: Float[Array, " components"]) -> 
 def metric(scene: Scene[Top], q: Float[Array, " 6"]) -> Float[Array, "6 6"]:
     """Kinetic metric G: the kinetic energy is q'.G q' / 2 = m |O' - a e'|^2 / 2 + I1 (p^2 + q^2) / 2 + I3 omega3^2 / 2.
 
-    This, with `potential`, is the paper's (6) with nothing left out, and on the cylinder too.
+    With `potential`, this is the paper's (6), completed and extended to the cylinder.
 
     **Arguments:**
 
@@ -150,7 +151,7 @@ def angular_velocity(scene: Scene[Top], q: Float[Array, " 6"], q_dot: Float[Arra
 def friction_per_normal_force(
     scene: Scene[Top], slip: Float[Array, " 2"], turning: Float[Array, " 3"]
 ) -> tuple[Float[Array, " 2"], Float[Array, " 3"]]:
-    """Tangential force [1] and torque [m] per unit normal force, zeros where there is none.
+    """Tangential force [1] and torque [m] per unit normal force, zeros if there is none.
 
     **Arguments:**
 
@@ -175,7 +176,7 @@ def per_normal_force(scene: Scene[Top], q: Float[Array, " 6"], q_dot: Float[Arra
 
 
 def spread(state: Float[Array, " 8"]) -> tuple[Float[Array, " 6"], Float[Array, " 6"]]:
-    """Coordinates (eta, y, theta, phi, psi, gap) and their rates; the cyclic ones and the gap are put to 0."""
+    """Coordinates (eta, y, theta, phi, psi, gap) and their rates; the cyclic ones and the gap are set to 0."""
     zero = jnp.zeros_like(state[0])
     return jnp.stack([state[0], zero, state[1], state[2], zero, zero]), jnp.append(state[3:], zero)
 
@@ -189,14 +190,14 @@ class Accelerations(NamedTuple):
 
 @eqx.filter_jit
 def by_lagrange(scene: Scene[Top], state: Float[Array, " 8"]) -> Accelerations:
-    """Lagrange's equations, by automatic differentiation of the energies, the contact kept by a multiplier.
+    """Lagrange's equations, by automatic differentiation of the energies, with a multiplier for the contact.
 
     d/dt dT/dq' - dT/dq + dU/dq = N (d gap/dq + f . dv/dq' + tau . dw/dq'), gap'' = 0: six equations, linear in q'' and in N.
 
     **Arguments:**
 
     - `scene`: a `Scene` on a `Plane` or a `Cylinder`, with any friction.
-    - `state`: (8,) as the module states it.
+    - `state`: (8,), as in the module's docstring.
 
     **Returns:** `Accelerations`.
     """
@@ -212,7 +213,7 @@ def by_lagrange(scene: Scene[Top], state: Float[Array, " 8"]) -> Accelerations:
 
 
 def equations(scene: Scene[Top], state: Float[Array, " 8"]) -> tuple[Float[Array, "6 6"], Float[Array, " 6"]]:
-    """The paper's (11) as it should read, with (12) among its rows: A (eta'', y'', theta'', phi'', psi'', N) = b.
+    """The paper's (11), corrected, with (12) among its rows: A (eta'', y'', theta'', phi'', psi'', N) = b.
 
     The rows are the momentum of the centre of mass along t1, t2 and n, the last one being (12), and the angular
     momentum about it along e1, e2 and e (`tippe.md`, section 2 (ii)):
@@ -296,14 +297,14 @@ def by_equation_11(scene: Scene[Top], state: Float[Array, " 8"]) -> Acceleration
 
 
 def normal_force(scene: Scene[Top], state: Float[Array, " 8"], second_rates: Float[Array, " 5"]) -> Float[Array, ""]:
-    """The paper's (12) exactly: the normal force [N] that a motion needs.
+    """The paper's (12), corrected: the normal force [N] for a motion.
 
     N/m = g cos(eta) + rho eta'^2 + a (theta'' sin(theta) + theta'^2 cos(theta)) + a eta'^2 cos(theta)
-    - a eta'' e_t - 2 a eta' e_t', with e_t = sin(theta) cos(phi); on the plane the terms in eta are absent.
+    - 2 a eta' e_t' - a eta'' e_t, with e_t = sin(theta) cos(phi); on the plane the terms in eta are absent.
 
     **Arguments:**
 
-    - `state`: (8,) as the module states it.
+    - `state`: (8,), as in the module's docstring.
     - `second_rates`: (5,) as in `Accelerations`.
     """
     metric, turns = across(scene)

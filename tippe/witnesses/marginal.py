@@ -1,12 +1,12 @@
-"""Where standing tops on the lowest line of a cylinder change their stability, followed from the plane on.
+"""The stability limits of standing tops on the lowest line of a cylinder, followed from the plane.
 
-On a cylinder Jellett's quantity is no constant and the formulas of the plane do not hold, but a top that stands on the
-lowest line is still an exact equilibrium at every spin. Its marginal states, those with an eigenvalue i nu, form curves
-in (curvature, spin, nu): two real equations in three unknowns, det(A(spin, curvature) - i nu) = 0, followed here by
-pseudo-arclength continuation, which passes folds where one curvature has several critical spins.
+On a cylinder, Jellett's quantity is not constant and the formulas of the plane do not hold, but a top that stands on
+the lowest line is still an exact equilibrium at every spin. Its marginal states, those with an eigenvalue i nu, form
+curves in (curvature, spin, nu): two real equations in three unknowns, det(A(spin, curvature) - i nu) = 0. They are
+followed by pseudo-arclength continuation, which passes folds, where one curvature has several critical spins.
 
-No tumbling top is followed: with friction, a motion that repeats itself keeps its energy and so never slips; on a
-cylinder precession at a fixed inclination slips, and its energy runs down.
+There are no tumbling tops to follow: with friction, a periodic motion keeps its energy and so never slips, but on a
+cylinder, precession at a fixed inclination slips, and its energy decreases.
 """
 
 import functools
@@ -25,9 +25,9 @@ from ..model.scene import Scene
 from ..model.top import Top
 from ..steady import inverted_critical_spin, standing_matrix, upright_critical_spin
 
-#: Curvature ratio at which the curve starts: so close to the plane that the plane's critical spin is the first guess.
+#: Curvature ratio at the start of the curve: so close to the plane that the plane's critical spin is the first guess.
 ALMOST_FLAT = 1e-9
-#: Unit of R / rc in the arclength: a cylinder of ten radii counts as far from the plane as a change of spin by itself.
+#: Unit of R / rc in the arclength: a cylinder of ten radii is as far from the plane as a 100 % change of spin.
 CURVATURE_UNIT = 0.1
 
 
@@ -61,7 +61,7 @@ def marginal_curve(
     - `inverted`: whether the stem points into the arena.
     - `start`: (R / rc, spin [rad/s]) close to the first point; by default the plane and its critical spin.
     - `largest_ratio`: R / rc at which to stop, below 1.
-    - `backwards`: whether to set out towards smaller R / rc.
+    - `backwards`: whether to start towards smaller R / rc.
     - `step`: longest step in arclength, in units of the plane's critical spin and of R / rc = 0.1.
 
     **Returns:** a `MarginalCurve`.
@@ -93,7 +93,7 @@ def marginal_curve(
         tangent *= np.sign(tangent @ direction)
         guess = points[-1] + length * tangent
         point = _newton(residual, guess, tangent)
-        # A point far from where it was expected belongs to another curve, or to another part of this one.
+        # A point far from its prediction belongs to another curve, or to another part of this one.
         if point is None or np.linalg.norm(point - guess) > 0.3 * length:
             length *= 0.5
             if length < 1e-6 * step:
@@ -126,7 +126,7 @@ def _residual(
 
 
 def _newton(residual: Callable[..., tuple[Array, Array]], guess: np.ndarray, normal: np.ndarray) -> np.ndarray | None:
-    """The marginal point in the plane through the guess with the given normal, or None if Newton does not settle."""
+    """The marginal point in the plane through the guess with the given normal, or None if Newton does not converge."""
     point = guess
     for _ in range(12):
         value, slope = residual(jnp.asarray(point))

@@ -1,8 +1,8 @@
 """Poincare's equations for the tippe top: the paper's (2) corrected, and the top as data for the general formulations.
 
-The frame of the configuration space has the fields X_1 = d/dpsi, which is cyclic, and besides it
-d/dtheta, (d/dphi - cos(theta) d/dpsi) / sin(theta), d/deta, d/dy and d/dgap. All commute with X_1; the bracket of the
-first two has X_1 as a component, which is where beta1 enters the equations.
+The frame of the configuration space has the cyclic field X_1 = d/dpsi, and the fields d/dtheta, (d/dphi - cos(theta)
+d/dpsi) / sin(theta), d/deta, d/dy and d/dgap. All commute with X_1; the bracket of the first two has X_1 as a
+component, through which beta1 enters the equations.
 """
 
 import equinox as eqx
@@ -17,14 +17,14 @@ from ..model.scene import Scene
 from ..model.top import Top
 from .euler_angles import Accelerations, metric, per_normal_force, potential, slip_velocity, spread
 
-#: Place of the cyclic angle psi among (eta, y, theta, phi, psi, gap).
+#: Index of the cyclic angle psi among (eta, y, theta, phi, psi, gap).
 PSI = 4
 
 
 def nodal_frame(q: Float[Array, " n"]) -> Float[Array, "n n"]:
     """The frame of the module as columns, in the order of the coordinates (eta, y, theta, phi, psi, ...).
 
-    The field that stands in the place of phi is (d/dphi - cos(theta) d/dpsi) / sin(theta).
+    The field in the place of phi is (d/dphi - cos(theta) d/dpsi) / sin(theta).
     """
     s, c = jnp.sin(q[2]), jnp.cos(q[2])
     return jnp.eye(q.size, dtype=q.dtype).at[3, 3].set(1.0 / s).at[PSI, 3].set(-c / s)
@@ -35,8 +35,8 @@ def by_equation_2(scene: Scene[Top], state: Float[Array, " 8"]) -> Accelerations
     """The paper's (2) with its indices right and with friction: Poincare's equations after Routh's reduction.
 
     d/dt dR/dv^rho - c^l_mu,rho v^mu dR/dv^l - c^1_mu,rho v^mu beta1 - X_rho R = Q_rho, R = L - beta1 v^1,
-    beta1' = Q_1, with [X_mu, X_rho] = c^l_mu,rho X_l. The printed form has c^l where c^1 belongs and leaves out the
-    forces Q; with friction, beta1 is then no constant (`tippe.md`, section 1).
+    beta1' = Q_1, with [X_mu, X_rho] = c^l_mu,rho X_l. The printed form has c^l instead of c^1 and omits the forces Q;
+    with friction, beta1 is then not constant (`tippe.md`, section 1).
 
     **Arguments:**
 
@@ -75,7 +75,7 @@ def by_equation_2(scene: Scene[Top], state: Float[Array, " 8"]) -> Accelerations
     gyroscopic = jnp.einsum("lmr,m,l->r", c[np.ix_(kept, np.arange(6), kept)], v, p) + beta * v @ c[PSI][:, kept]
     along = frame[:, kept].T @ jax.grad(routhian)(q)
 
-    # With the generalised forces Q = N contact, the equations are linear in the four v' that the gap leaves, and in N.
+    # With the generalised forces Q = N contact, the equations are linear in the four remaining v', and in N.
     contact = frame.T @ per_normal_force(scene, q, q_dot)
     column = contact[PSI] * b - contact[kept]
     system = jnp.concatenate([A[:, :4], column[:, None]], axis=1)
@@ -91,8 +91,7 @@ def by_equation_2(scene: Scene[Top], state: Float[Array, " 8"]) -> Accelerations
 
 
 class TopSystem(AbstractSystem):
-    """The top in contact, as the data that `nonholonomic.formulations.formulation` works on: coordinates (eta, y,
-    theta, phi, psi).
+    """The top in contact, as data for `nonholonomic.formulations.formulation`: coordinates (eta, y, theta, phi, psi).
 
     **Arguments:**
 
@@ -120,7 +119,7 @@ class TopSystem(AbstractSystem):
         return jax.jacfwd(lambda rate: slip_velocity(self.scene, whole, jnp.append(rate, 0.0)))(jnp.zeros_like(q))
 
     def frame(self, q: Float[Array, " 5"]) -> Float[Array, "5 5"]:
-        """The nodal frame; when rolling, the first three fields carry the centre along so that the slip vanishes."""
+        """The nodal frame; when rolling, the first three fields move the centre so that the slip vanishes."""
         frame = nodal_frame(q)
         if not self.rolling:
             return frame
@@ -131,6 +130,6 @@ class TopSystem(AbstractSystem):
 
 
 def from_angles(state: Float[Array, " 8"]) -> tuple[Float[Array, " 5"], Float[Array, " 5"]]:
-    """Coordinates and rates of `TopSystem` for a state of `euler_angles.py`; the cyclic coordinates are put to 0."""
+    """Coordinates and rates of `TopSystem` for a state of `euler_angles.py`; the cyclic coordinates are set to 0."""
     q, q_dot = spread(state)
     return q[:5], q_dot[:5]

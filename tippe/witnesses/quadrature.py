@@ -7,7 +7,7 @@ integral,
 
     t(chi) = integral of sqrt(mu(z) / (2 P(z))) dchi,
 
-which a few cosines represent to rounding error. P is minus the second divided difference of f, taken from f'' by
+which a few cosines represent to rounding error. P is minus the second divided difference of f, computed from f'' by
 Hermite and Genocchi's formula, so that nothing cancels where the swing is narrow or near its ends.
 """
 
@@ -41,7 +41,7 @@ class AbstractNutation(eqx.Module):
 
     @abc.abstractmethod
     def drive(self, z: Float[Array, ""]) -> Float[Array, ""]:
-        """f(z) = sin(theta)^2 times the energy left for nutation [J], analytic on [-1, 1]."""
+        """f(z) = sin(theta)^2 times the energy available for nutation [J], analytic on [-1, 1]."""
 
 
 class FrictionlessNutation(AbstractNutation):
@@ -153,7 +153,7 @@ def rolling_rate(scene: Scene[Top], state: Float[Array, " 6"]) -> Float[Array, "
     r = body.offset * e - body.radius * up
     inertia = body.I1 * jnp.eye(3) + (body.I3 - body.I1) * jnp.outer(e, e)
     e_dot = jnp.cross(w, e)
-    # J changes with e; its rate is already in w x L, which is taken in the turning body.
+    # J changes with e; its rate is already contained in w x L, which is taken in the turning body.
     torque = -jnp.cross(w, inertia @ w) + body.mass * jnp.cross(r, jnp.cross(body.offset * e_dot, w))
     torque = torque + body.mass * scene.gravity * jnp.cross(r, up)
     whole = inertia + body.mass * (r @ r * jnp.eye(3) - jnp.outer(r, r))
@@ -161,7 +161,7 @@ def rolling_rate(scene: Scene[Top], state: Float[Array, " 6"]) -> Float[Array, "
 
 
 class Swing(eqx.Module):
-    """The motion theta(t) of a nutation, exact to rounding error; made by `swing`.
+    """The motion theta(t) of a nutation, exact to rounding error; created by `swing`.
 
     - `middle`, `half`: middle and half width of the swing of z = cos(theta).
     - `cosines`: coefficients [s] of dt/dchi = c0 + c1 cos(chi) + ...
@@ -209,7 +209,7 @@ def swing(nutation: AbstractNutation, z: Float[Array, ""], z_dot: Float[Array, "
 
     **Arguments:**
 
-    - `nutation`: what is left of the top: `FrictionlessNutation` or `RollingNutation`.
+    - `nutation`: a `FrictionlessNutation` or `RollingNutation`.
     - `z`, `z_dot`: cos(theta) at t = 0 and its rate [1/s].
 
     **Returns:** a `Swing`.
@@ -234,16 +234,16 @@ def swing(nutation: AbstractNutation, z: Float[Array, ""], z_dot: Float[Array, "
     waves = jnp.cos(jnp.arange(COSINES)[:, None] * angles)
     cosines = (2.0 / COSINES) * waves @ jax.lax.map(pace, angles)
     motion = Swing(middle, half, cosines.at[0].divide(2.0), jnp.zeros_like(z))
-    # The rate fixes the phase near a turning point, where z does not.
+    # Near a turning point, the rate determines the phase; z does not.
     rough = jnp.arccos(jnp.clip((middle - z) / half, -1.0, 1.0))
     phase = jnp.arctan2(z_dot * motion.pace(rough), middle - z)
     return eqx.tree_at(lambda s: s.phase, motion, phase)
 
 
 def turning_point(nutation: AbstractNutation, z: Float[Array, ""], direction: float) -> Float[Array, ""]:
-    """The zero of f next to z in the given direction (+1 or -1), or z itself if f falls there.
+    """The zero of f next to z in the given direction (+1 or -1), or z itself if f decreases in that direction.
 
-    The step doubles until f is negative, which it is at the latest beyond a pole; then the bracket is halved.
+    The step doubles until f is negative, at the latest beyond a pole; then the bracket is bisected.
     """
 
     def ahead(step):

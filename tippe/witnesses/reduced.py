@@ -1,8 +1,8 @@
 """Two reduced forms of the tippe top on the plane: Rutstam's equations, and the paper's reduction by Routh and Jellett.
 
-Both are for friction at a point: with a contact torque Jellett's quantity is no constant. Both use the nodal frame
-(tx, ty, z): tx along the horizontal projection of the axis e, ty = z x tx. They are singular where sin(theta) = 0 and
-stand as witnesses beside the vector form, which is not.
+Both need friction at a point: with a contact torque, Jellett's quantity is not constant. Both use the nodal frame (tx,
+ty, z): tx along the horizontal projection of the axis e, ty = z x tx. Unlike the vector form, which they check, they
+are singular where sin(theta) = 0.
 """
 
 from typing import NamedTuple
@@ -28,7 +28,7 @@ def nodal(state: Float[Array, " 8"], vector: Float[Array, " 2"]) -> Float[Array,
 
 
 def point_friction(scene: Scene[Top], slip: Float[Array, " 2"]) -> Float[Array, " 2"]:
-    """Tangential force per unit normal force [1] along (tx, ty), zeros where there is none.
+    """Tangential force per unit normal force [1] along (tx, ty), zeros if there is none.
 
     **Arguments:** `slip`: velocity of the contact point along (tx, ty) [m/s].
 
@@ -69,7 +69,7 @@ def rutstam_rate(scene: Scene[Top], state: Float[Array, " 6"]) -> Float[Array, "
 
     **Arguments:**
 
-    - `scene`: a `Scene` on the plane. Where Rutstam has the viscous -mu nu, this has the law's force per normal force.
+    - `scene`: a `Scene` on the plane. The law's force per unit normal force replaces Rutstam's viscous -mu nu.
     - `state`: (theta, theta', phi', omega3, nu_x, nu_y) in rad, rad/s and m/s.
 
     **Returns:** its rate, (6,).
@@ -95,7 +95,7 @@ def rutstam_rate(scene: Scene[Top], state: Float[Array, " 6"]) -> Float[Array, "
 
 
 class JellettState(NamedTuple):
-    """What remains when psi is eliminated by beta1 and phi' by Jellett's constant.
+    """The state that remains when psi is eliminated by beta1 and phi' by Jellett's constant.
 
     - `theta`, `theta_dot`: inclination [rad] and its rate.
     - `spin_momentum`: beta1 = I3 omega3 [kg m^2/s], which friction changes.
@@ -119,7 +119,7 @@ def jellett_state(scene: Scene[Top], state: Float[Array, " 8"]) -> JellettState:
 def jellett_constant(
     scene: Scene[Top], theta: Float[Array, ""], phi_dot: Float[Array, ""], spin_momentum: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """The paper's (1) as it should read: J = beta1 (R cos(theta) - a) + I1 phi' R sin(theta)^2 [kg m^3/s]."""
+    """The paper's (1), corrected: J = beta1 (R cos(theta) - a) + I1 phi' R sin(theta)^2 [kg m^3/s]."""
     body, s, c = scene.body, jnp.sin(theta), jnp.cos(theta)
     return spin_momentum * (body.radius * c - body.offset) + body.I1 * phi_dot * body.radius * s**2
 
@@ -163,7 +163,7 @@ def spin_rate_from_jellett(
 def lagrangian(
     scene: Scene[Top], theta: Float[Array, ""], rates: Float[Array, " 3"], velocity: Float[Array, " 2"]
 ) -> Float[Array, ""]:
-    """The paper's (6) as it should read, in coordinates of the centre of mass [J].
+    """The paper's (6), corrected, in coordinates of the centre of mass [J].
 
     L = (m (x'^2 + y'^2 + a^2 theta'^2 sin(theta)^2) + I1 theta'^2 + I1 phi'^2 sin(theta)^2
     + I3 (psi' + phi' cos(theta))^2) / 2 - m g (R - a cos(theta)); the printed form lacks the term in a^2.
@@ -187,11 +187,11 @@ def routhian(
     velocity: Float[Array, " 2"],
     spin_momentum: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """What the paper's (9) should be, the Routhian R = L - beta1 psi' [J], psi' eliminated by (10).
+    """The paper's (9), corrected: the Routhian R = L - beta1 psi' [J], with psi' eliminated by (10).
 
     R = (m (x'^2 + y'^2 + a^2 theta'^2 sin(theta)^2) + I1 theta'^2 + I1 phi'^2 sin(theta)^2) / 2 + beta1 phi' cos(theta)
-    - beta1^2 / (2 I3) - m g (R - a cos(theta)). The printed (9) lacks the gyroscopic term and has the sign of the next
-    one changed: it is the kinetic energy's value, from which no equation of motion follows.
+    - beta1^2 / (2 I3) - m g (R - a cos(theta)). The printed (9) lacks the gyroscopic term and has the opposite sign of
+      the next term: it is the value of the kinetic energy, from which no equation of motion follows.
 
     **Arguments:** as for `lagrangian`, with `rates` (theta', phi').
     """

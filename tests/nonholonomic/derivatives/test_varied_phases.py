@@ -121,7 +121,7 @@ def test_a_bouncing_ball_inside_a_transformation(balls):
         settings = settings_of(1e-10)
         first = jnp.asarray(first)
         return traced_solve_hybrid_with_tangents(
-            modes, directions, first, states, times, settings, counters=1, ends_on_event=False
+            modes, directions, first, states, times, CELLS, settings, counters=1, ends_on_event=False
         )
 
     hybrid_outcome, found = run(*given, times)
@@ -180,7 +180,7 @@ def test_a_grazing_event_is_seen():
     @eqx.filter_jit
     def run(modes, directions, first, states):
         return traced_solve_hybrid_with_tangents(
-            modes, directions, first, states, jnp.asarray(9.0), settings_of(tolerance), counters=1
+            modes, directions, first, states, jnp.asarray(9.0), len(heights), settings_of(tolerance), counters=1
         )
 
     hybrid_outcome, found = jax.tree.map(np.asarray, run(modes, directions, first, states))

@@ -166,7 +166,7 @@ def test_a_direction_that_the_data_cannot_see_is_named():
     assert np.isinf(found.standard_errors["b"])
     assert found.standard_errors["c"] < 0.01
     assert_close(found.estimates["a"] * found.estimates["b"], 6.0, rtol=1e-6)
-    assert "NOT SEEN" in str(found)
+    assert "UNDETERMINED" in str(found)
     with pytest.raises(ValueError, match="'a', whose standard error is infinite"):
         found.profile("a")
     assert_close(coordinate_covariance(np.array([[2.0, 0.0]])), [[0.25, 0.0], [0.0, np.inf]])

@@ -1,4 +1,4 @@
-"""What is measured of a tippe top: inversion times of launches, and recorded motion."""
+"""Measured inversion times of launches."""
 
 import math
 from typing import Any, ClassVar
@@ -9,27 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from nonholonomic.identification import AbstractRecording, Measurements, Quantities, as_quantity, predicted
+from nonholonomic.identification import Measurements
 from nonholonomic.parameters import numbers, one_line, with_numbers
 from nonholonomic.validation import as_number, as_number_or_none, require
 
 from ..model.launch import Launch
 from ..model.scene import Scene
+from ..runs.checks import check_event
 from ..runs.extended_times import extended_inversion_time
-from ..runs.inversion import check_event
-from ..runs.trajectory import simulate
-
-#: What can be recorded of a top: as the properties of a `Trajectory` call it.
-QUANTITIES = Quantities(
-    columns={"position": ("x", "y", "z"), "axis": ("axis_x", "axis_y", "axis_z")},
-    units={"theta": "rad", "azimuth": "rad", "eta": "rad", "spin": "rad/s"}
-    | dict.fromkeys(("x", "y", "z"), "m")
-    | dict.fromkeys(("axis_x", "axis_y", "axis_z"), "1"),
-    angles=frozenset({"azimuth", "eta"}),
-)
-
-#: How far [rad] a recorded theta may be outside [0, pi] if its errors are smaller, or not known.
-NOISE = 0.3
 
 #: Parameters by name, one value a row.
 Values = dict[str, Float[Array, " rows"]]
@@ -83,8 +70,8 @@ class InversionTimes(eqx.Module):
             raise ValueError(f"time must be a non-empty list of times or of pairs of them, not of shape {shape}")
         require(self.t1, "t1", above=0.0)
         check_event(self.angle, "first")
-        given = np.asarray(self.time)
-        if np.any(np.isnan(given)):
+        measured = np.asarray(self.time)
+        if np.any(np.isnan(measured)):
             raise ValueError("time must be numbers, infinite where a launch did not invert")
         if self.until is not None:
             require(self.until, "until", above=0.0, at_most=self.t1, why="t1")
@@ -92,7 +79,7 @@ class InversionTimes(eqx.Module):
         require(first[first == last], "time", above=0.0, below=self.t1, why="t1")
         require(first, "time", at_least=0.0, at_most=self.t1, why="t1")
         if np.any(last < first):
-            raise ValueError(f"time = {given[np.argmax(last < first)]} must be a time, or two in order")
+            raise ValueError(f"time = {measured[np.argmax(last < first)]} must be a time, or two in order")
         if self.student is not None:
             require(self.student, "student", above=0.0)
         alike = numbers("launch", self.launch) | {"error": self.error, "until": self.until}
@@ -155,77 +142,10 @@ class InversionTimes(eqx.Module):
         return jax.vmap(one)(lanes).reshape(rows, launches)
 
 
-class Recording(AbstractRecording):
-    """A recorded run: some quantities at the readings of a clock.
-
-    **Arguments:**
-
-    - `launch`: a `Launch`, every number a scalar.
-    - `times`: (times,) [s], increasing.
-    - `value`: (times,) for one column, (times, columns) for several; NaN where a sample is missing.
-    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: to be estimated for each column
-      from the scatter about the fit.
-    - `quantity`: "theta", "azimuth", "eta" [rad], "spin" [rad/s], "position" ("x", "y", "z") [m] of the sphere's centre or
-      "axis" ("axis_x", "axis_y", "axis_z") [1] in the fixed frame, as in `Trajectory`; or a tuple of some of these words.
-      Azimuth and eta may be given up to whole turns.
-    - `t0`: the clock's reading [s] at the launch. Until then the top is where it is launched.
-    - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None`: Gaussian.
-
-    **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
-
-    **Example:** two frames of a film, in the second of which the azimuth could not be read off.
-
-    >>> import numpy as np, tippe
-    >>> value = [[0.11, 0.3], [0.14, np.nan]]
-    >>> film = tippe.Recording(tippe.Launch(0.1, 150.0), [0.0, 0.04], value, [0.01, 0.1], ("theta", "azimuth"))
-    >>> film.labels
-    ('theta(0 s)', 'azimuth(0 s)', 'theta(0.04 s)')
-    """
-
-    launch: Launch
-    quantity: str | tuple[str, ...] = eqx.field(static=True, default="theta", converter=as_quantity)
-    t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
-    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
-    quantities: ClassVar[Quantities] = QUANTITIES
-
-    def __check_init__(self):
-        # Of the right shapes, if this comes to its end.
-        super().__check_init__()
-        if "theta" not in self.columns:
-            return
-        value, error = np.asarray(self.value), 0.0 if self.error is None else 5.0 * np.asarray(self.error)
-        reach = np.maximum(NOISE, np.broadcast_to(error, value.shape)).reshape(len(self.times), -1)
-        place = self.columns.index("theta")
-        theta, reach = value.reshape(reach.shape)[:, place], reach[:, place]
-        seen = ~np.isnan(theta)
-        theta, reach = theta[seen], reach[seen]
-        require(theta, "theta", at_least=-reach, at_most=math.pi + reach, why="with room for its errors", unit="rad")
-
-
-def predict_recordings(
-    scene: Scene, recordings: list[tuple[Recording, Values]], rows: int, tolerance: Float[Array, ""]
-) -> list[Float[Array, "rows samples"]]:
-    """What is recorded of several runs, in every row, as for `nonholonomic.identification.predicted`."""
-
-    def run(lane: Values, times: Float[Array, " times"]) -> Any:
-        roots = with_numbers({"scene": scene, "launch": recordings[0][0].launch}, lane)
-        return simulate(roots["scene"], roots["launch"], times[-1], times, tolerance)
-
-    return predicted(recordings, rows, run, column_of)
-
-
-def column_of(run: Any, name: str) -> Float[Array, " times"]:
-    """A column of a trajectory."""
-    for quantity, columns in QUANTITIES.columns.items():
-        if name in columns:
-            return getattr(run, quantity)[:, columns.index(name)]
-    return getattr(run, name)
-
-
 def _launches(launch: Launch, count: int, rows: int) -> Values:
     """The numbers of all launches in every row, those that are one for each of them."""
-    found = {name: value for name, value in numbers("launch", launch).items() if value is not None and np.ndim(value)}
-    return {name: jnp.tile(value, rows) for name, value in found.items()}
+    lists = {name: value for name, value in numbers("launch", launch).items() if value is not None and np.ndim(value)}
+    return {name: jnp.tile(value, rows) for name, value in lists.items()}
 
 
 def _one_of(launch: Launch) -> Launch:

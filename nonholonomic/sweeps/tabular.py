@@ -1,0 +1,122 @@
+"""The quantities of a run over its times, as a table, and what every run offers with it."""
+
+import abc
+import json
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+from ..parameters import likely, text_as_html
+from ..validation import require_package
+from .layout import Values
+from .table import Table
+from .tasks import versions
+
+
+class Quantity(NamedTuple):
+    """A quantity of a run: its unit, a description, and the dimension of its components if it is a vector.
+
+    `read` returns it from a run; by default it is the property with the name of the quantity.
+    """
+
+    unit: str
+    long_name: str
+    components: str | None = None
+    read: Callable[[Any], Any] | None = None
+
+    def of(self, name: str, run: Any) -> Any:
+        """The values of the quantity in a run."""
+        return getattr(run, name) if self.read is None else self.read(run)
+
+
+def run_table(
+    quantities: dict[str, Quantity],
+    coords: dict[str, Values],
+    values: dict[str, Values],
+    axes: list[str],
+    request: dict[str, Any],
+) -> Table:
+    """A table of quantities over time.
+
+    **Arguments:**
+
+    - `quantities`: name -> `Quantity`; `values`: name -> its values.
+    - `coords`: name -> values, those of the `axes` first.
+    - `request`: plain data that describes the run.
+    """
+    attributes = {
+        "request": json.dumps(request, default=repr),
+        "axes": json.dumps(axes),
+        "versions": json.dumps(versions()),
+        "long_names": json.dumps(
+            {"time": "time"} | {name: quantity.long_name for name, quantity in quantities.items()}, sort_keys=True
+        ),
+    }
+    units = {"time": "s"} | {name: quantity.unit for name, quantity in quantities.items()}
+    inner = {name: (quantity.components,) for name, quantity in quantities.items() if quantity.components is not None}
+    return Table(coords, values, units, attributes, inner=inner)
+
+
+class Tabular(abc.ABC):
+    """A run whose quantities over time are a table."""
+
+    #: The names that a message for an unknown attribute lists; empty for the ordinary message.
+    readable: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    @abc.abstractmethod
+    def portrait_axes(self) -> tuple[str, str]:
+        """The variables that `portrait` draws by default."""
+
+    @abc.abstractmethod
+    def to_table(self) -> Table:
+        """All quantities of the run, as a `Table` over its times.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+
+    def to_xarray(self) -> Any:
+        """The run as an `xarray.Dataset` over "time" (needs xarray), with units and names.
+
+        **Raises:** `ValueError` for a batch of runs.
+        """
+        require_package("xarray", "xarray", "to_xarray")
+        return self.to_table().to_xarray()
+
+    def save(self, path: Any) -> None:
+        """Write the run to an HDF5 file that `Table.load` and xarray (`engine="h5netcdf"`) read.
+
+        **Raises:** `OSError` that names the path if it cannot be written; `ValueError` for a batch of runs.
+        """
+        self.to_table().save(path)
+
+    def portrait(self, x: str | None = None, y: str | None = None, ax: Any = None) -> Any:
+        """Draw one quantity over another, a phase portrait (needs matplotlib).
+
+        **Arguments:**
+
+        - `x`, `y`: variables of `to_table()`, such as "theta" or "steering", or one component, such as "position.x". By
+          default `portrait` draws theta and its rate, the steering angle and the yaw rate, or the first and the last
+          component of your own system.
+        - `ax`: matplotlib axes to draw in, instead of a new figure.
+
+        **Returns:** the matplotlib figure, or `ax`.
+
+        **Raises:** `ValueError` for an unknown variable.
+        """
+        require_package("matplotlib", "plot", "portrait")
+        from ..views import draw_portrait
+
+        across, up = self.portrait_axes
+        return draw_portrait(self.to_table(), across if x is None else x, up if y is None else y, ax)
+
+    def __getattr__(self, name: str) -> Any:
+        # Reached for unknown names, and where reading a known one has raised this kind of error: it raises it again.
+        if name.startswith("_") or hasattr(type(self), name) or not self.readable:
+            return object.__getattribute__(self, name)
+        raise AttributeError(f"the run has no {name!r}{likely(name, self.readable)} It has {', '.join(self.readable)}")
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        return text_as_html(str(self))

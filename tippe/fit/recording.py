@@ -1,0 +1,115 @@
+"""Recorded runs of tops, from arrays and from files."""
+
+import math
+from typing import Any, ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic.identification import AbstractRecording, Quantities, as_quantity, read_columns
+from nonholonomic.validation import as_number, as_number_or_none, require
+
+from ..model.launch import Launch
+
+#: What can be recorded of a top: as the properties of a `Trajectory` call it.
+QUANTITIES = Quantities(
+    columns={"position": ("x", "y", "z"), "axis": ("axis_x", "axis_y", "axis_z")},
+    units={"theta": "rad", "azimuth": "rad", "eta": "rad", "spin": "rad/s"}
+    | dict.fromkeys(("x", "y", "z"), "m")
+    | dict.fromkeys(("axis_x", "axis_y", "axis_z"), "1"),
+    angles=frozenset({"azimuth", "eta"}),
+)
+
+#: How far [rad] a recorded theta may be outside [0, pi] if its errors are smaller, or not known.
+NOISE = 0.3
+
+
+class Recording(AbstractRecording):
+    """A recorded run: some quantities at the readings of a clock.
+
+    **Arguments:**
+
+    - `launch`: a `Launch`, every number a scalar.
+    - `times`: (times,) [s], increasing.
+    - `value`: (times,) for one column, (times, columns) for several; NaN where a sample is missing.
+    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: to be estimated for each column
+      from the scatter about the fit.
+    - `quantity`: "theta", "azimuth", "eta" [rad], "spin" [rad/s], "position" ("x", "y", "z") [m] of the sphere's centre or
+      "axis" ("axis_x", "axis_y", "axis_z") [1] in the fixed frame, as in `Trajectory`; or a tuple of some of these words.
+      Azimuth and eta may be given up to whole turns.
+    - `t0`: the clock's reading [s] at the launch. Until then the top is where it is launched.
+    - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None`: Gaussian.
+
+    **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
+
+    **Example:** two frames of a film, in the second of which the azimuth could not be read off.
+
+    >>> import numpy as np, tippe
+    >>> value = [[0.11, 0.3], [0.14, np.nan]]
+    >>> film = tippe.Recording(tippe.Launch(0.1, 150.0), [0.0, 0.04], value, [0.01, 0.1], ("theta", "azimuth"))
+    >>> film.labels
+    ('theta(0 s)', 'azimuth(0 s)', 'theta(0.04 s)')
+    """
+
+    launch: Launch
+    quantity: str | tuple[str, ...] = eqx.field(static=True, default="theta", converter=as_quantity)
+    t0: Float[Array, ""] = eqx.field(converter=as_number, default=0.0)
+    student: Float[Array, ""] | None = eqx.field(converter=as_number_or_none, default=None)
+    quantities: ClassVar[Quantities] = QUANTITIES
+
+    def __check_init__(self):
+        # Of the right shapes, if this comes to its end.
+        super().__check_init__()
+        if "theta" not in self.columns:
+            return
+        value, error = np.asarray(self.value), 0.0 if self.error is None else 5.0 * np.asarray(self.error)
+        reach = np.maximum(NOISE, np.broadcast_to(error, value.shape)).reshape(len(self.times), -1)
+        place = self.columns.index("theta")
+        theta, reach = value.reshape(reach.shape)[:, place], reach[:, place]
+        seen = ~np.isnan(theta)
+        theta, reach = theta[seen], reach[seen]
+        require(theta, "theta", at_least=-reach, at_most=math.pi + reach, why="with room for its errors", unit="rad")
+
+
+def read_recording(
+    path: Any,
+    columns: Any,
+    fps: float | None = None,
+    *,
+    launch: Launch,
+    error: Any = None,
+    t0: float = 0.0,
+    student: float | None = None,
+) -> Recording:
+    """A recording of a top from a text file of columns with a line of headers (CSV).
+
+    **Arguments:**
+
+    - `path`: of the file. Columns are parted by commas, semicolons, tabs or blanks; empty cells and `nan` are missing samples;
+      lines that begin with # are left out.
+    - `columns`: what a column is -> (its header, its unit): `"time"`, or `"frame"`, and any of `"theta"`, `"azimuth"`, `"eta"`,
+      `"spin"`, `"x"`, `"y"`, `"z"`, `"axis_x"`, `"axis_y"`, `"axis_z"`. Units are s, ms, min; rad, deg, rev; rad/s, deg/s, rpm,
+      rev/s; m, cm, mm; 1, %; or a number, the SI units that one of the file is, such as the metres of a pixel.
+    - `fps`: frames a second, where there is no `"time"`; without a `"frame"` every line is one.
+    - `launch`: a `Launch`, as far as it is known.
+    - `error`: what a column is -> (its standard error, or the header of a column of them, unit); `None`: to be estimated.
+    - `t0`, `student`: as for `Recording`.
+
+    **Returns:** a `Recording`.
+
+    **Raises:** `ValueError` that names the column and what is wrong with it.
+
+    **Example:** three frames of a film at 50 frames a second, the second of them unreadable.
+
+    >>> import pathlib, tempfile, tippe
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "film.csv"
+    >>> _ = path.write_text("frame,tilt\\n0,5.7\\n1,\\n2,6.3\\n")
+    >>> launch = tippe.Launch(theta=0.1, spin=150.0)
+    >>> columns = {"frame": ("frame", "1"), "theta": ("tilt", "deg")}
+    >>> film = tippe.read_recording(path, columns, fps=50, launch=launch, error={"theta": (1.0, "deg")})
+    >>> print(film.times, film.value.round(4))
+    [0.   0.04] [0.0995 0.11  ]
+    """
+    read = read_columns(path, columns, fps, error, QUANTITIES)
+    return Recording(launch, *read, t0, student)

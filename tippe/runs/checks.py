@@ -1,0 +1,151 @@
+"""Checks of the arguments of a run, before anything compiles, and of traced arguments inside a program."""
+
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from nonholonomic.integration import legal_run, run_bounds
+from nonholonomic.parameters import numbers
+from nonholonomic.validation import (
+    Bound,
+    all_bounds,
+    is_traced,
+    legal,
+    nan_unless,
+    require_all,
+    require_kind,
+    require_scalars,
+)
+from nonholonomic.xla_cpu import compiled_setup
+
+from ..model.friction import Frictionless
+from ..model.launch import Launch
+from ..model.rigid_body import AbstractRigidBody
+from ..model.scene import Scene
+
+
+@eqx.filter_jit
+def permitted(
+    structure: Any, unchecked: bool, leaves: Sequence[Float[Array, "..."]]
+) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, ""]]:
+    """Which cells have legal numbers; the horizons, 0 for the others; and the tolerance of the ensemble.
+
+    One tolerance serves the whole ensemble: the smallest of a batch.
+
+    **Arguments:** `structure`, `leaves`: of scene, launch, angle, horizon and tolerance; `unchecked`: whether some of
+    them were traced when they were checked.
+    """
+    scene, launch, angle, t1, tolerance = jax.tree.unflatten(structure, leaves)
+    may = jnp.asarray(True)
+    if unchecked:
+        bounds = (*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch), *event_bounds(angle))
+        may = legal(bounds)
+        if angle is None:
+            may = may & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0)
+        may, t1, tolerance = legal_run(may, t1, tolerance)
+    return may, t1, jnp.min(tolerance)
+
+
+# One program where the function is called on its own, not one for every comparison.
+@compiled_setup
+def nan_if_illegal(time: Float[Array, ""], structure: Any, unchecked: bool, leaves: list[Any]) -> Float[Array, ""]:
+    """The time, or NaN with NaN derivatives where numbers are not legal. **Arguments:** as for `permitted`."""
+    return nan_unless(permitted(structure, unchecked, leaves)[0], time) if unchecked else time
+
+
+#: Advice in messages about lists, where a table is the better choice.
+LISTS = "inversion_table takes lists, and jax.vmap maps over them"
+
+
+def check_run(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LISTS) -> None:
+    """Raise `ValueError` unless these are a scene, a launch with a place on it, a positive horizon and a tolerance in range.
+
+    **Arguments:** as for `check_numbers`.
+    """
+    check_numbers(scene, launch, t1, tolerance, lists)
+    scene.check_start(launch)
+
+
+def check_numbers(scene: Any, launch: Any, t1: Any, tolerance: Any, lists: str = LISTS) -> None:
+    """Raise `ValueError` unless these are a scene, a launch, a positive horizon and a tolerance in range, each by
+    itself.
+
+    **Arguments:** as for `inversion_time`; `lists`: which functions accept lists instead of single numbers. The
+    parameters of a function, such as that of a `Graph`, may be lists.
+    """
+    require_kind(scene, "scene", Scene)
+    require_kind(launch, "launch", Launch)
+    require_all(run_bounds(t1, tolerance))
+    values = numbers("scene", scene, functions=False) | numbers("launch", launch) | {"t1": t1, "tolerance": tolerance}
+    require_scalars(values, lists)
+
+
+def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any) -> None:
+    """Warn of a scene without friction, and of a top that stands exactly upright on a level plane.
+
+    **Arguments:** `launch`: its theta is ignored; `theta`: one angle or several [rad].
+    """
+    if isinstance(scene.friction, Frictionless):
+        warnings.warn(
+            "friction = Frictionless(): without friction no top turns over; give the scene a law, such as "
+            "tippe.Scene(top, friction=tippe.Viscous(0.3))",
+            UserWarning,
+            stacklevel=4,
+        )
+    if isinstance(scene.body, AbstractRigidBody):
+        return
+    at_rest = launch.velocity is None and launch.angular_velocity is None
+    if scene.level and at_rest and not is_traced(theta) and np.any(np.asarray(theta) == 0.0):
+        warnings.warn(
+            "theta = 0.0 is exactly upright, where a top stays for ever: launch it at a small angle, such as 0.01 rad",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+def event_bounds(angle: Any) -> Iterator[Bound]:
+    """The range of the angle [rad] to be reached, if there is one."""
+    if angle is not None:
+        yield Bound(angle, "angle", above=0.0, at_most=math.pi, unit="rad")
+
+
+def check_smooth(scene: Scene, caller: str) -> None:
+    """Raise `ValueError` for a scene with hybrid runs, which do not support derivatives here."""
+    if scene.contact == "hybrid":
+        raise ValueError(f"contact = 'hybrid' must be 'stop' for {caller}; inversion_table goes through flights")
+    if scene.friction.set_valued:
+        kind = type(scene.friction).__name__
+        raise ValueError(f"friction = {kind} must be a law without phases for {caller}; inversion_table has them")
+
+
+def check_reversible(launch: Launch, values: dict[str, Any]) -> None:
+    """Raise `ValueError` for a launch without spin, which has none to reverse.
+
+    **Arguments:** `values`: full name of a number -> values in place of the launch's own.
+    """
+    spin = values.get("launch.spin", launch.spin)
+    if launch.angular_velocity is None and not is_traced(spin) and np.any(np.asarray(spin) == 0.0):
+        raise ValueError("spin = 0.0 must not be zero: the time of reversal is that of a spin that changes its sign")
+
+
+def check_revolution(scene: Scene, caller: str) -> None:
+    """Raise `ValueError` for a body of any shape and inertia, for what needs a body of revolution."""
+    if isinstance(scene.body, AbstractRigidBody):
+        kind = type(scene.body).__name__
+        raise ValueError(f"body = {kind} must be a body of revolution, such as a Top, for {caller}")
+
+
+def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:
+    """Raise `ValueError` unless the angle is in (0, pi] and the crossing one of the known words."""
+    require_all(event_bounds(angle))
+    if np.ndim(angle) != 0:
+        raise ValueError(f"angle must be one number, not of shape {np.shape(angle)}")
+    if crossing not in known:
+        raise ValueError(f"crossing = {crossing!r} must be {' or '.join(map(repr, known))}")
