@@ -353,9 +353,9 @@ def test_the_inertia_of_a_rattleback_is_found_from_its_motion():
         (lambda: tippe.RigidBody(1.0, INERTIA, lambda d: d), "one number for a direction"),
         (lambda: tippe.Scene(chaplygins_ball(LAW).body, tippe.Cylinder(1.0)), "must be a Plane for an Ellipsoid"),
         (lambda: tippe.Scene(chaplygins_ball(LAW).body, contact="hybrid"), "must be 'stop' for an Ellipsoid"),
-        (lambda: odd_scene(tippe.SetValuedCoulomb(0.3)), "law without phases for an Ellipsoid"),
+        (lambda: odd_scene(tippe.SetValuedCoulomb(0.3)), "law with a single mode for an Ellipsoid"),
         (lambda: tippe.Scene(rutstam_top(), friction=tippe.NoSlip()), "another law for a Top"),
-        (lambda: tippe.Rolling(1e-3, 1.0, tippe.NoSlip()), "law of sliding"),
+        (lambda: tippe.Rolling(1e-3, 1.0, tippe.NoSlip()), "must be a sliding law"),
         (
             lambda: tippe.simulate(rattleback(), tippe.Launch(0.1, 1.0, velocity=(1.0, 0.0)), 1.0),
             "velocity .* left out",

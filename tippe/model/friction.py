@@ -330,9 +330,10 @@ class NoSlip(AbstractFriction):
     >>> inertia = [[1e-5, 0, 0], [0, 2e-5, 0], [0, 0, 2.5e-5]]
     >>> ball = tippe.Ellipsoid(0.1, (0.02, 0.02, 0.02), (0.0, 0.0, 0.0), inertia)  # Chaplygin's ball
     >>> scene = tippe.Scene(ball, friction=tippe.NoSlip())
-    >>> run = tippe.simulate(scene, tippe.Launch(0.5, 20.0), t1=0.1, tolerance=1e-6)
+    >>> launch = tippe.Launch(0.5, spin=20.0, angular_velocity=(5.0, 0.0, 0.0))
+    >>> run = tippe.simulate(scene, launch, t1=0.1, tolerance=1e-6)
     >>> print(f"{run.grip.max():.3f}")
-    0.030
+    0.050
 
     ```
     """
