@@ -40,7 +40,7 @@ def ours(spin: float, tolerance: float) -> float:
 def scipy(spin: float, tolerance: float) -> float:
     """By the reference of the tests, in NumPy and SciPy's DOP853 [s]."""
     sys.path.append(str(Path(__file__).parents[1] / "tests" / "physics"))
-    from rigid_reference import Rattleback
+    from rigid_reference import Rattleback  # pyright: ignore[reportMissingImports]
 
     reference = Rattleback(1.0, SHAPE, CENTRE, INERTIA)
     return reference.reversal(reference.start(THETA, 0.0, spin), HORIZON, rtol=tolerance)

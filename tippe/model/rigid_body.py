@@ -275,8 +275,8 @@ def as_support(value: Any) -> eqx.Module:
     return closed if isinstance(closed, eqx.Module) else Plain(value)
 
 
-def evenly_spread(count: int) -> tuple[Float[np.ndarray, "count 3"], ...]:
-    """Unit vectors that cover a sphere evenly, along a spiral, and two unit vectors across each."""
+def evenly_spread(count: int) -> tuple[Any, ...]:
+    """Unit vectors (count, 3) that cover a sphere evenly, along a spiral, and two unit vectors across each."""
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     angle = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count)
     radius = np.sqrt(1.0 - z * z)

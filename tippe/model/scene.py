@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -37,7 +37,7 @@ from .dynamics import TURNING, Dynamics
 from .friction import A_LAW, AbstractFriction, Frictionless, NoSlip
 from .launch import Launch
 from .rigid_body import AbstractRigidBody
-from .rigid_dynamics import AbstractRigidDynamics, rigid_dynamics
+from .rigid_dynamics import rigid_dynamics
 from .state import angular_velocity, inclination, joined, parts
 from .stick_slip import StickSlip
 from .top import Top
@@ -190,8 +190,9 @@ class Scene(Bounded, Generic[Body]):
         return self.level and not self.friction.set_valued
 
     @property
-    def dynamics(self) -> Dynamics | StickSlip | AbstractRigidDynamics:
-        """The equations of motion, with the precomputed combinations of the scene's numbers."""
+    def dynamics(self) -> Any:
+        """The equations of motion, with the precomputed combinations of the scene's numbers: a `Dynamics`, a `StickSlip` or an
+        `AbstractRigidDynamics`."""
         numbers = (self.frame, self.friction, self.gravity)
         if isinstance(self.body, AbstractRigidBody):
             return rigid_dynamics(self.body, *numbers)
@@ -200,7 +201,7 @@ class Scene(Bounded, Generic[Body]):
         return Dynamics.of(self.body, *numbers)
 
     @property
-    def turning_dynamics(self) -> Dynamics | StickSlip | AbstractRigidDynamics:
+    def turning_dynamics(self) -> Any:
         """The equations of motion for angles, times, energies and forces, which are cheaper in a turning frame.
 
         On a level plane under an isotropic law, the frame turns with the top; its direction is not known afterwards.
@@ -329,7 +330,7 @@ class Scene(Bounded, Generic[Body]):
     def energy(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Kinetic energy plus weight times the height of the centre of mass above the arena's lowest point [J]."""
         body, dynamics = self.body, self.dynamics
-        if isinstance(dynamics, AbstractRigidDynamics):
+        if isinstance(body, AbstractRigidBody):
             return dynamics.energy(state)
         (u1, u2), e, L, place = parts(state)
         e3_dot = (L[0] * e[1] - L[1] * e[0]) / body.I1

@@ -25,7 +25,8 @@ class InversionProblem(AbstractProblem):
     """
 
     dynamics: Dynamics | StickSlip | ContactMode | AbstractRigidDynamics
-    cos_angle: Float[Array, "..."] | None
+    # An array, or `None`.
+    cos_angle: Any
     states: Float[Array, "components cells"]
     scales: Float[Array, "components cells"]
     spin: Float[Array, "..."] | None = None
@@ -49,6 +50,7 @@ class InversionProblem(AbstractProblem):
     def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
         if self.cos_angle is None:
             assert isinstance(self.dynamics, AbstractRigidDynamics)
+            assert self.spin is not None
             return self.dynamics.normal_spin(state) / self.spin
         return state[COS_THETA] - self.cos_angle
 
@@ -69,6 +71,5 @@ def _problem(scene: Scene[Top], launch: Launch, angle: Float[Array, "..."] | Non
     scales = jnp.broadcast_to(scene.scales(launch).reshape(shape[0], -1), shape)
     dynamics = scene.turning_dynamics
     if angle is None:
-        assert isinstance(dynamics, AbstractRigidDynamics)
         return InversionProblem(dynamics, None, states, scales, dynamics.normal_spin(states))
     return InversionProblem(dynamics, jnp.cos(angle), states, scales)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from nonholonomic.geometry import vector_of
 from nonholonomic.parameters import distinguishing_labels
 from nonholonomic.validation import require_one_run
 from nonholonomic.views import (
@@ -224,8 +225,8 @@ def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[Mesh, .
 
 def touching(body: AbstractRigidBody, directions: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
     """The points of a body's surface with some outward unit normals, from the centre of mass, in the body's axes [m]."""
-    normal = tuple(-jnp.asarray(directions).T)
-    return np.stack(body.contact(normal, (jnp.zeros_like(normal[0]),) * 3)[0], axis=-1)
+    normal, still = vector_of(-jnp.asarray(directions).T), jnp.zeros(len(directions))
+    return np.stack(body.contact(normal, (still, still, still))[0], axis=-1)
 
 
 def truncated(radius: float, knob: float, end: float) -> Float[np.ndarray, "points 2"]:
