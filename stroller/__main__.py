@@ -221,7 +221,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
         rides, audits, helm, asked = {}, [], Helm(options.force, options.steer, options.period), scenes(options)
         print(heading, flush=True)
-        # Programs are compiled side by side, for the compiler uses little more than one core; both rides of a ground have the same.
+        # Programs are compiled side by side, for the compiler uses little more than one core. Both rides of a ground have one.
         with Progress(len(asked) + 1, "ride") as counted, ThreadPoolExecutor(2) as threads:
             counted.begin()
             turns = {ground: Lock() for ground, _ in asked}
