@@ -38,12 +38,13 @@ from .runs.view import grouped
 
 RIDES = ("without friction", "with friction")
 
-#: Those of the rides that show how the energy's residual follows the tolerance.
+#: Tolerances of the rides that show how the energy residual depends on the tolerance.
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 
 
 class Ground(NamedTuple):
-    """A surface to ride on: how options make it, and where a ride starts, near the bottom or, outside, near the top."""
+    """A surface to ride on: how options create it, and where a ride starts, near the bottom or, outside, near the
+    top."""
 
     build: Callable[[argparse.Namespace], AbstractSurface]
     place: tuple[float, float]
@@ -62,7 +63,7 @@ GROUNDS = {
 
 
 class Helm(eqx.Module):
-    """Steer to and fro about straight ahead, and pull with a constant force: a torque towards a moving angle."""
+    """Steer alternately left and right, and pull with a constant force: a torque towards a moving angle."""
 
     force: Any = eqx.field(converter=as_number)
     angle: Any = eqx.field(converter=as_number)
@@ -154,7 +155,7 @@ def audit(name: str, runs: dict[str, Trajectory]) -> list[str]:
 
 
 def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
-    """The largest residual of energy against work over the tolerance of Dopri8, for the last ride."""
+    """The largest energy residual over the tolerance of Dopri8, for the last ride."""
     (ground, ride), (scene, launch) = list(scenes(options).items())[-1]
     lines = [f"Dopri8 {ground}, {ride}: residual [J] of energy against work over the tolerance"]
     for tolerance in TOLERANCES:
@@ -184,13 +185,14 @@ def table(options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory])
 def write_page(
     options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory], words: list[str], drawing: Path | None
 ) -> Path:
-    """The page of the main job: the rides in motion where three.js is installed, the audit, and the picture if there is one."""
+    """Write the page of the main job: the moving rides if three.js is installed, the audit, and the plot if there is
+    one."""
     groups: dict[str, list[tuple[int, Trajectory]]] = {}
     for number, ((ground, _), run) in enumerate(rides.items()):
         groups.setdefault(ground, []).append((number, run))
     drawn = []
     if can_view():
-        # The place of both rides is their stage's title, and their names stand beside it.
+        # The place of both rides is the title of their stage, and their names are beside it.
         drawn = [
             stage._replace(title=ground)
             for ground, stage in zip(groups, grouped(list(groups.values()), [ride for _, ride in rides]), strict=True)
@@ -221,7 +223,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
         rides, audits, helm, asked = {}, [], Helm(options.force, options.steer, options.period), scenes(options)
         print(heading, flush=True)
-        # Programs are compiled side by side, for the compiler uses little more than one core. Both rides of a ground have one.
+        # Compile in parallel, because the compiler uses little more than one core. The two rides of a ground share one program.
         with Progress(len(asked) + 1, "ride") as counted, ThreadPoolExecutor(2) as threads:
             counted.begin()
             turns = {ground: Lock() for ground, _ in asked}
@@ -268,7 +270,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    # A job of seconds: a tenth of them would go into looking for garbage among all that JAX holds, here and at the end.
+    # For a job of seconds, searching all of JAX's objects for garbage would take a tenth of the time, here and at the
+    # end.
     gc.disable()
     compile_quickly()
     status = interruptible(main, "stroller")
