@@ -107,6 +107,7 @@ def test_the_same_table_by_vmapped_diffrax(arena):
     assert np.all(fast.end_time <= slow.end_time + 1e-7)
 
 
+@pytest.mark.slow
 def test_starts_beyond_the_end_by_vmapped_diffrax():
     """On the ceiling of a cylinder and beyond the angle a run is over as it begins, by either method."""
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Viscous(0.3))
