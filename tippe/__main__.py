@@ -3,6 +3,7 @@
 import argparse
 import functools
 import gc
+import json
 import math
 import sys
 import time
@@ -16,12 +17,13 @@ import numpy as np
 
 from nonholonomic import __version__
 from nonholonomic.command_line import interruptible
-from nonholonomic.compilation_cache import enable_compilation_cache
+from nonholonomic.compilation_cache import enable_compilation_cache, kept_text
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table, saved_cells
 from nonholonomic.validation import require_folder
-from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html, table_as_html
+from nonholonomic.views import NO_VIEW, Page, can_view, page, picture_as_html, table_as_html
+from nonholonomic.views.explore import live_page
 from nonholonomic.xla_cpu import compile_quickly
 
 from . import presets, steady
@@ -29,16 +31,21 @@ from .model.friction import Coulomb
 from .model.launch import Launch
 from .model.scene import Scene
 from .papers import tables as paper_tables
+from .runs.explore import live_run, stage_at_start
+from .runs.observables import INVERTED
 from .runs.plot import Panel, draw_launches
 from .runs.table import inversion_table
-from .runs.trajectory import simulate
+from .runs.theta_over_time import theta_over_time
 
 TOPS = {top.__name__: top for top in (presets.wooden, presets.rutstam, presets.cohen, presets.leine_glocker)}
 
-#: Times at which theta is drawn, and how long the run is that is shown [s].
-SAMPLES, SHOWN = 1500, 5.0
+#: Times at which theta is drawn, and duration of the displayed run [s].
+SAMPLES, SHOWN = 256, 5.0
 
-#: What ends a run, as the table says it.
+#: The page's title, and the placeholder for the contents below the top.
+TITLE, BELOW = "A tippe top climbs onto its stem", "<!-- below -->"
+
+#: The words for the end of a run, as in the table.
 WORDS = {"not_inverted": "not in time", "contact_lost": "lost contact", "does_not_fit": "no room"}
 
 
@@ -72,7 +79,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def scenes(options: argparse.Namespace) -> dict[str, Scene]:
-    """The two arenas, with the middle one of the frictions."""
+    """The two arenas, with the middle one of the friction coefficients."""
     top, law = TOPS[options.top](), Coulomb(middle(options.mu), options.slip_speed)
     arenas = {"plane": Plane(), "cylinder": Cylinder(options.cylinder_radius)}
     return {name: Scene(top, arena, law, contact="hybrid") for name, arena in arenas.items()}
@@ -84,7 +91,7 @@ def middle(values: list[float]) -> float:
 
 
 def described(options: argparse.Namespace) -> list[str]:
-    """What the job is about, in some lines."""
+    """A description of the job, in some lines."""
     top, mm = TOPS[options.top](), lambda length: f"{1e3 * float(length):.3g} mm"
     alpha, gamma = steady.proportions(top)
     stem = "no stem" if top.stem is None else f"a stem {mm(2.0 * top.stem.radius)} thick"
@@ -99,32 +106,53 @@ def described(options: argparse.Namespace) -> list[str]:
     ]
 
 
-def tables(options: argparse.Namespace) -> tuple[dict[str, Table], Any]:
-    """The table of each arena, written to its file, and the run that is shown: the middle launch on the plane.
+def table(options: argparse.Namespace, arena: str) -> Table:
+    """The table of an arena, written to its file."""
+    return inversion_table(
+        scenes(options)[arena],
+        theta=[float(Launch.degrees(theta, 0.0).theta) for theta in options.theta],
+        spin=float(launch_shown(options).spin),
+        mu=options.mu,
+        t1=options.t1,
+        tolerance=options.tolerance,
+        path=options.out / f"{arena}.h5",
+        progress=False,
+    )
 
-    The programs of both arenas are compiled side by side, for the compiler uses little more than one core.
+
+def launch_shown(options: argparse.Namespace) -> Launch:
+    """The launch of the picture and of the page: the middle one."""
+    return Launch.degrees(middle(options.theta), options.rpm)
+
+
+def sliders(options: argparse.Namespace) -> str:
+    """The page of the top with sliders, with a placeholder for the contents below."""
+    run = (scenes(options)["plane"], launch_shown(options))
+    t1 = min(SHOWN, options.t1)
+    return live_page(live_run(*run, None, t1)._replace(title=TITLE), stage_at_start(*run, t1), 0.2, BELOW).html
+
+
+def computed(options: argparse.Namespace, folder: Path | None) -> tuple[dict[str, Table], Any, str]:
+    """The table of each arena, theta(t) of the displayed launch, and the page with sliders.
+
+    They are computed in parallel, because the compiler uses little more than one core.
     """
-    arenas, spin = scenes(options), float(Launch.degrees(0.0, options.rpm).spin)
-    thetas = [float(Launch.degrees(theta, 0.0).theta) for theta in options.theta]
+    times = np.linspace(0.0, min(SHOWN, options.t1), SAMPLES)
+    facts = sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
 
-    def table(name: str) -> Table:
-        return inversion_table(
-            arenas[name],
-            theta=thetas,
-            spin=spin,
-            mu=options.mu,
-            t1=options.t1,
-            tolerance=options.tolerance,
-            path=options.out / f"{name}.h5",
-            progress=False,
-        )
+    def angles() -> str:
+        run, axes = (scenes(options)["plane"], launch_shown(options)), ("launch.theta", "scene.friction.mu")
+        return json.dumps(theta_over_time(*run, times, options.tolerance, axes).tolist())
 
-    def run() -> Any:
-        return simulate(
-            arenas["plane"], Launch(middle(thetas), spin), min(SHOWN, options.t1), tolerance=options.tolerance
-        )
+    def on_plane() -> tuple[Table, Any]:
+        # The table first, whose programs the picture needs.
+        plane = table(options, "plane")
+        return plane, json.loads(kept_text(folder, ("theta", facts), angles)) if has_matplotlib() else None
 
-    jobs = (functools.partial(table, "cylinder"), functools.partial(table, "plane"), run)
+    def live() -> str:
+        return kept_text(folder, ("page", facts), functools.partial(sliders, options)) if can_view() else ""
+
+    jobs = (functools.partial(table, options, "cylinder"), on_plane, live)
     threads = ThreadPoolExecutor(2)
     try:
         with Progress(len(jobs), "job", "compiling") as counted:
@@ -134,21 +162,26 @@ def tables(options: argparse.Namespace) -> tuple[dict[str, Table], Any]:
                 future.result()
                 counted.advance(1)
     finally:
-        # After Ctrl-C the process ends while the compiler is at work, to which nothing gets through.
+        # After Ctrl-C, the process ends while the compiler is working, which nothing can interrupt.
         threads.shutdown(wait=False, cancel_futures=True)
-    cylinder, plane, shown = (future.result() for future in futures)
-    return {"plane": plane, "cylinder": cylinder}, shown
+    cylinder, (plane, theta), html = (future.result() for future in futures)
+    return {"plane": plane, "cylinder": cylinder}, None if theta is None else (times, np.array(theta)), html
+
+
+def has_matplotlib() -> bool:
+    """Whether pictures can be drawn."""
+    return find_spec("matplotlib") is not None
 
 
 def saved(options: argparse.Namespace) -> str:
-    """What Ctrl-C leaves."""
+    """Message after Ctrl-C."""
     cells = sum(saved_cells(options.out / f"{arena}.h5") for arena in scenes(options))
     total = len(scenes(options)) * len(options.theta) * len(options.mu)
     return f"saved {cells} of {total} cells to {options.out}; run the same command again to resume"
 
 
 def rows_of(options: argparse.Namespace, table: Table) -> list[list[str]]:
-    """The entries of a table, a number or a word each, under its two headings."""
+    """The entries of a table, numbers or words, under its two headings."""
     rows = [["theta(0)", *(f"mu = {mu:g}" for mu in options.mu)]]
     for theta, times, words in zip(options.theta, table.time, table.status, strict=True):
         entries = [f"{t:.2f}" if math.isfinite(t) else str(WORDS.get(w, w)) for t, w in zip(times, words, strict=True)]
@@ -157,7 +190,7 @@ def rows_of(options: argparse.Namespace, table: Table) -> list[list[str]]:
 
 
 def headings(options: argparse.Namespace) -> dict[str, str]:
-    """What is said over the table of each arena."""
+    """The headings of the table of each arena."""
     return {
         "plane": "on a table [s]",
         "cylinder": f"in a cylinder of {100.0 * options.cylinder_radius:g} cm radius [s]",
@@ -175,29 +208,28 @@ def report(options: argparse.Namespace, arenas: dict[str, Table]) -> str:
     return "\n".join(lines)
 
 
-def picture(options: argparse.Namespace, run: Any) -> Any:
-    """theta(t) of the run that is shown."""
-    times = np.linspace(0.0, float(run.end_time), SAMPLES)
-    theta = np.asarray(run.at(times).theta)
-    above = np.flatnonzero(theta > 0.95 * np.pi)
-    end = times[above[0]] if len(above) else np.inf
+def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> Any:
+    """theta(t) of the displayed launch, which has turned over at `end` [s]."""
     title = f"{options.top} top, {options.rpm:g} rpm, mu = {middle(options.mu):g}, on a table"
-    panel = Panel(title, times, theta[None], theta[:1], np.array([end]))
-    return draw_launches([panel], 0.95 * np.pi, "for the first time above the dashed angle")
+    if end <= times[-1]:
+        # Between the times, theta may be above the angle only for a moment.
+        after = np.searchsorted(times, end)
+        times, theta = np.insert(times, after, end), np.insert(theta, after, INVERTED)
+    panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]), joined=False)
+    return draw_launches([panel], INVERTED, "for the first time above the dashed angle")
 
 
-def write_page(options: argparse.Namespace, arenas: dict[str, Table], run: Any, drawing: Path | None) -> Path:
-    """The page of the main job: the top in motion where three.js is installed, the tables, and the picture if there is one."""
+def write_page(options: argparse.Namespace, arenas: dict[str, Table], live: str, drawing: Path | None) -> Path:
+    """Write the page of the main job: the top with sliders if three.js is installed, the tables, and the plot, if
+    any."""
     below = ""
     for name, heading in headings(options).items():
         below += f"<h2>Time until it has turned over, {heading}</h2>" + table_as_html(rows_of(options, arenas[name]), 1)
     below += "".join(f'<p class="note">{escape(line)}</p>' for line in described(options))
     below += "" if drawing is None else "<h2>θ(t)</h2>" + picture_as_html(drawing)
-    above = "" if can_view() else f'<p class="note">{NO_VIEW}</p>'
-    path, stages = options.out / "index.html", []
-    if can_view():
-        stages = run.stages()
-    page(stages, "A tippe top climbs onto its stem", 0.2, above, below).save(path)
+    path = options.out / "index.html"
+    html = live or page([], TITLE, 1.0, f'<p class="note">{NO_VIEW}</p>', BELOW).html
+    Page(html.replace(BELOW, below)).save(path)
     return path
 
 
@@ -212,25 +244,26 @@ def main(arguments: list[str] | None = None) -> int:
     if "--paper" in arguments:
         return paper_tables.main([word for word in arguments if word != "--paper"])
     options = parser().parse_args(arguments)
-    enable_compilation_cache()
+    folder = enable_compilation_cache()
     started = time.perf_counter()
     try:
         print("\n".join(described(options)), flush=True)
         require_folder(options.out, "--out")
-        arenas, run = tables(options)
+        arenas, shown, live = computed(options, folder)
         print(report(options, arenas), flush=True)
         with status_line("drawing") as line:
             written, drawing = [options.out / f"{arena}.h5" for arena in arenas], None
-            if find_spec("matplotlib") is None:
+            if shown is None:
                 with line.aside():
                     print(
                         "No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr
                     )
             else:
                 drawing = options.out / "theta.png"
-                picture(options, run).savefig(drawing, dpi=130)
+                middle_cell = options.theta.index(middle(options.theta)), options.mu.index(middle(options.mu))
+                picture(options, *shown, float(arenas["plane"].time[middle_cell])).savefig(drawing, dpi=130)
                 written.append(drawing)
-            shown = write_page(options, arenas, run, drawing)
+            path = write_page(options, arenas, live, drawing)
     except (ValueError, OSError) as error:
         print(f"python -m tippe: {error}", file=sys.stderr)
         return 2
@@ -239,12 +272,13 @@ def main(arguments: list[str] | None = None) -> int:
     cells = sum(table.status.size for table in arenas.values())
     print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
     print(f"Wrote {', '.join(map(str, written))}.")
-    print(f"To see the top climb onto its stem, open {shown}{'' if can_view() else f'. {NO_VIEW}'}")
+    print(f"To see the top climb onto its stem, open {path}{'' if can_view() else f'. {NO_VIEW}'}")
     return 0
 
 
 if __name__ == "__main__":
-    # A job of seconds: a fifth of them would go into looking for garbage among all that JAX holds, here and at the end.
+    # For a job of seconds, searching all of JAX's objects for garbage would take a fifth of the time, here and at the
+    # end.
     gc.disable()
     compile_quickly()
     status = interruptible(main, "tippe")

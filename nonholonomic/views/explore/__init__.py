@@ -1,7 +1,8 @@
-"""Pages in which sliders simulate anew, in the browser, with equations that are written from their jaxprs."""
+"""Pages with sliders that simulate in the browser, with equations generated from their jaxprs."""
 
 from .frame import Frame as Frame
 from .frame import quaternion as quaternion
+from .hybrid_simulator import HybridSimulator as HybridSimulator
 from .javascript import javascript as javascript
 from .live import Answer as Answer
 from .live import LiveRun as LiveRun

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...parameters import full_name, numbers, readable_unit, with_numbers
 
-#: Parameters with which what is drawn would have to be drawn anew.
+#: Parameters that change the drawn meshes.
 DRAWN = ("scene.surface.", "scene.body.radius", "scene.body.equatorial", "scene.body.polar", "scene.body.wheelbase")
 
 
@@ -23,16 +23,19 @@ class Slider(NamedTuple):
     value: float
 
 
-def sliders_of(ranges: Any, roots: dict[str, Any], labels: dict[str, str], units: dict[str, str]) -> tuple[Slider, ...]:
-    """The sliders that a user asks for.
+def sliders_of(
+    ranges: Any, roots: dict[str, Any], labels: dict[str, str], units: dict[str, str], drawn: tuple[str, ...] = ()
+) -> tuple[Slider, ...]:
+    """The sliders for the ranges of a user.
 
     **Arguments:**
 
     - `ranges`: name of a parameter -> (lowest, highest) value.
     - `roots`: "scene" and "launch".
     - `labels`, `units`: of parameters by their short names.
+    - `drawn`: parameters, in addition to `DRAWN`, that change the drawn meshes.
 
-    **Raises:** `ValueError` for an unknown name, a range that is none, and numbers that the modules do not allow.
+    **Raises:** `ValueError` for an unknown name, an illegal range, and numbers that the modules do not allow.
     """
     if not (isinstance(ranges, dict) and ranges and all(isinstance(name, str) for name in ranges)):
         raise ValueError(
@@ -45,7 +48,7 @@ def sliders_of(ranges: Any, roots: dict[str, Any], labels: dict[str, str], units
     for name, ends in ranges.items():
         path = full_name("sliders", name, scalars)
         low, high = _ends(name, ends)
-        if path.startswith(DRAWN):
+        if path.startswith((*DRAWN, *drawn)):
             raise ValueError(
                 f"sliders[{name!r}]: {path} changes what is drawn, the arena or the size of the body, which the page keeps; "
                 "write a page for each value"
