@@ -69,7 +69,7 @@ class Settings(eqx.Module):
 
     def with_tolerance(self, tolerance: Float[Array, ""] | None) -> Self:
         """The same with another tolerance, or without one, where the caller keeps it."""
-        return eqx.tree_at(lambda one: one.tolerance, self, tolerance, is_leaf=lambda leaf: leaf is None)
+        return eqx.tree_at(lambda settings: settings.tolerance, self, tolerance, is_leaf=lambda leaf: leaf is None)
 
     def lanes_of(self, cells: int, n_blocks: int = 1) -> int:
         """How many of the cells of a problem advance together, given the number of blocks in its state."""

@@ -62,11 +62,11 @@ class Layout(NamedTuple):
 
     def empty(self, cells: int, status: int = PENDING) -> dict[str, Values]:
         """The variables of cells that have no numbers, along the first axis; what consists of words is `status`."""
-        found = {}
+        variables = {}
         for name, kind in self.kinds.items():
             value = status if name in self.words else np.nan if kind.kind == "f" else PENDING
-            found[name] = np.full((cells, *self.inner_shape(name)), value, kind)
-        return found
+            variables[name] = np.full((cells, *self.inner_shape(name)), value, kind)
+        return variables
 
     def shaped(self, name: str, values: Values) -> Values:
         """A variable of all cells over the grid, with words for codes."""
