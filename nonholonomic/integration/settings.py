@@ -93,7 +93,7 @@ def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
 
 
 def legal_run(
-    others: Bool[ArrayLike, "..."], t1: Float[ArrayLike, "..."], tolerance: Float[ArrayLike, "..."], times: Any = None
+    others: Bool[Array, "..."] | bool, t1: Float[ArrayLike, "..."], tolerance: Float[ArrayLike, "..."], times: Any = None
 ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
     """Whether the traced numbers of a run are legal, and its horizon and tolerance: if not, 0 and the loosest.
 
@@ -102,7 +102,7 @@ def legal_run(
     **Arguments:** `others`: whether all numbers are legal but `t1`, `tolerance` and the `times` of output (times,), which
     must increase.
     """
-    may = others & legal(run_bounds(t1, tolerance))
+    may = jnp.asarray(others) & legal(run_bounds(t1, tolerance))
     if times is not None:
         may = jnp.all(may & jnp.all(legal(times_bounds(times, t1)))) & jnp.all(jnp.diff(times) > 0.0)
     return may, jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)
