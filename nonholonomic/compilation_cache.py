@@ -5,6 +5,7 @@ and set of XLA flags, because code compiled for one processor may not run on ano
 because a process that is killed while writing leaves half an entry, about which JAX would warn forever.
 """
 
+import contextlib
 import errno
 import hashlib
 import logging
@@ -13,6 +14,7 @@ import platform
 import uuid
 import warnings
 import zlib
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -179,3 +181,34 @@ def sound(entry: bytes) -> bool:
     except zlib.error:
         return False
     return True
+
+
+def kept_text(folder: Path | None, facts: Any, compute: Callable[[], str]) -> str:
+    """A text that takes seconds to compute, such as a page with sliders; kept beside the compiled programs.
+
+    **Arguments:** `folder`: of `enable_compilation_cache`, `None` if nothing is kept; `facts`: all that the text depends on
+    besides these packages, with a `repr`.
+    """
+    if folder is None:
+        return compute()
+    kept = hashlib.sha256(repr((facts, version("jax"), version("equinox"), version("diffrax"))).encode())
+    for path in sorted(_sources()):
+        kept.update(path.read_bytes())
+    path = folder / f"text-{kept.hexdigest()[:32]}"
+    try:
+        return zlib.decompress(path.read_bytes()).decode()
+    except (OSError, zlib.error):
+        text = compute()
+    # As a whole, for another process may read it; a full disk is no reason to stop.
+    with contextlib.suppress(OSError):
+        written = path.with_name(f".{uuid.uuid4().hex}")
+        written.write_bytes(zlib.compress(text.encode(), 1))
+        os.replace(written, path)
+    return text
+
+
+def _sources() -> Iterator[Path]:
+    """The sources of the packages that were installed with this file."""
+    root = Path(__file__).parent.parent
+    for package in ("nonholonomic", "tippe", "stroller"):
+        yield from (path for kind in ("py", "js", "html") for path in (root / package).rglob(f"*.{kind}"))

@@ -15,26 +15,32 @@ import numpy as np
 
 from nonholonomic import __version__
 from nonholonomic.command_line import closing_lines, run_and_exit
-from nonholonomic.compilation_cache import enable_compilation_cache
+from nonholonomic.compilation_cache import enable_compilation_cache, kept_text
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table, saved_cells
 from nonholonomic.validation import require_folder
-from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html, table_as_html
+from nonholonomic.views import NO_VIEW, Page, can_view, page, picture_as_html, table_as_html
+from nonholonomic.views.explore import live_page
 
 from . import presets, steady
 from .model.friction import Coulomb
 from .model.launch import Launch
 from .model.scene import Scene
 from .papers import tables as paper_tables
+from .runs.explore import live_run, stage_at_start
+from .runs.observables import INVERTED
 from .runs.plot import Panel, draw_launches
 from .runs.table import inversion_table
-from .runs.trajectory import simulate
+from .runs.theta_over_time import theta_over_time
 
 TOPS = {top.__name__: top for top in (presets.wooden, presets.rutstam, presets.cohen, presets.leine_glocker)}
 
 #: Times at which theta is drawn, and how long the run is that is shown [s].
-SAMPLES, SHOWN = 1500, 5.0
+SAMPLES, SHOWN = 256, 5.0
+
+#: The page's title, and what stands for what is below the top.
+TITLE, BELOW = "A tippe top climbs onto its stem", "<!-- below -->"
 
 #: What ends a run, as the table says it.
 WORDS = {"not_inverted": "not in time", "contact_lost": "lost contact", "does_not_fit": "no room"}
@@ -97,32 +103,53 @@ def described(options: argparse.Namespace) -> list[str]:
     ]
 
 
-def tables(options: argparse.Namespace) -> tuple[dict[str, Table], Any]:
-    """The table of each arena, written to its file, and the run that is shown: the middle launch on the plane.
+def table(options: argparse.Namespace, arena: str) -> Table:
+    """The table of an arena, written to its file."""
+    return inversion_table(
+        scenes(options)[arena],
+        theta=[float(Launch.degrees(theta, 0.0).theta) for theta in options.theta],
+        spin=float(launch_shown(options).spin),
+        mu=options.mu,
+        t1=options.t1,
+        tolerance=options.tolerance,
+        path=options.out / f"{arena}.h5",
+        progress=False,
+    )
 
-    The programs of both arenas are compiled side by side, for the compiler uses little more than one core.
+
+def launch_shown(options: argparse.Namespace) -> Launch:
+    """The launch of the picture and of the page: the middle one."""
+    return Launch.degrees(middle(options.theta), options.rpm)
+
+
+def sliders(options: argparse.Namespace) -> str:
+    """The page of the top with sliders, a placeholder for what stands below it; empty without three.js."""
+    if not can_view():
+        return ""
+    run = (scenes(options)["plane"], launch_shown(options))
+    t1 = min(SHOWN, options.t1)
+    return live_page(live_run(*run, None, t1)._replace(title=TITLE), stage_at_start(*run, t1), 0.2, BELOW).html
+
+
+def computed(options: argparse.Namespace, folder: Path | None) -> tuple[dict[str, Table], Any, str]:
+    """The table of each arena, theta(t) of the launch that is shown, and the page with sliders.
+
+    They are computed side by side, for the compiler uses little more than one core.
     """
-    arenas, spin = scenes(options), float(Launch.degrees(0.0, options.rpm).spin)
-    thetas = [float(Launch.degrees(theta, 0.0).theta) for theta in options.theta]
+    times = np.linspace(0.0, min(SHOWN, options.t1), SAMPLES)
 
-    def table(name: str) -> Table:
-        return inversion_table(
-            arenas[name],
-            theta=thetas,
-            spin=spin,
-            mu=options.mu,
-            t1=options.t1,
-            tolerance=options.tolerance,
-            path=options.out / f"{name}.h5",
-            progress=False,
-        )
+    def on_plane() -> tuple[Table, Any]:
+        plane, axes = table(options, "plane"), ("launch.theta", "scene.friction.mu")
+        return plane, theta_over_time(
+            scenes(options)["plane"], launch_shown(options), times, options.tolerance, axes
+        ) if has_matplotlib() else None
 
-    def run() -> Any:
-        return simulate(
-            arenas["plane"], Launch(middle(thetas), spin), min(SHOWN, options.t1), tolerance=options.tolerance
-        )
-
-    jobs = (functools.partial(table, "cylinder"), functools.partial(table, "plane"), run)
+    facts = sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
+    jobs = (
+        functools.partial(table, options, "cylinder"),
+        on_plane,
+        functools.partial(kept_text, folder, facts, functools.partial(sliders, options)),
+    )
     threads = ThreadPoolExecutor(2)
     try:
         with Progress(len(jobs), "job", "compiling") as counted:
@@ -134,8 +161,13 @@ def tables(options: argparse.Namespace) -> tuple[dict[str, Table], Any]:
     finally:
         # After Ctrl-C the process ends while the compiler is at work, to which nothing gets through.
         threads.shutdown(wait=False, cancel_futures=True)
-    cylinder, plane, shown = (future.result() for future in futures)
-    return {"plane": plane, "cylinder": cylinder}, shown
+    cylinder, (plane, theta), live = (future.result() for future in futures)
+    return {"plane": plane, "cylinder": cylinder}, None if theta is None else (times, theta), live
+
+
+def has_matplotlib() -> bool:
+    """Whether pictures can be drawn."""
+    return find_spec("matplotlib") is not None
 
 
 def saved(options: argparse.Namespace) -> str:
@@ -173,29 +205,27 @@ def report(options: argparse.Namespace, arenas: dict[str, Table]) -> str:
     return "\n".join(lines)
 
 
-def picture(options: argparse.Namespace, run: Any) -> Any:
-    """theta(t) of the run that is shown."""
-    times = np.linspace(0.0, float(run.end_time), SAMPLES)
-    theta = np.asarray(run.at(times).theta)
-    above = np.flatnonzero(theta > 0.95 * np.pi)
-    end = times[above[0]] if len(above) else np.inf
+def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> Any:
+    """theta(t) of the launch that is shown, which has turned over at `end` [s]."""
     title = f"{options.top} top, {options.rpm:g} rpm, mu = {middle(options.mu):g}, on a table"
-    panel = Panel(title, times, theta[None], theta[:1], np.array([end]))
-    return draw_launches([panel], 0.95 * np.pi, "for the first time above the dashed angle")
+    if end <= times[-1]:
+        # Between the times it may be above the angle for a moment only.
+        after = np.searchsorted(times, end)
+        times, theta = np.insert(times, after, end), np.insert(theta, after, INVERTED)
+    panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]))
+    return draw_launches([panel], INVERTED, "for the first time above the dashed angle")
 
 
-def write_page(options: argparse.Namespace, arenas: dict[str, Table], run: Any, drawing: Path | None) -> Path:
-    """The page of the main job: the top in motion where three.js is installed, the tables, and the picture if there is one."""
+def write_page(options: argparse.Namespace, arenas: dict[str, Table], live: str, drawing: Path | None) -> Path:
+    """The page of the main job: the top with sliders, where three.js is installed, the tables, and the picture, if any."""
     below = ""
     for name, heading in headings(options).items():
         below += f"<h2>Time until it has turned over, {heading}</h2>" + table_as_html(rows_of(options, arenas[name]), 1)
     below += "".join(f'<p class="note">{escape(line)}</p>' for line in described(options))
     below += "" if drawing is None else "<h2>θ(t)</h2>" + picture_as_html(drawing)
-    above = "" if can_view() else f'<p class="note">{NO_VIEW}</p>'
-    path, stages = options.out / "index.html", []
-    if can_view():
-        stages = run.stages()
-    page(stages, "A tippe top climbs onto its stem", 0.2, above, below).save(path)
+    path = options.out / "index.html"
+    html = live or page([], TITLE, 1.0, f'<p class="note">{NO_VIEW}</p>', BELOW).html
+    Page(html.replace(BELOW, below)).save(path)
     return path
 
 
@@ -210,32 +240,33 @@ def main(arguments: list[str] | None = None) -> int:
     if "--paper" in arguments:
         return paper_tables.main([word for word in arguments if word != "--paper"])
     options = parser().parse_args(arguments)
-    enable_compilation_cache()
+    folder = enable_compilation_cache()
     started = time.perf_counter()
     try:
         print("\n".join(described(options)), flush=True)
         require_folder(options.out, "--out")
-        arenas, run = tables(options)
+        arenas, shown, live = computed(options, folder)
         print(report(options, arenas), flush=True)
         with status_line("drawing") as line:
             written, drawing = [options.out / f"{arena}.h5" for arena in arenas], None
-            if find_spec("matplotlib") is None:
+            if shown is None:
                 with line.aside():
                     print(
                         "No picture: matplotlib is not installed (pip install 'nonholonomic[plot]').", file=sys.stderr
                     )
             else:
                 drawing = options.out / "theta.png"
-                picture(options, run).savefig(drawing, dpi=130)
+                middle_cell = options.theta.index(middle(options.theta)), options.mu.index(middle(options.mu))
+                picture(options, *shown, float(arenas["plane"].time[middle_cell])).savefig(drawing, dpi=130)
                 written.append(drawing)
-            shown = write_page(options, arenas, run, drawing)
+            path = write_page(options, arenas, live, drawing)
     except (ValueError, OSError) as error:
         print(f"python -m tippe: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         raise KeyboardInterrupt(saved(options)) from None
     cells = sum(table.status.size for table in arenas.values())
-    see = f"To see the top climb onto its stem, open {shown}{'' if can_view() else f'. {NO_VIEW}'}"
+    see = f"To see the top climb onto its stem, open {path}{'' if can_view() else f'. {NO_VIEW}'}"
     print(closing_lines(cells, started, written, see))
     return 0
 

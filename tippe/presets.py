@@ -1,5 +1,8 @@
 """Ready-made tops from a classroom and from the literature, each with its source.
 
+The tippe tops that Cross filmed (Am. J. Phys. 81 (2013) 280; Phys. Teach. 51 (2013) 144) are missing: we had no access to their
+dimensions and did not guess them. `Top.turned` makes a top of a measured shape.
+
 **Example:** a wooden top, spun by hand with `tippe.Launch.degrees(theta=6, rpm=1900)`, climbs onto its stem within 3 s.
 
 ```

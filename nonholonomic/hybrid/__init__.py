@@ -9,6 +9,7 @@ derivatives.
 
 from .ensemble import MOST_ROUNDS as MOST_ROUNDS
 from .ensemble import AbstractBatchedMode as AbstractBatchedMode
+from .ensemble import AbstractHoppingMode as AbstractHoppingMode
 from .ensemble import HybridOutcome as HybridOutcome
 from .ensemble import Transition as Transition
 from .ensemble import TransitionPath as TransitionPath

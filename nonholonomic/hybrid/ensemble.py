@@ -9,7 +9,7 @@ those at its end.
 
 import abc
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Generic, NamedTuple
+from typing import Any, ClassVar, Generic, NamedTuple
 
 import equinox as eqx
 import jax
@@ -88,6 +88,35 @@ class AbstractBatchedMode(eqx.Module):
     def between(self, motion: Any, passed: Float[Array, " times"]) -> Float[Array, "shown times"]:
         """The output rows of one stretch in `Transition.record`, at times [s] counted from its start."""
         raise NotImplementedError(f"{type(self).__name__} records stretches but does not say what they show")
+
+
+class AbstractHoppingMode(AbstractBatchedMode):
+    """A mode whose reset map is a succession of stretches of motion in closed form, each with a jump at its end.
+
+    The reset map goes on while a stretch's `open` holds, for at most `most_hops` stretches; its `elapsed` [s] counts from the
+    end of the mode.
+    """
+
+    most_hops: ClassVar[int]
+
+    @abc.abstractmethod
+    def lost(self, state: Float[Array, "components cells"]) -> Any:
+        """The first stretch, from the states at the end of the mode."""
+
+    @abc.abstractmethod
+    def hop(self, stretch: Any, left: Float[Array, " cells"]) -> tuple[Any, Any]:
+        """Go through a stretch; `left` [s] is the time from the end of the mode to the horizon.
+
+        **Returns:** the stretch at its end, before the jump; and the next one, behind the jump.
+        """
+
+    @abc.abstractmethod
+    def closed(self, stretch: Any) -> Transition:
+        """The transition that the last stretch leads to, without a record."""
+
+    @abc.abstractmethod
+    def motion_in(self, stretch: Any) -> Any:
+        """The argument of `between` for a stretch that begins."""
 
 
 class HybridOutcome(NamedTuple, Generic[Numbers]):

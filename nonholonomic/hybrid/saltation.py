@@ -85,7 +85,7 @@ class VariationalMode(AbstractBatchedMode):
     The mode's equations must not depend on time.
 
     - `tangents`: of the mode, as for `VariationalProblem`.
-    - `ends_on_event`: as there; `tolerance`: relative, of the integration.
+    - `ends_on_event`: as there; `tolerance`: relative tolerance of the integration.
     """
 
     mode: AbstractBatchedMode

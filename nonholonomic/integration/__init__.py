@@ -34,6 +34,7 @@ from .samples import solve_with_samples as solve_with_samples
 from .scheduler import LaneScheduler as LaneScheduler
 from .scheduler import Outcome as Outcome
 from .scheduler import Progress as Progress
+from .scheduler import outcome_of as outcome_of
 from .settings import ABSOLUTE as ABSOLUTE
 from .settings import DEFAULT_MAX_STEPS as DEFAULT_MAX_STEPS
 from .settings import LOOSEST as LOOSEST
@@ -55,6 +56,7 @@ from .status import REACHED_END as REACHED_END
 from .status import RUNNING as RUNNING
 from .status import UNRESOLVED as UNRESOLVED
 from .status import Status as Status
+from .step import Control as Control
 from .step import LaneState as LaneState
 from .step import after_step as after_step
 from .step import length_to_try as length_to_try

@@ -186,11 +186,11 @@ class LaneScheduler(eqx.Module):
 
     def empty(self) -> Outcome:
         """An empty outcome of the right shapes."""
-        return _outcome_of(self.fresh)
+        return outcome_of(self.fresh)
 
     def store(self, outcome: Outcome, lane_state: LaneState) -> Outcome:
         """Store the cells whose lanes have ended in the outcome."""
-        in_lanes = _outcome_of(lane_state)
+        in_lanes = outcome_of(lane_state)
         to = jnp.where((lane_state.status != RUNNING) & (lane_state.cell < self.cells), lane_state.cell, self.capacity)
         return jax.tree.map(lambda cells, lanes: cells.at[..., to].set(lanes, mode="drop"), outcome, in_lanes)
 
@@ -200,7 +200,8 @@ class LaneScheduler(eqx.Module):
         return lane_state._replace(cell=cell, status=jnp.where(cell < self.cells, lane_state.status, REACHED_END))
 
 
-def _outcome_of(lane_state: LaneState) -> Outcome:
+def outcome_of(lane_state: LaneState) -> Outcome:
+    """How the cells in the lanes have ended."""
     times = (lane_state.first_crossing, lane_state.crossing_time, lane_state.time)
     return Outcome(lane_state.status, *times, lane_state.state, lane_state.steps, lane_state.rejected)
 

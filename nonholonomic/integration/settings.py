@@ -93,7 +93,10 @@ def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
 
 
 def legal_run(
-    others: Bool[Array, "..."] | bool, t1: Float[ArrayLike, "..."], tolerance: Float[ArrayLike, "..."], times: Any = None
+    others: Bool[Array, "..."] | bool,
+    t1: Float[ArrayLike, "..."],
+    tolerance: Float[ArrayLike, "..."],
+    times: Any = None,
 ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
     """Whether the traced numbers of a run are legal, and its horizon and tolerance: if not, 0 and the loosest.
 

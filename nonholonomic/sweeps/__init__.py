@@ -1,7 +1,7 @@
-"""Grids of named axes, cut into chunks that run wherever there is room, and the labelled tables and files they end in.
+"""Grids of named axes, computed in chunks by any executor, and the resulting labelled tables and files.
 
-`sweep` computes a grid and returns a `Table`; with a file it writes every chunk as it finishes, and an
-interrupted sweep goes on from there. Any executor may compute the chunks; `local_processes` is one.
+`sweep` computes a grid and returns a `Table`; with a file it writes every finished chunk, and an interrupted sweep
+resumes. Any executor can compute the chunks; `local_processes` is one.
 """
 
 from ._chunks import saved_cells as saved_cells

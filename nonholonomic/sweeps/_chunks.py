@@ -1,4 +1,5 @@
-"""The chunks of a table that is being computed: a file each, in a folder beside its own; a sweep that was killed goes on."""
+"""The chunks of an unfinished table: one file per chunk, in a folder beside the table's file, so that a killed sweep
+can resume."""
 
 import contextlib
 import json
@@ -22,21 +23,21 @@ from .layout import Layout, Values
 
 
 def folder_of(path: Path) -> Path:
-    """Where the chunks of a table's file are while it is computed."""
+    """The folder of a table's chunks while it is computed."""
     return path.with_name(path.name + ".blocks")
 
 
 class ChunkStore:
     """The finished chunks of a table's file.
 
-    Each is complete and on the disk before it is counted, whenever the process dies, and whenever the machine does, as far as
-    its disk keeps what it confirms.
+    Each chunk is complete and on disk before it counts, even if the process dies, or if the machine dies and its disk
+    keeps confirmed data.
 
-    `finished`: the numbers of the chunks that were found when the sweep began.
+    `finished`: the indices of the chunks that existed when the sweep began.
     """
 
     def __init__(self, path: Any, layout: Layout):
-        """Find the chunks of an earlier run of the same request, or make room for new ones.
+        """Find the chunks of an earlier run of the same request, or create a folder for new ones.
 
         **Raises:** `OSError` that names the path if it cannot be read or written; `ValueError` that names the first
         difference if it holds the result of another request or of another version of this package.
@@ -59,7 +60,7 @@ class ChunkStore:
         begun = stored or (Stored(header) if header.exists() else None)
         if begun is not None:
             self._check(begun)
-            # The table says with what versions it was begun; words that have been added since come behind its own.
+            # The table records the versions with which it was begun; words added since then follow its own words.
             self.layout = begun.layout._replace(words=layout_words(begun.layout.words, self.layout.words))
         good = {chunk for chunk in range(self.layout.chunks) if stored is not None and stored.chunk(chunk) is not None}
         self._whole = len(good) == self.layout.chunks
@@ -88,8 +89,8 @@ class ChunkStore:
             )
 
     def _begin(self, header: Path) -> None:
-        """Make the folder, and say in it what it is for."""
-        # The chunks are there until the table's file is, too.
+        """Create the folder, with a note about its purpose."""
+        # The chunks remain until the table's file exists.
         need = 2 * self.layout.bytes_of_cells(self.layout.cells)
         try:
             room = shutil.disk_usage(self.path.parent).free
@@ -128,9 +129,9 @@ class ChunkStore:
             warnings.warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning, stacklevel=7)
 
     def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Stored:
-        """Store the chunks that are computed, each as it comes, and make the table's file of these and those there were.
+        """Store each chunk when it is computed, and write the table's file from these and from the existing chunks.
 
-        What goes into the file while chunks are computed need not be read again at the end.
+        Chunks that are written to the file during the computation need not be read again at the end.
 
         **Raises:** `OSError` that names the path if it cannot be written, or a chunk that is damaged; no chunk is lost.
         """
@@ -152,7 +153,7 @@ class ChunkStore:
     def write(self, chunk: int, values: dict[str, Values]) -> None:
         """Store a chunk.
 
-        **Raises:** `OSError` that names the path if that fails; no chunk is then finished but those that were.
+        **Raises:** `OSError` that names the path if that fails; earlier chunks remain finished.
         """
         kinds = self.layout.kinds
         with replacing(self.folder / f"{chunk}.npz") as scratch, scratch.open("wb") as stream:
@@ -160,7 +161,7 @@ class ChunkStore:
             np.savez(stream, **arrays)
 
     def interrupted(self) -> str:
-        """What Ctrl-C leaves, and how to go on."""
+        """Message after Ctrl-C: what is saved, and how to resume."""
         numbers = {int(file.stem) for file in self.folder.glob("*.npz")} | self.finished
         cells = self.layout.cells if self._whole else sum(map(self.layout.size, numbers))
         total = with_spaces(self.layout.cells)
@@ -181,21 +182,21 @@ class ChunkStore:
             except OSError:
                 lock.close()
                 raise OSError(f"cannot write {self.path}: another process is writing it") from None
-            # A process that has just closed the file has removed its lock, perhaps after we opened it.
+            # A process that has just closed the file has removed its lock, possibly after we opened it.
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(lock.fileno()), beside.stat()):
                     return lock
             lock.close()
 
     def close(self) -> None:
-        """Let other processes have the file."""
+        """Release the file for other processes."""
         if self._lock is not None:
             self.path.with_name(self.path.name + ".lock").unlink(missing_ok=True)
             self._lock.close()
 
 
 def layout_words(begun: dict[str, tuple[str, ...]], ours: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """The words of a table that goes on: ours where they begin like those with which it was begun, which stand otherwise."""
+    """The words of a resumed table: ours if they begin with those of the file, otherwise those of the file."""
     return {name: ours[name] if ours.get(name, ())[: len(words)] == words else words for name, words in begun.items()}
 
 
@@ -205,7 +206,7 @@ def with_spaces(count: int) -> str:
 
 
 def saved_cells(path: Path) -> int:
-    """How many cells of a table are on the disk: in its file, or in the files that it will be made of."""
+    """Number of cells of a table that are on disk, in its file or in the files of its chunks."""
     folder = folder_of(path)
     if path.exists():
         return Stored(path).layout.cells
@@ -216,7 +217,7 @@ def saved_cells(path: Path) -> int:
 
 
 def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
-    """What there is of a table whose file is still to be made; `None` if it is not being computed.
+    """The finished part of an unfinished table; `None` if there is none.
 
     **Returns:** its layout, and its variables with all cells along the first axis.
 
@@ -234,7 +235,7 @@ def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
         for name, cells in (values or {}).items():
             variables[name][first:end] = cells
     if path.exists():
-        # It was finished meanwhile.
+        # The table was finished in the meantime.
         return None
     if damaged:
         reason = f"{damaged} of its {layout.chunks} blocks do not match their checksums"
@@ -243,7 +244,7 @@ def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
 
 
 def read_chunk(folder: Path, layout: Layout, chunk: int) -> dict[str, Values] | None:
-    """The variables of a chunk; `None` if they are not those that were written, by the checksums of the archive."""
+    """The variables of a chunk; `None` if they do not match the checksums of the archive."""
     try:
         # NumPy does not close a file that it cannot read.
         with (folder / f"{chunk}.npz").open("rb") as file, np.load(file, allow_pickle=False) as archive:

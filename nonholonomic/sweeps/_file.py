@@ -1,8 +1,8 @@
 """The file of a table: HDF5 with dimension scales, as in netCDF-4, so that xarray opens it with named coordinates.
 
-Words, such as a cell's status, are stored as bytes with the attributes `flag_values` and `flag_meanings` (CF conventions).
-Every number is under a checksum: HDF5 has one for all that describes the arrays, and the group `checksums`, which xarray does
-not show, one for each chunk of each variable. A file appears when it is complete, or not at all.
+Words, such as a cell's status, are stored as bytes with the attributes `flag_values` and `flag_meanings` (CF
+conventions). Checksums cover every number: HDF5 has one for the description of the arrays, and the group `checksums`,
+which xarray does not show, has one for each chunk of each variable. A file appears only when it is complete.
 """
 
 import contextlib
@@ -25,21 +25,21 @@ if TYPE_CHECKING:
 #: The group of the checksums.
 CHECKSUMS = "checksums"
 
-#: The attribute of a table that names its variables in words; in a file each variable has its own, as in CF.
+#: The attribute of a table with the long names of its variables; in a file, each variable has its own, as in CF.
 LONG_NAMES, LONG_NAME = "long_names", "long_name"
 
-#: The file's attribute that names the dimensions which variables have besides the grid's.
+#: The file's attribute that names the dimensions of variables other than those of the grid.
 INNER = "inner"
 
-#: Tables of more than this [bytes] stay in their file until they are asked for.
+#: Variables of tables larger than this [bytes] are read only when needed.
 HELD = 1 << 27
 
 
 @contextlib.contextmanager
 def replacing(path: Path, beside: Path | None = None) -> Iterator[Path]:
-    """A new file, which takes the place of `path` when the context ends: all of it, or nothing.
+    """A new file that replaces `path` at the end of the context, completely or not at all.
 
-    **Arguments:** `beside`: the folder where it is until then, by default that of `path`.
+    **Arguments:** `beside`: the folder of the new file until then, by default that of `path`.
 
     **Raises:** `OSError` that names the path if it cannot be written.
     """
@@ -75,14 +75,14 @@ def sync_folder(folder: Path) -> None:
 def write_file(
     path: Path, layout: Layout, chunks: Iterable[tuple[int, dict[str, Values]]], beside: Path | None = None
 ) -> None:
-    """Write a table, all at once or not at all; a file that exists is replaced.
+    """Write a table completely or not at all; an existing file is replaced.
 
-    **Arguments:** `chunks`: the number of a chunk and its cells by variable, in any order; with none of them the file says what
-    there will be. `beside`: as for `replacing`.
+    **Arguments:** `chunks`: the index of a chunk and its cells by variable, in any order; without chunks, the file only
+    describes the table. `beside`: as for `replacing`.
 
     **Raises:** `OSError` that names the path if it cannot be written.
     """
-    # It takes a tenth of a second to import, and most processes do not need it.
+    # The import takes a tenth of a second, and most processes do not need it.
     import h5py
 
     with replacing(path, beside) as scratch, scratch.open("r+b", buffering=0) as disk:
@@ -106,17 +106,18 @@ def write_file(
 
 
 class Stream:
-    """A stream that keeps an error to itself until it is asked: HDF5 cannot close a file that a full disk does not take."""
+    """A stream that postpones errors until `check`: HDF5 cannot close a file after a write to a full disk has
+    failed."""
 
     def __init__(self, disk: Any):
-        """State what is written to."""
+        """Set the file to write to."""
         self._disk, self._error = disk, None
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._disk, name)
 
     def write(self, data: Any) -> int:
-        """Write all of the data, unless anything has failed before."""
+        """Write all data, unless an earlier call has failed."""
         rest = memoryview(data)
         while self._error is None and rest:
             with self._noting():
@@ -124,7 +125,7 @@ class Stream:
         return len(data)
 
     def truncate(self, size: int) -> int:
-        """Cut or lengthen the file, unless anything has failed before."""
+        """Change the length of the file, unless an earlier call has failed."""
         if self._error is None:
             with self._noting():
                 self._disk.truncate(size)
@@ -138,7 +139,7 @@ class Stream:
             self._error = error
 
     def check(self) -> None:
-        """Raise the error that there was."""
+        """Raise the postponed error, if any."""
         if self._error is not None:
             raise self._error
 
@@ -153,7 +154,7 @@ def _put(array: "h5py.Dataset", values: Values, shape: tuple[int, ...], first: i
 
 
 def _describe(file: "h5py.File", layout: Layout) -> None:
-    """All of a table but the numbers of its variables."""
+    """Write everything in a table except the numbers of its variables."""
     attributes: dict[str, Any] = (
         layout.attributes | ({INNER: layout.inner} if layout.inner else {}) | {"Conventions": "CF-1.10"}
     )
@@ -214,11 +215,11 @@ def _attribute(of: Any, name: str) -> Any:
 class Stored:
     """A table in its file.
 
-    `path`: the file; `layout`: what it holds. Numbers are checked against their checksums when they are read.
+    `path`: the file; `layout`: its contents. Numbers are checked against their checksums when they are read.
     """
 
     def __init__(self, path: Path):
-        """Look into a file.
+        """Open a file and read its layout.
 
         **Raises:** `OSError` that names the path if it cannot be read or holds no table.
         """
@@ -233,7 +234,7 @@ class Stored:
     def whole(self, name: str) -> Values:
         """A variable of all cells, which are along the first axis.
 
-        **Raises:** `OSError` that names the path if numbers are not those that were written.
+        **Raises:** `OSError` that names the path if numbers do not match their checksums.
         """
         with self._opened() as file:
             values, sums = np.asarray(_dataset(file, name)[()]), self._sums[name]
@@ -250,7 +251,7 @@ class Stored:
         return values
 
     def chunk(self, chunk: int) -> dict[str, Values] | None:
-        """The variables of one chunk; `None` if its numbers are not those that were written."""
+        """The variables of one chunk; `None` if its numbers do not match their checksums."""
         first, end = self.layout.ends(chunk)
         variables = {}
         with self._opened() as file:
@@ -296,7 +297,7 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
             long_names[name] = _attribute(array, LONG_NAME)
         if "flag_meanings" in array.attrs:
             meanings = _attribute(array, "flag_meanings").split()
-            # Words of earlier versions are read as those of today.
+            # Words of earlier versions are converted to current ones.
             words[name] = (
                 tuple(FORMER_WORDS.get(word, word) for word in meanings) if name == "status" else tuple(meanings)
             )
@@ -319,10 +320,10 @@ def _contents(file: "h5py.File") -> tuple[Layout, dict[str, Values]]:
 
 
 class StoredVariables(Mapping[str, Values]):
-    """The variables of a table that stays in its file: each is read when it is asked for."""
+    """The variables of a table that stays in its file: each is read when needed."""
 
     def __init__(self, stored: Stored):
-        """State where they are."""
+        """Set the location of the variables."""
         self.stored = stored
 
     def __getitem__(self, name: str) -> Values:
@@ -341,7 +342,7 @@ class StoredVariables(Mapping[str, Values]):
 
 
 def coded(values: Values, words: tuple[str, ...]) -> tuple[Values, tuple[str, ...]]:
-    """Words as the codes that stand for them, and the words in the order of their codes, first those given."""
+    """Words as codes, and the words in the order of their codes, beginning with the given ones."""
     met = (word for word in dict.fromkeys(values.ravel().tolist()) if word not in (*words, UNREACHED))
     words = (*words, *met)
     codes = {word: code for code, word in enumerate(words)} | {UNREACHED: PENDING}

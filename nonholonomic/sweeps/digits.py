@@ -1,4 +1,4 @@
-"""Numbers with the digits that their errors leave, in the concise notation: 5.01142(3) is 5.01142 with an error of 0.00003."""
+"""Numbers with their correct digits in concise notation: 5.01142(3) is 5.01142 with an error of 0.00003."""
 
 import math
 
@@ -7,14 +7,14 @@ from jaxtyping import Float, Shaped
 
 
 def concise(value: float, error: float) -> str:
-    """A number with the digits that its error leaves and, in parentheses, the error in the last digit, rounded up.
+    """A number with its correct digits and, in parentheses, the error of the last digit, rounded up.
 
     **Arguments:** `value`, `error`: finite numbers, the error at least 0; without one the number is written in full.
     """
     if error == 0.0:
         return repr(float(value))
     place = math.floor(math.log10(error))
-    # The quotient may exceed a whole number by its rounding alone.
+    # The quotient may exceed a whole number because of rounding.
     digit = math.ceil(error / 10.0**place * (1.0 - 1e-12))
     if digit == 10:
         place, digit = place + 1, 1
@@ -26,13 +26,13 @@ def concise(value: float, error: float) -> str:
 def concise_strings(
     values: Float[np.ndarray, "..."], errors: Float[np.ndarray, "..."], words: Shaped[np.ndarray, "..."]
 ) -> Shaped[np.ndarray, "..."]:
-    """Concise notation for every number of an array, and a word where there is none.
+    """Concise notation for every number of an array, or a word if there is no number.
 
     **Arguments:**
 
-    - `values`: numbers; not finite where there is none.
-    - `errors`: their errors; infinite where it is doubtful whether there is a number at all.
-    - `words`: what to say where there is none; with a question mark where that is doubtful.
+    - `values`: numbers; not finite if there is none.
+    - `errors`: their errors; infinite if it is doubtful whether there is a number.
+    - `words`: the words for missing numbers; a question mark is added if that is doubtful.
 
     **Returns:** an array of strings.
     """

@@ -1,4 +1,4 @@
-"""Chunks are handed to an executor as its workers become free, and again where a worker died."""
+"""Dispatch chunks to an executor as its workers become free, and again if a worker died."""
 
 import itertools
 import sys
@@ -8,24 +8,26 @@ from concurrent.futures import BrokenExecutor, CancelledError, Future
 from queue import SimpleQueue
 from typing import Any
 
-#: A chunk is given up once it has killed this many workers, the last of them when it was the only chunk handed out.
+#: A chunk is given up after it has killed this many workers, the last one while it was the only dispatched chunk.
 MAX_CRASHES = 3
 
 
 class ExecutorBroken(Exception):
-    """The executor computes nothing any more."""
+    """The executor no longer computes anything."""
 
 
 def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], most: int) -> Iterator[tuple[int, Any]]:
-    """Have chunks computed, each as soon as there is room.
+    """Have chunks computed, each as soon as a worker is free.
 
     After an exception, Ctrl-C included, no further chunk starts.
 
-    **Arguments:** `submit`: hands out a chunk; `chunks`: their numbers; `most`: how many may be handed out at once.
+    **Arguments:** `submit`: dispatches a chunk; `chunks`: their indices; `most`: greatest number of dispatched chunks
+    at a time.
 
-    **Returns:** the number and the results of each as it finishes; `None` for one that `MAX_CRASHES` workers died of.
+    **Returns:** the index and the results of each chunk as it finishes; `None` for a chunk that killed `MAX_CRASHES`
+    workers.
 
-    **Raises:** `ExecutorBroken` if the executor is gone; what a chunk itself raised.
+    **Raises:** `ExecutorBroken` if the executor is gone; exceptions of the chunks.
     """
     finished: SimpleQueue[tuple[int, Future]] = SimpleQueue()
     out: set[Future] = set()
@@ -66,8 +68,8 @@ def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], most: int
             if died and crashes[chunk] < MAX_CRASHES - 1:
                 hand_out(chunk)
             elif died and not was_last_try:
-                # Where an executor cannot tell of which chunk a worker died, all that were with it are accused. So the last
-                # try is made at the end, with each alone.
+                # If an executor cannot tell which chunk killed a worker, all chunks that were in flight are suspects.
+                # Therefore each of them is retried alone at the end.
                 suspects.append(chunk)
             hand_out_more()
             if was_last_try or not died:
@@ -78,10 +80,10 @@ def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], most: int
 
 
 def crashes_reported_by(error: Any) -> int:
-    """How many workers have died of a chunk, according to what its future raised."""
+    """Number of workers that a chunk killed, according to the exception of its future."""
     if isinstance(error, BrokenExecutor):
         return 1
-    # Dask has handed the chunk to others before it says so.
+    # Dask has already given the chunk to other workers.
     distributed = sys.modules.get("distributed")
     if distributed is not None and isinstance(error, distributed.KilledWorker):
         return 1 + error.allowed_failures

@@ -1,4 +1,4 @@
-"""A grid of named axes: its cells, and the numbers of each."""
+"""A grid of named axes: its cells, and the parameters of each cell."""
 
 import itertools
 from collections.abc import Iterator
@@ -9,12 +9,12 @@ import numpy as np
 from ..validation import require
 from .layout import Values
 
-#: Grids of at most this many cells are checked cell by cell before anything runs.
+#: Grids with at most this many cells are checked cell by cell before anything runs.
 CHECKED_WHOLE = 1 << 20
 
 
 class Axis(NamedTuple):
-    """One axis of a grid: its name in the table, the full name of the parameter it varies, the unit, and a name in words."""
+    """One axis of a grid: its name in the table, the full name of the varied parameter, the unit, and a long name."""
 
     name: str
     number: str
@@ -24,9 +24,9 @@ class Axis(NamedTuple):
 
 
 class Variable(NamedTuple):
-    """One result of every cell: its unit and dtype, and, if it is a code, the words it stands for.
+    """One result of every cell: its unit and dtype, and, for a code, the words for its values.
 
-    `inner` names the dimensions of a result that is an array, in order; `long_name` says what it is.
+    `inner`: names of the dimensions of an array result, in order; `long_name`: description.
     """
 
     unit: str
@@ -49,14 +49,15 @@ def axis(name: str, number: str, unit: str, values: Any, long_name: str = "") ->
 
 
 def size_of(axes: list[Axis]) -> int:
-    """How many cells a grid has."""
+    """Number of cells of a grid."""
     return int(np.prod([len(axis.values) for axis in axes], dtype=int))
 
 
 def columns(axes: list[Axis], first: int, count: int) -> dict[str, Values]:
-    """The numbers of some cells, the last axis varying fastest.
+    """The parameters of some cells; the last axis varies fastest.
 
-    **Arguments:** `axes`: the grid; `first`: the first of the cells; `count`: how many. Beyond the end the last is repeated.
+    **Arguments:** `axes`: the grid; `first`: index of the first cell; `count`: number of cells. Beyond the end, the
+    last cell is repeated.
 
     **Returns:** full name of a parameter -> its value in every cell.
     """
@@ -66,11 +67,11 @@ def columns(axes: list[Axis], first: int, count: int) -> dict[str, Values]:
 
 
 def cells_to_check(axes: list[Axis]) -> Iterator[dict[str, Values]]:
-    """The cells that are looked at before anything runs, as columns: all of a small grid; of a large one every value of every
-    axis, and all corners.
+    """The cells that are checked before anything runs, as columns: all cells of a small grid; for a large grid, every
+    value of every axis, and all corners.
 
-    Where a limit on one number rises or falls with the others, as those of the models do, it is broken in a corner if
-    anywhere. All other cells are checked when their turn comes.
+    If a limit on one parameter is monotonic in the others, as in the models, a violation also occurs in a corner. All
+    other cells are checked later, when they run.
     """
     if size_of(axes) <= CHECKED_WHOLE:
         yield columns(axes, 0, size_of(axes))

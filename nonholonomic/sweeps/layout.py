@@ -1,4 +1,4 @@
-"""What a table is made of besides its numbers, and how its cells are cut into chunks."""
+"""The layout of a table: everything except its numbers, and the division of its cells into chunks."""
 
 import math
 from collections.abc import Iterator
@@ -9,14 +9,14 @@ from jaxtyping import Shaped
 
 Values = Shaped[np.ndarray, "..."]
 
-#: Stored for a cell that has not been computed, and the word for it.
+#: Code and word for a cell that has not been computed.
 PENDING, UNREACHED = -1, "pending"
 
 
 class Layout(NamedTuple):
     """A table without its numbers.
 
-    `kinds`: variable -> dtype; `chunk`: how many cells a chunk has, all but the last; the rest is as in `Table`.
+    `kinds`: variable -> dtype; `chunk`: number of cells in a chunk, except for the last one; the rest is as in `Table`.
     """
 
     coords: dict[str, Values]
@@ -39,12 +39,12 @@ class Layout(NamedTuple):
 
     @property
     def cells(self) -> int:
-        """How many cells the grid has."""
+        """Number of cells of the grid."""
         return math.prod(self.shape)
 
     @property
     def chunks(self) -> int:
-        """How many chunks it is cut into."""
+        """Number of chunks."""
         return -(-self.cells // self.chunk)
 
     def ends(self, chunk: int) -> tuple[int, int]:
@@ -52,16 +52,16 @@ class Layout(NamedTuple):
         return chunk * self.chunk, min((chunk + 1) * self.chunk, self.cells)
 
     def size(self, chunk: int) -> int:
-        """How many cells a chunk has."""
+        """Number of cells in a chunk."""
         first, end = self.ends(chunk)
         return end - first
 
     def inner_shape(self, name: str) -> tuple[int, ...]:
-        """Shape of what a variable holds for one cell."""
+        """Shape of a variable's value for one cell."""
         return tuple(len(self.coords[dim]) for dim in self.inner.get(name, ()))
 
     def empty(self, cells: int, status: int = PENDING) -> dict[str, Values]:
-        """The variables of cells that have no numbers, along the first axis; what consists of words is `status`."""
+        """The variables of cells without results, along the first axis; variables of words get `status`."""
         variables = {}
         for name, kind in self.kinds.items():
             value = status if name in self.words else np.nan if kind.kind == "f" else PENDING
@@ -69,12 +69,12 @@ class Layout(NamedTuple):
         return variables
 
     def shaped(self, name: str, values: Values) -> Values:
-        """A variable of all cells over the grid, with words for codes."""
+        """A variable of all cells in the shape of the grid, with words instead of codes."""
         values = values.reshape((*self.shape, *self.inner_shape(name)))
         return np.array([*self.words[name], UNREACHED])[values] if name in self.words else values
 
     def bytes_of_cells(self, cells: int) -> int:
-        """What the numbers of some cells take."""
+        """Memory for the numbers of some cells [bytes]."""
         return cells * sum(kind.itemsize * math.prod(self.inner_shape(name)) for name, kind in self.kinds.items())
 
 

@@ -1,4 +1,4 @@
-"""Processes on this machine, each with its own cores, to compute the chunks of a sweep."""
+"""Processes on this machine, each with its own cores, that compute the chunks of a sweep."""
 
 import contextlib
 import multiprocessing
@@ -20,18 +20,18 @@ from ..validation import require
 def local_processes(n: int, threads: int = 1) -> Iterator[Executor]:
     """Processes for `executor=`, which compute on this machine's processor.
 
-    Each has its own cores, and the parent's store of compiled programs if there is one, before it imports JAX. They start as
-    chunks come. One that dies is replaced, and its chunk is tried in another; they end with the context, or with the
-    parent, however that ends. As for any process started by Python's `multiprocessing`, a script that makes them must have its
-    own calls under `if __name__ == "__main__":`.
+    Each process gets its own cores, and the parent's compilation cache if there is one, before it imports JAX.
+    Processes start when chunks arrive. A process that dies is replaced, and its chunk is retried in another one. The
+    processes end with the context, or with the parent, however it ends. As for any process started by Python's
+    `multiprocessing`, the script must have its own calls under `if __name__ == "__main__":`.
 
-    **Arguments:** `n`: how many; `threads`: how many cores each may use.
+    **Arguments:** `n`: number of processes; `threads`: number of cores for each.
 
     **Returns:** the executor, as a context.
 
     **Raises:** `ValueError` for numbers below 1.
 
-    **Example:** a table takes it as `executor=processes`.
+    **Example:** pass it to a table as `executor=processes`.
 
     ```
     >>> import nonholonomic
@@ -53,10 +53,10 @@ def local_processes(n: int, threads: int = 1) -> Iterator[Executor]:
 
 
 class LocalProcesses(Executor):
-    """An executor of pools of one process each: when a process dies, it is known of which call, and no other call is lost."""
+    """An executor of single-process pools: if a process dies, its call is known, and no other call is lost."""
 
     def __init__(self, n: int, threads: int):
-        """State how many processes, and how many cores each has."""
+        """Set the number of processes and the number of cores for each."""
         self._pools: list[ProcessPoolExecutor | None] = [None] * n
         self._threads = threads
         self._free: SimpleQueue[int] = SimpleQueue()
@@ -89,12 +89,12 @@ class LocalProcesses(Executor):
             self._free.put(place)
 
 
-#: A process inherits the cores of the thread that starts it, and the environment: that of all threads.
+#: A process inherits the cores of the thread that starts it, and the environment, which all threads share.
 _starting = threading.Lock()
 
 
 def _started(place: int, threads: int) -> ProcessPoolExecutor:
-    """A process, which has its cores and its settings before its first line runs."""
+    """A process that has its cores and its settings before its first line runs."""
     pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin)
     with _starting, _environment(_settings()), _cores(place, threads), _without_interrupts():
         # The process starts with the first call.
@@ -102,7 +102,7 @@ def _started(place: int, threads: int) -> ProcessPoolExecutor:
     try:
         begun.result()
     except BrokenProcessPool as error:
-        # It would do so again.
+        # It would die again.
         raise RuntimeError(
             "a process ended before it computed anything; a script that starts processes must have its own calls under "
             "`if __name__ == '__main__':`"
@@ -136,7 +136,8 @@ def _environment(settings: dict[str, str]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _cores(place: int, threads: int) -> Iterator[None]:
-    """This thread on the cores of a process; they are dealt out in turn, again from the first where they run out."""
+    """Put this thread on the cores of a process; cores are assigned in turn, and again from the first when none is
+    left."""
     if not hasattr(os, "sched_setaffinity"):
         yield
         return
@@ -150,7 +151,7 @@ def _cores(place: int, threads: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """Have this thread, and processes that it starts, put off Ctrl-C."""
+    """Make this thread, and processes that it starts, postpone Ctrl-C."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -162,7 +163,7 @@ def _without_interrupts() -> Iterator[None]:
 
 
 def _begin() -> None:
-    """Prepare a process: Ctrl-C on a terminal reaches it too, and ends it at once and without a traceback."""
+    """Prepare a process: Ctrl-C on a terminal also reaches it, and ends it at once without a traceback."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -170,7 +171,7 @@ def _begin() -> None:
 
 
 def _leave_with_the_parent() -> None:
-    """End this process when its parent does; one that was killed tells nobody."""
+    """End this process when its parent ends, even if the parent was killed."""
     parent = multiprocessing.parent_process()
 
     def watch() -> None:

@@ -1,4 +1,4 @@
-"""A grid is cut into chunks, which are computed wherever there is room, stored as they finish, and end up in a table."""
+"""Compute a grid in chunks, store each chunk when it finishes, and return a table."""
 
 import contextlib
 import functools
@@ -25,10 +25,10 @@ from .layout import Layout, Values
 from .table import Table
 from .tasks import ChunkTask, Job, packed, remote_results, stamp, versions
 
-#: The most chunks that are handed out at once: their results are held in memory until they are stored.
+#: Greatest number of dispatched chunks: their results are in memory until they are stored.
 HANDED_OUT = 512
 
-#: About how many chunks a large grid is cut into, and what the results of one may take [bytes].
+#: Approximate number of chunks of a large grid, and greatest memory for the results of a chunk [bytes].
 CHUNKS, MOST_BYTES = 1024, 1 << 21
 
 
@@ -49,25 +49,26 @@ def sweep(
 
     **Arguments:**
 
-    - `job`: (full name of a parameter -> values of some cells, how many of them count) -> name -> results. It may be called
-      from several threads at once; the first call, in which no cell counts, is for compiling. For an executor whose workers
-      are other processes it is pickled.
+    - `job`: function from (full name of a parameter -> values of some cells, number of cells that count) to (name ->
+      results). Several threads may call it at once; the first call, in which no cell counts, compiles it. It is pickled
+      if the workers of the executor are other processes.
     - `axes`: the grid, the last axis varying fastest.
-    - `variables`: what `job` returns.
-    - `request`: plain data that says what is computed; it is stored in the table and guards the file.
+    - `variables`: the results of `job`.
+    - `request`: plain data that describes the computation; it is stored in the table, and only equal requests may
+      resume a file.
     - `path`: file to write, chunk by chunk; if it holds part of the same request, only the rest is computed.
-    - `chunk`: how many cells `job` is given at once, by default `chunk_for` the number of cells; `most`: an upper limit
-      to it, where results are large.
-    - `inner`: the coordinates of the dimensions that results have besides the grid's, numbers or words.
-    - `progress`: whether to show it, on a terminal or in a notebook.
-    - `executor`: who computes; by default a thread for each core.
+    - `chunk`: number of cells in a call of `job`, by default `chunk_for` the number of cells; `most`: an upper limit,
+      for large results.
+    - `inner`: the coordinates of the results' own dimensions, numbers or words.
+    - `progress`: whether to show progress, on a terminal or in a notebook.
+    - `executor`: any executor; by default a thread for each core.
 
     **Returns:** the `Table`.
 
-    **Raises:** `ValueError` for an executor that is none, and if there is no file, and less memory than the table takes;
-    `OSError` or `ValueError` if the file cannot be written or holds another request; `RuntimeError` if the executor breaks
-    down or a worker has other versions: what had finished is in the file. `KeyboardInterrupt` after Ctrl-C, with a message that
-    says how many cells are saved.
+    **Raises:** `ValueError` for an illegal executor, and if there is no file and not enough memory for the table;
+    `OSError` or `ValueError` if the file cannot be written or holds another request; `RuntimeError` if the executor
+    breaks down or a worker has other versions: what had finished is in the file. `KeyboardInterrupt` after Ctrl-C, with
+    a message that says how many cells are saved.
     """
     require_flag(progress, "progress")
     if executor is not None and not isinstance(executor, Executor):
@@ -97,7 +98,7 @@ def sweep(
 def computed(
     work: ChunkTask, layout: Layout, finished: set[int], executor: Executor | None, progress: bool
 ) -> Iterator[tuple[int, dict[str, Values]]]:
-    """The chunks that are not finished, each as it is computed; see `sweep`."""
+    """The unfinished chunks, each when it is computed; see `sweep`."""
     todo = [chunk for chunk in range(layout.chunks) if chunk not in finished]
     done = layout.cells - sum(map(layout.size, todo))
     with Progress(layout.cells, "cell", shown=progress) as shown, workforce(work, executor) as submit:
@@ -110,7 +111,7 @@ def computed(
             for chunk, values in handed_out(lambda chunk: submit(chunk * layout.chunk, layout.chunk), todo, HANDED_OUT):
                 yield chunk, failed_chunk(work.axes, layout, chunk) if values is None else values
                 done += layout.size(chunk)
-                # Where others compute, nobody tells when the first of them has compiled.
+                # If other processes compute, they do not report when they have compiled.
                 if begun:
                     shown.advance(layout.size(chunk))
                 else:
@@ -123,7 +124,7 @@ def computed(
 def layout_of(
     axes: list[Axis], inner: Sequence[Axis], variables: dict[str, Variable], request: dict[str, Any], chunk: int
 ) -> Layout:
-    """What a sweep's table is made of; see `sweep`."""
+    """The layout of a sweep's table; see `sweep`."""
     coords = {variable.name: variable.values for variable in (*axes, *inner)}
     units = {variable.name: variable.unit for variable in (*axes, *inner) if variable.values.dtype.kind != "U"}
     units |= {name: variable.unit for name, variable in variables.items() if variable.words is None}
@@ -144,12 +145,12 @@ def layout_of(
 
 
 class Held:
-    """The chunks of a table that is not to be stored: the same as `ChunkStore`, in memory."""
+    """The chunks of a table without a file: like `ChunkStore`, in memory."""
 
     def __init__(self, layout: Layout):
-        """State what the table is made of.
+        """Set the layout of the table.
 
-        **Raises:** `ValueError` if this machine has less memory than it takes.
+        **Raises:** `ValueError` if this machine does not have enough memory.
         """
         need, room = layout.bytes_of_cells(layout.cells), memory()
         if need > room:
@@ -161,7 +162,7 @@ class Held:
         self._layout, self._found = layout, layout.empty(layout.cells)
 
     def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> dict[str, Values]:
-        """Keep the chunks that are computed; the variables, with all cells along the first axis."""
+        """Keep the computed chunks, and return the variables with all cells along the first axis."""
         for chunk, values in computed:
             first, end = self._layout.ends(chunk)
             for name, values_of_chunk in values.items():
@@ -169,15 +170,16 @@ class Held:
         return self._found
 
     def interrupted(self) -> str:
-        """What Ctrl-C leaves."""
+        """Message after Ctrl-C."""
         return f"interrupted; none of {with_spaces(self._layout.cells)} cells is saved without path="
 
     def close(self) -> None:
-        """Nothing is to be closed."""
+        """There is nothing to close."""
 
 
 def in_a_thread(function: Callable[[], None]) -> None:
-    """Call a function in another thread, so that this one hears Ctrl-C: XLA compiles for many seconds without listening."""
+    """Call a function in another thread, so that this one receives Ctrl-C: XLA compiles for many seconds without
+    checking."""
     pool = ThreadPoolExecutor(1)
     try:
         pool.submit(function).result()
@@ -187,9 +189,9 @@ def in_a_thread(function: Callable[[], None]) -> None:
 
 @contextlib.contextmanager
 def workforce(work: ChunkTask, executor: Executor | None) -> Iterator[Callable[[int, int], Future]]:
-    """Who computes: a function that has `count` cells from `first` on computed.
+    """A function that submits the computation of `count` cells from `first` on.
 
-    Threads share this process, and what it has compiled. Any other executor is sent all that it takes.
+    Threads share this process and its compiled programs. Other executors receive all data that they need.
     """
     if executor is None:
         pool = ThreadPoolExecutor(workers())
@@ -205,7 +207,7 @@ def workforce(work: ChunkTask, executor: Executor | None) -> Iterator[Callable[[
 
 
 def failed_chunk(axes: list[Axis], layout: Layout, chunk: int) -> dict[str, Values]:
-    """The results of a chunk that is given up: `failed`, and no numbers; a warning names its cells."""
+    """The results of a chunk that is given up: the status `failed`, without numbers. A warning names its cells."""
     first, end = layout.ends(chunk)
     ends = [columns(axes, cell, 1) for cell in (first, end - 1)]
     named = ", ".join(f"{name} {ends[0][name].item():.6g} to {ends[1][name].item():.6g}" for name in ends[0])
@@ -219,24 +221,26 @@ def failed_chunk(axes: list[Axis], layout: Layout, chunk: int) -> dict[str, Valu
 
 
 def chunk_for(cells: int) -> int:
-    """Cells in a chunk: few different sizes, so that few programs are compiled, but many chunks, to be shared among cores.
+    """Number of cells in a chunk: few different sizes, so that few programs are compiled, but many chunks, so that
+    cores share the work.
 
     It does not depend on the number of cores, so that a file can be resumed on another machine.
     """
     if jax.default_backend() != "cpu":
         return 65536 if cells > 4096 else 4096
-    # An ensemble of 64 lanes takes no longer for two cells than one of two lanes: most of the time is spent starting loops.
+    # For two cells, an ensemble of 64 lanes takes no longer than one of two lanes: most of the time is spent starting
+    # loops.
     return 64 if cells <= 64 else 128 if cells <= 4096 else 512
 
 
 def chunks_together(layout: Layout, chunk: int) -> int:
-    """How many chunks are handed out and stored as one, a power of two: more than one where the grid is large."""
+    """Number of chunks that are dispatched and stored together, a power of two, greater than one for large grids."""
     wanted = min(layout.cells // (CHUNKS * chunk), MOST_BYTES // layout.bytes_of_cells(chunk))
     return 1 << max(wanted, 1).bit_length() - 1
 
 
 def memory() -> float:
-    """The memory of this machine in bytes; infinite where it is not told."""
+    """The memory of this machine [bytes]; infinite if unknown."""
     try:
         return float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
@@ -244,7 +248,7 @@ def memory() -> float:
 
 
 def workers() -> int:
-    """How many chunks run at once in this process: one for each core it may use; an accelerator takes one at a time."""
+    """Number of chunks that run at once in this process: one for each core; an accelerator takes one at a time."""
     if jax.default_backend() != "cpu":
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -16,7 +16,7 @@ from ._file import HELD, LONG_NAMES, Stored, StoredVariables, coded, replacing, 
 from .digits import concise_strings
 from .layout import UNREACHED, Layout, Values, axes_of
 
-#: Cells under one checksum in the file of a table that is saved.
+#: Number of cells per checksum in the file of a saved table.
 CHUNK = 1 << 15
 
 
@@ -25,14 +25,14 @@ class Table(eqx.Module):
 
     **Arguments:**
 
-    - `coords`: name -> values, one for each axis of the grid, in order, and then for the dimensions that some variables have
-      besides, such as "time".
-    - `variables`: name -> array over the grid; `status` is an array of words. Those of a table of more than 128 MB that
-      has a file stay there: each is read, and checked against its checksums, whenever it is asked for.
+    - `coords`: name -> values, one for each axis of the grid, in order, followed by the additional dimensions of some
+      variables, such as "time".
+    - `variables`: name -> array over the grid; `status` is an array of words. The variables of a table with a file of
+      more than 128 MB stay in the file: each is read and checked against its checksums when needed.
     - `units`: name of a coordinate or variable -> its unit.
-    - `attributes`: what was computed, with what versions: plain data.
-    - `words`: variable that consists of words -> the words, in the order of the numbers that stand for them in a file.
-    - `inner`: variable -> the names of its dimensions after those of the grid, for variables that have such.
+    - `attributes`: the request and the versions, as plain data.
+    - `words`: variable of words -> the words, in the order of their codes in a file.
+    - `inner`: variable -> the names of its own dimensions after those of the grid, if any.
 
     **Example:**
 
@@ -58,7 +58,7 @@ class Table(eqx.Module):
     inner: dict[str, tuple[str, ...]] = eqx.field(default_factory=dict)
 
     def __getattr__(self, name: str) -> Values:
-        # Reached only for names that are not fields.
+        # Python calls this only for names that are not fields.
         variables = object.__getattribute__(self, "variables")
         if name in variables:
             return variables[name]
@@ -78,11 +78,11 @@ class Table(eqx.Module):
 
     @property
     def long_names(self) -> dict[str, str]:
-        """What coordinates and variables are, in words, by name."""
+        """Long names of coordinates and variables, by name."""
         return json.loads(self.attributes.get(LONG_NAMES, "{}"))
 
     def label(self, name: str) -> str:
-        """A coordinate or variable in words with its unit, as an axis of a picture says it: "inversion time [s]"."""
+        """The label of a coordinate or variable for plots: its long name with its unit, "inversion time [s]"."""
         unit = readable_unit(self.units.get(name, "1"))
         return self.long_names.get(name, name) + (f" [{unit}]" if unit else "")
 
@@ -98,13 +98,13 @@ class Table(eqx.Module):
     def to_xarray(self, chunks: Any = None) -> Any:
         """The table as an `xarray.Dataset` (needs xarray), with named dimensions and units; words stay words.
 
-        **Arguments:** `chunks`: sizes of the pieces along each dimension, such as `{"theta": 100}`, or "auto", if its numbers
-        are to be read piece by piece when something is computed from them (needs dask, and h5netcdf for a table that
-        stays in its file, which is then read without its checksums).
+        **Arguments:** `chunks`: sizes of the pieces along each dimension, such as `{"theta": 100}`, or "auto", to read
+        the numbers piece by piece when they are needed (needs dask, and h5netcdf for a table that stays in its file,
+        which is then read without its checksums).
 
         **Returns:** the dataset; `Table.save` and a sweep's file hold the same.
 
-        **Raises:** `ModuleNotFoundError`, with the line that installs it, for a package that is missing.
+        **Raises:** `ModuleNotFoundError`, with the command that installs it, for a missing package.
         """
         require_package("xarray", "xarray", "to_xarray")
         if chunks is not None:
@@ -132,12 +132,12 @@ class Table(eqx.Module):
         return dataset if chunks is None else dataset.chunk(chunks)
 
     def to_dataframe(self) -> Any:
-        """The table as a `pandas.DataFrame` (needs pandas): a row for each cell, a column for each axis and each variable.
+        """The table as a `pandas.DataFrame` (needs pandas): one row per cell, one column per axis and variable.
 
-        A table with variables that have dimensions of their own, such as "time", has a row for each point of these, too, and
-        the other variables are repeated. `attrs["units"]` of the frame are the units.
+        A table with variables that have dimensions of their own, such as "time", has one row for each point of these
+        dimensions, too, and the other variables are repeated. `attrs["units"]` of the frame are the units.
 
-        **Raises:** `ModuleNotFoundError`, with the line that installs it, if pandas is missing.
+        **Raises:** `ModuleNotFoundError`, with the command that installs it, if pandas is missing.
 
         **Example:**
 
@@ -159,7 +159,7 @@ class Table(eqx.Module):
         shape = tuple(len(self.coords[dim]) for dim in dims)
 
         def column(values: Values, own: tuple[str, ...]) -> Values:
-            # The variable's dimensions stand in the order of the table's.
+            # The variable's dimensions are in the order of the table's.
             spread = np.expand_dims(values, [k for k, dim in enumerate(dims) if dim not in own])
             return np.broadcast_to(spread, shape).reshape(-1)
 
@@ -170,7 +170,7 @@ class Table(eqx.Module):
         return frame
 
     def save(self, path: Any) -> None:
-        """Write the table to an HDF5 file that `xarray.open_dataset(path, engine="h5netcdf")` opens as it is.
+        """Write the table to an HDF5 file that `xarray.open_dataset(path, engine="h5netcdf")` opens.
 
         **Raises:** `OSError` that names the path if it cannot be written.
         """
@@ -192,8 +192,8 @@ class Table(eqx.Module):
 
     @classmethod
     def load(cls, path: Any) -> "Table":
-        """Read a table from a file that `save` or a sweep wrote, or that a sweep is still to write; a cell that it has not
-        reached is `pending`.
+        """Read a table from a file that `save` or a sweep wrote, also before the sweep has finished; cells not yet
+        computed are `pending`.
 
         **Raises:** `OSError` that names the path if it cannot be read or holds no table.
         """
@@ -216,14 +216,14 @@ class Table(eqx.Module):
         return cls(layout.coords, variables, layout.units, layout.attributes, layout.words, layout.inner)
 
     def digits(self, variable: str = "time") -> Values:
-        """A variable with the digits that its error leaves: "5.01142(3)" is 5.01142 with an error of 0.00003.
+        """A variable with its correct digits: "5.01142(3)" is 5.01142 with an error of 0.00003.
 
         **Arguments:** `variable`: name of a numeric variable, such as "time", whose error the table holds as "time_error".
 
-        **Returns:** an array of strings over the grid. Where there is no number the string is the cell's status, with a
-        question mark if that is in doubt.
+        **Returns:** an array of strings over the grid. For a cell without a number, the string is the cell's status,
+        with a question mark if it is in doubt.
 
-        **Raises:** `ValueError` if the table does not hold the variable and its error.
+        **Raises:** `ValueError` if the table does not contain the variable and its error.
         """
         for name in (variable, f"{variable}_error"):
             if name not in self.variables:
@@ -238,13 +238,13 @@ class Table(eqx.Module):
     ) -> Any:
         """Draw a variable over the grid (needs matplotlib): lines over the first axis, or a map of the first two.
 
-        Of every further axis one value is taken, the first unless `at` says otherwise; the title says which. The colours of a
-        map reach from the 2 % to the 98 % quantile.
+        For further axes, the plot uses the first value, or the value in `at`; the title names it. The colours of a map
+        range from the 2 % to the 98 % quantile.
 
         **Arguments:**
 
         - `variable`: name of a numeric variable, the first by default.
-        - `at`: name of an axis -> the value at which to cut it; the nearest of the grid is taken.
+        - `at`: name of an axis -> the value at which to cut it; the nearest grid value is used.
         - `log`: whether the variable's scale is logarithmic.
         - `ax`: axes of matplotlib to draw in, instead of a new figure.
 
@@ -264,11 +264,11 @@ class Table(eqx.Module):
 
     @property
     def _rows(self) -> list[tuple[str, str, str]]:
-        """Each variable in a few words: its name with its dimensions, its range, and what it is."""
+        """A summary of each variable: its name with its dimensions, its range, and its long name."""
         if isinstance(self.variables, StoredVariables):
             place = f"in {self.variables.stored.path}"
             return [(name, place, self.long_names.get(name, "")) for name in self.variables]
-        # Cells that have not been computed show in the status only.
+        # Cells that have not been computed appear only in the status.
         computed = self.variables["status"] != UNREACHED if "status" in self.variables else ...
         rows = []
         for name, values in self.variables.items():
@@ -290,7 +290,7 @@ class Table(eqx.Module):
 
 
 def _summary(values: Values) -> str:
-    """A variable in a few words: how often each word occurs, or its range."""
+    """A summary of a variable: the count of each word, or its range."""
     if values.dtype.kind == "U":
         words, counts = np.unique(values, return_counts=True)
         return ", ".join(f"{count} {word}" for word, count in zip(words, counts, strict=True))

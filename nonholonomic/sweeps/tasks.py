@@ -1,4 +1,4 @@
-"""What is computed somewhere: some cells of a grid, in this process or in another one that has only what it was sent."""
+"""The computation of some cells of a grid, in this process or in another process that has only the data it received."""
 
 import functools
 import os
@@ -17,22 +17,23 @@ from ..compiled_programs import forget_programs_if_many
 from .grid import Axis, columns, size_of
 from .layout import Values
 
-#: (full name of a parameter -> values of some cells, how many of them count) -> name -> results.
+#: A function from (full name of a parameter -> values of some cells, number of cells that count) to (name -> results).
 Job = Callable[[dict[str, Values], int], dict[str, Values]]
 
-#: What must be the same wherever a part of a table is computed.
+#: Packages and settings that must agree wherever a part of a table is computed.
 MUST_AGREE = ("nonholonomic", "jax", "jaxlib", "diffrax", "float")
 
 
 class ChunkTask(NamedTuple):
-    """A job and the grid it is for; `chunk`: how many cells the job is given at once, so that one compiled program serves."""
+    """A job and its grid; `chunk`: number of cells in each call of the job, always the same, so that it is compiled
+    once."""
 
     job: Job
     axes: list[Axis]
     chunk: int
 
     def compile(self) -> None:
-        """Call the job with no cell that counts."""
+        """Call the job without counting cells, to compile it."""
         self.job(columns(self.axes, 0, self.chunk), 0)
 
     def results(self, first: int, count: int) -> dict[str, Values]:
@@ -47,9 +48,9 @@ class ChunkTask(NamedTuple):
 
 
 def packed(work: ChunkTask) -> bytes:
-    """The work as another process can be sent it.
+    """The work in a form that can be sent to another process.
 
-    **Raises:** `ValueError` that says what cannot be sent.
+    **Raises:** `ValueError` that names what cannot be sent.
     """
     try:
         return pickle.dumps(work)
@@ -63,8 +64,8 @@ def packed(work: ChunkTask) -> bytes:
 def remote_results(sent: bytes, needed: dict[str, str], first: int, count: int, mark: str) -> dict[str, Values]:
     """The results of some cells, in the process that this is called in.
 
-    **Arguments:** `sent`: from `packed`; `needed`: the `stamp` of who sent it; `first`, `count`: as for `ChunkTask.results`;
-    `mark`: different in every call, because Dask takes calls with the same arguments for one.
+    **Arguments:** `sent`: from `packed`; `needed`: the `stamp` of the sender; `first`, `count`: as for
+    `ChunkTask.results`; `mark`: different in every call, because Dask merges calls with equal arguments.
 
     **Raises:** `RuntimeError` that names the worker if it has another version of a package whose numbers may differ.
     """
@@ -75,7 +76,7 @@ def remote_results(sent: bytes, needed: dict[str, str], first: int, count: int, 
                 f"the worker {platform.node()}, process {os.getpid()}, has {name} {own[name]}, and {needed[name]} is needed: "
                 "a table is computed with one version of everything"
             )
-    # Threads of one worker would compile the same program twice.
+    # Otherwise, threads of one worker would compile the same program twice.
     with _unpacking:
         work = _unpacked(sent)
     return work.results(first, count)
@@ -86,7 +87,7 @@ _unpacking = threading.Lock()
 
 @functools.lru_cache(maxsize=4)
 def _unpacked(sent: bytes) -> ChunkTask:
-    """The work, compiled: once in a process, however many parts of it come this way."""
+    """The work, compiled once per process, however many parts of it arrive."""
     forget_programs_if_many()
     work = pickle.loads(sent)
     work.compile()
@@ -102,6 +103,6 @@ def versions() -> dict[str, str]:
 
 def stamp() -> dict[str, str]:
     """What `MUST_AGREE`, in this process."""
-    # Doubles may have been switched off by hand.
+    # Float64 may have been switched off by hand.
     own = versions() | {"float": str(np.dtype(jnp.result_type(float)))}
     return {name: own[name] for name in MUST_AGREE}

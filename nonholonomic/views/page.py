@@ -281,7 +281,7 @@ def view_from(stage: Stage) -> tuple[list[float], bool]:
     points = np.concatenate(paths)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
     reach = np.linalg.norm(points - middle, axis=-1).max()
-    follow = bool(reach > 4.0 * size)
+    follow = stage.follows or bool(reach > 4.0 * size)
     if follow:
         middle, apart = among(np.stack([path[0] for path in paths]))
         reach = 1.1 * size + apart

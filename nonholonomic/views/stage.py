@@ -104,11 +104,12 @@ class Arena(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """An arena and the runs on it, seen by one camera."""
+    """An arena and the runs on it, seen by one camera, which follows them where they go far or `follows` says so."""
 
     title: str
     arena: Arena
     shows: tuple[Show, ...]
+    follows: bool = False
 
 
 #: Colours of a page's runs, for the curves and one half of the body; arrows have other colours.

@@ -17,6 +17,12 @@ window.views = window.views || {};
     return [low, (time - times[low]) / (times[high] - times[low])];
   }
 
+  // The value there, on the straight line that is drawn, as bodies and arrows are; beside a gap the nearer value.
+  function valueAt(values, [k, part]) {
+    const before = values[k], after = values[Math.min(k + 1, values.length - 1)], v = (1 - part) * before + part * after;
+    return Number.isFinite(v) ? v : part < 0.5 ? before : after;
+  }
+
   const LEFT = 58, FOOT = 4;
 
   class Strips {
@@ -105,7 +111,7 @@ window.views = window.views || {};
       const shown = this.pointed ?? time;
       strip.value.textContent = this.pointed === null ? "" : `${shown.toFixed(3)} s: `;
       for (const { times, values, colour } of strip.curves) {
-        const [k, part] = place(times, shown), v = values[Math.min(Math.round(k + part), values.length - 1)];
+        const v = valueAt(values, place(times, shown));
         views.element("span", strip.value, { textContent: ` ${Number.isFinite(v) ? digits(v) : "-"}` }).style.color = colour;
         if (Number.isFinite(v) && shown <= times[times.length - 1] + 1e-9) {
           pen.fillStyle = colour; pen.beginPath(); pen.arc(strip.x(shown), strip.y(v), 3 * ratio, 0, 7); pen.fill();

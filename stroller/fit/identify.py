@@ -1,4 +1,4 @@
-"""Parameters of a stroller, its ground and its launch from recorded rides."""
+"""Estimate parameters of a stroller, its ground and its launch from recorded rides."""
 
 from collections.abc import Hashable
 from typing import Any
@@ -60,21 +60,21 @@ def identify(
     max_steps: int = 60,
     progress: bool = True,
 ) -> Identification:
-    """Parameters of a scene and its launch from recorded rides, with their errors and with what is not determined.
+    """Estimate parameters of a scene and its launch from recorded rides, with errors and undetermined combinations.
 
     **Arguments:**
 
-    - `scene`: a `Scene`; what is not free is taken from it.
+    - `scene`: a `Scene`, with the values of the parameters that are not free.
     - `data`: a `Recording`, or a list of several to be fitted together.
-    - `free`: full name of a parameter -> a `Free` or only the value from which to start: `"scene.friction.rolling"`, or
-      `"rolling"` where nothing else ends so; `"launch.place[0]"` and `"launch.place[1]"` are parts of the place. A parameter
-      of the launch, or `"t0"`, the reading of a recording's clock at the launch, is the same in all recordings;
-      `"data[1].launch.heading"` is that of the second, and `"data[*].t0"` stands for one of each. Parameters that cannot be
-      negative are fitted in their logarithms.
+    - `free`: full name of a parameter -> a `Free` or only the start value: `"scene.friction.rolling"`, or `"rolling"`
+      if no other name ends so; `"launch.place[0]"` and `"launch.place[1]"` are parts of the place. A parameter of the
+      launch, or `"t0"`, the reading of a recording's clock at the launch, is the same in all recordings;
+      `"data[1].launch.heading"` is that of the second, and `"data[*].t0"` stands for one of each. Parameters that
+      cannot be negative are fitted by their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
     - `tolerance`: relative tolerance of the integration.
 
-    **Returns:** an `Identification`, with its `verdict`; of which it warns (`FitWarning`) if it is not good.
+    **Returns:** an `Identification` with its `verdict`; a doubtful fit gives a `FitWarning`.
 
     **Raises:** `ValueError` for arguments out of range or an unknown name.
 

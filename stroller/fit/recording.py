@@ -11,7 +11,7 @@ from nonholonomic.validation import as_number, as_number_or_none
 from ..model.input import Input
 from ..model.launch import Launch
 
-#: What can be recorded of a ride: as the properties of a `Trajectory` call it.
+#: The quantities of a ride that can be recorded, with the names of a `Trajectory`'s properties.
 QUANTITIES = Quantities(
     columns={"position": ("x", "y", "z")},
     units=dict.fromkeys(("x", "y", "z"), "m")
@@ -28,13 +28,13 @@ class Recording(AbstractRecording):
     - `launch`: a `Launch`, every number a scalar.
     - `times`: (times,) [s], increasing.
     - `value`: (times,) for one column, (times, columns) for several; NaN where a sample is missing.
-    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: to be estimated for each column
-      from the scatter about the fit.
-    - `quantity`: "position" ("x", "y", "z") [m] of the rear axle in the fixed frame, "heading", "steering" [rad], "speed"
-      [m/s], "yaw_rate" or "steering_rate" [rad/s], all as in `Trajectory`; or a tuple of some of these words. A heading may
-      be given up to whole turns.
-    - `input`: what drove the stroller, as for `simulate`.
-    - `t0`: the clock's reading [s] at the launch. Until then the stroller is where it is launched.
+    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: estimated for each column
+      from the residuals.
+    - `quantity`: "position" ("x", "y", "z") [m] of the rear axle in the fixed frame, "heading", "steering" [rad],
+      "speed" [m/s], "yaw_rate" or "steering_rate" [rad/s], all as in `Trajectory`; or a tuple of some of these words. A
+      heading may differ by whole turns.
+    - `input`: the input of the ride, as for `simulate`.
+    - `t0`: the clock's reading [s] at the launch. Before that, the stroller is at its launch position.
     - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None`: Gaussian.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
@@ -67,23 +67,23 @@ def read_recording(
     t0: float = 0.0,
     student: float | None = None,
 ) -> Recording:
-    """A recording of a ride from a text file of columns with a line of headers (CSV).
+    """A recording of a ride from a text file of columns with a header line (CSV).
 
     **Arguments:**
 
-    - `path`: of the file. Columns are parted by commas, semicolons, tabs or blanks; empty cells and `nan` are missing samples;
-      lines that begin with # are left out.
-    - `columns`: what a column is -> (its header, its unit): `"time"`, or `"frame"`, and any of `"x"`, `"y"`, `"z"`,
-      `"heading"`, `"steering"`, `"speed"`, `"yaw_rate"`, `"steering_rate"`. Units are s, ms, min; rad, deg, rev; rad/s, deg/s,
-      rpm, rev/s; m, cm, mm; m/s, cm/s, mm/s, km/h; or a number, the SI units that one of the file is, such as the metres of a
-      pixel.
-    - `fps`: frames a second, where there is no `"time"`; without a `"frame"` every line is one.
-    - `launch`: a `Launch`, as far as it is known; `input`, `t0`, `student`: as for `Recording`.
-    - `error`: what a column is -> (its standard error, or the header of a column of them, unit); `None`: to be estimated.
+    - `path`: of the file. Columns are separated by commas, semicolons, tabs or blanks; empty cells and `nan` are
+      missing samples; lines that begin with # are ignored.
+    - `columns`: quantity -> (header of its column, unit): `"time"`, or `"frame"`, and any of `"x"`, `"y"`, `"z"`,
+      `"heading"`, `"steering"`, `"speed"`, `"yaw_rate"`, `"steering_rate"`. Units are s, ms, min; rad, deg, rev; rad/s,
+      deg/s, rpm, rev/s; m, cm, mm; m/s, cm/s, mm/s, km/h; or a factor that converts the file's numbers to SI units,
+      such as metres per pixel.
+    - `fps`: frames per second, if there is no `"time"`; without a `"frame"`, every line is a frame.
+    - `launch`: a `Launch`, as far as known; `input`, `t0`, `student`: as for `Recording`.
+    - `error`: quantity -> (standard error or the header of its column, unit); `None`: estimated from the residuals.
 
     **Returns:** a `Recording`.
 
-    **Raises:** `ValueError` that names the column and what is wrong with it.
+    **Raises:** `ValueError` that names the column and the problem.
 
     **Example:** a speedometer, read every second.
 

@@ -1,1 +1,1 @@
-"""Questions to a scene and their answers: rides, tables, crossings, pictures and pages."""
+"""Computations with a scene: rides, tables, crossings, plots and pages."""

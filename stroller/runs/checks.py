@@ -1,4 +1,4 @@
-"""Checks of what is asked of a ride, before anything compiles."""
+"""Check the arguments of a ride before anything compiles."""
 
 from typing import Any
 
@@ -12,7 +12,8 @@ from ..model.scene import Scene
 
 
 def check_run(scene: Any, launch: Any, t1: Any, input: Any, tolerance: Any) -> None:
-    """Raise `ValueError` unless these are a scene, a launch it can start from, a positive horizon, an input, a tolerance."""
+    """Raise `ValueError` unless scene, launch, horizon, input and tolerance are legal and the scene can start with the
+    launch."""
     require_kind(scene, "scene", Scene)
     require_kind(launch, "launch", Launch)
     require_all(run_bounds(t1, tolerance))
@@ -23,13 +24,13 @@ def check_run(scene: Any, launch: Any, t1: Any, input: Any, tolerance: Any) -> N
 
 
 def check_times(times: Any, t1: Any) -> None:
-    """Raise `ValueError` unless these are times of output: a list that increases, within [0, t1]."""
+    """Raise `ValueError` unless the times of output are an increasing list within [0, t1]."""
     require_all(times_bounds(times, t1))
     require_increasing(times, "times")
 
 
 def check_options(solver: Any, max_steps: Any, adjoint: Any) -> None:
-    """Raise `ValueError` unless the solver chooses its steps or is an `ImplicitMidpoint`, and the others are in range too."""
+    """Raise `ValueError` unless the solver is adaptive or an `ImplicitMidpoint`, and the other options are in range."""
     if not isinstance(solver, ImplicitMidpoint):
         require_adaptive(solver, ", or an ImplicitMidpoint")
     require_whole(max_steps, "max_steps", 1)

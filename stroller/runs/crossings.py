@@ -1,4 +1,4 @@
-"""When a quantity was zero during a run: found within a step by repeating that step with other lengths."""
+"""Find the times at which a quantity was zero during a run, within a step by repeating that step with other lengths."""
 
 from typing import NamedTuple
 
@@ -13,16 +13,18 @@ from ..model.dynamics import State
 from .ride import RideSpec
 from .steps import Lanes, States, Steps, in_blocks
 
-#: What can be watched: the normal force [N], the cosine of the steering angle, and the relative reduced mass.
+#: Quantities that can be watched: the normal force [N], the cosine of the steering angle, and the relative reduced
+#: mass.
 WATCHED = ("normal_force", "steering_cosine", "rank")
 
-#: Parts into which a step is divided, to look at the sign at their ends, if there may be a crossing.
+#: Number of parts into which a step is divided, to check the sign at their ends, if there may be a crossing.
 PARTS = 8
 
-#: How many times looks are added where the quantity is nearest to zero, so that two crossings close together are seen.
+#: Number of rounds in which checks are added where the quantity is nearest to zero, to detect two crossings close
+#: together.
 CLOSER_LOOKS = 3
 
-#: Looks closer together than this [s] would show nothing new.
+#: Checks closer together than this [s] give no new information.
 CLOSEST = 1e-14
 
 
@@ -35,7 +37,7 @@ class Between(NamedTuple):
     level: float
 
     def at(self, times: Lanes) -> Lanes:
-        """The quantity at the given times; what is not a number counts as beyond the level."""
+        """The quantity at the given times; NaN counts as beyond the level."""
         value = watched(self.spec, self.steps.at(self.spec, times), self.name) - self.level
         return np.where(np.isfinite(value), value, -np.inf)
 
@@ -73,7 +75,8 @@ def crossings(spec: RideSpec, steps: Steps, name: str, level: float) -> Float[np
 
 
 def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
-    """Steps in which a quantity may be zero: it changes sign, or it or a neighbour changes by more than its size."""
+    """Steps in which a quantity may be zero: its sign changes, or it changes by more than its size, there or in a
+    neighbour."""
     with np.errstate(invalid="ignore"):
         change = np.abs(np.diff(value))
         largest = np.max([change, np.append(change[1:], 0.0), np.insert(change[:-1], 0, 0.0)], axis=0)
@@ -82,7 +85,7 @@ def _may_cross(value: Float[np.ndarray, " steps"]) -> Bool[np.ndarray, " gaps"]:
 
 
 def _nearest(time: Float[np.ndarray, " looks"], value: Float[np.ndarray, " looks"]) -> Float[np.ndarray, " new"]:
-    """Where a quantity is nearest to zero between looks that show no change of sign: the vertices of parabolas."""
+    """The times at which a quantity is nearest to zero between checks of equal sign: the vertices of parabolas."""
     distance = np.abs(value)
     least = (distance[1:-1] < distance[:-2]) & (distance[1:-1] <= distance[2:])
     least &= (value[1:-1] > 0.0) == (value[:-2] > 0.0)

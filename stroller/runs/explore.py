@@ -1,4 +1,4 @@
-"""A page with sliders in which a ride is simulated anew in the browser."""
+"""A page with sliders that simulates a ride in the browser."""
 
 import math
 from typing import Any
@@ -39,11 +39,11 @@ from .view import RADIUS, TRACK
 
 Numbers = Float[Array, " numbers"]
 
-#: The tolerance in the page, and that of the runs that only say how far the ground is drawn.
+#: The tolerance in the page, and that of the runs that determine the drawn part of the ground.
 TOLERANCE = 1e-7
 DRAWN = 1e-5
 
-#: Steps after which a run in the page is given up: some hundred milliseconds.
+#: Greatest number of steps of a run in the page, some hundred milliseconds.
 MOST_STEPS_OF_A_PAGE = 50_000
 
 
@@ -67,8 +67,9 @@ def explore(
 
     - `scene`, `launch`, `input`: the ride at the start, as for `simulate`.
     - `path`: file to write the page to, or `None`.
-    - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name will do where only one parameter fits, such
-      as "launch.speed", "launch.steering" or "inertia". By default speed, steering angle, heading and friction.
+    - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name is enough if only one parameter
+      matches, such as "launch.speed", "launch.steering" or "inertia". By default speed, steering angle, heading and
+      friction.
     - `t1`: horizon [s].
 
     **Returns:** a `Page`, with its `html`.
@@ -103,7 +104,7 @@ def explore(
 
 
 def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input: Any) -> LiveRun:
-    """What the page shows of a scene, a launch and an input, `roots`, some of whose numbers are those of sliders."""
+    """The contents of the page for a scene, a launch and an input, `roots`, some of whose numbers come from sliders."""
     settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
     controls = as_module(input, roots["scene"], roots["launch"])
 
@@ -115,7 +116,7 @@ def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input:
         return frame(*modules(values), problem, lane)
 
     asked = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
-    # On a plane contact is never lost, and nothing is watched for.
+    # On a plane, contact is never lost, so no event is needed.
     watched = not isinstance(roots["scene"].surface, Plane)
     ride = Simulator(lambda values: RideProblem.of(*modules(values), 1, watched), t1, settings, asked, watched)
     return LiveRun(
@@ -129,7 +130,7 @@ def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float, input:
 
 
 def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
-    """The sliders if a user names none: speed, steering angle, heading, and what friction has."""
+    """The default sliders: speed, steering angle, heading, and the parameters of friction."""
     speed, steering, heading = float(launch.speed), abs(float(launch.steering)), float(launch.heading)
     ranges = {
         "launch.speed": (min(0.0, 2.0 * speed), max(3.0, 2.0 * speed)),
@@ -145,7 +146,7 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
 
 
 class RollingRide(AbstractProblem):
-    """A ride with the angles by which its left, right and front wheel have rolled."""
+    """A ride with the rolling angles of its left, right and front wheel."""
 
     ride: RideProblem
 
@@ -174,7 +175,7 @@ class RollingRide(AbstractProblem):
 
 
 def outcome(problem: RideProblem, lane: LaneState) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """How a ride ended, a `Status`, and how far from its start [m], infinite where it is not completed."""
+    """The `Status` of a ride and the distance of its end from its start [m], infinite if the ride is not completed."""
     first, last = problem.dynamics.unpack(problem.states)[0], problem.dynamics.unpack(lane.state)[0]
     apart = [(a - b) ** 2 for a, b in zip(first, last, strict=True) if a is not None and b is not None]
     status = jnp.where(jnp.isfinite(lane.first_crossing), int(Status.CONTACT_LOST), int(Status.COMPLETED))
@@ -184,7 +185,7 @@ def outcome(problem: RideProblem, lane: LaneState) -> tuple[Int[Array, ""], Floa
 
 
 def stage(runs: list[dict[str, Any]], t1: float, controls: Any) -> Stage:
-    """The first of some scenes and launches as it is drawn, on a piece of the ground on which all of them are."""
+    """The stage of the first of some scenes and launches, on a part of the ground that contains all of them."""
     rides = [simulate(run["scene"], run["launch"], t1, run.get("input", controls), tolerance=DRAWN) for run in runs]
     (first,), length = rides[0].stages(), float(runs[0]["scene"].body.wheelbase)
     points = np.concatenate([np.asarray(ride.position) for ride in rides])
@@ -192,7 +193,7 @@ def stage(runs: list[dict[str, Any]], t1: float, controls: Any) -> Stage:
 
 
 def frame(scene: Scene, launch: Launch, controls: Input | None, problem: RollingRide, lane: LaneState) -> Frame:
-    """What is drawn of a stroller at one time, as `view.show` orders it."""
+    """The drawn quantities of a stroller at one time, in the order of `view.show`."""
     spec = RideSpec.of(Ride(scene, launch, controls, jnp.zeros(()), Settings(TOLERANCE), None))
     run = read_off(spec, lane.time, lane.state[:-3], Stats(jnp.zeros(()), jnp.zeros(()), jnp.asarray(True)))
     length, position, heading = scene.body.wheelbase, run.position[0], run.direction[0]

@@ -1,4 +1,4 @@
-"""The picture of the main job (needs matplotlib): paths on the ground, speed, energy and side forces."""
+"""The plot of the main job (needs matplotlib): paths on the ground, speed, energy and side forces."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ COLOURS = ("tab:blue", "tab:red")
 
 
 def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str], Trajectory]) -> Any:
-    """Draw rides, a row of pictures for each ground.
+    """Draw rides, one row of plots per ground.
 
     **Arguments:**
 
@@ -43,7 +43,8 @@ def draw_rides(grounds: dict[str, AbstractSurface], rides: dict[tuple[str, str],
         for panel, label in zip(panels, ("speed [m/s]", "energy [J]", "side force [N]"), strict=True):
             panel.set_xlabel("time [s]")
             panel.set_ylabel(label)
-        # Colours are told beside the path; here it is lines that need words, and above, where they hide nothing.
+        # The legend beside the path explains the colours; this one explains the line styles, above, where it hides
+        # nothing.
         panels[1].set_title("dotted: start plus work", fontsize="small")
         panels[2].set_title("full: rear axle, dashed: front wheel", fontsize="small")
     return figure
@@ -65,7 +66,7 @@ def _draw_ground(space: Any, ground: AbstractSurface, rides: dict[str, Trajector
     space.set_ylabel("y [m]")
     space.set_zlabel("z [m]")
     space.locator_params(nbins=4)
-    # A plane has hardly any height to tell.
+    # A plane has nearly no height to show.
     if np.ptp(z) < 0.1 * max(np.ptp(x), np.ptp(y)):
         space.set_zticks([])
         space.set_zlabel("")

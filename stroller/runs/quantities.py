@@ -32,7 +32,7 @@ QUANTITIES = {
 
 
 def table_of(runs: list[Any], names: list[str], request: dict[str, Any]) -> Table:
-    """Everything that is read off some runs over their times, which are the same for all.
+    """All quantities of some runs over their times, which are the same for all.
 
     **Arguments:**
 
@@ -41,7 +41,7 @@ def table_of(runs: list[Any], names: list[str], request: dict[str, Any]) -> Tabl
     - `request`: plain data that says what was computed.
     """
     flat = {isinstance(run.spec.ride.scene.surface, Plane) for run in runs}
-    # On grounds of both kinds a place has no common unit.
+    # On grounds of different kinds, a place has no common unit.
     places, unit = {True: (("x", "y"), "m"), False: (("mu", "eta"), "rad")}[flat.pop()]
     places, unit = (("first", "second"), "m or rad") if flat else (places, unit)
     coords = {"ride": np.array(names)} if names else {}
@@ -54,7 +54,7 @@ def table_of(runs: list[Any], names: list[str], request: dict[str, Any]) -> Tabl
 
 
 def table_of_one(run: Any) -> Table:
-    """Everything that is read off a run, over its times.
+    """All quantities of a run, over its times.
 
     **Raises:** `ValueError` for a batch of runs.
     """

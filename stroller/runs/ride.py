@@ -1,4 +1,4 @@
-"""Rides as problems, what made a run, and runs inside transformations."""
+"""Rides as problems, their specifications, and runs inside transformations."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -19,21 +19,22 @@ from ..model.input import Formula, Input
 from ..model.launch import Launch
 from ..model.scene import Scene
 
-#: Reduced mass, relative to its largest, below which the constraints count as having lost rank.
+#: Reduced mass, relative to its largest value, below which the constraints count as having lost rank.
 RANK_LOST = 1e-8
 
 #: The coefficient of friction [1] that no tyre exceeds on a dry road: 0.7 to 1.0 is usual, and 1.8 is that of racing slicks
 #: (Milliken and Milliken, Race Car Vehicle Dynamics (1995), chapter 2).
 MOST_GRIP = 1.8
 
-#: Pull on the ground, relative to the weight, that still counts as round-off.
+#: Largest pull on the ground, relative to the weight, that counts as round-off.
 CONTACT_ROUND_OFF = 1e-12
 
 
 class RideProblem(AbstractProblem):
     """One ride, or those of many cells.
 
-    Where `watched`, the event is that the ground would have to pull; where `guarded`, a ride ends where constraints lose rank.
+    With `watched`, the event is that the ground would have to pull; with `guarded`, a ride ends when the constraints
+    lose rank.
     """
 
     dynamics: Dynamics
@@ -46,7 +47,7 @@ class RideProblem(AbstractProblem):
 
     @classmethod
     def single(cls, scene: Scene, launch: Launch, controls: Input | None) -> "RideProblem":
-        """The problem of one ride, which goes on where contact or rank is lost."""
+        """The problem of one ride, which continues if contact or rank is lost."""
         driven = controls is not None
         press = scene.body.mass * (scene.gravity + launch.speed**2 / scene.body.wheelbase + 1e-3)
         start = (scene.state(launch, driven), scene.scales(launch, driven))
@@ -92,7 +93,8 @@ class Stats(NamedTuple):
 
 
 class Ride(NamedTuple):
-    """What is run and how: until `t1` [s]; `grid` are the ends of the steps [s] of a solver without an error estimate."""
+    """A ride and how it is integrated: until `t1` [s]; `grid`: the ends of the steps [s] of a solver without an error
+    estimate."""
 
     scene: Scene
     launch: Launch
@@ -103,24 +105,24 @@ class Ride(NamedTuple):
 
 
 class RideSpec(eqx.Module):
-    """A `Ride` as it can leave a transformation: its numbers are leaves and everything else is static."""
+    """A `Ride` that can leave a transformation: its numbers are leaves and everything else is static."""
 
     numbers: Any
     rest: Any = eqx.field(static=True)
 
     @classmethod
     def of(cls, ride: Ride) -> "RideSpec":
-        """The recipe of a ride."""
+        """The specification of a ride."""
         return cls(*eqx.partition(ride, eqx.is_array_like))
 
     @property
     def ride(self) -> Ride:
-        """What is run and how."""
+        """The ride."""
         return eqx.combine(self.numbers, self.rest)
 
 
 def as_module(controls: Input | None, scene: Scene, launch: Launch) -> Any:
-    """An input as a module, whose numbers are leaves; a function is read once, as it is called with scalars."""
+    """An input as a module whose numbers are leaves; a function is traced once, with scalar arguments."""
     if controls is None or isinstance(controls, eqx.Module):
         return controls
 

@@ -1,4 +1,4 @@
-"""Run the stroller from a launch."""
+"""Simulate a ride."""
 
 import dataclasses
 import functools
@@ -23,7 +23,7 @@ from .ride import Ride, RideSpec, as_module, traced_ride
 from .steps import followed
 from .trajectory import Trajectory, read_off
 
-#: How many times are saved if none are asked for.
+#: Default number of times to report.
 DEFAULT_TIMES = 201
 
 
@@ -39,7 +39,7 @@ def simulate(
     max_steps: int = 65536,
     adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> Trajectory:
-    """Run the stroller from a launch until `t1`.
+    """Simulate a ride from a launch until `t1`.
 
     **Arguments:**
 
@@ -48,21 +48,21 @@ def simulate(
     - `t1`: end of the run [s], positive.
     - `input`: a function `(t, motion) -> (drive force [N], steering torque [N m])` (see `input.py`), or `None`.
     - `times`: times [s] to report, increasing, within [0, t1]; by default 201 equally spaced ones.
-    - `tolerance`: relative tolerance of an adaptive solver, in [1e-14, 1e-2]; a tenth of it is the absolute tolerance, in units
-      of the scene's magnitudes.
+    - `tolerance`: relative tolerance of an adaptive solver, in [1e-14, 1e-2]; the absolute tolerance is a tenth of it,
+      in units of the scene's magnitudes.
     - `solver`: any adaptive solver of Diffrax for ordinary differential equations, or an `ImplicitMidpoint`; by default
       `diffrax.Dopri8()`, inside transformations, without `adjoint` and where every number is a scalar,
       `nonholonomic.integration.Oscillatory8()`.
-    - `max_steps`: a run that needs more has failed; at least 1.
-    - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
-      parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax differentiates, which pays if a loss
-      is differentiated by many parameters, such as the weights of an input.
+    - `max_steps`: a run that needs more steps fails; at least 1.
+    - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for
+      each parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax differentiates, which is
+      cheaper for a loss with many parameters, such as the weights of an input.
 
-    **Returns:** a `Trajectory`; its `status` says whether the run reached its end and what happened on the way.
+    **Returns:** a `Trajectory`; its `status` says whether the run reached its end, and what happened before.
 
-    **Raises:** `ValueError` for arguments out of range, a number that is a list, a launch that the scene cannot start from,
-    times that are not increasing, a solver without an error estimate, and an input that is no function, cannot be traced, or
-    is not finite at the start.
+    **Raises:** `ValueError` for arguments out of range, a number that is a list, a launch that the scene cannot start
+    from, times that do not increase, a solver without an error estimate, and an input that is not a function, cannot be
+    traced, or is not finite at the start.
 
     **Example:**
 
@@ -86,7 +86,7 @@ def simulate(
         grid = even_steps(times, end, solver.step_length)
         max_steps = grid.size
     settings = Settings(tolerance, solver, max_steps=max_steps)
-    # Inside a transformation numbers become its own here, even if all are known.
+    # Inside a transformation, this traces all numbers, even if they are known.
     ride = Ride(scene, launch, as_module(input, scene, launch), jnp.add(end, 0.0), settings, grid)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((ride, times))):
         return _legal_or_nan(ride, times, adjoint)
@@ -102,7 +102,7 @@ def _concrete(ride: Ride, times: Float[Array, " times"]) -> Trajectory:
     return dataclasses.replace(_read_off(spec, times, steps.at(spec, np.asarray(times)), stats), steps=steps)
 
 
-# Compiled functions take NumPy's arrays too.
+# Compiled functions also accept NumPy arrays.
 _read_off: Callable[..., Trajectory] = eqx.filter_jit(read_off)
 
 # Steps of other implicit solvers cannot be repeated cheaply, so they end on the times.
@@ -112,14 +112,14 @@ _sampled = eqx.filter_jit(functools.partial(traced_ride, adjoint=None))
 # Compiled as a whole even under a bare `vmap` or `grad`, which would otherwise dispatch each operation.
 @eqx.filter_jit
 def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.AbstractAdjoint | None) -> Trajectory:
-    """The run, or NaN and `finished` false where a traced number is out of range."""
+    """The run, or NaN and `finished` false if a traced number is out of range."""
     starts = ride.scene.may_start(ride.launch, ride.input)
     may, t1, tolerance = legal_run(starts, ride.t1, ride.settings.tolerance, times)
     begun, run_times = ride._replace(settings=ride.settings.with_tolerance(tolerance)), times
     if ride.grid is None:
         begun, run_times = begun._replace(t1=t1), jnp.where(may, times, 0.0)
     if adjoint is not None:
-        # Diffrax would differentiate the run that is not begun.
+        # Diffrax would differentiate a run that never begins.
         begun = begun._replace(**nan_unless(may, {"scene": ride.scene, "launch": ride.launch, "input": ride.input}))
     run = read_off(RideSpec.of(ride), run_times, *traced_ride(begun, run_times, adjoint))
     stats = run.stats._replace(finished=run.stats.finished & may)
@@ -127,16 +127,16 @@ def _legal_or_nan(ride: Ride, times: Float[Array, " times"], adjoint: diffrax.Ab
 
 
 def _evenly_spaced(t1: Float[Array, ""]) -> Float[Array, " times"]:
-    """The times of output if none are asked for; known inside a transformation if `t1` is."""
+    """The default times of output; known inside a transformation if `t1` is known."""
     return jnp.linspace(0.0, t1, DEFAULT_TIMES) if is_traced(t1) else as_known(np.linspace(0.0, t1, DEFAULT_TIMES))
 
 
 def even_steps(
     times: Float[Array, " times"], t1: Float[Array, ""], longest: Float[Array, ""]
 ) -> Float[Array, " steps"]:
-    """Times from 0 to `t1` at most `longest` apart that fall on every one of `times`, evenly between them.
+    """Times from 0 to `t1`, at most `longest` apart, that include all `times` and are evenly spaced between them.
 
-    **Raises:** `ValueError` if one of the three is traced: how many steps there are is part of the program.
+    **Raises:** `ValueError` if one of the three is traced: the number of steps is part of the program.
     """
     for name, number in {"t1": t1, "times": times, "step_length": longest}.items():
         if is_traced(number):

@@ -1,6 +1,6 @@
 """The steps of a run, and the states between them, found by repeating a step with another length.
 
-So a state has the accuracy of the integration and not that of an interpolation. Only the field is compiled; the stages of
+A state therefore has the accuracy of the integration, not of an interpolant. Only the field is compiled; the stages of
 the steps are summed in NumPy.
 """
 
@@ -22,18 +22,18 @@ from .ride import RideProblem, RideSpec, Stats
 Lanes = Float[np.ndarray, " lanes"]
 States = Float[np.ndarray, "components lanes"]
 
-#: How many states a compiled function is given at once, so that it is compiled once.
+#: Number of states in a call of a compiled function, always the same, so that it is compiled once.
 WIDTH = 256
 
 
 class Steps(NamedTuple):
-    """Where the steps of a run ended: times [s], the first of them 0, and states."""
+    """The ends of a run's steps: times [s], beginning with 0, and states."""
 
     times: Float[np.ndarray, " steps"]
     states: Float[np.ndarray, "components steps"]
 
     def at(self, spec: RideSpec, times: Lanes) -> States:
-        """The states at the given times [s]; not a number after the end of the run."""
+        """The states at the given times [s]; NaN after the end of the run."""
         which = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         ends = np.where(times == self.times[which], which, which + 1)
         states = self.states[:, ends]
@@ -44,7 +44,7 @@ class Steps(NamedTuple):
         return states
 
     def _between(self, spec: RideSpec, which: Any, length: Lanes) -> States:
-        """The states some time [s] after the starts of some steps."""
+        """The states at given times [s] after the starts of some steps."""
 
         def field(times: Lanes, states: States) -> States:
             return in_blocks(lambda *at: _field(spec, *at), times, states)
@@ -52,7 +52,7 @@ class Steps(NamedTuple):
         time, start, solver = self.times[which], self.states[:, which], spec.ride.settings.for_steps_alone
         rates = [field(time, start)]
         if not isinstance(solver, diffrax.AbstractERK):
-            # The cubic through states and rates at both ends; an implicit step cannot be repeated so cheaply.
+            # Use the cubic through states and rates at both ends; repeating an implicit step would be expensive.
             whole, end = self.times[which + 1] - time, self.states[:, which + 1]
             part, change = length / whole, end - start
             last = field(time + whole, end)
@@ -96,7 +96,8 @@ def followed(spec: RideSpec) -> tuple[Steps, Stats]:
 
 
 def _counted(accepted: int, rejected: int, finished: bool) -> Stats:
-    """Statistics as arrays: as plain numbers they would be constants of a program, and other numbers another program."""
+    """Statistics as arrays: plain numbers would be constants of a program, and other values would compile another
+    program."""
     return Stats(jnp.asarray(accepted), jnp.asarray(rejected), jnp.asarray(finished))
 
 

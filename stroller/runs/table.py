@@ -1,4 +1,4 @@
-"""Many rides in one batched call: every combination of some parameters of scene, launch and input."""
+"""Many rides in one batched call, for every combination of some parameters of scene, launch and input."""
 
 import dataclasses
 from concurrent.futures import Executor
@@ -26,7 +26,7 @@ from ..model.stroller import Stroller
 from .checks import check_run
 from .ride import RideProblem, as_module
 
-#: What the numbers of a place in the fixed frame are called.
+#: Names of the coordinates of a place in the fixed frame.
 FIXED = (("x", "m"), ("y", "m"), ("z", "m"))
 
 WORDS = ("completed", "contact_lost", "rank_lost", "failed")
@@ -50,7 +50,7 @@ VARIABLES = {
 UNITS = Stroller.units | Scene.units | Damping.units | RollingResistance.units | Steady.units | Launch.units
 UNITS |= {"tilt": "rad", "radius": "m", "equatorial": "m", "polar": "m", "ring": "m", "tube": "m", "p": "m"}
 
-#: What the axes are, in words.
+#: Descriptions of the axes.
 LONG_NAMES = {"steering_inertia": "inertia of the fork", "steering_spring": "spring of the fork"}
 LONG_NAMES |= {
     "steering": "steering angle φ(0)",
@@ -90,24 +90,24 @@ def sweep(
 
     - `scene`, `launch`, `input`: as for `simulate`, every number a scalar.
     - `t1`: end of every ride [s].
-    - `axes`: full name of a parameter, or the end of it that means one only -> values, such as
-      `{"launch.speed": [1.0, 2.0], "polar": [0.8, 0.9]}`; the parts of the place are `"launch.place[0]"` and
-      `"launch.place[1]"`, the parameters of an input that is a module are under `"input."`. The first axis varies slowest;
-      without any, `{}`, the table has a single ride.
+    - `axes`: full name of a parameter, or its unambiguous end -> values, such as `{"launch.speed": [1.0, 2.0], "polar":
+      [0.8, 0.9]}`; the parts of the place are `"launch.place[0]"` and `"launch.place[1]"`, the parameters of an input
+      that is a module are under `"input."`. The first axis varies slowest; without any, `{}`, the table has a single
+      ride.
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`.
-    - `path`: HDF5 file to write, chunk by chunk. A run that was interrupted resumes from it.
-    - `progress`: whether to show it, on a terminal or in a notebook.
-    - `executor`: who computes: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a
-      Dask client, to which blocks are handed as its workers become free; by default a thread for each core. The numbers
-      are the same, to the bit on the same kind of processor.
-    - `max_steps`: a ride that needs more steps, rejected ones included, has failed; at least 1.
+    - `path`: HDF5 file to write, chunk by chunk. The same call resumes an interrupted table from it.
+    - `progress`: whether to show progress, on a terminal or in a notebook.
+    - `executor`: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a Dask client;
+      it gets chunks as its workers become free. By default a thread for each core. The results are bitwise equal on the
+      same kind of processor.
+    - `max_steps`: a ride that needs more steps, including rejected ones, fails; at least 1.
 
     **Returns:** a `Table` of the rides' ends: position `x`, `y`, `z` [m] in the fixed frame, `heading`, `end_steering`
-    [rad], `end_speed` [m/s], `energy` [J], `residual` [J] of energy against work, `contact_time` [s] at which the ground
-    first had to pull (infinite if never; the ride goes on), `end_time` [s], `status` ("completed", "contact_lost",
-    "rank_lost" where a projected heading ended the ride, "failed"), `steps` and `rejected`.
+    [rad], `end_speed` [m/s], `energy` [J], `residual` [J] of energy against work, `contact_time` [s] at which the
+    ground first had to pull (infinite if never; the ride continues), `end_time` [s], `status` ("completed",
+    "contact_lost", "rank_lost" if a projected heading ended the ride, "failed"), `steps` and `rejected`.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
     `RuntimeError` for an executor that breaks down, or a worker with other versions.
@@ -152,7 +152,7 @@ def sweep(
 
 
 def variable_numbers(roots: dict[str, Any]) -> list[str]:
-    """The full names of what can be varied: single numbers, those that are left out for 0 among them."""
+    """The full names of the parameters that can be varied: single numbers, including omitted ones, which are 0."""
     values_by_name = {name: value for root, tree in roots.items() for name, value in numbers(root, tree).items()}
     level = isinstance(roots["scene"].surface, Plane)
     return [
@@ -161,9 +161,9 @@ def variable_numbers(roots: dict[str, Any]) -> list[str]:
 
 
 class RideJob(NamedTuple):
-    """What is asked of every cell, as data that can be sent to another process; see `sweep`.
+    """The computation for every cell, as data that can be sent to another process; see `sweep`.
 
-    `controls`: the input as a module, which each process makes for itself.
+    `controls`: the input as a module, which each process creates.
     """
 
     roots: dict[str, Any]
@@ -191,13 +191,13 @@ class RideJob(NamedTuple):
         return RideJob.of, tuple(self[:-1])
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
-        """The variables of some cells, of which the first `count` are to be run."""
+        """The variables of some cells, of which only the first `count` are run."""
         cells = with_numbers(self.roots, columns)
         size = next((len(values) for values in columns.values()), 1)
         controls = cells.get("input", self.controls)
         problem = RideProblem.of(cells["scene"], cells["launch"], controls, size, watched=True)
         horizon, settings = as_number(self.t1), Settings(self.tolerance, self.solver, max_steps=self.max_steps)
-        # A ride goes on where contact is lost, as if the ground could pull.
+        # A ride continues if contact is lost, as if the ground could pull.
         outcome, _ = solve_ensemble(problem, horizon, jnp.asarray(count), settings, nonterminal=problem.watched)
         contact_time = np.asarray(outcome.first_crossing)
         lost = np.isfinite(contact_time)
@@ -214,7 +214,7 @@ class RideJob(NamedTuple):
 
 @eqx.filter_jit
 def read_ends(scene: Scene, states: State, starts: State) -> dict[str, Float[Array, " cells"]]:
-    """What the table shows of the states at the ends of the rides, given those at their starts."""
+    """The variables of the table from the states at the ends of the rides and at their starts."""
     dynamics, surface = scene.dynamics, scene.surface
     states = dynamics.righted(states)
     motion = dynamics.geometry(states).motion
@@ -236,7 +236,7 @@ def place_numbers(launch: Launch) -> list[str]:
 
 
 def named_axes(axes: dict[str, Any], surface: AbstractSurface, launch: Launch) -> list[Axis]:
-    """The axes of the table, each under the last part of its full name, or the last two where that is not enough.
+    """The axes of the table, each named by the last part of its full name, or the last two if that is ambiguous.
 
     The numbers of a place are named as the surface names them, with a zero: `x0`.
     """
@@ -257,7 +257,7 @@ def named_axes(axes: dict[str, Any], surface: AbstractSurface, launch: Launch) -
 
 
 def described(controls: Any) -> Any:
-    """An input as plain data; a function has nothing but its name to show."""
+    """An input as plain data; a function is described by its name alone."""
     if isinstance(controls, eqx.Module):
         return description("input", controls)
     return getattr(controls, "__qualname__", repr(controls))

@@ -1,4 +1,4 @@
-"""One run of the stroller, and what can be read off it."""
+"""One run of the stroller and its quantities."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -38,9 +38,9 @@ class Trajectory(Viewable, Tabular, eqx.Module):
     - `side_force` [N] of the ground on the rear axle and the front wheel, to the left of each, (times, 2);
     - `normal_force` [N] of the ground, and `load` [N] on the rear and the front axle, (times, 2);
     - `constraint` [m/s]: speed at which the rear axle and the front wheel slip sideways, (times, 2);
-    - `departure`: how far the position is off the ground [m]: an error of the integration;
-    - `stats` of the integration; `spec`: what made the run; `steps`: where its steps ended, `None` if it was made inside a
-      transformation: what happened between the times is then found by running it once more, when it is asked for.
+    - `departure`: distance of the position from the ground [m], an integration error;
+    - `stats` of the integration; `spec`: the specification of the run; `steps`: the ends of its steps, `None` for a run
+      inside a transformation, which is repeated when you ask for events between the times.
 
     **Example:**
 
@@ -94,7 +94,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
 
     @property
     def wheelbase_error(self) -> Float[Array, " times"]:
-        """Relative error |K| l^2 / 6 of taking the ground for its tangent plane as far as the wheelbase l reaches.
+        """Relative error |K| l^2 / 6 of replacing the ground by its tangent plane over the wheelbase l.
 
         K is the Gaussian curvature (`stroller.md`, section 9). The model holds for a wheelbase short against the radii of
         curvature.
@@ -105,22 +105,23 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         return jnp.abs(spread(curvature, states[0])) * scene.body.wheelbase**2 / 6.0
 
     def grip(self) -> Float[Array, "times 2"]:
-        """Coefficient of friction that each axle needs in order not to slip; infinite for a force without a load."""
+        """Coefficient of friction that each axle needs so as not to slip; infinite for a force without a load."""
         force = jnp.abs(self.side_force)
         return jnp.where(force == 0.0, 0.0, force / jnp.maximum(self.load, 0.0))
 
     @property
     def loaded_axles(self) -> tuple[str, ...]:
-        """The axles that carry a load: the rear one alone where the centre of mass is on it (`centre` 0)."""
+        """The axles that carry a load: only the rear one if the centre of mass is above it (`centre` 0)."""
         return ("rear",) if self.spec.ride.scene.body.centre is None else ("rear", "front")
 
     def grip_margin(self, coefficient: Float[Array, ""]) -> Float[Array, "times 2"]:
-        """Side force [N] that each axle has left before it slips, given a coefficient of friction [1]."""
+        """Reserve of side force [N] of each axle before it slips, for a given coefficient of friction [1]."""
         return coefficient * jnp.maximum(self.load, 0.0) - jnp.abs(self.side_force)
 
     @property
     def _grip_line(self) -> str:
-        """The greatest friction that each axle needs, and what slips if that is more than any tyre gives."""
+        """The greatest friction coefficient that each axle needs, and the axle that slips if tyres cannot provide
+        it."""
         needs = dict(zip(self.loaded_axles, np.max(np.asarray(self.grip()), axis=0), strict=False))
         text = ", ".join(f"{name} axle {most:.3g}" for name, most in needs.items())
         slips = " and ".join(name for name, most in needs.items() if most > MOST_GRIP)
@@ -142,7 +143,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
 
     @property
     def rank_lost_at(self) -> float:
-        """Time [s] at which the constraints first lose rank, as only a projected heading can; otherwise infinite."""
+        """Time [s] at which the constraints first lose rank (only with a projected heading); otherwise infinite."""
         return self.with_steps()._first_below("rank", RANK_LOST)
 
     @property
@@ -153,7 +154,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         return crossings(self.spec, steps, "steering_cosine", 0.0)
 
     def _first_below(self, name: str, level: float) -> float:
-        """Time [s] at which a watched quantity first is below a level; infinite if it never is."""
+        """Time [s] at which a watched quantity is first below a level; infinite if it never is."""
         assert self.steps is not None
         if watched(self.spec, self.steps.states[:, :1], name)[0] < level:
             return float(self.steps.times[0])
@@ -161,9 +162,9 @@ class Trajectory(Viewable, Tabular, eqx.Module):
 
     @property
     def status(self) -> str:
-        """`failed`, `rank_lost`, `contact_lost` or `completed`: the first of these words that holds.
+        """The first of the words `failed`, `rank_lost`, `contact_lost` and `completed` that applies.
 
-        After `contact_lost` the run goes on as if the ground could pull.
+        After `contact_lost`, the run continues as if the ground could pull.
         """
         if not (bool(self.stats.finished) and np.all(np.isfinite(self.state))):
             return "failed"
@@ -181,7 +182,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
 
     @status_line("reading off")
     def __str__(self) -> str:
-        # A batch, or a run inside a transformation, has no numbers to show.
+        # A batch, or a run inside a transformation, has no single values to show.
         if is_traced(self.t) or self.t.ndim > 1:
             return f"Trajectory of {self.t.shape} times"
         self = self.with_steps()
@@ -238,7 +239,7 @@ def side_slip(scene: Scene, rate: State, state: State) -> tuple[Float[Array, "..
 
 
 def spread(component: Component, like: Float[Array, "..."]) -> Float[Array, "..."]:
-    """A component as an array, zeros where it vanishes identically."""
+    """A component as an array, with zeros if it vanishes identically."""
     return jnp.zeros_like(like) if component is None else jnp.broadcast_to(component, like.shape)
 
 

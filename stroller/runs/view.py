@@ -1,4 +1,4 @@
-"""A ride as it is drawn: the vehicle with its wheels, the traces of its wheels, forces, and curves over time."""
+"""The drawing of a ride: the vehicle, the traces of its wheels, forces, and curves over time."""
 
 from typing import Any
 
@@ -29,26 +29,26 @@ from nonholonomic.views import (
 from ..model.scene import DRIVES
 from .ride import MOST_GRIP
 
-#: Lengths in units of the wheelbase, which is all that the model knows: radius and width of the wheels, and the track.
+#: Drawn lengths in units of the wheelbase, the only length of the model: radius and width of the wheels, and the track.
 RADIUS, WIDTH, TRACK = 0.2, 0.07, 0.8
 
-#: How large it counts to the camera, in units of the wheelbase.
+#: Size of the vehicle for the camera, in units of the wheelbase.
 SIZE = 0.65
 
-#: Most radians by which a wheel rolls from one frame to the next.
+#: Greatest angle [rad] by which a wheel rolls from frame to frame.
 ROLL_PER_FRAME = 0.5
 
-#: Length of the arrow of a force as great as the weight, in units of the wheelbase.
+#: Length of the arrow of a force equal to the weight, in units of the wheelbase.
 WEIGHT = 1.0
 
-#: The most that is drawn of the coefficient of friction that the tyres need: it is infinite where the load vanishes.
+#: Upper limit for drawing the coefficient of friction that the tyres need, which is infinite where the load vanishes.
 DRAWN_GRIP = 3.0
 
 GREEN, BLUE, VIOLET, GOLD = 0x1F8A4C, 0x1B6CA8, 0x7B4FA3, 0xE0A100
 
 
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
-    """Rides as they are drawn: a stage for each, or one for all if they are to be overlaid."""
+    """Rides as stages: one stage for each, or a common one for overlaid rides."""
     for run in runs:
         require_one_run(run, "a picture", ", and hand the others over as others=")
     rides = [run.spec.ride for run in runs]
@@ -58,7 +58,7 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
 
 
 def grouped(groups: list[list[tuple[int, Any]]], names: list[str]) -> list[Stage]:
-    """A stage for each group of rides, which are numbered and have one ground; `names` are those of the rides."""
+    """A stage for each group of numbered rides on a common ground; `names` are those of the rides."""
     stages = []
     for group in groups:
         scene = group[0][1].spec.ride.scene
@@ -80,7 +80,7 @@ def normals(surface: AbstractSurface, side: str | None, position: np.ndarray) ->
 
 
 def show(run: Any, number: int, name: str) -> Show:
-    """One ride as it is drawn, the `number`-th of all."""
+    """The drawing of one ride, the `number`-th of all."""
     scene = run.spec.ride.scene
     length, colour = float(scene.body.wheelbase), COLOURS[number % len(COLOURS)]
     radius, half = RADIUS * length, TRACK * length / 2.0
@@ -123,7 +123,7 @@ def show(run: Any, number: int, name: str) -> Show:
             Trace("path of the front wheel", contacts[1], BLUE, 0.025 * length),
         ),
         (
-            # Above the axle the basket would hide it.
+            # Above the axle, the basket would hide it.
             Arrow("normal force", axle - 1.4 * half * y, push, "N", scale, VIOLET, 0.035 * length),
             Arrow("side force, rear", contacts[0], forces[:, :1] * y, "N", scale, GOLD, 0.035 * length, 2.0 * length),
             Arrow(
@@ -142,7 +142,7 @@ def show(run: Any, number: int, name: str) -> Show:
 
 
 def grip_warning(run: Any) -> str:
-    """What to say of a ride that needs more grip than tyres give; nothing of others."""
+    """A warning for a ride that needs more grip than tyres provide; empty for others."""
     needed = float(np.max(np.asarray(run.grip())[:, : len(run.loaded_axles)]))
     return (
         f"needs friction {needed:.2g}, more than any tyre gives: a real stroller would slip"
@@ -152,7 +152,8 @@ def grip_warning(run: Any) -> str:
 
 
 def refined(run: Any, radius: float) -> tuple[np.ndarray, Any]:
-    """Times between which wheels roll little, those of the ride among them, and how its numbers are read there."""
+    """Times between which wheels roll little, including those of the ride, and a function that reads the ride's numbers
+    there."""
     times = np.asarray(run.t)
     if len(times) < 4:
         return times, np.asarray
@@ -189,7 +190,7 @@ def _turning(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _rolling(x: np.ndarray, y: np.ndarray, z: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Turned about y by an angle, forwards."""
+    """A rotation about y by an angle, forwards."""
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
     return _turning(cosine * x - sine * z, y, sine * x + cosine * z)
 

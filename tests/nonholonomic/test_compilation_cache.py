@@ -15,7 +15,7 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from nonholonomic import enable_compilation_cache
-from nonholonomic.compilation_cache import LOOKED_AT, environment_name
+from nonholonomic.compilation_cache import LOOKED_AT, environment_name, kept_text
 
 pytestmark = pytest.mark.newest
 
@@ -175,3 +175,18 @@ def test_a_folder_that_was_chosen_before_stands(unset, tmp_path, caplog):
     assert not caplog.records
     # With JAX's limits.
     assert jax.config.jax_persistent_cache_min_compile_time_secs == 0.7
+
+
+def test_a_text_is_kept_until_its_facts_change(tmp_path):
+    calls = []
+
+    def compute() -> str:
+        calls.append(1)
+        return f"text {len(calls)}"
+
+    assert [kept_text(tmp_path, facts, compute) for facts in ("a", "a", "b")] == ["text 1", "text 1", "text 2"]
+    # A damaged file is written anew.
+    for path in tmp_path.iterdir():
+        path.write_bytes(b"half")
+    assert kept_text(tmp_path, "a", compute) == kept_text(tmp_path, "a", compute) == "text 3"
+    assert kept_text(None, "a", compute) == "text 4"

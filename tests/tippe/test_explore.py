@@ -9,7 +9,7 @@ from browser import complaints, needs_browser, open_browser, wait
 from tops import rutstam_top
 
 import tippe
-from nonholonomic.views.explore import programs, sliders_of
+from nonholonomic.views.explore import programs
 from tippe.runs.explore import TOLERANCE, live_run
 
 pytestmark = needs_browser
@@ -66,8 +66,7 @@ def table_of(scene: tippe.Scene, launch: tippe.Launch, grid: dict[str, np.ndarra
 )
 def test_the_browser_says_what_the_table_says(browser, arena, law):
     scene, launch, grid = launches_of(arena, law, CASES.index((arena, law)))
-    roots = {"scene": scene, "launch": launch}
-    live = live_run(roots, sliders_of(RANGES, roots, {}, {}), HORIZONS[law])
+    live = live_run(scene, launch, RANGES, HORIZONS[law])
     table = table_of(scene, launch, grid, HORIZONS[law])
     theta, mu, spin = (values.ravel() for values in np.meshgrid(grid["theta"], grid["mu"], grid["spin"], indexing="ij"))
     runs = json.dumps(np.stack([theta, spin, mu], axis=-1).tolist())
@@ -183,6 +182,25 @@ def test_the_map_fills_and_a_click_sets_the_sliders(browser, page, rutstam_scene
     assert 150.0 < spin < 200.0
 
 
+CONTROLS = """
+return [...document.querySelectorAll('#explore button, #explore input, #explore select, #map canvas, #controls button')]
+  .map((one) => { one.scrollIntoView({ block: 'center' }); const box = one.getBoundingClientRect();
+    return one === document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2); })
+"""
+
+
+def test_a_phone_in_portrait_shows_all_controls(browser, page):
+    screen = {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    try:
+        assert browser.execute_script("return document.documentElement.scrollWidth <= innerWidth")
+        uncovered = browser.execute_script(CONTROLS)
+        assert len(uncovered) > 6
+        assert all(uncovered)
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
 def test_keys_play_and_reset(browser, page):
     from selenium.webdriver.common.keys import Keys
 
@@ -201,8 +219,7 @@ def test_keys_play_and_reset(browser, page):
 
 
 def test_numbers_that_do_not_fit_together_are_refused_in_the_page(browser, rutstam_scene):
-    roots = {"scene": rutstam_scene, "launch": tippe.Launch(0.1, 155.0)}
-    live = live_run(roots, sliders_of({"theta": (0.05, 0.5)}, roots, {}, {}), 7.0)
+    live = live_run(rutstam_scene, tippe.Launch(0.1, 155.0), {"theta": (0.05, 0.5)}, 7.0)
     browser.get("about:blank")
     script = f"{programs(live)} return [[0.3], [-0.3], [4.0]].map((values) => Boolean(live.allowed(values, [])[0]))"
     assert browser.execute_script(script) == [True, False, False]
@@ -225,12 +242,69 @@ def test_what_is_no_slider_is_refused(rutstam_scene, change, message):
         tippe.explore(rutstam_scene, tippe.Launch(0.1, 155.0), **change)
 
 
-def test_runs_with_modes_are_refused():
+def test_flights_of_curved_arenas_and_sticking_are_refused(rutstam_scene):
     launch = tippe.Launch(0.1, 155.0)
-    with pytest.raises(ValueError, match="contact = 'hybrid' must be 'stop' for explore"):
-        tippe.explore(tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), contact="hybrid"), launch)
+    with pytest.raises(ValueError, match="contact = 'hybrid' must be 'stop' for explore on a Cylinder"):
+        tippe.explore(tippe.presets.classroom(tippe.Cylinder(0.3)), launch)
     with pytest.raises(ValueError, match="SetValuedCoulomb must be a law without modes"):
         tippe.explore(tippe.Scene(rutstam_top(), friction=tippe.SetValuedCoulomb(0.3)), launch)
+    with pytest.raises(ValueError, match="offset changes what is drawn"):
+        tippe.explore(tippe.presets.classroom(), launch, sliders={"body.offset": (0.001, 0.002)})
+
+
+def test_in_the_browser_the_wooden_top_hops_and_climbs_onto_its_stem(browser):
+    """As `simulate` has it: through flights, impacts and changes of contact, to the end on its stem."""
+    scene, launch = tippe.presets.classroom(), tippe.Launch.degrees(theta=6, rpm=1900)
+    live, times = live_run(scene, launch, None, 4.0), np.array([0.0, 0.5, 2.6, 2.78, 2.85, 4.0])
+    run = tippe.simulate(scene, launch, 4.0, tolerance=1e-10)
+    browser.get("about:blank")
+    (status, time), end, hops, rows = browser.execute_script(
+        f"""{programs(live)}
+        const values = live.facts.sliders.map((slider) => slider.value), asks = integrator(live.answer);
+        const moves = integrator(live.motion);
+        asks.run(values);
+        const outcome = asks.read("outcome", values), run = moves.trajectory(values, "frame");
+        return [outcome, run.end, moves.run(values)[live.motion.runs.counts],
+          run.read({times.tolist()}).map((row) => [...row])]"""
+    )
+    assert (tippe.Status(status).word, end) == ("inverted", 4.0)
+    assert time == pytest.approx(run.inversion_time, rel=CLOSE)
+    assert hops == len(run.hops) >= 3
+    there, rows = run.at(times), np.array(rows)
+    np.testing.assert_allclose(rows[:, 3:6], there.position, atol=CLOSE)
+    theta, energy, _, force = rows[:, -5:-1].T
+    np.testing.assert_allclose(theta, there.theta, atol=5e-6)
+    np.testing.assert_allclose(energy, there.energy, rtol=CLOSE)
+    np.testing.assert_allclose(force, there.normal_force, atol=1e-5 * float(there.normal_force[0]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["wooden", "bouncing"])
+def test_the_browser_flies_as_the_table_does(browser, kind):
+    if kind == "wooden":
+        scene, launch, mu = tippe.presets.classroom(), tippe.Launch(0.1, 199.0), (0.05, 0.8)
+    else:
+        scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3), contact="hybrid", restitution=0.6)
+        launch, mu = tippe.Launch(0.1, 199.0), (0.1, 1.0)
+    ranges = {"theta": (0.03, 0.6), "spin": (100.0, 280.0), "mu": mu}
+    rng, counts = np.random.default_rng(3), {"theta": 5, "spin": 5, "mu": 2}
+    grid = {name: np.sort(rng.uniform(*ends, counts[name])) for name, ends in ranges.items()}
+    table = table_of(scene, launch, grid, 5.0)
+    theta, mu, spin = (values.ravel() for values in np.meshgrid(grid["theta"], grid["mu"], grid["spin"], indexing="ij"))
+    runs = json.dumps(np.stack([theta, spin, mu], axis=-1).tolist())
+    browser.get("about:blank")
+    script = f"""{programs(live_run(scene, launch, ranges, 5.0))}
+        const asks = integrator(live.answer), at = live.answer.runs, text = (x) => Number.isFinite(x) ? x : String(x);
+        return {runs}.map((values) => {{
+          const runs = asks.run(values);
+          return [...asks.read("outcome", values), runs[at.end_time], runs[at.counts]].map(text);
+        }})"""
+    status, time, end, hops = np.array(browser.execute_script(script), dtype=float).T
+    assert [tippe.Status(int(code)).word for code in status] == list(np.ravel(table.status))
+    np.testing.assert_allclose(time, np.ravel(table.time), rtol=CLOSE)
+    np.testing.assert_allclose(end, np.ravel(table.end_time), rtol=CLOSE)
+    assert np.max(hops) > 10
+    assert len(set(status)) > 1
 
 
 @pytest.mark.slow

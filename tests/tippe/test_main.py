@@ -1,5 +1,6 @@
 """`python -m tippe`, and `python -m tippe --paper`."""
 
+import dataclasses
 import json
 
 import jax
@@ -11,6 +12,7 @@ import tippe
 from tippe import __main__ as job
 from tippe.__main__ import main
 from tippe.papers.tables import drawn, parser
+from tippe.runs.theta_over_time import theta_over_time
 
 SMALL = ["--paper", "--theta", "0.1", "0.3", "--eta", "0", "--t1", "12", "--tolerance", "1e-7"]
 
@@ -40,8 +42,11 @@ def test_the_papers_tables_are_printed_written_and_drawn(tmp_path, capsys):
 
 
 def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rutstam_scene):
-    """Its own scenes fly and change to the stem; these have programs that other tests compile, too."""
-    monkeypatch.setattr(job, "scenes", lambda options: {"plane": rutstam_scene, "cylinder": rutstam_scene})
+    """Its own top has a stem and a cylinder; these scenes have smaller programs, which other tests compile, too."""
+    flying = dataclasses.replace(rutstam_scene, contact="hybrid")
+    monkeypatch.setattr(job, "scenes", lambda options: {"plane": flying, "cylinder": flying})
+    # A page that is kept would be that of other scenes.
+    monkeypatch.setenv("NONHOLONOMIC_CACHE", "0")
     arguments = ["--theta", "6", "18", "--mu", "0.2", "0.3", "--rpm", "1480", "--t1", "8", "--out", str(tmp_path)]
     assert main(arguments) == 0
     printed = capsys.readouterr().out
@@ -59,7 +64,8 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rut
         assert data["time"].dims == ("theta", "mu")
     page = (tmp_path / "index.html").read_text()
     assert "<td>18 deg</td>" in page
-    assert 'id="floats"' in page
+    assert "window.live" in page
+    assert "A tippe top climbs onto its stem" in page
     assert "data:image/png" in page
 
 
@@ -71,6 +77,15 @@ def test_the_wooden_top_turns_over_in_four_fifths_of_the_launches(tmp_path, caps
         table = tippe.Table.load(tmp_path / f"{arena}.h5")
         assert np.mean(table.status == "inverted") >= 0.8
     assert "nan" not in capsys.readouterr().out
+
+
+def test_theta_over_time_is_that_of_the_run(rutstam_scene):
+    """In contact and in flight; each time is a run of its own, and more times than one block of a table has."""
+    scene, launch = dataclasses.replace(rutstam_scene, contact="hybrid"), tippe.Launch.degrees(18, 1480)
+    times = np.linspace(0.0, 8.0, 70)
+    theta = theta_over_time(scene, launch, times, 1e-9, ("launch.theta", "scene.friction.mu"))
+    run = tippe.simulate(rutstam_scene, launch, 8.0, times=times)
+    np.testing.assert_allclose(theta, run.theta, atol=1e-6)
 
 
 def test_picture_and_page_share_their_programs(caplog):

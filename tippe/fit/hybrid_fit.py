@@ -1,4 +1,4 @@
-"""Predictions for fits of runs with several modes, by whose differences they are fitted: outside of transformations."""
+"""Predictions for fits of runs with several modes, which use differences and run outside transformations."""
 
 from typing import Any, NamedTuple
 
@@ -18,10 +18,10 @@ from .recording import Recording
 
 
 class HybridModel(NamedTuple):
-    """Predictions of all data of a scene with flights, impacts, stick and slip, as `SceneModel` gives them for one without.
+    """Predictions of all data of a scene with flights, impacts, stick and slip, like `SceneModel` for smooth scenes.
 
-    Times are computed as in tables, in one ensemble; recordings are simulated one by one. Parameters that the scene refuses
-    have no predictions.
+    Times are computed as in tables, in one ensemble; recordings are simulated one by one. Parameters that are illegal
+    in the scene have no predictions.
     """
 
     scene: Scene
@@ -29,7 +29,7 @@ class HybridModel(NamedTuple):
     seen: Float[np.ndarray, " n"]
     tolerance: float
 
-    #: It runs mode by mode, and cannot be traced.
+    #: The model runs mode by mode and cannot be traced.
     on_host = True
 
     def __call__(self, parameters: dict[str, Any]) -> Float[np.ndarray, "rows n"]:
@@ -43,7 +43,8 @@ class HybridModel(NamedTuple):
         data, predictions = self.data[k], np.full((len(rows), self.data[k].size), np.nan)
         allowed = [i for i, row in enumerate(rows) if self._allows(data, row)]
         if allowed and isinstance(data, InversionTimes):
-            # Others are run in their place, so that every call has the same number of cells and is compiled once.
+            # Legal rows run in the place of illegal ones, so that every call has the same number of cells and is
+            # compiled once.
             every = [rows[i] if i in allowed else rows[allowed[0]] for i in range(len(rows))]
             predictions[allowed] = self._times(data, every)[allowed]
         elif allowed:
@@ -63,7 +64,7 @@ class HybridModel(NamedTuple):
         return with_numbers({"scene": self.scene, "launch": data.launch}, own)
 
     def _times(self, data: InversionTimes, rows: list[dict[str, float]]) -> Float[np.ndarray, "rows launches"]:
-        """Times as `extended_inversion_time` gives them."""
+        """Times continued beyond the horizon, as by `extended_inversion_time`."""
         launches = data.size
         of_launch = {name: value for name, value in numbers("launch", data.launch).items() if value is not None}
         columns = {
@@ -82,7 +83,7 @@ class HybridModel(NamedTuple):
         return np.where(failed, np.nan, time).reshape(len(rows), launches)
 
     def _samples(self, data: Recording, row: dict[str, float]) -> Float[np.ndarray, " size"]:
-        """The samples of one run, those before the launch as at the launch, NaN after its end."""
+        """The samples of one run; before the launch those at the launch, after its end NaN."""
         roots = self._roots(data, row)
         since = np.maximum(np.asarray(data.times) - row.get("t0", float(data.t0)), 0.0)
         at, where = np.unique(since, return_inverse=True)

@@ -1,4 +1,4 @@
-"""Parameters of a top, its arena and its launches from inversion times and from recorded motion."""
+"""Estimate parameters of a top, its arena and its launches from inversion times and recorded motion."""
 
 from collections.abc import Hashable
 from typing import Any
@@ -68,26 +68,28 @@ def identify(
     slopes: str | None = None,
     progress: bool = True,
 ) -> Identification:
-    """Parameters of a scene and its launches from measurements, with their errors and with what is not determined.
+    """Estimate parameters of a scene and its launches from measurements, with errors and undetermined combinations.
 
     **Arguments:**
 
-    - `scene`: a `Scene`; what is not free is taken from it.
+    - `scene`: a `Scene`, with the values of the parameters that are not free.
     - `data`: an `InversionTimes` or a `Recording`, or a list of several to be fitted together.
-    - `free`: full name of a parameter -> a `Free` or only the value from which to start: `"scene.friction.mu"`, or
-      `"friction.mu"` where nothing else ends so. A parameter of the launch, or `"t0"`, the reading of a recording's clock at
-      the launch, is the same in all data; `"data[1].launch.azimuth"` is that of the second, and `"data[*].t0"` stands for one
-      of each recording. Parameters that cannot be negative are fitted in their logarithms.
+    - `free`: full name of a parameter -> a `Free` or only the start value: `"scene.friction.mu"`, or `"friction.mu"` if
+      no other name ends so. A parameter of the launch, or `"t0"`, the reading of a recording's clock at the launch, is
+      the same in all data; `"data[1].launch.azimuth"` is that of the second, and `"data[*].t0"` stands for one of each
+      recording. Parameters that cannot be negative are fitted by their logarithms.
     - `starts`, `spread`, `seed`, `max_steps`, `progress`: as for `nonholonomic.identification.identify`.
-    - `slopes`: "exact", those of the equations; or "differences", central ones of 1 % in every parameter, 2 k + 1 runs for k
-      parameters, recordings one by one, which smooth over the staircase of the times. By default exact ones where a run is one
-      smooth motion, and differences through flights, impacts, stick and slip.
+    - `slopes`: "exact", the derivatives of the equations; or "differences", central differences of 1 % in every
+      parameter, which smooth over the staircase of the times. They take 2 k + 1 runs for k parameters and simulate
+      recordings one by one. By default, slopes are exact if a run is one smooth motion, and differences through
+      flights, impacts, stick and slip.
     - `tolerance`: relative tolerance of the integration.
 
-    **Returns:** an `Identification`, with its `verdict`; of which it warns (`FitWarning`) if it is not good.
+    **Returns:** an `Identification` with its `verdict`; a doubtful fit gives a `FitWarning`.
 
-    **Raises:** `ValueError` for arguments out of range, an unknown name, and for exact slopes through modes: the time of a top
-    that hops has a slope, but with steps of every flight it may point the other way than the trend.
+    **Raises:** `ValueError` for arguments out of range, an unknown name, and for exact slopes through modes: the time
+    of a hopping top has a slope, but because the time jumps with every flight, the slope may have the opposite sign of
+    the trend.
 
     **Example:**
 
@@ -116,7 +118,8 @@ def identify(
 
 
 def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) -> tuple[Any, ...]:
-    """The sets of data as a tuple, once all is checked; `caller` is who needs derivatives, or `None`."""
+    """The sets of data as a tuple, after all checks; `caller`: name of the function that needs derivatives, or
+    `None`."""
     require_kind(scene, "scene", Scene)
     if caller is not None:
         check_smooth(scene, caller)

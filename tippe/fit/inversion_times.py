@@ -18,32 +18,33 @@ from ..model.scene import Scene
 from ..runs.checks import check_event
 from ..runs.extended_times import extended_inversion_time
 
-#: Parameters by name, one value a row.
+#: Parameters by name, one value per row.
 Values = dict[str, Float[Array, " rows"]]
 
 
 class InversionTimes(eqx.Module):
     """Measured inversion times of some launches.
 
-    Over a nutation period the time is a staircase in every parameter, so its slope differs from its trend; where theta grows
-    without falling back it is smooth. Small angles at the launch, angles to be reached of 0.6 to 0.8 pi, and several
-    launches keep the steps below the errors.
+    Over a nutation period, the time is a staircase in every parameter, so its slope differs from its trend; it is
+    smooth if theta grows monotonically. Small initial angles, target angles of 0.6 to 0.8 pi, and several launches keep
+    the steps below the errors.
 
     **Arguments:**
 
     - `launch`: a `Launch` whose numbers are one for all or (launches,).
-    - `time`: (launches,) [s], infinite for a launch that was not seen to invert; or (launches, 2), between which two times it
-      inverted: (0, a) before a, (b, inf) not until b, (a, b) between a and b, (t, t) at t.
-    - `error`: standard errors [s], one for all or (launches,); those of a limit are of the clock that it was read off.
-    - `t1`: until when the model follows a launch [s]: several times the longest time measured, because a start may be far off.
-    - `until`: until when a launch of infinite time was watched [s], one for all or (launches,); `t1` by default. Its
-      likelihood is one-sided: the probability of a time beyond `until`.
+    - `time`: (launches,) [s], infinite for a launch that did not invert while watched; or (launches, 2), two times
+      between which it inverted: (0, a) before a, (b, inf) not until b, (a, b) between a and b, (t, t) at t.
+    - `error`: standard errors [s], one for all or (launches,); for a limit, the error of the clock.
+    - `t1`: horizon of the model's runs [s]: choose several times the longest measured time, because start values may be
+      far off.
+    - `until`: time [s] until which a launch of infinite time was watched, one for all or (launches,); `t1` by default.
+      The likelihood of such a launch is the probability of a time beyond `until`.
     - `angle`: angle [rad] that counted as inverted.
     - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None`: Gaussian.
 
     **Raises:** `ValueError` for numbers out of range or shapes that do not fit.
 
-    **Example:** the second launch was seen to invert between two frames, the third had not inverted after 6 s.
+    **Example:** the second launch inverted between two frames, the third had not inverted after 6 s.
 
     >>> import numpy as np, tippe
     >>> launch = tippe.Launch(theta=0.1, spin=[150.0, 120.0, 60.0])
@@ -89,7 +90,7 @@ class InversionTimes(eqx.Module):
 
     @property
     def _limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """After which time, and until which, every launch inverted."""
+        """The limits between which every launch inverted."""
         time = np.asarray(self.time)
         if time.ndim == 2:
             return time[:, 0], time[:, 1]
@@ -111,12 +112,12 @@ class InversionTimes(eqx.Module):
 
     @property
     def size(self) -> int:
-        """How many numbers are predicted."""
+        """Number of predictions."""
         return len(self.time)
 
     @property
     def seen(self) -> np.ndarray:
-        """Which of the predictions were measured: all."""
+        """Mask of the measured predictions: all."""
         return np.arange(self.size)
 
     @property
@@ -130,7 +131,7 @@ class InversionTimes(eqx.Module):
     def predict(
         self, scene: Scene, values: Values, rows: int, tolerance: Float[Array, ""]
     ) -> Float[Array, "rows launches"]:
-        """Times of all launches in every row, all of them lanes of one block."""
+        """Times of all launches in every row, computed as lanes of one ensemble."""
         launches = len(self.time)
         lanes = _launches(self.launch, launches, rows)
         lanes |= {name: jnp.repeat(value, launches) for name, value in values.items() if name != "t0"}
@@ -143,7 +144,7 @@ class InversionTimes(eqx.Module):
 
 
 def _launches(launch: Launch, count: int, rows: int) -> Values:
-    """The numbers of all launches in every row, those that are one for each of them."""
+    """The numbers of all launches in every row that differ between launches."""
     lists = {name: value for name, value in numbers("launch", launch).items() if value is not None and np.ndim(value)}
     return {name: jnp.tile(value, rows) for name, value in lists.items()}
 

@@ -12,23 +12,24 @@ from .identify import SceneModel, checked_data, unknowns_of
 def log_density(
     scene: Scene, data: Any, free: dict[str, Any], priors: dict[str, Any] | None = None, *, tolerance: float = 1e-8
 ) -> LogDensity:
-    """The log of the posterior density of a scene's parameters, as a function of coordinates without bounds.
+    """The log of the posterior density of a scene's parameters, as a function of unbounded coordinates.
 
-    The coordinate of a parameter that cannot be negative is its logarithm (see `Free`). A parameter without a prior has a flat
-    one in its coordinate.
+    The coordinate of a parameter that cannot be negative is its logarithm (see `Free`). A parameter without a prior has
+    a flat prior in its coordinate.
 
     **Arguments:**
 
     - `scene`, `data`, `free`, `tolerance`: as for `identify`; a recording's error of `None` is an unknown, too.
-    - `priors`: name of a free parameter -> (mean, standard deviation) of a Gaussian of the parameter, or a function, written
-      in JAX, that gives the log density of the parameter; besides those of `Free`.
+    - `priors`: name of a free parameter -> (mean, standard deviation) of a Gaussian of the parameter, or a function,
+      written in JAX, that returns the log density of the parameter; in addition to the priors of `Free`.
 
-    **Returns:** a `LogDensity`: a function of coordinates (unknowns,) for any sampler, with `value_and_gradient` for those that
-    do not know JAX, `values` for the way back to parameters, `names` and `start`.
+    **Returns:** a `LogDensity`: a function of coordinates (unknowns,) for any sampler, with `value_and_gradient` for
+    samplers without JAX, `values` to convert back to parameters, `names` and `start`.
 
-    **Raises:** `ValueError` for arguments out of range, an unknown name, and scenes through whose modes no derivative goes.
+    **Raises:** `ValueError` for arguments out of range, an unknown name, and scenes with modes that do not support
+    derivatives.
 
-    **Example:** friction from one time, known to 10 % beforehand.
+    **Example:** friction from one time, with a prior of 10 %.
 
     >>> import tippe
     >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=3.0e-6, I3=3.2e-6)

@@ -12,7 +12,7 @@ from nonholonomic.validation import as_number, as_number_or_none, require
 
 from ..model.launch import Launch
 
-#: What can be recorded of a top: as the properties of a `Trajectory` call it.
+#: The quantities of a top that can be recorded, with the names of a `Trajectory`'s properties.
 QUANTITIES = Quantities(
     columns={"position": ("x", "y", "z"), "axis": ("axis_x", "axis_y", "axis_z")},
     units={"theta": "rad", "azimuth": "rad", "eta": "rad", "spin": "rad/s"}
@@ -21,7 +21,7 @@ QUANTITIES = Quantities(
     angles=frozenset({"azimuth", "eta"}),
 )
 
-#: How far [rad] a recorded theta may be outside [0, pi] if its errors are smaller, or not known.
+#: Distance [rad] by which a recorded theta may be outside [0, pi] if its errors are smaller or unknown.
 NOISE = 0.3
 
 
@@ -33,17 +33,17 @@ class Recording(AbstractRecording):
     - `launch`: a `Launch`, every number a scalar.
     - `times`: (times,) [s], increasing.
     - `value`: (times,) for one column, (times, columns) for several; NaN where a sample is missing.
-    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: to be estimated for each column
-      from the scatter about the fit.
-    - `quantity`: "theta", "azimuth", "eta" [rad], "spin" [rad/s], "position" ("x", "y", "z") [m] of the sphere's centre or
-      "axis" ("axis_x", "axis_y", "axis_z") [1] in the fixed frame, as in `Trajectory`; or a tuple of some of these words.
-      Azimuth and eta may be given up to whole turns.
-    - `t0`: the clock's reading [s] at the launch. Until then the top is where it is launched.
+    - `error`: standard errors, one for all, (columns,), or of the shape of `value`; `None`: estimated for each column
+      from the residuals.
+    - `quantity`: "theta", "azimuth", "eta" [rad], "spin" [rad/s], "position" ("x", "y", "z") [m] of the sphere's centre
+      or "axis" ("axis_x", "axis_y", "axis_z") [1] in the fixed frame, as in `Trajectory`; or a tuple of some of these
+      words. Azimuth and eta may differ by whole turns.
+    - `t0`: the clock's reading [s] at the launch. Before that, the top is at its launch position.
     - `student`: degrees of freedom of Student's t distribution of the errors, against outliers, such as 4; `None`: Gaussian.
 
     **Raises:** `ValueError` for an unknown quantity or shapes that do not fit.
 
-    **Example:** two frames of a film, in the second of which the azimuth could not be read off.
+    **Example:** two frames of a video; in the second, the azimuth was unreadable.
 
     >>> import numpy as np, tippe
     >>> value = [[0.11, 0.3], [0.14, np.nan]]
@@ -59,7 +59,7 @@ class Recording(AbstractRecording):
     quantities: ClassVar[Quantities] = QUANTITIES
 
     def __check_init__(self):
-        # Of the right shapes, if this comes to its end.
+        # If no check fails, the shapes are right.
         super().__check_init__()
         if "theta" not in self.columns:
             return
@@ -82,25 +82,26 @@ def read_recording(
     t0: float = 0.0,
     student: float | None = None,
 ) -> Recording:
-    """A recording of a top from a text file of columns with a line of headers (CSV).
+    """A recording of a top from a text file of columns with a header line (CSV).
 
     **Arguments:**
 
-    - `path`: of the file. Columns are parted by commas, semicolons, tabs or blanks; empty cells and `nan` are missing samples;
-      lines that begin with # are left out.
-    - `columns`: what a column is -> (its header, its unit): `"time"`, or `"frame"`, and any of `"theta"`, `"azimuth"`, `"eta"`,
-      `"spin"`, `"x"`, `"y"`, `"z"`, `"axis_x"`, `"axis_y"`, `"axis_z"`. Units are s, ms, min; rad, deg, rev; rad/s, deg/s, rpm,
-      rev/s; m, cm, mm; 1, %; or a number, the SI units that one of the file is, such as the metres of a pixel.
-    - `fps`: frames a second, where there is no `"time"`; without a `"frame"` every line is one.
-    - `launch`: a `Launch`, as far as it is known.
-    - `error`: what a column is -> (its standard error, or the header of a column of them, unit); `None`: to be estimated.
+    - `path`: of the file. Columns are separated by commas, semicolons, tabs or blanks; empty cells and `nan` are
+      missing samples; lines that begin with # are ignored.
+    - `columns`: quantity -> (header of its column, unit): `"time"`, or `"frame"`, and any of `"theta"`, `"azimuth"`,
+      `"eta"`, `"spin"`, `"x"`, `"y"`, `"z"`, `"axis_x"`, `"axis_y"`, `"axis_z"`. Units are s, ms, min; rad, deg, rev;
+      rad/s, deg/s, rpm, rev/s; m, cm, mm; 1, %; or a factor that converts the file's numbers to SI units, such as
+      metres per pixel.
+    - `fps`: frames per second, if there is no `"time"`; without a `"frame"`, every line is a frame.
+    - `launch`: a `Launch`, as far as known.
+    - `error`: quantity -> (standard error or the header of its column, unit); `None`: estimated from the residuals.
     - `t0`, `student`: as for `Recording`.
 
     **Returns:** a `Recording`.
 
-    **Raises:** `ValueError` that names the column and what is wrong with it.
+    **Raises:** `ValueError` that names the column and the problem.
 
-    **Example:** three frames of a film at 50 frames a second, the second of them unreadable.
+    **Example:** three frames of a video at 50 frames per second, the second of which is unreadable.
 
     >>> import pathlib, tempfile, tippe
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "film.csv"

@@ -6,7 +6,7 @@ mass [m], the vector c of `trajectory_problem.py`, the rotation angle of the top
 friction and impacts [J].
 """
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.geometry import dot, multiply, scale
-from nonholonomic.hybrid import Transition, TransitionPath
+from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
 from nonholonomic.integration import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup, greatest, least
 
@@ -108,12 +108,14 @@ def height(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Flo
     return own.radius - other.radius + (other.offset - own.offset) * state[COS_THETA]
 
 
-class Slide(AbstractFlyingMode):
+class Slide(AbstractFlyingMode, AbstractHoppingMode):
     """Sliding on the sphere numbered `number`, in the order of `free_body.balls`, up to an angle of theta.
 
     The number is an array, so that one program serves both spheres; with `last` a run continues through the angle. A
     single run whose path is kept records its flights.
     """
+
+    most_hops: ClassVar[int] = MOST_BOUNCES
 
     number: Int[Array, ""]
     last: bool = eqx.field(static=True)
@@ -140,27 +142,38 @@ class Slide(AbstractFlyingMode):
 
         def hop(carry: tuple[Air, Array, TransitionPath | None]) -> tuple[Air, Array, TransitionPath | None]:
             air, count, record = carry
-            after, landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
-            if air.falls is not None:
-                after, landed = _where(air.falls, air, after), air.falls | landed
-            record = _with_flight(self.scene.body, record, air, after)
-            after = _where(landed, land(self.scene, after), after)
-            return _where(air.open, after, air), count + 1, record
+            after, landed = self.hop(air, left)
+            return landed, count + 1, _with_flight(self.scene.body, record, air, after)
 
         def under_way(carry: tuple[Air, Array, TransitionPath | None]) -> Array:
             return jnp.any(carry[0].open) & (carry[1] < MOST_BOUNCES)
 
-        start = lost_contact(self.scene, self.number, state)
-        if self.with_quadratures:
-            start = start._replace(quadratures=state[OWN:])
+        start = self.lost(state)
         record = _no_flights(start) if self.with_quadratures else None
         air, _, record = jax.lax.while_loop(under_way, hop, (start, jnp.zeros((), int), record))
-        status = jnp.where(air.open, UNRESOLVED, air.status)
-        state = contact_state(air.free)
+        return self.closed(air)._replace(record=record)
+
+    def lost(self, state: Float[Array, "components cells"]) -> "Air":
+        start = lost_contact(self.scene, self.number, state)
+        return start._replace(quadratures=state[OWN:]) if self.with_quadratures else start
+
+    def hop(self, air: "Air", left: Cells) -> tuple["Air", "Air"]:
+        """One flight of a top whose contact is open, and after it the impact at its end."""
+        after, landed = take_flight(self.scene, air, self.cos_angle, left, self.last)
+        if air.falls is not None:
+            after, landed = _where(air.falls, air, after), air.falls | landed
+        return after, _where(air.open, _where(landed, land(self.scene, after), after), air)
+
+    def motion_in(self, air: "Air") -> tuple[FreeBody, Float[Array, "7 cells"] | None]:
+        return air.free, air.quadratures
+
+    def closed(self, air: "Air") -> Transition:
+        """The transition of a top that is back on the plane, or whose run has ended."""
+        status, state = jnp.where(air.open, UNRESOLVED, air.status), contact_state(air.free)
         if air.quadratures is not None:
             state = jnp.concatenate([state, air.quadratures])
-        fields = (air.ball, state, air.elapsed, status, air.crossing_time, air.flights[None])
-        return Transition(*fields, record, air.log_rates)
+        counts = air.flights[None]
+        return Transition(air.ball, state, air.elapsed, status, air.crossing_time, counts, log_rates=air.log_rates)
 
 
 class Lean(AbstractFlyingMode):
@@ -312,7 +325,8 @@ def land(scene: Scene[Top], air: Air) -> Air:
         struck = _with_other(scene, air, struck, other, (speed <= closing) & ~rebounds, closing)
     if air.quadratures is not None:
         gained = energy(body, scene.gravity, struck.free) - energy(body, scene.gravity, air.free)
-        struck = struck._replace(quadratures=air.quadratures.at[-1].add(gained))
+        *others, work = air.quadratures
+        struck = struck._replace(quadratures=jnp.stack([*others, work + gained]))
     return struck._replace(open=struck.open & ~fails)
 
 

@@ -1,1 +1,1 @@
-"""Questions to a scene and their answers: trajectories, inversion times, tables, Lyapunov exponents, pictures and pages."""
+"""Computations with a scene: trajectories, inversion times, tables, Lyapunov exponents, plots and pages."""

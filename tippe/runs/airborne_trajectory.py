@@ -45,16 +45,16 @@ NEAR = 1e-6
 
 
 class ArenaTrajectory(HybridTrajectory):
-    """A `HybridTrajectory` over any arena: `theta` and `azimuth` refer to the frame at the foot, the point of the arena nearest
-    to the centre of the top's own sphere, and `distance` is that of this sphere from it. The frame of `slip` is that at the
-    foot of the sphere that touches."""
+    """A `HybridTrajectory` over any arena: `theta` and `azimuth` refer to the frame at the foot, the point of the arena
+    nearest to the centre of the top's own sphere, and `distance` is the distance of this sphere from the arena. `slip`
+    refers to the frame at the foot of the touching sphere."""
 
     @of_each_run
     def energy(self) -> Float[Array, " times"]:
         """Kinetic energy plus weight times the height of the centre of mass [J]."""
         scene, (_, e, L, place) = self.scene, parts(self._states)
         (distance, rate), n_up = self.above, scene.frame.vertical(place)[2]
-        # In contact the velocity along n is that of the centre of mass about the sphere's centre.
+        # In contact, the velocity along n is that of the centre of mass about the sphere's centre.
         about = -scene.body.offset * (L[0] * e[1] - L[1] * e[0]) / scene.body.I1
         lifted = scene.gravity * distance * n_up + 0.5 * ((about + rate) ** 2 - about**2)
         return scene.energy(self._states) + scene.body.mass * lifted
@@ -63,7 +63,7 @@ class ArenaTrajectory(HybridTrajectory):
     def theta_rate(self) -> Float[Array, " times"]:
         """Rate of change of theta [rad/s]."""
         dynamics = self.scene.dynamics
-        # The frame is carried along by the centre of the top's sphere, wherever that is.
+        # The frame moves with the centre of the top's sphere, in flight, too.
         frame = dataclasses.replace(carried_frame(self.scene), distance=self.scene.body.radius + self.above[0])
         rates = dataclasses.replace(dynamics, frame=frame).field(self._states)
         return jax.jvp(self.scene.theta, (self._states,), (rates,))[1]
@@ -78,8 +78,8 @@ class ArenaTrajectory(HybridTrajectory):
 
     @of_each_run
     def slip(self) -> Float[Array, "times 2"]:
-        """Velocity along the tangent plane of the point of a sphere that is closest to the arena [m/s]: of the stem's sphere
-        while that touches, else of the top's own."""
+        """Velocity along the tangent plane of the point of a sphere that is closest to the arena [m/s]: of the stem's
+        sphere while it touches, otherwise of the top's own."""
         slip = self.scene.slip_velocity(self._states)
         if self.scene.body.stem is not None:
             of_stem = self._on_stem.slip
@@ -88,10 +88,11 @@ class ArenaTrajectory(HybridTrajectory):
 
     @property
     def _on_stem(self) -> Motion:
-        """The motion on the stem, at times at which that touches; the first tangent is the projection of the one shown."""
+        """The motion on the stem, at times at which the stem touches; the first tangent is the projection of the
+        reported one."""
         scene, place = self.scene, parts(self._states).place
         (distance, rate), own, stem = self.above, *balls(scene.body)
-        # Its place is that of a top whose own sphere is so much greater that it touches.
+        # Its place is that of a top with a larger sphere that touches.
         flying = flight_state(lift_off(scene, self._states, False, Ball(own.offset, own.radius + distance)))
         frame = carried_frame(scene)
         flying = flying._replace(velocity=vector_of(sum_vectors(flying.velocity, scale(rate, frame.normal(place[:3])))))
@@ -116,17 +117,17 @@ class ArenaTrajectory(HybridTrajectory):
 
     @staticmethod
     def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
-        # Also of traced numbers, -1 after the end of a run.
+        # Also for traced numbers; -1 after the end of a run.
         return (numbers == ON_STEM) - 1 * ((numbers == FLYING) | (numbers == STRIKING) | (numbers < 0))
 
 
 class StickSlipArenaTrajectory(ArenaTrajectory):
-    """An `ArenaTrajectory` under Coulomb's law as it stands; `stats` holds `sticks` too, how often a slip has turned into
-    rolling."""
+    """An `ArenaTrajectory` under exact Coulomb friction; `stats` also holds `sticks`, the number of changes from slip
+    to rolling."""
 
     @staticmethod
     def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
-        # Between two modes a slip begins.
+        # Between two modes, a slip begins.
         return -1 * (numbers == FLYING)
 
     @staticmethod
@@ -137,9 +138,9 @@ class StickSlipArenaTrajectory(ArenaTrajectory):
 
 
 def arena_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "19 1"]]:
-    """The modes of one launch of a hybrid scene on any arena, the number of the first, and the state there.
+    """The modes of one launch of a hybrid scene on any arena, the index of the first, and its initial state.
 
-    **Arguments:** `modules`: scene and launch; `tolerance`: relative, of the integration.
+    **Arguments:** `modules`: scene and launch; `tolerance`: relative tolerance of the integration.
     """
     problem = _start(*modules)
     modes = airborne.modes if modules[0].body.stem is None else airborne_stem.modes
@@ -163,7 +164,8 @@ def simulate_airborne(
     tolerance: float | Float[Array, ""],
     solver: diffrax.AbstractSolver | None,
 ) -> ArenaTrajectory:
-    """Run one launch of a hybrid scene whose flights are integrated. **Arguments:** as for `simulate`, checked."""
+    """Simulate one launch of a hybrid scene whose flights are integrated. **Arguments:** as for `simulate`, already
+    checked."""
     batched_modes, first, state = arena_modes((scene, launch), tolerance)
     exact = scene.friction.set_valued
     start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
@@ -183,7 +185,8 @@ def simulate_airborne(
 
 
 def sampled_airborne(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:
-    """Run one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, checked."""
+    """Simulate one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, already
+    checked."""
     samples = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, counters=1)
     codes = jnp.array([int(status) for status in LOSSES])
     return sampled_flights(ArenaTrajectory, scene, times, samples, codes[loss(scene, samples.end_state)])

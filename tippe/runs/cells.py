@@ -48,12 +48,12 @@ def _at_the_end(
     return is_inverted(ended, problem, last), scene.theta(jnp.asarray(ended.state))
 
 
-#: The word for a run's status if it has not inverted; `not_inverted` for all others.
+#: The word for the status of a run that has not inverted; `not_inverted` for all other codes.
 WORD_OF_STATUS = {LEFT_DOMAIN: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
 
 
 def too_many_steps(t1: float, most: int, end: float) -> str:
-    """Message for a run that needs more than the most steps."""
+    """Message for a run that needs more than the allowed steps."""
     return (
         f"t1 = {t1:g} s is too long: the run needs more than {most:_} steps, with which it came to {end:.4g} s; "
         "take a shorter t1 or a larger tolerance"
@@ -79,7 +79,7 @@ class InversionRuns(NamedTuple):
 
     @property
     def last(self) -> bool:
-        """Whether a run continues through the angle: where it ends above it, the last crossing counts."""
+        """Whether a run continues through the angle; if it ends above the angle, the last crossing counts."""
         return self.crossing != "first"
 
     @property
@@ -110,8 +110,8 @@ class InversionRuns(NamedTuple):
     def results(self, roots: dict[str, Any], columns: dict[str, Any], tolerance: float, count: int) -> dict[str, Any]:
         """The variables of some cells.
 
-        **Arguments:** `roots`: scene and launch; `columns`: full name of a parameter -> its value in every cell, of which the
-        first `count` are to be run; `tolerance`: relative tolerance.
+        **Arguments:** `roots`: scene and launch; `columns`: full name of a parameter -> its value in every cell, of
+        which only the first `count` are run; `tolerance`: relative tolerance.
         """
         cells = with_numbers(roots, columns)
         scene, launch = cells["scene"], cells["launch"]
@@ -133,7 +133,7 @@ class InversionRuns(NamedTuple):
             outcome = solved(self.last)
         variables = self._named(scene, problem, outcome)
         if self.crossing == "both":
-            # With several modes the first crossing takes a hybrid solve of its own, which ends there.
+            # With several modes, the first crossing needs a separate hybrid solve, which ends there.
             variables["first_time"] = (
                 np.asarray(outcome.first_crossing) if isinstance(outcome, Outcome) else _time_of_first(solved(False))
             )
@@ -169,7 +169,7 @@ class InversionRuns(NamedTuple):
     def _loss(self, scene: Scene, state: Float[Array, "components cells"]) -> Any:
         """Why contact ended in each cell, as a code in `LOSSES`."""
         if self.run_kind is HYBRID:
-            # A run with flights continues where contact is lost, and its ball fits everywhere.
+            # A run with flights continues when contact is lost, and its ball fits everywhere.
             return LOSSES.index(Status.JAMMED)
         return np.asarray(_flight_loss(scene, state) if self.run_kind.flight_state else _loss(scene.dynamics, state))
 

@@ -49,7 +49,7 @@ def permitted(
     return may, t1, jnp.min(tolerance)
 
 
-# One program where the function is called on its own, not one for every comparison.
+# One program if the function is called on its own, instead of one for every comparison.
 @compiled_setup
 def nan_if_illegal(time: Float[Array, ""], structure: Any, unchecked: bool, leaves: list[Any]) -> Float[Array, ""]:
     """The time, or NaN with NaN derivatives where numbers are not legal. **Arguments:** as for `permitted`."""

@@ -1,16 +1,21 @@
-"""A page with sliders in which a top is simulated anew in the browser."""
+"""A page with sliders that simulates a top in the browser."""
 
+import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import (
     CROSSED,
     FAILED,
     LEFT_DOMAIN,
+    UNRESOLVED,
     LaneState,
     Settings,
     Status,
@@ -23,6 +28,7 @@ from nonholonomic.views import Page, Stage, arena
 from nonholonomic.views.explore import (
     Answer,
     Frame,
+    HybridSimulator,
     LiveRun,
     Simulator,
     Slider,
@@ -38,11 +44,13 @@ from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.top import Top
 from ..modes.inversion_problem import InversionProblem
+from ..modes.sliding import Slide, modes
 from ..modes.trajectory_problem import TrajectoryProblem
 from .checks import check_run
+from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, UNITS
 from .trajectory import Trajectory, simulate
-from .view import AXIS, BESIDE, Motion, aside
+from .view import AXIS, BESIDE, Motion, aside, show
 
 Numbers = Float[Array, " numbers"]
 
@@ -50,10 +58,13 @@ Numbers = Float[Array, " numbers"]
 ANGLE = 0.95 * math.pi
 TOLERANCE = 1e-7
 
-#: Tolerance of the runs that only say how far the arena is drawn.
+#: Tolerance of the runs that determine the drawn part of the arena.
 DRAWN = 1e-5
 
-#: Steps after which a run in the page is given up: some hundred milliseconds.
+#: How far a level plane is drawn about the start of a run with flights, in units of sqrt(g R) t1.
+REACH = 0.5
+
+#: Greatest number of steps of a run in the page, some hundred milliseconds.
 MOST_STEPS_OF_A_PAGE = 50_000
 
 
@@ -75,11 +86,12 @@ def explore(
 
     **Arguments:**
 
-    - `scene`, `launch`: the run at the start, every number a scalar; `contact` must be "stop", and the friction law
-      must have a single mode.
+    - `scene`, `launch`: the run at the start, every number a scalar; `contact` must be "stop" unless the arena is a level
+      plane, and the friction law must have a single mode.
     - `path`: file to write the page to, or `None`.
-    - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name will do where only one parameter fits, such
-      as "theta", "spin", "mu", "friction.mu" or "offset". By default theta, spin, the coefficient of friction and the offset.
+    - `sliders`: name of a parameter -> (lowest, highest) value. The end of a name is enough if only one parameter
+      matches, such as "theta", "spin", "mu", "friction.mu" or "offset". By default theta, spin, the coefficient of
+      friction and, of a top without a stem, the offset.
     - `t1`: horizon [s].
 
     **Returns:** a `Page`, with its `html`.
@@ -100,20 +112,23 @@ def explore(
 
     ```
     """
-    check_run(scene, launch, t1, TOLERANCE)
-    check_smooth(scene)
-    roots = {"scene": scene, "launch": launch}
-    ranges = default_ranges(scene, launch) if sliders is None else sliders
-    knobs = sliders_of(ranges, roots, LONG_NAMES, UNITS | scene.body.units | scene.friction.units)
-    shapes = [roots, *(with_numbers(roots, {path: end}) for path, end in ends_of(knobs))]
-    page = live_page(live_run(roots, knobs, float(t1)), stage(shapes, float(t1)))
+    live = live_run(scene, launch, sliders, t1)
+    drawn = stage_at_start(scene, launch, t1) if flies(scene) else stage_of_runs(scene, launch, live.sliders, float(t1))
+    page = live_page(live, drawn)
     if path is not None:
         page.save(path)
     return page
 
 
-def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float) -> LiveRun:
-    """What the page shows of a scene and a launch, `roots`, some of whose numbers are those of sliders."""
+def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float]] | None, t1: float) -> LiveRun:
+    """What the page shows. **Arguments:** as for `explore`."""
+    check_run(scene, launch, t1, TOLERANCE)
+    check_modes(scene)
+    roots = {"scene": scene, "launch": launch}
+    ranges = default_ranges(scene, launch) if sliders is None else sliders
+    # A stem's end counts from the centre of mass: moving that would change the shape.
+    drawn = ("scene.body.stem.", "scene.body.offset") if has_stem(scene) else ()
+    knobs = sliders_of(ranges, roots, LONG_NAMES, UNITS | scene.body.units | scene.friction.units, drawn)
 
     def modules(values: Numbers) -> tuple[Scene, Launch]:
         replaced = with_numbers(roots, {knob.path: value for knob, value in zip(knobs, values, strict=True)})
@@ -123,28 +138,59 @@ def live_run(roots: dict[str, Any], knobs: tuple[Slider, ...], t1: float) -> Liv
         scene, launch = modules(values)
         return jnp.all(legal((*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch))))
 
-    def moment(values: Numbers, problem: TrajectoryProblem, lane: LaneState) -> Frame:
-        return frame(modules(values)[0], problem, lane)
-
     settings = Settings(TOLERANCE, max_steps=MOST_STEPS_OF_A_PAGE)
-    asked = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
-    launched = Simulator(lambda values: InversionProblem.of(*modules(values), ANGLE, 1), t1, settings, asked)
+    answer, motion = (hybrid_simulators if flies(scene) else smooth_simulators)(modules, float(t1), settings)
     return LiveRun(
-        title=f"Tippe top on a {type(roots['scene'].surface).__name__.lower()}",
+        title=f"Tippe top on a {type(scene.surface).__name__.lower()}",
         sliders=knobs,
         allowed=allowed,
-        answer=Answer("inversion time", "s", launched),
-        motion=Simulator(lambda values: TrajectoryProblem.of(*modules(values), 1), t1, settings, {"frame": moment}),
+        answer=Answer("inversion time", "s", answer),
+        motion=motion,
         summaries=(Summary("energy", "J", 1), Summary("Jellett's constant", "kg m²/s", 2)),
     )
 
 
-def check_smooth(scene: Scene) -> None:
-    """Raise `ValueError` for a scene whose runs have several modes, which the page does not know."""
-    if scene.contact == "hybrid":
+def smooth_simulators(
+    modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
+) -> tuple[Simulator, Simulator]:
+    """How a run of one smooth motion is simulated: to its inversion, and as it is drawn."""
+
+    def moment(values: Numbers, problem: TrajectoryProblem, lane: LaneState) -> Frame:
+        return smooth_frame(modules(values)[0], problem, lane)
+
+    asked = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
+    return (
+        Simulator(lambda values: InversionProblem.of(*modules(values), ANGLE, 1), t1, settings, asked),
+        Simulator(lambda values: TrajectoryProblem.of(*modules(values), 1), t1, settings, {"frame": moment}),
+    )
+
+
+def hybrid_simulators(
+    modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
+) -> tuple[HybridSimulator, HybridSimulator]:
+    """The same for runs with flights, impacts and a stem, on a level plane."""
+
+    def to_inversion(values: Numbers) -> Any:
+        scene, launch = modules(values)
+        problem = InversionProblem.of(scene, launch, ANGLE, 1)
+        return (*modes(scene, problem, TOLERANCE, last=False), problem.states)
+
+    def moment(values: Numbers, number: Any, rows: Any, time: Any) -> Frame:
+        return hybrid_frame(modules(values)[0], number, rows, time)
+
+    asked = {"outcome": lambda values, runs: hybrid_outcome(runs)}
+    return (
+        HybridSimulator(to_inversion, t1, settings, 1, asked),
+        HybridSimulator(lambda values: level_modes(modules(values), TOLERANCE), t1, settings, 1, {}, moment),
+    )
+
+
+def check_modes(scene: Scene) -> None:
+    """Raise `ValueError` for a scene whose runs have modes that the page does not know."""
+    if flies(scene) and not scene.level:
         raise ValueError(
-            "contact = 'hybrid' must be 'stop' for explore, whose page ends a run where contact is lost; leave the stem "
-            "out, by dataclasses.replace(top, stem=None), or show one run with its flights by simulate(...).view()"
+            f"contact = 'hybrid' must be 'stop' for explore on a {type(scene.surface).__name__}: the page knows flights over a "
+            "level Plane only; show one run with its flights by simulate(...).view()"
         )
     if scene.friction.set_valued:
         raise ValueError(
@@ -152,14 +198,24 @@ def check_smooth(scene: Scene) -> None:
         )
 
 
+def flies(scene: Scene) -> bool:
+    """Whether runs go on through flights, and impacts."""
+    return scene.contact == "hybrid"
+
+
+def has_stem(scene: Scene) -> bool:
+    """Whether the body is a top with a stem."""
+    return isinstance(scene.body, Top) and scene.body.stem is not None
+
+
 def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
-    """The sliders if a user names none: theta, spin, the coefficient of friction and the offset, about their own values."""
+    """The sliders if a user names none: theta, spin, friction, and the offset of a top without a stem, about their values."""
     theta, spin = float(launch.theta), float(launch.spin)
     ranges = {"theta": (min(0.02, theta), max(0.6, theta)), "spin": tuple(sorted((0.4 * spin, 1.4 * spin)))}
     if spin == 0.0:
         ranges["spin"] = (0.0, 200.0)
-    known = numbers("scene", scene)
-    for name, (least, most) in {"mu": (0.1, 3.0), "offset": (0.5, 1.5)}.items():
+    known, parts = numbers("scene", scene), {"mu": (0.1, 3.0)} | ({} if has_stem(scene) else {"offset": (0.5, 1.5)})
+    for name, (least, most) in parts.items():
         path = next((path for path in known if path.endswith(f".{name}")), None)
         if path is not None and known[path] > 0.0:
             value = float(known[path])
@@ -171,9 +227,9 @@ def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float
 
 
 def outcome(problem: InversionProblem, lane: LaneState) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """How a run that ends with the inversion ended, a `Status`, and its inversion time [s], or infinity."""
+    """The `Status` of a run that ends with the inversion, and its inversion time [s], or infinity."""
     inverted = lane.status == CROSSED
-    # A run that starts above the angle is there at once.
+    # A run that starts above the angle is inverted at once.
     time = jnp.where(lane.time > 0.0, crossing_time(problem, lane.time, lane.state), 0.0)
     lost = jnp.array([int(status) for status in LOSSES])[problem.dynamics.loss(lane.state)]
     others = jnp.where(lane.status == FAILED, int(Status.FAILED), int(Status.NOT_INVERTED))
@@ -181,20 +237,71 @@ def outcome(problem: InversionProblem, lane: LaneState) -> tuple[Int[Array, ""],
     return jnp.where(inverted, int(Status.INVERTED), status)[0], jnp.where(inverted, time, jnp.inf)[0]
 
 
-def stage(runs: list[dict[str, Any]], t1: float) -> Stage:
-    """The first of some scenes and launches as it is drawn, on a piece of the arena on which all of them are."""
-    paths = [simulate(run["scene"], run["launch"], t1, tolerance=DRAWN) for run in runs]
-    (first,), size = paths[0].stages(), float(runs[0]["scene"].body.size)
+def hybrid_outcome(runs: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    """The same for a run with flights."""
+    ended = {CROSSED: Status.INVERTED, LEFT_DOMAIN: Status.JAMMED, FAILED: Status.FAILED, UNRESOLVED: Status.UNRESOLVED}
+    status, inverted = jnp.asarray(int(Status.NOT_INVERTED)), runs.status[0] == CROSSED
+    for code, word in ended.items():
+        status = jnp.where(runs.status[0] == code, int(word), status)
+    return status, jnp.where(inverted, runs.crossing_time[0], jnp.inf)
+
+
+def stage_of_runs(scene: Scene, launch: Launch, knobs: tuple[Slider, ...], t1: float) -> Stage:
+    """The run at the start, on a piece of the arena on which are also the runs at the ends of the sliders."""
+    roots = {"scene": scene, "launch": launch}
+    shapes = [roots, *(with_numbers(roots, {path: end}) for path, end in ends_of(knobs))]
+    paths = [simulate(run["scene"], run["launch"], t1, tolerance=DRAWN) for run in shapes]
+    (first,), size = paths[0].stages(), float(scene.body.size)
     points = np.concatenate([np.asarray(path.contact) for path in paths])
-    surface, normal = runs[0]["scene"].surface, first.arena.normal
-    return first._replace(arena=arena(surface, points, normal, 4.0 * size, 2.5 * size))
+    return first._replace(arena=arena(scene.surface, points, first.arena.normal, 4.0 * size, 2.5 * size))
 
 
-def frame(scene: Scene, problem: TrajectoryProblem, lane: LaneState) -> Frame:
-    """What is drawn of a top at one time, as `view.show` orders it."""
+def stage_at_start(scene: Scene[Top], launch: Launch, t1: float) -> Stage:
+    """A top on a level plane as it is launched: the page simulates before it shows anything."""
+    start = Motion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(scene, launch)))
+    drawn, size = show(scene, start._replace(times=np.array([0.0, 1.0])), 0, ""), float(scene.body.size)
+    # Slips grow as the top rises: the arrow of one half as fast as the equator is as long as the longest.
+    normal_force, slip, *others = drawn.arrows
+    assert slip.limit is not None
+    fastest = 0.5 * size * float(np.linalg.norm(start.angular_velocity[0]))
+    drawn = drawn._replace(arrows=(normal_force, slip._replace(scale=slip.limit / max(fastest, 1e-12)), *others))
+    reach = REACH * math.sqrt(float(scene.gravity) * size) * t1
+    ground = arena(scene.surface, start.contact, start.normal[0], max(reach, 10.0 * size), 2.5 * size)
+    return Stage("", ground, (drawn,), follows=True)
+
+
+@eqx.filter_jit
+def _motion_at_start(scene: Scene[Top], launch: Launch) -> Motion[Array]:
+    modes, number, state = level_modes((scene, launch), TOLERANCE)
+    assert isinstance(modes[0], Slide)
+    # The others stand on their stem.
+    rows = dataclasses.replace(modes[0], number=number).shown(state)
+    return Motion.of(hybrid_run(scene, number, rows, jnp.zeros(1)))
+
+
+def smooth_frame(scene: Scene, problem: TrajectoryProblem, lane: LaneState) -> Frame:
+    """What is drawn of a top at one time in contact."""
     lean, rows = len(problem.state), lane.state
     parts = (rows[:lean], rows[lean:-2], rows[-2], rows[-1])
-    run = Trajectory(lane.time, scene, *parts, status=0, end_time=lane.time[0], stats={}, dense=None)
+    return frame(scene, Trajectory(lane.time, scene, *parts, status=0, end_time=lane.time[0], stats={}, dense=None))
+
+
+def hybrid_frame(scene: Scene, number: Int[Array, "1"], rows: Float[Array, "17 1"], time: Float[Array, "1"]) -> Frame:
+    """What is drawn of a top at one time in contact or in flight; `rows` are what the modes show."""
+    return frame(scene, hybrid_run(scene, number, rows, time))
+
+
+def hybrid_run(
+    scene: Scene[Top], number: Int[Array, "1"], rows: Float[Array, "17 1"], time: Float[Array, "1"]
+) -> HybridTrajectory:
+    """The only time of a run in contact or in flight."""
+    states, place, spin_angle, work, distance = HybridTrajectory.parts_of(rows)
+    ends = (0, time[0], {}, None, distance, number, None)
+    return HybridTrajectory(time, scene, states, place, spin_angle, work, *ends)
+
+
+def frame(scene: Scene, run: Any) -> Frame:
+    """What is drawn of a top at the only time of a run, as `view.show` orders it."""
     motion = Motion(*(part[0] for part in Motion.of(run)))
     radius = scene.body.size
     lifted = motion.contact + 0.02 * radius * motion.normal

@@ -38,14 +38,16 @@ def extended_inversion_time(
     angle: Float[ArrayLike, ""] = 0.95 * math.pi,
     tolerance: float | Float[Array, ""] = 1e-8,
 ) -> Float[Array, ""]:
-    """Inversion time, continued beyond the horizon so that a loss is finite everywhere and leads back.
+    """Inversion time, continued beyond the horizon so that a loss function is finite everywhere and its slope leads
+    back.
 
-    A top that has not inverted by `t1`, or has lost contact, and is then at theta counts as inverting at
-    t1 (1 + log(angle / theta) / C), C = log(angle / theta at the launch), 1 at least. Where theta grows as exp(s t), as it
-    does from small angles, this is the tangent to the time C / s, taken at the rate s that arrives exactly at `t1`: continuous
-    with its slope where a time passes the horizon, and linear in the rate beyond. It is a penalty, not a prediction. It works
-    under `jit`, `vmap`, `grad`, `jvp` and their compositions; the derivative is that of the event's time (implicit function
-    theorem) and of the penalty, by every number but `t1` and `tolerance`.
+    A top that is at theta at `t1` or at its loss of contact, without having inverted, counts as inverting at t1 (1 +
+    log(angle / theta) / C), C = log(angle / theta at the launch), at least 1. Where theta grows as exp(s t), as it does
+    from small angles, this is the tangent to the time C / s, taken at the rate s that arrives exactly at `t1`:
+    continuous with its slope where a time passes the horizon, and linear in the rate beyond. This is a penalty, not a
+    prediction. The function works under `jit`, `vmap`, `grad`, `jvp` and their compositions; the derivative is that of
+    the event's time (implicit function theorem) and of the penalty, with respect to every number except `t1` and
+    `tolerance`.
 
     **Arguments:**
 
@@ -56,7 +58,7 @@ def extended_inversion_time(
 
     **Raises:** `ValueError` for arguments out of range, and for a scene with `contact="hybrid"` or `SetValuedCoulomb`.
 
-    **Example:** this top does not invert by 3 s, and counts as one that would later.
+    **Example:** this top does not invert by 3 s, and counts as one that inverts later.
 
     >>> import tippe
     >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=3.0e-6, I3=3.2e-6)
@@ -79,7 +81,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
     movable: int
     # JAX's PyTreeDef, which type checkers take for a variable.
     structure: Any = eqx.field(static=True)
-    # Whether some numbers were traced, so that they could not be checked.
+    # Whether some numbers were traced and therefore could not be checked.
     unchecked: bool = eqx.field(static=True)
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
@@ -117,7 +119,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         """The extended times of every cell, and their derivatives along tangents (as of `VariationalProblem`)."""
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         varied = VariationalProblem(problem, tangents, True)
-        # Parameters tried by a fit may be far off.
+        # A fit may try parameters that are far off.
         settings = Settings(tolerance, max_steps=MOST_STEPS)
         queue = LaneScheduler.of(
             varied, t1, jnp.asarray(cells), settings, one_kernel=not nested, n_blocks=1 + len(tangents)

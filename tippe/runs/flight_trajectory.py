@@ -33,11 +33,11 @@ from ..modes.sliding import MOST_BOUNCES, modes
 from ..modes.trajectory_problem import TrajectoryProblem
 from .observables import AbstractTrajectory, of_each_run
 
-#: The greatest energy residual of a run, relative to its energy and over its tolerance. Flights over ripples and in a spheroid
-#: stay below 1e-4 of this; a landing where no arena was had left a residual of 8e4 times it.
+#: The greatest energy residual of a run, relative to its energy and over its tolerance. Flights over ripples and in a
+#: spheroid stay below 1e-4 of this; a landing away from the arena gave a residual of 8e4 times this.
 BALANCED = 1e4
 
-#: What users are told, by the code of the integration.
+#: The words for users, by the code of the integration.
 STATUS = {
     REACHED_END: Status.COMPLETED,
     LEFT_DOMAIN: Status.JAMMED,
@@ -49,22 +49,23 @@ STATUS = {
 class HybridTrajectory(AbstractTrajectory):
     """A run through contacts, flights and impacts; vectors are arrays (times, 3) in the fixed frame (x, y, z).
 
-    `status` is "completed", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a row or
-    2000 contacts; sphere and stem on the plane together with so much friction that the forces are not determined; sphere and
-    stem at rest together on another arena, where the equations of both contacts at once are not implemented; a flight that
-    does not end at the arena; an energy residual beyond 1e4 times the tolerance, relative to the energy); the run ends at
-    `end_time`, and `print(run)` says why it is unresolved. `contact` says at each time which sphere touches: 0 the top's, 1
-    its stem's, 2 both, -1 none. At the time of an impact the values are those before it. `distance` is that of the top's own
-    sphere from the plane [m] with its rate [m/s]. `hops` has a row for each flight until `end_time`, its begin and its end
-    [s]; a table counts those before the inversion. Bounces that shrink by the restitution e are followed down to 1e-5 sqrt(g
-    R); from there on the top counts as in contact, though all that are left would take e / (1 - e) of the last one's time.
-    `work` is that of friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest drift of |e|,
-    the greatest energy residual |E - E(0) - work| and the energy lost in impacts [J]. `rotation` and `angular_velocity` are
-    those of `Trajectory`.
+    `status` is "completed", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a row
+    or 2000 contacts; sphere and stem on the plane together with so much friction that the forces are not determined;
+    sphere and stem at rest together on another arena, where the equations of both contacts at once are not implemented;
+    a flight that does not end at the arena; an energy residual beyond 1e4 times the tolerance, relative to the energy);
+    the run ends at `end_time`, and `print(run)` says why it is unresolved. `contact` is the sphere that touches at each
+    time: 0 the top's, 1 its stem's, 2 both, -1 none. At the time of an impact, values are those before the impact.
+    `distance` is the distance of the top's own sphere from the plane [m] with its rate [m/s]. `hops` has a row for each
+    flight until `end_time`, with its start and end [s]; a table counts only the flights before the inversion. Bounces
+    that shrink by the restitution e are followed down to a speed of 1e-5 sqrt(g R); after that the top counts as in
+    contact, although the remaining bounces would take e / (1 - e) of the last one's time. `work` is the work of
+    friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest drift of |e|, the greatest
+    energy residual |E - E(0) - work| and the energy lost in impacts [J]. `rotation` and `angular_velocity` are those of
+    `Trajectory`.
 
-    Inside a transformation `status` is the integer of the `Status`; `hops` is `None`, `stats["hops"]`
-    counts the flights. First derivatives by the scene and the launch go through flights and impacts; they are NaN behind an
-    event that is grazing, so that within the tolerance it may not happen at all.
+    Inside a transformation `status` is the integer of the `Status`; `hops` is `None`, `stats["hops"]` counts the
+    flights. First derivatives by the scene and the launch go through flights and impacts; they are NaN after a grazing
+    event, which may not happen within the tolerance.
 
     **Example:**
 
@@ -107,7 +108,7 @@ class HybridTrajectory(AbstractTrajectory):
 
     @property
     def _free(self) -> FreeBody:
-        """The top as a free body, in contact too."""
+        """The top as a free body, also in contact."""
         body = self.scene.body
         free = as_free_body(body, balls(body)[0], self._states)
         (distance, rate), (u1, u2, u3) = self.above, free.velocity
@@ -115,7 +116,7 @@ class HybridTrajectory(AbstractTrajectory):
 
     @property
     def _ball(self) -> Ball:
-        """The sphere that touches, the top's own in flight and where both do."""
+        """The touching sphere; in flight, and if both touch, the top's own."""
         spheres = balls(self.scene.body)
         return Ball(
             *(jnp.where(self.contact == 1, stem, own) for own, stem in zip(spheres[0], spheres[-1], strict=True))
@@ -128,19 +129,19 @@ class HybridTrajectory(AbstractTrajectory):
 
     @of_each_run
     def normal_force(self) -> Float[Array, " times"]:
-        """Normal force [N]; 0 in flight. Where both spheres touch it is their sum, the weight."""
+        """Normal force [N]; 0 in flight. If both spheres touch, it is the sum of both, the weight."""
         motion = standing_on(self.scene.dynamics, self._ball).motion(self._states)
         both = jnp.where(self.contact == BOTH, self.scene.body.mass * self.scene.gravity, motion.normal_force)
         return jnp.where(self.contact < 0, 0.0, both)
 
     @of_each_run
     def slip(self) -> Float[Array, "times 2"]:
-        """Velocity along the plane of the lowest point of the sphere that touches [m/s]: of the top's own in flight too, and
-        where both touch."""
+        """Velocity along the plane of the lowest point of the sphere that touches [m/s]: of the top's own in flight,
+        and if both touch."""
         return jnp.stack(approach(self.scene.body, self._ball, self._free).velocity[:2], axis=-1)
 
     def resampled(self, times: Float[np.ndarray, " times"]) -> "HybridTrajectory":
-        """The same run at other times, which are not checked."""
+        """The same run at other times, without checking them."""
         arrays = (times, *self.parts_of(self.dense.at(times)), self.touching(self.dense.numbers(times)))
         return eqx.tree_at(
             lambda run: (run.t, run.states, run.cyclic, run.spin_angle, run.work, run.distance, run.contact),
@@ -150,17 +151,18 @@ class HybridTrajectory(AbstractTrajectory):
 
     @staticmethod
     def parts_of(shown: Float[Array | np.ndarray, "rows times"]) -> tuple[Any, Any, Any, Any, Any]:
-        """State, cyclic coordinates, spin angle, work, and the distance with its rate, from what the modes show."""
+        """State, cyclic coordinates, spin angle, work, and the distance with its rate, from the output rows of the
+        modes."""
         return shown[:8], shown[8:13], shown[13], shown[14], shown[15:]
 
     @staticmethod
     def work_in(piece: Segment) -> float:
-        """The work [J] of friction in a piece of the path, that of impacts apart."""
+        """The work [J] of friction in a segment of the path, without that of impacts."""
         return 0.0 if piece.number == BETWEEN else piece.motion.states[-1, -1] - piece.motion.states[-1, 0]
 
     @staticmethod
     def touching(numbers: Int[Array | np.ndarray, " times"]) -> Any:
-        """Which sphere touches, for the numbers of the modes."""
+        """The sphere that touches, for each mode index."""
         return numbers
 
     @property
@@ -169,11 +171,11 @@ class HybridTrajectory(AbstractTrajectory):
 
     @property
     def where_the_model_ends(self) -> str:
-        """Why no motion is determined from the end of the run on."""
+        """The reason why the motion is undetermined after the end of the run."""
         return "sphere and stem touch the plane together, and friction is so strong that the forces are not determined"
 
     def _reason(self) -> str:
-        """Why the status is "unresolved"."""
+        """The reason for the status "unresolved"."""
         contacts = sum(segment.number != BETWEEN for segment in self.dense.segments)
         if self.dense.status != UNRESOLVED:
             return f"the energy residual of {self.stats['energy_residual']:.1e} J is beyond what the tolerance allows"
@@ -187,7 +189,7 @@ class HybridTrajectory(AbstractTrajectory):
 
 
 def level_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int[Array, "1"], Float[Array, "15 1"]]:
-    """The modes of one launch of a hybrid scene on a level plane, the number of the first, and the state there.
+    """The modes of one launch of a hybrid scene on a level plane, the index of the first, and its initial state.
 
     **Arguments:** `modules`: scene and launch; `tolerance`: no mode needs it.
     """
@@ -197,9 +199,10 @@ def level_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int
 
 @compiled_setup
 def _start(scene: Scene[Top], launch: Launch) -> InversionProblem:
-    """The launch as one cell, with the passive quadratures; their place is that of the centre of mass."""
+    """The launch as one cell, with the passive quadratures, whose position is that of the centre of mass."""
     state, scales = TrajectoryProblem.of(scene, launch).start()
-    state = state.at[8:10].add(-scene.body.offset * state[2:4])
+    place = state[8:10] - scene.body.offset * state[2:4]
+    state = jnp.concatenate([state[:8], place, state[10:]])
     return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
 
 
@@ -211,7 +214,7 @@ def simulate_hybrid(
     tolerance: float | Float[Array, ""],
     solver: diffrax.AbstractSolver | None,
 ) -> HybridTrajectory:
-    """Run one launch of a hybrid scene until `t1`. **Arguments:** as for `simulate`, checked."""
+    """Run one launch of a hybrid scene until `t1`. **Arguments:** as for `simulate`, already checked."""
     batched_modes, first, state = level_modes((scene, launch), tolerance)
     start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
     path = solve_hybrid_dense(batched_modes, *start, t1, Settings(tolerance, solver), counters=1)
@@ -221,7 +224,7 @@ def simulate_hybrid(
 
 
 def sampled_hybrid(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
-    """Run one launch of a hybrid scene inside a transformation. **Arguments:** as for `simulate`, checked."""
+    """Run one launch of a hybrid scene inside a transformation. **Arguments:** as for `simulate`, already checked."""
     samples = hybrid_samples(level_modes, (scene, launch), times, t1, settings, counters=1)
     return sampled_flights(HybridTrajectory, scene, times, samples, jnp.asarray(int(Status.JAMMED)))
 
@@ -229,9 +232,9 @@ def sampled_hybrid(scene: Scene[Top], launch: Launch, times: Any, t1: Any, setti
 def sampled_flights(
     kind: type[HybridTrajectory], scene: Scene[Top], times: Any, samples: HybridSamples, lost: Int[Array, ""]
 ) -> Any:
-    """A trajectory of some kind from samples; `lost` is the code of how a run ended that left its domain."""
+    """A trajectory of the given class from samples; `lost` is the code for a run that left its domain."""
     states, place, spin_angle, work, distance = kind.parts_of(samples.shown)
-    # After the end no sphere touches.
+    # After the end, no sphere touches.
     number = jnp.where(jnp.isnan(samples.number), BETWEEN, samples.number).astype(int)
     ended = {code: jnp.asarray(int(status)) for code, status in STATUS.items()} | {LEFT_DOMAIN: lost}
     status = sum(jnp.where(samples.status == code, index, 0) for code, index in ended.items())
@@ -250,16 +253,16 @@ def flights_of(
     times: Any,
     tolerance: float | Float[Array, ""],
 ) -> Any:
-    """A trajectory of some kind along a path, at given times or at those of its steps.
+    """A trajectory of the given class along a path, at given times or at those of its steps.
 
-    A run whose energy is not what friction and impacts have left of it ends as "unresolved".
+    A run whose energy does not balance the work of friction and impacts ends as "unresolved".
     """
     shown = path.times
     states, place, spin_angle, work, distance = kind.parts_of(path.at(shown))
     ends = (status, path.end_time, {}, path, distance, kind.touching(path.numbers(shown)), hops)
     run = kind(shown, scene, states, place, spin_angle, work, *ends)
     in_contact = sum(kind.work_in(segment) for segment in path.segments)
-    # What is left of the work is that of the impacts.
+    # The remaining work is that of the impacts.
     run = run.with_stats(path, impact_loss=float(in_contact - path.state[-1]))
     size = float(np.max(np.abs(run.energy))) + float(scene.body.mass * scene.gravity * scene.body.radius)
     if status != Status.FAILED.word and not run.stats["energy_residual"] <= BALANCED * tolerance * size:

@@ -1,7 +1,7 @@
 """Inversions of many launches: whether and when each top turns over, and the derivatives of that time.
 
-Tables solve launches with concrete numbers (`ON_HOST`); functions that run inside `jit`, `vmap` and `grad` solve them with
-traced numbers (`traced`). Runs are one smooth motion, or go through the modes of their `RunKind`.
+Tables use concrete numbers (`ON_HOST`); functions that run inside `jit`, `vmap` and `grad` use traced numbers
+(`traced`). Runs are one smooth motion, or go through the modes of their `RunKind`.
 """
 
 import functools
@@ -44,7 +44,8 @@ ON_HOST = Solvers(np, solve_ensemble, solve_ensemble_with_tangents, solve_hybrid
 
 
 def traced(one_kernel: bool = True) -> Solvers:
-    """The functions for traced numbers. **Arguments:** `one_kernel`: not for programs that are differentiated again."""
+    """The functions for traced numbers. **Arguments:** `one_kernel`: false for programs that are differentiated
+    again."""
     return Solvers(
         jnp,
         functools.partial(traced_solve_ensemble, one_kernel=one_kernel),
@@ -55,10 +56,10 @@ def traced(one_kernel: bool = True) -> Solvers:
 
 
 class Inversions(eqx.Module):
-    """Launches in many cells, to be run until theta reaches an angle.
+    """Launches in many cells that run until theta reaches an angle.
 
     - `problem`: the smooth motion, and the initial states of all cells.
-    - `modes`, `first`: the modes of a hybrid run, and the number of each cell's first mode; `None` for smooth runs.
+    - `modes`, `first`: the modes of a hybrid run, and the index of each cell's first mode; `None` for smooth runs.
     - `last`: whether a run continues through the angle: where it ends above it, the last crossing counts.
     """
 
@@ -76,7 +77,8 @@ class Inversions(eqx.Module):
         return cls(problem, modes, first, kind, last)
 
     def solve(self, t1: Any, cells: int, settings: Settings, solvers: Solvers = ON_HOST) -> Outcome | HybridOutcome:
-        """How the runs end. **Arguments:** `t1`: horizon [s]; `cells`: how many cells to run, the rest is padding."""
+        """The outcome of the runs. **Arguments:** `t1`: horizon [s]; `cells`: number of cells to run, the rest is
+        padding."""
         if self.modes is None:
             horizon = (jnp.asarray(t1), jnp.asarray(cells))
             return solvers.ensemble(self.problem, *horizon, settings, nonterminal=self.last)[0]
@@ -91,10 +93,10 @@ class Inversions(eqx.Module):
         settings: Settings,
         solvers: Solvers = ON_HOST,
     ) -> tuple[Outcome | HybridOutcome, Sequence[Any], Any]:
-        """How the runs end, and the derivatives of their crossing times along some tangents.
+        """The outcome of the runs, and the derivatives of their crossing times along some tangents.
 
-        **Returns:** the outcome; for each tangent the derivative in every cell, 0 where there is no crossing or it is at the
-        start; and where the derivative is NaN because an event on the way was grazing.
+        **Returns:** the outcome; for each tangent the derivative in every cell, 0 if there is no crossing or if it is
+        at the start; and the cells whose derivative is NaN because an earlier event was grazing.
         """
         if self.modes is None:
             arguments = (tuple(tangent.problem for tangent in tangents), jnp.asarray(t1), jnp.asarray(cells), settings)
@@ -102,7 +104,7 @@ class Inversions(eqx.Module):
             return outcome, slopes, False
         outcome, xp = None, solvers.xp
         if self.last:
-            # The derivatives need the run only up to the event, whose time is then known.
+            # The derivatives need the run only up to the event, whose time is known.
             outcome = self.solve(t1, cells, settings, solvers)
             t1 = xp.where(xp.isfinite(outcome.crossing_time), outcome.crossing_time, 0.0)
         moved = tuple((tangent.modes, tangent.problem.states) for tangent in tangents)
@@ -113,7 +115,7 @@ class Inversions(eqx.Module):
         return run if outcome is None else outcome, sensitivities.slopes, sensitivities.grazing
 
     def _start(self, xp: Any) -> tuple[Any, Any]:
-        """The number of each cell's first mode, and its initial state."""
+        """The index of each cell's first mode, and its initial state."""
         return xp.asarray(self.first), xp.asarray(self.problem.states)
 
 
@@ -122,14 +124,15 @@ _on_the_ground = eqx.filter_jit(airborne.on_the_ground)
 
 
 def with_contact_state(scene: Scene[Any], outcome: Outcome | HybridOutcome) -> Outcome | HybridOutcome:
-    """The outcome with all states in the layout of a contact, those of flight too."""
+    """The outcome with all states, including those of flight, in the layout of a contact."""
     if not isinstance(outcome, HybridOutcome) or not run_kind_of(scene).flight_state:
         return outcome
     return outcome._replace(state=_on_the_ground(scene, outcome.state, outcome.mode))
 
 
 def is_inverted(outcome: Outcome | HybridOutcome, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:
-    """Which cells count as inverted: those that reached the angle, or that end above it where the last crossing counts."""
+    """The cells that count as inverted: those that reached the angle, or those that end above it if the last crossing
+    counts."""
     if not last:
         return outcome.status == CROSSED
     above = problem.event_function(jnp.asarray(outcome.state)) <= 0.0

@@ -39,10 +39,10 @@ def inversion_time(
 ) -> Float[Array, ""]:
     """Time at which theta reaches an angle; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
-    The derivative is that of the event's time by the implicit function theorem; it is 0 where the result is infinite.
-    The time and its derivative by one parameter cost about three times the time alone, by two parameters five times, by
-    three or four seven to ten times, and by any number more eight to thirteen times (`nonholonomic/derivatives/slopes.py`);
-    second derivatives take forward-mode passes.
+    The derivative is that of the event's time by the implicit function theorem; it is 0 if the result is infinite. The
+    time and its derivative with respect to one parameter cost about three times the time alone; two parameters cost
+    five times, three or four seven to ten times, and more parameters eight to thirteen times
+    (`nonholonomic/derivatives/slopes.py`); second derivatives take forward-mode passes.
 
     **Arguments:**
 
@@ -58,12 +58,12 @@ def inversion_time(
     **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before; NaN
     if the integration failed, or if numbers inside a transformation are out of range.
 
-    With `contact="hybrid"` and `SetValuedCoulomb` first derivatives go through flights, impacts, stick and slip
-    (`nonholonomic/hybrid/saltation.py`). Where an event on the way is grazing, so that within the tolerance it may
-    not happen at all, the derivative is NaN; `inversion_table` says so in the variable `grazes`.
+    With `contact="hybrid"` and `SetValuedCoulomb`, first derivatives include flights, impacts, stick and slip
+    (`nonholonomic/hybrid/saltation.py`). If an earlier event is grazing, so that it may not happen within the
+    tolerance, the derivative is NaN; the variable `grazes` of `inversion_table` reports this.
 
-    **Raises:** `ValueError` for arguments outside these ranges, for a run that needs more than 2 000 000 steps, for second
-    derivatives through changes of mode, and for derivatives with both, whose impacts may stop a slip.
+    **Raises:** `ValueError` for arguments outside these ranges, for a run that needs more than 2 000 000 steps, for
+    second derivatives through changes of mode, and for derivatives with both, because an impact may stop a slip.
 
     **Example:**
 
@@ -84,7 +84,7 @@ def inversion_time(
     warn_if_it_cannot_invert(scene, launch, launch.theta)
     leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
     unchecked = any(is_traced(leaf) for leaf in leaves)
-    # The last two leaves, horizon and tolerance, do not move the event.
+    # The last two leaves, horizon and tolerance, do not affect the event.
     solve = InversionSolve(len(leaves) - 2, structure, method, crossing == "last", unchecked)
     time = differentiable_solve(solve, *leaves)
     if not is_traced(time) and not unchecked and np.isnan(time):
@@ -101,8 +101,8 @@ def explain_failure(
     crossing: str,
     solver: diffrax.AbstractSolver,
 ) -> None:
-    """Raise `ValueError` for a run that needed too many steps; warn of any other failure. The run is repeated to find
-    out.
+    """Raise `ValueError` for a run that needed too many steps; warn of any other failure. This repeats the run to find
+    the cause.
 
     **Arguments:** as for `inversion_time`.
     """
@@ -129,7 +129,7 @@ class InversionSolve(AbstractDifferentiableSolve):
     structure: Any = eqx.field(static=True)
     solver: diffrax.AbstractSolver
     last: bool = eqx.field(static=True)
-    # Whether some numbers were traced, so that they could not be checked.
+    # Whether some numbers were traced and therefore could not be checked.
     unchecked: bool = eqx.field(static=True)
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
@@ -158,7 +158,7 @@ class InversionSolve(AbstractDifferentiableSolve):
         return self._times(leaves, may, inversions, outcome, gather([*slopes]))
 
     def _modules(self, leaves: Sequence[Array]) -> Any:
-        """Scene, launch, angle, horizon and tolerance; `None` in place of leaves that are left out at the end."""
+        """Scene, launch, angle, horizon and tolerance; `None` for omitted leaves at the end."""
         unused = (None,) * (self.structure.num_leaves - len(leaves))
         return jax.tree.unflatten(self.structure, (*leaves, *unused))
 
@@ -177,7 +177,7 @@ class InversionSolve(AbstractDifferentiableSolve):
         outcome: Outcome | HybridOutcome,
         slopes: list[Float[Array, " cells"]],
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-        """The times of inversion and their derivatives: infinite and 0 where there is none, NaN where the run failed."""
+        """The inversion times and their derivatives: infinite and 0 without inversion, NaN if the run failed."""
         outcome = with_contact_state(self._modules(leaves)[0], outcome)
         inverted = is_inverted(outcome, inversions.problem, self.last)
         good = may & (outcome.status != FAILED) & (outcome.status != UNRESOLVED)

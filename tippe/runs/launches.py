@@ -1,4 +1,4 @@
-"""The grid of launches and scenes that a table is asked for, made of its arguments and checked."""
+"""The grid of launches and scenes of a table, from its arguments, checked."""
 
 from collections import Counter
 from collections.abc import Collection
@@ -17,7 +17,7 @@ from .checks import check_numbers
 
 UNITS = Top.units | Scene.units | Launch.units
 
-#: What the axes are, in words.
+#: Descriptions of the axes.
 LONG_NAMES = {
     "theta": "θ(0)",
     "eta": "η(0)",
@@ -36,13 +36,13 @@ LONG_NAMES = {
     "restitution": "restitution e_N",
 }
 
-#: The parts of a launch that are several numbers: what an axis along each is called, and its unit.
+#: The parts of a launch that consist of several numbers: the name of an axis along each number, and its unit.
 SEVERAL = {
     "velocity": [(f"velocity_{axis}", "m s-1") for axis in ("t1", "t2")],
     "angular_velocity": [(f"angular_velocity_{axis}", "rad s-1") for axis in ("t1", "t2", "n")],
 }
 
-#: What can be varied of a launch.
+#: Parameters of a launch that can be varied.
 NUMBERS_OF_A_LAUNCH = [f"launch.{name}" for name in ("theta", "spin", "eta", "azimuth")]
 NUMBERS_OF_A_LAUNCH += [
     f"launch.{name}[{k}]"
@@ -52,7 +52,8 @@ NUMBERS_OF_A_LAUNCH += [
 
 
 def variable_numbers(scene: Scene) -> list[str]:
-    """The full names of what can be varied of a scene: single numbers, those that are left out for 0 among them."""
+    """The full names of a scene's parameters that can be varied: single numbers, including omitted ones, which are
+    0."""
     names = [name for name, value in numbers("scene", scene).items() if np.ndim(value) == 0]
     return [name for name in names if name != "scene.restitution" or scene.contact == "hybrid"]
 
@@ -66,19 +67,21 @@ def launches(
     taken: Collection[str] = (),
     scattered: bool = False,
 ) -> tuple[dict[str, Any], list[Axis], dict[str, str]]:
-    """The scene and launch that all cells share, and the axes of the grid, its cells checked before anything compiles.
+    """The scene and launch that all cells share, and the axes of the grid; checks the cells before anything compiles.
 
     **Arguments:**
 
     - `scene`: the scene, every number a scalar.
-    - `launch_values`: number of the launch, or "mu" for the scene's friction, its own if `None` -> a number or a list.
-    - `axes`: path of a number, or the end of it that means one only -> values, or `None`; those of a launch's several numbers
-      are `"launch.place[0]"` and so on, and what is left out of them is 0.
+    - `launch_values`: parameter of the launch, or "mu" for the scene's friction (`None` for its own value) -> a number
+      or a list.
+    - `axes`: full name of a parameter, or its unambiguous end -> values, or `None`; the numbers of a launch's vectors
+      are `"launch.place[0]"` and so on, and omitted ones are 0.
     - `t1`, `tolerance`: as for `inversion_table`.
-    - `taken`: names that no axis may have; it then goes by its path, as do axes that would share a name.
-    - `scattered`: whether the lists are of one length and taken together, the k-th of each for the k-th cell.
+    - `taken`: names that no axis may have; such an axis gets its full name, as do axes that would share a name.
+    - `scattered`: whether the lists have equal length and are combined element by element: the k-th of each for the
+      k-th cell.
 
-    **Returns:** "scene" and "launch" with the numbers that are no axes, for `with_numbers`; the axes, the last varying
+    **Returns:** "scene" and "launch" with the numbers that are not axes, for `with_numbers`; the axes, the last varying
     fastest; and the units of numbers by their short names.
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis.
@@ -99,7 +102,7 @@ def launches(
     launch, several = _with_room(scene, values)
     units = UNITS | scene.body.units | scene.friction.units | dict(several.values())
     names = {number: several.get(number, (number.rsplit(".", 1)[-1],))[0] for number in values}
-    # A place that is given takes the place of the argument eta.
+    # `place` replaces the argument `eta`.
     counts = Counter(name for number, name in names.items() if number != "launch.eta" or launch.place is None)
     grid = []
     for number, name in names.items():
@@ -108,9 +111,9 @@ def launches(
             unit, long_name = units.get(name, "1"), LONG_NAMES.get(name, name)
             grid.append(axis(name if alone else number, number, unit, values[number], long_name))
     roots = with_numbers({"scene": scene, "launch": launch}, fixed)
-    # The numbers that axes stand for are 0 here, which may be no place of the arena: starts are checked cell by cell.
+    # The numbers of axes are 0 here, which may not be a place on the arena; starts are checked cell by cell.
     check_numbers(roots["scene"], roots["launch"], t1, tolerance)
-    # The modules check their numbers, which may be impossible only together.
+    # The modules check their numbers, which may be illegal only in combination.
     for cells in [rows(grid)] if scattered else cells_to_check(grid):
         looked_at = with_numbers(roots, cells)
         looked_at["scene"].check_start(looked_at["launch"])
@@ -118,9 +121,9 @@ def launches(
 
 
 def rows(lists: list[Axis]) -> dict[str, Any]:
-    """The numbers of scattered cells: full name -> a value for each.
+    """The numbers of scattered cells: full name -> one value per cell.
 
-    **Raises:** `ValueError` unless there are lists, all of one length.
+    **Raises:** `ValueError` unless there are lists, all of equal length.
     """
     lengths = {grid_axis.name: len(grid_axis.values) for grid_axis in lists}
     if len(set(lengths.values())) != 1:
@@ -130,7 +133,7 @@ def rows(lists: list[Axis]) -> dict[str, Any]:
 
 
 def _with_room(scene: Scene, values: Collection[str]) -> tuple[Launch, dict[str, tuple[str, str]]]:
-    """A launch with room for all numbers that are given, and the name and unit of each that is one of several."""
+    """A launch with entries for all given numbers, and the name and unit of each number of a vector."""
     components: dict[str, tuple[str, str]] = {}
     parts: dict[str, Any] = {}
     coordinates = list(scene.surface.coordinates)
@@ -145,6 +148,6 @@ def _with_room(scene: Scene, values: Collection[str]) -> tuple[Launch, dict[str,
 
 
 def described(roots: dict[str, Any], grid: list[Axis]) -> dict[str, Any]:
-    """What is asked of which scene and launch, as plain data; the values of axes stand elsewhere."""
+    """The request for a scene and launch as plain data, without the values of axes."""
     texts = {path: value for name, root in roots.items() for path, value in description(name, root).items()}
     return texts | {grid_axis.number: "an axis" for grid_axis in grid}

@@ -22,7 +22,7 @@ from ..model.state import joined, parts
 from ..modes.inversion_problem import InversionProblem
 from .run_kind import run_kind_of
 
-#: Stretches of time whose growth is recorded; half of them give the exponent and its scatter.
+#: Number of time intervals with recorded growth; half of them give the exponent and its scatter.
 STRETCHES = 32
 
 
@@ -30,9 +30,9 @@ class LyapunovExponent(NamedTuple):
     """The largest Lyapunov exponent of a run, or of each of several.
 
     - `exponent`: mean rate [1/s] of exponential divergence in the second half of the run; NaN if the run ended early.
-    - `error`: of the exponent [1/s]; an exponent below twice its error is no sign of chaos.
+    - `error`: of the exponent [1/s]; an exponent below twice its error does not indicate chaos.
     - `status`: "completed", "contact_lost", "jammed", "does_not_fit" or "failed".
-    - `end_time`: when the run ended [s]; `steps`: accepted and rejected ones.
+    - `end_time`: time at which the run ended [s]; `steps`: numbers of accepted and rejected steps.
     - `times`: [s], (32,), and `running`: the mean rate of divergence [1/s] from the start to each of them, (32, ...).
 
     **Example:**
@@ -67,8 +67,9 @@ def lyapunov_exponent(
 ) -> LyapunovExponent:
     """The largest Lyapunov exponent of one launch or of many at once, by the variational equation.
 
-    Positive if nearby launches diverge exponentially. While a top rises, it is the rate of the rise; chaos is a rate that stays
-    positive as `t1` grows. Source: Benettin et al., Meccanica 15 (1980) 9; see `nonholonomic/derivatives/lyapunov.py`.
+    The exponent is positive if nearby launches diverge exponentially. While a top rises, it is the rate of the rise; in
+    chaotic motion it stays positive as `t1` grows. Source: Benettin et al., Meccanica 15 (1980) 9; see
+    `nonholonomic/derivatives/lyapunov.py`.
 
     **Arguments:**
 
@@ -109,9 +110,9 @@ def lyapunov_exponent(
         raise ValueError(f"scene and launch must hold scalars or one number per launch, not arrays of shapes {shapes}")
     shape = shapes.pop() if shapes else ()
     cells = int(np.prod(shape, dtype=int))
-    # No angle has this cosine, so only a contact that is lost or jams ends a run before the horizon.
+    # No angle has this cosine, so only the loss or jam of a contact ends a run before the horizon.
     problem = InversionProblem.of(scene, launch, jnp.pi, cells)
-    # A turning frame turns by another angle for each launch, and that difference would count as divergence.
+    # A turning frame turns by a different angle for each launch, and the difference would count as divergence.
     problem = dataclasses.replace(problem, dynamics=scene.dynamics, cos_angle=jnp.asarray(NO_COSINE))
     growths = growth(problem, _direction(scene, launch, cells), float(t1), STRETCHES, settings)
     exponent, error = exponent_of(growths.logarithm, float(t1))
@@ -120,7 +121,7 @@ def lyapunov_exponent(
     words = np.select([whole, growths.status == LEFT_DOMAIN], ["completed", lost], "failed")
     times = t1 * np.arange(1, STRETCHES + 1) / STRETCHES
     passed = np.minimum(times[:, None], growths.end_time)
-    # A run that ends where it starts has not diverged from anything.
+    # A run of zero length has no divergence.
     running = np.cumsum(growths.logarithm, axis=0) / np.where(passed > 0.0, passed, 1.0)
     return LyapunovExponent(
         exponent=np.where(whole, exponent, np.nan).reshape(shape),
@@ -134,7 +135,7 @@ def lyapunov_exponent(
 
 
 def _direction(scene: Scene, launch: Launch, cells: int) -> Float[Array, "components cells"]:
-    """A direction with nothing special about it, tangent to the set of states: axis and vertical keep length 1."""
+    """A generic direction, tangent to the set of states: axis and vertical keep length 1."""
     magnitudes = scene.scales(launch)
     u1, u2, r1, r2, r3, *L = (magnitudes[i] * jnp.cos(1.0 + i) for i in range(8))
     e = parts(scene.state(launch)).axis

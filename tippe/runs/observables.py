@@ -1,4 +1,4 @@
-"""What is read off a run of a tippe top, with its contact kept or through flights: one state at each time."""
+"""The quantities of a run of a tippe top, in contact or through flights: one state at each time."""
 
 import abc
 import dataclasses
@@ -29,14 +29,14 @@ from .view import as_stages
 #: The angle [rad] that counts as inverted by default.
 INVERTED = 0.95 * math.pi
 
-#: Steps that come so near to the angle [rad] are looked at in so many parts.
+#: Distance from the angle [rad] within which a step is checked in parts, and the number of parts.
 NEAR, LOOKS = 0.3, 8
 
 
 def of_each_run(function: Callable[[Any], Array]) -> property:
-    """A property of one run that is, for a batch of runs as `vmap` returns it, the property of each.
+    """A property of one run that is also defined for a batch of runs from `vmap`, run by run.
 
-    Outside of transformations it is compiled for powers of two only: every run has another number of steps.
+    Outside transformations it is compiled for powers of two only, because every run has a different number of steps.
     """
     compiled = eqx.filter_jit(function)
 
@@ -86,14 +86,15 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         return "theta", "theta_rate"
 
     def padded(self) -> Self:
-        """The run with the last of its times repeated, up to a power of two; without what observables do not need."""
+        """The run with its last time repeated, up to a power of two, and without fields that observables do not
+        need."""
         longer = {name: padded(np.asarray(getattr(self, name)), len(self.t)) for name in self.by_time}
         return dataclasses.replace(self, **longer, **dict.fromkeys(self.unused, None))
 
     @property
     @abc.abstractmethod
     def above(self) -> tuple[Component, Component]:
-        """Distance of the top's sphere from the arena [m] and its rate [m/s]; `None` where it touches at all times."""
+        """Distance of the top's sphere from the arena [m] and its rate [m/s]; `None` if it touches at all times."""
 
     @property
     @abc.abstractmethod
@@ -102,7 +103,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
 
     @abc.abstractmethod
     def resampled(self, times: Float[np.ndarray, " times"]) -> Self:
-        """The same run at other times, which are not checked."""
+        """The same run at other times, without checking them."""
 
     @of_each_run
     def theta(self) -> Float[Array, " times"]:
@@ -111,7 +112,8 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
 
     @property
     def inversion_time(self) -> float:
-        """Time [s] at which theta first reaches 0.95 pi, as `tippe.inversion_time` gives it; infinite if it has not by the end.
+        """Time [s] at which theta first reaches 0.95 pi, like `tippe.inversion_time`; infinite if it does not by the
+        end.
 
         It is located on the run's dense output, to the tolerance of the run.
 
@@ -129,7 +131,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         value = beyond(times)
         if value[0] >= 0.0:
             return 0.0
-        # Between the ends of the steps theta may rise a little more.
+        # Within a step, theta may exceed its values at the ends.
         last = np.argmax(value >= 0.0) if np.any(value >= 0.0) else len(value) - 1
         near = np.flatnonzero(np.maximum(value[:last], value[1 : last + 1]) > -NEAR)
         between = times[near] + np.arange(1, LOOKS)[:, None] / LOOKS * (times[near + 1] - times[near])
@@ -148,7 +150,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
 
     @of_each_run
     def eta(self) -> Float[Array, " times"]:
-        """Angle of the place from the arena's lowest point [rad]; 0 on the plane."""
+        """Angle of the position from the arena's lowest point [rad]; 0 on the plane."""
         return self.scene.frame.angle(self._place, self._path)
 
     @of_each_run
@@ -173,15 +175,15 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
 
     @of_each_run
     def velocity(self) -> Float[Array, "times 3"]:
-        """Velocity of the point whose path `position` is [m/s]."""
+        """Velocity of the point whose path is `position` [m/s]."""
         motion, axis = self.scene.dynamics.motion(self.states), parts(self.states).axis
         beside = jax.jvp(self.scene.body.path_from_frame, (axis,), (motion.rate[2:5],))[1]
         return self._fixed(sum_vectors((*motion.velocity, self.above[1]), beside))
 
     @of_each_run
     def position(self) -> Float[Array, "times 3"]:
-        """Position of the sphere's centre, of other bodies of the centre of mass [m]; the plane is z = 0, the cylinder's axis
-        x = z = 0, and a run on the plane starts above the origin."""
+        """Position of the sphere's centre, or of the centre of mass for other bodies [m]; the plane is z = 0, the
+        cylinder's axis x = z = 0, and a run on the plane starts above the origin."""
         frame, where = self.scene.frame, (self._place, self._path)
         centre = sum_vectors(frame.position(*where), scale(self.above[0], frame.axes(*where)[2]))
         beside = self.scene.body.path_from_frame(parts(self.states).axis)
@@ -190,8 +192,8 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
 
     @of_each_run
     def jellett(self) -> Float[Array, " times"]:
-        """Jellett's quantity of the top's own sphere [kg m^3/s]; constant on the plane where friction acts at one of its
-        points, so not while a stem touches."""
+        """Jellett's quantity of the top's own sphere [kg m^3/s]; constant on the plane while friction acts at a point
+        of that sphere, so not while a stem touches."""
         return self.scene.jellett(self.states)
 
     def at(self, times: Float[ArrayLike, " times"]) -> Self:
@@ -216,7 +218,8 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         return as_stages([self, *others], overlaid)
 
     def with_stats(self, path: DenseSolution | HybridPath, **more: Any) -> Self:
-        """The same run with what it took, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and more."""
+        """The same run with its statistics: steps, the greatest drift of |e|, the greatest |E - E(0) - work| [J], and
+        more."""
         energy, work = np.asarray(self.energy), np.asarray(self.work)
         stats = {
             "accepted": path.accepted,
@@ -239,9 +242,9 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
 
     @of_each_run
     def rotation(self) -> Float[Array, "times 3 3"]:
-        """From the body to the fixed frame: its columns are the body's axes, the third of them e. At the start the first is
-        de/dtheta: it leans from e away from the arena's normal."""
-        # The errors of the steps take both vectors off unit length and off a right angle.
+        """Rotation from the body to the fixed frame: its columns are the body's axes, and the third is e. At the start,
+        the first is de/dtheta, which points from e away from the arena's normal."""
+        # Step errors change the unit length of both vectors and their right angle.
         e, angle = unit(self.axis), self.spin_angle[:, None]
         aside = unit(jnp.cross(e, self._fixed(tuple(self.cyclic[-3:]))))
         across = jnp.cross(aside, e)
@@ -250,7 +253,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
 
     @property
     def _path(self) -> tuple[Array, ...]:
-        """The cyclic coordinates of the arena's frame; behind them stands the vector c of `trajectory_problem.py`."""
+        """The cyclic coordinates of the arena's frame, followed by the vector c of `trajectory_problem.py`."""
         return tuple(self.cyclic[:-3])
 
     @property

@@ -1,4 +1,4 @@
-"""The picture of the main job: theta(t) of every launch, as the papers' figures 2 and 3 (needs matplotlib)."""
+"""The plot of the main job: theta(t) of every launch, as in the papers' figures 2 and 3 (needs matplotlib)."""
 
 from typing import Any, NamedTuple
 
@@ -23,8 +23,8 @@ def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
 
     **Arguments:**
 
-    - `panels`: what to draw; `ends` are the times [s] that get a dot, not finite for none.
-    - `angle`: angle [rad] that counts as inverted; `dots`: what the dots show.
+    - `panels`: the panels; `ends` are the times [s] that get a dot, if finite.
+    - `angle`: angle [rad] that counts as inverted; `dots`: description of the dots.
 
     **Returns:** a matplotlib figure.
     """

@@ -24,10 +24,10 @@ QUANTITIES = {
     "slip": Quantity("m s-1", "slip velocity", "tangent"),
 }
 
-#: The directions that components belong to: of the fixed frame, and of the moving one.
+#: Names of components: in the fixed frame, and in the moving frame.
 COMPONENTS = {"component": ("x", "y", "z"), "tangent": ("t1", "t2")}
 
-#: Quantities of a single run that a table of many does not have.
+#: Quantities of a single run that tables of many runs do not have.
 OF_ONE_RUN = {
     "spin_angle": Quantity("rad", "spin angle"),
     "work": Quantity("J", "work of friction"),
@@ -37,7 +37,7 @@ OF_ONE_RUN = {
 def table_of(run: Any) -> Table:
     """All quantities of a run, over its times.
 
-    **Arguments:** `run`: a `Trajectory` or a `HybridTrajectory`, one and not a batch.
+    **Arguments:** `run`: a `Trajectory` or a `HybridTrajectory`, not a batch.
 
     **Raises:** `ValueError` for a batch of runs.
     """

@@ -1,4 +1,5 @@
-"""The kinds of runs: one smooth motion, or several modes of contact and flight; and what a table says of each."""
+"""The kinds of runs: one smooth motion, or several modes of contact and flight; and the variables of a table for
+each."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -18,8 +19,9 @@ from ..modes.sticking import modes as stick_slip_modes
 class RunKind(NamedTuple):
     """How to run a kind of scene: its status words, its counters besides steps, and its modes.
 
-    `modes` takes (scene, problem, tolerance, last) and returns the modes and the number of each cell's first; `None`
-    for runs of one smooth motion. `flight_state` is whether states may be those of flight, in a layout of their own.
+    `modes` takes (scene, problem, tolerance, last) and returns the modes and the index of each cell's first mode;
+    `None` for runs of one smooth motion. `flight_state` is whether states may be those of flight, which have a separate
+    layout.
     """
 
     words: tuple[str, ...]
@@ -34,7 +36,7 @@ class RunKind(NamedTuple):
 
     @property
     def variables(self) -> dict[str, Variable]:
-        """The table's variables besides the times."""
+        """The table's variables in addition to the times."""
         counts = ("steps", "rejected", *self.counts)
         return {
             "status": Variable("1", np.int8, self.words, long_name="how the run ended"),
@@ -47,7 +49,7 @@ class RunKind(NamedTuple):
 #: Descriptions of the counters of a run.
 COUNTED = {"steps": "steps", "rejected": "rejected steps", "hops": "flights", "sticks": "changes from slip to rolling"}
 
-#: The words of tables, in the order of the integers in their files, which is older than `Status`.
+#: The words of tables, in the order of the integers in files (older than `Status`).
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit")
 
 SMOOTH = RunKind(WORDS, (), None)

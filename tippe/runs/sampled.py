@@ -21,14 +21,14 @@ def ended(
     left_domain: Bool[Array, "..."],
     failed: Bool[Array, "..."],
 ) -> Int[Array, "..."]:
-    """The `Status` of a run that ended in some state, as an integer."""
+    """The `Status` of a run that ended in the given state, as an integer."""
     lost = jnp.array([int(status) for status in LOSSES])[run.dynamics.loss(state[: len(run.state)])]
     return jnp.where(left_domain, lost, jnp.where(failed, int(Status.FAILED), int(Status.COMPLETED)))
 
 
 class Found(NamedTuple):
-    """What is found of a run: `states`, and as `quadratures` what else a `TrajectoryProblem` carries, are NaN after the end;
-    `status` is a `Status`, a float."""
+    """The samples of a run: `states`, and `quadratures` (the other components of a `TrajectoryProblem`), are NaN after
+    the end; `status` is a `Status` as a float."""
 
     states: Float[Array, "components times"]
     quadratures: Float[Array, "quadratures times"]
@@ -46,7 +46,7 @@ def sampled(
     settings: Settings,
     adjoint: diffrax.AbstractAdjoint | None,
 ) -> Found:
-    """Run one launch inside a transformation and sample it.
+    """Simulate one launch inside a transformation and sample it.
 
     **Arguments:** as for `simulate`.
     """

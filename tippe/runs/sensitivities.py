@@ -18,9 +18,9 @@ from .inversion import Inversions
 
 
 def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
-    """The full names of the numbers to differentiate by.
+    """The full names of the parameters to differentiate by.
 
-    **Arguments:** `roots`: the table's scene and launch; `names`: full names, or the ends of them that fit one only.
+    **Arguments:** `roots`: the table's scene and launch; `names`: full names, or their unambiguous ends.
 
     **Raises:** `ValueError` unless `names` is a list of such names.
     """
@@ -34,7 +34,7 @@ def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
 
 
 def sensitivity_columns(names: list[str]) -> list[str]:
-    """The table's variables: `time_by_mu` for `scene.friction.mu`, the full name where two numbers share a name."""
+    """The table's variables: `time_by_mu` for `scene.friction.mu`, the full name if two parameters share a name."""
     ends = [name.rsplit(".", 1)[-1] for name in names]
     return [
         "time_by_" + (end if ends.count(end) == 1 else name.replace(".", "_"))
@@ -67,15 +67,16 @@ def sensitivities_of_cells(
     size: int,
     last: bool,
 ) -> tuple[Outcome | HybridOutcome, dict[str, Any], Any]:
-    """How every cell ended, and the derivative of its crossing time by every number, 0 where there is no crossing.
+    """The outcome of every cell, and the derivative of its crossing time with respect to every parameter, 0 if there is
+    no crossing.
 
     **Arguments:** as for `inversion_table`, and
 
-    - `columns`: full name of a parameter -> its value in every cell; `count` of the `size` cells are to be run.
+    - `columns`: full name of a parameter -> its value in every cell; only `count` of the `size` cells are run.
     - `names`: full names of the numbers to differentiate by.
 
-    **Returns:** the outcome; name of the variable -> derivatives (size,); and where these are NaN, because an event on the
-    way was grazing.
+    **Returns:** the outcome; name of the variable -> derivatives (size,); and the cells whose derivatives are NaN
+    because an earlier event was grazing.
     """
     numbers = (jnp.asarray(angle, float), settings.tolerance)
     inversions, tangents, scales = _with_tangents(roots, columns, names, *numbers, size, last)
@@ -94,7 +95,8 @@ def _with_tangents(
     size: int,
     last: bool,
 ) -> tuple[Inversions, tuple[Any, ...], list[Float[Array, "..."]]]:
-    """The launches of all cells, their tangents along the numbers to differentiate by, and the scale of each tangent."""
+    """The launches of all cells, their tangents along the parameters to differentiate by, and the scale of each
+    tangent."""
 
     def build(*moving: Any) -> Inversions:
         cells = with_numbers(roots, columns | dict(zip(names, moving, strict=True)))

@@ -15,7 +15,7 @@ def solve_stick_slip_dense(run: TrajectoryProblem, t1: float, settings: Settings
     - `run`: of a scene with `SetValuedCoulomb`.
     - `t1`, `settings`: as for `follow`.
 
-    **Returns:** a `HybridPath`, whose counts tell how often slipping has turned into rolling.
+    **Returns:** a `HybridPath`, whose counts include the changes from slip to rolling.
     """
     both, first, state = contact_modes(run, settings.tolerance)
     return solve_hybrid_dense(both, int(first[0]), state[:, 0], t1, settings, counters=1)

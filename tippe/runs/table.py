@@ -51,51 +51,50 @@ def inversion_table(
     **Arguments:**
 
     - `scene`: the scene, every number a scalar.
-    - `theta`, `spin`, `eta`, `azimuth`: of the launch, as for `Launch`; `mu`: of the scene's friction, or of the
-      law of sliding in it, its own by default. A list or array becomes an axis of the table, in the order (theta, eta, mu,
-      spin, azimuth); a number does not.
+    - `theta`, `spin`, `eta`, `azimuth`: of the launch, as for `Launch`; `mu`: of the scene's friction law, or of the
+      sliding law in it, by default its own value. A list or array becomes an axis of the table, in the order (theta,
+      eta, mu, spin, azimuth); a number does not.
     - `t1`: horizon [s].
     - `angle`: angle [rad] that counts as inverted.
     - `tolerance`: relative tolerance of the integration.
     - `crossing`: "first" for the first time theta reaches the angle; "last" for the up-crossing after which theta stays
-      above it until `t1` (first crossings are ill-conditioned where theta oscillates about the angle); "both" for the two from
-      one run, in the variables `first_time` and `last_time` in place of `time`, the status being that of the last.
-    - `path`: HDF5 file to write, chunk by chunk. A run that was interrupted resumes from it.
-    - `axes`: further axes, full name of a parameter, or the end of it that means one only -> values, such as
-      `{"offset": [0.005, 0.006]}` for `"scene.body.offset"`.
+      above it until `t1` (first crossings are ill-conditioned if theta oscillates about the angle); "both" for both
+      times from one run, in the variables `first_time` and `last_time` instead of `time`, with the status of the last.
+    - `path`: HDF5 file to write, chunk by chunk. The same call resumes an interrupted table from it.
+    - `axes`: further axes, full name of a parameter, or its unambiguous end -> values, such as `{"offset": [0.005,
+      0.006]}` for `"scene.body.offset"`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`, or `Dopri8()` for method "diffrax".
-    - `method`: "ensemble" for the fast driver; "diffrax" for vmapped `diffeqsolve`, the slow reference, which supports first
-      crossings only and can miss a loss of contact that is shorter than a step.
-    - `scattered`: whether the lists are no axes of a grid but columns of one length: the k-th cell has the k-th number of each.
-      The table then has the only axis "cell", and the columns are among its variables.
-    - `errors`: whether to run every cell again at a hundredth of the tolerance, for bounds of its errors; a table then costs
-      2.8 times as much. Below a tolerance of 1e-12 the second run has a hundred times the tolerance instead, and the bounds
-      are wider.
-    - `sensitivities`: full names of parameters to differentiate the times by, such as `["scene.friction.mu", "launch.theta"]`;
-      the end of a name will do where only one parameter fits.
-    - `progress`: whether to show it, on a terminal or in a notebook; `NONHOLONOMIC_PROGRESS=0` hides it everywhere.
-    - `executor`: who computes: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a
-      Dask client, to which blocks are handed as its workers become free; by default a thread for each core. The numbers
-      are the same, to the bit on the same kind of processor.
-    - `max_steps`: a run that needs more steps, rejected ones included, has failed; at least 1. With several modes the limit
-      holds for each stay in a mode; `method="diffrax"` allows
-      100 000 steps at most.
+    - `method`: "ensemble" (fast); or "diffrax" for vmapped `diffeqsolve`, a slow reference that supports only first
+      crossings and can miss a loss of contact shorter than a step.
+    - `scattered`: whether the lists are columns of equal length instead of axes of a grid: the k-th cell has the k-th
+      number of each. The table then has the only axis "cell", and the columns are among its variables.
+    - `errors`: whether to run every cell again at a hundredth of the tolerance, for bounds of its errors; this costs
+      2.8 times as much as a table without errors. Below a tolerance of 1e-12, the second run has a hundred times the
+      tolerance instead, and the bounds are wider.
+    - `sensitivities`: names of the parameters with respect to which the times are differentiated, such as
+      `["scene.friction.mu", "launch.theta"]`; the end of a name is enough if only one parameter matches.
+    - `progress`: whether to show progress, on a terminal or in a notebook; `NONHOLONOMIC_PROGRESS=0` hides it
+      everywhere.
+    - `executor`: any `concurrent.futures.Executor`, such as that of `nonholonomic.local_processes` or of a Dask client;
+      it gets chunks as its workers become free. By default a thread for each core. The results are bitwise equal on the
+      same kind of processor.
+    - `max_steps`: a run that needs more steps, including rejected ones, fails; at least 1. With several modes, the
+      limit applies to each stay in a mode; `method="diffrax"` allows 100 000 steps at most.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
-    "contact_lost", "failed", "jammed"), `end_time` [s] and `end_theta` [rad] at which the run ended (where contact was
-    lost or jammed, when and at what angle), `steps` and `rejected`. With `errors` also `time_error` [s], a bound that is
-    infinite where the two runs disagree on the status or failed, 0 where they agree that there is no time;
-    `Table.digits("time")` shows the digits it leaves. The same for `end_time` and `end_theta`; `hops_error` and
-    `sticks_error` are the differences of the two runs, and `status_error` is 1 where the runs disagree on the status or
-    failed. With `sensitivities` also the derivative of `time` by each number, `time_by_mu` for
-    `"scene.friction.mu"`, 0 where the top did not invert. It goes through flights, impacts, stick and slip; there
-    `grazes` is 1 where an event on the way, such as a landing, was grazing, so that within the tolerance it may not
-    happen at all: the derivative is then NaN (`SetValuedCoulomb` with `contact="hybrid"` has none). A scene with
-    `contact="hybrid"` flies on where contact is lost, and the angle counts in flight too; `hops` is the number of
-    flights until the run ended, and `status` may be "unresolved" (10 000 of them in a row, or sphere and stem on the
-    plane together with so much friction that the forces are not determined). With `SetValuedCoulomb`, `sticks` is how
-    often a slip has turned into rolling, impacts apart, and `status` may be "unresolved" (too many changes).
+    "contact_lost", "failed", "jammed"), `end_time` [s] and `end_theta` [rad] at which the run ended (also if contact
+    was lost or jammed), `steps` and `rejected`. With `errors` also `time_error` [s], a bound that is infinite if the
+    two runs disagree on the status or failed, and 0 if both find no time; `Table.digits("time")` shows the correct
+    digits. The same for `end_time` and `end_theta`; `hops_error` and `sticks_error` are the differences of the two
+    runs, and `status_error` is 1 if the runs disagree on the status or failed. With `sensitivities` also the derivative
+    of `time` with respect to each parameter, `time_by_mu` for `"scene.friction.mu"`, 0 if the top did not invert. It
+    includes flights, impacts, stick and slip; `grazes` is 1 and the derivative is NaN if an earlier event, such as a
+    landing, was grazing, so that it may not happen within the tolerance (`SetValuedCoulomb` with `contact="hybrid"` has
+    none). With `contact="hybrid"`, a run continues through flights, and the angle also counts in flight; `hops` is the
+    number of flights until the run ended, and `status` may be "unresolved" (10 000 flights in a row, or sphere and stem
+    on the plane together with so much friction that the forces are undetermined). With `SetValuedCoulomb`, `sticks` is
+    the number of changes from slip to rolling outside impacts, and `status` may be "unresolved" (too many changes).
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
     `RuntimeError` for an executor that breaks down, or a worker with other versions.
@@ -169,7 +168,7 @@ def inversion_table(
 
 
 def warn_of_long_runs(table: Table, t1: float, most: int) -> None:
-    """Warn of runs that needed more steps than they may take; a table that stays in its file is not looked at."""
+    """Warn of runs that needed more than the allowed steps; tables that stay in their file are not checked."""
     if not isinstance(table.variables, dict):
         return
     long = (table.variables["status"] == "failed") & (table.variables["steps"] >= most)
@@ -181,7 +180,7 @@ def warn_of_long_runs(table: Table, t1: float, most: int) -> None:
 
 
 class InversionJob(NamedTuple):
-    """What is asked of every cell, as data that can be sent to another process.
+    """The computation for every cell, as data that can be sent to another process.
 
     `errors`: whether to run every cell again at another tolerance.
     """
@@ -192,10 +191,10 @@ class InversionJob(NamedTuple):
     errors: bool
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
-        """The variables of some cells, of which the first `count` are to be run."""
+        """The variables of some cells, of which only the first `count` are run."""
         runs, words = self.runs, self.runs.run_kind.words
         if runs.method == "diffrax" and count == 0:
-            # The reference runs whole blocks: a call that is only meant to compile would compute the first one twice.
+            # The reference runs whole chunks: a call that only compiles would compute the first chunk twice.
             return {}
         variables = runs.results(self.roots, columns, self.tolerance, count)
         if self.errors:
@@ -206,7 +205,7 @@ class InversionJob(NamedTuple):
 
 
 class ScatteredJob(NamedTuple):
-    """A job whose cells are the rows of some columns; these are among the results.
+    """A job whose cells are the rows of some columns; the columns are among the results.
 
     `columns`: full name of a number -> its value in every cell; `names`: full name -> name of the variable.
     """
@@ -216,13 +215,13 @@ class ScatteredJob(NamedTuple):
     names: dict[str, str]
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
-        """The variables of some cells, of which the first `count` are to be run."""
+        """The variables of some cells, of which only the first `count` are run."""
         chosen = {number: values[columns["cell"]] for number, values in self.columns.items()}
         return self.job(chosen, count) | {self.names[number]: values for number, values in chosen.items()}
 
 
 def digest(columns: dict[str, Any]) -> str:
-    """A checksum of columns of numbers and of their names."""
+    """A checksum of the columns and their names."""
     whole = hashlib.sha256()
     for name, values in columns.items():
         whole.update(name.encode() + np.ascontiguousarray(values, float).tobytes())

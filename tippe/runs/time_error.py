@@ -1,32 +1,33 @@
-"""How far the numbers of a table can be trusted, from a second run of each cell at another tolerance."""
+"""Error bounds for a table, from a second run of each cell at another tolerance."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
 from nonholonomic.integration import TIGHTEST
 
-#: Ratio of a tolerance to that of the second run, which with a pair of eighth order costs 1.8 times the first. The error of the
-#: second run is then a hundredth of the first one's, so that the difference of the two is the error of the first. A second run
-#: ten times finer leaves three to five times as many errors above the bound; one ten times coarser, twenty times as many at
-#: 1e-8 with a bound of twice the difference, which exceeds the error by more than 30 in a third of the cells.
+#: Ratio of a tolerance to that of the second run, which with a pair of eighth order costs 1.8 times the first. The
+#: error of the second run is then a hundredth of that of the first, so the difference of the two is the error of the
+#: first. With a ratio of 10, three to five times as many errors exceed the bound; with a coarser second run, twenty
+#: times as many do at 1e-8 with a bound of twice the difference, which exceeds the error by more than a factor of 30 in
+#: a third of the cells.
 FINER = 100.0
 
-#: Ratio of the bound to the difference of the two runs. With 3 instead of it twice as many errors are above the bound.
+#: Ratio of the bound to the difference of the two runs. With a ratio of 3, twice as many errors exceed the bound.
 SAFETY = 5.0
 
-#: The same where the two runs differ in the number of flights or sticks on the way. Such a run is chaotic: the difference
-#: is that of two random histories, and up to 90 times smaller than the error.
+#: The ratio if the two runs differ in the number of flights or sticks. Such a run is chaotic: the difference is that of
+#: two random histories, and up to 90 times smaller than the error.
 SAFETY_OF_HISTORIES = 100.0
 
-#: Least relative error of what accumulates round-off over thousands of steps.
+#: Least relative error of values that accumulate round-off over thousands of steps.
 ROUND_OFF = 1e-14
 
 
 def second_tolerance(tolerance: float) -> float:
-    """Tolerance of the second run: a hundredth of the first one's, or a hundred times as large where the integration
-    allows no tighter one; the bound is then up to a hundred times wider."""
+    """Tolerance of the second run: a hundredth of that of the first run, or a hundred times as large if the integration
+    allows no smaller tolerance; the bound is then up to a hundred times wider."""
     finer = tolerance / FINER
-    # The quotient of 1e-12 may be a rounding below the least tolerance.
+    # Because of rounding, the quotient of 1e-12 may be below the least tolerance.
     return max(finer, TIGHTEST) if finer > 0.99 * TIGHTEST else tolerance * FINER
 
 
@@ -40,12 +41,12 @@ def error_bound(
 
     **Arguments:**
 
-    - `value`: times [s], infinite where there is none, or other numbers.
+    - `value`: times [s], infinite if there is no event, or other numbers.
     - `second`: the same from the second run.
-    - `agree`: where the two runs agree on what happened.
-    - `same_history`: where they agree on how often each kind of event happened on the way.
+    - `agree`: mask of the cells in which the two runs have the same status.
+    - `same_history`: mask of the cells in which the numbers of all kinds of events agree.
 
-    **Returns:** the bound, in units of the value: infinite where the runs disagree, 0 where they agree that there is no time.
+    **Returns:** the bound, in units of the value: infinite if the runs disagree, 0 if both find no time.
     """
     agree = agree & (np.isfinite(value) == np.isfinite(second))
     both = np.isfinite(value) & np.isfinite(second)
@@ -62,16 +63,16 @@ def errors_of(
     counts: tuple[str, ...],
     silent: tuple[int, ...],
 ) -> dict[str, Num[np.ndarray, " cells"]]:
-    """What a table with errors has besides: for each variable an error, under its name and "_error".
+    """The additional variables of a table with errors: for each variable its error, named by the suffix "_error".
 
     **Arguments:**
 
     - `first`, `second`: the variables of the two runs of every cell.
-    - `times`, `counts`: which of them are times of crossings, and counts of events on the way.
-    - `silent`: codes of a status with which a run ends before its answer: two such runs agree on nothing.
+    - `times`, `counts`: names of the variables that are times of crossings, and of those that count events.
+    - `silent`: codes of a status with which a run ends without a result: two such runs do not agree.
 
     **Returns:** bounds for the times, `end_time` and `end_theta`; for each count the difference of the runs; and 1 as
-    `status_error` where the runs disagree on the status or one is silent.
+    `status_error` if the runs disagree on the status or one is silent.
     """
     agree = (first["status"] == second["status"]) & ~np.isin(first["status"], silent)
     counted = {name: np.abs(first[name] - second[name]) for name in counts}

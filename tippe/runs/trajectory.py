@@ -49,19 +49,19 @@ from .stick_slip_trajectory import solve_stick_slip_dense
 class Trajectory(AbstractTrajectory):
     """A run of a tippe top, or a batch of runs, with the batch first.
 
-    Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame (t1,
-    t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre, of bodies that are no
-    sphere those of the centre of mass; `contact` is where the body touches the arena, `normal` the arena's normal there.
-    `rotation` (times, 3, 3) takes the body's axes to the fixed frame, and `angular_velocity` is the rate at which it turns.
+    Vectors are given in the fixed frame (x, y, z) as arrays (times, 3); `azimuth` and `slip` refer to the moving frame
+    (t1, t2, n) at the place where the top is. `position` and `velocity` are those of the sphere's centre, or of the
+    centre of mass for other bodies; `contact` is the contact point, and `normal` the arena's normal there. `rotation`
+    (times, 3, 3) rotates the body's axes to the fixed frame, and `angular_velocity` is its rate.
 
     `status` is the word of a `Status`: "completed", "contact_lost", "failed", "jammed" or "does_not_fit"; inside a
-    transformation it is the integer, also `Status.ILLEGAL` for numbers out of range, for which everything is NaN. The run ends
-    at `end_time`. The top does
-    not fit where a curvature of the arena reaches that of its sphere, which then touches elsewhere too. It is jammed where the
-    equation for the normal force ceases to have a solution, because friction pulls the top into the arena as hard as the
-    normal force pushes it out: strong friction, a large offset and a slip along the axis do that. `stats` holds accepted and
-    rejected steps, the greatest drift of |e| and the greatest energy residual |E - E(0) - work of friction| [J]; with
-    `SetValuedCoulomb` also `sticks`, how often a slip has turned into rolling.
+    transformation it is the integer; for numbers out of range it is `Status.ILLEGAL`, and everything is NaN. The run
+    ends at `end_time`. The top does not fit where a curvature of the arena reaches that of its sphere, which then
+    touches at other points, too. It is jammed if the equation for the normal force has no solution, because friction
+    pulls the top into the arena as strongly as the normal force pushes it out; this needs strong friction, a large
+    offset and a slip along the axis. `stats` holds accepted and rejected steps, the greatest drift of |e| and the
+    greatest energy residual |E - E(0) - work of friction| [J]; with `SetValuedCoulomb` also `sticks`, the number of
+    changes from slip to rolling.
 
     **Example:**
 
@@ -119,7 +119,7 @@ class Trajectory(AbstractTrajectory):
         return self.scene.slip_velocity(self.states).T
 
     def resampled(self, times: Float[np.ndarray, " times"]) -> "Trajectory":
-        """The same run at other times, which are not checked."""
+        """The same run at other times, without checking them."""
         arrays = on_device(times, *_parts(len(self.states), self.dense.at(times)))
         return eqx.tree_at(lambda run: (run.t, run.states, run.cyclic, run.spin_angle, run.work), self, arrays)
 
@@ -134,30 +134,32 @@ def simulate(
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
 ) -> Trajectory | HybridTrajectory:
-    """Run one launch until `t1`, or until contact is lost or jams; through flights and impacts if its contact is "hybrid".
+    """Simulate one launch until `t1`, or until contact is lost or jams; with `contact="hybrid"`, through flights and
+    impacts.
 
-    Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run are then
-    NaN, and `status` and `end_time` say so. A batch, as `vmap` makes it, runs as the cells of one block, as tables do; where a
-    program under `jit` reads neither path nor rotation nor work, they are not integrated.
+    Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run, given by
+    `status` and `end_time`, are then NaN. A batch from `vmap` is solved as one ensemble, like the cells of a table. If
+    a program under `jit` does not use path, rotation or work, they are not integrated.
 
     **Arguments:**
 
     - `scene`, `launch`: every number a scalar.
     - `t1`: horizon [s].
-    - `times`: times of the result [s], increasing, within [0, t1]; by default those of the accepted steps. Outside of
-      transformations those after the end of the run are left out, and `Trajectory.at` gives others.
+    - `times`: times of the result [s], increasing, within [0, t1]; by default those of the accepted steps. Outside
+      transformations, times after the end of the run are omitted; `Trajectory.at` returns the run at other times.
     - `tolerance`: relative tolerance, in [1e-14, 1e-2]; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
-    - `solver`: any adaptive solver of Diffrax for ordinary differential equations; by default `Dopri8()`, inside
-      transformations and without `adjoint` `nonholonomic.integration.Oscillatory8()`.
-    - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for each
-      parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax integrates a traced run, which pays if a
-      loss is differentiated by many parameters; it can miss a loss of contact that is shorter than a step.
+    - `solver`: any adaptive solver of Diffrax for ordinary differential equations; by default `Dopri8()`, or inside
+      transformations without `adjoint` `nonholonomic.integration.Oscillatory8()`.
+    - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for
+      each parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax integrates a traced run,
+      which is cheaper for a loss with many parameters, but can miss a loss of contact shorter than a step.
 
-    **Returns:** a `Trajectory`, for a hybrid scene a `HybridTrajectory`.
+    **Returns:** a `Trajectory`, or a `HybridTrajectory` for a hybrid scene.
 
     **Raises:** `ValueError` for arguments out of range, and for times that are all after the end of the run; inside a
-    transformation for a law with several modes (`SetValuedCoulomb`), and for a hybrid scene with `adjoint`, with a solver that
-    is not an explicit Runge-Kutta one, and where derivatives by `times` or second derivatives are asked for.
+    transformation for a law with several modes (`SetValuedCoulomb`), and for a hybrid scene with `adjoint`, with a
+    solver that is not an explicit Runge-Kutta method, and for derivatives with respect to `times` or second
+    derivatives.
 
     **Example:**
 
@@ -209,14 +211,14 @@ def _legal_or_nan(
     solver: diffrax.AbstractSolver | None,
     adjoint: diffrax.AbstractAdjoint | None,
 ) -> Trajectory | HybridTrajectory:
-    """What `_traced` gives, or NaN and the status "illegal" where a traced number is out of range."""
+    """The result of `_traced`, or NaN and the status "illegal" if a traced number is out of range."""
     if times is None:
-        # It raises the error that says so.
+        # This raises the error that explains the problem.
         return _traced(scene, launch, times, t1, tolerance, solver, adjoint)
     bounds = (*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch))
     may, t1, tolerance = legal_run(legal(bounds), t1, tolerance, times)
     if adjoint is not None:
-        # Diffrax would differentiate the run of no length.
+        # Diffrax would differentiate a run of zero length.
         scene, launch = nan_unless(may, (scene, launch))
     trajectory = _traced(scene, launch, times, t1, tolerance, solver, adjoint)
     status = jnp.where(may, trajectory.status, int(Status.ILLEGAL))
@@ -260,7 +262,7 @@ _ended = eqx.filter_jit(ended)
 
 
 def _as_trajectory(scene: Scene, run: TrajectoryProblem, path: DenseSolution | HybridPath) -> Trajectory:
-    # NumPy cuts these: JAX would compile every cut anew for every number of steps.
+    # NumPy slices these: JAX would compile every slice again for every number of steps.
     states = np.asarray(path.states)
     times, end, last = on_device(path.times, path.times[-1], states[:, -1])
     status = Status(int(_ended(run, last, jnp.asarray(path.left_domain), jnp.asarray(path.failed)))).word

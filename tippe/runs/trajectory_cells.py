@@ -1,4 +1,4 @@
-"""How the cells of a table of trajectories are run and read: samples of many launches, and what is observed at them."""
+"""The cells of a table of trajectories: samples of many launches, and the quantities at the samples."""
 
 import dataclasses
 from typing import Any, cast
@@ -19,18 +19,20 @@ from .quantities import QUANTITIES
 from .sampled import ended
 from .trajectory import Trajectory
 
-#: What can be read off the state alone; all else needs the path, except on the plane, where only the position does.
+#: Quantities that follow from the state alone; the others need the path, except that on the plane only the position
+#: does.
 OF_THE_STATE = {"theta", "azimuth", "spin", "energy", "jellett", "normal_force", "slip", "theta_rate"}
 
-#: What is the same in a frame that has turned about n, by no matter how much.
+#: Quantities that do not change if the frame turns about n.
 WITHOUT_DIRECTION = {"theta", "theta_rate", "eta", "spin", "energy", "jellett", "normal_force"}
 
 
 def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ...]) -> CoreProblem:
-    """The runs of some cells with as much of a `TrajectoryProblem` as the named quantities need.
+    """The runs of some cells with the parts of a `TrajectoryProblem` that the named quantities need.
 
-    That is the path for some of them only, and neither rotation nor work: on the plane a run without them takes half the time.
-    If none of them has a direction, the frame turns on the level plane, and samples are some thirty times as accurate.
+    Only some quantities need the path, and none needs rotation or work: on the plane, a run without them takes half the
+    time. If no quantity has a direction, the frame turns on the level plane, and samples are about thirty times as
+    accurate.
     """
     run = TrajectoryProblem.of(scene, launch, cells)
     if scene.level and WITHOUT_DIRECTION.issuperset(names):
@@ -46,14 +48,14 @@ def _read(
     samples: Float[Array, "cells times components"],
     name: str,
 ) -> Float[Array, "cells times ..."]:
-    """A quantity at every sample, not a number after the end of a run."""
+    """A quantity at every sample, NaN after the end of a run."""
     quadratures = len(run.state) + len(run.cyclic) - samples.shape[-1]
 
     def read_cell(scene: Scene, states: Float[Array, "times components"]) -> Float[Array, "times ..."]:
         nothing = jnp.zeros(len(times))
         state, cyclic = jnp.split(jnp.pad(states.T, ((0, quadratures), (0, 0))), [len(run.state)])
         values = getattr(Trajectory(times, scene, state, cyclic, nothing, nothing, None, times[-1], {}, None), name)
-        # What does not depend on the state would be a number after the end too.
+        # A quantity that does not depend on the state would be a number even after the end.
         reached = jnp.isfinite(states[:, 0]).reshape(-1, *[1] * (values.ndim - 1))
         return jnp.where(reached, values, jnp.nan)
 
@@ -63,7 +65,7 @@ def _read(
     return eqx.filter_vmap(read_cell, in_axes=(cell_axis, 0))(scene, samples)
 
 
-# On its own, not inside other transformed functions: only so does it get the compiler's options.
+# Compiled on its own, not inside other transformed functions; otherwise it does not get the compiler's options.
 @compiled_alone
 def _followed(
     problem: CoreProblem,
@@ -73,7 +75,7 @@ def _followed(
     settings: Settings,
     names: tuple[str, ...],
 ) -> tuple[Outcome, Int[Array, " cells"], dict[str, Float[Array, "cells times ..."]]]:
-    """How the runs end, as integers of `Status`, and the named quantities on the way."""
+    """The `Status` of the runs as integers, and the named quantities at the samples."""
     outcome, samples = solve_with_samples(problem, times, times[-1], count, settings, one_kernel=True)
     run = cast(TrajectoryProblem, problem.whole)
     status = ended(run, outcome.state, outcome.status == LEFT_DOMAIN, outcome.status == FAILED)
@@ -85,9 +87,9 @@ def solve_cells(
 ) -> dict[str, Array]:
     """The variables of some cells.
 
-    **Arguments:** `scene`, `launch`: numbers that are scalars or one per cell; `cells`: how many there are, of which the first
-    `count` are to be run; `times`: of the samples [s], the last the horizon; `settings`: how they are integrated; `names`: the
-    quantities to be read.
+    **Arguments:** `scene`, `launch`: numbers that are scalars or one per cell; `cells`: how many there are, of which
+    only the first `count` are run; `times`: of the samples [s], the last the horizon; `settings`: how they are
+    integrated; `names`: the quantities to be read.
 
     **Returns:** name -> values, the cells first.
     """

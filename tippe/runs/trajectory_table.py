@@ -18,10 +18,10 @@ from .quantities import COMPONENTS, QUANTITIES
 from .run_kind import COUNTED
 from .trajectory_cells import solve_cells
 
-#: How a run may end, in the order of `Status`.
+#: The ways in which a run can end, in the order of `Status`.
 WORDS = tuple(Status(code).word for code in range(Status.UNRESOLVED + 1))
 
-#: Numbers of the samples of a block, at most: 256 MB of them.
+#: Greatest number of values in the samples of a chunk: 256 MB.
 MOST_SAMPLED = 1 << 25
 
 
@@ -43,34 +43,34 @@ def trajectory_table(
 ) -> Table:
     """Trajectories over a grid of launches and scenes, sampled at given times, in one batched call on all cores.
 
-    The samples have the accuracy of `simulate`: a step ends on each of the times. With a sample for each step of the
-    integration it costs twice as much as a table of inversion times to the same horizon.
+    The samples have the accuracy of `simulate`: a step ends on each of the times. With one sample per integration step,
+    it costs twice as much as a table of inversion times to the same horizon.
 
     **Arguments:**
 
     - `scene`: the scene, every number a scalar.
-    - `theta`, `spin`, `eta`: of the launch, as for `Launch`; `mu`: of the scene's friction, or of the law of sliding in it, its
-      own by default. A list or array becomes an axis of the table, in the order (theta, eta, mu, spin); a number does not.
-      The axes of a launch's numbers are called "launch.theta", "launch.eta" and "launch.spin", for `theta` is what becomes
-      of it.
+    - `theta`, `spin`, `eta`: of the launch, as for `Launch`; `mu`: of the scene's friction law, or of the sliding law
+      in it, by default its own value. A list or array becomes an axis of the table, in the order (theta, eta, mu,
+      spin); a number does not. The axes of the launch are called "launch.theta", "launch.eta" and "launch.spin",
+      because `theta` is the sampled quantity.
     - `times`: of the samples [s], increasing, from 0 or later; the last is the horizon.
     - `axes`: further axes, as for `inversion_table`, such as `{"azimuth": [0.0, 1.0]}`.
     - `quantities`: what to sample: any of "theta", "eta", "azimuth" [rad], "theta_rate", "spin" [rad/s], "energy" [J],
       "jellett" [kg m^3/s], "normal_force" [N], and the vectors "axis" [1], "position" [m], "velocity" [m/s], "angular_momentum"
       [kg m^2/s] and "slip" [m/s]; all as in `Trajectory`.
     - `tolerance`: relative tolerance of the integration.
-    - `path`: HDF5 file to write, chunk by chunk. A call that was interrupted resumes from it.
+    - `path`: HDF5 file to write, chunk by chunk. The same call resumes an interrupted table from it.
     - `progress`, `executor`: as for `inversion_table`.
-    - `max_steps`: a run that needs more steps, rejected ones included, has failed; at least 1.
+    - `max_steps`: a run that needs more steps, including rejected ones, fails; at least 1.
 
-    **Returns:** a `Table` with a variable for each quantity, which has the axes' dimensions and a last dimension "time"; a
-    vector has one more behind it, "component" (x, y, z), for "slip" "tangent" (t1, t2). They are not a number after the end of
-    a run. Besides, over the axes: `status` (the word of a `Status`, "completed" at the last of the times), `end_time` [s],
-    `steps` and `rejected`.
+    **Returns:** a `Table` with a variable for each quantity, which has the axes' dimensions and a last dimension
+    "time"; a vector has one more dimension, "component" (x, y, z), or "tangent" (t1, t2) for "slip". Values after the
+    end of a run are NaN. The table also has, over the axes: `status` (the word of a `Status`, "completed" at the last
+    of the times), `end_time` [s], `steps` and `rejected`.
 
     **Raises:** `ValueError` for arguments out of range, an unknown axis or quantity, and for a scene with
-    `contact="hybrid"` or `SetValuedCoulomb`, whose runs `simulate` samples one by one; `OSError` for a path that cannot be
-    used; `RuntimeError` for an executor that breaks down, or a worker with other versions.
+    `contact="hybrid"` or `SetValuedCoulomb`, whose runs only `simulate` samples, one by one; `OSError` for a path that
+    cannot be used; `RuntimeError` for an executor that breaks down, or a worker with other versions.
 
     **Example:**
 
@@ -117,7 +117,7 @@ def trajectory_table(
     request |= {"solver": type(Settings(tolerance).for_lanes).__name__}
     if max_steps != DEFAULT_MAX_STEPS:
         request |= {"max_steps": int(max_steps)}
-    # A run has a dozen components or so.
+    # A run has about a dozen components.
     most = max(16, 1 << (MOST_SAMPLED // (12 * len(times))).bit_length() - 1)
     job = SamplingJob(roots, times, float(tolerance), int(max_steps), names)
     options = {"path": path, "most": most, "inner": inner, "progress": progress, "executor": executor}
@@ -125,7 +125,7 @@ def trajectory_table(
 
 
 class SamplingJob(NamedTuple):
-    """What is asked of every cell, as data that can be sent to another process."""
+    """The computation for every cell, as data that can be sent to another process."""
 
     roots: dict[str, Any]
     times: Float[np.ndarray, " times"]
@@ -134,7 +134,7 @@ class SamplingJob(NamedTuple):
     names: tuple[str, ...]
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
-        """The variables of some cells, of which the first `count` are to be run."""
+        """The variables of some cells, of which only the first `count` are run."""
         cells = with_numbers(self.roots, columns)
         size = next((len(values) for values in columns.values()), 1)
         settings = Settings(self.tolerance, max_steps=self.max_steps)

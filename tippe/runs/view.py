@@ -1,4 +1,4 @@
-"""A run of a top as it is drawn: its body, its contact's trace, the path of its axis, arrows, and curves over time."""
+"""The drawing of a run: body, trace of the contact, path of the axis, arrows, and curves over time."""
 
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -32,19 +32,19 @@ from ..model.body import AbstractBody
 from ..model.scene import Scene
 from ..model.top import Top
 
-#: Radians by which the top turns from one frame to the next, about, and most frames.
+#: Approximate angle [rad] by which the top turns from frame to frame, and the greatest number of frames.
 TURN_PER_FRAME = 0.4
 MOST_FRAMES = 12_000
 LEAST_FRAMES = 400
 
-#: Lengths in units of the radius: of the axis as it is drawn from the centre, and of the arrows for the weight, for the
-#: longest slip, and for the angular velocity and momentum at the start.
+#: Lengths in units of the radius: of the drawn axis from the centre, and of the arrows for the weight, for the longest
+#: slip, and for the angular velocity and momentum at the start.
 AXIS, WEIGHT, SLIP, SPIN = 1.6, 1.5, 2.0, 2.5
 
-#: How far beside the contact the normal force is drawn, in units of the radius.
+#: Distance of the drawn normal force from the contact, in units of the radius.
 BESIDE = 1.35
 
-#: Slips above this quantile are not drawn longer: the first moments would hide the rest.
+#: Slips above this quantile are clipped; otherwise the first moments would hide the rest.
 COMMON_SLIP = 0.9
 
 GREEN, VIOLET, BLUE, GOLD = 0x1F8A4C, 0x7B4FA3, 0x1B6CA8, 0xE0A100
@@ -56,7 +56,8 @@ Numbers = TypeVar("Numbers", Array, np.ndarray)
 
 
 class Motion(NamedTuple, Generic[Numbers]):
-    """What is drawn of a run: vectors in the fixed frame, (times, 3), and the rotation to it from the body."""
+    """The drawn quantities of a run: vectors in the fixed frame, (times, 3), and the rotation from the body to this
+    frame."""
 
     times: Float[Numbers, " times"]
     position: Float[Numbers, "times 3"]
@@ -106,7 +107,7 @@ _turning = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis
 
 
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
-    """Runs as they are drawn: a stage for each, or one for all if they are to be overlaid."""
+    """Runs as stages: one stage for each, or a common one for overlaid runs."""
     for run in runs:
         require_one_run(run, "a picture", ", and hand the others over as others=")
     starts = [f"θ(0) = {float(run.theta[0]):.3g} rad, {float(run.spin[0]):.4g} rad/s" for run in runs]
@@ -116,10 +117,11 @@ def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
 
 
 def motion(run: Any) -> Motion[np.ndarray]:
-    """The motion of one run at times so close together that its turning is seen, where it can be told between its own."""
+    """The motion of one run at times that are close enough to show its rotation, if the run can be evaluated between
+    its own times."""
     if run.dense is not None:
         times = np.asarray(run.t)
-        # Not the angle about the axis alone: half-way up a top turns across it, as fast.
+        # The angle about the axis is not enough: half-way up, a top turns about other directions equally fast.
         turned_by = np.trapezoid(np.asarray(_turning(run.padded()))[: len(times)], times)
         frames = int(np.clip(turned_by / TURN_PER_FRAME, LEAST_FRAMES, MOST_FRAMES))
         run = run.at(np.linspace(0.0, float(run.end_time), frames))
@@ -128,7 +130,7 @@ def motion(run: Any) -> Motion[np.ndarray]:
 
 
 def show(scene: Scene, motion: Motion[np.ndarray], number: int, name: str) -> Show:
-    """One run as it is drawn, the `number`-th of its stage."""
+    """The drawing of one run, the `number`-th of its stage."""
     body, colour = scene.body, COLOURS[number % len(COLOURS)]
     motion = Motion(*(np.asarray(part)[np.isfinite(motion.theta)] for part in motion))
     radius, weight = float(body.size), float(body.mass * scene.gravity)
@@ -157,7 +159,7 @@ def show(scene: Scene, motion: Motion[np.ndarray], number: int, name: str) -> Sh
 def arrows(motion: Motion[np.ndarray], offset: float, radius: float, weight: float) -> tuple[Arrow, ...]:
     """Forces and slip at the contact, weight, angular velocity and momentum at the centre of mass."""
     lifted = motion.contact + 0.02 * radius * motion.normal
-    # Within the sphere it could not be seen.
+    # Inside the sphere it would be invisible.
     beside = lifted + BESIDE * radius * np.asarray(aside(motion.normal))
     centre = motion.position - offset * motion.axis
     speed = np.linalg.norm(motion.slip, axis=-1)
@@ -181,7 +183,7 @@ def arrows(motion: Motion[np.ndarray], offset: float, radius: float, weight: flo
 
 
 def stages(groups: list[list[tuple[str, Scene, Motion]]]) -> list[Stage]:
-    """A stage for each group of runs, which have one arena, with their names; colours tell all runs apart."""
+    """A stage for each group of runs on a common arena, with their names; all runs have different colours."""
     all_stages, number = [], 0
     for group in groups:
         (_, scene, first), radius = group[0], float(group[0][1].body.size)
@@ -204,7 +206,7 @@ def aside(normal: Float[Array | np.ndarray, "times 3"]) -> Float[Array, "times 3
 
 
 def meshes(body: AbstractBody, colour: int) -> tuple[Mesh, ...]:
-    """The body in two colours; of a top with the stem, as it is, or a short one that only shows where the axis points."""
+    """The body in two colours; for a top with its stem, or with a short stem that only shows the axis."""
     if not isinstance(body, Top):
         return striped(profile(body), (colour, PALE))
     radius = float(body.radius)
@@ -218,7 +220,7 @@ def meshes(body: AbstractBody, colour: int) -> tuple[Mesh, ...]:
 def truncated(radius: float, knob: float, end: float) -> Float[np.ndarray, "points 2"]:
     """The meridian of a ball whose cap is cut off, about its centre, from the flat down.
 
-    A top does not say where it was cut; its rim must lie above what touches the arena before the stem does.
+    The scene does not contain the height of the cut; the rim must not touch the arena before the stem does.
     """
     lowest = min(radius * (radius - knob) / end, 0.9 * radius)
     polar = np.linspace(np.arccos((radius - 0.8 * (radius - lowest)) / radius), np.pi, 25)

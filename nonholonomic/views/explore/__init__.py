@@ -2,6 +2,7 @@
 
 from .frame import Frame as Frame
 from .frame import quaternion as quaternion
+from .hybrid_simulator import HybridSimulator as HybridSimulator
 from .javascript import javascript as javascript
 from .live import Answer as Answer
 from .live import LiveRun as LiveRun

@@ -1,96 +1,161 @@
-// The loops over steps and stages. All else is generated from Python (`simulator.py`) and stands in `model`: the equations, the
-// coefficients of the Runge-Kutta pair, the first step, step-size control and the location of events.
+// The loops over steps and stages, rounds and flights. All else is generated from Python (`simulator.py`, `hybrid_simulator.py`) and
+// stands in `model`: the equations, the coefficients of the Runge-Kutta pair, the first step, step-size control, the location of
+// events, and what happens between the modes.
 "use strict";
 
 function integrator(model) {
-  const n = model.components, at = model.lane, stages = model.stages.length;
-  const [constants, lane] = [new Float64Array(model.constants), new Float64Array(at.size)];
-  const start = new Float64Array(model.constants + at.size);
-  const rates = Array.from({ length: stages + 2 }, () => new Float64Array(n));
-  const [there, time, length, number] = [new Float64Array(n), new Float64Array(1), new Float64Array(1), [1]];
-  // As a `Step` of Python: state, rate, error, the least of margins and event function at the end, where one was negative before, and
-  // the margins at the start, at the stages that are looked at, and at the end.
-  const m = model.kinds, rows = model.looks.length + 2, tried = new Float64Array(3 * n + 2 + rows * m);
-  const [end, last, error] = [0, 1, 2].map((k) => tried.subarray(k * n, (k + 1) * n));
-  const margins = Array.from({ length: rows }, (_, k) => tried.subarray(3 * n + 2 + k * m, 3 * n + 2 + (k + 1) * m));
+  // The steps of one smooth motion.
+  function stepper(model) {
+    const n = model.components, at = model.lane, stages = model.stages.length;
+    const [constants, lane] = [new Float64Array(model.constants), new Float64Array(at.size)];
+    const start = new Float64Array(model.constants + at.size);
+    const rates = Array.from({ length: stages + 2 }, () => new Float64Array(n));
+    const [there, time, length, number] = [new Float64Array(n), new Float64Array(1), new Float64Array(1), [1]];
+    // As a `Step` of Python: state, rate, error, the least of margins and event function at the end, where one was negative before,
+    // and the margins at the start, at the stages that are looked at, and at the end.
+    const m = model.margins_count, rows = model.looks.length + 2, tried = new Float64Array(3 * n + 2 + rows * m);
+    const [end, last, error] = [0, 1, 2].map((k) => tried.subarray(k * n, (k + 1) * n));
+    const margins = Array.from({ length: rows }, (_, k) => tried.subarray(3 * n + 2 + k * m, 3 * n + 2 + (k + 1) * m));
 
-  // There = state + length * (weights . rates).
-  function move(there, state, length, weights) {
-    for (let k = 0; k < n; k++) {
-      let sum = 0;
-      for (let j = 0; j < weights.length; j++) if (weights[j] !== 0) sum += weights[j] * rates[j][k];
-      there[k] = state[k] + length * sum;
+    // There = state + length * (weights . rates).
+    function move(there, state, length, weights) {
+      for (let k = 0; k < n; k++) {
+        let sum = 0;
+        for (let j = 0; j < weights.length; j++) if (weights[j] !== 0) sum += weights[j] * rates[j][k];
+        there[k] = state[k] + length * sum;
+      }
     }
-  }
-  const none = new Float64Array(n);
-  const value = (function_, ...inputs) => (number.length = 0, function_(...inputs, number), number.length ? number[0] : Infinity);
+    const none = new Float64Array(n);
+    const value = (function_, ...inputs) => (number.length = 0, function_(...inputs, number), number.length ? number[0] : Infinity);
 
-  // The least of the margins, which are written into a row, and of the event function.
-  function least(row, time, state, rate, side) {
-    model.margins(constants, time, state, margins[row]);
-    return Math.min(...margins[row], side * value(model.crossing, constants, state, rate));
-  }
-
-  // One step from a state at a time, whose rate is known, written into `tried`; only its end where nobody watches for events.
-  function step(from, state, rate, side, length, watches = true) {
-    rates[0].set(rate);
-    let negative = 2;
-    for (let stage = 0; stage < stages; stage++) {
-      move(there, state, length, model.stages[stage]);
-      time[0] = from + model.places[stage] * length;
-      model.field(constants, time, there, rates[stage + 1]);
-      const row = model.looks.indexOf(stage) + 1;
-      if (watches && row > 0 && least(row, time, there, rates[stage + 1], side) < 0) negative = Math.min(negative, model.places[stage]);
+    // The least of the margins, which are written into a row, and of the event function.
+    function least(row, time, state, rate, side) {
+      model.margins(constants, time, state, margins[row]);
+      return Math.min(...margins[row], side * value(model.crossing, constants, state, rate));
     }
-    move(end, state, length, model.step);
-    if (!watches) return;
-    time[0] = from + length;
-    model.field(constants, time, end, last);
-    rates[stages + 1].set(last);
-    move(error, none, length, model.error);
-    const margin = least(rows - 1, time, end, last, side);
-    tried[3 * n] = margin === Infinity ? 1 : margin;
-    tried[3 * n + 1] = negative;
-  }
 
-  // Runs from the start that the sliders' numbers say; `record` is called with the start and the length of each step that is taken.
-  function run(values, record) {
-    model.begin(values, start);
-    constants.set(start.subarray(0, model.constants));
-    lane.set(start.subarray(model.constants));
-    const [state, rate] = [lane.subarray(at.state, at.state + n), lane.subarray(at.rate, at.rate + n)];
-    while (lane[at.status] === model.running) {
-      model.length(constants, lane, length);
-      margins[0].set(lane.subarray(at.margins, at.margins + m));
-      const from = lane[at.time], before = record && { time: from, state: state.slice(), rate: rate.slice() };
-      step(from, state, rate, lane[at.side], length[0]);
-      model.after(constants, lane, length, tried, lane);
-      if (record && lane[at.time] > from) record({ ...before, length: lane[at.time] - from });
+    // One step from a state at a time, whose rate is known, written into `tried`; only its end where nobody watches for events.
+    function step(from, state, rate, side, length, watches = true) {
+      rates[0].set(rate);
+      let negative = 2;
+      for (let stage = 0; stage < stages; stage++) {
+        move(there, state, length, model.stages[stage]);
+        time[0] = from + model.places[stage] * length;
+        model.field(constants, time, there, rates[stage + 1]);
+        const row = model.looks.indexOf(stage) + 1;
+        if (watches && row > 0 && least(row, time, there, rates[stage + 1], side) < 0) negative = Math.min(negative, model.places[stage]);
+      }
+      move(end, state, length, model.step);
+      if (!watches) return;
+      time[0] = from + length;
+      model.field(constants, time, end, last);
+      rates[stages + 1].set(last);
+      move(error, none, length, model.error);
+      const margin = least(rows - 1, time, end, last, side);
+      tried[3 * n] = margin === Infinity ? 1 : margin;
+      tried[3 * n + 1] = negative;
     }
-    return lane;
+
+    // Runs from the start that `inputs` say to an end; `record` is called with each step that is taken.
+    function run(inputs, record) {
+      model.begin(...inputs, start);
+      constants.set(start.subarray(0, model.constants));
+      lane.set(start.subarray(model.constants));
+      const [state, rate] = [lane.subarray(at.state, at.state + n), lane.subarray(at.rate, at.rate + n)];
+      const held = record && constants.slice();
+      while (lane[at.status] === model.running) {
+        model.length(constants, lane, length);
+        margins[0].set(lane.subarray(at.margins, at.margins + m));
+        const from = lane[at.time], before = record && { time: from, state: state.slice(), rate: rate.slice(), constants: held };
+        step(from, state, rate, lane[at.side], length[0]);
+        model.after(constants, lane, length, tried, lane);
+        if (record && lane[at.time] > from) record(before);
+      }
+    }
+
+    // The state at a time within a step that was recorded, by a shorter step from where it begins.
+    function within(one, wanted) {
+      constants.set(one.constants);
+      step(one.time, one.state, one.rate, 1, wanted - one.time, false);
+      return end;
+    }
+    return { run, within, constants, lane };
   }
 
-  // A run with its steps kept: what is read off it at any times within it, by shorter steps from where its steps begin.
-  function trajectory(values, reading) {
-    const steps = [];
-    run(values, (one) => steps.push(one));
-    const ended = lane[at.time], copy = lane.slice();
-    function read(times) {
-      const found = [];
+  // What is read off a run at growing times within it, from its pieces in order, each with the `time` at which it begins.
+  function reader(pieces, read) {
+    return (times) => {
       let k = 0;
-      for (const wanted of times) {
-        while (k + 1 < steps.length && steps[k + 1].time <= wanted) k++;
-        if (steps.length) {
-          step(steps[k].time, steps[k].state, steps[k].rate, 1, wanted - steps[k].time, false);
-          copy.set(end, at.state);
+      return Array.from(times, (wanted) => {
+        while (k + 1 < pieces.length && pieces[k + 1].time <= wanted) k++;
+        return Float64Array.from(read(pieces[k], wanted));
+      });
+    };
+  }
+
+  function smooth() {
+    const motion = stepper(model), { constants, lane } = motion, at = model.lane;
+    const run = (values, record) => (motion.run([values], record), lane);
+    // A run with its steps kept.
+    function trajectory(values, reading) {
+      const steps = [];
+      run(values, (one) => steps.push(one));
+      const ended = lane[at.time], copy = lane.slice();
+      const read = reader(steps, (one, wanted) => {
+        if (one) {
+          copy.set(motion.within(one, wanted), at.state);
           copy[at.time] = wanted;
         }
-        found.push(Float64Array.from(model[reading](values, constants, copy, [])));
-      }
-      return found;
+        return model[reading](values, constants, copy, []);
+      });
+      return { end: ended, steps: steps.length, read };
     }
-    return { end: ended, steps: steps.length, read };
+    return { run, trajectory, read: (name, values) => model[name](values, constants, lane, []) };
   }
 
-  return { run, trajectory, read: (name, values) => model[name](values, constants, lane, []) };
+  // Runs through modes: round by round a mode is integrated to its end, and its transition leads to the next one.
+  function hybrid() {
+    const kinds = model.kinds.map((kind) => ({ ...kind, motion: stepper(kind) })), at = model.runs, runs = new Float64Array(at.size);
+
+    function run(values, record) {
+      model.first(values, runs);
+      for (let round = 0; round < model.rounds && runs[at.status] === model.running; round++) {
+        const kind = kinds[model.modes[runs[at.mode]]], { motion } = kind, before = record && runs.slice(), began = runs[at.end_time];
+        motion.run([values, runs], record && ((one) => record({
+          time: began + one.time,
+          mode: before[at.mode],
+          rows: (wanted) => kind.shown(values, before, motion.within(one, wanted - began), []),
+        })));
+        kind.ended(motion.constants, motion.lane, runs, runs);
+        if (runs[at.status] === model.left) leave(kind, values, record);
+      }
+      if (runs[at.status] === model.running) runs[at.status] = model.unresolved;
+      return runs;
+    }
+
+    // The transition at the end of a mode: at once, or through flights with an impact at the end of each.
+    function leave(kind, values, record) {
+      if (kind.reset) { kind.reset(values, runs, runs); return; }
+      const before = runs.slice(), began = runs[at.end_time];
+      let [open, elapsed, ...stretch] = kind.lost(values, before, []);
+      for (let hops = 0; open && hops < kind.most_hops; hops++) {
+        const from = stretch, start = elapsed;
+        [open, elapsed, ...stretch] = kind.hop(values, before, from, []);
+        if (record && elapsed > start) {
+          record({ time: began + start, mode: -1, rows: (wanted) => kind.between(values, before, from, [wanted - began - start], []) });
+        }
+      }
+      kind.closed(values, before, stretch, runs);
+    }
+
+    function trajectory(values, reading) {
+      const pieces = [];
+      run(values, (piece) => pieces.push(piece));
+      const read = reader(pieces, (piece, wanted) => model[reading](values, [piece.mode], piece.rows(wanted), [wanted], []));
+      return { end: runs[at.end_time], steps: pieces.length, read };
+    }
+    return { run, trajectory, read: (name, values) => model[name](values, runs, []) };
+  }
+
+  return model.kinds ? hybrid() : smooth();
 }

@@ -132,7 +132,9 @@ def _value(array: Any) -> Value:
 
 def _map(function: Callable[..., Number], *values: Value) -> Value:
     """A function of numbers, for every element of some values."""
-    return np.asarray(np.frompyfunc(function, len(values), 1)(*values), object)
+    # What is not a number is so in JavaScript, too.
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.frompyfunc(function, len(values), 1)(*values), object)
 
 
 class _Block:
@@ -193,6 +195,10 @@ class _Block:
             return self.indexed(equation, inputs, range(len(inputs))[INDEXED[name]])
         if name in REDUCTIONS:
             return [self.reduced(REDUCTIONS[name], inputs[0], parameters["axes"])]
+        if name == "cumsum":
+            rows = _rows(inputs[0], parameters["axis"])[:: -1 if parameters["reverse"] else 1]
+            sums = list(itertools.accumulate(rows, functools.partial(self.each, "add")))
+            return [np.stack(sums[:: -1 if parameters["reverse"] else 1], parameters["axis"])]
         if name == "dot_general":
             return [self.product(*inputs, *parameters["dimension_numbers"])]
         if name == "iota":
@@ -279,7 +285,9 @@ class _Block:
             for (k, index), choice in zip(unknown, option, strict=True):
                 operands[k][index] = choice
                 same.append(self.each("eq", np.asarray(inputs[k][index], object), _value(choice)))
-            moved = equation.primitive.bind(*(operand.astype(int) for operand in operands), **equation.params)
+            # Beyond the end stands -1, which is no label.
+            parameters = equation.params | ({"fill_value": -1} if "fill_value" in equation.params else {})
+            moved = equation.primitive.bind(*(operand.astype(int) for operand in operands), **parameters)
             results = [picked(np.asarray(part)) for part in jax.tree.leaves(moved)]
             if values:
                 chosen = functools.reduce(functools.partial(self.each, "and"), same)

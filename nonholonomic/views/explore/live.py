@@ -13,8 +13,9 @@ from ...integration import Status
 from ..page import Page, page, script
 from ..stage import Stage
 from .frame import Frame
+from .hybrid_simulator import HybridSimulator
 from .javascript import javascript
-from .simulator import Simulator, written
+from .simulator import Simulator
 from .slider import Slider
 
 Numbers = Float[Array, " numbers"]
@@ -29,7 +30,7 @@ class Answer(NamedTuple):
 
     label: str
     unit: str
-    simulator: Simulator
+    simulator: Simulator | HybridSimulator
 
 
 class Summary(NamedTuple):
@@ -54,14 +55,14 @@ class LiveRun(NamedTuple):
     sliders: tuple[Slider, ...]
     allowed: Callable[[Numbers], Bool[Array, ""]]
     answer: Answer
-    motion: Simulator
+    motion: Simulator | HybridSimulator
     summaries: tuple[Summary, ...]
 
 
-def live_page(live: LiveRun, stage: Stage) -> Page:
+def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "") -> Page:
     """The page of a run with sliders.
 
-    **Arguments:** `stage`: with one run, for its arena, meshes and names.
+    **Arguments:** `stage`: with one run, for its arena, meshes and names; `speed`, `below`: as for `page`.
 
     **Raises:** `ModuleNotFoundError` if the library for views is not installed; `ValueError` for equations that cannot be
     written in JavaScript.
@@ -69,7 +70,9 @@ def live_page(live: LiveRun, stage: Stage) -> Page:
     # Its name and its warning are those of one run.
     drawn = stage._replace(title="", shows=tuple(show._replace(note="") for show in stage.shows))
     scripts = [script(text) for text in (programs(live), _file("map.js"), _file("explore.js"))]
-    return page([drawn], live.title, above=_file("explore.html"), scripts=scripts, autoplay=False)
+    return page(
+        [drawn], live.title, speed, _file("explore.html"), f'<section id="below">{below}</section>', scripts=scripts
+    )
 
 
 def programs(live: LiveRun) -> str:
@@ -84,8 +87,8 @@ def programs(live: LiveRun) -> str:
     }
     parts = {
         "facts": json.dumps(facts),
-        "answer": written(live.answer.simulator, values),
-        "motion": written(live.motion, values),
+        "answer": live.answer.simulator.javascript(values),
+        "motion": live.motion.javascript(values),
         "allowed": javascript("", live.allowed, values),
     }
     return (
@@ -93,7 +96,7 @@ def programs(live: LiveRun) -> str:
     )
 
 
-def _layout(motion: Simulator, values: Numbers) -> dict[str, Any]:
+def _layout(motion: Simulator | HybridSimulator, values: Numbers) -> dict[str, Any]:
     return Frame(*eqx.filter_eval_shape(lambda values: motion.read("frame", values), values)).layout()
 
 

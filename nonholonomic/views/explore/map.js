@@ -19,8 +19,8 @@ function makeMap(box, live, integrator, choose) {
   let values = sliders.map((slider) => slider.value), axes = [0, Math.min(1, sliders.length - 1)], results = [], round = 0, next = 0;
 
   // A program of its own for each worker, from the page's own text, so that it works from disk.
-  const text = (model) => `{${Object.entries(model).map(([key, part]) =>
-    `${key}: ${typeof part === "function" ? part : JSON.stringify(part)}`).join(",")}}`;
+  const text = (part) => typeof part === "function" ? String(part) : Array.isArray(part) ? `[${part.map(text)}]`
+    : part && typeof part === "object" ? `{${Object.entries(part).map(([key, inner]) => `${key}: ${text(inner)}`)}}` : JSON.stringify(part);
   const program = `${integrator}
     const work = integrator(${text(live.answer)}), allowed = ${live.allowed};
     onmessage = ({ data: { round, first, runs } }) => postMessage({ round, first, found: runs.map((values) =>

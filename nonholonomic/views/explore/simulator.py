@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from ...integration import (
     RUNNING,
     AbstractProblem,
+    Control,
     LaneScheduler,
     LaneState,
     Settings,
@@ -31,6 +32,9 @@ from ...integration import (
 from .javascript import javascript
 
 Numbers = Float[Array, " numbers"]
+
+#: Functions of a page by their names, with examples of their arguments.
+Functions = dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]
 
 
 class Simulator(NamedTuple):
@@ -58,69 +62,107 @@ class Simulator(NamedTuple):
         scheduler = self.begin(values)
         return self.readings[name](values, scheduler.problem, scheduler.fresh)
 
+    def javascript(self, values: Numbers) -> str:
+        """The simulator as an object of JavaScript.
 
-def written(simulator: Simulator, values: Numbers) -> str:
-    """A simulator as an object of JavaScript.
+        **Arguments:** `values`: numbers of the sliders, which only say how many there are.
+        """
+        stepper = Stepper.of(self.begin, (values,), self.settings)
+        functions = stepper.functions
+        for name, read in self.readings.items():
+            functions[name] = (
+                lambda values, constants, lane, read=read: read(values, stepper.run(constants)[0], lane),
+                (values, stepper.constants, stepper.lane),
+            )
+        return as_object(stepper.facts, functions)
 
-    **Arguments:** `values`: numbers of the sliders, which only say how many there are.
+
+class Stepper(NamedTuple):
+    """The steps of a motion in JavaScript.
+
+    - `begin`: makes the scheduler of one cell from its arguments, of which `examples` are some; `settings`: of the steps.
+    - `constants`, `lane`: the shapes of what stays the same in a run, and of the lane; `run` makes problem, control and
+      absolute tolerances of the constants.
     """
 
-    def begin(values: Numbers) -> tuple[Any, LaneState]:
-        scheduler = simulator.begin(values)
-        return (scheduler.problem, scheduler.control, scheduler.atols), scheduler.fresh
+    begin: Callable[..., LaneScheduler]
+    examples: tuple[Any, ...]
+    settings: Settings
+    constants: Any
+    lane: LaneState
+    run: Callable[[Any], tuple[Any, Control, Any]]
 
-    shapes = eqx.filter_eval_shape(begin, values)
-    (constants, lane), static = eqx.partition(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
-    run = functools.partial(eqx.combine, static[0])
-    time, state = lane.time, lane.state
-    tableau = explicit_tableau(simulator.settings.for_lanes)
-    kinds = 0 if lane.margins is None else len(lane.margins)
-    places = len(watched_places(tableau))
-    margins = jax.tree.map(lambda least: jax.ShapeDtypeStruct((places, *least.shape), least.dtype), lane.margins)
-    tried = Step(state, state, state, time, time, margins)
+    @classmethod
+    def of(cls, begin: Callable[..., LaneScheduler], examples: tuple[Any, ...], settings: Settings) -> "Stepper":
+        """The steps of the motion that some function begins."""
+        shapes = eqx.filter_eval_shape(functools.partial(_started, begin), *examples)
+        (constants, lane), static = eqx.partition(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
+        return cls(begin, examples, settings, constants, lane, functools.partial(eqx.combine, static[0]))
 
-    def after(constants: Any, lane: LaneState, length: Any, tried: Step) -> LaneState:
-        problem, control, atols = run(constants)
-        return after_step(problem, control, atols, lane, length, tried)
+    @property
+    def functions(self) -> Functions:
+        """The functions that `integrator.js` calls."""
+        constants, lane, run = self.constants, self.lane, self.run
+        time, state = lane.time, lane.state
+        places = len(watched_places(explicit_tableau(self.settings.for_lanes)))
+        margins = jax.tree.map(lambda least: jax.ShapeDtypeStruct((places, *least.shape), least.dtype), lane.margins)
+        tried = Step(state, state, state, time, time, margins)
 
-    functions: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
-        "begin": (lambda values: eqx.filter(begin(values), eqx.is_array), (values,)),
-        "length": (lambda constants, lane: length_to_try(run(constants)[1], lane), (constants, lane)),
-        "field": (lambda constants, time, state: run(constants)[0].field(time, state), (constants, time, state)),
-        "margins": (lambda constants, time, state: run(constants)[0].margins(time, state), (constants, time, state)),
-        "crossing": (
-            lambda constants, state, rate: run(constants)[0].crossing_along(state, rate),
-            (constants, state, state),
-        ),
-        "after": (after, (constants, lane, time, tried)),
-    }
-    for name, read in simulator.readings.items():
-        functions[name] = (
-            lambda values, constants, lane, read=read: read(values, run(constants)[0], lane),
-            (values, constants, lane),
-        )
-    inner = len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
-    facts = {
-        "constants": _size(constants),
-        "components": state.shape[0],
-        "lane": _offsets(lane),
-        "running": RUNNING,
-        "stages": [row.tolist() for row in tableau.a_lower[:inner]],
-        "places": np.asarray(tableau.c[:inner]).tolist(),
-        "looks": stages_to_look(tableau.c),
-        "kinds": kinds,
-        "step": np.asarray(tableau.b_sol[: 1 + inner]).tolist(),
-        "error": np.asarray(tableau.b_error).tolist(),
-    }
+        def after(constants: Any, lane: LaneState, length: Any, tried: Step) -> LaneState:
+            problem, control, atols = run(constants)
+            return after_step(problem, control, atols, lane, length, tried)
+
+        return {
+            "begin": (lambda *inputs: eqx.filter(_started(self.begin, *inputs), eqx.is_array), self.examples),
+            "length": (lambda constants, lane: length_to_try(run(constants)[1], lane), (constants, lane)),
+            "field": (lambda constants, time, state: run(constants)[0].field(time, state), (constants, time, state)),
+            "margins": (
+                lambda constants, time, state: run(constants)[0].margins(time, state),
+                (constants, time, state),
+            ),
+            "crossing": (
+                lambda constants, state, rate: run(constants)[0].crossing_along(state, rate),
+                (constants, state, state),
+            ),
+            "after": (after, (constants, lane, time, tried)),
+        }
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The sizes and the coefficients that it reads."""
+        tableau = explicit_tableau(self.settings.for_lanes)
+        inner = len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
+        return {
+            "constants": size_of(self.constants),
+            "components": self.lane.state.shape[0],
+            "lane": offsets_of(self.lane),
+            "running": RUNNING,
+            "stages": [row.tolist() for row in tableau.a_lower[:inner]],
+            "places": np.asarray(tableau.c[:inner]).tolist(),
+            "looks": stages_to_look(tableau.c),
+            "margins_count": 0 if self.lane.margins is None else len(self.lane.margins),
+            "step": np.asarray(tableau.b_sol[: 1 + inner]).tolist(),
+            "error": np.asarray(tableau.b_error).tolist(),
+        }
+
+
+def _started(begin: Callable[..., LaneScheduler], *inputs: Any) -> tuple[Any, LaneState]:
+    scheduler = begin(*inputs)
+    return (scheduler.problem, scheduler.control, scheduler.atols), scheduler.fresh
+
+
+def as_object(facts: dict[str, Any], functions: Functions, **more: str) -> str:
+    """An object of JavaScript with facts and functions; `more`: text of further entries."""
     lines = [f"{name}: {javascript('', function, *examples)}" for name, (function, examples) in functions.items()]
+    lines += [f"{name}: {text}" for name, text in more.items()]
     return "{\n" + ",\n".join([*(f"{name}: {json.dumps(fact)}" for name, fact in facts.items()), *lines]) + "}"
 
 
-def _size(tree: Any) -> int:
+def size_of(tree: Any) -> int:
+    """How many numbers a tree of arrays has."""
     return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
 
 
-def _offsets(lane: LaneState) -> dict[str, int]:
-    """Where each part of a lane begins, as its numbers stand one after another, and under `size` how many there are."""
-    sizes = [_size(part) for part in lane]
-    return dict(zip((*LaneState._fields, "size"), np.cumsum([0, *sizes]).tolist(), strict=True))
+def offsets_of(parts: Any) -> dict[str, int]:
+    """Where each part of a named tuple begins, as its numbers stand one after another, and under `size` how many there are."""
+    return dict(zip((*parts._fields, "size"), np.cumsum([0, *map(size_of, parts)]).tolist(), strict=True))

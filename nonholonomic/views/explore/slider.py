@@ -23,7 +23,9 @@ class Slider(NamedTuple):
     value: float
 
 
-def sliders_of(ranges: Any, roots: dict[str, Any], labels: dict[str, str], units: dict[str, str]) -> tuple[Slider, ...]:
+def sliders_of(
+    ranges: Any, roots: dict[str, Any], labels: dict[str, str], units: dict[str, str], drawn: tuple[str, ...] = ()
+) -> tuple[Slider, ...]:
     """The sliders that a user asks for.
 
     **Arguments:**
@@ -31,6 +33,7 @@ def sliders_of(ranges: Any, roots: dict[str, Any], labels: dict[str, str], units
     - `ranges`: name of a parameter -> (lowest, highest) value.
     - `roots`: "scene" and "launch".
     - `labels`, `units`: of parameters by their short names.
+    - `drawn`: parameters, besides `DRAWN`, that change what is drawn.
 
     **Raises:** `ValueError` for an unknown name, a range that is none, and numbers that the modules do not allow.
     """
@@ -45,7 +48,7 @@ def sliders_of(ranges: Any, roots: dict[str, Any], labels: dict[str, str], units
     for name, ends in ranges.items():
         path = full_name("sliders", name, scalars)
         low, high = _ends(name, ends)
-        if path.startswith(DRAWN):
+        if path.startswith((*DRAWN, *drawn)):
             raise ValueError(
                 f"sliders[{name!r}]: {path} changes what is drawn, the arena or the size of the body, which the page keeps; "
                 "write a page for each value"

@@ -130,23 +130,24 @@ return [...document.querySelectorAll('#controls button, #controls input, #contro
 """
 
 
-def test_controls_lie_under_nothing_and_nothing_overflows(browser):
-    """At 500 px, in the page itself and in the frame of a notebook or of the gallery."""
+def test_controls_lie_under_nothing_and_nothing_overflows(browser, stages):
+    """At 500 px, in the page itself and in the frame that a notebook and the gallery put it in."""
     for inside in (False, True):
         if inside:
+            frame = page(stages, "Both models", height=100, autoplay=False)._repr_html_()
             browser.execute_script(
-                "const frame = document.createElement('iframe'); frame.id = 'frame'; frame.src = location.href;"
-                "frame.style = 'position: fixed; inset: 0; width: 480px; height: 490px; z-index: 99; background: #fff';"
-                "document.body.append(frame)"
+                "const box = document.createElement('div'); box.id = 'box'; box.innerHTML = arguments[0];"
+                "document.body.prepend(box); scrollTo(0, 0)",
+                frame.replace('loading="lazy"', ""),
             )
-            browser.switch_to.frame("frame")
+            browser.switch_to.frame(browser.find_element("css selector", "#box iframe"))
             wait(browser, "return !!window.player")
         found = browser.execute_script(CENTRES)
         assert len(found) > 15
         assert set(found) == {True}
         assert browser.execute_script("return document.documentElement.scrollWidth <= innerWidth")
     browser.switch_to.default_content()
-    browser.execute_script("document.getElementById('frame').remove(); scrollTo(0, 0)")
+    browser.execute_script("document.getElementById('box').remove(); scrollTo(0, 0)")
 
 
 def test_the_camera_never_goes_under_the_floor(browser):
@@ -171,6 +172,24 @@ def test_arrows_are_labelled_in_their_units_and_switched_off(browser, top):
     browser.execute_script("arguments[0].click()", chip)
     assert browser.execute_script(label) == shown - 1
     browser.execute_script("arguments[0].click()", chip)
+
+
+def test_curves_and_arrows_tell_the_same_between_frames(browser, stages):
+    """Both are on the straight line between frames; the nearer frame would be 0.4 % off, where the force swings fast."""
+    show = stages[0].shows[0]
+    force = next(curve.values for curve in show.curves if curve.label == "normal force [N]")
+    swing = int(np.argmax(np.abs(np.diff(force))))
+    at = float(0.51 * show.times[swing] + 0.49 * show.times[swing + 1])
+    expected = 0.51 * force[swing] + 0.49 * force[swing + 1]
+    assert abs(expected - force[swing]) > 3e-3 * expected
+    arrow, curve = browser.execute_script(
+        f"player.seek({at!r});"
+        "const strip = [...document.querySelectorAll('.strip')].find((one) => one.textContent.includes('normal force'));"
+        "return [player.stages[0].runs[0].arrows[0].size, Number(strip.querySelector('.value span').textContent)]"
+    )
+    assert arrow == pytest.approx(expected, rel=1e-4)
+    # Told to four digits.
+    assert curve == pytest.approx(expected, rel=5e-4)
 
 
 def test_keys_move_time_and_a_click_on_a_curve_seeks(browser):

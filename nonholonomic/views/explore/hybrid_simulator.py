@@ -1,0 +1,170 @@
+"""A hybrid system that is integrated in the browser: its modes and its transitions, in JavaScript.
+
+Everything is generated from the modes that make tables (`nonholonomic.hybrid`). Only the loops over rounds and over the
+stretches of a transition are written by hand, in `integrator.js`.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ...hybrid import (
+    MOST_ROUNDS,
+    AbstractBatchedMode,
+    AbstractHoppingMode,
+    HybridOutcome,
+    after_reset,
+    after_solve,
+)
+from ...integration import (
+    LEFT_DOMAIN,
+    RUNNING,
+    UNRESOLVED,
+    LaneScheduler,
+    Settings,
+    outcome_of,
+    with_crossing_times,
+)
+from .simulator import Functions, Numbers, Stepper, as_object, offsets_of, size_of
+
+Start = tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]
+
+
+class HybridSimulator(NamedTuple):
+    """What is integrated in the browser through modes.
+
+    - `start`: for the numbers of the sliders, the modes, the number of the first, and the state there, of one cell.
+    - `t1`: horizon [s]; `settings`: with an explicit Runge-Kutta solver of Diffrax; `counters`: rows of `Transition.counts`.
+    - `readings`: what is read off a run at its end, name -> a function of (the sliders' numbers, a `HybridOutcome`).
+    - `frame`: what is read off at any time, from (the sliders' numbers, the number of the mode or -1 between modes, the output
+      rows of the modes, the time [s]); `None` where no path is asked for.
+    """
+
+    start: Callable[[Numbers], Start]
+    t1: float
+    settings: Settings
+    counters: int
+    readings: dict[str, Callable[[Numbers, HybridOutcome], Any]]
+    frame: Callable[[Numbers, Any, Any, Any], Any] | None = None
+
+    def first(self, values: Numbers) -> HybridOutcome[Array]:
+        """The run that the sliders' numbers say, at its start."""
+        _, mode, state = self.start(values)
+        zero, none = jnp.zeros(1), jnp.zeros(1, int)
+        counts = jnp.zeros((self.counters, 1), int)
+        return HybridOutcome(none + RUNNING, zero + jnp.inf, zero, state, none, none, mode, counts)
+
+    def read(self, name: str, values: Numbers) -> Any:
+        """A reading at the start of a run."""
+        assert self.frame is not None, name
+        modes, number, state = self.start(values)
+        return self.frame(values, number, modes[0].shown(state), jnp.zeros(1))
+
+    def javascript(self, values: Numbers) -> str:
+        """The simulator as an object of JavaScript.
+
+        **Arguments:** `values`: numbers of the sliders, which only say how many there are.
+        """
+        modes = eqx.filter_eval_shape(self.start, values)[0]
+        runs = jax.eval_shape(self.first, values)
+        groups = _alike(modes)
+        facts = {
+            "runs": offsets_of(runs),
+            "modes": [next(k for k, group in enumerate(groups) if number in group) for number in range(len(modes))],
+            "rounds": MOST_ROUNDS,
+            "running": RUNNING,
+            "left": LEFT_DOMAIN,
+            "unresolved": UNRESOLVED,
+        }
+        functions: Functions = {"first": (self.first, (values,))}
+        functions |= {name: (read, (values, runs)) for name, read in self.readings.items()}
+        if self.frame is not None:
+            rows = jax.eval_shape(lambda values: self._mode(values, [0], 0).shown(self.first(values).state), values)
+            functions["frame"] = (self.frame, (values, runs.mode, rows, runs.end_time))
+        kinds = [self._kind(values, group, modes[group[0]], runs) for group in groups]
+        return as_object(facts, functions, kinds=f"[{', '.join(kinds)}]")
+
+    def _mode(self, values: Numbers, group: list[int], number: Any) -> Any:
+        """The mode with a number, one of a group of alike ones."""
+        modes = self.start(values)[0]
+        return _chosen([modes[k] for k in group], group, number)
+
+    def _kind(self, values: Numbers, group: list[int], mode: AbstractBatchedMode, runs: HybridOutcome) -> str:
+        """The modes of one group: how they are integrated, and how they end."""
+        t1 = jnp.full(1, self.t1)
+
+        def begin(values: Numbers, runs: HybridOutcome) -> LaneScheduler:
+            problem = self._mode(values, group, runs.mode).problem(runs.state)
+            return LaneScheduler.of(problem, _left(t1, runs), jnp.asarray(1), self.settings)
+
+        def ended(constants: Any, lane: Any, runs: HybridOutcome) -> HybridOutcome:
+            outcome = with_crossing_times(stepper.run(constants)[0], outcome_of(lane))
+            return after_solve(jnp, runs, outcome, t1)
+
+        def reset(values: Numbers, runs: HybridOutcome) -> HybridOutcome:
+            transition = self._mode(values, group, runs.mode).reset_map(runs.state, _left(t1, runs))
+            return after_reset(jnp, runs, transition, t1)
+
+        def lost(values: Numbers, runs: HybridOutcome) -> Any:
+            stretch = self._mode(values, group, runs.mode).lost(runs.state)
+            return stretch.open, stretch.elapsed, stretch
+
+        def hop(values: Numbers, runs: HybridOutcome, stretch: Any) -> Any:
+            after, following = self._mode(values, group, runs.mode).hop(stretch, _left(t1, runs))
+            return following.open, after.elapsed, following
+
+        def closed(values: Numbers, runs: HybridOutcome, stretch: Any) -> HybridOutcome:
+            return after_reset(jnp, runs, self._mode(values, group, runs.mode).closed(stretch), t1)
+
+        def shown(values: Numbers, runs: HybridOutcome, state: Any) -> Any:
+            return self._mode(values, group, runs.mode).shown(state)
+
+        def between(values: Numbers, runs: HybridOutcome, stretch: Any, passed: Any) -> Any:
+            mode = self._mode(values, group, runs.mode)
+            return mode.between(mode.motion_in(stretch), passed)
+
+        stepper = Stepper.of(begin, (values, runs), self.settings)
+        functions, facts = stepper.functions, stepper.facts
+        functions["ended"] = (ended, (stepper.constants, stepper.lane, runs))
+        if not isinstance(mode, AbstractHoppingMode):
+            functions["reset"] = (reset, (values, runs))
+        else:
+            stretch = eqx.filter_eval_shape(lost, values, runs)[2]
+            facts |= {"stretch": size_of(stretch), "most_hops": mode.most_hops}
+            functions |= {"lost": (lost, (values, runs)), "hop": (hop, (values, runs, stretch))}
+            functions["closed"] = (closed, (values, runs, stretch))
+            if self.frame is not None:
+                functions["between"] = (between, (values, runs, stretch, runs.end_time))
+        if self.frame is not None:
+            functions["shown"] = (shown, (values, runs, runs.state))
+        return as_object(facts, functions)
+
+
+def _left(t1: Float[Array, "1"], runs: HybridOutcome) -> Float[Array, "1"]:
+    """Time to the horizon [s]."""
+    return jnp.maximum(t1 - runs.end_time, 0.0)
+
+
+def _alike(modes: tuple[AbstractBatchedMode, ...]) -> list[list[int]]:
+    """The numbers of the modes, together those that differ in numbers only."""
+    groups: dict[Any, list[int]] = {}
+    for number, mode in enumerate(modes):
+        leaves, tree = jax.tree.flatten(mode)
+        groups.setdefault((tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves)), []).append(number)
+    return list(groups.values())
+
+
+def _chosen(modes: list[AbstractBatchedMode], numbers: list[int], number: Any) -> Any:
+    """The mode with a number."""
+
+    def leaf(*leaves: Any) -> Any:
+        value = leaves[-1]
+        for other, candidate in list(zip(numbers, leaves, strict=True))[-2::-1]:
+            value = value if candidate is value else jnp.where(number == other, candidate, value)
+        return value
+
+    return jax.tree.map(leaf, *modes)
