@@ -8,8 +8,10 @@ from concurrent.futures import ThreadPoolExecutor
 from html import escape
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 
 from nonholonomic import __version__
@@ -19,10 +21,10 @@ from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid,
 from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table
-from nonholonomic.validation import require, require_folder
+from nonholonomic.validation import as_number, require, require_folder
 from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html
 
-from .model.friction import Damping, Frictionless
+from .model.friction import Damping
 from .model.launch import Launch
 from .model.scene import FORKS, Scene
 from .model.stroller import Stroller
@@ -34,12 +36,13 @@ from .runs.view import grouped
 
 RIDES = ("without friction", "with friction")
 
-#: Those of the rides that show how the energy's residual follows the tolerance.
+#: Tolerances of the rides that show how the energy residual depends on the tolerance.
 TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 
 
 class Ground(NamedTuple):
-    """A surface to ride on: how options make it, and where a ride starts, near the bottom or, outside, near the top."""
+    """A surface to ride on: how options create it, and where a ride starts, near the bottom or, outside, near the
+    top."""
 
     build: Callable[[argparse.Namespace], AbstractSurface]
     place: tuple[float, float]
@@ -57,12 +60,15 @@ GROUNDS = {
 }
 
 
-class Helm:
-    """Steer to and fro about straight ahead, and pull with a constant force: a torque towards a moving angle."""
+class Helm(eqx.Module):
+    """Steer alternately left and right, and pull with a constant force: a torque towards a moving angle."""
 
-    def __init__(self, force: float, angle: float, period: float):
-        require(period, "period", above=0.0)
-        self.force, self.angle, self.period = force, angle, period
+    force: Any = eqx.field(converter=as_number)
+    angle: Any = eqx.field(converter=as_number)
+    period: Any = eqx.field(converter=as_number)
+
+    def __check_init__(self) -> None:
+        require(self.period, "period", above=0.0)
 
     def __call__(self, t: Any, motion: Any) -> tuple[Any, Any]:
         wanted = self.angle * jnp.sin(2.0 * jnp.pi * t / self.period)
@@ -116,7 +122,8 @@ def parser() -> argparse.ArgumentParser:
 def scenes(options: argparse.Namespace) -> dict[tuple[str, str], tuple[Scene, Launch]]:
     """The rides, without and with friction on each surface: (ground, friction) -> scene and launch."""
     body = Stroller(options.mass, options.wheelbase, options.inertia, options.steering_inertia)
-    laws = dict(zip(RIDES, (Frictionless(), Damping(*options.damping)), strict=True))
+    # No friction is damping by nothing: so both rides have one program.
+    laws = dict(zip(RIDES, (Damping(0.0, 0.0, 0.0, 0.0), Damping(*options.damping)), strict=True))
     rides = {}
     for name in dict.fromkeys(options.surface):
         ground = GROUNDS[name]
@@ -146,12 +153,11 @@ def audit(name: str, runs: dict[str, Trajectory]) -> list[str]:
 
 
 def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
-    """The largest residual of energy against work over the tolerance of Dopri8, for the last ride."""
+    """The largest energy residual over the tolerance of Dopri8, for the last ride."""
     (ground, ride), (scene, launch) = list(scenes(options).items())[-1]
     lines = [f"Dopri8 {ground}, {ride}: residual [J] of energy against work over the tolerance"]
     for tolerance in TOLERANCES:
-        # Few times of output, so that the tolerance alone chooses the steps.
-        run = simulate(scene, launch, options.t1, helm, times=jnp.linspace(0.0, options.t1, 3), tolerance=tolerance)
+        run = simulate(scene, launch, options.t1, helm, tolerance=tolerance)
         residual = float(jnp.max(jnp.abs(run.energy_residual)))
         lines.append(f"  {tolerance:7.0e}  {residual:8.1e}  in {int(run.stats.steps)} steps")
     return lines
@@ -177,13 +183,14 @@ def table(options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory])
 def write_page(
     options: argparse.Namespace, rides: dict[tuple[str, str], Trajectory], words: list[str], drawing: Path | None
 ) -> Path:
-    """The page of the main job: the rides in motion where three.js is installed, the audit, and the picture if there is one."""
+    """Write the page of the main job: the moving rides if three.js is installed, the audit, and the plot if there is
+    one."""
     groups: dict[str, list[tuple[int, Trajectory]]] = {}
     for number, ((ground, _), run) in enumerate(rides.items()):
         groups.setdefault(ground, []).append((number, run))
     drawn = []
     if can_view():
-        # The place of both rides is their stage's title, and their names stand beside it.
+        # The place of both rides is the title of their stage, and their names are beside it.
         drawn = [
             stage._replace(title=ground)
             for ground, stage in zip(groups, grouped(list(groups.values()), [ride for _, ride in rides]), strict=True)
@@ -214,14 +221,21 @@ def main(arguments: list[str] | None = None) -> int:
         )
         rides, audits, helm, asked = {}, [], Helm(options.force, options.steer, options.period), scenes(options)
         print(heading, flush=True)
-        # Their programs are compiled side by side, for the compiler uses little more than one core.
+        # Compile in parallel, because the compiler uses little more than one core. The two rides of a ground share one program.
         with Progress(len(asked) + 1, "ride") as counted, ThreadPoolExecutor(2) as threads:
             counted.begin()
+            turns = {ground: Lock() for ground, _ in asked}
+
+            def in_turn(name: tuple[str, str]) -> tuple[Trajectory, list[str]]:
+                with turns[name[0]]:
+                    return audited(options, helm, name)
+
+            futures = {
+                name: threads.submit(in_turn, name) for name in sorted(asked, key=lambda name: RIDES.index(name[1]))
+            }
             curves = threads.submit(tolerance_curve, options, helm)
-            for name, (ride, lines) in zip(
-                asked, threads.map(lambda name: audited(options, helm, name), asked), strict=True
-            ):
-                rides[name] = ride
+            for name in asked:
+                rides[name], lines = futures[name].result()
                 audits += lines
                 with counted.aside():
                     print("\n".join(lines), flush=True)

@@ -2,6 +2,7 @@
 
 import argparse
 import functools
+import json
 import math
 import sys
 import time
@@ -36,13 +37,13 @@ from .runs.theta_over_time import theta_over_time
 
 TOPS = {top.__name__: top for top in (presets.wooden, presets.rutstam, presets.cohen, presets.leine_glocker)}
 
-#: Times at which theta is drawn, and how long the run is that is shown [s].
+#: Times at which theta is drawn, and duration of the displayed run [s].
 SAMPLES, SHOWN = 256, 5.0
 
-#: The page's title, and what stands for what is below the top.
+#: The page's title, and the placeholder for the contents below the top.
 TITLE, BELOW = "A tippe top climbs onto its stem", "<!-- below -->"
 
-#: What ends a run, as the table says it.
+#: The words for the end of a run, as in the table.
 WORDS = {"not_inverted": "not in time", "contact_lost": "lost contact", "does_not_fit": "no room"}
 
 
@@ -76,7 +77,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def scenes(options: argparse.Namespace) -> dict[str, Scene]:
-    """The two arenas, with the middle one of the frictions."""
+    """The two arenas, with the middle one of the friction coefficients."""
     top, law = TOPS[options.top](), Coulomb(middle(options.mu), options.slip_speed)
     arenas = {"plane": Plane(), "cylinder": Cylinder(options.cylinder_radius)}
     return {name: Scene(top, arena, law, contact="hybrid") for name, arena in arenas.items()}
@@ -88,7 +89,7 @@ def middle(values: list[float]) -> float:
 
 
 def described(options: argparse.Namespace) -> list[str]:
-    """What the job is about, in some lines."""
+    """A description of the job, in some lines."""
     top, mm = TOPS[options.top](), lambda length: f"{1e3 * float(length):.3g} mm"
     alpha, gamma = steady.proportions(top)
     stem = "no stem" if top.stem is None else f"a stem {mm(2.0 * top.stem.radius)} thick"
@@ -123,33 +124,33 @@ def launch_shown(options: argparse.Namespace) -> Launch:
 
 
 def sliders(options: argparse.Namespace) -> str:
-    """The page of the top with sliders, a placeholder for what stands below it; empty without three.js."""
-    if not can_view():
-        return ""
+    """The page of the top with sliders, with a placeholder for the contents below."""
     run = (scenes(options)["plane"], launch_shown(options))
     t1 = min(SHOWN, options.t1)
     return live_page(live_run(*run, None, t1)._replace(title=TITLE), stage_at_start(*run, t1), 0.2, BELOW).html
 
 
 def computed(options: argparse.Namespace, folder: Path | None) -> tuple[dict[str, Table], Any, str]:
-    """The table of each arena, theta(t) of the launch that is shown, and the page with sliders.
+    """The table of each arena, theta(t) of the displayed launch, and the page with sliders.
 
-    They are computed side by side, for the compiler uses little more than one core.
+    They are computed in parallel, because the compiler uses little more than one core.
     """
     times = np.linspace(0.0, min(SHOWN, options.t1), SAMPLES)
+    facts = sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
+
+    def angles() -> str:
+        run, axes = (scenes(options)["plane"], launch_shown(options)), ("launch.theta", "scene.friction.mu")
+        return json.dumps(theta_over_time(*run, times, options.tolerance, axes).tolist())
 
     def on_plane() -> tuple[Table, Any]:
-        plane, axes = table(options, "plane"), ("launch.theta", "scene.friction.mu")
-        return plane, theta_over_time(
-            scenes(options)["plane"], launch_shown(options), times, options.tolerance, axes
-        ) if has_matplotlib() else None
+        # The table first, whose programs the picture needs.
+        plane = table(options, "plane")
+        return plane, json.loads(kept_text(folder, ("theta", facts), angles)) if has_matplotlib() else None
 
-    facts = sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
-    jobs = (
-        functools.partial(table, options, "cylinder"),
-        on_plane,
-        functools.partial(kept_text, folder, facts, functools.partial(sliders, options)),
-    )
+    def live() -> str:
+        return kept_text(folder, ("page", facts), functools.partial(sliders, options)) if can_view() else ""
+
+    jobs = (functools.partial(table, options, "cylinder"), on_plane, live)
     threads = ThreadPoolExecutor(2)
     try:
         with Progress(len(jobs), "job", "compiling") as counted:
@@ -159,10 +160,10 @@ def computed(options: argparse.Namespace, folder: Path | None) -> tuple[dict[str
                 future.result()
                 counted.advance(1)
     finally:
-        # After Ctrl-C the process ends while the compiler is at work, to which nothing gets through.
+        # After Ctrl-C, the process ends while the compiler is working, which nothing can interrupt.
         threads.shutdown(wait=False, cancel_futures=True)
-    cylinder, (plane, theta), live = (future.result() for future in futures)
-    return {"plane": plane, "cylinder": cylinder}, None if theta is None else (times, theta), live
+    cylinder, (plane, theta), html = (future.result() for future in futures)
+    return {"plane": plane, "cylinder": cylinder}, None if theta is None else (times, np.array(theta)), html
 
 
 def has_matplotlib() -> bool:
@@ -171,14 +172,14 @@ def has_matplotlib() -> bool:
 
 
 def saved(options: argparse.Namespace) -> str:
-    """What Ctrl-C leaves."""
+    """Message after Ctrl-C."""
     cells = sum(saved_cells(options.out / f"{arena}.h5") for arena in scenes(options))
     total = len(scenes(options)) * len(options.theta) * len(options.mu)
     return f"saved {cells} of {total} cells to {options.out}; run the same command again to resume"
 
 
 def rows_of(options: argparse.Namespace, table: Table) -> list[list[str]]:
-    """The entries of a table, a number or a word each, under its two headings."""
+    """The entries of a table, numbers or words, under its two headings."""
     rows = [["theta(0)", *(f"mu = {mu:g}" for mu in options.mu)]]
     for theta, times, words in zip(options.theta, table.time, table.status, strict=True):
         entries = [f"{t:.2f}" if math.isfinite(t) else str(WORDS.get(w, w)) for t, w in zip(times, words, strict=True)]
@@ -187,7 +188,7 @@ def rows_of(options: argparse.Namespace, table: Table) -> list[list[str]]:
 
 
 def headings(options: argparse.Namespace) -> dict[str, str]:
-    """What is said over the table of each arena."""
+    """The headings of the table of each arena."""
     return {
         "plane": "on a table [s]",
         "cylinder": f"in a cylinder of {100.0 * options.cylinder_radius:g} cm radius [s]",
@@ -206,18 +207,19 @@ def report(options: argparse.Namespace, arenas: dict[str, Table]) -> str:
 
 
 def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> Any:
-    """theta(t) of the launch that is shown, which has turned over at `end` [s]."""
+    """theta(t) of the displayed launch, which has turned over at `end` [s]."""
     title = f"{options.top} top, {options.rpm:g} rpm, mu = {middle(options.mu):g}, on a table"
     if end <= times[-1]:
-        # Between the times it may be above the angle for a moment only.
+        # Between the times, theta may be above the angle only for a moment.
         after = np.searchsorted(times, end)
         times, theta = np.insert(times, after, end), np.insert(theta, after, INVERTED)
-    panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]))
+    panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]), joined=False)
     return draw_launches([panel], INVERTED, "for the first time above the dashed angle")
 
 
 def write_page(options: argparse.Namespace, arenas: dict[str, Table], live: str, drawing: Path | None) -> Path:
-    """The page of the main job: the top with sliders, where three.js is installed, the tables, and the picture, if any."""
+    """Write the page of the main job: the top with sliders if three.js is installed, the tables, and the plot, if
+    any."""
     below = ""
     for name, heading in headings(options).items():
         below += f"<h2>Time until it has turned over, {heading}</h2>" + table_as_html(rows_of(options, arenas[name]), 1)

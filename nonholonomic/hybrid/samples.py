@@ -82,7 +82,9 @@ def _fixed(times: Float[Array, " times"]) -> Float[Array, " times"]:
 @_fixed.def_jvp
 def _refused(primals: Any, tangents: Any) -> Any:
     if tangents[0] is not None:
-        raise ValueError("times must not be differentiated by where runs have phases: contact = 'hybrid'")
+        raise ValueError(
+            "derivatives with respect to times are not available for runs of several modes: contact = 'hybrid'"
+        )
     return primals[0], jnp.zeros_like(primals[0])
 
 
@@ -106,7 +108,7 @@ class HybridSampling(AbstractSampling):
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[HybridSamples, list[HybridSamples]]:
         if nested:
-            raise ValueError("second derivatives do not go through changes of phase: contact = 'hybrid'")
+            raise ValueError("second derivatives are not available through changes of mode: contact = 'hybrid'")
         numbers, (*horizon, tolerance), spec = self._sorted(leaves)
         settings = spec.settings.with_tolerance(tolerance)
 

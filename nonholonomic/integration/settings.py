@@ -1,4 +1,4 @@
-"""How runs are integrated."""
+"""Settings of the integration."""
 
 from collections.abc import Iterator
 from typing import Any, Self
@@ -18,16 +18,16 @@ ABSOLUTE = 0.1
 #: The least and the greatest relative tolerance: below, round-off decides on steps; above, steps are hardly controlled.
 TIGHTEST, LOOSEST = 1e-14, 1e-2
 
-#: Most steps of a run for which no other limit is set.
+#: Default limit of the steps of a run.
 DEFAULT_MAX_STEPS = 2_000_000
 
-#: Most steps of runs that should be short: an impact, parameters tried by a fit, a run of the slow reference. A run
-#: that needs more has failed.
+#: Greatest number of steps of runs that should be short: an impact, parameters tried by a fit, a run of the slow
+#: reference. A run that needs more steps fails.
 MOST_STEPS = 100_000
 
 
 class Settings(eqx.Module):
-    """How runs are integrated, for every kind of result.
+    """Settings of the integration, for every kind of result.
 
     **Arguments:**
 
@@ -35,8 +35,8 @@ class Settings(eqx.Module):
     - `solver`: a solver of Diffrax, an explicit Runge-Kutta one for ensembles; `None` for `Oscillatory8` in ensembles
       and `Dopri8` in single runs, which need its dense output.
     - `absolute`: absolute tolerance as a fraction of the relative one, in units of the problem's magnitudes.
-    - `max_steps`: a run that needs more has failed.
-    - `lanes`: how many cells advance together; by default as many as suit the machine (`lanes_for`).
+    - `max_steps`: a run that needs more steps fails.
+    - `lanes`: number of cells that advance together; by default as many as suit the machine (`lanes_for`).
     """
 
     tolerance: Float[Array, ""] = eqx.field(converter=as_number)
@@ -68,11 +68,11 @@ class Settings(eqx.Module):
         return diffrax.Dopri8() if self.solver is None else self.solver
 
     def with_tolerance(self, tolerance: Float[Array, ""] | None) -> Self:
-        """The same with another tolerance, or without one, where the caller keeps it."""
+        """The same settings with another tolerance, or without one if the caller stores it."""
         return eqx.tree_at(lambda settings: settings.tolerance, self, tolerance, is_leaf=lambda leaf: leaf is None)
 
     def lanes_of(self, cells: int, n_blocks: int = 1) -> int:
-        """How many of the cells of a problem advance together, given the number of blocks in its state."""
+        """Number of a problem's cells that advance together, from the number of blocks in its state."""
         return lanes_for(cells, n_blocks) if self.lanes is None else self.lanes
 
 
@@ -98,9 +98,10 @@ def legal_run(
     tolerance: Float[ArrayLike, "..."],
     times: Any = None,
 ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
-    """Whether the traced numbers of a run are legal, and its horizon and tolerance: if not, 0 and the loosest.
+    """Whether the traced numbers of a run are legal, with its horizon and tolerance: if not, 0 and the largest
+    tolerance.
 
-    A run of illegal numbers might never reach its end, so it does not begin, and its tolerance is not that of its batch.
+    A run of illegal numbers might never end, so it does not begin, and its tolerance does not affect its batch.
 
     **Arguments:** `others`: whether all numbers are legal but `t1`, `tolerance` and the `times` of output (times,), which
     must increase.
@@ -132,7 +133,7 @@ def require_adjoint(adjoint: Any) -> None:
 
 
 def lanes_for(cells: int, n_blocks: int = 1) -> int:
-    """How many cells should advance together, given their number and the number of equal blocks in the state.
+    """Number of cells that should advance together, from their number and the number of equal blocks in the state.
 
     On a CPU the lanes and their stages should fit the first caches; an accelerator is idle below tens of thousands.
     """

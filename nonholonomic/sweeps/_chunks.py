@@ -95,7 +95,9 @@ class ChunkStore:
         try:
             room = shutil.disk_usage(self.path.parent).free
             if room < need:
-                raise OSError(0, f"{1e-9 * room:.3g} GB are free, and it takes {1e-9 * need:.3g} GB on the way")
+                raise OSError(
+                    0, f"{1e-9 * room:.3g} GB are free, and the table needs {1e-9 * need:.3g} GB while it is computed"
+                )
             self.folder.mkdir(exist_ok=True)
             sync_folder(self.path.parent)
         except OSError as error:
@@ -119,7 +121,7 @@ class ChunkStore:
         if difference is None and old.get("nonholonomic") != new.get("nonholonomic"):
             difference = f"nonholonomic is {old.get('nonholonomic')} there and {new.get('nonholonomic')} here"
         if difference is None and (theirs.kinds, theirs.inner, theirs.chunk) != (ours.kinds, ours.inner, ours.chunk):
-            difference = f"it was not written by a sweep in {ours.chunks} blocks"
+            difference = f"it was not written by a sweep in {ours.chunks} chunks"
         if difference is not None:
             what = self.path if begun.path == self.path else self.folder
             raise ValueError(f"{what} holds the result of another run: {difference}; give another path or remove it")

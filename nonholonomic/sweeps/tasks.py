@@ -74,7 +74,7 @@ def remote_results(sent: bytes, needed: dict[str, str], first: int, count: int, 
         if own[name] != needed[name]:
             raise RuntimeError(
                 f"the worker {platform.node()}, process {os.getpid()}, has {name} {own[name]}, and {needed[name]} is needed: "
-                "a table is computed with one version of everything"
+                "all workers of a table need the same versions"
             )
     # Otherwise, threads of one worker would compile the same program twice.
     with _unpacking:

@@ -57,6 +57,7 @@ def check_flights(number: int, run: tippe.HybridTrajectory) -> None:
     assert_close(end + (end - begin) * RESTITUTION / (1.0 - RESTITUTION), row["rest"], atol=2e-9)
 
 
+@pytest.mark.slow
 def test_bounces_in_a_bowl():
     """To rest, then sliding, against NumPy and SciPy: the error goes with the tolerance, to 2e-10, and no constant stops it."""
     loose, tight = (bounced(0, tippe.Paraboloid(CASES[0].p1), tolerance) for tolerance in (1e-8, 1e-12))

@@ -65,6 +65,7 @@ def check_against_the_program(number: int, surface: tippe.Cylinder | tippe.Parab
     return run
 
 
+@pytest.mark.slow
 def test_both_spheres_bounce_in_a_cylinder():
     """A top thrown over onto its stem, and one that starts on it, against NumPy and SciPy."""
     thrown = check_against_the_program(0, tippe.Cylinder(CASES[0].p1))

@@ -172,6 +172,7 @@ def ride() -> tippe.HybridTrajectory:
     return tippe.simulate(scene_of(case), tippe.Launch(case.theta, case.spin), case.t1, tolerance=1e-11)
 
 
+@pytest.mark.slow
 def test_a_top_leans_and_falls_back(ride):
     """From the first moment of leaning on, the reference: when it ends, and state and work 0.5 s later."""
     case, piece = CASES[SHORT], next(piece for piece in ride.dense.segments if piece.number == BOTH)
@@ -198,6 +199,7 @@ def test_a_top_leans_and_falls_back(ride):
     assert_close(found[9:], stands.y[9:, -1], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_while_it_leans(ride):
     """theta and the height are constant to the bit, both spheres push, energy never grows, and the work accounts for it."""
     on_both = ride.contact == BOTH

@@ -87,7 +87,7 @@ def relative_error(found, expected, lengths):
 @pytest.mark.parametrize(
     ("arena", "friction"),
     [
-        pytest.param(*pair, marks=[] if pair in (("plane", "viscous"), ("cylinder", "torques")) else pytest.mark.slow)
+        pytest.param(*pair, marks=[] if pair == ("plane", "viscous") else pytest.mark.slow)
         for pair in itertools.product(ARENAS, FRICTIONS)
     ],
 )

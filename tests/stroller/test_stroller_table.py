@@ -154,6 +154,7 @@ def test_bad_sweeps_are_refused(change, message):
         stroller.sweep(BOWL, **given)
 
 
+@pytest.mark.slow
 def test_main_job(tmp_path, capsys):
     """`python -m stroller` prints an audit that closes and writes its file and picture."""
     assert main(["--t1", "2", "--surface", "spheroid", "--out", str(tmp_path)]) == 0

@@ -257,6 +257,7 @@ def test_float32_works_at_its_own_tolerance():
     assert_close([float(time) for time in done.stdout.split(",")], expected.time.ravel(), rtol=2e-2)
 
 
+@pytest.mark.slow
 def test_a_frame_that_turns_with_the_top_saves_digits_and_changes_none(rutstam_scene):
     """Tops on the plane under a law with torques too, slow and fast, by equations at rest and by those of the tables."""
     disc = tippe.Contensou(np.array([0.3, 0.3, 0.1, 0.5]), np.array([0.0, 1e-3, 2e-3, 0.0]), 0.2)

@@ -17,6 +17,7 @@ from tippe.runs.theta_over_time import theta_over_time
 SMALL = ["--paper", "--theta", "0.1", "0.3", "--eta", "0", "--t1", "12", "--tolerance", "1e-7"]
 
 
+@pytest.mark.slow
 def test_the_papers_tables_are_printed_written_and_drawn(tmp_path, capsys):
     assert main([*SMALL, "--out", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out

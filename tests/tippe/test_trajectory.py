@@ -75,6 +75,7 @@ def test_illegal_numbers_in_a_batch_of_runs_give_nothing_that_looks_right(rutsta
         assert np.all(np.isnan(read[1:]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [{"adjoint": diffrax.ForwardMode()}, pytest.param({"solver": diffrax.Kvaerno3()}, marks=pytest.mark.slow)],

@@ -26,6 +26,7 @@ def extrapolated(function, at, step):
     return (4.0 * one - two) / 3.0
 
 
+@pytest.mark.slow
 def test_an_upright_start_has_its_tangent_integrated_too():
     """At theta = 0 the state is a steady one, and steps judged by it alone outgrow what the tangent can bear."""
 
@@ -113,6 +114,7 @@ def test_every_number_of_the_launch_and_some_of_the_scene():
         assert_close(gradient[k], expected, rtol=2e-6)
 
 
+@pytest.mark.slow
 def test_later_samples_are_further_along():
     def angle(stretch):
         scene = tippe.Scene(rutstam_top(), friction=tippe.Viscous(0.3))
@@ -142,6 +144,7 @@ def test_theta_by_theta_at_the_pole_is_the_one_sided_derivative_forward_and_unkn
     assert by_mu == 0.0
 
 
+@pytest.mark.slow
 def test_a_first_sample_at_the_pole_leaves_the_derivatives_of_the_others():
     """On a slope the axis leaves the normal: d theta / d mu of all samples together, backward, against a difference."""
 

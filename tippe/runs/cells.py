@@ -55,7 +55,7 @@ WORD_OF_STATUS = {LEFT_DOMAIN: WORDS.index("contact_lost"), FAILED: WORDS.index(
 def too_many_steps(t1: float, most: int, end: float) -> str:
     """Message for a run that needs more than the allowed steps."""
     return (
-        f"t1 = {t1:g} s is too long: the run needs more than {most:_} steps, with which it came to {end:.4g} s; "
+        f"t1 = {t1:g} s is too long: the run needs more than {most:_} steps, which reached only {end:.4g} s; "
         "take a shorter t1 or a larger tolerance"
     ).replace("_", " ")
 

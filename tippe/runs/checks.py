@@ -98,7 +98,7 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any) -> None:
     at_rest = launch.velocity is None and launch.angular_velocity is None
     if scene.level and at_rest and not is_traced(theta) and np.any(np.asarray(theta) == 0.0):
         warnings.warn(
-            "theta = 0.0 is exactly upright, where a top stays for ever: launch it at a small angle, such as 0.01 rad",
+            "theta = 0.0 is exactly upright, where a top stays forever: launch it at a small angle, such as 0.01 rad",
             UserWarning,
             stacklevel=4,
         )
@@ -112,10 +112,12 @@ def event_bounds(angle: Any) -> Iterator[Bound]:
 def check_smooth(scene: Scene, caller: str) -> None:
     """Raise `ValueError` for a scene with hybrid runs, which do not support derivatives here."""
     if scene.contact == "hybrid":
-        raise ValueError(f"contact = 'hybrid' must be 'stop' for {caller}; inversion_table goes through flights")
+        raise ValueError(f"contact = 'hybrid' must be 'stop' for {caller}; inversion_table supports flights")
     if scene.friction.set_valued:
         kind = type(scene.friction).__name__
-        raise ValueError(f"friction = {kind} must be a law without phases for {caller}; inversion_table has them")
+        raise ValueError(
+            f"friction = {kind} must be a law with a single mode for {caller}; inversion_table supports others"
+        )
 
 
 def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:

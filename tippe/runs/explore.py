@@ -61,7 +61,7 @@ TOLERANCE = 1e-7
 #: Tolerance of the runs that determine the drawn part of the arena.
 DRAWN = 1e-5
 
-#: How far a level plane is drawn about the start of a run with flights, in units of sqrt(g R) t1.
+#: Drawn radius of a level plane about the start of a run with flights, in units of sqrt(g R) t1.
 REACH = 0.5
 
 #: Greatest number of steps of a run in the page, some hundred milliseconds.
@@ -76,7 +76,7 @@ def explore(
     sliders: dict[str, tuple[float, float]] | None = None,
     t1: float = 8.0,
 ) -> Page:
-    """Make a page with sliders that simulates the top again, in the browser, while you move a slider.
+    """Make a page with sliders that simulates the top in the browser while you move a slider.
 
     The page is one file that needs no network; a notebook shows the returned `Page`. The equations of motion, the Runge-Kutta
     pair, the step-size control and the location of the event are generated from those of `inversion_table`, so times and
@@ -121,12 +121,12 @@ def explore(
 
 
 def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float]] | None, t1: float) -> LiveRun:
-    """What the page shows. **Arguments:** as for `explore`."""
+    """The contents of the page. **Arguments:** as for `explore`."""
     check_run(scene, launch, t1, TOLERANCE)
     check_modes(scene)
     roots = {"scene": scene, "launch": launch}
     ranges = default_ranges(scene, launch) if sliders is None else sliders
-    # A stem's end counts from the centre of mass: moving that would change the shape.
+    # The stem's end counts from the centre of mass: moving that would change the shape.
     drawn = ("scene.body.stem.", "scene.body.offset") if has_stem(scene) else ()
     knobs = sliders_of(ranges, roots, LONG_NAMES, UNITS | scene.body.units | scene.friction.units, drawn)
 
@@ -153,7 +153,7 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
 def smooth_simulators(
     modules: Callable[[Numbers], tuple[Scene, Launch]], t1: float, settings: Settings
 ) -> tuple[Simulator, Simulator]:
-    """How a run of one smooth motion is simulated: to its inversion, and as it is drawn."""
+    """The simulators of a run of one smooth motion: to its inversion, and of the drawn run."""
 
     def moment(values: Numbers, problem: TrajectoryProblem, lane: LaneState) -> Frame:
         return smooth_frame(modules(values)[0], problem, lane)
@@ -186,7 +186,7 @@ def hybrid_simulators(
 
 
 def check_modes(scene: Scene) -> None:
-    """Raise `ValueError` for a scene whose runs have modes that the page does not know."""
+    """Raise `ValueError` for a scene whose runs have modes that the page does not support."""
     if flies(scene) and not scene.level:
         raise ValueError(
             f"contact = 'hybrid' must be 'stop' for explore on a {type(scene.surface).__name__}: the page knows flights over a "
@@ -199,7 +199,7 @@ def check_modes(scene: Scene) -> None:
 
 
 def flies(scene: Scene) -> bool:
-    """Whether runs go on through flights, and impacts."""
+    """Whether runs continue through flights and impacts."""
     return scene.contact == "hybrid"
 
 
@@ -209,7 +209,7 @@ def has_stem(scene: Scene) -> bool:
 
 
 def default_ranges(scene: Scene, launch: Launch) -> dict[str, tuple[float, float]]:
-    """The sliders if a user names none: theta, spin, friction, and the offset of a top without a stem, about their values."""
+    """The default sliders: theta, spin, friction, and the offset of a top without a stem, around their own values."""
     theta, spin = float(launch.theta), float(launch.spin)
     ranges = {"theta": (min(0.02, theta), max(0.6, theta)), "spin": tuple(sorted((0.4 * spin, 1.4 * spin)))}
     if spin == 0.0:
@@ -247,7 +247,7 @@ def hybrid_outcome(runs: HybridOutcome) -> tuple[Int[Array, ""], Float[Array, ""
 
 
 def stage_of_runs(scene: Scene, launch: Launch, knobs: tuple[Slider, ...], t1: float) -> Stage:
-    """The run at the start, on a piece of the arena on which are also the runs at the ends of the sliders."""
+    """The run at the start, on a part of the arena that also contains the runs at the ends of the sliders."""
     roots = {"scene": scene, "launch": launch}
     shapes = [roots, *(with_numbers(roots, {path: end}) for path, end in ends_of(knobs))]
     paths = [simulate(run["scene"], run["launch"], t1, tolerance=DRAWN) for run in shapes]
@@ -257,10 +257,10 @@ def stage_of_runs(scene: Scene, launch: Launch, knobs: tuple[Slider, ...], t1: f
 
 
 def stage_at_start(scene: Scene[Top], launch: Launch, t1: float) -> Stage:
-    """A top on a level plane as it is launched: the page simulates before it shows anything."""
+    """A top on a level plane at its launch: the page simulates before it shows anything."""
     start = Motion(*(np.repeat(np.asarray(part), 2, axis=0) for part in _motion_at_start(scene, launch)))
     drawn, size = show(scene, start._replace(times=np.array([0.0, 1.0])), 0, ""), float(scene.body.size)
-    # Slips grow as the top rises: the arrow of one half as fast as the equator is as long as the longest.
+    # Slips grow as the top rises: an arrow half as fast as the equator has the greatest length.
     normal_force, slip, *others = drawn.arrows
     assert slip.limit is not None
     fastest = 0.5 * size * float(np.linalg.norm(start.angular_velocity[0]))
@@ -274,20 +274,20 @@ def stage_at_start(scene: Scene[Top], launch: Launch, t1: float) -> Stage:
 def _motion_at_start(scene: Scene[Top], launch: Launch) -> Motion[Array]:
     modes, number, state = level_modes((scene, launch), TOLERANCE)
     assert isinstance(modes[0], Slide)
-    # The others stand on their stem.
+    # The other tops stand on their stem.
     rows = dataclasses.replace(modes[0], number=number).shown(state)
     return Motion.of(hybrid_run(scene, number, rows, jnp.zeros(1)))
 
 
 def smooth_frame(scene: Scene, problem: TrajectoryProblem, lane: LaneState) -> Frame:
-    """What is drawn of a top at one time in contact."""
+    """The drawn quantities of a top at one time in contact."""
     lean, rows = len(problem.state), lane.state
     parts = (rows[:lean], rows[lean:-2], rows[-2], rows[-1])
     return frame(scene, Trajectory(lane.time, scene, *parts, status=0, end_time=lane.time[0], stats={}, dense=None))
 
 
 def hybrid_frame(scene: Scene, number: Int[Array, "1"], rows: Float[Array, "17 1"], time: Float[Array, "1"]) -> Frame:
-    """What is drawn of a top at one time in contact or in flight; `rows` are what the modes show."""
+    """The drawn quantities of a top at one time in contact or in flight; `rows` are the output rows of the modes."""
     return frame(scene, hybrid_run(scene, number, rows, time))
 
 
@@ -301,7 +301,7 @@ def hybrid_run(
 
 
 def frame(scene: Scene, run: Any) -> Frame:
-    """What is drawn of a top at the only time of a run, as `view.show` orders it."""
+    """The drawn quantities of a top at the only time of a run, in the order of `view.show`."""
     motion = Motion(*(part[0] for part in Motion.of(run)))
     radius = scene.body.size
     lifted = motion.contact + 0.02 * radius * motion.normal

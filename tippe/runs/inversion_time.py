@@ -151,7 +151,7 @@ class InversionSolve(AbstractDifferentiableSolve):
         check_differentiable(self._modules(leaves)[0])
         if nested and not inversions.kind.smooth:
             raise ValueError(
-                "second derivatives do not go through changes of phase: contact = 'hybrid', SetValuedCoulomb"
+                "second derivatives are not available through changes of mode: contact = 'hybrid', SetValuedCoulomb"
             )
         settings, solvers = Settings(tolerance, self.solver), traced(one_kernel=not nested)
         outcome, slopes, _ = inversions.solve_with_tangents(tangents, t1, cells, settings, solvers)

@@ -99,7 +99,7 @@ def lyapunov_exponent(
     require_kind(launch, "launch", Launch)
     if not run_kind_of(scene).smooth:
         raise ValueError(
-            "contact = 'hybrid' and SetValuedCoulomb have no exponents: variations end at a change of phase"
+            "contact = 'hybrid' and SetValuedCoulomb have no exponents: variations end at a change of mode"
         )
     require(t1, "t1", above=0.0)
     tolerance_bound(tolerance).require()

@@ -204,7 +204,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         **Raises:** `ValueError` for times outside the run, or if the run was made inside a transformation.
         """
         if self.dense is None:
-            raise ValueError("a run made inside jit, vmap or grad has no dense output: hand `times` to simulate")
+            raise ValueError("a run made inside jit, vmap or grad has no dense output: pass `times` to simulate")
         times = np.asarray(times, dtype=float)
         require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
         require_increasing(times, "times")
@@ -275,7 +275,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
             f"  theta: {float(self.theta[0]):.6g} to {float(self.theta[-1]):.6g} rad",
         ]
         if word == "contact_lost" and self.scene.contact == "stop" and isinstance(self.scene.body, Top):
-            lines.append("  the top flies on from there in a Scene with contact='hybrid'")
+            lines.append("  to continue through the flight, use a Scene with contact='hybrid'")
         if "axis_drift" in self.stats:
             lines.append(f"  steps: {self.stats['accepted']} accepted, {self.stats['rejected']} rejected")
             lines.append(f"  drift of |e|: {self.stats['axis_drift']:.1e}")

@@ -76,6 +76,5 @@ def check_differentiable(scene: Scene[Any]) -> None:
     """Raise `ValueError` for a scene whose modes do not support derivatives."""
     if run_kind_of(scene) is STICK_SLIP_FLY:
         raise ValueError(
-            "friction = SetValuedCoulomb with contact = 'hybrid' has no derivatives: they do not go through impacts in which a "
-            "slip may stop"
+            "friction = SetValuedCoulomb with contact = 'hybrid' has no derivatives, because an impact may stop a slip"
         )

@@ -29,7 +29,7 @@ def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
     known = [name for root, tree in roots.items() for name, value in numbers(root, tree).items() if value is not None]
     full_names = [full_name("sensitivities", name, known) for name in names]
     if len(set(full_names)) < len(full_names):
-        raise ValueError(f"sensitivities = {names!r} must name every number once")
+        raise ValueError(f"sensitivities = {names!r} must name every parameter only once")
     return full_names
 
 

@@ -139,7 +139,9 @@ def inversion_table(
     if paths:
         check_differentiable(scene)
     if not run_kind.smooth and method == "diffrax":
-        raise ValueError("method = 'diffrax' is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
+        raise ValueError(
+            "method = 'diffrax' does not support runs of several modes: contact = 'hybrid' or SetValuedCoulomb"
+        )
     looked_at = {axis.number: axis.values for axis in grid}
     warn_if_it_cannot_invert(scene, roots["launch"], looked_at.get("launch.theta", roots["launch"].theta))
     runs = InversionRuns(run_kind, float(t1), float(angle), crossing, integrator, method, paths, int(max_steps))

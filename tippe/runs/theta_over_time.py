@@ -21,8 +21,8 @@ def theta_over_time(
 ) -> Float[np.ndarray, " times"]:
     """theta [rad] of one launch at some times, also in flight.
 
-    Each time has a run of its own that ends there, and all of them are cells of a table. So a job that has computed a table
-    compiles nothing more for its picture, where `simulate` needs fifty programs.
+    Each time has a separate run that ends there, and all runs are cells of a table. So a job that has computed a table
+    compiles nothing more for its plot, while `simulate` needs fifty programs.
 
     **Arguments:** `axes`: full names of the parameters along the axes of that table, such as "launch.theta".
     """
@@ -32,7 +32,7 @@ def theta_over_time(
     columns, blocks = {name: np.full(size, float(values[name])) for name in axes}, []
     for first in range(0, len(times), size):
         block = times[first : first + size]
-        # Nothing turns further than by pi, so that no run ends before its time.
+        # No inclination exceeds pi, so no run ends before its time.
         horizons = np.pad(block, (0, size - len(block)))
         runs = InversionRuns(run_kind_of(scene), horizons, math.pi, "first", solver, "ensemble", [])
         blocks.append(runs.results(roots, columns, tolerance, len(block))["end_theta"][: len(block)])

@@ -236,14 +236,14 @@ def _traced(
 ) -> Trajectory | HybridTrajectory:
     if scene.friction.set_valued:
         raise ValueError(
-            f"friction = {type(scene.friction).__name__} must be a law without phases inside jit, vmap and grad"
+            f"friction = {type(scene.friction).__name__} must be a law with a single mode inside jit, vmap and grad"
         )
     if times is None:
         raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
     settings = Settings(tolerance, solver)
     if scene.contact == "hybrid":
         if adjoint is not None:
-            raise ValueError(f"adjoint = {adjoint!r} must be left out for contact = 'hybrid'")
+            raise ValueError(f"adjoint = {adjoint!r} must be omitted for contact = 'hybrid'")
         explicit_tableau(settings.for_lanes)
         return (sampled_hybrid if scene.flies_in_closed_form else sampled_airborne)(scene, launch, times, t1, settings)
     samples = sampled(scene, launch, times, t1, settings, adjoint)

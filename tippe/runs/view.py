@@ -109,7 +109,7 @@ _turning = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     """Runs as stages: one stage for each, or a common one for overlaid runs."""
     for run in runs:
-        require_one_run(run, "a picture", ", and hand the others over as others=")
+        require_one_run(run, "a picture", ", and pass the others as others=")
     starts = [f"θ(0) = {float(run.theta[0]):.3g} rad, {float(run.spin[0]):.4g} rad/s" for run in runs]
     names = distinguishing_labels(starts, [run.scene for run in runs])
     named = [(name, run.scene, motion(run)) for name, run in zip(names, runs, strict=True)]

@@ -1,4 +1,4 @@
-"""Pages in which sliders simulate anew, in the browser, with equations that are written from their jaxprs."""
+"""Pages with sliders that simulate in the browser, with equations generated from their jaxprs."""
 
 from .frame import Frame as Frame
 from .frame import quaternion as quaternion

@@ -1,4 +1,4 @@
-"""What a page shows at one time of a run, as the player takes it (`player.js`)."""
+"""The contents of a page at one time of a run, in the form for the player (`player.js`)."""
 
 from typing import Any, NamedTuple
 
@@ -9,12 +9,12 @@ Three = Float[Array, "3"]
 
 
 class Frame(NamedTuple):
-    """One moment of a run; bodies, traces, arrows and curves in the order of the `Show` that the page has been made with.
+    """One moment of a run, with bodies, traces, arrows and curves in the order of the `Show` of the page.
 
-    - `normal`: of the arena, into the room; `bodies`: place [m] and quaternion (x, y, z, w) of each.
+    - `normal`: of the arena, towards the body; `bodies`: position [m] and quaternion (x, y, z, w) of each.
     - `traces`: the point of each [m], and the point that it is relative to, or `None`.
-    - `arrows`: start [m] and vector of each, in its unit; `curves`: a number for each.
-    - `turning_rate`: how fast the fastest part turns [rad/s], which says how many frames a run needs.
+    - `arrows`: start [m] and vector of each, in its unit; `curves`: one number each.
+    - `turning_rate`: greatest rotation rate of all parts [rad/s], which determines the number of frames.
     """
 
     normal: Three
@@ -25,7 +25,7 @@ class Frame(NamedTuple):
     turning_rate: Float[Array, ""]
 
     def layout(self) -> dict[str, Any]:
-        """How many there are of each kind, for those who read the numbers one after another."""
+        """The number of items of each kind, for readers of the flat list of numbers."""
         return {
             "bodies": len(self.bodies),
             "traces": [about is not None for _, about in self.traces],
@@ -37,7 +37,7 @@ class Frame(NamedTuple):
 def quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:
     """The quaternion (x, y, z, w) of a rotation matrix, from its largest component (Shepperd 1978)."""
     m, trace = rotation, rotation[0, 0] + rotation[1, 1] + rotation[2, 2]
-    # Four times the products of the quaternion's components: a row for each.
+    # Four times the products of the quaternion's components, one row each.
     skew = (m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
     even = (m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1])
     squares = [1.0 - trace + 2.0 * m[k, k] for k in range(3)]
@@ -51,6 +51,6 @@ def quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:
     )
     best = rows[0]
     for k in range(1, 4):
-        # The first k that were compared left their largest in `best`.
+        # `best` holds the largest of the first k compared rows.
         best = jnp.where(rows[k, k] > jnp.max(jnp.stack([rows[j, j] for j in range(k)])), rows[k], best)
     return best / jnp.sqrt(jnp.sum(best * best))

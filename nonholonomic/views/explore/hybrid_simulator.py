@@ -1,4 +1,4 @@
-"""A hybrid system that is integrated in the browser: its modes and its transitions, in JavaScript.
+"""A hybrid system for integration in the browser: its modes and transitions, in JavaScript.
 
 Everything is generated from the modes that make tables (`nonholonomic.hybrid`). Only the loops over rounds and over the
 stretches of a transition are written by hand, in `integrator.js`.
@@ -35,13 +35,15 @@ Start = tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "co
 
 
 class HybridSimulator(NamedTuple):
-    """What is integrated in the browser through modes.
+    """A hybrid system that is integrated in the browser.
 
-    - `start`: for the numbers of the sliders, the modes, the number of the first, and the state there, of one cell.
-    - `t1`: horizon [s]; `settings`: with an explicit Runge-Kutta solver of Diffrax; `counters`: rows of `Transition.counts`.
-    - `readings`: what is read off a run at its end, name -> a function of (the sliders' numbers, a `HybridOutcome`).
-    - `frame`: what is read off at any time, from (the sliders' numbers, the number of the mode or -1 between modes, the output
-      rows of the modes, the time [s]); `None` where no path is asked for.
+    - `start`: from the numbers of the sliders to the modes, the index of the first, and the initial state, for one
+      cell.
+    - `t1`: horizon [s]; `settings`: with an explicit Runge-Kutta solver of Diffrax; `counters`: rows of
+      `Transition.counts`.
+    - `readings`: results at the end of a run, name -> a function of (the sliders' numbers, a `HybridOutcome`).
+    - `frame`: the frame at any time, from (the sliders' numbers, the index of the mode or -1 between modes, the output
+      rows of the modes, the time [s]); `None` if no path is needed.
     """
 
     start: Callable[[Numbers], Start]
@@ -52,7 +54,7 @@ class HybridSimulator(NamedTuple):
     frame: Callable[[Numbers, Any, Any, Any], Any] | None = None
 
     def first(self, values: Numbers) -> HybridOutcome[Array]:
-        """The run that the sliders' numbers say, at its start."""
+        """The run for the sliders' numbers, at its start."""
         _, mode, state = self.start(values)
         zero, none = jnp.zeros(1), jnp.zeros(1, int)
         counts = jnp.zeros((self.counters, 1), int)
@@ -67,7 +69,7 @@ class HybridSimulator(NamedTuple):
     def javascript(self, values: Numbers) -> str:
         """The simulator as an object of JavaScript.
 
-        **Arguments:** `values`: numbers of the sliders, which only say how many there are.
+        **Arguments:** `values`: numbers of the sliders; only their count matters.
         """
         modes = eqx.filter_eval_shape(self.start, values)[0]
         runs = jax.eval_shape(self.first, values)
@@ -89,7 +91,7 @@ class HybridSimulator(NamedTuple):
         return as_object(facts, functions, kinds=f"[{', '.join(kinds)}]")
 
     def _mode(self, values: Numbers, group: list[int], number: Any) -> Any:
-        """The mode with a number, one of a group of alike ones."""
+        """The mode with an index, one of a group of similar modes."""
         modes = self.start(values)[0]
         return _chosen([modes[k] for k in group], group, number)
 
@@ -150,7 +152,7 @@ def _left(t1: Float[Array, "1"], runs: HybridOutcome) -> Float[Array, "1"]:
 
 
 def _alike(modes: tuple[AbstractBatchedMode, ...]) -> list[list[int]]:
-    """The numbers of the modes, together those that differ in numbers only."""
+    """The indices of the modes, grouped so that modes in a group differ only in numbers."""
     groups: dict[Any, list[int]] = {}
     for number, mode in enumerate(modes):
         leaves, tree = jax.tree.flatten(mode)
@@ -159,7 +161,7 @@ def _alike(modes: tuple[AbstractBatchedMode, ...]) -> list[list[int]]:
 
 
 def _chosen(modes: list[AbstractBatchedMode], numbers: list[int], number: Any) -> Any:
-    """The mode with a number."""
+    """The mode with an index."""
 
     def leaf(*leaves: Any) -> Any:
         value = leaves[-1]

@@ -1,8 +1,8 @@
-"""A writer of JavaScript: it turns a function that JAX can trace into a JavaScript function of the same numbers.
+"""Convert a function that JAX can trace to a JavaScript function of the same numbers.
 
-The function's jaxpr is written element by element: an array becomes as many scalars as it has elements. Slices, stacks and the
-like then cost nothing, and elements that no result needs are left out. Loops and branches that depend on numbers stay loops and
-branches. Of the packages that read jaxprs none writes JavaScript.
+The function's jaxpr is written element by element: an array becomes one scalar per element. Slices, stacks and similar
+operations then cost nothing, and unused elements are omitted. Loops and branches that depend on numbers stay loops and
+branches. No package that reads jaxprs writes JavaScript.
 """
 
 import functools
@@ -17,12 +17,12 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 
-#: A number: of Python where it is known, else the name or text that stands for it in JavaScript. A value is an array of them.
+#: A number: a Python number if known, otherwise its name or text in JavaScript. A value is an array of numbers.
 Number = str | float
 Value = np.ndarray
 Values = list[Value]
 
-#: JavaScript for what is done element by element.
+#: JavaScript for elementwise operations.
 _MATH = "abs sqrt cbrt sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp expm1 log log1p sign floor ceil"
 _PAIRS = {"add": "+", "add_any": "+", "sub": "-", "mul": "*", "div": "/", "rem": "%", "eq": "==", "ne": "!=", "lt": "<"}
 _PAIRS |= {"le": "<=", "gt": ">", "ge": ">=", "and": "&", "or": "|", "xor": "^"}
@@ -34,14 +34,14 @@ ELEMENTWISE |= {"clamp": "Math.min(Math.max({1}, {0}), {2})", "logistic": "1 / (
 ELEMENTWISE |= {"is_finite": "Number.isFinite({})"}
 CHOICE = "{0} ? {2} : {1}"
 
-#: What of it is worked out in Python where all numbers are known: indices, mostly.
+#: Elementwise operations that Python evaluates if all numbers are known, mostly for indices.
 KNOWN: dict[str, Callable[..., Number]] = {
     name: getattr(operator, name) for name in ("add", "sub", "mul", "lt", "le", "gt", "ge", "eq", "ne")
 }
 KNOWN |= {"max": max, "min": min, "clamp": lambda low, value, high: min(max(value, low), high)}
 KNOWN |= {CHOICE: lambda which, no, yes: yes if which else no}
 
-#: What takes numbers from one place to another; with NumPy where JAX would compile a program for each.
+#: Operations that move elements; evaluated by NumPy, because JAX would compile a program for each.
 MOVES: dict[str, Callable[..., Any]] = {
     "reshape": lambda x, new_sizes, **_: x.reshape(new_sizes),
     "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
@@ -56,7 +56,7 @@ MOVES: dict[str, Callable[..., Any]] = {
     ),
 }
 
-#: The same, with places that are numbers too: which of the operands they are.
+#: Operations that move elements to indices given by operands, and the positions of these operands.
 INDEXED = {"dynamic_slice": slice(1, None), "dynamic_update_slice": slice(2, None), "gather": slice(1, 2)}
 INDEXED |= {"scatter": slice(1, 2)} | {name: slice(0) for name in ("pad", "split", "transpose", "rev")}
 
@@ -64,10 +64,10 @@ SAME = ("stop_gradient", "optimization_barrier", "copy", "copy_p", "reduce_preci
 REDUCTIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"}
 REDUCTIONS |= {"reduce_and": "and", "reduce_or": "or"}
 
-#: Loops that are no longer are written out.
+#: Loops with at most this many iterations are unrolled.
 WRITTEN_OUT = 16
 
-#: Stands among the names for the way out of a loop.
+#: Marks the exit of a loop among the names.
 LEAVES = "break"
 
 
@@ -77,13 +77,13 @@ def javascript(name: str, function: Callable[..., Any], *arguments: Any) -> str:
     **Arguments:**
 
     - `name`: of the function in JavaScript.
-    - `function`: what JAX can trace.
+    - `function`: a function that JAX can trace.
     - `arguments`: examples of its arguments, arrays or trees of arrays.
 
-    **Returns:** the text of a function that takes a list of numbers for each argument, the elements of its leaves one after
-    another, and a list into which it writes those of the result, and which it returns.
+    **Returns:** the text of a function. Its arguments are a list of numbers for each argument, the elements of its
+    leaves one after another, and a list for the results, which it fills and returns.
 
-    **Raises:** `ValueError` for a primitive of JAX that it cannot write.
+    **Raises:** `ValueError` for an unsupported primitive of JAX.
 
     **Example:**
 
@@ -126,37 +126,37 @@ def _text(number: Number) -> str:
 
 
 def _value(array: Any) -> Value:
-    """A known array as numbers of Python."""
+    """A known array as Python numbers."""
     return np.asarray(array).astype(object)
 
 
 def _map(function: Callable[..., Number], *values: Value) -> Value:
-    """A function of numbers, for every element of some values."""
-    # What is not a number is so in JavaScript, too.
+    """Apply a function of numbers to every element of some values."""
+    # NaN is NaN in JavaScript, too.
     with np.errstate(invalid="ignore"):
         return np.asarray(np.frompyfunc(function, len(values), 1)(*values), object)
 
 
 class _Block:
-    """Statements one after another: each names numbers, reads others, and has lines of text."""
+    """Consecutive statements: each defines names, reads others, and has lines of text."""
 
     def __init__(self, names: Any, known: dict[str, str]):
         self.names, self.known = names, known
         self.statements: list[tuple[list[Number], set[str], list[str]]] = []
 
     def name(self, text: str, *reads: Number) -> str:
-        """The name of what an expression gives, which is written once only."""
+        """The name for the value of an expression, which is written only once."""
         if text not in self.known:
             self.known[text] = f"v{next(self.names)}"
             self.statements.append(([self.known[text]], set(_strings(reads)), [f"const {self.known[text]} = {text};"]))
         return self.known[text]
 
     def inner(self) -> "_Block":
-        """A block inside this one, which knows what this one knows."""
+        """A block inside this one that sees the names of this one."""
         return _Block(self.names, dict(self.known))
 
     def leading_to(self, needed: Sequence[Number]) -> tuple[list[str], set[str]]:
-        """The lines that lead to some numbers, and the names that are read on the way."""
+        """The lines that some numbers depend on, and the names that these lines read."""
         names, kept = set(_strings(needed)), []
         for results, reads, lines in reversed(self.statements):
             if not names.isdisjoint(results):
@@ -165,7 +165,7 @@ class _Block:
         return [line for lines in reversed(kept) for line in lines], names
 
     def call(self, closed: Any, arguments: Sequence[Value]) -> Values:
-        """The values that a jaxpr gives."""
+        """The results of a jaxpr."""
         jaxpr, constants = _opened(closed)
         values = dict(zip(jaxpr.constvars, map(_value, constants), strict=True))
         values |= dict(zip(jaxpr.invars, arguments, strict=True))
@@ -179,7 +179,7 @@ class _Block:
         return [read(atom) for atom in jaxpr.outvars]
 
     def apply(self, equation: Any, inputs: Values) -> Values:
-        """What one equation gives."""
+        """The results of one equation."""
         name, parameters = equation.primitive.name, equation.params
         if name in SAME:
             return inputs
@@ -208,7 +208,7 @@ class _Block:
         return [self.each(self.kind(equation), *inputs)]
 
     def kind(self, equation: Any) -> str:
-        """What is done element by element: the name of a primitive, or JavaScript."""
+        """An elementwise operation: the name of a primitive, or JavaScript."""
         name, parameters = equation.primitive.name, equation.params
         types = [atom.aval.dtype for atom in equation.invars]
         if name == "integer_pow":
@@ -232,7 +232,7 @@ class _Block:
         return name
 
     def each(self, kind: str, *values: Value) -> Value:
-        """Something done element by element."""
+        """Apply an elementwise operation."""
         return _map(functools.partial(self.element, kind), *values)
 
     def element(self, kind: str, *numbers: Number) -> Number:
@@ -243,13 +243,13 @@ class _Block:
         return self.name(ELEMENTWISE.get(kind, kind).format(*map(_text, numbers)), *numbers)
 
     def reduced(self, kind: str, value: Value, axes: Sequence[int]) -> Value:
-        """Elements along some axes, put together one by one."""
+        """Combine the elements along some axes, one by one."""
         for axis in sorted(axes, reverse=True):
             value = functools.reduce(functools.partial(self.each, kind), _rows(value, axis))
         return np.asarray(value, object)
 
     def product(self, a: Value, b: Value, contracted: Any, together: Any) -> Value:
-        """The product of two arrays, summed over some axes of both, with other axes of both side by side."""
+        """The product of two arrays, summed over the contracted axes; batch axes are kept."""
 
         def factor(value: Value, summed: Sequence[int], beside: Sequence[int]) -> tuple[Value, list[list[int]]]:
             free = [k for k in range(value.ndim) if k not in (*summed, *beside)]
@@ -261,7 +261,7 @@ class _Block:
         return whole.reshape([*common, *rows, *columns])
 
     def extreme(self, kind: str, value: Value, axis: int) -> Value:
-        """The place of the first extreme element along an axis."""
+        """The index of the first extreme element along an axis."""
 
         def better(best: Values, other: Values) -> Values:
             is_better = self.each(kind, other[1], best[1])
@@ -271,21 +271,21 @@ class _Block:
         return functools.reduce(better, rows)[0]
 
     def indexed(self, equation: Any, inputs: Values, indices: Sequence[int]) -> Values:
-        """Numbers taken from places that may be known only in JavaScript: there all possible ones are told apart."""
+        """Elements at indices that may be known only in JavaScript, which then selects among all possible indices."""
         pool = _flat([value for k, value in enumerate(inputs) if k not in indices])
         unknown = [(k, place) for k in indices for place, x in np.ndenumerate(inputs[k]) if isinstance(x, str)]
         labels, values = itertools.count(), []
         labelled = [value if k in indices else _map(lambda _: next(labels), value) for k, value in enumerate(inputs)]
-        # A gather beyond the end fills with a number that is none of the labels.
+        # A gather beyond the end fills with a number that is not a label.
         picked = functools.partial(_map, lambda k: pool[k] if 0 <= k < len(pool) else math.nan)
-        # One more than there are: an index beyond the end has a meaning of its own.
+        # One more than the number of elements: an index beyond the end has a separate meaning.
         options = range(max(inputs[0].shape, default=0) + 1)
         for option in itertools.product(options, repeat=len(unknown)):
             operands, same = [value.copy() for value in labelled], []
             for (k, index), choice in zip(unknown, option, strict=True):
                 operands[k][index] = choice
                 same.append(self.each("eq", np.asarray(inputs[k][index], object), _value(choice)))
-            # Beyond the end stands -1, which is no label.
+            # An index beyond the end gives -1, which is not a label.
             parameters = equation.params | ({"fill_value": -1} if "fill_value" in equation.params else {})
             moved = equation.primitive.bind(*(operand.astype(int) for operand in operands), **parameters)
             results = [picked(np.asarray(part)) for part in jax.tree.leaves(moved)]
@@ -296,10 +296,10 @@ class _Block:
         return values
 
     def loop(self, head: str, carry: Values, step: Callable[["_Block", Values], Values]) -> Values:
-        """What is carried through a loop, each step of which gives what is carried on."""
+        """A loop: each iteration computes the next values of the loop variables."""
         variables = self.variables(carry)
         names, starts, block = _flat(variables), _flat(carry), self.inner()
-        # A variable may be carried on as another one, so all are read before any is written.
+        # A loop variable may become another one, so read all of them before writing any.
         after = [
             block.name(f"({number})", number) if number in names and number != name else number
             for name, number in zip(names, _flat(step(block, variables)), strict=True)
@@ -312,7 +312,7 @@ class _Block:
         return variables
 
     def variables(self, values: Sequence[Value]) -> Values:
-        """New names, as many as there are numbers in some values."""
+        """New names, one for each number in some values."""
         return [_map(lambda _: f"v{next(self.names)}", value) for value in values]
 
     def while_(self, inputs: Values, cond_jaxpr: Any, body_jaxpr: Any, cond_nconsts: int, body_nconsts: int) -> Values:
@@ -366,7 +366,7 @@ def _flat(values: Sequence[Value]) -> list[Number]:
 
 
 def _opened(jaxpr: Any) -> tuple[Any, Sequence[Any]]:
-    """A jaxpr without its constants, and these."""
+    """A jaxpr without its constants, and the constants."""
     return (jaxpr.jaxpr, jaxpr.consts) if isinstance(jaxpr, ClosedJaxpr) else (jaxpr, ())
 
 

@@ -1,4 +1,4 @@
-"""A page with sliders: what it is made of, and how that gets into one file."""
+"""A page with sliders: its contents, and how they are combined into one file."""
 
 import json
 from collections.abc import Callable
@@ -22,10 +22,10 @@ Numbers = Float[Array, " numbers"]
 
 
 class Answer(NamedTuple):
-    """What is asked of every run, and shown as a map: its `label` and `unit`, and the `simulator` that finds it.
+    """The result of every run, which is also shown as a map: its `label` and `unit`, and the `simulator` that computes
+    it.
 
-    The simulator has the reading "outcome": how the run ended, a `Status`, and the number asked for, or
-    infinity.
+    The simulator has the reading "outcome": the `Status` of the run, and the result, or infinity.
     """
 
     label: str
@@ -34,7 +34,7 @@ class Answer(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """A curve of the `Show` that is also told in numbers, from the start of a run to its end."""
+    """A curve of the `Show` whose values at the start and the end of the run are also shown as numbers."""
 
     label: str
     unit: str
@@ -42,13 +42,13 @@ class Summary(NamedTuple):
 
 
 class LiveRun(NamedTuple):
-    """What a page with sliders shows.
+    """The contents of a page with sliders.
 
     - `title`: of the page.
-    - `sliders`: and `allowed`, whether their numbers are legal together.
-    - `answer`: what is asked of a run.
-    - `motion`: the run as it is drawn, with the reading "frame", a `Frame`.
-    - `summaries`: numbers that are told beside the answer.
+    - `sliders`: the sliders; `allowed`: whether their numbers are legal in combination.
+    - `answer`: the result of a run.
+    - `motion`: the simulator of the drawn run, with the reading "frame", a `Frame`.
+    - `summaries`: numbers shown beside the result.
     """
 
     title: str
@@ -67,7 +67,7 @@ def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "") 
     **Raises:** `ModuleNotFoundError` if the library for views is not installed; `ValueError` for equations that cannot be
     written in JavaScript.
     """
-    # Its name and its warning are those of one run.
+    # Name and warning belong to a single run.
     drawn = stage._replace(title="", shows=tuple(show._replace(note="") for show in stage.shows))
     scripts = [script(text) for text in (programs(live), _file("map.js"), _file("explore.js"))]
     return page(
@@ -76,7 +76,7 @@ def live_page(live: LiveRun, stage: Stage, speed: float = 1.0, below: str = "") 
 
 
 def programs(live: LiveRun) -> str:
-    """The JavaScript that simulates: what is known of the sliders, all functions and the integrator, without a page."""
+    """The JavaScript that simulates: the data of the sliders, all functions and the integrator, without a page."""
     values = jnp.array([slider.value for slider in live.sliders])
     facts = {
         "sliders": [slider._asdict() for slider in live.sliders],

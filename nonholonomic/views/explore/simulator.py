@@ -1,4 +1,4 @@
-"""A problem that is integrated in the browser: its functions, and its method, in JavaScript.
+"""A problem for integration in the browser: its functions and its method, in JavaScript.
 
 Everything is generated from the objects that make tables (`nonholonomic.integration`), so both take the same steps. Only the
 loops over steps and stages are written by hand, in `integrator.js`.
@@ -33,17 +33,18 @@ from .javascript import javascript
 
 Numbers = Float[Array, " numbers"]
 
-#: Functions of a page by their names, with examples of their arguments.
+#: Functions of a page by name, with examples of their arguments.
 Functions = dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]
 
 
 class Simulator(NamedTuple):
-    """What is integrated in the browser.
+    """A problem that is integrated in the browser.
 
     - `problem`: of one cell, for the numbers of the sliders.
     - `t1`: horizon [s]; `settings`: with an explicit Runge-Kutta solver of Diffrax.
-    - `readings`: what is read off a run, name -> a function of (the sliders' numbers, the problem, a `LaneState` of one lane).
-    - `passes`: whether a run goes on through its event.
+    - `readings`: results of a run, name -> a function of (the sliders' numbers, the problem, a `LaneState` of one
+      lane).
+    - `passes`: whether a run continues through its event.
     """
 
     problem: Callable[[Numbers], AbstractProblem]
@@ -53,7 +54,7 @@ class Simulator(NamedTuple):
     passes: bool = False
 
     def begin(self, values: Numbers) -> LaneScheduler:
-        """The run that the sliders' numbers say, at its start."""
+        """The run for the sliders' numbers, at its start."""
         t1, cells = jnp.asarray(self.t1), jnp.asarray(1)
         return LaneScheduler.of(self.problem(values), t1, cells, self.settings, nonterminal=self.passes)
 
@@ -65,7 +66,7 @@ class Simulator(NamedTuple):
     def javascript(self, values: Numbers) -> str:
         """The simulator as an object of JavaScript.
 
-        **Arguments:** `values`: numbers of the sliders, which only say how many there are.
+        **Arguments:** `values`: numbers of the sliders; only their count matters.
         """
         stepper = Stepper.of(self.begin, (values,), self.settings)
         functions = stepper.functions
@@ -80,9 +81,10 @@ class Simulator(NamedTuple):
 class Stepper(NamedTuple):
     """The steps of a motion in JavaScript.
 
-    - `begin`: makes the scheduler of one cell from its arguments, of which `examples` are some; `settings`: of the steps.
-    - `constants`, `lane`: the shapes of what stays the same in a run, and of the lane; `run` makes problem, control and
-      absolute tolerances of the constants.
+    - `begin`: creates the scheduler of one cell from its arguments, of which `examples` are examples; `settings`: of
+      the steps.
+    - `constants`, `lane`: the shapes of the constants of a run, and of the lane; `run` computes problem, control and
+      absolute tolerances from the constants.
     """
 
     begin: Callable[..., LaneScheduler]
@@ -94,7 +96,7 @@ class Stepper(NamedTuple):
 
     @classmethod
     def of(cls, begin: Callable[..., LaneScheduler], examples: tuple[Any, ...], settings: Settings) -> "Stepper":
-        """The steps of the motion that some function begins."""
+        """The steps of the motion that a function begins."""
         shapes = eqx.filter_eval_shape(functools.partial(_started, begin), *examples)
         (constants, lane), static = eqx.partition(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
         return cls(begin, examples, settings, constants, lane, functools.partial(eqx.combine, static[0]))
@@ -129,7 +131,7 @@ class Stepper(NamedTuple):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """The sizes and the coefficients that it reads."""
+        """The sizes and the coefficients that `integrator.js` reads."""
         tableau = explicit_tableau(self.settings.for_lanes)
         inner = len(tableau.c) - 1 if tableau.fsal else len(tableau.c)
         return {
@@ -152,17 +154,17 @@ def _started(begin: Callable[..., LaneScheduler], *inputs: Any) -> tuple[Any, La
 
 
 def as_object(facts: dict[str, Any], functions: Functions, **more: str) -> str:
-    """An object of JavaScript with facts and functions; `more`: text of further entries."""
+    """A JavaScript object with facts and functions; `more`: text of further entries."""
     lines = [f"{name}: {javascript('', function, *examples)}" for name, (function, examples) in functions.items()]
     lines += [f"{name}: {text}" for name, text in more.items()]
     return "{\n" + ",\n".join([*(f"{name}: {json.dumps(fact)}" for name, fact in facts.items()), *lines]) + "}"
 
 
 def size_of(tree: Any) -> int:
-    """How many numbers a tree of arrays has."""
+    """Number of numbers in a tree of arrays."""
     return sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(tree))
 
 
 def offsets_of(parts: Any) -> dict[str, int]:
-    """Where each part of a named tuple begins, as its numbers stand one after another, and under `size` how many there are."""
+    """The offset of each part of a named tuple in its flat list of numbers, and under `size` the length of the list."""
     return dict(zip((*parts._fields, "size"), np.cumsum([0, *map(size_of, parts)]).tolist(), strict=True))

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...parameters import full_name, numbers, readable_unit, with_numbers
 
-#: Parameters with which what is drawn would have to be drawn anew.
+#: Parameters that change the drawn meshes.
 DRAWN = ("scene.surface.", "scene.body.radius", "scene.body.equatorial", "scene.body.polar", "scene.body.wheelbase")
 
 
@@ -26,16 +26,16 @@ class Slider(NamedTuple):
 def sliders_of(
     ranges: Any, roots: dict[str, Any], labels: dict[str, str], units: dict[str, str], drawn: tuple[str, ...] = ()
 ) -> tuple[Slider, ...]:
-    """The sliders that a user asks for.
+    """The sliders for the ranges of a user.
 
     **Arguments:**
 
     - `ranges`: name of a parameter -> (lowest, highest) value.
     - `roots`: "scene" and "launch".
     - `labels`, `units`: of parameters by their short names.
-    - `drawn`: parameters, besides `DRAWN`, that change what is drawn.
+    - `drawn`: parameters, in addition to `DRAWN`, that change the drawn meshes.
 
-    **Raises:** `ValueError` for an unknown name, a range that is none, and numbers that the modules do not allow.
+    **Raises:** `ValueError` for an unknown name, an illegal range, and numbers that the modules do not allow.
     """
     if not (isinstance(ranges, dict) and ranges and all(isinstance(name, str) for name in ranges)):
         raise ValueError(

@@ -77,6 +77,7 @@ def draws():
     return fit, density, sample(density, fit.coordinates, fit.coordinate_covariance, draws=400, progress=False)
 
 
+@pytest.mark.slow
 def test_draws_have_the_mean_and_the_covariance_of_the_regression(draws):
     fit, density, found = draws
     assert all(value < 1.02 for value in found.r_hat.values())

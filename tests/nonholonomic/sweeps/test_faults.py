@@ -161,7 +161,7 @@ def test_a_disk_too_small_for_anything(tmp_path, room):
 
 def test_a_disk_too_small_for_the_table(tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
-    told = r"cannot write .*table\.h5: 1e-06 GB are free, and it takes 1\.7e-06 GB on the way"
+    told = r"cannot write .*table\.h5: 1e-06 GB are free, and the table needs 1\.7e-06 GB while"
     with pytest.raises(OSError, match=told):
         cheap_sweep(tmp_path / "table.h5", pytest.fail)
     assert not list(tmp_path.iterdir())
