@@ -121,7 +121,7 @@ class InversionRuns(NamedTuple):
 
         problem = InversionProblem.of(scene, launch, self.angle, size)
 
-        def solved(last: bool) -> Outcome | HybridOutcome:
+        def solved(last: bool) -> Any:
             return Inversions.of(scene, problem, tolerance, last).solve(self.t1, count, settings)
 
         slopes, grazing = {}, False

@@ -153,25 +153,25 @@ class InversionSolve(AbstractDifferentiableSolve):
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isinf(value)
 
-    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         inversions = self._inversions((*leaves[: self.movable], tolerance), cells)
         outcome = inversions.solve(t1, cells, Settings(tolerance, self.solver), traced())
         return self._times(leaves, may, inversions, outcome, [])[0]
 
-    def with_slopes(
-        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    def value_and_tangents(
+        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         # Cells are independent, so varying a parameter in all of them at once gives each its own derivative.
         moving = (*leaves[: self.movable], tolerance)
         inversions, tangents, gather = tangents_by(self._inversions, active, moving, cells)
         check_differentiable(self._modules(leaves)[0])
-        if again and not inversions.kind.smooth:
+        if nested and not inversions.kind.smooth:
             raise ValueError(
                 "second derivatives are not available through changes of mode: contact = 'hybrid', SetValuedCoulomb"
             )
-        settings, solvers = Settings(tolerance, self.solver), traced(one_kernel=not again)
+        settings, solvers = Settings(tolerance, self.solver), traced(one_kernel=not nested)
         outcome, slopes, _ = inversions.solve_with_tangents(tangents, t1, cells, settings, solvers)
         return self._times(leaves, may, inversions, outcome, gather([*slopes]))
 
