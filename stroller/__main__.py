@@ -1,7 +1,6 @@
 """The main job, `python -m stroller`: rides on some surfaces, with and without friction, and their audit."""
 
 import argparse
-import gc
 import sys
 import time
 from collections.abc import Callable
@@ -9,22 +8,23 @@ from concurrent.futures import ThreadPoolExecutor
 from html import escape
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 
 from nonholonomic import __version__
-from nonholonomic.command_line import interruptible
+from nonholonomic.command_line import closing_lines, run_and_exit
 from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.integration import ImplicitMidpoint
 from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table
-from nonholonomic.validation import require, require_folder
+from nonholonomic.validation import as_number, require, require_folder
 from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html
-from nonholonomic.xla_cpu import compile_quickly
 
-from .model.friction import Damping, Frictionless
+from .model.friction import Damping
 from .model.launch import Launch
 from .model.scene import FORKS, Scene
 from .model.stroller import Stroller
@@ -60,12 +60,15 @@ GROUNDS = {
 }
 
 
-class Helm:
+class Helm(eqx.Module):
     """Steer alternately left and right, and pull with a constant force: a torque towards a moving angle."""
 
-    def __init__(self, force: float, angle: float, period: float):
-        require(period, "period", above=0.0)
-        self.force, self.angle, self.period = force, angle, period
+    force: Any = eqx.field(converter=as_number)
+    angle: Any = eqx.field(converter=as_number)
+    period: Any = eqx.field(converter=as_number)
+
+    def __check_init__(self) -> None:
+        require(self.period, "period", above=0.0)
 
     def __call__(self, t: Any, motion: Any) -> tuple[Any, Any]:
         wanted = self.angle * jnp.sin(2.0 * jnp.pi * t / self.period)
@@ -119,7 +122,8 @@ def parser() -> argparse.ArgumentParser:
 def scenes(options: argparse.Namespace) -> dict[tuple[str, str], tuple[Scene, Launch]]:
     """The rides, without and with friction on each surface: (ground, friction) -> scene and launch."""
     body = Stroller(options.mass, options.wheelbase, options.inertia, options.steering_inertia)
-    laws = dict(zip(RIDES, (Frictionless(), Damping(*options.damping)), strict=True))
+    # No friction is damping by nothing: so both rides have one program.
+    laws = dict(zip(RIDES, (Damping(0.0, 0.0, 0.0, 0.0), Damping(*options.damping)), strict=True))
     rides = {}
     for name in dict.fromkeys(options.surface):
         ground = GROUNDS[name]
@@ -153,8 +157,7 @@ def tolerance_curve(options: argparse.Namespace, helm: Helm) -> list[str]:
     (ground, ride), (scene, launch) = list(scenes(options).items())[-1]
     lines = [f"Dopri8 {ground}, {ride}: residual [J] of energy against work over the tolerance"]
     for tolerance in TOLERANCES:
-        # Few times of output, so that only the tolerance determines the steps.
-        run = simulate(scene, launch, options.t1, helm, times=jnp.linspace(0.0, options.t1, 3), tolerance=tolerance)
+        run = simulate(scene, launch, options.t1, helm, tolerance=tolerance)
         residual = float(jnp.max(jnp.abs(run.energy_residual)))
         lines.append(f"  {tolerance:7.0e}  {residual:8.1e}  in {int(run.stats.steps)} steps")
     return lines
@@ -218,14 +221,21 @@ def main(arguments: list[str] | None = None) -> int:
         )
         rides, audits, helm, asked = {}, [], Helm(options.force, options.steer, options.period), scenes(options)
         print(heading, flush=True)
-        # Compile the programs in parallel, because the compiler uses little more than one core.
+        # Compile in parallel, because the compiler uses little more than one core. The two rides of a ground share one program.
         with Progress(len(asked) + 1, "ride") as counted, ThreadPoolExecutor(2) as threads:
             counted.begin()
+            turns = {ground: Lock() for ground, _ in asked}
+
+            def in_turn(name: tuple[str, str]) -> tuple[Trajectory, list[str]]:
+                with turns[name[0]]:
+                    return audited(options, helm, name)
+
+            futures = {
+                name: threads.submit(in_turn, name) for name in sorted(asked, key=lambda name: RIDES.index(name[1]))
+            }
             curves = threads.submit(tolerance_curve, options, helm)
-            for name, (ride, lines) in zip(
-                asked, threads.map(lambda name: audited(options, helm, name), asked), strict=True
-            ):
-                rides[name] = ride
+            for name in asked:
+                rides[name], lines = futures[name].result()
                 audits += lines
                 with counted.aside():
                     print("\n".join(lines), flush=True)
@@ -251,17 +261,10 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"python -m stroller: {error}", file=sys.stderr)
         return 2
-    print(f"\n{2 * len(rides)} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
-    print(f"Wrote {', '.join(map(str, written))}.")
-    print(f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}")
+    see = f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}"
+    print(closing_lines(2 * len(rides), started, written, see))
     return 0
 
 
 if __name__ == "__main__":
-    # For a job of seconds, searching all of JAX's objects for garbage would take a tenth of the time, here and at the
-    # end.
-    gc.disable()
-    compile_quickly()
-    status = interruptible(main, "stroller")
-    gc.freeze()
-    sys.exit(status)
+    run_and_exit(main, "stroller")

@@ -2,7 +2,7 @@
 
 import argparse
 import functools
-import gc
+import json
 import math
 import sys
 import time
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from nonholonomic import __version__
-from nonholonomic.command_line import interruptible
+from nonholonomic.command_line import closing_lines, run_and_exit
 from nonholonomic.compilation_cache import enable_compilation_cache, kept_text
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.progress import Progress, status_line
@@ -23,7 +23,6 @@ from nonholonomic.sweeps import Table, saved_cells
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Page, can_view, page, picture_as_html, table_as_html
 from nonholonomic.views.explore import live_page
-from nonholonomic.xla_cpu import compile_quickly
 
 from . import presets, steady
 from .model.friction import Coulomb
@@ -125,9 +124,7 @@ def launch_shown(options: argparse.Namespace) -> Launch:
 
 
 def sliders(options: argparse.Namespace) -> str:
-    """The page of the top with sliders, with a placeholder for the contents below; empty without three.js."""
-    if not can_view():
-        return ""
+    """The page of the top with sliders, with a placeholder for the contents below."""
     run = (scenes(options)["plane"], launch_shown(options))
     t1 = min(SHOWN, options.t1)
     return live_page(live_run(*run, None, t1)._replace(title=TITLE), stage_at_start(*run, t1), 0.2, BELOW).html
@@ -139,19 +136,21 @@ def computed(options: argparse.Namespace, folder: Path | None) -> tuple[dict[str
     They are computed in parallel, because the compiler uses little more than one core.
     """
     times = np.linspace(0.0, min(SHOWN, options.t1), SAMPLES)
+    facts = sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
+
+    def angles() -> str:
+        run, axes = (scenes(options)["plane"], launch_shown(options)), ("launch.theta", "scene.friction.mu")
+        return json.dumps(theta_over_time(*run, times, options.tolerance, axes).tolist())
 
     def on_plane() -> tuple[Table, Any]:
-        plane, axes = table(options, "plane"), ("launch.theta", "scene.friction.mu")
-        return plane, theta_over_time(
-            scenes(options)["plane"], launch_shown(options), times, options.tolerance, axes
-        ) if has_matplotlib() else None
+        # The table first, whose programs the picture needs.
+        plane = table(options, "plane")
+        return plane, json.loads(kept_text(folder, ("theta", facts), angles)) if has_matplotlib() else None
 
-    facts = sorted((name, repr(value)) for name, value in vars(options).items() if name != "out")
-    jobs = (
-        functools.partial(table, options, "cylinder"),
-        on_plane,
-        functools.partial(kept_text, folder, facts, functools.partial(sliders, options)),
-    )
+    def live() -> str:
+        return kept_text(folder, ("page", facts), functools.partial(sliders, options)) if can_view() else ""
+
+    jobs = (functools.partial(table, options, "cylinder"), on_plane, live)
     threads = ThreadPoolExecutor(2)
     try:
         with Progress(len(jobs), "job", "compiling") as counted:
@@ -163,8 +162,8 @@ def computed(options: argparse.Namespace, folder: Path | None) -> tuple[dict[str
     finally:
         # After Ctrl-C, the process ends while the compiler is working, which nothing can interrupt.
         threads.shutdown(wait=False, cancel_futures=True)
-    cylinder, (plane, theta), live = (future.result() for future in futures)
-    return {"plane": plane, "cylinder": cylinder}, None if theta is None else (times, theta), live
+    cylinder, (plane, theta), html = (future.result() for future in futures)
+    return {"plane": plane, "cylinder": cylinder}, None if theta is None else (times, np.array(theta)), html
 
 
 def has_matplotlib() -> bool:
@@ -214,7 +213,7 @@ def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> 
         # Between the times, theta may be above the angle only for a moment.
         after = np.searchsorted(times, end)
         times, theta = np.insert(times, after, end), np.insert(theta, after, INVERTED)
-    panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]))
+    panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]), joined=False)
     return draw_launches([panel], INVERTED, "for the first time above the dashed angle")
 
 
@@ -269,17 +268,10 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         raise KeyboardInterrupt(saved(options)) from None
     cells = sum(table.status.size for table in arenas.values())
-    print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
-    print(f"Wrote {', '.join(map(str, written))}.")
-    print(f"To see the top climb onto its stem, open {path}{'' if can_view() else f'. {NO_VIEW}'}")
+    see = f"To see the top climb onto its stem, open {path}{'' if can_view() else f'. {NO_VIEW}'}"
+    print(closing_lines(cells, started, written, see))
     return 0
 
 
 if __name__ == "__main__":
-    # For a job of seconds, searching all of JAX's objects for garbage would take a fifth of the time, here and at the
-    # end.
-    gc.disable()
-    compile_quickly()
-    status = interruptible(main, "tippe")
-    gc.freeze()
-    sys.exit(status)
+    run_and_exit(main, "tippe")

@@ -211,7 +211,7 @@ def test_every_scene_compiles(arena, law, asked):
     [
         ({"theta": None}, "theta = None is not a number"),
         ({"spin": None}, "spin = None is not a number"),
-        ({"axes": {"launch.theta": [0.1]}}, "'launch.theta' is an argument of its own"),
+        ({"axes": {"launch.theta": [0.1]}}, "'launch.theta' has its own argument"),
         ({"axes": [0.1]}, "axes = .* must be a dictionary"),
         ({"t1": [1.0, 2.0]}, r"t1 must be one number, not of shape \(2,\)"),
         ({"angle": [1.0, 2.0]}, r"angle must be one number, not of shape \(2,\)"),

@@ -9,13 +9,17 @@ Values = Float[np.ndarray, "..."]
 
 
 class Panel(NamedTuple):
-    """One arena and place: its title, times [s], theta [rad] of every launch (launches, times), and theta(0)."""
+    """One arena and place: its title, times [s], theta [rad] of every launch (launches, times), and theta(0).
+
+    Where the times are too far apart to show nutation, the values are not `joined` by lines.
+    """
 
     title: str
     times: Values
     theta: Values
     starts: Values
     ends: Values
+    joined: bool = True
 
 
 def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
@@ -36,7 +40,8 @@ def draw_launches(panels: list[Panel], angle: float, dots: str) -> Any:
     for drawing, panel in zip(drawings, panels, strict=True):
         colours = colormaps["viridis"](np.linspace(0.0, 0.92, len(panel.starts)))
         for theta, start, end, colour in zip(panel.theta, panel.starts, panel.ends, colours, strict=True):
-            drawing.plot(panel.times, theta, color=colour, linewidth=1.2, label=f"{start:.4g}")
+            style = {"linewidth": 1.2} if panel.joined else {"linestyle": "", "marker": ".", "markersize": 4}
+            drawing.plot(panel.times, theta, color=colour, label=f"{start:.4g}", **style)
             if np.isfinite(end):
                 drawing.plot(
                     end,

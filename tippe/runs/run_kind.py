@@ -61,6 +61,7 @@ def energy_of_state(
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
 
 SMOOTH = RunKind(WORDS, (), None, energy_of_state)
+REVERSAL = RunKind(("reversed", "not_reversed", *WORDS[2:]), (), None, energy_of_state)
 STICK_SLIP = RunKind(WORDS, ("sticks",), sticking.modes, sticking.energy_in)
 HYBRID = RunKind(WORDS, ("hops",), sliding.modes, free_body.energy_in)
 AIRBORNE = RunKind(WORDS, ("hops",), airborne.modes, airborne_ends.energy_in, flight_state=True)
@@ -96,6 +97,5 @@ def check_differentiable(scene: Scene[Any]) -> None:
     """Raise `ValueError` for a scene whose modes do not support derivatives."""
     if run_kind_of(scene) is STICK_SLIP_FLY:
         raise ValueError(
-            "friction = SetValuedCoulomb with contact = 'hybrid' has no derivatives: they do not go through impacts in which a "
-            "slip may stop"
+            "friction = SetValuedCoulomb with contact = 'hybrid' has no derivatives, because an impact may stop a slip"
         )

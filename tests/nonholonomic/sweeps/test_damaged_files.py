@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 from cheap_sweep import BLOCK, cheap_sweep, resumed
-from struck import half_finished
+from disk_faults import half_finished
 
 from nonholonomic.sweeps import Table
 
@@ -175,7 +175,7 @@ def test_foreign_files_and_folders_are_left_alone(images, tmp_path):
         assert path.read_bytes() == before
     saved = tmp_path / "saved.h5"
     saved.write_bytes(images["saved"])
-    with pytest.raises(ValueError, match=r"saved\.h5 holds .*: it was not written by a sweep in 7 blocks"):
+    with pytest.raises(ValueError, match=r"saved\.h5 holds .*: it was not written by a sweep in 7 chunks"):
         cheap_sweep(saved, pytest.fail)
     folder = tmp_path / "folder"
     folder.mkdir()
