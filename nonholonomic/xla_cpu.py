@@ -218,15 +218,15 @@ def _inlined(*arguments: Array, program: Jaxpr, plain: Any) -> list[Array]:
 def _without_attributes(program: Any, plain: Any) -> Any:
     """A program with plain contexts in its equations and those of the programs inside; other values unchanged."""
     if type(program) in (tuple, list):
-        return type(program)(_without_attributes(one, plain) for one in program)
+        return type(program)(_without_attributes(part, plain) for part in program)
     # Since JAX 0.12, a `ClosedJaxpr` is a `Jaxpr`.
     if isinstance(program, ClosedJaxpr) and program.jaxpr is not program:
         return program.replace(jaxpr=_without_attributes(program.jaxpr, plain))
     if not isinstance(program, Jaxpr):
         return program
     equations = [
-        one.replace(ctx=plain, params={name: _without_attributes(value, plain) for name, value in one.params.items()})
-        for one in program.eqns
+        part.replace(ctx=plain, params={name: _without_attributes(value, plain) for name, value in part.params.items()})
+        for part in program.eqns
     ]
     return program.replace(eqns=equations)
 

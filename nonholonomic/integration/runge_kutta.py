@@ -191,7 +191,7 @@ def scaled_error(
     took half of the time of a run with twelve.
     """
     ratio = error / (atol + rtol * jnp.maximum(jnp.abs(before), jnp.abs(after)))
-    squares, size = [one * one for one in ratio], ratio.shape[0] // n_blocks
+    squares, size = [component * component for component in ratio], ratio.shape[0] // n_blocks
     means = [functools.reduce(operator.add, squares[k * size : (k + 1) * size]) / size for k in range(n_blocks)]
     return jnp.sqrt(functools.reduce(jnp.maximum, means))
 

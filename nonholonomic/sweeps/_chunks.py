@@ -117,17 +117,17 @@ class ChunkStore:
                     difference = f"the axis {name} differs"
         if difference is None and list(theirs.coords) != list(ours.coords):
             difference = f"its axes are {', '.join(theirs.coords)}"
-        here, there = (json.loads(str(one.attributes.get("versions", "{}"))) for one in (ours, theirs))
-        if difference is None and there.get("nonholonomic") != here.get("nonholonomic"):
-            difference = f"nonholonomic is {there.get('nonholonomic')} in the file and {here.get('nonholonomic')} here"
+        new, old = (json.loads(str(layout.attributes.get("versions", "{}"))) for layout in (ours, theirs))
+        if difference is None and old.get("nonholonomic") != new.get("nonholonomic"):
+            difference = f"nonholonomic is {old.get('nonholonomic')} in the file and {new.get('nonholonomic')} here"
         if difference is None and (theirs.kinds, theirs.inner, theirs.chunk) != (ours.kinds, ours.inner, ours.chunk):
             difference = f"it was not written by a sweep in {ours.chunks} chunks"
         if difference is not None:
             what = self.path if begun.path == self.path else self.folder
             raise ValueError(f"{what} holds the result of another run: {difference}; give another path or remove it")
-        others = [name for name in here if name not in ("nonholonomic", "python") and there.get(name) != here[name]]
+        others = [name for name in new if name not in ("nonholonomic", "python") and old.get(name) != new[name]]
         if others and begun.path != self.path:
-            versions = ", ".join(f"{name} {there.get(name)}, now {here[name]}" for name in others)
+            versions = ", ".join(f"{name} {old.get(name)}, now {new[name]}" for name in others)
             warnings.warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning, stacklevel=7)
 
     def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Stored:

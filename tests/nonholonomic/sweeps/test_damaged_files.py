@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 from cheap_sweep import BLOCK, cheap_sweep, resumed
-from struck import half_finished
+from disk_faults import half_finished
 
 from nonholonomic.sweeps import Table
 
