@@ -61,11 +61,11 @@ def too_many_steps(t1: float, most: int, end: float) -> str:
 
 
 class InversionRuns(NamedTuple):
-    """The requested variables of every cell of a table; see `inversion_table`."""
+    """The requested variables of every cell of a table; see `inversion_table`. `angle` is `None` where reversals are timed."""
 
     run_kind: RunKind
     t1: float
-    angle: float
+    angle: float | None
     crossing: str
     solver: diffrax.AbstractSolver | None
     method: str
@@ -85,7 +85,8 @@ class InversionRuns(NamedTuple):
     @property
     def variables(self) -> dict[str, Variable]:
         """The table's variables, without errors and derivatives."""
-        times = {name: Variable("s", np.float64, long_name=TIMES[name]) for name in self.times}
+        names = TIMES if self.angle is not None else {"time": "reversal time"}
+        times = {name: Variable("s", np.float64, long_name=names[name]) for name in self.times}
         grazes = Variable("1", np.int8, long_name="whether an event on the way was grazing")
         return (
             times

@@ -53,6 +53,7 @@ COUNTED = {"steps": "steps", "rejected": "rejected steps", "hops": "flights", "s
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit")
 
 SMOOTH = RunKind(WORDS, (), None)
+REVERSAL = RunKind(("reversed", "not_reversed", *WORDS[2:]), (), None)
 STICK_SLIP = RunKind((*WORDS, "unresolved"), ("sticks",), stick_slip_modes)
 HYBRID = RunKind((*WORDS, "unresolved"), ("hops",), hybrid_modes)
 AIRBORNE = RunKind((*WORDS, "unresolved"), ("hops",), airborne.modes, flight_state=True)
