@@ -37,6 +37,8 @@ def test_both_packages_hand_out_one_list_whose_integers_do_not_change():
         "inverted": 7,
         "not_inverted": 8,
         "rank_lost": 9,
+        "reversed": 10,
+        "not_reversed": 11,
     }
     assert all(Status.of(word) is status for word, status in zip(words, Status, strict=True))
 

@@ -116,9 +116,9 @@ def reversal_table(
     require_rigid(scene)
     require_flag(errors, "errors")
     require_flag(scattered, "scattered")
-    given = {"theta": theta, "mu": mu, "spin": spin, "azimuth": azimuth}
+    launch_values = {"theta": theta, "mu": mu, "spin": spin, "azimuth": azimuth}
     options = (solver, "ensemble", scattered, errors, sensitivities, path, progress, executor, max_steps)
-    return event_table(scene, given, axes, t1, None, tolerance, "first", *options)
+    return event_table(scene, launch_values, axes, t1, None, tolerance, "first", *options)
 
 
 def require_rigid(scene: Scene) -> None:
