@@ -216,7 +216,9 @@ def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> 
         after = np.searchsorted(times, end)
         times, theta = np.insert(times, after, end), np.insert(theta, after, INVERTED)
     panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]), joined=False)
-    return draw_launches([panel], INVERTED, "for the first time above the dashed angle")
+    return draw_launches(
+        [panel], INVERTED, "large, for the first time above the dashed angle; small, runs to these times"
+    )
 
 
 def write_page(options: argparse.Namespace, arenas: dict[str, Table], live: str, drawing: Path | None) -> Path:
