@@ -157,7 +157,7 @@ def computed(options: argparse.Namespace, folder: Path | None) -> tuple[dict[str
     try:
         with Progress(len(jobs), "job", "compiling") as counted:
             counted.begin()
-            futures = [threads.submit(job) for job in jobs]
+            futures: list[Any] = [threads.submit(job) for job in jobs]
             for future in as_completed(futures):
                 future.result()
                 counted.advance(1)
@@ -263,7 +263,8 @@ def main(arguments: list[str] | None = None) -> int:
             else:
                 drawing = options.out / "theta.png"
                 middle_cell = options.theta.index(middle(options.theta)), options.mu.index(middle(options.mu))
-                picture(options, *shown, float(arenas["plane"].time[middle_cell])).savefig(drawing, dpi=130)
+                end = float(arenas["plane"].time[middle_cell])
+                picture(options, shown[0], shown[1], end).savefig(drawing, dpi=130)
                 written.append(drawing)
             path = write_page(options, arenas, live, drawing)
     except (ValueError, OSError) as error:
