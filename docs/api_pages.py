@@ -34,8 +34,8 @@ PAGES = {
     ),
     "bodies": Page(
         "Bodies",
-        "The bodies that a scene can hold: tops, convex bodies of revolution and the stroller.",
-        [*of("tippe", "Top Stem SpheroidBody ConvexBody"), "stroller.Stroller"],
+        "The bodies that a scene can hold: tops, convex bodies of revolution, bodies of any inertia, and the stroller.",
+        [*of("tippe", "Top Stem SpheroidBody ConvexBody Ellipsoid RigidBody"), "stroller.Stroller"],
     ),
     "arenas": Page(
         "Arenas",
@@ -46,7 +46,7 @@ PAGES = {
         "Friction",
         "Friction laws for the top and damping for the stroller.",
         [
-            *of("tippe", "Frictionless Viscous Coulomb SetValuedCoulomb Contensou Rolling AbstractFriction"),
+            *of("tippe", "Frictionless Viscous Coulomb SetValuedCoulomb Contensou Rolling NoSlip AbstractFriction"),
             *of("stroller", "Frictionless Damping RollingResistance AbstractFriction"),
         ],
     ),
@@ -64,7 +64,7 @@ PAGES = {
         "Simulate many runs at once, in memory or into a file. :doc:`tables` lists the variables, the statuses and the file "
         "format.",
         [
-            *of("tippe", "inversion_table trajectory_table"),
+            *of("tippe", "inversion_table reversal_table trajectory_table"),
             "stroller.sweep",
             "tippe.Table",
             *of("nonholonomic", "local_processes enable_compilation_cache"),
@@ -73,7 +73,7 @@ PAGES = {
     "derivatives": Page(
         "Times, derivatives and stability",
         "Differentiable inversion times, Lyapunov exponents and steady states.",
-        of("tippe", "inversion_time extended_inversion_time lyapunov_exponent LyapunovExponent steady"),
+        of("tippe", "inversion_time reversal_time extended_inversion_time lyapunov_exponent LyapunovExponent steady"),
     ),
     "fitting": Page(
         "Fitting",
@@ -117,7 +117,7 @@ MEMBERS = {
     "distance place_at charted in_fixed_frame in_own_axes",
     "tippe.AbstractFriction": "set_valued uses_spin isotropic per_normal_force",
     "stroller.AbstractFriction": "dissipates drag",
-    "tippe.Trajectory": f"at {RUN} {TOP} contact",
+    "tippe.Trajectory": f"at {RUN} {TOP} contact normal_spin reaction grip",
     "tippe.HybridTrajectory": f"at {RUN} {TOP}",
     "stroller.Scene": "state energy work contact",
     "stroller.Trajectory": f"{RUN} status energy_residual wheelbase_error grip grip_margin contact_lost_at rank_lost_at "

@@ -142,13 +142,13 @@ def remove_damaged(folder: Path) -> None:
     """
     looked_at = folder / LOOKED_AT
     known = set(looked_at.read_bytes().split(b"\n")) if looked_at.exists() else set()
-    found = []
+    sound_lines = []
     for entry in folder.glob("*-cache"):
         # Another process may remove the entry, too.
         try:
             line = _line(entry)
             if line in known or sound(entry.read_bytes()):
-                found.append(line)
+                sound_lines.append(line)
             else:
                 entry.unlink()
         except FileNotFoundError:
@@ -156,7 +156,7 @@ def remove_damaged(folder: Path) -> None:
     # Use a unique name: each of several processes that start together writes a file, and the last file remains.
     looking = folder / f"{LOOKED_AT}-{uuid.uuid4().hex}"
     try:
-        looking.write_bytes(b"\n".join([b"sound:", *found]))
+        looking.write_bytes(b"\n".join([b"sound:", *sound_lines]))
         os.replace(looking, looked_at)
     except OSError as error:
         looking.unlink(missing_ok=True)

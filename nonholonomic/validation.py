@@ -143,7 +143,7 @@ def require_kind(value: Any, name: str, kind: type, example: str = "") -> None:
         return
     wanted = kind.__name__.removeprefix("Abstract")
     if type(value).__name__ == wanted:
-        theirs, ours = (one.__module__.partition(".")[0] for one in (type(value), kind))
+        theirs, ours = (either.__module__.partition(".")[0] for either in (type(value), kind))
         raise ValueError(f"{name} is a {theirs}.{wanted} and must be a {ours}.{wanted}: each package has its own")
     raise ValueError(f"{name} = {value!r} must be a {wanted}{example}{uncalled(value)}")
 

@@ -127,8 +127,8 @@ def least(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     2.0
     """
 
-    def lesser(one: Any, other: Any) -> Any:
-        return jnp.where((one < other) | jnp.isnan(one), one, other)
+    def lesser(a: Any, b: Any) -> Any:
+        return jnp.where((a < b) | jnp.isnan(a), a, b)
 
     return functools.reduce(lesser, numbers)
 
@@ -143,8 +143,8 @@ def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     2.0
     """
 
-    def greater(one: Any, other: Any) -> Any:
-        return jnp.where((one > other) | jnp.isnan(one), one, other)
+    def greater(a: Any, b: Any) -> Any:
+        return jnp.where((a > b) | jnp.isnan(a), a, b)
 
     return functools.reduce(greater, numbers)
 
@@ -218,15 +218,15 @@ def _inlined(*arguments: Array, program: Jaxpr, plain: Any) -> list[Array]:
 def _without_attributes(program: Any, plain: Any) -> Any:
     """A program with plain contexts in its equations and those of the programs inside; other values unchanged."""
     if type(program) in (tuple, list):
-        return type(program)(_without_attributes(one, plain) for one in program)
+        return type(program)(_without_attributes(part, plain) for part in program)
     # Since JAX 0.12, a `ClosedJaxpr` is a `Jaxpr`.
     if isinstance(program, ClosedJaxpr) and program.jaxpr is not program:
         return program.replace(jaxpr=_without_attributes(program.jaxpr, plain))
     if not isinstance(program, Jaxpr):
         return program
     equations = [
-        one.replace(ctx=plain, params={name: _without_attributes(value, plain) for name, value in one.params.items()})
-        for one in program.eqns
+        part.replace(ctx=plain, params={name: _without_attributes(value, plain) for name, value in part.params.items()})
+        for part in program.eqns
     ]
     return program.replace(eqns=equations)
 

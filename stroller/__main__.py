@@ -1,7 +1,6 @@
 """The main job, `python -m stroller`: rides on some surfaces, with and without friction, and their audit."""
 
 import argparse
-import gc
 import sys
 import time
 from collections.abc import Callable
@@ -16,7 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from nonholonomic import __version__
-from nonholonomic.command_line import interruptible
+from nonholonomic.command_line import closing_lines, run_and_exit
 from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.geometry import CLOSED, AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.integration import ImplicitMidpoint
@@ -24,7 +23,6 @@ from nonholonomic.progress import Progress, status_line
 from nonholonomic.sweeps import Table
 from nonholonomic.validation import as_number, require, require_folder
 from nonholonomic.views import NO_VIEW, can_view, page, picture_as_html
-from nonholonomic.xla_cpu import compile_quickly
 
 from .model.friction import Damping
 from .model.launch import Launch
@@ -112,7 +110,7 @@ def parser() -> argparse.ArgumentParser:
     ride = command.add_argument_group("the ride")
     ride.add_argument("--speed", type=float, default=2.0, help="speed at the start [m/s]")
     ride.add_argument("--force", type=float, default=1.0, help="drive force [N]")
-    ride.add_argument("--steer", type=float, default=0.3, help="steering angle aimed at [rad]")
+    ride.add_argument("--steer", type=float, default=0.3, help="target steering angle [rad]")
     ride.add_argument("--period", type=float, default=6.0, help="period of the steering [s]")
     ride.add_argument("--t1", type=float, default=20.0, help="end of the ride [s]")
     ride.add_argument("--tolerance", type=float, default=1e-9, help="relative tolerance of Dopri8")
@@ -263,17 +261,10 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"python -m stroller: {error}", file=sys.stderr)
         return 2
-    print(f"\n{2 * len(rides)} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
-    print(f"Wrote {', '.join(map(str, written))}.")
-    print(f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}")
+    see = f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}"
+    print(closing_lines(2 * len(rides), started, written, see))
     return 0
 
 
 if __name__ == "__main__":
-    # For a job of seconds, searching all of JAX's objects for garbage would take a tenth of the time, here and at the
-    # end.
-    gc.disable()
-    compile_quickly()
-    status = interruptible(main, "stroller")
-    gc.freeze()
-    sys.exit(status)
+    run_and_exit(main, "stroller")

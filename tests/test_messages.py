@@ -258,11 +258,11 @@ SUSPECTED = {
     ),
     "exactly upright": (
         lambda: tippe.inversion_time(TOP, tippe.Launch(0.0, 155.0), 1.0),
-        "theta = 0.0 is exactly upright, where a top stays for ever",
+        "theta = 0.0 is exactly upright, where a top stays forever",
     ),
     "some exactly upright": (
         lambda: tippe.inversion_table(TOP, theta=[0.0, 0.1], spin=155.0, t1=1.0),
-        "theta = 0.0 is exactly upright, where a top stays for ever",
+        "theta = 0.0 is exactly upright, where a top stays forever",
     ),
 }
 
@@ -318,7 +318,9 @@ def programs_of_its_own():
 def test_a_time_that_takes_too_many_steps_is_an_error_that_says_how_many(monkeypatch):
     for module in ("tippe.runs.inversion_time", "tippe.runs.cells"):
         monkeypatch.setattr(importlib.import_module(module), "Settings", functools.partial(Settings, max_steps=40))
-    message = r"t1 = 100000 s is too long: the run needs more than 40 steps, with which it came to 0\.\d+ s; take a shorter t1"
+    message = (
+        r"t1 = 100000 s is too long: the run needs more than 40 steps, which reached only 0\.\d+ s; take a shorter t1"
+    )
     with pytest.raises(ValueError, match=message):
         tippe.inversion_time(TOP, LAUNCH, 1e5, tolerance=1e-6)
 
@@ -326,7 +328,7 @@ def test_a_time_that_takes_too_many_steps_is_an_error_that_says_how_many(monkeyp
 def test_a_run_that_lost_contact_says_what_flies_on():
     lost = dataclasses.replace(run_of_nothing(), status="contact_lost")
     assert "lost contact at 0 s" in str(lost)
-    assert "the top flies on from there in a Scene with contact='hybrid'" in str(lost)
+    assert "to continue through the flight, use a Scene with contact='hybrid'" in str(lost)
 
 
 def small_table():
@@ -393,7 +395,7 @@ def test_an_axis_may_be_named_by_its_end():
         ({"ofset": [0.005]}, "unknown axis 'ofset': the numbers that can be varied are .*; did you mean 'offset'"),
         ({"offset": [0.02, 0.021]}, "axes: 'offset' could be scene.body.offset or scene.body.stem.offset"),
         ({"body.mass": [0.02], "mass": [0.02]}, "axes: 'scene.body.mass' is named twice"),
-        ({"theta": [0.1]}, "axes: 'launch.theta' is an argument of its own"),
+        ({"theta": [0.1]}, "axes: 'launch.theta' has its own argument"),
     ],
 )
 def test_an_axis_whose_name_means_nothing_or_too_much_is_refused(axes, message):

@@ -29,10 +29,13 @@ from .model.friction import AbstractFriction as AbstractFriction
 from .model.friction import Contensou as Contensou
 from .model.friction import Coulomb as Coulomb
 from .model.friction import Frictionless as Frictionless
+from .model.friction import NoSlip as NoSlip
 from .model.friction import Rolling as Rolling
 from .model.friction import SetValuedCoulomb as SetValuedCoulomb
 from .model.friction import Viscous as Viscous
 from .model.launch import Launch as Launch
+from .model.rigid_body import Ellipsoid as Ellipsoid
+from .model.rigid_body import RigidBody as RigidBody
 from .model.scene import Scene as Scene
 from .model.top import Stem as Stem
 from .model.top import Top as Top
@@ -42,6 +45,8 @@ from .runs.flight_trajectory import HybridTrajectory as HybridTrajectory
 from .runs.inversion_time import inversion_time as inversion_time
 from .runs.lyapunov import LyapunovExponent as LyapunovExponent
 from .runs.lyapunov import lyapunov_exponent as lyapunov_exponent
+from .runs.reversal import reversal_table as reversal_table
+from .runs.reversal import reversal_time as reversal_time
 from .runs.table import inversion_table as inversion_table
 from .runs.trajectory import Trajectory as Trajectory
 from .runs.trajectory import simulate as simulate

@@ -2,7 +2,6 @@
 
 import argparse
 import functools
-import gc
 import json
 import math
 import sys
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from nonholonomic import __version__
-from nonholonomic.command_line import interruptible
+from nonholonomic.command_line import closing_lines, run_and_exit
 from nonholonomic.compilation_cache import enable_compilation_cache, kept_text
 from nonholonomic.geometry import Cylinder, Plane
 from nonholonomic.progress import Progress, status_line
@@ -24,7 +23,6 @@ from nonholonomic.sweeps import Table, saved_cells
 from nonholonomic.validation import require_folder
 from nonholonomic.views import NO_VIEW, Page, can_view, page, picture_as_html, table_as_html
 from nonholonomic.views.explore import live_page
-from nonholonomic.xla_cpu import compile_quickly
 
 from . import presets, steady
 from .model.friction import Coulomb
@@ -273,17 +271,10 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         raise KeyboardInterrupt(saved(options)) from None
     cells = sum(table.status.size for table in arenas.values())
-    print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
-    print(f"Wrote {', '.join(map(str, written))}.")
-    print(f"To see the top climb onto its stem, open {path}{'' if can_view() else f'. {NO_VIEW}'}")
+    see = f"To see the top climb onto its stem, open {path}{'' if can_view() else f'. {NO_VIEW}'}"
+    print(closing_lines(cells, started, written, see))
     return 0
 
 
 if __name__ == "__main__":
-    # For a job of seconds, searching all of JAX's objects for garbage would take a fifth of the time, here and at the
-    # end.
-    gc.disable()
-    compile_quickly()
-    status = interruptible(main, "tippe")
-    gc.freeze()
-    sys.exit(status)
+    run_and_exit(main, "tippe")

@@ -26,57 +26,55 @@ from ..xla_cpu import compiled_alone, compiled_quickly
 class Request:
     """Which outputs of a differentiable solve to compute for a number of cells.
 
-    - `question`: an `AbstractDifferentiableSolve`.
-    - `active`: indices of the leaves to differentiate by, as for `with_slopes`; `None` for the primal alone.
+    - `solve`: an `AbstractDifferentiableSolve`.
+    - `active`: indices of the leaves to differentiate by, as for `value_and_tangents`; `None` for the primal alone.
     - `wanted`: indices of the parts of the output tree to compute, all if `None`; parts that are `None` count.
     """
 
-    question: Any
+    solve: Any
     active: tuple[int, ...] | None = None
     wanted: tuple[int, ...] | None = None
 
     def tree(self, cells: int, *leaves: Float[Array, "..."]) -> Any:
         """The primal of some cells, with its derivatives if there are active leaves; a tree of arrays, the cells first."""
         if self.active is None:
-            return self.question.answer(cells, *leaves)
-        return self.question.with_slopes(self.active, False, cells, *leaves)
+            return self.solve.solve(cells, *leaves)
+        return self.solve.value_and_tangents(self.active, False, cells, *leaves)
 
     def parts(self, cells: int, *leaves: Float[Array, "..."]) -> list[Array]:
         """The wanted parts that are not `None`."""
-        found = _flat(self.tree(cells, *leaves))[0]
-        kept = found if self.wanted is None else [found[k] for k in self.wanted]
+        parts = _flat(self.tree(cells, *leaves))[0]
+        kept = parts if self.wanted is None else [parts[k] for k in self.wanted]
         return [part for part in kept if part is not None]
 
 
-def find(request: Request, *leaves: Float[Array, "..."]) -> Any:
+def solve_one(request: Request, *leaves: Float[Array, "..."]) -> Any:
     """The outputs for a single cell, without the axis of cells; under `vmap` the batch is solved as one ensemble.
 
     **Arguments:** `request`: with all parts wanted; `leaves`: numbers of a single cell.
     """
-    shapes, structure = _flat(
-        jax.eval_shape(functools.partial(_compiled_tree, request.question, request.active), *leaves)
-    )
+    shapes, structure = _flat(jax.eval_shape(functools.partial(_compiled_tree, request.solve, request.active), *leaves))
     present = [k for k, shape in enumerate(shapes) if shape is not None]
     kinds = tuple(ShapedArray(shapes[k].shape[1:], shapes[k].dtype) for k in present)
     request = dataclasses.replace(request, wanted=tuple(present))
-    found = iter(_found.bind(*leaves, request=request, cells=1, own=(False,) * len(leaves), kinds=kinds))
-    return jax.tree.unflatten(structure, [None if shape is None else next(found)[0] for shape in shapes])
+    outputs = iter(_solve_cells.bind(*leaves, request=request, cells=1, own=(False,) * len(leaves), kinds=kinds))
+    return jax.tree.unflatten(structure, [None if shape is None else next(outputs)[0] for shape in shapes])
 
 
 @eqx.filter_jit
-def _compiled_tree(question: Any, active: tuple[int, ...] | None, *leaves: Float[Array, "..."]) -> Any:
+def _compiled_tree(solve: Any, active: tuple[int, ...] | None, *leaves: Float[Array, "..."]) -> Any:
     """The outputs for a single cell; never run, but JAX caches their shapes for equal solves."""
-    return Request(question, active).tree(1, *leaves)
+    return Request(solve, active).tree(1, *leaves)
 
 
 def _parts(
-    question: Any, active: tuple[int, ...] | None, wanted: tuple[int, ...], cells: int, leaves: list[Array]
+    solve: Any, active: tuple[int, ...] | None, wanted: tuple[int, ...], cells: int, leaves: list[Array]
 ) -> list[Array]:
     """`Request.parts` as one program, which serves all equal solves, whatever the values of the leaves.
 
     Otherwise, outside `jit`, each operation would be a separate program, and every call would compile its loops again.
     """
-    return Request(question, active, wanted).parts(cells, *leaves)
+    return Request(solve, active, wanted).parts(cells, *leaves)
 
 
 #: For one run: a hybrid scene compiles in half the time, with a third of the memory and of the mappings (289 instead of
@@ -92,19 +90,19 @@ def _flat(tree: Any) -> tuple[list[Any], Any]:
 
 #: The parts that a `Request` wants of a number of cells. `own` marks the leaves that have a value per cell; `kinds`
 #: holds the shapes and dtypes of the parts of one cell.
-_found = Primitive("found_in_block")
-_found.multiple_results = True
+_solve_cells = Primitive("solve_cells")
+_solve_cells.multiple_results = True
 
 
-@_found.def_impl
+@_solve_cells.def_impl
 def _run(*leaves: Array, request: Request, cells: int, own: Any, kinds: Any) -> list[Array]:
     # Python numbers would become part of the program.
     arrays = [leaf if isinstance(leaf, jax.Array) else jax.device_put(np.asarray(leaf)) for leaf in leaves]
     compiled = _parts_of_one if cells == 1 else _parts_of_many
-    return compiled(request.question, request.active, request.wanted, cells, arrays)
+    return compiled(request.solve, request.active, request.wanted, cells, arrays)
 
 
-@_found.def_abstract_eval
+@_solve_cells.def_abstract_eval
 def _shaped(*leaves: Any, request: Request, cells: int, own: Any, kinds: tuple[ShapedArray, ...]) -> list[ShapedArray]:
     return [ShapedArray((cells, *kind.shape), kind.dtype) for kind in kinds]
 
@@ -113,7 +111,7 @@ def _traced(*leaves: Array, request: Request, cells: int, own: Any, kinds: Any) 
     return request.parts(cells, *leaves)
 
 
-mlir.register_lowering(_found, mlir.lower_fun(_traced, multiple_results=True))
+mlir.register_lowering(_solve_cells, mlir.lower_fun(_traced, multiple_results=True))
 
 
 def _batched(
@@ -132,11 +130,11 @@ def _batched(
 
     either = tuple(has or axis is not None for has, axis in zip(own, axes, strict=True))
     whole = map(joined, leaves, own, axes)
-    found = _found.bind(*whole, request=request, cells=size * cells, own=either, kinds=kinds)
-    return [part.reshape(size, cells, *part.shape[1:]) for part in found], [0] * len(found)
+    outputs = _solve_cells.bind(*whole, request=request, cells=size * cells, own=either, kinds=kinds)
+    return [part.reshape(size, cells, *part.shape[1:]) for part in outputs], [0] * len(outputs)
 
 
-batching.primitive_batchers[_found] = _batched
+batching.primitive_batchers[_solve_cells] = _batched
 
 
 def _only_read(read: list[bool], *others: Any) -> tuple[list[bool], Any]:
@@ -147,11 +145,11 @@ def _only_read(read: list[bool], *others: Any) -> tuple[list[bool], Any]:
         return [False] * len(equation.invars), None
     request, kinds = equation.params["request"], equation.params["kinds"]
     wanted = tuple(k for k, is_read in zip(request.wanted, read, strict=True) if is_read)
-    smaller = Request(request.question.for_parts(wanted), request.active, wanted)
+    smaller = Request(request.solve.for_parts(wanted), request.active, wanted)
     kept = tuple(kind for kind, is_read in zip(kinds, read, strict=True) if is_read)
     outputs = [variable for variable, is_read in zip(equation.outvars, read, strict=True) if is_read]
     new = equation.replace(outvars=outputs, params={**equation.params, "request": smaller, "kinds": kept})
     return [True] * len(equation.invars), new
 
 
-partial_eval.dce_rules[_found] = _only_read
+partial_eval.dce_rules[_solve_cells] = _only_read

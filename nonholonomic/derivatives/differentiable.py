@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..validation import is_traced
-from ._batched_primitive import Request, find
+from ._batched_primitive import Request, solve_one
 from .slopes import tangents_of
 from .variation import tangent_scale
 
 #: The primal output of a solve: arrays of floats, the cells along the first axis.
-Answer = Any
+Primal = Any
 
 
 class AbstractDifferentiableSolve(eqx.Module):
@@ -37,18 +37,18 @@ class AbstractDifferentiableSolve(eqx.Module):
         """Where an entry of the primal means "none", such as an infinite time: its derivative is 0 there."""
 
     @abc.abstractmethod
-    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Answer:
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Primal:
         """The primal in every cell; each leaf is a scalar or has one number per cell."""
 
     @abc.abstractmethod
-    def with_slopes(
-        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
-    ) -> tuple[Answer, list[Answer]]:
+    def value_and_tangents(
+        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
+    ) -> tuple[Primal, list[Primal]]:
         """The primal and its derivative by each active leaf, shaped like the primal with the leaf's own axes last;
         `None` for a part of the primal that is not differentiable.
 
-        **Arguments:** `active`: which leaves; `again`: whether the outputs will be differentiated once more, in forward
-        mode; `cells`, `leaves`: as for `answer`.
+        **Arguments:** `active`: which leaves; `nested`: whether the outputs will be differentiated once more, in forward
+        mode; `cells`, `leaves`: as for `solve`.
         """
 
     def for_parts(self, wanted: tuple[int, ...]) -> Self:
@@ -59,7 +59,7 @@ class AbstractDifferentiableSolve(eqx.Module):
         return self
 
 
-def differentiable_solve(question: AbstractDifferentiableSolve, *leaves: Float[Array, "..."]) -> Answer:
+def differentiable_solve(solve: AbstractDifferentiableSolve, *leaves: Float[Array, "..."]) -> Primal:
     """Solve for one member. Where there is no event the derivative is zero, whatever the cotangent.
 
     **Arguments:** `leaves`: the numbers of a single cell, in the order of the solve.
@@ -68,22 +68,22 @@ def differentiable_solve(question: AbstractDifferentiableSolve, *leaves: Float[A
     """
 
     @jax.custom_jvp
-    def found(*leaves):
-        return _of_one(Request(question), *leaves)
+    def primal(*leaves):
+        return _of_one(Request(solve), *leaves)
 
-    @functools.partial(found.defjvp, symbolic_zeros=True)
+    @functools.partial(primal.defjvp, symbolic_zeros=True)
     def variation(leaves, tangents):
         zero = jax.custom_derivatives.SymbolicZero
-        active = tuple(i for i in range(question.movable) if not isinstance(tangents[i], zero))
+        active = tuple(i for i in range(solve.movable) if not isinstance(tangents[i], zero))
         if not active:
-            answer = found(*leaves)
-            return answer, jax.tree.map(jnp.zeros_like, answer)
-        answer, slopes = _with_slopes(question, active)(*leaves)
+            value = primal(*leaves)
+            return value, jax.tree.map(jnp.zeros_like, value)
+        value, slopes = _value_and_tangents(solve, active)(*leaves)
         moved = [tangents[i] for i in active]
         # Derivatives are `None` where the primal has an array that is not differentiated.
-        return answer, jax.tree.map(lambda value, *by: _change(question, value, by, moved), answer, *slopes)
+        return value, jax.tree.map(lambda part, *by: _change(solve, part, by, moved), value, *slopes)
 
-    return found(*_canonical(leaves))
+    return primal(*_canonical(leaves))
 
 
 def _canonical(leaves: tuple[Any, ...]) -> list[Any]:
@@ -93,10 +93,10 @@ def _canonical(leaves: tuple[Any, ...]) -> list[Any]:
     return [jnp.array(leaf) if is_traced(leaf) else leaf for leaf in leaves]
 
 
-def _change(question: AbstractDifferentiableSolve, value: Array, slopes: tuple[Any, ...], tangents: list[Array]) -> Any:
+def _change(solve: AbstractDifferentiableSolve, value: Array, slopes: tuple[Any, ...], tangents: list[Array]) -> Any:
     if slopes[0] is None:
         return jax.custom_derivatives.zero_from_primal(value, symbolic_zeros=True)
-    none = question.absent(value)
+    none = solve.absent(value)
 
     def share(slope: Array, tangent: Array) -> Array:
         # Selected before and after, so that an infinite tangent or cotangent of an absent output is dropped, not
@@ -110,33 +110,33 @@ def _change(question: AbstractDifferentiableSolve, value: Array, slopes: tuple[A
     return sum(share(slope, tangent) for slope, tangent in zip(slopes, tangents, strict=True))
 
 
-def _with_slopes(
-    question: AbstractDifferentiableSolve, active: tuple[int, ...]
-) -> Callable[..., tuple[Answer, list[Answer]]]:
+def _value_and_tangents(
+    solve: AbstractDifferentiableSolve, active: tuple[int, ...]
+) -> Callable[..., tuple[Primal, list[Primal]]]:
     """Primal and derivatives of one run, which can be differentiated once more."""
 
     @jax.custom_jvp
-    def found(*leaves):
-        return _of_one(Request(question, active), *leaves)
+    def primal(*leaves):
+        return _of_one(Request(solve, active), *leaves)
 
-    @found.defjvp
+    @primal.defjvp
     def second_variation(leaves, tangents):
         # Differentiated operation by operation; the ensemble solve does not allow this.
-        return jax.jvp(functools.partial(_again, question, active), leaves, tangents)
+        return jax.jvp(functools.partial(_nested, solve, active), leaves, tangents)
 
-    return found
+    return primal
 
 
 # Compiled as a whole even outside of `jit`.
 @eqx.filter_jit
-def _again(question: AbstractDifferentiableSolve, active: tuple[int, ...], *leaves: Float[Array, "..."]) -> Any:
+def _nested(solve: AbstractDifferentiableSolve, active: tuple[int, ...], *leaves: Float[Array, "..."]) -> Any:
     """Primal and derivatives of one run as differentiable operations."""
-    return _only(question.with_slopes(active, True, 1, *leaves))
+    return _only(solve.value_and_tangents(active, True, 1, *leaves))
 
 
 def _of_one(request: Request, *leaves: Float[Array, "..."]) -> Any:
     """The outputs for one run."""
-    return find(request, *leaves) if request.question.in_blocks else _only(request.tree(1, *leaves))
+    return solve_one(request, *leaves) if request.solve.in_blocks else _only(request.tree(1, *leaves))
 
 
 def _only(results: Any) -> Any:
@@ -148,7 +148,7 @@ def tangents_by(
     active: tuple[int, ...],
     leaves: tuple[Array, ...],
     cells: int | None,
-) -> tuple[Any, tuple[Any, ...], Callable[[list[Answer]], list[Answer]]]:
+) -> tuple[Any, tuple[Any, ...], Callable[[list[Primal]], list[Primal]]]:
     """Build a problem and its tangents along leaves, each scaled by the leaf's own size.
 
     **Arguments:**
@@ -177,7 +177,7 @@ def tangents_by(
     if cells is not None:
         tangents = [along(k, size) for k, size in enumerate(sizes)]
 
-        def gather(slopes: list[Answer]) -> list[Answer]:
+        def gather(slopes: list[Primal]) -> list[Primal]:
             return [
                 jax.tree.map(functools.partial(_by_cells, size), slope)
                 for slope, size in zip(slopes, sizes, strict=True)
@@ -186,13 +186,13 @@ def tangents_by(
         entries = [(k, index) for k, size in enumerate(sizes) for index in np.ndindex(size.shape)]
         tangents = [along(k, zeros[k].at[index].set(sizes[k][index])) for k, index in entries]
 
-        def gather(slopes: list[Answer]) -> list[Answer]:
+        def gather(slopes: list[Primal]) -> list[Primal]:
             by_leaf = [
                 [slope for (k, _), slope in zip(entries, slopes, strict=True) if k == i] for i in range(len(sizes))
             ]
             return [
-                jax.tree.map(functools.partial(_by_entries, size), *some)
-                for size, some in zip(sizes, by_leaf, strict=True)
+                jax.tree.map(functools.partial(_by_entries, size), *entries_of_leaf)
+                for size, entries_of_leaf in zip(sizes, by_leaf, strict=True)
             ]
 
     return moved(*point), tangents_of(moved, point, tangents), gather

@@ -165,18 +165,18 @@ class BlockSampling(AbstractSampling):
     places: Any = eqx.field(static=True)
     alone: bool = eqx.field(static=True, default=False)
 
-    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
         build, numbers, arguments, settings = self._builder(leaves)
         return _march(VariationalProblem(build(numbers, cells), (), False), arguments, settings)[0]
 
-    def with_slopes(
-        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    def value_and_tangents(
+        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[SampledRun, list[SampledRun]]:
         build, numbers, arguments, settings = self._builder(leaves)
         problem, tangents, gather = tangents_by(build, active, numbers, cells)
 
         def run(group: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
-            return _march(VariationalProblem(problem, group, False), arguments, settings, not again)
+            return _march(VariationalProblem(problem, group, False), arguments, settings, not nested)
 
         samples, slopes = in_groups(run, tangents)
         return samples, gather(slopes)
@@ -191,7 +191,7 @@ class BlockSampling(AbstractSampling):
         numbers, arguments, spec = self._sorted(leaves)
 
         def build(numbers: tuple[Array, ...], cells: int | None) -> AbstractProblem:
-            problem = spec.made(numbers, cells)
+            problem = spec.built(numbers, cells)
             return core_problem(problem) if self.alone else problem
 
         return build, numbers, arguments, spec.settings
@@ -255,16 +255,16 @@ class SingleSampling(AbstractSampling):
     spec: ProblemSpec
     places: Any = eqx.field(static=True)
 
-    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> SampledRun:
         numbers, arguments, spec = self._sorted(leaves)
-        samples, _ = _follow(VariationalProblem(spec.made(numbers, None), (), False), arguments, spec)
+        samples, _ = _follow(VariationalProblem(spec.built(numbers, None), (), False), arguments, spec)
         return jax.tree.map(lambda part: part[None], samples)
 
-    def with_slopes(
-        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    def value_and_tangents(
+        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[SampledRun, list[SampledRun]]:
         numbers, arguments, spec = self._sorted(leaves)
-        problem, tangents, gather = tangents_by(spec.made, active, numbers, None)
+        problem, tangents, gather = tangents_by(spec.built, active, numbers, None)
 
         def run(group: tuple[Any, ...]) -> tuple[SampledRun, list[SampledRun]]:
             return _follow(VariationalProblem(problem, group, False), arguments, spec)

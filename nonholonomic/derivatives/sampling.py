@@ -23,9 +23,9 @@ class ProblemSpec(eqx.Module):
     settings: Settings
     grid: Float[Array, " steps"] | None
 
-    def made(self, numbers: tuple[Array, ...], given: Any) -> Any:
+    def built(self, numbers: tuple[Array, ...], extra: Any) -> Any:
         """Build the problem from the modules with some numbers, and from the extra argument of `build`."""
-        return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), self.rest), given)
+        return self.build(eqx.combine(jax.tree.unflatten(self.structure, numbers), self.rest), extra)
 
 
 class AbstractSampling(AbstractDifferentiableSolve):
@@ -48,7 +48,7 @@ class AbstractSampling(AbstractDifferentiableSolve):
 
 
 def solve_for_samples(
-    question: Callable[[int, ProblemSpec, Any], AbstractSampling],
+    sampling: Callable[[int, ProblemSpec, Any], AbstractSampling],
     build: Callable[[Any, Any], Any],
     modules: Any,
     times: Float[Array, " times"],
@@ -58,7 +58,7 @@ def solve_for_samples(
 ) -> Any:
     """Solve for the samples of a run.
 
-    **Arguments:** `question`: builds the solve from its first three fields; `build`: builds the problem from the
+    **Arguments:** `sampling`: builds the solve from its first three fields; `build`: builds the problem from the
     modules and an extra argument of the solve, compared by identity; the others as for `sampled_run`.
     """
     numbers, rest = eqx.partition(modules, eqx.is_inexact_array)
@@ -67,5 +67,5 @@ def solve_for_samples(
     arrays, spec = eqx.partition(ProblemSpec(build, structure, rest, settings.with_tolerance(None), grid), eqx.is_array)
     held, places = jax.tree.flatten(arrays)
     return differentiable_solve(
-        question(len(leaves), spec, places), *leaves, times, as_number(t1), settings.tolerance, *held
+        sampling(len(leaves), spec, places), *leaves, times, as_number(t1), settings.tolerance, *held
     )

@@ -155,7 +155,7 @@ traced_solve_ensemble_with_tangents = eqx.filter_jit(ensemble_solve_with_tangent
 
 
 def tangents_of(
-    build: Callable[..., AbstractProblem], numbers: tuple[Any, ...], tangents: list[tuple[Any, ...]]
+    build: Callable[..., Any], numbers: tuple[Any, ...], tangents: list[tuple[Any, ...]]
 ) -> tuple[Any, ...]:
     """The tangents of a problem that is built from numbers.
 

@@ -69,8 +69,8 @@ def hybrid_samples(
 
     **Raises:** `ValueError` for derivatives by the times, and for second derivatives.
     """
-    question = functools.partial(HybridSampling, counters=counters)
-    return solve_for_samples(question, build, modules, _fixed(times), t1, settings)
+    sampling = functools.partial(HybridSampling, counters=counters)
+    return solve_for_samples(sampling, build, modules, _fixed(times), t1, settings)
 
 
 @eqx.filter_custom_jvp
@@ -82,7 +82,9 @@ def _fixed(times: Float[Array, " times"]) -> Float[Array, " times"]:
 @_fixed.def_jvp
 def _refused(primals: Any, tangents: Any) -> Any:
     if tangents[0] is not None:
-        raise ValueError("times must not be differentiated by where runs have phases: contact = 'hybrid'")
+        raise ValueError(
+            "derivatives with respect to times are not available for runs of several modes: contact = 'hybrid'"
+        )
     return primals[0], jnp.zeros_like(primals[0])
 
 
@@ -96,22 +98,22 @@ class HybridSampling(AbstractSampling):
     places: Any = eqx.field(static=True)
     counters: int = eqx.field(static=True)
 
-    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> HybridSamples:
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> HybridSamples:
         numbers, (*horizon, tolerance), spec = self._sorted(leaves)
         settings = spec.settings.with_tolerance(tolerance)
-        samples, _ = _follow(spec.made(numbers, tolerance), (), horizon, settings, self.counters)
+        samples, _ = _follow(spec.built(numbers, tolerance), (), horizon, settings, self.counters)
         return jax.tree.map(lambda part: part[None], samples)
 
-    def with_slopes(
-        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    def value_and_tangents(
+        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[HybridSamples, list[HybridSamples]]:
-        if again:
-            raise ValueError("second derivatives do not go through changes of phase: contact = 'hybrid'")
+        if nested:
+            raise ValueError("second derivatives are not available through changes of mode: contact = 'hybrid'")
         numbers, (*horizon, tolerance), spec = self._sorted(leaves)
         settings = spec.settings.with_tolerance(tolerance)
 
         def build(numbers: tuple[Array, ...], cells: int | None) -> Any:
-            return spec.made(numbers, tolerance)
+            return spec.built(numbers, tolerance)
 
         built, tangents, gather = tangents_by(build, active, numbers, None)
 

@@ -32,7 +32,7 @@ def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np
 
 def series_units(data: tuple[Any, ...]) -> tuple[str, ...]:
     """The unit of each series of the joined measurements. **Arguments:** `data`: each with `measurements`, `series_units`."""
-    return tuple(unit for one in data for unit in one.series_units[: 1 + int(np.max(one.measurements.series))])
+    return tuple(unit for source in data for unit in source.series_units[: 1 + int(np.max(source.measurements.series))])
 
 
 def of_data(parameters: dict[str, Any], k: int) -> dict[str, Any]:

@@ -92,7 +92,7 @@ class LogDensity(eqx.Module):
     def _first_errors(self) -> Float[Array, " errors"]:
         """The first guesses of the unknown errors, one for each series."""
         own = [self.measurements.estimated & (self.measurements.series == k) for k in self.open_series]
-        return jnp.array([self.measurements.error[jnp.argmax(one)] for one in own])
+        return jnp.array([self.measurements.error[jnp.argmax(series)] for series in own])
 
     @property
     def start(self) -> Float[Array, " unknowns"]:

@@ -37,9 +37,11 @@ class DenseSolution(NamedTuple):
         """States at the given times, by the dense output; times must lie within the run."""
         states = np.repeat(self.states[:, :1], len(times), axis=1)
         for segment in self.segments:
-            here = (times > float(segment.t0)) & (times <= float(segment.t1))
-            if here.any():
-                states[:, here] = np.asarray(_evaluate(segment, padded(times[here], len(times)))).T[:, : here.sum()]
+            within = (times > float(segment.t0)) & (times <= float(segment.t1))
+            if within.any():
+                states[:, within] = np.asarray(_evaluate(segment, padded(times[within], len(times)))).T[
+                    :, : within.sum()
+                ]
         return states
 
 

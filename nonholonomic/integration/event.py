@@ -70,9 +70,9 @@ def refine(
     tired = bracket.trials >= MOST_TRIALS
     close = bracketing & ((jnp.abs(guess - length) <= 2.0 * located) | tired)
     # A run through a nonterminal event must restart beyond the event, or it would locate the same event again.
-    found = close & replaces_high
+    is_located = close & replaces_high
     beyond = jnp.where(tired, bracket.high, jnp.minimum(length + located, bracket.high))
-    return bracket, jnp.where(close & ~found, beyond, guess), found
+    return bracket, jnp.where(close & ~is_located, beyond, guess), is_located
 
 
 def _fade(margin: Lanes, replaced: Lanes) -> Lanes:

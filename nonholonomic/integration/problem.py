@@ -115,8 +115,8 @@ def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States],
     """The problem's event function by state and rate, counted positive on the lane's side of the event."""
 
     def crossing(state: States, rate: States) -> Lanes | None:
-        found = problem.crossing_along(state, rate)
-        return None if found is None else side * found
+        value = problem.crossing_along(state, rate)
+        return None if value is None else side * value
 
     return crossing
 

@@ -34,7 +34,7 @@ def solve_by_diffrax(
     (starts, scales), rtol = problem.start(), settings.tolerance
     varying = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 0 else -1, problem)
 
-    def one(here: AbstractProblem, state: Array, scale: Array) -> Outcome:
+    def solve_cell(cell_problem: AbstractProblem, state: Array, scale: Array) -> Outcome:
         conditions = {
             CROSSED: None
             if problem.event_function(starts) is None
@@ -45,7 +45,7 @@ def solve_by_diffrax(
         }
         conditions = {code: condition for code, condition in conditions.items() if condition is not None}
         # Diffrax detects an event where a condition changes its sign: a cell that starts beyond one has ended.
-        at_once = [condition(jnp.zeros(()), state, here) <= 0.0 for condition in conditions.values()]
+        at_once = [condition(jnp.zeros(()), state, cell_problem) <= 0.0 for condition in conditions.values()]
         ends_at_once = functools.reduce(jnp.logical_or, at_once, jnp.asarray(False))
         event = diffrax.Event(list(conditions.values()), root_finder=optimistix.Newton(1e-13, 1e-13))
         solution = diffrax.diffeqsolve(
@@ -55,7 +55,7 @@ def solve_by_diffrax(
             jnp.where(ends_at_once, 0.0, t1),
             None,
             state,
-            args=here,
+            args=cell_problem,
             stepsize_controller=diffrax.PIDController(rtol, settings.absolute * rtol * scale),
             max_steps=min(settings.max_steps, MOST_STEPS),
             event=event if conditions else None,
@@ -77,4 +77,4 @@ def solve_by_diffrax(
         )
 
     out = Outcome._make((0, 0, 0, 0, -1, 0, 0))
-    return jax.vmap(one, in_axes=(varying, -1, -1), out_axes=out)(problem, starts, scales)
+    return jax.vmap(solve_cell, in_axes=(varying, -1, -1), out_axes=out)(problem, starts, scales)

@@ -69,7 +69,7 @@ class Settings(eqx.Module):
 
     def with_tolerance(self, tolerance: Float[Array, ""] | None) -> Self:
         """The same settings with another tolerance, or without one if the caller stores it."""
-        return eqx.tree_at(lambda one: one.tolerance, self, tolerance, is_leaf=lambda leaf: leaf is None)
+        return eqx.tree_at(lambda settings: settings.tolerance, self, tolerance, is_leaf=lambda leaf: leaf is None)
 
     def lanes_of(self, cells: int, n_blocks: int = 1) -> int:
         """Number of a problem's cells that advance together, from the number of blocks in its state."""
@@ -93,7 +93,10 @@ def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
 
 
 def legal_run(
-    others: Bool[ArrayLike, "..."], t1: Float[ArrayLike, "..."], tolerance: Float[ArrayLike, "..."], times: Any = None
+    others: Bool[Array, "..."] | bool,
+    t1: Float[ArrayLike, "..."],
+    tolerance: Float[ArrayLike, "..."],
+    times: Any = None,
 ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
     """Whether the traced numbers of a run are legal, with its horizon and tolerance: if not, 0 and the largest
     tolerance.
@@ -103,7 +106,7 @@ def legal_run(
     **Arguments:** `others`: whether all numbers are legal but `t1`, `tolerance` and the `times` of output (times,), which
     must increase.
     """
-    may = others & legal(run_bounds(t1, tolerance))
+    may = jnp.asarray(others) & legal(run_bounds(t1, tolerance))
     if times is not None:
         may = jnp.all(may & jnp.all(legal(times_bounds(times, t1)))) & jnp.all(jnp.diff(times) > 0.0)
     return may, jnp.where(may, t1, 0.0), jnp.where(may, tolerance, LOOSEST)

@@ -129,8 +129,8 @@ def after_step(
     beyond = good & ~between & (margin <= 0.0)
     forward = free & good & ~between & ~beyond
 
-    bracket, guess, found = refine(lane_state.bracketing, lane_state.bracket, lane_state.margin, margin, tried_length)
-    hit = running & found
+    bracket, guess, located = refine(lane_state.bracketing, lane_state.bracket, lane_state.margin, margin, tried_length)
+    hit = running & located
     bracketing = (lane_state.bracketing | (free & beyond)) & ~hit
     moved = forward | hit
     time = jnp.where(moved, lane_state.time + tried_length, lane_state.time)
@@ -201,8 +201,8 @@ def _classify(
         return status, side, lane_state.first_crossing, lane_state.crossing_time
     # Only a crossing from positive to negative is the event; the return does not count.
     counts = crossed & (lane_state.side > 0.0)
-    here = crossing_time(problem, time, tried.state)
-    first = jnp.where(counts & jnp.isinf(lane_state.first_crossing), here, lane_state.first_crossing)
-    latest = jnp.where(counts, here, lane_state.crossing_time)
+    time_of_crossing = crossing_time(problem, time, tried.state)
+    first = jnp.where(counts & jnp.isinf(lane_state.first_crossing), time_of_crossing, lane_state.first_crossing)
+    latest = jnp.where(counts, time_of_crossing, lane_state.crossing_time)
     status = jnp.where(by_margin, LEFT_DOMAIN, lane_state.status)
     return status, jnp.where(crossed, -lane_state.side, lane_state.side), first, latest

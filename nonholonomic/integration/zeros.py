@@ -50,11 +50,11 @@ def sign_changes(
     **Arguments:** `function`: of an array of numbers, element by element; `grid`: growing numbers.
     """
     values = function(grid)
-    found = np.flatnonzero(np.sign(values[:-1]) != np.sign(values[1:]))
-    if found.size == 0:
+    changes = np.flatnonzero(np.sign(values[:-1]) != np.sign(values[1:]))
+    if changes.size == 0:
         return jnp.zeros(0)
-    sign = jnp.sign(values[found])
-    low, high = halved(lambda middle: jnp.sign(function(middle)) == sign, grid[found], grid[found + 1])
+    sign = jnp.sign(values[changes])
+    low, high = halved(lambda middle: jnp.sign(function(middle)) == sign, grid[changes], grid[changes + 1])
     return 0.5 * (low + high)
 
 

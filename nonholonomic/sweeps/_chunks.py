@@ -83,7 +83,7 @@ class ChunkStore:
             part.unlink()
         if damaged:
             warnings.warn(
-                f"{self.path} is damaged: {len(damaged)} finished blocks do not match their checksums and are computed again",
+                f"{self.path} is damaged: {len(damaged)} finished chunks do not match their checksums and are computed again",
                 RuntimeWarning,
                 stacklevel=6,
             )
@@ -95,7 +95,9 @@ class ChunkStore:
         try:
             room = shutil.disk_usage(self.path.parent).free
             if room < need:
-                raise OSError(0, f"{1e-9 * room:.3g} GB are free, and it takes {1e-9 * need:.3g} GB on the way")
+                raise OSError(
+                    0, f"{1e-9 * room:.3g} GB are free, and the table needs {1e-9 * need:.3g} GB while it is computed"
+                )
             self.folder.mkdir(exist_ok=True)
             sync_folder(self.path.parent)
         except OSError as error:
@@ -115,17 +117,17 @@ class ChunkStore:
                     difference = f"the axis {name} differs"
         if difference is None and list(theirs.coords) != list(ours.coords):
             difference = f"its axes are {', '.join(theirs.coords)}"
-        here, there = (json.loads(str(one.attributes.get("versions", "{}"))) for one in (ours, theirs))
-        if difference is None and there.get("nonholonomic") != here.get("nonholonomic"):
-            difference = f"nonholonomic is {there.get('nonholonomic')} there and {here.get('nonholonomic')} here"
+        new, old = (json.loads(str(layout.attributes.get("versions", "{}"))) for layout in (ours, theirs))
+        if difference is None and old.get("nonholonomic") != new.get("nonholonomic"):
+            difference = f"nonholonomic is {old.get('nonholonomic')} in the file and {new.get('nonholonomic')} here"
         if difference is None and (theirs.kinds, theirs.inner, theirs.chunk) != (ours.kinds, ours.inner, ours.chunk):
-            difference = f"it was not written by a sweep in {ours.chunks} blocks"
+            difference = f"it was not written by a sweep in {ours.chunks} chunks"
         if difference is not None:
             what = self.path if begun.path == self.path else self.folder
             raise ValueError(f"{what} holds the result of another run: {difference}; give another path or remove it")
-        others = [name for name in here if name not in ("nonholonomic", "python") and there.get(name) != here[name]]
+        others = [name for name in new if name not in ("nonholonomic", "python") and old.get(name) != new[name]]
         if others and begun.path != self.path:
-            versions = ", ".join(f"{name} {there.get(name)}, now {here[name]}" for name in others)
+            versions = ", ".join(f"{name} {old.get(name)}, now {new[name]}" for name in others)
             warnings.warn(f"{self.path} was begun with {versions}: digits may differ", RuntimeWarning, stacklevel=7)
 
     def filled(self, computed: Iterable[tuple[int, dict[str, Values]]]) -> Stored:
@@ -147,7 +149,7 @@ class ChunkStore:
         for chunk in sorted(self.finished):
             kept = read_chunk(self.folder, self.layout, chunk)
             if kept is None:
-                raise OSError(f"cannot read {self.folder}: block {chunk} is damaged; the same call computes it again")
+                raise OSError(f"cannot read {self.folder}: chunk {chunk} is damaged; the same call computes it again")
             yield chunk, kept
 
     def write(self, chunk: int, values: dict[str, Values]) -> None:
@@ -238,7 +240,7 @@ def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
         # The table was finished in the meantime.
         return None
     if damaged:
-        reason = f"{damaged} of its {layout.chunks} blocks do not match their checksums"
+        reason = f"{damaged} of its {layout.chunks} chunks do not match their checksums"
         raise OSError(f"cannot read {path}: it is damaged: {reason}")
     return layout, variables
 
@@ -261,5 +263,5 @@ def same_request(left: str, right: str) -> str | None:
     first, second = json.loads(left), json.loads(right)
     for name in [*first, *(name for name in second if name not in first)]:
         if first.get(name) != second.get(name):
-            return f"{name} is {first.get(name)!r} there and {second.get(name)!r} here"
+            return f"{name} is {first.get(name)!r} in the file and {second.get(name)!r} here"
     return None

@@ -245,7 +245,7 @@ class Stored:
             damaged += zlib.crc32(np.ascontiguousarray(values[first:end]).data) != sums[chunk]
         if damaged:
             raise OSError(
-                f"cannot read {self.path}: it is damaged: {damaged} of its {self.layout.chunks} blocks do not match their "
+                f"cannot read {self.path}: it is damaged: {damaged} of its {self.layout.chunks} chunks do not match their "
                 "checksums"
             )
         return values
@@ -253,15 +253,15 @@ class Stored:
     def chunk(self, chunk: int) -> dict[str, Values] | None:
         """The variables of one chunk; `None` if its numbers do not match their checksums."""
         first, end = self.layout.ends(chunk)
-        found = {}
+        variables = {}
         with self._opened() as file:
             for name in self.layout.kinds:
                 parts = [np.asarray(_dataset(file, name)[box]) for box in boxes(self.layout.shape, first, end)]
                 shape = self.layout.inner_shape(name)
-                found[name] = np.concatenate([part.reshape(-1, *shape) for part in parts])
-                if zlib.crc32(found[name].data) != self._sums[name][chunk]:
+                variables[name] = np.concatenate([part.reshape(-1, *shape) for part in parts])
+                if zlib.crc32(variables[name].data) != self._sums[name][chunk]:
                     return None
-        return found
+        return variables
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator["h5py.File"]:

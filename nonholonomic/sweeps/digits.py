@@ -42,5 +42,5 @@ def concise_strings(
             return f"{word}?"
         return concise(value, error) if np.isfinite(value) else str(word)
 
-    strings = [string(*one) for one in zip(values.ravel(), errors.ravel(), words.ravel(), strict=True)]
+    strings = [string(*entry) for entry in zip(values.ravel(), errors.ravel(), words.ravel(), strict=True)]
     return np.array(strings, dtype=str).reshape(values.shape)

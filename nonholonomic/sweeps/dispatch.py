@@ -40,7 +40,7 @@ def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], most: int
             future = submit(chunk)
         except (RuntimeError, OSError) as error:
             # A pool that is broken or shut down, a scheduler that does not answer.
-            raise ExecutorBroken(f"the executor takes no more blocks ({error or type(error).__name__})") from error
+            raise ExecutorBroken(f"the executor accepts no more chunks ({error or type(error).__name__})") from error
         out.add(future)
         future.add_done_callback(lambda future: finished.put((chunk, future)))
 
@@ -58,7 +58,7 @@ def handed_out(submit: Callable[[int], Future], chunks: Iterable[int], most: int
             try:
                 died, results = 0, future.result()
             except CancelledError as error:
-                raise ExecutorBroken("the executor has cancelled its blocks") from error
+                raise ExecutorBroken("the executor has cancelled its chunks") from error
             except Exception as error:
                 died, results = crashes_reported_by(error), None
                 if not died:

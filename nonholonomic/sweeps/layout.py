@@ -62,11 +62,11 @@ class Layout(NamedTuple):
 
     def empty(self, cells: int, status: int = PENDING) -> dict[str, Values]:
         """The variables of cells without results, along the first axis; variables of words get `status`."""
-        found = {}
+        variables = {}
         for name, kind in self.kinds.items():
             value = status if name in self.words else np.nan if kind.kind == "f" else PENDING
-            found[name] = np.full((cells, *self.inner_shape(name)), value, kind)
-        return found
+            variables[name] = np.full((cells, *self.inner_shape(name)), value, kind)
+        return variables
 
     def shaped(self, name: str, values: Values) -> Values:
         """A variable of all cells in the shape of the grid, with words instead of codes."""

@@ -88,7 +88,9 @@ def sweep(
         raise KeyboardInterrupt(store.interrupted()) from None
     except ExecutorBroken as error:
         kept = (
-            "nothing is kept without path=" if path is None else f"{path} has what is done; the same call does the rest"
+            "without path=, nothing is saved"
+            if path is None
+            else f"{path} has the finished chunks; repeat the call to resume"
         )
         raise RuntimeError(f"{error}, {kept}") from error.__cause__
     finally:
@@ -156,7 +158,7 @@ class Held:
         if need > room:
             raise ValueError(
                 f"path = None: {layout.cells:.3g} cells take {1e-9 * need:.3g} GB, and this machine has {1e-9 * room:.3g} GB "
-                "of memory; with path= they are held in a file"
+                "of memory; pass path= to keep them in a file"
             )
         self.finished: set[int] = set()
         self._layout, self._found = layout, layout.empty(layout.cells)
@@ -171,7 +173,7 @@ class Held:
 
     def interrupted(self) -> str:
         """Message after Ctrl-C."""
-        return f"interrupted; none of {with_spaces(self._layout.cells)} cells is saved without path="
+        return f"interrupted; without path=, none of {with_spaces(self._layout.cells)} cells is saved"
 
     def close(self) -> None:
         """There is nothing to close."""
@@ -212,7 +214,7 @@ def failed_chunk(axes: list[Axis], layout: Layout, chunk: int) -> dict[str, Valu
     ends = [columns(axes, cell, 1) for cell in (first, end - 1)]
     named = ", ".join(f"{name} {ends[0][name].item():.6g} to {ends[1][name].item():.6g}" for name in ends[0])
     warnings.warn(
-        f"cells {first} to {end - 1} ({named}) are given up as failed: {MAX_CRASHES} workers or more died of them",
+        f"cells {first} to {end - 1} ({named}) are given up as failed: they killed {MAX_CRASHES} workers or more",
         RuntimeWarning,
         stacklevel=4,
     )

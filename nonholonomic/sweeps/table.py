@@ -187,7 +187,7 @@ class Table(eqx.Module):
         layout = Layout(self.coords, kinds, self.units, self.attributes, words, self.inner, CHUNK)
         flat = {name: values.reshape(-1, *layout.inner_shape(name)) for name, values in stored.items()}
         ends = enumerate(map(layout.ends, range(layout.chunks)))
-        cut = ((chunk, {name: some[first:end] for name, some in flat.items()}) for chunk, (first, end) in ends)
+        cut = ((chunk, {name: values[first:end] for name, values in flat.items()}) for chunk, (first, end) in ends)
         write_file(Path(path), layout, cut)
 
     @classmethod
@@ -212,7 +212,7 @@ class Table(eqx.Module):
     @classmethod
     def laid_out(cls, layout: Layout, values: dict[str, Values]) -> "Table":
         """A table of numbers with all cells along the first axis, codes for words."""
-        variables = {name: layout.shaped(name, some) for name, some in values.items()}
+        variables = {name: layout.shaped(name, of_cells) for name, of_cells in values.items()}
         return cls(layout.coords, variables, layout.units, layout.attributes, layout.words, layout.inner)
 
     def digits(self, variable: str = "time") -> Values:

@@ -42,8 +42,8 @@ class ChunkTask(NamedTuple):
         parts = []
         for start in range(first, end, self.chunk):
             counted = min(self.chunk, end - start)
-            found = self.job(columns(self.axes, start, self.chunk), counted)
-            parts.append({name: np.asarray(values)[:counted] for name, values in found.items()})
+            variables = self.job(columns(self.axes, start, self.chunk), counted)
+            parts.append({name: np.asarray(values)[:counted] for name, values in variables.items()})
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
@@ -69,12 +69,12 @@ def remote_results(sent: bytes, needed: dict[str, str], first: int, count: int, 
 
     **Raises:** `RuntimeError` that names the worker if it has another version of a package whose numbers may differ.
     """
-    here = stamp()
+    own = stamp()
     for name in MUST_AGREE:
-        if here[name] != needed[name]:
+        if own[name] != needed[name]:
             raise RuntimeError(
-                f"the worker {platform.node()}, process {os.getpid()}, has {name} {here[name]}, and {needed[name]} is needed: "
-                "a table is computed with one version of everything"
+                f"the worker {platform.node()}, process {os.getpid()}, has {name} {own[name]}, and {needed[name]} is needed: "
+                "all workers of a table need the same versions"
             )
     # Otherwise, threads of one worker would compile the same program twice.
     with _unpacking:
@@ -104,5 +104,5 @@ def versions() -> dict[str, str]:
 def stamp() -> dict[str, str]:
     """What `MUST_AGREE`, in this process."""
     # Float64 may have been switched off by hand.
-    here = versions() | {"float": str(np.dtype(jnp.result_type(float)))}
-    return {name: here[name] for name in MUST_AGREE}
+    own = versions() | {"float": str(np.dtype(jnp.result_type(float)))}
+    return {name: own[name] for name in MUST_AGREE}

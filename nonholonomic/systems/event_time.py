@@ -149,14 +149,14 @@ class SmoothEvent(AbstractDifferentiableSolve):
         may, t1, tolerance = legal_run(finite, t1, tolerance)
         return may, t1, Settings(jnp.min(tolerance), self.solver)
 
-    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, settings = self.permitted(leaves)
         problem = self.of_leaves(leaves).problem(cells)
         outcome, _ = traced_solve_ensemble(problem, t1, jnp.asarray(cells), settings, one_kernel=True)
         return _named(may, outcome)
 
-    def with_slopes(
-        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    def value_and_tangents(
+        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         def build(movable: tuple[Array, ...], cells: int | None) -> Any:
             return self.of_leaves((*movable, *leaves[self.movable :])).problem(cells)
@@ -164,7 +164,7 @@ class SmoothEvent(AbstractDifferentiableSolve):
         may, t1, settings = self.permitted(leaves)
         problem, tangents, gather = tangents_by(build, active, leaves[: self.movable], cells)
         outcome, slopes = traced_solve_ensemble_with_tangents(
-            problem, tangents, t1, jnp.asarray(cells), settings, one_kernel=not again
+            problem, tangents, t1, jnp.asarray(cells), settings, one_kernel=not nested
         )
         time = _named(may, outcome)
         return time, [jnp.where(jnp.isinf(time), 0.0, slope + 0.0 * time) for slope in gather(slopes)]
@@ -173,16 +173,18 @@ class SmoothEvent(AbstractDifferentiableSolve):
 class HybridEvent(SmoothEvent):
     """Event times of cells whose runs have resets."""
 
-    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, settings = self.permitted(leaves)
         modes, first, states = self.of_leaves(leaves).modes(cells)
         return _named(may, traced_solve_hybrid(modes, first, states, t1, cells, settings, counters=1))
 
-    def with_slopes(
-        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    def value_and_tangents(
+        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-        if again:
-            raise ValueError("second derivatives do not go through resets; differentiate a gradient by differences")
+        if nested:
+            raise ValueError(
+                "second derivatives are not available through resets; take differences of a gradient instead"
+            )
 
         def build(movable: tuple[Array, ...], cells: int | None) -> Any:
             assert cells is not None

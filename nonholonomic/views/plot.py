@@ -217,6 +217,6 @@ def _column(table: "Table", argument: str, name: str) -> tuple[Any, str]:
         place = int(np.flatnonzero(table.coords[dims[0]] == component)[0])
         name, bracket, unit = table.label(variable).rpartition(" [")
         return table[variable][:, place], f"{name}, {component}{bracket}{unit}" if bracket else f"{unit}, {component}"
-    known = [one for one in table.variables if one not in table.inner]
-    known += [f"{one}.{part}" for one, dims in table.inner.items() for part in table.coords[dims[0]]]
+    known = [other for other in table.variables if other not in table.inner]
+    known += [f"{other}.{part}" for other, dims in table.inner.items() for part in table.coords[dims[0]]]
     raise ValueError(f"{argument} = {name!r} must be one of {', '.join(known)}{likely(name, known)}")

@@ -153,8 +153,8 @@ def turned(rotation: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "times
         products[:, i, 3] = products[:, 3, i] = m[:, k, j] - m[:, j, k]
     products[:, 3, 3] = 1.0 + trace
     largest = np.argmax(np.diagonal(products, axis1=1, axis2=2), axis=-1)
-    found = products[np.arange(len(m)), largest]
-    return found / np.linalg.norm(found, axis=-1, keepdims=True)
+    axis = products[np.arange(len(m)), largest]
+    return axis / np.linalg.norm(axis, axis=-1, keepdims=True)
 
 
 def matrices(turning: Float[np.ndarray, "times 4"]) -> Float[np.ndarray, "times 3 3"]:

@@ -43,10 +43,10 @@ class Viewable(abc.ABC):
         if path is not None:
             require_file(path, "path", ".html", ".htm")
         stages = self.stages(others, overlaid)
-        found = page(stages, "; ".join(stage.title for stage in stages), speed=0.5)
+        html_page = page(stages, "; ".join(stage.title for stage in stages), speed=0.5)
         if path is not None:
-            found.save(path)
-        return found
+            html_page.save(path)
+        return html_page
 
     @status_line("drawing")
     def animate(self, path: Any, times: Any = None, others: Sequence[Any] = (), overlaid: bool = False) -> None:

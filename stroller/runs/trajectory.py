@@ -125,7 +125,7 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         needs = dict(zip(self.loaded_axles, np.max(np.asarray(self.grip()), axis=0), strict=False))
         text = ", ".join(f"{name} axle {most:.3g}" for name, most in needs.items())
         slips = " and ".join(name for name, most in needs.items() if most > MOST_GRIP)
-        remark = f": the {slips} wheels would slip, for a tyre gives at most {MOST_GRIP:g}" if slips else ""
+        remark = f": the {slips} wheels would slip, because tyres provide at most {MOST_GRIP:g}" if slips else ""
         return f"needed friction up to {text}{remark}"
 
     def with_steps(self) -> "Trajectory":
@@ -201,9 +201,11 @@ class Trajectory(Viewable, Tabular, eqx.Module):
         ]
         error = float(jnp.max(self.wheelbase_error))
         if error > 0.0:
-            lines.append(f"  wheelbase       off by up to {error:.1e} of its effect: the ground curves over its length")
+            lines.append(
+                f"  wheelbase       relative error of its effect up to {error:.1e}: the ground is curved over its length"
+            )
         if np.isfinite(self.contact_lost_at):
-            lines.append(f"  contact lost    at {self.contact_lost_at:.6g} s; from there the ground pulls")
+            lines.append(f"  contact lost    at {self.contact_lost_at:.6g} s; after that the ground would have to pull")
         if np.isfinite(self.rank_lost_at):
             lines.append(f"  rank lost       at {self.rank_lost_at:.6g} s; from there the motion is undetermined")
         if jackknives.size:

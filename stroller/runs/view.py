@@ -50,7 +50,7 @@ GREEN, BLUE, VIOLET, GOLD = 0x1F8A4C, 0x1B6CA8, 0x7B4FA3, 0xE0A100
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     """Rides as stages: one stage for each, or a common one for overlaid rides."""
     for run in runs:
-        require_one_run(run, "a picture", ", and hand the others over as others=")
+        require_one_run(run, "a picture", ", and pass the others as others=")
     rides = [run.spec.ride for run in runs]
     starts = [f"ride of {float(run.t[-1]):.3g} s" for run in runs]
     names = distinguishing_labels(starts, [ride.scene for ride in rides], [ride.launch for ride in rides])
@@ -145,7 +145,7 @@ def grip_warning(run: Any) -> str:
     """A warning for a ride that needs more grip than tyres provide; empty for others."""
     needed = float(np.max(np.asarray(run.grip())[:, : len(run.loaded_axles)]))
     return (
-        f"needs friction {needed:.2g}, more than any tyre gives: a real stroller would slip"
+        f"needs friction {needed:.2g}, more than any tyre provides: a real stroller would slip"
         if needed > MOST_GRIP
         else ""
     )

@@ -202,11 +202,11 @@ def test_the_error_of_many_slips_falls_with_the_tolerance_and_is_known():
     [
         (
             lambda s: jax.jit(lambda x: tippe.simulate(s, tippe.Launch(x, 100.0), 1.0, times=[1.0]).theta)(0.1),
-            "friction = SetValuedCoulomb must be a law without phases inside jit",
+            "friction = SetValuedCoulomb must be a law with a single mode inside jit",
         ),
         (
             lambda s: tippe.inversion_table(s, theta=0.1, spin=100.0, t1=1.0, method="diffrax"),
-            "method = 'diffrax' is not for runs of several phases",
+            "method = 'diffrax' does not support runs of several modes",
         ),
         (lambda s: tippe.SetValuedCoulomb(-0.1), "mu = -0.1 must be at least 0"),
     ],

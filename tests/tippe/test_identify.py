@@ -190,7 +190,7 @@ def test_how_to_search_is_checked_before_the_data_are(rutstam_scene):
     ("modes", "message"),
     [
         ({"contact": "hybrid"}, "contact = 'hybrid' must be 'stop' for"),
-        ({"friction": tippe.SetValuedCoulomb(0.3)}, "friction = SetValuedCoulomb must be a law without phases for"),
+        ({"friction": tippe.SetValuedCoulomb(0.3)}, "friction = SetValuedCoulomb must be a law with a single mode for"),
     ],
 )
 def test_scenes_with_phases_are_refused_where_slopes_are_needed(rutstam_scene, modes, message):

@@ -46,7 +46,7 @@ def test_a_run_that_needs_more_than_the_most_steps_has_failed(table, rutstam_sce
     assert (short["steps"] == 40).all()
     assert json.loads(short.attributes["request"])["max_steps"] == 40
     assert "max_steps" not in json.loads(table.attributes["request"])
-    with pytest.raises(ValueError, match="max_steps is 40 there"):
+    with pytest.raises(ValueError, match="max_steps is 40 in the file"):
         tippe.inversion_table(rutstam_scene_module, **arguments)
 
 
@@ -211,7 +211,7 @@ def test_every_scene_compiles(arena, law, asked):
     [
         ({"theta": None}, "theta = None is not a number"),
         ({"spin": None}, "spin = None is not a number"),
-        ({"axes": {"launch.theta": [0.1]}}, "'launch.theta' is an argument of its own"),
+        ({"axes": {"launch.theta": [0.1]}}, "'launch.theta' has its own argument"),
         ({"axes": [0.1]}, "axes = .* must be a dictionary"),
         ({"t1": [1.0, 2.0]}, r"t1 must be one number, not of shape \(2,\)"),
         ({"angle": [1.0, 2.0]}, r"angle must be one number, not of shape \(2,\)"),

@@ -130,6 +130,8 @@ def checked_data(scene: Scene, data: Any, tolerance: float, caller: str | None) 
 
 def unknowns_of(scene: Scene, data: tuple[Any, ...], free: Any) -> dict[str, Free]:
     """The unknowns of a scene and its data by their full names, checked."""
-    launches = [[name for name, value in numbers("launch", one.launch).items() if value is not None] for one in data]
-    own = [names + ["t0"] * isinstance(one, Recording) for names, one in zip(launches, data, strict=True)]
+    launches = [
+        [name for name, value in numbers("launch", source.launch).items() if value is not None] for source in data
+    ]
+    own = [names + ["t0"] * isinstance(source, Recording) for names, source in zip(launches, data, strict=True)]
     return scene_unknowns(free, scene, data[0].launch, list(variable_numbers(scene)), own)

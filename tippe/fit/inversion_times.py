@@ -136,11 +136,11 @@ class InversionTimes(eqx.Module):
         lanes = _launches(self.launch, launches, rows)
         lanes |= {name: jnp.repeat(value, launches) for name, value in values.items() if name != "t0"}
 
-        def one(lane: dict[str, Array]) -> Float[Array, ""]:
+        def time_of_lane(lane: dict[str, Array]) -> Float[Array, ""]:
             roots = with_numbers({"scene": scene, "launch": _one_of(self.launch)}, lane)
             return extended_inversion_time(roots["scene"], roots["launch"], self.t1, self.angle, tolerance)
 
-        return jax.vmap(one)(lanes).reshape(rows, launches)
+        return jax.vmap(time_of_lane)(lanes).reshape(rows, launches)
 
 
 def _launches(launch: Launch, count: int, rows: int) -> Values:

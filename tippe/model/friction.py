@@ -291,7 +291,7 @@ class Rolling(AbstractFriction):
 
     def __check_init__(self):
         require_kind(self.sliding, "sliding", AbstractFriction, A_LAW)
-        if isinstance(self.sliding, Rolling) or self.sliding.set_valued:
+        if isinstance(self.sliding, Rolling | NoSlip) or self.sliding.set_valued:
             raise ValueError(f"sliding = {self.sliding!r} must be a sliding law with a force at every slip velocity")
 
     def bounds(self) -> Iterator[Bound]:
@@ -315,6 +315,34 @@ class Rolling(AbstractFriction):
         factor = -self.resistance / jnp.sqrt(w1 * w1 + w2 * w2 + self.turning_speed * self.turning_speed)
         load = self.sliding.per_normal_force(slip)
         return ContactLoad(load.force, sum_vectors(load.torque, (factor * w1, factor * w2, None)))
+
+
+class NoSlip(AbstractFriction):
+    """Pure rolling: the contact point is at rest, whatever force that takes, for an `Ellipsoid` or a `RigidBody`.
+
+    The nonholonomic constraint replaces the law of friction. A run reports the reaction, and as `grip` the coefficient of
+    friction that the reaction needs.
+
+    **Example:**
+
+    ```
+    >>> import tippe
+    >>> inertia = [[1e-5, 0, 0], [0, 2e-5, 0], [0, 0, 2.5e-5]]
+    >>> ball = tippe.Ellipsoid(0.1, (0.02, 0.02, 0.02), (0.0, 0.0, 0.0), inertia)  # Chaplygin's ball
+    >>> scene = tippe.Scene(ball, friction=tippe.NoSlip())
+    >>> launch = tippe.Launch(0.5, spin=20.0, angular_velocity=(5.0, 0.0, 0.0))
+    >>> run = tippe.simulate(scene, launch, t1=0.1, tolerance=1e-6)
+    >>> print(f"{run.grip.max():.3f}")
+    0.050
+
+    ```
+    """
+
+    def per_normal_force(self, slip: Slip) -> ContactLoad:
+        """
+        **Raises:** `ValueError`: the force follows from the equations of motion.
+        """
+        raise ValueError("NoSlip has no force per slip: the reaction follows from the equations of motion")
 
 
 class SetValuedCoulomb(AbstractFriction):

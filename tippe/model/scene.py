@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -17,6 +17,7 @@ from nonholonomic.geometry import (
     Component,
     Plane,
     PlaneFrame,
+    Vector,
     cross,
     dot,
     frame_of,
@@ -33,14 +34,16 @@ from nonholonomic.validation import Bound, Bounded, as_number, is_traced, requir
 
 from .body import AbstractBody
 from .dynamics import TURNING, Dynamics
-from .friction import A_LAW, AbstractFriction, Frictionless
+from .friction import A_LAW, AbstractFriction, Frictionless, NoSlip
 from .launch import Launch
-from .state import inclination, joined, parts
+from .rigid_body import AbstractRigidBody
+from .rigid_dynamics import rigid_dynamics
+from .state import angular_velocity, inclination, joined, parts
 from .stick_slip import StickSlip
 from .top import Top
 
 #: The body's class: code that needs a sphere takes a `Scene[Top]`.
-Body = TypeVar("Body", bound=AbstractBody)
+Body = TypeVar("Body", bound=AbstractBody | AbstractRigidBody)
 
 #: Tilt [rad] of a launch below which errors across the normal are measured in proportion to the tilt.
 NEARLY_UPRIGHT = 1e-2
@@ -60,13 +63,13 @@ class Scene(Bounded, Generic[Body]):
 
     **Arguments:**
 
-    - `body`: a `Top`; or a `SpheroidBody` or `ConvexBody`, on a plane, with `contact="stop"` and a friction law with a
-      single mode.
+    - `body`: a `Top`; or a `SpheroidBody`, `ConvexBody`, `Ellipsoid` or `RigidBody`, on a plane, with `contact="stop"` and a
+      friction law with a single mode.
     - `surface`: the arena: `Plane(tilt)`, `Cylinder(radius)`, `Sphere(radius)`, `Spheroid(equatorial, polar)`, `Torus(ring,
       tube)`, `Paraboloid(p)`, `Graph(height)` or `Implicit(function)`.
     - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
-      or `Rolling(resistance, turning_speed, sliding)` with one of them, or, for a top without a stem,
-      `SetValuedCoulomb(mu)`.
+      or `Rolling(resistance, turning_speed, sliding)` with one of them; for a top without a stem also
+      `SetValuedCoulomb(mu)`, for an `Ellipsoid` or a `RigidBody` also `NoSlip()`.
     - `gravity`: acceleration of free fall [m/s^2], positive.
     - `contact`: "stop" (the default): a run ends where the contact is lost; "hybrid": it continues through flights,
       impacts, and changes to the stem and back (`modes/`). "stop" is faster to compile and works for every body and
@@ -106,8 +109,8 @@ class Scene(Bounded, Generic[Body]):
     side: str | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        if not isinstance(self.body, AbstractBody):
-            kinds = f"a Top, a SpheroidBody or a ConvexBody{uncalled(self.body)}"
+        if not isinstance(self.body, AbstractBody | AbstractRigidBody):
+            kinds = f"a Top, a SpheroidBody, a ConvexBody, an Ellipsoid or a RigidBody{uncalled(self.body)}"
             raise ValueError(f"body = {self.body!r} must be {kinds}")
         require_kind(self.surface, "surface", AbstractSurface, ", such as tippe.Plane() or tippe.Cylinder(0.3)")
         require_kind(self.friction, "friction", AbstractFriction, A_LAW)
@@ -117,8 +120,13 @@ class Scene(Bounded, Generic[Body]):
             raise ValueError(f"contact = {self.contact!r} must be 'stop' or 'hybrid'")
         if self.restitution is not None and self.contact == "stop":
             raise ValueError(f"restitution = {self.restitution!r} must be omitted for contact = 'stop'")
+        if isinstance(self.friction, NoSlip) and not isinstance(self.body, AbstractRigidBody):
+            raise ValueError(
+                f"friction = NoSlip() must be another law for a {type(self.body).__name__}, such as Coulomb; describe the body "
+                "as an Ellipsoid or a RigidBody to roll it"
+            )
         if not isinstance(self.body, Top):
-            self._check_convex(type(self.body).__name__)
+            self._check_convex()
             return
         if self.friction.set_valued and self.body.stem is not None:
             raise ValueError(
@@ -128,15 +136,17 @@ class Scene(Bounded, Generic[Body]):
         if self.contact == "stop" and self.body.stem is not None:
             raise ValueError("contact = 'stop' must be 'hybrid' for a top with a stem")
 
-    def _check_convex(self, kind: str) -> None:
+    def _check_convex(self) -> None:
         """Raise `ValueError` for options that need a sphere, whose contact follows from the place of its centre."""
+        kind = type(self.body).__name__
+        kind = f"an {kind}" if kind[0] in "AEIOU" else f"a {kind}"
         if not isinstance(self.surface, Plane):
-            raise ValueError(f"surface = {self.surface!r} must be a Plane for a {kind}; a Top runs on any arena")
+            raise ValueError(f"surface = {self.surface!r} must be a Plane for {kind}; a Top runs on any arena")
         if self.contact != "stop":
-            raise ValueError(f"contact = {self.contact!r} must be 'stop' for a {kind}; only a Top can fly")
+            raise ValueError(f"contact = {self.contact!r} must be 'stop' for {kind}; only a Top can fly")
         if self.friction.set_valued:
             raise ValueError(
-                f"friction = {self.friction!r} must be a law with a single mode for a {kind}, such as Coulomb"
+                f"friction = {self.friction!r} must be a law with a single mode for {kind}, such as Coulomb"
             )
 
     def bounds(self) -> Iterator[Bound]:
@@ -180,15 +190,18 @@ class Scene(Bounded, Generic[Body]):
         return self.level and not self.friction.set_valued
 
     @property
-    def dynamics(self) -> Dynamics | StickSlip:
-        """The equations of motion, with the precomputed combinations of the scene's numbers."""
+    def dynamics(self) -> Any:
+        """The equations of motion, with the precomputed combinations of the scene's numbers: a `Dynamics`, a `StickSlip` or an
+        `AbstractRigidDynamics`."""
         numbers = (self.frame, self.friction, self.gravity)
+        if isinstance(self.body, AbstractRigidBody):
+            return rigid_dynamics(self.body, *numbers)
         if isinstance(self.body, Top) and self.friction.set_valued:
             return StickSlip.of(self.body, *numbers)
         return Dynamics.of(self.body, *numbers)
 
     @property
-    def turning_dynamics(self) -> Dynamics | StickSlip:
+    def turning_dynamics(self) -> Any:
         """The equations of motion for angles, times, energies and forces, which are cheaper in a turning frame.
 
         On a level plane under an isotropic law, the frame turns with the top; its direction is not known afterwards.
@@ -211,6 +224,10 @@ class Scene(Bounded, Generic[Body]):
 
         **Raises:** `ValueError` for a place with the wrong number of numbers.
         """
+        if isinstance(self.friction, NoSlip) and launch.velocity is not None:
+            raise ValueError(
+                f"velocity = {launch.velocity!r} must be left out where friction = NoSlip(): it follows from the rotation"
+            )
         surface = self.surface
         names, kind = [name for name, _ in surface.coordinates], type(surface).__name__
         if launch.place is None:
@@ -244,6 +261,11 @@ class Scene(Bounded, Generic[Body]):
         """
         body, sine, zero = self.body, jnp.sin(launch.theta), jnp.zeros_like(launch.theta)
         e = (sine * jnp.cos(launch.azimuth), sine * jnp.sin(launch.azimuth), jnp.cos(launch.theta))
+        if isinstance(body, AbstractRigidBody):
+            turning = sum_vectors(scale(launch.spin, e), launch.angular_velocity or (None, None, None))
+            return rigid_dynamics(body, self.frame, self.friction, self.gravity).start(
+                launch, self.start(launch)[0], e, vector_of(turning)
+            )
         L, u = scale(body.I3 * launch.spin, e), launch.velocity or (zero, zero)
         if launch.angular_velocity is not None:
             turning = vector_of(launch.angular_velocity)
@@ -265,16 +287,26 @@ class Scene(Bounded, Generic[Body]):
         ones = jnp.ones_like(launch.theta)
         rate = jnp.sqrt(self.gravity / self.body.size)
         velocity = rate * self.body.size
-        momentum = jnp.maximum(self.body.I3 * jnp.abs(launch.spin), self.body.I1 * rate)
+        I1, I3 = self._moments
+        momentum = jnp.maximum(I3 * jnp.abs(launch.spin), I1 * rate)
         if launch.angular_velocity is not None:
             turning = launch.angular_velocity
-            momentum = jnp.maximum(momentum, self.body.I1 * jnp.sqrt(dot(turning, turning)))
+            momentum = jnp.maximum(momentum, I1 * jnp.sqrt(dot(turning, turning)))
         place = scale(ones, self.frame.place_scales)
         tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
         # A top that stands exactly upright has no growth to resolve.
         tilt = jnp.where(tilt > 0.0, jnp.clip(tilt, 1e-280, 1.0), 1.0)
         velocities, momenta = (velocity * tilt, velocity * tilt), (momentum * tilt, momentum * tilt, momentum)
-        return joined(velocities, (tilt, tilt, ones), momenta, place)
+        x_axis = (ones, ones, tilt) if isinstance(self.body, AbstractRigidBody) else ()
+        return joined(velocities, (tilt, tilt, ones), momenta, place, x_axis)
+
+    @property
+    def _moments(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """The magnitudes of the body's moments of inertia across and along its axis [kg m^2]."""
+        if isinstance(self.body, AbstractRigidBody):
+            inertia = self.body.inertia
+            return 0.5 * (inertia.xx + inertia.yy), inertia.zz
+        return self.body.I1, self.body.I3
 
     def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """Rate of change of the state: (m/s^2, 1/s, N m, 1/s) for (velocity, axis, angular momentum, place)."""
@@ -298,6 +330,8 @@ class Scene(Bounded, Generic[Body]):
     def energy(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Kinetic energy plus weight times the height of the centre of mass above the arena's lowest point [J]."""
         body, dynamics = self.body, self.dynamics
+        if isinstance(body, AbstractRigidBody):
+            return dynamics.energy(state)
         (u1, u2), e, L, place = parts(state)
         e3_dot = (L[0] * e[1] - L[1] * e[0]) / body.I1
         speed2 = u1**2 + u2**2 + (body.meridian.at(e[2]).offset * e3_dot) ** 2
@@ -314,6 +348,8 @@ class Scene(Bounded, Generic[Body]):
         a e) (`tippe.md`, section 2).
         """
         _, e, L, _ = parts(state)
+        if isinstance(self.body, AbstractRigidBody):
+            return dot(L, self.dynamics.mass_from_contact(state))
         lever = self.body.meridian.at(e[2])
         return lever.radius * L[2] - lever.offset * dot(e, L)
 
@@ -324,4 +360,20 @@ class Scene(Bounded, Generic[Body]):
     def spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Angular velocity about the axis, w.e [rad/s]."""
         _, e, L, _ = parts(state)
+        if isinstance(self.body, AbstractRigidBody):
+            return dot(e, self.angular_velocity(state))
         return dot(e, L) / self.body.I3
+
+    def angular_velocity(self, state: Float[Array, "components ..."]) -> Vector:
+        """Angular velocity of the body in the moving frame [rad/s]."""
+        if isinstance(self.body, AbstractRigidBody):
+            return self.dynamics.angular_velocity(state)
+        _, e, L, _ = parts(state)
+        return angular_velocity(self.body, e, L)
+
+    def path_from_frame(self, state: Float[Array, "components ..."]) -> Vector:
+        """From the point that the frame carries to the one whose path is reported [m], in the moving frame."""
+        if isinstance(self.body, AbstractRigidBody):
+            x, y, z = self.dynamics.mass_from_contact(state)
+            return (x, y, z - self.body.size)
+        return self.body.path_from_frame(parts(state).axis)

@@ -201,6 +201,6 @@ class Top(AbstractBody):
             return None
         ratio = float(strange[0])
         likely = {f"I1 in {unit}": factor for unit, factor in INERTIAS.items()} | {"the mass in g": 1e3}
-        found = [what for what, factor in likely.items() if RATIOS[0] <= ratio * factor <= RATIOS[1]]
-        question = f"was {found[0]}?" if found else "are mass, radius and I1 in kg, m and kg m^2?"
+        suspects = [what for what, factor in likely.items() if RATIOS[0] <= ratio * factor <= RATIOS[1]]
+        question = f"was {suspects[0]}?" if suspects else "are mass, radius and I1 in kg, m and kg m^2?"
         return f"I1 = {ratio:.3g} m R^2 is out of the range {RATIOS} of bodies like a top: {question}"

@@ -1,4 +1,4 @@
-"""Motion on one smooth contact until theta reaches an angle or the contact ends, for many cells."""
+"""Motion on one smooth contact until theta reaches an angle, or the spin reverses, or the contact ends, for many cells."""
 
 from typing import Any
 
@@ -10,6 +10,7 @@ from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import Dynamics
 from ..model.launch import Launch
+from ..model.rigid_dynamics import AbstractRigidDynamics
 from ..model.scene import Scene
 from ..model.state import COS_THETA
 from ..model.stick_slip import ContactMode, StickSlip
@@ -17,20 +18,28 @@ from ..model.top import Top
 
 
 class InversionProblem(AbstractProblem):
-    """Launches that end when theta reaches an angle or the contact is lost or jams."""
+    """Launches that end when theta reaches an angle or the contact is lost or jams.
 
-    dynamics: Dynamics | StickSlip | ContactMode
-    cos_angle: Float[Array, "..."]
+    Without an angle, `cos_angle` being `None`, they end when the spin about the arena's normal reverses; `spin` is that at the
+    start [rad/s].
+    """
+
+    dynamics: Dynamics | StickSlip | ContactMode | AbstractRigidDynamics
+    # An array, or `None`.
+    cos_angle: Any
     states: Float[Array, "components cells"]
     scales: Float[Array, "components cells"]
+    spin: Float[Array, "..."] | None = None
 
     @classmethod
-    def of(cls, scene: Scene[Top], launch: Launch, angle: Float[ArrayLike, "..."], cells: int) -> "InversionProblem":
+    def of(
+        cls, scene: Scene[Top], launch: Launch, angle: Float[ArrayLike, "..."] | None, cells: int
+    ) -> "InversionProblem":
         """The problem of the given number of cells; the numbers of scene and launch are scalars or one per cell.
 
         Its frame is that of `Scene.turning_dynamics`: its final states do not give directions.
         """
-        return _problem(scene, launch, jnp.asarray(angle), cells)
+        return _problem(scene, launch, None if angle is None else jnp.asarray(angle), cells)
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
@@ -39,6 +48,10 @@ class InversionProblem(AbstractProblem):
         return self.dynamics.field(state)
 
     def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
+        if self.cos_angle is None:
+            assert isinstance(self.dynamics, AbstractRigidDynamics)
+            assert self.spin is not None
+            return self.dynamics.normal_spin(state) / self.spin
         return state[COS_THETA] - self.cos_angle
 
     def domain_margin(
@@ -51,9 +64,12 @@ class InversionProblem(AbstractProblem):
 
 
 @compiled_setup
-def _problem(scene: Scene[Top], launch: Launch, angle: Float[Array, "..."], cells: int) -> InversionProblem:
+def _problem(scene: Scene[Top], launch: Launch, angle: Float[Array, "..."] | None, cells: int) -> InversionProblem:
     states = scene.state(launch)
     shape = (states.shape[0], cells)
     states = jnp.broadcast_to(states.reshape(shape[0], -1), shape)
     scales = jnp.broadcast_to(scene.scales(launch).reshape(shape[0], -1), shape)
-    return InversionProblem(scene.turning_dynamics, jnp.cos(angle), states, scales)
+    dynamics = scene.turning_dynamics
+    if angle is None:
+        return InversionProblem(dynamics, None, states, scales, dynamics.normal_spin(states))
+    return InversionProblem(dynamics, jnp.cos(angle), states, scales)

@@ -163,7 +163,7 @@ class LeaningDynamics(eqx.Module):
             gains.append(zero if (power := load.power(slip)) is None else power)
         speeds = [gap_rate(self.body, ball, free) for ball in spheres]
         rates = [axis_rate(self.body, free.axis, turn)[2] for turn in turns]
-        (G_00, G_01), (G_10, G_11) = ([1.0 / self.body.mass + ball.offset * one for one in rates] for ball in spheres)
+        (G_00, G_01), (G_10, G_11) = ([1.0 / self.body.mass + ball.offset * rate for rate in rates] for ball in spheres)
         determinant = G_00 * G_11 - G_01 * G_10
         per = 1.0 / jnp.where(determinant == 0.0, 1.0, determinant)
         impulses = (per * (G_01 * speeds[1] - G_11 * speeds[0]), per * (G_10 * speeds[0] - G_00 * speeds[1]))

@@ -11,6 +11,8 @@ from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import Dynamics, stacked
 from ..model.launch import Launch
+from ..model.rigid_body import AbstractRigidBody
+from ..model.rigid_dynamics import AbstractRigidDynamics
 from ..model.scene import Scene
 from ..model.state import parts
 from ..model.stick_slip import ContactMode, StickSlip
@@ -27,7 +29,7 @@ class TrajectoryProblem(AbstractProblem):
     `rest` are spin angle and work at the start, `None` where both are 0.
     """
 
-    dynamics: Dynamics | StickSlip | ContactMode
+    dynamics: Dynamics | StickSlip | ContactMode | AbstractRigidDynamics
     axial: Float[Array, "..."]
     state: Float[Array, "components ..."]
     cyclic: Float[Array, "components ..."]
@@ -58,7 +60,10 @@ class TrajectoryProblem(AbstractProblem):
         path, across = cyclic[:-3], cyclic[-3:]
         _, e, L, _ = parts(lean)
         path_rate = self.dynamics.frame.cyclic_rate(path, motion.velocity, motion.turning)
-        falls = -dot(cross(L, e), across) * self.dynamics.per_transverse
+        if isinstance(self.dynamics, AbstractRigidDynamics):
+            falls = -dot(motion.rate[2:5], across)
+        else:
+            falls = -dot(cross(L, e), across) * self.dynamics.per_transverse
         across_rate = sum_vectors(scale(falls, e), carried(across, motion.turning))
         quadratures = (*path_rate, *across_rate, motion.spin_momentum / self.axial, motion.friction_power)
         return stacked((*motion.rate, *quadratures), state)
@@ -85,7 +90,9 @@ def _problem(scene: Scene[Top], launch: Launch, cells: int | None) -> Trajectory
     rows = (scene.state(launch), cyclic, scene.scales(launch), extra)
     if cells is not None:
         rows = tuple(jnp.broadcast_to(row.reshape(len(row), -1), (len(row), cells)) for row in rows)
-    return TrajectoryProblem(scene.dynamics, scene.body.I3, rows[0], rows[1], jnp.concatenate(rows[2:]))
+    # The equations of a rigid body give its spin itself in place of the angular momentum about the axis.
+    axial = jnp.ones(()) if isinstance(scene.body, AbstractRigidBody) else scene.body.I3
+    return TrajectoryProblem(scene.dynamics, axial, rows[0], rows[1], jnp.concatenate(rows[2:]))
 
 
 def trajectory_problem(modules: tuple[Scene, Launch], cells: int | None) -> TrajectoryProblem:

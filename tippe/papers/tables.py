@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from nonholonomic import __version__
+from nonholonomic.command_line import closing_lines
 from nonholonomic.compilation_cache import enable_compilation_cache
 from nonholonomic.geometry import AbstractSurface, Cylinder, Paraboloid, Plane, Sphere, Spheroid, Torus
 from nonholonomic.progress import Progress, status_line
@@ -101,7 +102,7 @@ def parser() -> argparse.ArgumentParser:
         "--out",
         type=Path,
         default=Path("tippe-paper-out"),
-        help="folder for the tables and the picture; another run needs another",
+        help="folder for the tables and the picture; use another folder for another run",
     )
     return command
 
@@ -336,7 +337,6 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"python -m tippe --paper: {error}", file=sys.stderr)
         return 2
     cells = sum(table.status.size for table in by_arena.values())
-    print(f"\n{cells} runs in {time.perf_counter() - started:.1f} s, compilation included. ", end="")
-    print(f"Wrote {', '.join(map(str, written))}.")
-    print(f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}")
+    see = f"To see it, open {shown}{'' if can_view() else f'. {NO_VIEW}'}"
+    print(closing_lines(cells, started, written, see))
     return 0

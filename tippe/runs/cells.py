@@ -55,17 +55,17 @@ WORD_OF_STATUS = {LEFT_DOMAIN: WORDS.index("contact_lost"), FAILED: WORDS.index(
 def too_many_steps(t1: float, most: int, end: float) -> str:
     """Message for a run that needs more than the allowed steps."""
     return (
-        f"t1 = {t1:g} s is too long: the run needs more than {most:_} steps, with which it came to {end:.4g} s; "
+        f"t1 = {t1:g} s is too long: the run needs more than {most:_} steps, which reached only {end:.4g} s; "
         "take a shorter t1 or a larger tolerance"
     ).replace("_", " ")
 
 
 class InversionRuns(NamedTuple):
-    """The requested variables of every cell of a table; see `inversion_table`."""
+    """The requested variables of every cell of a table; see `inversion_table`. `angle` is `None` where reversals are timed."""
 
     run_kind: RunKind
     t1: float
-    angle: float
+    angle: float | None
     crossing: str
     solver: diffrax.AbstractSolver | None
     method: str
@@ -85,7 +85,8 @@ class InversionRuns(NamedTuple):
     @property
     def variables(self) -> dict[str, Variable]:
         """The table's variables, without errors and derivatives."""
-        times = {name: Variable("s", np.float64, long_name=TIMES[name]) for name in self.times}
+        names = TIMES if self.angle is not None else {"time": "reversal time"}
+        times = {name: Variable("s", np.float64, long_name=names[name]) for name in self.times}
         grazes = Variable("1", np.int8, long_name="whether an event on the way was grazing")
         return (
             times
@@ -120,7 +121,7 @@ class InversionRuns(NamedTuple):
 
         problem = InversionProblem.of(scene, launch, self.angle, size)
 
-        def solved(last: bool) -> Outcome | HybridOutcome:
+        def solved(last: bool) -> Any:
             return Inversions.of(scene, problem, tolerance, last).solve(self.t1, count, settings)
 
         slopes, grazing = {}, False

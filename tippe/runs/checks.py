@@ -27,6 +27,7 @@ from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.friction import Frictionless
 from ..model.launch import Launch
+from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 
 
@@ -45,7 +46,10 @@ def permitted(
     may = jnp.asarray(True)
     if unchecked:
         bounds = (*all_bounds(scene), *all_bounds(launch), *scene.start_bounds(launch), *event_bounds(angle))
-        may, t1, tolerance = legal_run(legal(bounds), t1, tolerance)
+        may = legal(bounds)
+        if angle is None:
+            may = may & (scene.dynamics.normal_spin(scene.state(launch)) != 0.0)
+        may, t1, tolerance = legal_run(may, t1, tolerance)
     return may, t1, jnp.min(tolerance)
 
 
@@ -95,27 +99,49 @@ def warn_if_it_cannot_invert(scene: Scene, launch: Launch, theta: Any) -> None:
             UserWarning,
             stacklevel=4,
         )
+    if isinstance(scene.body, AbstractRigidBody):
+        return
     at_rest = launch.velocity is None and launch.angular_velocity is None
     if scene.level and at_rest and not is_traced(theta) and np.any(np.asarray(theta) == 0.0):
         warnings.warn(
-            "theta = 0.0 is exactly upright, where a top stays for ever: launch it at a small angle, such as 0.01 rad",
+            "theta = 0.0 is exactly upright, where a top stays forever: launch it at a small angle, such as 0.01 rad",
             UserWarning,
             stacklevel=4,
         )
 
 
 def event_bounds(angle: Any) -> Iterator[Bound]:
-    """The range of the angle [rad] to be reached."""
-    yield Bound(angle, "angle", above=0.0, at_most=math.pi, unit="rad")
+    """The range of the angle [rad] to be reached, if there is one."""
+    if angle is not None:
+        yield Bound(angle, "angle", above=0.0, at_most=math.pi, unit="rad")
 
 
 def check_smooth(scene: Scene, caller: str) -> None:
     """Raise `ValueError` for a scene with hybrid runs, which do not support derivatives here."""
     if scene.contact == "hybrid":
-        raise ValueError(f"contact = 'hybrid' must be 'stop' for {caller}; inversion_table goes through flights")
+        raise ValueError(f"contact = 'hybrid' must be 'stop' for {caller}; inversion_table supports flights")
     if scene.friction.set_valued:
         kind = type(scene.friction).__name__
-        raise ValueError(f"friction = {kind} must be a law without phases for {caller}; inversion_table has them")
+        raise ValueError(
+            f"friction = {kind} must be a law with a single mode for {caller}; inversion_table supports others"
+        )
+
+
+def check_reversible(launch: Launch, values: dict[str, Any]) -> None:
+    """Raise `ValueError` for a launch without spin, which has none to reverse.
+
+    **Arguments:** `values`: full name of a number -> values in place of the launch's own.
+    """
+    spin = values.get("launch.spin", launch.spin)
+    if launch.angular_velocity is None and not is_traced(spin) and np.any(np.asarray(spin) == 0.0):
+        raise ValueError("spin = 0.0 must not be zero: the time of reversal is that of a spin that changes its sign")
+
+
+def check_revolution(scene: Scene, caller: str) -> None:
+    """Raise `ValueError` for a body of any shape and inertia, for what needs a body of revolution."""
+    if isinstance(scene.body, AbstractRigidBody):
+        kind = type(scene.body).__name__
+        raise ValueError(f"body = {kind} must be a body of revolution, such as a Top, for {caller}")
 
 
 def check_event(angle: Any, crossing: Any, known: tuple[str, ...] = ("first", "last")) -> None:

@@ -46,7 +46,7 @@ from ..model.top import Top
 from ..modes.inversion_problem import InversionProblem
 from ..modes.sliding import Slide, modes
 from ..modes.trajectory_problem import TrajectoryProblem
-from .checks import check_run
+from .checks import check_revolution, check_run
 from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, UNITS
 from .trajectory import Trajectory, simulate
@@ -124,6 +124,7 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
     """The contents of the page. **Arguments:** as for `explore`."""
     check_run(scene, launch, t1, TOLERANCE)
     check_modes(scene)
+    check_revolution(scene, "explore")
     roots = {"scene": scene, "launch": launch}
     ranges = default_ranges(scene, launch) if sliders is None else sliders
     # The stem's end counts from the centre of mass: moving that would change the shape.

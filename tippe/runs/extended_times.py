@@ -88,16 +88,16 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         # Every run has a time. A select on NaN would make the derivative of a failed run zero.
         return jnp.zeros(jnp.shape(value), bool)
 
-    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         return self._extended((), self._problem(leaves[: self.movable], cells), leaves, cells)[0]
 
-    def with_slopes(
-        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    def value_and_tangents(
+        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         problem, tangents, gather = tangents_by(self._problem, active, leaves[: self.movable], cells)
 
         def run(group: tuple[Any, ...]) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-            return self._extended(group, problem, leaves, cells, again)
+            return self._extended(group, problem, leaves, cells, nested)
 
         times, slopes = in_groups(run, tangents)
         return times, gather(slopes)
@@ -114,7 +114,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         problem: InversionProblem,
         leaves: tuple[Array, ...],
         cells: int,
-        again: bool = False,
+        nested: bool = False,
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         """The extended times of every cell, and their derivatives along tangents (as of `VariationalProblem`)."""
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
@@ -122,7 +122,7 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         # A fit may try parameters that are far off.
         settings = Settings(tolerance, max_steps=MOST_STEPS)
         queue = LaneScheduler.of(
-            varied, t1, jnp.asarray(cells), settings, one_kernel=not again, n_blocks=1 + len(tangents)
+            varied, t1, jnp.asarray(cells), settings, one_kernel=not nested, n_blocks=1 + len(tangents)
         )
         outcome, _ = queue.outcome()
         state, *variations = varied.parts(outcome.state)

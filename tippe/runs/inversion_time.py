@@ -82,13 +82,30 @@ def inversion_time(
     method = Settings(tolerance, solver).for_lanes
     explicit_tableau(method)
     warn_if_it_cannot_invert(scene, launch, launch.theta)
-    leaves, structure = jax.tree.flatten((scene, launch, as_number(angle), as_number(t1), as_number(tolerance)))
+    return first_or_last_time(scene, launch, t1, as_number(angle), tolerance, crossing, method)
+
+
+def first_or_last_time(
+    scene: Scene,
+    launch: Launch,
+    t1: float,
+    angle: Float[Array, ""] | None,
+    tolerance: float,
+    crossing: str,
+    method: diffrax.AbstractSolver,
+) -> Float[Array, ""]:
+    """The time of a launch's event: that theta reaches an angle, or, without one, that the spin about the normal reverses.
+
+    **Arguments:** as for `inversion_time`, checked.
+    """
+    leaves, structure = jax.tree.flatten((scene, launch, angle, as_number(t1), as_number(tolerance)))
     unchecked = any(is_traced(leaf) for leaf in leaves)
     # The last two leaves, horizon and tolerance, do not affect the event.
     solve = InversionSolve(len(leaves) - 2, structure, method, crossing == "last", unchecked)
     time = differentiable_solve(solve, *leaves)
     if not is_traced(time) and not unchecked and np.isnan(time):
-        explain_failure(scene, launch, float(t1), np.asarray(angle).item(), float(tolerance), crossing, method)
+        known = None if angle is None else np.asarray(angle).item()
+        explain_failure(scene, launch, float(t1), known, float(tolerance), crossing, method)
     return nan_if_illegal(time, structure, unchecked, leaves)
 
 
@@ -96,7 +113,7 @@ def explain_failure(
     scene: Scene,
     launch: Launch,
     t1: float,
-    angle: float,
+    angle: float | None,
     tolerance: float,
     crossing: str,
     solver: diffrax.AbstractSolver,
@@ -114,15 +131,16 @@ def explain_failure(
     word = runs.run_kind.words[cell["status"]]
     if word == "failed" and cell["steps"] >= most:
         raise ValueError(too_many_steps(t1, most, cell["end_time"]))
+    event = "reversal" if angle is None else "inversion"
     warnings.warn(
-        f"the inversion time is NaN: the run ended as {word!r} at {cell['end_time']:.6g} s, at {cell['end_theta']:.6g} rad",
+        f"the {event} time is NaN: the run ended as {word!r} at {cell['end_time']:.6g} s, at {cell['end_theta']:.6g} rad",
         UserWarning,
         stacklevel=4,
     )
 
 
 class InversionSolve(AbstractDifferentiableSolve):
-    """Inversion times of cells; the leaves are those of scene and launch, the angle, the horizon, the tolerance."""
+    """Inversion times of cells; the leaves are those of scene and launch, the angle if any, the horizon, the tolerance."""
 
     movable: int
     # JAX's PyTreeDef, which type checkers take for a variable.
@@ -135,25 +153,25 @@ class InversionSolve(AbstractDifferentiableSolve):
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isinf(value)
 
-    def answer(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
+    def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         inversions = self._inversions((*leaves[: self.movable], tolerance), cells)
         outcome = inversions.solve(t1, cells, Settings(tolerance, self.solver), traced())
         return self._times(leaves, may, inversions, outcome, [])[0]
 
-    def with_slopes(
-        self, active: tuple[int, ...], again: bool, cells: int, *leaves: Float[Array, "..."]
+    def value_and_tangents(
+        self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         # Cells are independent, so varying a parameter in all of them at once gives each its own derivative.
         moving = (*leaves[: self.movable], tolerance)
         inversions, tangents, gather = tangents_by(self._inversions, active, moving, cells)
         check_differentiable(self._modules(leaves)[0])
-        if again and not inversions.kind.smooth:
+        if nested and not inversions.kind.smooth:
             raise ValueError(
-                "second derivatives do not go through changes of phase: contact = 'hybrid', SetValuedCoulomb"
+                "second derivatives are not available through changes of mode: contact = 'hybrid', SetValuedCoulomb"
             )
-        settings, solvers = Settings(tolerance, self.solver), traced(one_kernel=not again)
+        settings, solvers = Settings(tolerance, self.solver), traced(one_kernel=not nested)
         outcome, slopes, _ = inversions.solve_with_tangents(tangents, t1, cells, settings, solvers)
         return self._times(leaves, may, inversions, outcome, gather([*slopes]))
 

@@ -96,7 +96,7 @@ def launches(
     values = {paths[name]: value for name, value in launch_values.items() if name != "mu" or value is not None}
     for number in values:
         if number in axes:
-            raise ValueError(f"axes: {number!r} is an argument of its own")
+            raise ValueError(f"axes: {number!r} has its own argument")
     values |= axes
     fixed = {number: value for number, value in values.items() if np.ndim(value) == 0}
     launch, several = _with_room(scene, values)

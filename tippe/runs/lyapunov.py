@@ -20,6 +20,7 @@ from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.state import joined, parts
 from ..modes.inversion_problem import InversionProblem
+from .checks import check_revolution
 from .run_kind import run_kind_of
 
 #: Number of time intervals with recorded growth; half of them give the exponent and its scatter.
@@ -97,9 +98,10 @@ def lyapunov_exponent(
     """
     require_kind(scene, "scene", Scene)
     require_kind(launch, "launch", Launch)
+    check_revolution(scene, "lyapunov_exponent")
     if not run_kind_of(scene).smooth:
         raise ValueError(
-            "contact = 'hybrid' and SetValuedCoulomb have no exponents: variations end at a change of phase"
+            "contact = 'hybrid' and SetValuedCoulomb have no exponents: variations end at a change of mode"
         )
     require(t1, "t1", above=0.0)
     tolerance_bound(tolerance).require()

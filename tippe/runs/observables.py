@@ -20,8 +20,9 @@ from nonholonomic.sweeps import Table, Tabular
 from nonholonomic.validation import is_traced, require, require_increasing
 from nonholonomic.views import Stage, Viewable
 
+from ..model.dynamics import stacked
+from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
-from ..model.state import angular_velocity, parts
 from ..model.top import Top
 from .quantities import OF_ONE_RUN, QUANTITIES, table_of
 from .view import as_stages
@@ -120,9 +121,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         **Raises:** `ValueError` for a run that was made inside a transformation, and for a batch.
         """
         if self.dense is None:
-            raise ValueError(
-                "a run made inside jit, vmap or grad has no dense output to find the time on: use tippe.inversion_time there"
-            )
+            raise ValueError("a run made inside jit, vmap or grad has no dense output: use tippe.inversion_time there")
 
         def beyond(times: Float[np.ndarray, " looks"]) -> Float[np.ndarray, " looks"]:
             return np.asarray(self.resampled(times).theta) - INVERTED
@@ -176,8 +175,9 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     @of_each_run
     def velocity(self) -> Float[Array, "times 3"]:
         """Velocity of the point whose path is `position` [m/s]."""
-        motion, axis = self.scene.dynamics.motion(self.states), parts(self.states).axis
-        beside = jax.jvp(self.scene.body.path_from_frame, (axis,), (motion.rate[2:5],))[1]
+        motion = self.scene.dynamics.motion(self.states)
+        rate = stacked(motion.rate, self.states)
+        beside = jax.jvp(self.scene.path_from_frame, (self.states,), (rate,))[1]
         return self._fixed(sum_vectors((*motion.velocity, self.above[1]), beside))
 
     @of_each_run
@@ -186,7 +186,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         cylinder's axis x = z = 0, and a run on the plane starts above the origin."""
         frame, where = self.scene.frame, (self._place, self._path)
         centre = sum_vectors(frame.position(*where), scale(self.above[0], frame.axes(*where)[2]))
-        beside = self.scene.body.path_from_frame(parts(self.states).axis)
+        beside = self.scene.path_from_frame(self.states)
         point = jnp.stack(centre, axis=-1)
         return point if beside == (None, None, None) else point + self._fixed(beside)
 
@@ -204,7 +204,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         **Raises:** `ValueError` for times outside the run, or if the run was made inside a transformation.
         """
         if self.dense is None:
-            raise ValueError("a run made inside jit, vmap or grad has no dense output: hand `times` to simulate")
+            raise ValueError("a run made inside jit, vmap or grad has no dense output: pass `times` to simulate")
         times = np.asarray(times, dtype=float)
         require(times, "times", at_least=0.0, at_most=self.end_time, why="the run ends there")
         require_increasing(times, "times")
@@ -237,14 +237,17 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
     @of_each_run
     def angular_velocity(self) -> Float[Array, "times 3"]:
         """Angular velocity of the body [rad/s]."""
-        _, e, L, _ = parts(self.states)
-        return self._fixed(angular_velocity(self.scene.body, e, L))
+        return self._fixed(self.scene.angular_velocity(self.states))
 
     @of_each_run
     def rotation(self) -> Float[Array, "times 3 3"]:
         """Rotation from the body to the fixed frame: its columns are the body's axes, and the third is e. At the start,
-        the first is de/dtheta, which points from e away from the arena's normal."""
+        the first is de/dtheta, which points from e away from the arena's normal, but for an `Ellipsoid` or a `RigidBody`."""
         # Step errors change the unit length of both vectors and their right angle.
+        if isinstance(self.scene.body, AbstractRigidBody):
+            e, x = unit(self.axis), self._fixed(tuple(self.states[-3:]))
+            aside = unit(jnp.cross(e, x))
+            return jnp.stack([jnp.cross(aside, e), aside, e], axis=-1)
         e, angle = unit(self.axis), self.spin_angle[:, None]
         aside = unit(jnp.cross(e, self._fixed(tuple(self.cyclic[-3:]))))
         across = jnp.cross(aside, e)
@@ -258,7 +261,8 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
 
     @property
     def _place(self) -> tuple[Array, ...]:
-        return tuple(self.states[8:])
+        place = tuple(self.states[8:])
+        return place[:-3] if isinstance(self.scene.body, AbstractRigidBody) else place
 
     def _fixed(self, vector: Vector) -> Float[Array, "times 3"]:
         axes = self.scene.frame.axes(self._place, self._path)
@@ -275,7 +279,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
             f"  theta: {float(self.theta[0]):.6g} to {float(self.theta[-1]):.6g} rad",
         ]
         if word == "contact_lost" and self.scene.contact == "stop" and isinstance(self.scene.body, Top):
-            lines.append("  the top flies on from there in a Scene with contact='hybrid'")
+            lines.append("  to continue through the flight, use a Scene with contact='hybrid'")
         if "axis_drift" in self.stats:
             lines.append(f"  steps: {self.stats['accepted']} accepted, {self.stats['rejected']} rejected")
             lines.append(f"  drift of |e|: {self.stats['axis_drift']:.1e}")

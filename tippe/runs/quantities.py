@@ -8,6 +8,8 @@ from nonholonomic.parameters import description
 from nonholonomic.sweeps import Quantity, Table, run_table
 from nonholonomic.validation import require_one_run
 
+from ..model.rigid_body import AbstractRigidBody
+
 QUANTITIES = {
     "theta": Quantity("rad", "inclination θ"),
     "eta": Quantity("rad", "place η"),
@@ -33,6 +35,13 @@ OF_ONE_RUN = {
     "work": Quantity("J", "work of friction"),
 }
 
+#: Quantities of a single run of a body of any shape and inertia.
+OF_RIGID_BODIES = {
+    "normal_spin": Quantity("rad s-1", "spin about the normal"),
+    "grip": Quantity("1", "friction over normal force"),
+    "reaction": Quantity("N", "force of the arena", "component"),
+}
+
 
 def table_of(run: Any) -> Table:
     """All quantities of a run, over its times.
@@ -43,6 +52,8 @@ def table_of(run: Any) -> Table:
     """
     require_one_run(run, "to_table", "; trajectory_table makes a table of many")
     quantities = QUANTITIES | OF_ONE_RUN
+    if isinstance(run.scene.body, AbstractRigidBody):
+        quantities |= OF_RIGID_BODIES
     dims = [quantity.components for quantity in quantities.values() if quantity.components is not None]
     coords = {"time": np.asarray(run.t)} | {dim: np.array(COMPONENTS[dim]) for dim in dict.fromkeys(dims)}
     values = {name: np.asarray(quantity.of(name, run)) for name, quantity in quantities.items()}

@@ -53,6 +53,7 @@ COUNTED = {"steps": "steps", "rejected": "rejected steps", "hops": "flights", "s
 WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit")
 
 SMOOTH = RunKind(WORDS, (), None)
+REVERSAL = RunKind(("reversed", "not_reversed", *WORDS[2:]), (), None)
 STICK_SLIP = RunKind((*WORDS, "unresolved"), ("sticks",), stick_slip_modes)
 HYBRID = RunKind((*WORDS, "unresolved"), ("hops",), hybrid_modes)
 AIRBORNE = RunKind((*WORDS, "unresolved"), ("hops",), airborne.modes, flight_state=True)
@@ -76,6 +77,5 @@ def check_differentiable(scene: Scene[Any]) -> None:
     """Raise `ValueError` for a scene whose modes do not support derivatives."""
     if run_kind_of(scene) is STICK_SLIP_FLY:
         raise ValueError(
-            "friction = SetValuedCoulomb with contact = 'hybrid' has no derivatives: they do not go through impacts in which a "
-            "slip may stop"
+            "friction = SetValuedCoulomb with contact = 'hybrid' has no derivatives, because an impact may stop a slip"
         )

@@ -29,7 +29,7 @@ def sensitivity_names(roots: dict[str, Any], names: Any) -> list[str]:
     known = [name for root, tree in roots.items() for name, value in numbers(root, tree).items() if value is not None]
     full_names = [full_name("sensitivities", name, known) for name in names]
     if len(set(full_names)) < len(full_names):
-        raise ValueError(f"sensitivities = {names!r} must name every number once")
+        raise ValueError(f"sensitivities = {names!r} must name every parameter only once")
     return full_names
 
 
@@ -42,15 +42,15 @@ def sensitivity_columns(names: list[str]) -> list[str]:
     ]
 
 
-def sensitivity_variables(names: list[str], units: dict[str, str]) -> dict[str, Variable]:
-    """The table's variables, with their units."""
+def sensitivity_variables(names: list[str], units: dict[str, str], event: str = "inversion") -> dict[str, Variable]:
+    """The table's variables, with their units; `event`: what is timed."""
 
     def unit(name: str) -> str:
         of_number = units.get(name.rsplit(".", 1)[-1], "1")
         return "s" if of_number == "1" else f"s ({of_number})-1"
 
     return {
-        slope: Variable(unit(name), np.float64, long_name=f"inversion time by {name}")
+        slope: Variable(unit(name), np.float64, long_name=f"{event} time by {name}")
         for slope, name in zip(sensitivity_columns(names), names, strict=True)
     }
 
@@ -59,7 +59,7 @@ def sensitivities_of_cells(
     roots: dict[str, Any],
     columns: dict[str, Any],
     names: list[str],
-    angle: float,
+    angle: float | None,
     t1: float,
     settings: Settings,
     *,
@@ -78,7 +78,7 @@ def sensitivities_of_cells(
     **Returns:** the outcome; name of the variable -> derivatives (size,); and the cells whose derivatives are NaN
     because an earlier event was grazing.
     """
-    numbers = (jnp.asarray(angle, float), settings.tolerance)
+    numbers = (None if angle is None else jnp.asarray(angle, float), settings.tolerance)
     inversions, tangents, scales = _with_tangents(roots, columns, names, *numbers, size, last)
     outcome, slopes, grazing = inversions.solve_with_tangents(tangents, t1, count, settings)
     by_number = [np.asarray(slope) / np.asarray(scale) for slope, scale in zip(slopes, scales, strict=True)]
@@ -90,7 +90,7 @@ def _with_tangents(
     roots: dict[str, Any],
     columns: dict[str, Any],
     names: list[str],
-    angle: Float[Array, ""],
+    angle: Float[Array, ""] | None,
     tolerance: Float[Array, ""],
     size: int,
     last: bool,

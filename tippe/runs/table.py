@@ -16,9 +16,9 @@ from nonholonomic.validation import require_flag, require_outside, require_whole
 
 from ..model.scene import Scene
 from .cells import InversionRuns, too_many_steps
-from .checks import check_event, warn_if_it_cannot_invert
+from .checks import check_event, check_reversible, warn_if_it_cannot_invert
 from .launches import described, launches, rows
-from .run_kind import check_differentiable, run_kind_of
+from .run_kind import REVERSAL, check_differentiable, run_kind_of
 from .sensitivities import sensitivity_names, sensitivity_variables
 from .time_error import errors_of, second_tolerance
 
@@ -129,23 +129,56 @@ def inversion_table(
     if method == "diffrax" and crossing != "first":
         raise ValueError(f"crossing = {crossing!r} must be 'first' for method = 'diffrax'")
     launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin, "azimuth": azimuth}
+    options = (solver, method, scattered, errors, sensitivities, path, progress, executor, max_steps)
+    return event_table(scene, launch_values, axes, t1, angle, tolerance, crossing, *options)
+
+
+def event_table(
+    scene: Scene,
+    launch_values: dict[str, Any],
+    axes: dict[str, Any] | None,
+    t1: float,
+    angle: float | None,
+    tolerance: float,
+    crossing: str,
+    solver: diffrax.AbstractERK | None,
+    method: str,
+    scattered: bool,
+    errors: bool,
+    sensitivities: Sequence[str],
+    path: Any,
+    progress: bool,
+    executor: Executor | None,
+    max_steps: int,
+) -> Table:
+    """The table of the times at which theta reaches an angle, or, without one, the spin about the normal reverses.
+
+    **Arguments:** as for `inversion_table`; `launch_values`: number of the launch, or "mu" -> a number or a list.
+    """
     roots, grid, units = launches(scene, launch_values, axes, t1, tolerance, scattered=scattered)
     require_whole(max_steps, "max_steps", 1)
     settings = Settings(tolerance, solver)
     integrator = settings.for_single_runs if method == "diffrax" else settings.for_lanes
     explicit_tableau(integrator)
     paths = sensitivity_names(roots, sensitivities)
-    run_kind = run_kind_of(scene)
+    run_kind = run_kind_of(scene) if angle is not None else REVERSAL
     if paths:
         check_differentiable(scene)
     if not run_kind.smooth and method == "diffrax":
-        raise ValueError("method = 'diffrax' is not for runs of several phases: contact = 'hybrid' or SetValuedCoulomb")
+        raise ValueError(
+            "method = 'diffrax' does not support runs of several modes: contact = 'hybrid' or SetValuedCoulomb"
+        )
     looked_at = {axis.number: axis.values for axis in grid}
-    warn_if_it_cannot_invert(scene, roots["launch"], looked_at.get("launch.theta", roots["launch"].theta))
-    runs = InversionRuns(run_kind, float(t1), float(angle), crossing, integrator, method, paths, int(max_steps))
+    if angle is None:
+        check_reversible(roots["launch"], looked_at)
+    else:
+        warn_if_it_cannot_invert(scene, roots["launch"], looked_at.get("launch.theta", roots["launch"].theta))
+        angle = float(angle)
+    runs = InversionRuns(run_kind, float(t1), angle, crossing, integrator, method, paths, int(max_steps))
     job = InversionJob(runs, roots, float(tolerance), errors)
 
-    request = {"t1": float(t1), "angle": float(angle), "tolerance": float(tolerance), "crossing": crossing}
+    event = {"event": "reversal"} if angle is None else {"angle": angle}
+    request = {"t1": float(t1), **event, "tolerance": float(tolerance), "crossing": crossing}
     request = described(roots, grid) | request | {"solver": type(integrator).__name__, "method": method}
     variables = runs.variables
     if max_steps != DEFAULT_MAX_STEPS:
@@ -155,7 +188,7 @@ def inversion_table(
         variables = variables | runs.error_variables
     if paths:
         request |= {"sensitivities": paths}
-        variables = variables | sensitivity_variables(paths, units)
+        variables = variables | sensitivity_variables(paths, units, "reversal" if angle is None else "inversion")
     if scattered:
         columns = rows(grid)
         request |= {"cells": digest(columns)}

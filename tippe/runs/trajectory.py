@@ -35,6 +35,7 @@ from nonholonomic.validation import (
 )
 from nonholonomic.xla_cpu import on_device
 
+from ..model.friction import length
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..modes.trajectory_problem import TrajectoryProblem
@@ -105,6 +106,25 @@ class Trajectory(AbstractTrajectory):
     def normal_force(self) -> Float[Array, " times"]:
         """Normal force [N]."""
         return self.scene.normal_force(self.states)
+
+    @of_each_run
+    def reaction(self) -> Float[Array, "times 3"]:
+        """Force of the arena on the body [N]: normal force and friction."""
+        motion = self.scene.dynamics.motion(self.states)
+        f1, f2 = motion.friction.force
+        return self._fixed(scale(motion.normal_force, (f1, f2, 1.0)))
+
+    @of_each_run
+    def grip(self) -> Float[Array, " times"]:
+        """Friction over normal force [1]: the coefficient of friction that the contact needs at least."""
+        motion = self.scene.dynamics.motion(self.states)
+        f1, f2 = (jnp.zeros_like(self.t) if part is None else part for part in motion.friction.force)
+        return length(f1, f2)
+
+    @of_each_run
+    def normal_spin(self) -> Float[Array, " times"]:
+        """Angular velocity about the arena's normal [rad/s]."""
+        return self.scene.angular_velocity(self.states)[2]
 
     @of_each_run
     def contact(self) -> Float[Array, "times 3"]:
@@ -195,7 +215,7 @@ def simulate(
     if not reached.size:
         raise ValueError(
             f"times = {shown(times)} are all after the end of the run at {float(trajectory.end_time):.6g} s "
-            f"({trajectory.status}): ask for earlier times, or leave `times` out to get those of the steps"
+            f"({trajectory.status}): pass earlier times, or omit `times` to get those of the steps"
         )
     return trajectory.at(reached)
 
@@ -236,14 +256,14 @@ def _traced(
 ) -> Trajectory | HybridTrajectory:
     if scene.friction.set_valued:
         raise ValueError(
-            f"friction = {type(scene.friction).__name__} must be a law without phases inside jit, vmap and grad"
+            f"friction = {type(scene.friction).__name__} must be a law with a single mode inside jit, vmap and grad"
         )
     if times is None:
         raise ValueError("times must be given inside jit, vmap and grad, where the number of steps is not known")
     settings = Settings(tolerance, solver)
     if scene.contact == "hybrid":
         if adjoint is not None:
-            raise ValueError(f"adjoint = {adjoint!r} must be left out for contact = 'hybrid'")
+            raise ValueError(f"adjoint = {adjoint!r} must be omitted for contact = 'hybrid'")
         explicit_tableau(settings.for_lanes)
         return (sampled_hybrid if scene.flies_in_closed_form else sampled_airborne)(scene, launch, times, t1, settings)
     samples = sampled(scene, launch, times, t1, settings, adjoint)

@@ -96,11 +96,11 @@ def trajectory_table(
     require(times[-1], "times[-1]", above=0.0, why="it is the horizon")
     launch_values = {"theta": theta, "eta": eta, "mu": mu, "spin": spin}
     roots, grid, _ = launches(scene, launch_values, axes, times[-1], tolerance, taken=QUANTITIES)
-    why = "for trajectory_table: runs with phases are sampled one by one, by simulate"
+    why = "for trajectory_table: simulate samples runs of several modes, one by one"
     if scene.contact == "hybrid":
         raise ValueError(f"contact = 'hybrid' must be 'stop' {why}")
     if scene.friction.set_valued:
-        raise ValueError(f"friction = {type(scene.friction).__name__} must be a law without phases {why}")
+        raise ValueError(f"friction = {type(scene.friction).__name__} must be a law with a single mode {why}")
 
     inner = [axis("time", "time", "s", times, "time")]
     variables = {}
@@ -150,5 +150,5 @@ def _names(quantities: Any) -> tuple[str, ...]:
         if name not in QUANTITIES:
             raise ValueError(f"quantities: {name!r} must be one of {', '.join(QUANTITIES)}")
         if quantities.count(name) > 1:
-            raise ValueError(f"quantities: {name!r} must be there once only")
+            raise ValueError(f"quantities: {name!r} must be named only once")
     return tuple(quantities)

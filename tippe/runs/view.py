@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from nonholonomic.geometry import vector_of
 from nonholonomic.parameters import distinguishing_labels
 from nonholonomic.validation import require_one_run
 from nonholonomic.views import (
@@ -29,6 +30,7 @@ from nonholonomic.views import (
 )
 
 from ..model.body import AbstractBody
+from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.top import Top
 
@@ -84,7 +86,11 @@ class Motion(NamedTuple, Generic[Numbers]):
             stem = position + (body.stem.offset - body.offset) * axis - body.stem.radius * normal
             contact = jnp.where((run.contact == 1)[:, None], stem, contact)
         turning = run.angular_velocity
-        along = jnp.sum(turning * axis, axis=-1, keepdims=True)
+        if isinstance(body, AbstractRigidBody):
+            momentum = run.angular_momentum
+        else:
+            along = jnp.sum(turning * axis, axis=-1, keepdims=True)
+            momentum = body.I1 * turning + (body.I3 - body.I1) * along * axis
         return Motion(
             run.t,
             position,
@@ -98,7 +104,7 @@ class Motion(NamedTuple, Generic[Numbers]):
             run.jellett,
             run.normal_force,
             turning,
-            body.I1 * turning + (body.I3 - body.I1) * along * axis,
+            momentum,
         )
 
 
@@ -109,7 +115,7 @@ _turning = eqx.filter_jit(lambda run: jnp.linalg.norm(run.angular_velocity, axis
 def as_stages(runs: list[Any], overlaid: bool) -> list[Stage]:
     """Runs as stages: one stage for each, or a common one for overlaid runs."""
     for run in runs:
-        require_one_run(run, "a picture", ", and hand the others over as others=")
+        require_one_run(run, "a picture", ", and pass the others as others=")
     starts = [f"θ(0) = {float(run.theta[0]):.3g} rad, {float(run.spin[0]):.4g} rad/s" for run in runs]
     names = distinguishing_labels(starts, [run.scene for run in runs])
     named = [(name, run.scene, motion(run)) for name, run in zip(names, runs, strict=True)]
@@ -205,8 +211,10 @@ def aside(normal: Float[Array | np.ndarray, "times 3"]) -> Float[Array, "times 3
     return across / jnp.linalg.norm(across, axis=-1, keepdims=True)
 
 
-def meshes(body: AbstractBody, colour: int) -> tuple[Mesh, ...]:
+def meshes(body: AbstractBody | AbstractRigidBody, colour: int) -> tuple[Mesh, ...]:
     """The body in two colours; for a top with its stem, or with a short stem that only shows the axis."""
+    if isinstance(body, AbstractRigidBody):
+        return tuple(mesh._replace(vertices=touching(body, mesh.vertices)) for mesh in ball(1.0, (colour, PALE)))
     if not isinstance(body, Top):
         return striped(profile(body), (colour, PALE))
     radius = float(body.radius)
@@ -215,6 +223,12 @@ def meshes(body: AbstractBody, colour: int) -> tuple[Mesh, ...]:
         return (*sphere, rod(0.10 * radius, 0.9 * radius, AXIS * radius - 0.16 * radius, 0.16 * radius, DARK))
     knob, end = float(body.stem.radius), float(body.stem.offset - body.offset)
     return (*striped(truncated(radius, knob, end), (colour, PALE)), rod(0.999 * knob, 0.0, end, knob, DARK))
+
+
+def touching(body: AbstractRigidBody, directions: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3"]:
+    """The points of a body's surface with some outward unit normals, from the centre of mass, in the body's axes [m]."""
+    normal, still = vector_of(-jnp.asarray(directions).T), jnp.zeros(len(directions))
+    return np.stack(body.contact(normal, (still, still, still))[0], axis=-1)
 
 
 def truncated(radius: float, knob: float, end: float) -> Float[np.ndarray, "points 2"]:

@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 from cheap_sweep import BLOCK, cheap_sweep, resumed
-from struck import half_finished
+from disk_faults import half_finished
 
 from nonholonomic.sweeps import Table
 
@@ -110,9 +110,9 @@ def test_a_changed_number_is_refused_by_a_reader_and_repaired_by_a_sweep(tmp_pat
     cheap_sweep(path)
     with h5py.File(path, "r+") as file:
         file["value"][2 * BLOCK + 1] += 1e-16
-    with pytest.raises(OSError, match=r"cannot read .*table\.h5: it is damaged: 1 of its 7 blocks do not match"):
+    with pytest.raises(OSError, match=r"cannot read .*table\.h5: it is damaged: 1 of its 7 chunks do not match"):
         Table.load(path)
-    with pytest.warns(RuntimeWarning, match=r"table\.h5 is damaged: 1 finished blocks .* computed again"):
+    with pytest.warns(RuntimeWarning, match=r"table\.h5 is damaged: 1 finished chunks .* computed again"):
         cheap_sweep(path)
     with h5py.File(path, "r+") as file:
         file["value"][2 * BLOCK + 1] += 1e-16
@@ -175,7 +175,7 @@ def test_foreign_files_and_folders_are_left_alone(images, tmp_path):
         assert path.read_bytes() == before
     saved = tmp_path / "saved.h5"
     saved.write_bytes(images["saved"])
-    with pytest.raises(ValueError, match=r"saved\.h5 holds .*: it was not written by a sweep in 7 blocks"):
+    with pytest.raises(ValueError, match=r"saved\.h5 holds .*: it was not written by a sweep in 7 chunks"):
         cheap_sweep(saved, pytest.fail)
     folder = tmp_path / "folder"
     folder.mkdir()

@@ -127,7 +127,7 @@ def test_a_block_whose_worker_dies_is_computed_by_another(way, tmp_path, request
 @pytest.mark.parametrize("way", ["processes", pytest.param("dask", marks=pytest.mark.slow)])
 def test_a_block_that_three_workers_die_of_is_failed_and_the_others_are_not(way, tmp_path, request):
     job, path = CheapJob(tmp_path, deadly=2, crashes=99), tmp_path / "table.h5"
-    told = r"cells 16 to 23 \(x 0\.326\d* to 0\.469\d*\) are given up as failed: 3 workers or more died of them"
+    told = r"cells 16 to 23 \(x 0\.326\d* to 0\.469\d*\) are given up as failed: they killed 3 workers or more"
     with pytest.warns(RuntimeWarning, match=told):
         table = cheap_sweep(path, job=job, executor=request.getfixturevalue(way))
     # Dask blames blocks that only waited at a worker that died, too; nobody else kills workers here.
@@ -142,7 +142,7 @@ def test_a_block_that_three_workers_die_of_is_failed_and_the_others_are_not(way,
 def test_a_pool_that_breaks_ends_the_sweep_and_another_goes_on(processes, tmp_path):
     """Python's own pool has no more workers after the first that dies."""
     job, path = CheapJob(tmp_path, deadly=3, crashes=1, pause=0.05), tmp_path / "table.h5"
-    told = r"takes no more blocks .*; 24 of 50 cells are done, .*table\.h5 has"
+    told = r"accepts no more chunks .*; 24 of 50 cells are done, .*table\.h5 has"
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, spawn) as pool, pytest.raises(RuntimeError, match=told):
         cheap_sweep(path, job=job, executor=pool)
@@ -184,7 +184,7 @@ def test_a_scheduler_that_dies_ends_the_sweep_and_threads_go_on(tmp_path):
         with distributed.Client(scheduler_file=str(address), timeout=60) as client:
             killer.start()
             with pytest.raises(
-                RuntimeError, match=r"cancelled its blocks; .* cells are done, .*table\.h5 has what is done"
+                RuntimeError, match=r"cancelled its chunks; .* cells are done, .*table\.h5 has the finished chunks"
             ):
                 cheap_sweep(path, job=job, executor=client.get_executor())
     finally:
@@ -335,7 +335,7 @@ def test_who_computes_and_what_is_shown_is_checked_before_a_file_is_there(change
 def test_an_executor_that_is_shut_down_takes_no_blocks():
     pool = ThreadPoolExecutor(1)
     pool.shutdown()
-    with pytest.raises(ExecutorBroken, match="takes no more blocks"):
+    with pytest.raises(ExecutorBroken, match="accepts no more chunks"):
         next(handed_out(lambda block: pool.submit(abs, block), range(3), 2))
-    with pytest.raises(RuntimeError, match=f"0 of {CELLS} cells are done, nothing is kept without path="):
+    with pytest.raises(RuntimeError, match=f"0 of {CELLS} cells are done, without path=, nothing is saved"):
         cheap_sweep(None, executor=pool)

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from cheap_sweep import BLOCK, cheap_sweep, finished_blocks, resumed
-from struck import FOR_A_BLOCK, FOR_THE_FILE, FOR_THE_FOLDER, ContactImpulse, resolve_impact
+from disk_faults import FOR_A_BLOCK, FOR_THE_FILE, FOR_THE_FOLDER, Killed, fail_on_disk
 
 from nonholonomic.sweeps import Table, running
 from nonholonomic.sweeps._chunks import ChunkStore
@@ -51,19 +51,17 @@ def test_sweeps_killed_at_a_hundred_random_moments(tmp_path):
     assert files > 10
 
 
-@pytest.mark.parametrize(
-    "error", [ContactImpulse(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))], ids=["killed", "full"]
-)
+@pytest.mark.parametrize("error", [Killed(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))], ids=["killed", "full"])
 def test_every_moment_of_writing(tmp_path, error):
     """Struck down in each operation of the first three blocks, in the middle of it or before, and of the file: none is lost."""
     ends = FOR_THE_FOLDER + 7 * FOR_A_BLOCK
     for moment in (*range(FOR_THE_FOLDER, FOR_THE_FOLDER + 3 * FOR_A_BLOCK + 1), *range(ends, ends + FOR_THE_FILE)):
         path = tmp_path / f"{moment}.h5"
         with pytest.MonkeyPatch.context() as patch:
-            resolve_impact(patch, moment, torn=(moment % 3) / 2.0, error=error)
-            with pytest.raises(ContactImpulse if isinstance(error, ContactImpulse) else OSError) as raised:
+            fail_on_disk(patch, moment, torn=(moment % 3) / 2.0, error=error)
+            with pytest.raises(Killed if isinstance(error, Killed) else OSError) as raised:
                 cheap_sweep(path)
-        if not isinstance(error, ContactImpulse):
+        if not isinstance(error, Killed):
             assert re.fullmatch(rf"cannot write {path}(\.blocks/\d\.npz)?: No space left on device", str(raised.value))
         after = finished_blocks(Table.load(path))
         written = (moment - FOR_THE_FOLDER) // FOR_A_BLOCK
@@ -163,7 +161,7 @@ def test_a_disk_too_small_for_anything(tmp_path, room):
 
 def test_a_disk_too_small_for_the_table(tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
-    told = r"cannot write .*table\.h5: 1e-06 GB are free, and it takes 1\.7e-06 GB on the way"
+    told = r"cannot write .*table\.h5: 1e-06 GB are free, and the table needs 1\.7e-06 GB while"
     with pytest.raises(OSError, match=told):
         cheap_sweep(tmp_path / "table.h5", pytest.fail)
     assert not list(tmp_path.iterdir())
@@ -221,9 +219,9 @@ def test_another_version_is_told_or_refused(tmp_path, monkeypatch):
     path = tmp_path / "table.h5"
     now = running.versions()
     with monkeypatch.context() as patch:
-        resolve_impact(patch, 20, torn=0.0, error=ContactImpulse())
+        fail_on_disk(patch, 20, torn=0.0, error=Killed())
         patch.setattr(running, "versions", lambda: now | {"jax": "0.0.1", "python": "2.7"})
-        with pytest.raises(ContactImpulse):
+        with pytest.raises(Killed):
             cheap_sweep(path)
     with pytest.warns(RuntimeWarning, match=rf"was begun with jax 0\.0\.1, now {now['jax']}: digits may differ"):
         table = cheap_sweep(path)
@@ -234,5 +232,5 @@ def test_another_version_is_told_or_refused(tmp_path, monkeypatch):
         cheap_sweep(path)
     with monkeypatch.context() as patch:
         patch.setattr(running, "versions", lambda: now | {"nonholonomic": "99.0"})
-        with pytest.raises(ValueError, match=r"another run: nonholonomic is .* there and 99\.0 here"):
+        with pytest.raises(ValueError, match=r"another run: nonholonomic is .* in the file and 99\.0 here"):
             cheap_sweep(path)

@@ -156,7 +156,7 @@ def test_an_illegal_cell_inside_a_large_grid_ends_the_sweep_when_its_turn_comes(
 def test_more_cells_than_memory_holds_are_refused_at_once(tmp_path):
     """10^10 of them: without a file for want of memory, with one for want of room on the disk, unless there is that much."""
     many = [axis(name, name, "1", np.arange(1e5)) for name in ("x", "y")]
-    told = r"path = None: 1e\+10 cells take 2\d\d GB, and this machine has .* GB of memory; with path= they are held in a file"
+    told = r"path = None: 1e\+10 cells take 2\d\d GB, and this machine has .* GB of memory; pass path= to keep them in a file"
     with pytest.raises(ValueError, match=told):
         sweep(
             job, many, {"value": VARIABLES["value"], "count": Variable("1", np.int64), "more": VARIABLES["value"]}, {}

@@ -1,4 +1,4 @@
-"""Sweeps that are struck down at a chosen operation on the disk."""
+"""Sweeps that end at a chosen operation on the disk."""
 
 import io
 import itertools
@@ -11,7 +11,7 @@ from cheap_sweep import cheap_sweep, finished_blocks
 from nonholonomic.sweeps import Table
 
 
-class ContactImpulse(BaseException):
+class Killed(BaseException):
     """The end of the process at a chosen moment."""
 
 
@@ -19,11 +19,11 @@ class ContactImpulse(BaseException):
 FOR_THE_FOLDER, FOR_A_BLOCK, FOR_THE_FILE = 4, 4, 3
 
 
-def resolve_impact(monkeypatch, moment, torn, error):
+def fail_on_disk(monkeypatch, moment, torn, error):
     """Have a sweep end at an operation on the disk: before a sync or a renaming, or in a block, of which a part is written."""
     count = itertools.count()
 
-    def struck(function):
+    def failing(function):
         def operation(*arguments):
             if next(count) == moment:
                 raise error
@@ -39,15 +39,15 @@ def resolve_impact(monkeypatch, moment, torn, error):
         if falls:
             raise error
 
-    monkeypatch.setattr(os, "fsync", struck(os.fsync))
-    monkeypatch.setattr(os, "replace", struck(os.replace))
+    monkeypatch.setattr(os, "fsync", failing(os.fsync))
+    monkeypatch.setattr(os, "replace", failing(os.replace))
     monkeypatch.setattr(np, "savez", saved)
 
 
 def half_finished(path):
-    """A sweep that was struck down after three blocks."""
+    """A sweep that ended after three blocks."""
     with pytest.MonkeyPatch.context() as patch:
-        resolve_impact(patch, FOR_THE_FOLDER + 3 * FOR_A_BLOCK, torn=0.5, error=ContactImpulse())
-        with pytest.raises(ContactImpulse):
+        fail_on_disk(patch, FOR_THE_FOLDER + 3 * FOR_A_BLOCK, torn=0.5, error=Killed())
+        with pytest.raises(Killed):
             cheap_sweep(path)
     assert len(finished_blocks(Table.load(path))) == 3

@@ -1,0 +1,102 @@
+"""An ellipsoid of any inertia that slides or rolls on a level plane: a reference in plain NumPy and SciPy, SI units.
+
+A rigid body in space, with nothing of the simulator: centre of mass x, its velocity u, a unit quaternion from the body's axes
+to the fixed ones, and the angular velocity w in the fixed axes. Accelerations and contact force come from one linear system:
+m u' = F - m g z, J w' + w x J w = r x F, and as many conditions on the contact as there are unknown forces. Rolling, the
+velocity of the contact point stays zero as a vector; sliding, its normal component does, and F = N (z + f(slip)).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+UP = np.array((0.0, 0.0, 1.0))
+
+
+def skew(w):
+    return np.array(((0.0, -w[2], w[1]), (w[2], 0.0, -w[0]), (-w[1], w[0], 0.0)))
+
+
+def rotation(q):
+    """The rotation matrix of a quaternion (scalar first) of any length."""
+    s, v = q[0], q[1:]
+    return np.eye(3) + 2.0 * (s * skew(v) + skew(v) @ skew(v)) / (q @ q)
+
+
+@dataclass(frozen=True)
+class Rattleback:
+    """An ellipsoid; `friction` gives the force per newton of N for a slip velocity, `None` for pure rolling."""
+
+    mass: float
+    semi_axes: tuple
+    centre_of_mass: tuple
+    inertia: tuple
+    friction: object = None
+    gravity: float = 9.81
+
+    def lever(self, Q):
+        """The lowest point from the centre of mass, in the fixed axes, and its rate as a function of the angular velocity."""
+        S = Q @ np.diag(np.square(self.semi_axes)) @ Q.T
+        reach = np.sqrt(UP @ S @ UP)
+        centre = -Q @ np.array(self.centre_of_mass)
+        r = centre - S @ UP / reach
+
+        def rate(w):
+            W = skew(w)
+            S_dot = W @ S - S @ W
+            return W @ centre - S_dot @ UP / reach + S @ UP * (UP @ S_dot @ UP) / (2.0 * reach**3)
+
+        return r, rate
+
+    def motion(self, y):
+        """Rates, and the force of the plane."""
+        u, q, w = y[3:6], y[6:10], y[10:13]
+        Q = rotation(q)
+        J = Q @ np.array(self.inertia) @ Q.T
+        r, rate = self.lever(Q)
+        system, right = np.zeros((9, 9)), np.zeros(9)
+        system[:3, :3], system[:3, 6:], right[:3] = self.mass * np.eye(3), -np.eye(3), -self.mass * self.gravity * UP
+        system[3:6, 3:6], system[3:6, 6:], right[3:6] = J, -skew(r), -np.cross(w, J @ w)
+        # The contact point's velocity u + w x r changes at the rate u' + w' x r + w x r'.
+        acceleration, known = np.hstack((np.eye(3), -skew(r))), np.cross(w, rate(w))
+        if self.friction is None:
+            system[6:, :6], right[6:] = acceleration, -known
+        else:
+            slip = u + np.cross(w, r)
+            along = self.friction(slip * (1.0 - UP))
+            system[8, :6], right[8] = acceleration[2], -known[2]
+            for k in range(2):
+                system[6 + k, 6 + k], system[6 + k, 8] = 1.0, -along[k]
+        found = np.linalg.solve(system, right)
+        q_dot = 0.5 * np.concatenate(([-w @ q[1:]], q[0] * w + np.cross(w, q[1:])))
+        return np.concatenate((u, found[:3], q_dot, found[3:6])), found[6:]
+
+    def start(self, theta, azimuth, spin, turning=(0.0, 0.0, 0.0), velocity=(0.0, 0.0)):
+        """The launch of `tippe.Launch` with the contact at the origin: the body is turned by theta about a horizontal axis."""
+        q = np.array(
+            (np.cos(theta / 2), -np.sin(azimuth) * np.sin(theta / 2), np.cos(azimuth) * np.sin(theta / 2), 0.0)
+        )
+        Q = rotation(q)
+        w = spin * Q[:, 2] + turning
+        r, _ = self.lever(Q)
+        u = -np.cross(w, r)
+        if self.friction is not None:
+            u[:2] = velocity
+        return np.concatenate((-r, u, q, w))
+
+    def run(self, y, times, rtol=1e-12):
+        """The states at the times, (times, 13)."""
+        return self._solve(y, times[-1], rtol=rtol, t_eval=times).y.T
+
+    def reversal(self, y, t1, rtol=1e-12):
+        """The first time at which the spin about the vertical vanishes."""
+
+        def spin(t, y):
+            return y[12]
+
+        spin.terminal = True
+        return self._solve(y, t1, rtol=rtol, events=spin).t_events[0][0]
+
+    def _solve(self, y, t1, rtol=1e-12, **options):
+        return solve_ivp(lambda t, y: self.motion(y)[0], (0.0, t1), y, "DOP853", rtol=rtol, atol=1e-2 * rtol, **options)

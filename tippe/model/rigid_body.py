@@ -1,0 +1,285 @@
+"""Bodies of any shape and any inertia: an unbalanced top, a rattleback.
+
+A strictly convex body touches a plane at the point that is farthest against the plane's normal. In the body's own axes that
+point is p(d) = grad h at d = -normal, where the support function h(d), extended to all vectors with degree 1, is the distance
+from the origin of the axes to the plane that the body touches with the outward normal d.
+
+Source: Bonnesen and Fenchel, Theorie der konvexen Koerper (1934), section 15.
+"""
+
+import abc
+import contextlib
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from nonholonomic.geometry import Vector, dot, scale, sum_vectors, vector_of
+from nonholonomic.systems.components import TooLarge, by_components
+from nonholonomic.systems.tracing import with_own_numbers
+from nonholonomic.validation import Bound, Bounded, as_number, is_traced
+
+from .inertia import Inertia
+from .launch import as_numbers
+
+#: Directions in which a support function is evaluated to check that the body is convex.
+SAMPLES = 200
+
+
+class AbstractRigidBody(Bounded):
+    """A strictly convex body of any inertia.
+
+    Its axes x, y and z are fixed in it; theta is the angle from the arena's normal to its z axis.
+    """
+
+    mass: eqx.AbstractVar[Float[Array, "..."]]
+    inertia: eqx.AbstractVar[Inertia]
+    centre_of_mass: eqx.AbstractVar[tuple[Float[Array, "..."], ...]]
+
+    @property
+    @abc.abstractmethod
+    def size(self) -> Float[Array, "..."]:
+        """A length of it [m], by which places and velocities are measured."""
+
+    @abc.abstractmethod
+    def surface_point(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
+        """Where it touches a plane.
+
+        **Arguments:** `normal`: of the plane, towards the body, in the body's axes; `rate`: of change of these components.
+
+        **Returns:** the point [m] in the body's axes, and its rate of change [m/s].
+        """
+
+    def contact(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
+        """The vector r from the centre of mass to the contact [m] in the body's axes, and its rate; arguments as above."""
+        point, point_rate = self.surface_point(normal, rate)
+        return vector_of(sum_vectors(point, scale(-1.0, self.centre_of_mass))), point_rate
+
+    def check_components(self) -> None:
+        """Raise `ValueError` unless the centre of mass has three components."""
+        require_three(self.centre_of_mass, "centre_of_mass")
+
+
+def require_three(value: Any, name: str) -> None:
+    """Raise `ValueError` unless these are three numbers."""
+    if not isinstance(value, tuple) or len(value) != 3:
+        raise ValueError(f"{name} = {value!r} must be three numbers, along the body's axes x, y and z")
+
+
+#: The units of what rigid bodies have in common, as scenes show them and as axes of tables name them.
+UNITS = {"mass": "kg", "centre_of_mass": "m"} | {f"centre_of_mass[{k}]": "m" for k in range(3)} | Inertia.units
+
+
+class Ellipsoid(AbstractRigidBody):
+    """An ellipsoid with any inertia and any centre of mass inside: a rattleback, or a sphere that is not balanced.
+
+    It runs on a plane, level or tilted, under laws of friction that have a force at every slip, or without slip (`NoSlip`).
+    The part that never touches the plane is yours to choose: half an ellipsoid, or a boat, moves like the whole one.
+
+    **Arguments:**
+
+    - `mass`: mass [kg], positive.
+    - `semi_axes`: the three semi-axes [m], along the body's axes x, y and z, positive.
+    - `centre_of_mass`: where the centre of mass is [m], from the centre of the ellipsoid, in the body's axes; inside.
+    - `inertia`: symmetric matrix (3, 3) of the inertia about the centre of mass [kg m^2], in the body's axes. Its principal
+      moments are positive, and the largest is at most the sum of the other two. Tables name the components
+      `"scene.body.inertia.xx"`, `.yy`, `.zz`, `.xy`, `.xz` and `.yz`.
+
+    **Raises:** `ValueError` for numbers outside these ranges.
+
+    **Example:** Kane and Levinson's rattleback, spun against its sense.
+
+    ```
+    >>> import tippe
+    >>> body = tippe.Ellipsoid(
+    ...     mass=1.0,
+    ...     semi_axes=(0.2, 0.03, 0.02),
+    ...     centre_of_mass=(0.0, 0.0, -0.01),
+    ...     inertia=[[2e-4, -2e-5, 0.0], [-2e-5, 1.6e-3, 0.0], [0.0, 0.0, 1.7e-3]],
+    ... )
+    >>> scene = tippe.Scene(body, friction=tippe.NoSlip())
+    >>> time = tippe.reversal_time(scene, tippe.Launch(0.02, spin=-5.0), t1=5.0, tolerance=1e-6)
+    >>> print(f"it spins the other way after {time:.1f} s")
+    it spins the other way after 2.6 s
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = UNITS | {"semi_axes": "m"} | {f"semi_axes[{k}]": "m" for k in range(3)}
+
+    mass: Float[Array, "..."] = eqx.field(converter=as_number)
+    semi_axes: tuple[Float[Array, "..."], ...] = eqx.field(converter=as_numbers)
+    centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(converter=as_numbers)
+    inertia: Inertia = eqx.field(converter=Inertia.of)
+
+    def __check_init__(self):
+        self.check_components()
+        require_three(self.semi_axes, "semi_axes")
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.mass, "mass", above=0.0)
+        for k in range(3):
+            yield Bound(self.semi_axes[k], f"semi_axes[{k}]", above=0.0)
+            yield Bound(self.centre_of_mass[k], f"centre_of_mass[{k}]")
+        depth = sum((place / axis) ** 2 for place, axis in zip(self.centre_of_mass, self.semi_axes, strict=True))
+        yield Bound(depth, "sum of (centre_of_mass / semi_axes)^2", below=1.0, why="the centre of mass lies inside")
+
+    @property
+    def size(self) -> Float[Array, "..."]:
+        a, b, c = self.semi_axes
+        return jnp.maximum(jnp.maximum(a, b), c)
+
+    def surface_point(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
+        # p = -A n / q with q^2 = n.A n, A the squares of the semi-axes.
+        scaled = vector_of(axis * axis * part for axis, part in zip(self.semi_axes, normal, strict=True))
+        per_height = 1.0 / jnp.sqrt(dot(normal, scaled))
+        point = vector_of(scale(-per_height, scaled))
+        along = dot(point, rate)
+        change = (
+            along * part - axis * axis * moved for axis, part, moved in zip(self.semi_axes, point, rate, strict=True)
+        )
+        return point, vector_of(scale(per_height, vector_of(change)))
+
+
+class RigidBody(AbstractRigidBody):
+    """A body of any strictly convex shape, given by its support function, with any inertia.
+
+    It runs where an `Ellipsoid` does.
+
+    **Arguments:**
+
+    - `mass`: mass [kg], positive.
+    - `inertia`: as for `Ellipsoid`.
+    - `support`: function of a unit vector (3,) in the body's axes: how far [m] the body reaches in that direction from the
+      origin of its axes, `jnp.sqrt(jnp.sum((semi_axes * d) ** 2))` for an ellipsoid. Write it with `jax.numpy`, smooth in the
+      neighbourhood of all unit vectors. Both principal radii of curvature must be positive; they are evaluated in 200
+      directions. You can sweep and differentiate the numbers of an `equinox.Module`.
+    - `centre_of_mass`: where the centre of mass is [m] in the body's axes; inside, by default at the origin.
+
+    **Raises:** `ValueError` for numbers outside these ranges, and for a support function of another kind.
+
+    **Example:** an unbalanced top, whose moments of inertia across its axis differ by 4 %.
+
+    ```
+    >>> import jax.numpy as jnp, tippe
+    >>> def support(direction):  # a sphere, whose centre is 6 mm above the centre of mass
+    ...     return 0.02 * jnp.sqrt(jnp.sum(direction**2)) + 0.006 * direction[2]
+    >>> top = tippe.RigidBody(0.02, [[2.94e-6, 0, 0], [0, 3.06e-6, 0], [0, 0, 3.2e-6]], support)
+    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
+    >>> time = tippe.inversion_time(scene, tippe.Launch(0.1, 155.0), t1=8.0, tolerance=1e-6)
+    >>> print(f"{time:.1f} s")
+    5.9 s
+
+    ```
+    """
+
+    units: ClassVar[dict[str, str]] = UNITS
+
+    mass: Float[Array, "..."] = eqx.field(converter=as_number)
+    inertia: Inertia = eqx.field(converter=Inertia.of)
+    support: Any = eqx.field(converter=lambda value: as_support(value))
+    centre_of_mass: tuple[Float[Array, "..."], ...] = eqx.field(converter=as_numbers, default=(0.0, 0.0, 0.0))
+
+    def __check_init__(self):
+        self.check_components()
+
+    def bounds(self) -> Iterator[Bound]:
+        yield Bound(self.mass, "mass", above=0.0)
+        for k in range(3):
+            yield Bound(self.centre_of_mass[k], f"centre_of_mass[{k}]")
+        height, sharpest = (jnp.min(part, axis=0) for part in self._samples())
+        yield Bound(height, "least support seen from centre_of_mass", above=0.0, why="the centre of mass lies inside")
+        yield Bound(sharpest, "least radius of curvature by support", above=0.0, why="the body is strictly convex")
+
+    def _samples(self) -> tuple[Float[Array, "samples ..."], Float[Array, "samples ..."]]:
+        """Height of the centre of mass above a plane, and the smaller principal radius of curvature [m], by direction."""
+
+        def sample(normal: Float[Array, "3"], first: Float[Array, "3"], second: Float[Array, "3"]) -> tuple[Any, Any]:
+            # A plane that turns about one tangent moves the contact by the radius along the other.
+            point, along = self.contact(tuple(normal), tuple(first))
+            _, across = self.contact(tuple(normal), tuple(second))
+            a, b, c = -dot(tuple(first), along), -dot(tuple(first), across), -dot(tuple(second), across)
+            return -dot(tuple(normal), point), 0.5 * (a + c) - jnp.sqrt(0.25 * (a - c) ** 2 + b * b)
+
+        return jax.vmap(sample)(*evenly_spread(SAMPLES))
+
+    @property
+    def size(self) -> Float[Array, "..."]:
+        return jnp.max(self._samples()[0], axis=0)
+
+    def surface_point(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
+        leaves, structure = jax.tree.flatten(self.support)
+
+        def of_one(leaves: list[Any], direction: Vector, rate: Vector) -> tuple[Vector, Vector]:
+            support = jax.tree.unflatten(structure, leaves)
+
+            def point(direction: Float[Array, "3"]) -> Float[Array, "3"]:
+                # The gradient of |d| h(d / |d|), the support function's extension with degree 1.
+                return jax.grad(lambda d: _length(d) * support(d / _length(d)))(direction)
+
+            place, change = jax.jvp(point, (jnp.stack(direction),), (jnp.stack(rate),))
+            return vector_of(place), vector_of(change)
+
+        numbers = (leaves, *(vector_of(scale(-1.0, vector)) for vector in (normal, rate)))
+        scalar = jax.ShapeDtypeStruct((), jnp.result_type(float))
+        with contextlib.suppress(TooLarge):
+            return by_components(of_one, *jax.tree.map(lambda _: scalar, numbers))(*numbers)
+        if all(jnp.ndim(number) == 0 for number in jax.tree.leaves(numbers)):
+            return of_one(*numbers)
+        return jax.vmap(of_one, in_axes=jax.tree.map(lambda number: 0 if jnp.ndim(number) else None, numbers))(*numbers)
+
+
+def _length(vector: Float[Array, "3"]) -> Float[Array, ""]:
+    return jnp.sqrt(jnp.sum(vector * vector))
+
+
+class Plain(eqx.Module):
+    """A support function that holds no number of interest; the same function is the same program."""
+
+    function: Any = eqx.field(static=True)
+
+    def __call__(self, direction: Float[Array, "3"]) -> Float[Array, ""]:
+        return self.function(direction)
+
+
+def as_support(value: Any) -> eqx.Module:
+    """A support function as a module, its numbers as arrays.
+
+    **Raises:** `ValueError` unless it gives one number for a vector of three.
+    """
+    if not callable(value):
+        raise ValueError(f"support = {value!r} must be a function of a direction (3,)")
+    if isinstance(value, eqx.Module):
+        value = jax.tree.map(lambda leaf: as_number(leaf) if isinstance(leaf, float | np.ndarray) else leaf, value)
+        if any(np.ndim(leaf) and not is_traced(leaf) for leaf in jax.tree.leaves(value)):
+            return value
+    direction = jnp.array([0.0, 0.0, 1.0])
+    try:
+        result = jax.eval_shape(value, direction)
+    except jax.errors.JAXTypeError as error:
+        raise ValueError(
+            f"support = {value!r} cannot be traced by JAX: write it with jax.numpy in place of numpy and math, and with "
+            "jnp.where in place of `if`"
+        ) from error
+    except (TypeError, IndexError) as error:
+        raise ValueError(f"support = {value!r} must be a function of a direction (3,): {error}") from error
+    if getattr(result, "shape", None) != () or not jnp.issubdtype(result.dtype, jnp.floating):
+        raise ValueError(f"support = {value!r} must give one number for a direction (3,), not {result}")
+    if isinstance(value, eqx.Module):
+        return value
+    closed = with_own_numbers(value, direction)
+    return closed if isinstance(closed, eqx.Module) else Plain(value)
+
+
+def evenly_spread(count: int) -> tuple[Any, ...]:
+    """Unit vectors (count, 3) that cover a sphere evenly, along a spiral, and two unit vectors across each."""
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    angle = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count)
+    radius = np.sqrt(1.0 - z * z)
+    normal = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
+    first = np.stack([-np.sin(angle), np.cos(angle), np.zeros(count)], axis=-1)
+    return normal, first, np.cross(normal, first)

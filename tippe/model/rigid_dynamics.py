@@ -1,0 +1,278 @@
+"""The equations of motion of a body of any shape and inertia on a plane, free of trigonometry and of poles.
+
+The state is that of a top (`state.py`) with one vector more: in the arena's frame (t1, t2, n) the velocity (u1, u2) of the
+centre of mass along the arena, the body's z axis e, the angular momentum L about the centre of mass, the arena's place, and the
+body's x axis c. With d = e x c, the components of n in the body's axes are (c.n, d.n, e.n), and give the contact
+(`rigid_body.py`).
+
+On a plane n is fixed. With r from the centre of mass to the contact, both laws of motion are L' = r x F + N tau and
+m u' = F - m g z, where the height of the centre of mass, -r.n, keeps the contact. Source: Newton and Euler; for rolling,
+Garcia and Hubbard, Proc. R. Soc. A 418 (1988) 165, and Kane and Levinson, Int. J. Non-Linear Mechanics 17 (1982) 175.
+"""
+
+import abc
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from nonholonomic.geometry import (
+    AbstractFrame,
+    Vector,
+    add,
+    cross,
+    dot,
+    multiply,
+    scale,
+    subtract,
+    sum_vectors,
+    vector_of,
+)
+from nonholonomic.xla_cpu import least, stored
+
+from .dynamics import JAMMED, Motion, stacked
+from .friction import AbstractFriction, ContactLoad, NoSlip, Slip
+from .inertia import SymmetricMatrix
+from .launch import Launch
+from .rigid_body import AbstractRigidBody
+from .state import joined, parts
+
+
+class Attitude(NamedTuple):
+    """How a body stands and turns, and where it touches.
+
+    - `axes`: the body's axes x, y and z in the frame (t1, t2, n).
+    - `normal`, `momentum`, `turning`: n, angular momentum and angular velocity in the body's axes; `normal_rate`: rate of
+      change of the components of n.
+    - `lever`, `lever_rate`: the vector r from the centre of mass to the contact [m] in the body's axes, and the rate of change
+      of its components.
+    """
+
+    axes: tuple[Vector, Vector, Vector]
+    normal: Vector
+    normal_rate: Vector
+    momentum: Vector
+    turning: Vector
+    lever: Vector
+    lever_rate: Vector
+
+    def in_frame(self, vector: Vector) -> Vector:
+        """A vector in the frame, from its components in the body's axes."""
+        x, y, z = (scale(part, axis) for part, axis in zip(vector, self.axes, strict=True))
+        return vector_of(sum_vectors(x, y, z))
+
+    def in_body(self, vector: Vector) -> Vector:
+        """A vector in the body's axes, from its components in the frame."""
+        return vector_of(dot(vector, axis) for axis in self.axes)
+
+
+class AbstractRigidDynamics(eqx.Module):
+    """A scene with such a body, with the combinations of its numbers that every evaluation needs; in place of `Dynamics`."""
+
+    frame: eqx.AbstractVar[AbstractFrame]
+    body: eqx.AbstractVar[AbstractRigidBody]
+    gravity: eqx.AbstractVar[Float[Array, "..."]]
+    inverse: eqx.AbstractVar[SymmetricMatrix]
+
+    @abc.abstractmethod
+    def motion(self, state: Float[Array, "components ..."]) -> Motion:
+        """Evaluate the equations of motion.
+
+        **Arguments:** `state`: (11 + the arena's place, ...).
+
+        **Returns:** a `Motion`, whose `spin_momentum` is the angular velocity about the body's z axis.
+        """
+
+    @abc.abstractmethod
+    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
+        """As `Dynamics.margins`."""
+
+    def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+        """Rate of change of the state, (components, ...)."""
+        return stacked(self.motion(state).rate, state)
+
+    def contact_margin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """The least of `margins`."""
+        return least(*self.margins(state))
+
+    def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
+        """How a contact has ended whose margin is zero: a code in `LOSSES`."""
+        return jnp.argmin(jnp.stack([jnp.maximum(margin, 0.0) for margin in self.margins(state)]), axis=0)
+
+    def attitude(self, state: Float[Array, "components ..."]) -> Attitude:
+        """How the body stands and turns."""
+        _, e, L, place = parts(state)
+        c = vector_of(place[-3:])
+        axes = (c, cross(e, c), e)
+        n = vector_of(axis[2] for axis in axes)
+        momentum = vector_of(dot(L, axis) for axis in axes)
+        turning = vector_of(stored(*self.inverse.times(momentum)))
+        normal_rate = cross(n, turning)
+        return Attitude(axes, n, normal_rate, momentum, turning, *self.body.contact(n, normal_rate))
+
+    def angular_velocity(self, state: Float[Array, "components ..."]) -> Vector:
+        """Angular velocity of the body in the frame [rad/s]."""
+        attitude = self.attitude(state)
+        return attitude.in_frame(attitude.turning)
+
+    def mass_from_contact(self, state: Float[Array, "components ..."]) -> Vector:
+        """From the contact to the centre of mass [m], in the frame."""
+        attitude = self.attitude(state)
+        return vector_of(scale(-1.0, attitude.in_frame(attitude.lever)))
+
+    def energy(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Kinetic energy plus weight times the height of the centre of mass [J]."""
+        (u1, u2), _, _, place = parts(self.carried_along(state))
+        attitude, place = self.attitude(state), place[:-3]
+        rising = -dot(attitude.turning, cross(attitude.lever, attitude.normal))
+        rotation = 0.5 * dot(attitude.turning, attitude.momentum)
+        foot = subtract(self.frame.height(place), multiply(self.body.size, self.frame.vertical(place)[2]))
+        height = add(foot, dot(self.mass_from_contact(state), self.frame.vertical(place)))
+        return self.body.mass * (0.5 * (u1**2 + u2**2 + rising**2) + self.gravity * height) + rotation
+
+    def normal_spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
+        """Angular velocity about the arena's normal [rad/s]."""
+        attitude = self.attitude(state)
+        return dot(attitude.turning, attitude.normal)
+
+    def start(
+        self, launch: Launch, place: tuple[Float[Array, "..."], ...], axis: Vector, turning: Vector
+    ) -> Float[Array, "components ..."]:
+        """The state at the start of a run.
+
+        **Arguments:** `place`: that of the frame; `axis`: e; `turning`: angular velocity [rad/s], both in the frame.
+        """
+        zero = jnp.zeros_like(launch.theta)
+        # The body's axes are those of the frame, turned without rotation about n until z is e.
+        x, y = jnp.cos(launch.azimuth), jnp.sin(launch.azimuth)
+        fall = 1.0 - axis[2]
+        c = (1.0 - fall * x * x, -fall * x * y, -axis[0])
+        axes = (c, cross(axis, c), axis)
+        momentum = self.body.inertia.tensor.times(vector_of(dot(turning, one) for one in axes))
+        x, y, z = (scale(part, one) for part, one in zip(momentum, axes, strict=True))
+        state = joined(launch.velocity or (zero, zero), axis, sum_vectors(x, y, z), place, c)
+        return self.carried_along(state)
+
+    def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+        """The state with the velocity that the law of friction imposes; only rolling imposes one."""
+        return state
+
+
+class SlippingDynamics(AbstractRigidDynamics):
+    """The equations of motion under a law of friction with a force at every slip."""
+
+    frame: AbstractFrame
+    body: AbstractRigidBody
+    gravity: Float[Array, "..."]
+    inverse: SymmetricMatrix
+    friction: AbstractFriction
+    per_mass: Float[Array, "..."]
+
+    def motion(self, state: Float[Array, "components ..."]) -> Motion:
+        """Evaluate the equations of motion, with the normal force solved for including friction.
+
+        With q = r x n and J the inertia, all in the body's axes, the centre of mass rises at -w.q. So the second rate of the
+        height gives N (1 + m (J^-1 q).M) = m (g z.n - (J^-1 q).(L x w) - w.q'), M the moment per unit normal force.
+        """
+        (u1, u2), _, _, place = parts(state)
+        attitude = self.attitude(state)
+        up = self.frame.vertical(place[:-3])
+        w, r = attitude.in_frame(attitude.turning), attitude.in_frame(attitude.lever)
+        swing = cross(w, r)
+        slip_x, slip_y = stored(u1 + swing[0], u2 + swing[1])
+        slip = Slip(slip_x, slip_y, w)
+        friction = self.friction.per_normal_force(slip)
+        f1, f2 = friction.force
+        moment = vector_of(stored(*sum_vectors(cross(r, (f1, f2, 1.0)), friction.torque)))
+
+        lever, normal = attitude.lever, attitude.normal
+        arm = self.inverse.times(cross(lever, normal))
+        moved = sum_vectors(cross(attitude.lever_rate, normal), cross(lever, attitude.normal_rate))
+        bend = dot(arm, cross(attitude.momentum, attitude.turning)) + dot(attitude.turning, vector_of(moved))
+        mass = self.body.mass
+        painleve_factor = 1.0 + mass * dot(arm, attitude.in_body(moment))
+        N = mass * (multiply(self.gravity, up[2]) - bend) / painleve_factor
+
+        thrust = N * self.per_mass
+        u1_dot = add(multiply(thrust, f1), multiply(-self.gravity, up[0]))
+        u2_dot = add(multiply(thrust, f2), multiply(-self.gravity, up[1]))
+        along = attitude.in_frame(attitude.lever_rate)
+        path = (slip_x + along[0], slip_y + along[1])
+        place_rate = self.frame.frame_motion(place[:-3], path).place_rate
+        c, _, e = attitude.axes
+        rate = (u1_dot, u2_dot, *cross(w, e), *scale(N, moment), *place_rate, *cross(w, c))
+        return Motion(rate, N, friction, slip, path, (None, None), attitude.turning[2], painleve_factor, None)
+
+    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
+        motion = self.motion(state)
+        return motion.normal_force / (self.body.mass * self.gravity) + 1e-12, motion.painleve_factor - JAMMED
+
+
+class RollingDynamics(AbstractRigidDynamics):
+    """The equations of motion of a body whose contact point is at rest: the nonholonomic constraint itself.
+
+    The velocity follows from attitude and angular momentum; the two components in the state are carried along but not used.
+    """
+
+    frame: AbstractFrame
+    body: AbstractRigidBody
+    gravity: Float[Array, "..."]
+    inverse: SymmetricMatrix
+
+    def motion(self, state: Float[Array, "components ..."]) -> Motion:
+        """Evaluate the equations of motion and the reaction.
+
+        In the body's axes, with the velocity r x w of the centre of mass and r' the rate of r as a vector,
+        (J + m (r^2 - r r^T)) w' = L x w + m r x (r' x w + g z), and F = m (r' x w + r x w' + g z).
+        """
+        place, attitude = parts(state).place, self.attitude(state)
+        up = self.frame.vertical(place[:-3])
+        m, r, w = self.body.mass, attitude.lever, attitude.turning
+        r_dot = sum_vectors(attitude.lever_rate, cross(w, r))
+        turning = sum_vectors(cross(vector_of(r_dot), w), scale(self.gravity, attitude.in_body(up)))
+        torque = sum_vectors(cross(attitude.momentum, w), scale(m, cross(r, vector_of(turning))))
+        square, inertia = dot(r, r), self.body.inertia
+        about_contact = SymmetricMatrix(
+            inertia.xx + m * (square - r[0] * r[0]),
+            inertia.yy + m * (square - r[1] * r[1]),
+            inertia.zz + m * (square - r[2] * r[2]),
+            inertia.xy - m * r[0] * r[1],
+            inertia.xz - m * r[0] * r[2],
+            inertia.yz - m * r[1] * r[2],
+        )
+        w_dot = about_contact.solve(vector_of(stored(*torque)))
+        push = attitude.in_frame(vector_of(scale(m, sum_vectors(turning, cross(r, w_dot)))))
+        F = vector_of(stored(*push))
+
+        lever, spinning = attitude.in_frame(r), attitude.in_frame(w)
+        u1_dot = subtract(F[0] / m, multiply(self.gravity, up[0]))
+        u2_dot = subtract(F[1] / m, multiply(self.gravity, up[1]))
+        along = attitude.in_frame(attitude.lever_rate)
+        path = (along[0], along[1])
+        place_rate = self.frame.frame_motion(place[:-3], path).place_rate
+        c, _, e = attitude.axes
+        rate = (u1_dot, u2_dot, *cross(spinning, e), *cross(lever, F), *place_rate, *cross(spinning, c))
+        still = jnp.zeros_like(F[2])
+        load = ContactLoad((F[0] / F[2], F[1] / F[2]))
+        slip = Slip(still, still, spinning)
+        return Motion(rate, F[2], load, slip, path, (None, None), w[2], 1.0 + still, None)
+
+    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
+        return (self.motion(state).normal_force / (self.body.mass * self.gravity) + 1e-12,)
+
+    def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+        """The state with the velocity r x w of the centre of mass."""
+        attitude = self.attitude(state)
+        u = attitude.in_frame(cross(attitude.lever, attitude.turning))
+        return state.at[:2].set(jnp.stack(jnp.broadcast_arrays(*u[:2], state[0])[:2]))
+
+
+def rigid_dynamics(
+    body: AbstractRigidBody, frame: AbstractFrame, friction: AbstractFriction, gravity: Float[Array, "..."]
+) -> AbstractRigidDynamics:
+    """The equations of motion of a body on a plane; arguments as for `Dynamics.of`."""
+    inverse = body.inertia.tensor.inverse
+    if isinstance(friction, NoSlip):
+        return RollingDynamics(frame, body, gravity, inverse)
+    return SlippingDynamics(frame, body, gravity, inverse, friction, 1.0 / body.mass)
