@@ -80,8 +80,8 @@ class Ellipsoid(AbstractRigidBody):
     It runs on a plane, level or tilted, under laws of friction that have a force at every slip, or without slip (`NoSlip`).
     Only the part that touches the plane matters: half an ellipsoid moves like a whole one of the same mass and inertia.
 
-    At a `Launch`, the body's axes x, y and z are those of the arena (t1, t2, n), turned by theta about a horizontal axis so that
-    z leans in the direction `azimuth`. `spin` is the angular velocity about z.
+    At a `Launch`, the body's axes x, y and z are those of the arena (t1, t2, n), turned by theta about a horizontal axis so
+    that z leans in the direction `azimuth`. `spin` is the angular velocity about z.
 
     **Arguments:**
 
