@@ -1,10 +1,10 @@
-"""A rattleback: error beside time, the cost of a step beside that of a top, and the same body in SciPy and MuJoCo.
+"""A rattleback: error against time, cost of a step compared with that of a top, and the same body in SciPy and MuJoCo.
 
     python benchmarks/rattleback.py
 
 Kane and Levinson's rattleback, tilted by 0.02 rad about its y axis and spun at -5 and 5 rad/s, rolls without slip. The script
 prints the time at which the spin about the vertical first vanishes, its error, and the CPU time on one core. MuJoCo gets a
-coefficient of friction of 3, above what the rolling needs; its contact is compliant, and gets stiffer as the step shrinks.
+coefficient of friction of 3, above what rolling needs; its contact is compliant, and gets stiffer as the step shrinks.
 Programs that are not installed are named and skipped. The last table has the CPU time per step of a table of 1024 runs.
 """
 
@@ -47,7 +47,7 @@ def scipy(spin: float, tolerance: float) -> float:
 
 
 def mujoco(spin: float, step: float) -> float:
-    """By MuJoCo with RK4, elliptic cones and impratio 100 [s], infinite if it does not reverse."""
+    """By MuJoCo with RK4, elliptic cones and impratio 100 [s], infinite if the body does not reverse."""
     import mujoco
 
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = INERTIA

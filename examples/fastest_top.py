@@ -38,17 +38,17 @@ def time_and_force(numbers: jax.Array) -> jax.Array:
 
 
 def main() -> None:
-    here, many, slopes = map(jax.jit, (time_and_force, jax.vmap(time_and_force), jax.jacfwd(time_and_force)))
+    single, many, slopes = map(jax.jit, (time_and_force, jax.vmap(time_and_force), jax.jacfwd(time_and_force)))
     grid = np.stack(np.meshgrid(np.linspace(0.15, 0.48, 12), np.linspace(0.87, 1.08, 8)), axis=-1).reshape(-1, 2)
     times, forces = np.asarray(many(grid)).T
-    limit = {"type": "ineq", "fun": lambda at: here(at)[1] - LEAST, "jac": lambda at: slopes(at)[1]}
+    limit = {"type": "ineq", "fun": lambda at: single(at)[1] - LEAST, "jac": lambda at: slopes(at)[1]}
     fits = []
     for start in grid[np.argsort(np.where(forces > LEAST, times, 2.0 * T1))[:4]]:
         options = {"jac": lambda at: slopes(at)[0], "bounds": BOUNDS, "constraints": limit, "tol": 1e-6}
-        fits.append(minimize(lambda at: here(at)[0], start, method="SLSQP", **options).x)
-        print("from", start.round(3), "to", fits[-1].round(4), "time and force", np.round(here(fits[-1]), 4))
-    best = min(fits, key=lambda at: here(at)[0] if here(at)[1] > LEAST - 1e-4 else np.inf)
-    time, force = np.asarray(here(best))
+        fits.append(minimize(lambda at: single(at)[0], start, method="SLSQP", **options).x)
+        print("from", start.round(3), "to", fits[-1].round(4), "time and force", np.round(single(fits[-1]), 4))
+    best = min(fits, key=lambda at: single(at)[0] if single(at)[1] > LEAST - 1e-4 else np.inf)
+    time, force = np.asarray(single(best))
     print(f"fastest: offset / radius {best[0]:.4f}, I1 / I3 {best[1]:.4f}: {time:.3f} s, least force {force:.4f} mg")
     turn = 2.0 * np.pi * np.arange(64) / 64.0
     times, forces = np.asarray(many(best + 0.005 * np.stack([np.cos(turn), np.sin(turn)], axis=-1))).T

@@ -44,7 +44,11 @@ def main() -> None:
         scene(0.5), LAUNCH, 10.0, axes={"launch.speed": speeds, "scene.surface.height.height": heights}
     )
     for k, height in enumerate(heights):
-        print(f"hills of {height} m:", *(f"{one:.1f}" for one in np.asarray(table.x)[:, k]), "m along x, by speed")
+        print(
+            f"hills of {height} m:",
+            *(f"{distance:.1f}" for distance in np.asarray(table.x)[:, k]),
+            "m along x, by speed",
+        )
     print(f"contact lost in {int(np.isfinite(np.asarray(table.contact_time)).sum())} of {table.x.size} rides")
 
 

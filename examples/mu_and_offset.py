@@ -22,10 +22,10 @@ def main() -> None:
     times = jax.vmap(lambda a, w: tippe.inversion_time(top, tippe.Launch(a, w), t1=60.0, angle=ANGLE))(THETA, SPIN)
     measured = np.asarray(times) + ERROR * np.random.default_rng(1).normal(size=len(THETA))
     data = tippe.InversionTimes(tippe.Launch(THETA, SPIN), measured, ERROR, t1=60.0, angle=ANGLE)
-    found = tippe.identify(top, data, {"friction.mu": 0.45, "offset": 0.005}, starts=4)
-    print(found)
+    fit = tippe.identify(top, data, {"friction.mu": 0.45, "offset": 0.005}, starts=4)
+    print(fit)
     for name, value in true.items():
-        low, high = found.interval(name)
+        low, high = fit.interval(name)
         print(f"truth {name} = {value}: {'inside' if low < value < high else 'outside'} its 95 % interval")
     print("Times fix one combination, friction times a power of the offset, far better than either number alone.")
     print("Mass, I1 and I3 could not be free as well: scaled alike they leave every time as it is.")

@@ -19,8 +19,8 @@ def scene() -> tippe.Scene:
 
 def errors(information: np.ndarray) -> str:
     """The relative standard errors from an information matrix."""
-    found = np.sqrt(np.diag(np.linalg.inv(information)))
-    return ", ".join(f"{name} to {100.0 * error:.2g} %" for name, error in zip(NAMES, found, strict=True))
+    deviations = np.sqrt(np.diag(np.linalg.inv(information)))
+    return ", ".join(f"{name} to {100.0 * error:.2g} %" for name, error in zip(NAMES, deviations, strict=True))
 
 
 def main() -> None:
@@ -38,8 +38,8 @@ def main() -> None:
         best = np.unravel_index(np.argmax(gain), gain.shape)
         information = more[best]
         print(f"next: theta {THETA[best[0]]}, spin {SPIN[best[1]]:.0f} rad/s: then {errors(information)}")
-    again = sum(np.outer(slopes[launch], slopes[launch]) for launch in (*DONE, *DONE, DONE[0]))
-    print(f"measuring the first ones again instead: {errors(again)}")
+    repeated = sum(np.outer(slopes[launch], slopes[launch]) for launch in (*DONE, *DONE, DONE[0]))
+    print(f"measuring the first ones again instead: {errors(repeated)}")
     print("A time is a staircase in the parameters: check that slopes do not depend on small changes of the launch.")
 
 

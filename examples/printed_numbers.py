@@ -15,21 +15,21 @@ from nonholonomic.identification import Measurements, identify
 from tippe import steady
 
 
-def scene(mass: float, radius: float, one: dict) -> tippe.Scene:
-    top = tippe.Top(mass, radius, one["offset"], one["I1"], one["I3"])
-    return tippe.Scene(top, friction=tippe.Viscous(one["mu"]))
+def scene(mass: float, radius: float, printed: dict) -> tippe.Scene:
+    top = tippe.Top(mass, radius, printed["offset"], printed["I1"], printed["I3"])
+    return tippe.Scene(top, friction=tippe.Viscous(printed["mu"]))
 
 
-def thresholds(one: dict) -> jnp.ndarray:
+def thresholds(printed: dict) -> jnp.ndarray:
     """Spins [rad/s] above which Rutstam's top inverts if launched upright, and above which standing upright is unstable."""
-    of, lever = scene(0.02, 0.02, one), 0.02 - one["offset"]
-    return jnp.stack([steady.jellett_thresholds(of)[1] / (lever * one["I3"]), steady.upright_critical_spin(of)])
+    of, lever = scene(0.02, 0.02, printed), 0.02 - printed["offset"]
+    return jnp.stack([steady.jellett_thresholds(of)[1] / (lever * printed["I3"]), steady.upright_critical_spin(of)])
 
 
-def final_motion(one: dict) -> jnp.ndarray:
+def final_motion(printed: dict) -> jnp.ndarray:
     """Final inclination [rad], phi' and psi' [rad/s] of Cohen's top, launched at 0.1 rad with 100 rad/s."""
-    of = scene(0.015, 0.025, one)
-    launched = 100.0 * one["I3"] * (0.025 * jnp.cos(0.1) - one["offset"])
+    of = scene(0.015, 0.025, printed)
+    launched = 100.0 * printed["I3"] * (0.025 * jnp.cos(0.1) - printed["offset"])
     theta = jnp.asarray(2.0)
     for _ in range(8):
         jellett, slope = jax.value_and_grad(lambda theta: steady.tumbling(of, theta).jellett - launched)(theta)

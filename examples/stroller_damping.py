@@ -17,10 +17,10 @@ def main() -> None:
     path = stroller.simulate(scene(*truth.values()), launch, 6.0, times=times).position
     recorded = path + error * np.random.default_rng(1).normal(size=path.shape)
     data = stroller.Recording(launch, times, recorded, error)
-    found = stroller.identify(scene(1.0, 1.4), data, {"friction.rolling": 1.0, "wheelbase": 1.4}, starts=4)
-    print(found)
+    fit = stroller.identify(scene(1.0, 1.4), data, {"friction.rolling": 1.0, "wheelbase": 1.4}, starts=4)
+    print(fit)
     for name, value in truth.items():
-        low, high = found.interval(name)
+        low, high = fit.interval(name)
         print(f"truth {name} = {value}: {'inside' if low < value < high else 'outside'} its 95 % interval")
     print(
         "Mass, inertias and dampings could not all be free: scaled alike they leave the path on level ground as it is."

@@ -127,8 +127,8 @@ def least(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     2.0
     """
 
-    def lesser(one: Any, other: Any) -> Any:
-        return jnp.where((one < other) | jnp.isnan(one), one, other)
+    def lesser(a: Any, b: Any) -> Any:
+        return jnp.where((a < b) | jnp.isnan(a), a, b)
 
     return functools.reduce(lesser, numbers)
 
@@ -143,8 +143,8 @@ def greatest(*numbers: Float[ArrayLike, "..."]) -> Float[Array, "..."]:
     2.0
     """
 
-    def greater(one: Any, other: Any) -> Any:
-        return jnp.where((one > other) | jnp.isnan(one), one, other)
+    def greater(a: Any, b: Any) -> Any:
+        return jnp.where((a > b) | jnp.isnan(a), a, b)
 
     return functools.reduce(greater, numbers)
 

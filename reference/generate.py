@@ -41,7 +41,7 @@ def main(names: Sequence[str]) -> None:
                 {k: v["bound"] for k, v in scene["states"].items() if k != "times"},
                 flush=True,
             )
-            print("   ", [(one["kind"], one["time"], one["bound"]) for one in scene["events"]], flush=True)
+            print("   ", [(event["kind"], event["time"], event["bound"]) for event in scene["events"]], flush=True)
 
 
 if __name__ == "__main__":

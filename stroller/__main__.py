@@ -110,7 +110,7 @@ def parser() -> argparse.ArgumentParser:
     ride = command.add_argument_group("the ride")
     ride.add_argument("--speed", type=float, default=2.0, help="speed at the start [m/s]")
     ride.add_argument("--force", type=float, default=1.0, help="drive force [N]")
-    ride.add_argument("--steer", type=float, default=0.3, help="steering angle aimed at [rad]")
+    ride.add_argument("--steer", type=float, default=0.3, help="target steering angle [rad]")
     ride.add_argument("--period", type=float, default=6.0, help="period of the steering [s]")
     ride.add_argument("--t1", type=float, default=20.0, help="end of the ride [s]")
     ride.add_argument("--tolerance", type=float, default=1e-9, help="relative tolerance of Dopri8")

@@ -155,7 +155,7 @@ def computed(options: argparse.Namespace, folder: Path | None) -> tuple[dict[str
     try:
         with Progress(len(jobs), "job", "compiling") as counted:
             counted.begin()
-            futures = [threads.submit(job) for job in jobs]
+            futures: list[Any] = [threads.submit(job) for job in jobs]
             for future in as_completed(futures):
                 future.result()
                 counted.advance(1)
@@ -214,7 +214,9 @@ def picture(options: argparse.Namespace, times: Any, theta: Any, end: float) -> 
         after = np.searchsorted(times, end)
         times, theta = np.insert(times, after, end), np.insert(theta, after, INVERTED)
     panel = Panel(title, times, theta[None], theta[:1], np.array([end if end <= times[-1] else np.inf]), joined=False)
-    return draw_launches([panel], INVERTED, "for the first time above the dashed angle")
+    return draw_launches(
+        [panel], INVERTED, "large, for the first time above the dashed angle; small, runs to these times"
+    )
 
 
 def write_page(options: argparse.Namespace, arenas: dict[str, Table], live: str, drawing: Path | None) -> Path:
@@ -259,7 +261,8 @@ def main(arguments: list[str] | None = None) -> int:
             else:
                 drawing = options.out / "theta.png"
                 middle_cell = options.theta.index(middle(options.theta)), options.mu.index(middle(options.mu))
-                picture(options, *shown, float(arenas["plane"].time[middle_cell])).savefig(drawing, dpi=130)
+                end = float(arenas["plane"].time[middle_cell])
+                picture(options, shown[0], shown[1], end).savefig(drawing, dpi=130)
                 written.append(drawing)
             path = write_page(options, arenas, live, drawing)
     except (ValueError, OSError) as error:

@@ -35,7 +35,6 @@ from ..integration import (
     try_step,
 )
 from ..xla_cpu import uncounted, written_by_component, written_in_place
-from ._shared_values import sharing_values
 from .variation import VariationalProblem
 
 #: Iterations per period: as many as fit in the caches with their record.
@@ -354,9 +353,7 @@ def step_taken_back(
         stage, (by_stage, total) = stages - 1 - done, carry
         by_rate = jax.lax.optimization_barrier(moved_state(stage, weights.shares, nothing, length, by_stage))
         at = time + fractions[stage] * length
-        pulled = sharing_values(pull)(
-            at, numbers, tuple(jnp.unstack(_read(along, at=stage))), tuple(jnp.unstack(by_rate))
-        )
+        pulled = pull(at, numbers, tuple(jnp.unstack(_read(along, at=stage))), tuple(jnp.unstack(by_rate)))
         # If no step was made, values may not be finite.
         pulled = jax.lax.optimization_barrier(jnp.where(length > 0.0, jnp.stack(pulled), 0.0))
         return written_in_place(by_stage, pulled[:components], at=stage + 1), total + pulled

@@ -214,7 +214,10 @@ class Multipliers(AbstractFormulation):
         if not is_traced(violation) and violation.size:
             worst = float(jnp.max(jnp.abs(violation)) / jnp.maximum(jnp.max(jnp.abs(rate)), 1e-300))
             if worst > START_TOLERANCE:
-                warnings.warn(f"velocity violates the constraints by {worst:.1e} of itself; projected", stacklevel=2)
+                warnings.warn(
+                    f"the velocity violates the constraints by a relative {worst:.1e} and is projected onto them",
+                    stacklevel=2,
+                )
         return jnp.concatenate([q, self.projected(q, self.system.metric(q) @ rate)])
 
     def split(self, state: Float[Array, " state"]) -> tuple[Coordinates, Coordinates]:

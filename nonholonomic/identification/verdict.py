@@ -121,7 +121,7 @@ def judge(
         concerns.append("the fit has not converged: allow more steps (max_steps), or start closer")
     if not np.all(np.isfinite(prediction[exact])):
         missing = int(np.sum(~np.isfinite(prediction[exact])))
-        concerns.append(f"the model predicts nothing for {missing} measurements: its run ends before, or fails")
+        concerns.append(f"the model has no prediction for {missing} measurements: its run ends earlier, or fails")
     if p_value < POOR:
         concerns.append(
             f"the residuals are too large (p = {p_value:.2g}): the model is wrong, the errors are too small, "

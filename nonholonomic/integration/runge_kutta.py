@@ -95,15 +95,15 @@ def explicit_step(
 
     def do(stage: Int[Array, ""], carry: tuple[Stages, Any]) -> tuple[Stages, Any]:
         rates, seen = carry
-        there = moved_state(stage, tableau.a_lower[:inner], state, length, rates)
+        trial = moved_state(stage, tableau.a_lower[:inner], state, length, rates)
         at = time + places[stage] * length
 
         def look(seen: Float[Array, "places margins lanes"]) -> Float[Array, "places margins lanes"]:
-            return written_in_place(seen, jnp.stack(margins(at, there)), at=rows[stage])
+            return written_in_place(seen, jnp.stack(margins(at, trial)), at=rows[stage])
 
         # A branch, so that the other stages do not pay for it: a tenth of a step of a top in a cylinder.
         seen = None if seen is None else jax.lax.cond(looked[stage], look, lambda seen: seen, seen)
-        return written_by_component(rates, field(at, there), at=stage + 1), seen
+        return written_by_component(rates, field(at, trial), at=stage + 1), seen
 
     none, first = jnp.zeros((1 + inner, *rate.shape), rate.dtype), jnp.zeros((), int)
     seen = None
@@ -113,8 +113,8 @@ def explicit_step(
     rates, seen = over_stages(inner, do, (written_in_place(none, rate, at=first), seen))
     stages, first_negative = list(jnp.unstack(rates)), jnp.full_like(length, 2.0)
     for row, stage in enumerate(looks, start=1):
-        there = state + length * weighted_sum(tableau.a_lower[stage], stages[: stage + 1])
-        margin = lesser(_least(None if seen is None else seen[row]), crossing(there, stages[stage + 1]), length)
+        trial = state + length * weighted_sum(tableau.a_lower[stage], stages[: stage + 1])
+        margin = lesser(_least(None if seen is None else seen[row]), crossing(trial, stages[stage + 1]), length)
         negative = jnp.where(margin < 0.0, tableau.c[stage], 2.0)
         first_negative = jnp.minimum(first_negative, negative)
     # Stored, because the step, its error and the event all depend on it.

@@ -83,7 +83,7 @@ class ChunkStore:
             part.unlink()
         if damaged:
             warnings.warn(
-                f"{self.path} is damaged: {len(damaged)} finished blocks do not match their checksums and are computed again",
+                f"{self.path} is damaged: {len(damaged)} finished chunks do not match their checksums and are computed again",
                 RuntimeWarning,
                 stacklevel=6,
             )
@@ -119,7 +119,7 @@ class ChunkStore:
             difference = f"its axes are {', '.join(theirs.coords)}"
         new, old = (json.loads(str(layout.attributes.get("versions", "{}"))) for layout in (ours, theirs))
         if difference is None and old.get("nonholonomic") != new.get("nonholonomic"):
-            difference = f"nonholonomic is {old.get('nonholonomic')} there and {new.get('nonholonomic')} here"
+            difference = f"nonholonomic is {old.get('nonholonomic')} in the file and {new.get('nonholonomic')} here"
         if difference is None and (theirs.kinds, theirs.inner, theirs.chunk) != (ours.kinds, ours.inner, ours.chunk):
             difference = f"it was not written by a sweep in {ours.chunks} chunks"
         if difference is not None:
@@ -149,7 +149,7 @@ class ChunkStore:
         for chunk in sorted(self.finished):
             kept = read_chunk(self.folder, self.layout, chunk)
             if kept is None:
-                raise OSError(f"cannot read {self.folder}: block {chunk} is damaged; the same call computes it again")
+                raise OSError(f"cannot read {self.folder}: chunk {chunk} is damaged; the same call computes it again")
             yield chunk, kept
 
     def write(self, chunk: int, values: dict[str, Values]) -> None:
@@ -240,7 +240,7 @@ def unfinished(path: Path) -> tuple[Layout, dict[str, Values]] | None:
         # The table was finished in the meantime.
         return None
     if damaged:
-        reason = f"{damaged} of its {layout.chunks} blocks do not match their checksums"
+        reason = f"{damaged} of its {layout.chunks} chunks do not match their checksums"
         raise OSError(f"cannot read {path}: it is damaged: {reason}")
     return layout, variables
 
@@ -263,5 +263,5 @@ def same_request(left: str, right: str) -> str | None:
     first, second = json.loads(left), json.loads(right)
     for name in [*first, *(name for name in second if name not in first)]:
         if first.get(name) != second.get(name):
-            return f"{name} is {first.get(name)!r} there and {second.get(name)!r} here"
+            return f"{name} is {first.get(name)!r} in the file and {second.get(name)!r} here"
     return None

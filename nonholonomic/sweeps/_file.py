@@ -245,7 +245,7 @@ class Stored:
             damaged += zlib.crc32(np.ascontiguousarray(values[first:end]).data) != sums[chunk]
         if damaged:
             raise OSError(
-                f"cannot read {self.path}: it is damaged: {damaged} of its {self.layout.chunks} blocks do not match their "
+                f"cannot read {self.path}: it is damaged: {damaged} of its {self.layout.chunks} chunks do not match their "
                 "checksums"
             )
         return values

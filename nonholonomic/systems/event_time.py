@@ -182,7 +182,9 @@ class HybridEvent(SmoothEvent):
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
         if nested:
-            raise ValueError("second derivatives do not go through resets; differentiate a gradient by differences")
+            raise ValueError(
+                "second derivatives are not available through resets; take differences of a gradient instead"
+            )
 
         def build(movable: tuple[Array, ...], cells: int | None) -> Any:
             assert cells is not None

@@ -27,7 +27,7 @@ def hops() -> Iterator[Scene]:
         for flight, other in list(zip(flights, others, strict=False))[:4]:
             events += [bounded_event("takes_off", flight[0], other[0])] if flight[0] > 0.0 else []
             events += [bounded_event("lands", flight[1], other[1])]
-        exported = [np.array([top.exported(one) for one in run]) for run in (states, check)]
+        exported = [np.array([top.exported(state) for state in run]) for run in (states, check)]
         yield scene | {
             "restitution": arena_hop_reference.RESTITUTION,
             "outcome": "completed",
@@ -66,14 +66,14 @@ def stick_slip() -> Iterator[Scene]:
             """Kind, begin and last state of every stretch."""
             if flies:
                 run = exact_hop_reference.follow(body, y, t, 0.0, rtol, floor)
-                return [(one.kind, one.begin, one.state) for one in run]
+                return [(piece.kind, piece.begin, piece.state) for piece in run]
             run = coulomb_top.follow(body, y, t, floor, 0.01 * floor, rtol)
-            return [(one.kind, one.times[0], one.states[:, -1]) for one in run]
+            return [(piece.kind, piece.times[0], piece.states[:, -1]) for piece in run]
 
         times = rounded_times(t1, (0.25, 0.5, 0.75, 1.0))
         accuracies = ((1e-11, 1e-8), (1e-10, 1e-7))
-        states = [np.array([top.exported(follow(t, *one)[-1][2]) for t in times]) for one in accuracies]
-        lists = [events_of(follow(t1, *one)) for one in accuracies]
+        states = [np.array([top.exported(follow(t, *accuracy)[-1][2]) for t in times]) for accuracy in accuracies]
+        lists = [events_of(follow(t1, *accuracy)) for accuracy in accuracies]
         assert [kind for kind, _ in lists[0]] == [kind for kind, _ in lists[1]]
         events = [bounded_event(kind, time, other[1]) for (kind, time), other in zip(*lists, strict=True)]
         shape = {"shape": "plane", "tilt": 0.0} if arena is None else {"shape": "sphere", "radius": arena}

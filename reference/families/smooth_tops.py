@@ -76,7 +76,7 @@ class NewtonEuler:
         }
 
     def states(self, y: Array, times: Sequence[float], rtol: float) -> Array:
-        return np.array([self.exported(one) for one in states_at(self.field, y, times, rtol, rtol * self.scales)])
+        return np.array([self.exported(state) for state in states_at(self.field, y, times, rtol, rtol * self.scales)])
 
     def event(self, y: Array, t1: float, rtol: float) -> tuple[str, float]:
         return first_event(self.field, y, t1, self.margins, rtol, rtol * self.scales)
@@ -127,7 +127,7 @@ def plane_and_cylinder() -> Iterator[Scene]:
         # Lagrange's equations give theta at the same times.
         raw = states_at(top.field, y, times, FINE, FINE * top.scales)
         tilts = [lagrange_top.follow(lagrange_top.Scene(**plain), t, pi, FINE)[2] for t in times]
-        apart = max(abs(tilt - top.angle(one)) for tilt, one in zip(tilts, raw, strict=True))
+        apart = max(abs(tilt - top.angle(state)) for tilt, state in zip(tilts, raw, strict=True))
         shape = {"shape": "plane", "tilt": 0.0} if arena is None else {"shape": "cylinder", "radius": arena}
         scene = top_scene(f"{row['family'].lower()}-{number % 10 + 1:02d}", top, y, shape)
         solution = top_states(times, states, check)
@@ -208,7 +208,7 @@ class ArenaTop(arena_reference.Top):
 
     def states(self, y: Array, times: Sequence[float], rtol: float) -> Array:
         self.start()
-        return np.array([self.exported(one) for one in states_at(self.field, y, times, rtol, 0.1 * rtol)])
+        return np.array([self.exported(state) for state in states_at(self.field, y, times, rtol, 0.1 * rtol)])
 
     def event(self, y: Array, t1: float, rtol: float, kinds: Sequence[str] = ("inverted", "contact_lost")):
         self.start()
@@ -323,7 +323,7 @@ def eggs() -> Iterator[Scene]:
             "gravity": egg.gravity,
             "start": top_start(exported(y), y[:3] + r, UP),
             "outcome": "completed",
-            "states": top_states(times, *(np.array([exported(one) for one in run]) for run in runs)),
+            "states": top_states(times, *(np.array([exported(state) for state in run]) for run in runs)),
             "events": [],
             "source": {
                 "values": "rotation matrix and shape matrix, tests/physics/egg_reference.py, rtol 1e-13",

@@ -320,15 +320,15 @@ def render() -> str:
         "",
         "This page lists which equations of *Vector Fields of the Dynamics of Non-Holonomic Constraint System With",
         "Elliptical Configuration Space* hold, and the corrected form of the others. D stands for sinh²ξ + sin²η. The",
-        "functions are in `stroller/papers/paper.py`, the tests in `tests/stroller/papers/test_stroller_paper.py`. Each",
+        "functions, and the names of the tests, are in `stroller/papers/paper.py`. Each",
         "test derives the corrected form from the position on the spheroid and shows that a wrong printed form does not",
         "follow. `stroller.papers.paper.render()` returns this page.",
         "",
         'The paper constrains the horizontal projections of the wheels\' velocities: `heading="projected"`. On a slope',
         'this is not a vehicle with a rigid frame, so `heading="intrinsic"` is the default.',
         "",
-        "| equation | as printed | verdict | correct form | test |",
-        "|---|---|---|---|---|",
+        "| equation | as printed | verdict | correct form |",
+        "|---|---|---|---|",
     ]
-    lines += [f"| {' | '.join((*equation[:4], f'`{equation.test}`'))} |" for equation in EQUATIONS]
+    lines += [f"| {' | '.join(equation[:4])} |" for equation in EQUATIONS]
     return "\n".join(lines) + "\n"

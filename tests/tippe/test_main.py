@@ -39,7 +39,7 @@ def test_the_papers_tables_are_printed_written_and_drawn(tmp_path, capsys):
     capsys.readouterr()
     assert main([*SMALL, "--mu", "0.2", "--out", str(tmp_path / "out")]) == 2
     printed = capsys.readouterr().err
-    assert "scene.friction.mu is 0.3 there and 0.2 here" in printed
+    assert "scene.friction.mu is 0.3 in the file and 0.2 here" in printed
 
 
 def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rutstam_scene):

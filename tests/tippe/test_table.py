@@ -46,7 +46,7 @@ def test_a_run_that_needs_more_than_the_most_steps_has_failed(table, rutstam_sce
     assert (short["steps"] == 40).all()
     assert json.loads(short.attributes["request"])["max_steps"] == 40
     assert "max_steps" not in json.loads(table.attributes["request"])
-    with pytest.raises(ValueError, match="max_steps is 40 there"):
+    with pytest.raises(ValueError, match="max_steps is 40 in the file"):
         tippe.inversion_table(rutstam_scene_module, **arguments)
 
 

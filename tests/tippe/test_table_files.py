@@ -163,7 +163,7 @@ def test_a_file_of_another_scene_is_refused_by_name(rutstam_scene_module, tmp_pa
     tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
     other = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.2))
     with pytest.raises(
-        ValueError, match=r"table\.h5 holds the result of another run: scene\.friction\.mu is 0\.3 there"
+        ValueError, match=r"table\.h5 holds the result of another run: scene\.friction\.mu is 0\.3 in the file"
     ):
         tippe.inversion_table(other, path=path, **arguments)
     with pytest.raises(ValueError, match="the axis spin differs"):

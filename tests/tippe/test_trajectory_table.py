@@ -176,16 +176,16 @@ def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scen
     assert sorted(done + again) == [0, 1, 2]
     with h5py.File(path, "r+") as file:
         file["theta"][9, 1, 3, 7] += 1e-12
-    with pytest.raises(OSError, match="1 of its 3 blocks do not match"):
+    with pytest.raises(OSError, match="1 of its 3 chunks do not match"):
         tippe.Table.load(path)
-    with pytest.warns(RuntimeWarning, match="1 finished blocks"):
+    with pytest.warns(RuntimeWarning, match="1 finished chunks"):
         mended = tippe.trajectory_table(scene, path=path, **arguments)
     assert sorted(done + again) == [0, 0, 1, 1, 2, 2]
     fresh = tippe.trajectory_table(scene, **arguments)
     for table in (whole, mended, tippe.Table.load(path)):
         np.testing.assert_array_equal(table.theta, fresh.theta)
         np.testing.assert_array_equal(table.status, fresh.status)
-    with pytest.raises(ValueError, match=r"another run: quantities is \['theta', 'eta'\] there"):
+    with pytest.raises(ValueError, match=r"another run: quantities is \['theta', 'eta'\] in the file"):
         tippe.trajectory_table(scene, path=path, quantities=["theta"], **arguments)
     with pytest.raises(ValueError, match="another run: the axis time differs"):
         tippe.trajectory_table(scene, path=path, **arguments | {"times": TIMES * 0.9})

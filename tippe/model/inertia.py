@@ -1,4 +1,4 @@
-"""The inertia tensor of a rigid body, and symmetric matrices by their six numbers."""
+"""The inertia tensor of a rigid body, and symmetric matrices stored by their six components."""
 
 from collections.abc import Iterator
 from typing import Any, ClassVar
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from nonholonomic.geometry import Vector, scale, vector_of
 from nonholonomic.validation import Bound, Bounded, as_number, is_traced
 
-#: Rounding error that the moments of a flat body are allowed, as a fraction of their sum.
+#: Rounding error allowed in the moments of a flat body, as a fraction of their sum.
 FLAT = 1e-12
 
 #: Names of the components of inertia.
@@ -26,10 +26,10 @@ class Inertia(Bounded):
     """The inertia tensor about the centre of mass, in the body's axes, by its six components [kg m^2].
 
     The off-diagonal components are those of the matrix: `xy` is minus the integral of x y over the mass. `RigidBody` and
-    `Ellipsoid` make it from a symmetric matrix (3, 3).
+    `Ellipsoid` create it from a symmetric matrix (3, 3).
 
-    **Raises:** `ValueError` for a tensor that no rigid body has: the principal moments are positive, and the largest is at most
-    the sum of the other two.
+    **Raises:** `ValueError` for a tensor that is impossible for a rigid body: the principal moments must be positive,
+    and the largest at most the sum of the other two.
     """
 
     units: ClassVar[dict[str, str]] = dict.fromkeys(COMPONENTS, "kg m2")
@@ -43,7 +43,7 @@ class Inertia(Bounded):
 
     @classmethod
     def of(cls, matrix: Any) -> "Inertia":
-        """The tensor with a symmetric matrix (3, 3); one that is traced is taken as its symmetric part."""
+        """The tensor from a symmetric matrix (3, 3); for a traced matrix, its symmetric part."""
         if isinstance(matrix, Inertia):
             return matrix
         values = as_number(matrix)
@@ -68,8 +68,9 @@ class Inertia(Bounded):
             yield Bound(getattr(self, name), name)
         xx, yy, zz, xy, xz, yz = self.numbers
         half = 0.5 * (xx + yy + zz)
-        # Half the trace minus the tensor is the matrix of the second moments of the mass, which is positive semidefinite; the
-        # tensor is positive definite. Both are divided by powers of the trace, so that rounding errors count alike.
+        # Half the trace minus the tensor is the matrix of the second moments of the mass, which is positive
+        # semidefinite; the tensor is positive definite. Both are divided by powers of the trace, so that rounding
+        # errors are comparable.
         second = SymmetricMatrix(half - xx, half - yy, half - zz, -xy, -xz, -yz)
         why = "the largest principal moment of a rigid body is at most the sum of the other two" + self._moments
         for number, degree in zip(second.principal_minors, DEGREES, strict=True):
@@ -85,7 +86,7 @@ class Inertia(Bounded):
 
     @property
     def tensor(self) -> "SymmetricMatrix":
-        """The tensor, without the checks."""
+        """The tensor, without checks."""
         return SymmetricMatrix(*self.numbers)
 
     @property
@@ -96,14 +97,14 @@ class Inertia(Bounded):
 
     @property
     def _moments(self) -> str:
-        """What messages add about a known tensor: its principal moments."""
+        """The principal moments of a known tensor, as an addition to messages."""
         if any(is_traced(number) or np.ndim(number) for number in self.numbers):
             return ""
         return f"; here they are {', '.join(f'{moment:.4g}' for moment in np.linalg.eigvalsh(self.matrix))}"
 
 
 class SymmetricMatrix(eqx.Module):
-    """A symmetric matrix by its six numbers, each a scalar or one per lane."""
+    """A symmetric matrix as six components, each a scalar or one per lane."""
 
     xx: Float[Array, "..."]
     yy: Float[Array, "..."]
@@ -146,7 +147,8 @@ class SymmetricMatrix(eqx.Module):
 
     @property
     def principal_minors(self) -> tuple[Float[Array, "..."], ...]:
-        """The seven principal minors, those of one row first; none is negative if the matrix is positive semidefinite."""
+        """The seven principal minors, those of one row first; all are nonnegative if the matrix is positive
+        semidefinite."""
         adjugate = self.adjugate
         smaller = (self.xx, self.yy, self.zz, adjugate.xx, adjugate.yy, adjugate.zz)
         return (*smaller, self.determinant(adjugate))

@@ -1,8 +1,8 @@
 """Bodies of any shape and any inertia: an unbalanced top, a rattleback.
 
-A strictly convex body touches a plane at the point that is farthest against the plane's normal. In the body's own axes that
-point is p(d) = grad h at d = -normal, where the support function h(d), extended to all vectors with degree 1, is the distance
-from the origin of the axes to the plane that the body touches with the outward normal d.
+A strictly convex body touches a plane at the point that is farthest against the plane's normal. In the body's own axes
+this point is p(d) = grad h at d = -normal. The support function h(d), extended to all vectors with degree 1, is the
+distance from the origin of the axes to the plane that the body touches with the outward normal d.
 
 Source: Bonnesen and Fenchel, Theorie der konvexen Koerper (1934), section 15.
 """
@@ -26,7 +26,7 @@ from nonholonomic.validation import Bound, Bounded, as_number, is_traced
 from .inertia import Inertia
 from .launch import as_numbers
 
-#: Directions in which a support function is evaluated to check that the body is convex.
+#: Number of directions in which a support function is evaluated to check that the body is convex.
 SAMPLES = 200
 
 
@@ -43,11 +43,11 @@ class AbstractRigidBody(Bounded):
     @property
     @abc.abstractmethod
     def size(self) -> Float[Array, "..."]:
-        """A length of it [m], by which places and velocities are measured."""
+        """A length of the body [m], the unit for places and velocities."""
 
     @abc.abstractmethod
     def surface_point(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
-        """Where it touches a plane.
+        """The point at which the body touches a plane.
 
         **Arguments:** `normal`: of the plane, towards the body, in the body's axes; `rate`: of change of these components.
 
@@ -70,15 +70,15 @@ def require_three(value: Any, name: str) -> None:
         raise ValueError(f"{name} = {value!r} must be three numbers, along the body's axes x, y and z")
 
 
-#: The units of what rigid bodies have in common, as scenes show them and as axes of tables name them.
+#: Units of the common parameters of rigid bodies, with their names in scenes and tables.
 UNITS = {"mass": "kg", "centre_of_mass": "m"} | {f"centre_of_mass[{k}]": "m" for k in range(3)} | Inertia.units
 
 
 class Ellipsoid(AbstractRigidBody):
-    """An ellipsoid with any inertia and any centre of mass inside: a rattleback, or a sphere that is not balanced.
+    """An ellipsoid with any inertia and any centre of mass inside: a rattleback, or an unbalanced sphere.
 
-    It runs on a plane, level or tilted, under laws of friction that have a force at every slip, or without slip (`NoSlip`).
-    Only the part that touches the plane matters: half an ellipsoid moves like a whole one of the same mass and inertia.
+    It runs on a level or tilted plane, with every friction law except `SetValuedCoulomb`, or without slip (`NoSlip`).
+    The part that never touches the plane does not matter: half an ellipsoid, or a boat, moves like the whole one.
 
     At a `Launch`, the body's axes x, y and z are those of the arena (t1, t2, n), turned by theta about a horizontal axis so
     that z leans in the direction `azimuth`. `spin` is the angular velocity about z.
@@ -87,7 +87,8 @@ class Ellipsoid(AbstractRigidBody):
 
     - `mass`: mass [kg], positive.
     - `semi_axes`: the three semi-axes [m], along the body's axes x, y and z, positive.
-    - `centre_of_mass`: where the centre of mass is [m], from the centre of the ellipsoid, in the body's axes; inside.
+    - `centre_of_mass`: position of the centre of mass [m], from the centre of the ellipsoid, in the body's axes;
+      inside.
     - `inertia`: symmetric matrix (3, 3) of the inertia about the centre of mass [kg m^2], in the body's axes. Its principal
       moments are positive, and the largest is at most the sum of the other two. Tables name the components
       `"scene.body.inertia.xx"`, `.yy`, `.zz`, `.xy`, `.xz` and `.yz`.
@@ -151,19 +152,19 @@ class Ellipsoid(AbstractRigidBody):
 class RigidBody(AbstractRigidBody):
     """A body of any strictly convex shape, given by its support function, with any inertia.
 
-    It runs where an `Ellipsoid` does.
+    It runs in the same scenes as an `Ellipsoid`.
 
     **Arguments:**
 
     - `mass`: mass [kg], positive.
     - `inertia`: as for `Ellipsoid`.
-    - `support`: function of a unit vector (3,) in the body's axes: how far [m] the body reaches in that direction from the
-      origin of its axes, `jnp.sqrt(jnp.sum((semi_axes * d) ** 2))` for an ellipsoid. Write it with `jax.numpy`, smooth in the
-      neighbourhood of all unit vectors. Both principal radii of curvature must be positive; they are evaluated in 200
-      directions. You can sweep and differentiate the numbers of an `equinox.Module`.
-    - `centre_of_mass`: where the centre of mass is [m] in the body's axes; inside, by default at the origin.
+    - `support`: function of a unit vector (3,) in the body's axes: the distance [m] that the body reaches in that
+      direction from the origin of its axes, `jnp.sqrt(jnp.sum((semi_axes * d) ** 2))` for an ellipsoid. Write it with
+      `jax.numpy`, smooth in the neighbourhood of all unit vectors. Both principal radii of curvature must be positive,
+      which is checked in 200 directions. If it is an `equinox.Module`, you can sweep and differentiate its numbers.
+    - `centre_of_mass`: position of the centre of mass [m] in the body's axes; inside, by default at the origin.
 
-    **Raises:** `ValueError` for numbers outside these ranges, and for a support function of another kind.
+    **Raises:** `ValueError` for numbers outside these ranges, and for an illegal support function.
 
     **Example:** an unbalanced top, whose moments of inertia across its axis differ by 4 %.
 
@@ -241,7 +242,7 @@ def _length(vector: Float[Array, "3"]) -> Float[Array, ""]:
 
 
 class Plain(eqx.Module):
-    """A support function that holds no number of interest; the same function is the same program."""
+    """A support function without parameters; the same function gives the same program."""
 
     function: Any = eqx.field(static=True)
 
@@ -250,9 +251,9 @@ class Plain(eqx.Module):
 
 
 def as_support(value: Any) -> eqx.Module:
-    """A support function as a module, its numbers as arrays.
+    """A support function as a module whose numbers are arrays.
 
-    **Raises:** `ValueError` unless it gives one number for a vector of three.
+    **Raises:** `ValueError` unless it returns one number for a vector of three.
     """
     if not callable(value):
         raise ValueError(f"support = {value!r} must be a function of a direction (3,)")

@@ -1,12 +1,14 @@
-"""The equations of motion of a body of any shape and inertia on a plane, free of trigonometry and of poles.
+"""The equations of motion of a body of any shape and inertia on a plane, free of trigonometry and of coordinate
+singularities.
 
-The state is that of a top (`state.py`) with one vector more: in the arena's frame (t1, t2, n) the velocity (u1, u2) of the
-centre of mass along the arena, the body's z axis e, the angular momentum L about the centre of mass, the arena's place, and the
-body's x axis c. With d = e x c, the components of n in the body's axes are (c.n, d.n, e.n), and give the contact
+The state is that of a top (`state.py`) with an additional vector: in the arena's frame (t1, t2, n) the velocity (u1,
+u2) of the centre of mass along the arena, the body's z axis e, the angular momentum L about the centre of mass, the
+arena's place, and the body's x axis c. With d = e x c, the components of n in the body's axes are (c.n, d.n, e.n),
+which determine the contact
 (`rigid_body.py`).
 
-On a plane n is fixed. With r from the centre of mass to the contact, both laws of motion are L' = r x F + N tau and
-m u' = F - m g z, where the height of the centre of mass, -r.n, keeps the contact. Source: Newton and Euler; for rolling,
+On a plane, n is fixed. With r from the centre of mass to the contact, the laws of motion are L' = r x F + N tau and m
+u' = F - m g z; the contact persists if the height of the centre of mass is -r.n. Source: Newton and Euler; for rolling,
 Garcia and Hubbard, Proc. R. Soc. A 418 (1988) 165, and Kane and Levinson, Int. J. Non-Linear Mechanics 17 (1982) 175.
 """
 
@@ -40,7 +42,7 @@ from .state import joined, parts
 
 
 class Attitude(NamedTuple):
-    """How a body stands and turns, and where it touches.
+    """The attitude and rotation of a body, and its contact point.
 
     - `axes`: the body's axes x, y and z in the frame (t1, t2, n).
     - `normal`, `momentum`, `turning`: n, angular momentum and angular velocity in the body's axes; `normal_rate`: rate of
@@ -76,7 +78,7 @@ class Attitude(NamedTuple):
 
 
 class AbstractRigidDynamics(eqx.Module):
-    """A scene with such a body, with the combinations of its numbers that every evaluation needs; in place of `Dynamics`."""
+    """A scene with a rigid body, with the precomputed combinations of its numbers; in place of `Dynamics`."""
 
     frame: eqx.AbstractVar[AbstractFrame]
     body: eqx.AbstractVar[AbstractRigidBody]
@@ -94,7 +96,7 @@ class AbstractRigidDynamics(eqx.Module):
 
     @abc.abstractmethod
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
-        """As `Dynamics.margins`."""
+        """Like `Dynamics.margins`."""
 
     def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """Rate of change of the state, (components, ...)."""
@@ -105,11 +107,11 @@ class AbstractRigidDynamics(eqx.Module):
         return least(*self.margins(state))
 
     def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-        """How a contact has ended whose margin is zero: a code in `LOSSES`."""
+        """How a contact with zero margin has ended: a code in `LOSSES`."""
         return jnp.argmin(jnp.stack([jnp.maximum(margin, 0.0) for margin in self.margins(state)]), axis=0)
 
     def attitude(self, state: Float[Array, "components ..."]) -> Attitude:
-        """How the body stands and turns."""
+        """The attitude and rotation of the body, and its contact point."""
         _, e, L, place = parts(state)
         c = vector_of(place[-3:])
         axes = (c, cross(e, c), e)
@@ -125,7 +127,7 @@ class AbstractRigidDynamics(eqx.Module):
         return attitude.in_frame(attitude.turning)
 
     def mass_from_contact(self, state: Float[Array, "components ..."]) -> Vector:
-        """From the contact to the centre of mass [m], in the frame."""
+        """Vector from the contact to the centre of mass [m], in the frame."""
         attitude = self.attitude(state)
         return vector_of(scale(-1.0, attitude.in_frame(attitude.lever)))
 
@@ -152,7 +154,7 @@ class AbstractRigidDynamics(eqx.Module):
         **Arguments:** `place`: that of the frame; `axis`: e; `turning`: angular velocity [rad/s], both in the frame.
         """
         zero = jnp.zeros_like(launch.theta)
-        # The body's axes are those of the frame, turned without rotation about n until z is e.
+        # The body's axes are those of the frame, rotated without rotation about n until z is e.
         x, y = jnp.cos(launch.azimuth), jnp.sin(launch.azimuth)
         fall = 1.0 - axis[2]
         c = (1.0 - fall * x * x, -fall * x * y, -axis[0])
@@ -163,7 +165,7 @@ class AbstractRigidDynamics(eqx.Module):
         return self.carried_along(state)
 
     def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """The state with the velocity that the law of friction imposes; only rolling imposes one."""
+        """The state with the velocity that the friction law imposes; only rolling imposes one."""
         return state
 
 
@@ -178,7 +180,7 @@ class SlippingDynamics(AbstractRigidDynamics):
     per_mass: Float[Array, "..."]
 
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
-        """Evaluate the equations of motion, with the normal force solved for including friction.
+        """Evaluate the equations of motion, solving for the normal force with friction included.
 
         With q = r x n and J the inertia, all in the body's axes, the centre of mass rises at -w.q. So the second rate of the
         height gives N (1 + m (J^-1 q).M) = m (g z.n - (J^-1 q).(L x w) - w.q'), M the moment per unit normal force.
@@ -219,7 +221,8 @@ class SlippingDynamics(AbstractRigidDynamics):
 class RollingDynamics(AbstractRigidDynamics):
     """The equations of motion of a body whose contact point is at rest: the nonholonomic constraint itself.
 
-    The velocity follows from attitude and angular momentum; the two components in the state are carried along but not used.
+    The velocity follows from attitude and angular momentum; its two components in the state are integrated but not
+    used.
     """
 
     frame: AbstractFrame

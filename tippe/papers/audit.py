@@ -243,8 +243,7 @@ Cylinder Coordinate* hold, the corrected form of the others, and the code and te
 * Jellett's quantity is constant on a plane, but **not in the cylinder**, where the paper uses it in place of an
   equation of motion.
 * Friction changes the momentum β₁. Either β₁ or Jellett's quantity is constant, never both.
-* This package uses none of the paper's equations. The corrected equations agree with its vector form
-  (`tippe/model/dynamics.py`) at 1000 random tops, arenas and states each, to 10⁻¹⁰.
+* This package uses none of the paper's equations. The corrected equations agree with its vector form to 10⁻¹⁰.
 
 `python -m tippe.papers.audit` prints this page.
 """

@@ -102,7 +102,7 @@ def parser() -> argparse.ArgumentParser:
         "--out",
         type=Path,
         default=Path("tippe-paper-out"),
-        help="folder for the tables and the picture; another run needs another",
+        help="folder for the tables and the picture; use another folder for another run",
     )
     return command
 

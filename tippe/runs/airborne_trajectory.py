@@ -106,8 +106,8 @@ class ArenaTrajectory(HybridTrajectory):
         height = self.parts_of(self.dense.at(np.array([self.end_time])))[-1][0, 0]
         if body.stem is not None and abs(height) < NEAR * body.radius:
             return (
-                "sphere and stem came to rest on the arena together; the equations of sliding on both at once are those of "
-                "the level plane, Plane() without tilt"
+                "sphere and stem came to rest on the arena together; sliding on both at once is implemented only for the level "
+                "plane, Plane() without tilt"
             )
         return "a flight does not end at the arena"
 

@@ -298,7 +298,8 @@ def hybrid_run(
     """The only time of a run in contact or in flight."""
     states, place, spin_angle, work, distance = HybridTrajectory.parts_of(rows)
     ends = (0, time[0], {}, None, distance, number, None)
-    return HybridTrajectory(time, scene, states, place, spin_angle, work, *ends)
+    kind: Any = HybridTrajectory
+    return kind(time, scene, states, place, spin_angle, work, *ends)
 
 
 def frame(scene: Scene, run: Any) -> Frame:

@@ -121,9 +121,7 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         **Raises:** `ValueError` for a run that was made inside a transformation, and for a batch.
         """
         if self.dense is None:
-            raise ValueError(
-                "a run made inside jit, vmap or grad has no dense output to find the time on: use tippe.inversion_time there"
-            )
+            raise ValueError("a run made inside jit, vmap or grad has no dense output: use tippe.inversion_time there")
 
         def beyond(times: Float[np.ndarray, " looks"]) -> Float[np.ndarray, " looks"]:
             return np.asarray(self.resampled(times).theta) - INVERTED

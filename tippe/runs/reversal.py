@@ -1,4 +1,4 @@
-"""When a body that is not one of revolution, such as a rattleback, reverses its spin about the arena's normal."""
+"""Reversal times: when a body such as a rattleback reverses its spin about the arena's normal."""
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -31,8 +31,8 @@ def reversal_time(
     """Time at which the spin about the arena's normal first vanishes; works under `jit`, `vmap`, `grad`, `jvp` and their
     compositions.
 
-    Derivatives by every number of the body, its inertia, the friction law and the launch are those of the event's time by the
-    implicit function theorem; they are 0 where the result is infinite.
+    Derivatives with respect to every number of the body, its inertia, the friction law and the launch use the implicit
+    function theorem at the event; they are 0 if the result is infinite.
 
     **Arguments:**
 
@@ -93,12 +93,13 @@ def reversal_table(
     **Arguments:** as for `inversion_table`; the body of the scene is an `Ellipsoid` or a `RigidBody`, and the spin is not zero.
     Axes have names such as `"scene.body.inertia.xy"` and `"scene.body.semi_axes[0]"`.
 
-    **Returns:** a `Table` as of `inversion_table`, with the time [s] at which the spin about the arena's normal first vanishes,
+    **Returns:** a `Table` like that of `inversion_table`, with the time [s] at which the spin about the arena's normal
+    first vanishes,
     infinite if it does not, and `status`: "reversed", "not_reversed" by `t1`, "contact_lost", "failed", "jammed".
 
-    **Raises:** as `inversion_table`, and `ValueError` for another body and a launch without spin.
+    **Raises:** as for `inversion_table`, and `ValueError` for another body and a launch without spin.
 
-    **Example:** a rattleback reverses sooner one way round than the other.
+    **Example:** a rattleback reverses sooner in one sense than in the other.
 
     ```
     >>> import tippe
@@ -116,13 +117,13 @@ def reversal_table(
     require_rigid(scene)
     require_flag(errors, "errors")
     require_flag(scattered, "scattered")
-    given = {"theta": theta, "mu": mu, "spin": spin, "azimuth": azimuth}
+    launch_values = {"theta": theta, "mu": mu, "spin": spin, "azimuth": azimuth}
     options = (solver, "ensemble", scattered, errors, sensitivities, path, progress, executor, max_steps)
-    return event_table(scene, given, axes, t1, None, tolerance, "first", *options)
+    return event_table(scene, launch_values, axes, t1, None, tolerance, "first", *options)
 
 
 def require_rigid(scene: Scene) -> None:
-    """Raise `ValueError` unless the body may reverse its spin."""
+    """Raise `ValueError` unless the body can reverse its spin."""
     if not isinstance(scene.body, AbstractRigidBody):
         kind = type(scene.body).__name__
         raise ValueError(

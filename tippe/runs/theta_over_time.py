@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -33,7 +34,7 @@ def theta_over_time(
     for first in range(0, len(times), size):
         block = times[first : first + size]
         # No inclination exceeds pi, so no run ends before its time.
-        horizons = np.pad(block, (0, size - len(block)))
+        horizons: Any = np.pad(block, (0, size - len(block)))
         runs = InversionRuns(run_kind_of(scene), horizons, math.pi, "first", solver, "ensemble", [])
         blocks.append(runs.results(roots, columns, tolerance, len(block))["end_theta"][: len(block)])
     return np.concatenate(blocks)

@@ -215,7 +215,7 @@ def simulate(
     if not reached.size:
         raise ValueError(
             f"times = {shown(times)} are all after the end of the run at {float(trajectory.end_time):.6g} s "
-            f"({trajectory.status}): ask for earlier times, or leave `times` out to get those of the steps"
+            f"({trajectory.status}): pass earlier times, or omit `times` to get those of the steps"
         )
     return trajectory.at(reached)
 

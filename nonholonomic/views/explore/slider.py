@@ -50,7 +50,7 @@ def sliders_of(
         low, high = _ends(name, ends)
         if path.startswith((*DRAWN, *drawn)):
             raise ValueError(
-                f"sliders[{name!r}]: {path} changes what is drawn, the arena or the size of the body, which the page keeps; "
+                f"sliders[{name!r}]: {path} changes the drawn arena or body, which a page cannot change; "
                 "write a page for each value"
             )
         value, short = float(known[path]), path.rsplit(".", 1)[-1]

@@ -11,7 +11,6 @@ from close import assert_close
 import nonholonomic.derivatives._adjoint as adjoint
 import nonholonomic.derivatives.slopes as slopes
 from nonholonomic.derivatives import tangents_of
-from nonholonomic.derivatives._shared_values import sharing_values
 from nonholonomic.integration import CROSSED, LEFT_DOMAIN, AbstractProblem, Settings
 
 MOVED = ("rate", "height", "growth")
@@ -147,38 +146,6 @@ def test_the_starts_that_are_kept_are_spread_out(monkeypatch):
     assert (np.diff(indices) > 0).all()
     assert np.diff(indices).max() <= 100
     assert_close(np.asarray(kept.progress)[np.asarray(kept.slot)], indices)
-
-
-def test_a_shared_value_is_computed_once():
-    """A function whose results all need one value: the same numbers, and its square root once instead of four times."""
-
-    def function(x, scale):
-        root = jnp.sqrt(jnp.stack([x * scale, x])[0] + 1.0)
-        return {"a": (root * x, root - x), "b": jnp.stack([root + 1.0, jnp.where(x > 1.0, root, x)])}
-
-    x, scale = jnp.linspace(0.5, 2.0, 8), jnp.asarray(3.0)
-    plain, shared = function(x, scale), sharing_values(function)(x, scale)
-    jax.tree.map(lambda one, other: assert_close(one, other, rtol=1e-15), plain, shared)
-    text = str(jax.make_jaxpr(sharing_values(function))(x, scale))
-    assert text.count("sqrt") == 1
-    assert text.count("optimization_barrier") == 1
-
-
-def test_values_of_several_kinds_are_shared():
-    """Truth values beside numbers, stacks of stacks, and a stack taken apart along its other axis."""
-
-    def function(x, y):
-        root = jnp.sqrt(x) * y
-        above, below = root * root > 1.0, jnp.sqrt(root + 1.0)
-        table = jnp.stack([x, y, x + y])
-        deep = jnp.stack([table, 2.0 * table])
-        along = jnp.unstack(table, axis=1)
-        return jnp.where(above, x, y), jnp.where(above, y, below), jnp.where(above, x * y, below), deep + root, along
-
-    x, y = jnp.linspace(0.5, 2.0, 3), jnp.linspace(2.0, 0.1, 3)
-    jax.tree.map(
-        lambda one, other: assert_close(one, other, rtol=1e-15), function(x, y), sharing_values(function)(x, y)
-    )
 
 
 class AtRest(AbstractProblem):

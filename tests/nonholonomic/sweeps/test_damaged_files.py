@@ -110,9 +110,9 @@ def test_a_changed_number_is_refused_by_a_reader_and_repaired_by_a_sweep(tmp_pat
     cheap_sweep(path)
     with h5py.File(path, "r+") as file:
         file["value"][2 * BLOCK + 1] += 1e-16
-    with pytest.raises(OSError, match=r"cannot read .*table\.h5: it is damaged: 1 of its 7 blocks do not match"):
+    with pytest.raises(OSError, match=r"cannot read .*table\.h5: it is damaged: 1 of its 7 chunks do not match"):
         Table.load(path)
-    with pytest.warns(RuntimeWarning, match=r"table\.h5 is damaged: 1 finished blocks .* computed again"):
+    with pytest.warns(RuntimeWarning, match=r"table\.h5 is damaged: 1 finished chunks .* computed again"):
         cheap_sweep(path)
     with h5py.File(path, "r+") as file:
         file["value"][2 * BLOCK + 1] += 1e-16

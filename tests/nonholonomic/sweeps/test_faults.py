@@ -232,5 +232,5 @@ def test_another_version_is_told_or_refused(tmp_path, monkeypatch):
         cheap_sweep(path)
     with monkeypatch.context() as patch:
         patch.setattr(running, "versions", lambda: now | {"nonholonomic": "99.0"})
-        with pytest.raises(ValueError, match=r"another run: nonholonomic is .* there and 99\.0 here"):
+        with pytest.raises(ValueError, match=r"another run: nonholonomic is .* in the file and 99\.0 here"):
             cheap_sweep(path)
