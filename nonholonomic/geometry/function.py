@@ -1,6 +1,7 @@
 """User functions for surfaces: convert them to modules with visible parameters, check them, and differentiate them."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -31,14 +32,68 @@ class Closure(eqx.Module):
     program: Any = eqx.field(static=True)
 
     def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
-        single = [k for k, constant in enumerate(self.program.constvars) if constant.aval.shape == ()]
+        shapes, count = tuple(constant.aval.shape for constant in self.program.constvars), len(self.numbers)
 
         def value(*scalars: Float[Array, ""]) -> Float[Array, ""]:
-            replaced = dict(zip(single, scalars, strict=False))
-            numbers = [replaced.get(k, number) for k, number in enumerate(self.numbers)]
-            return eval_jaxpr(self.program, numbers, *scalars[len(single) :])[0]
+            return eval_jaxpr(self.program, gathered(scalars[:count], shapes), *scalars[count:])[0]
 
-        return jnp.vectorize(value)(*(self.numbers[k] for k in single), *at)
+        return jnp.vectorize(value)(*self.numbers, *at)
+
+
+class Held(eqx.Module):
+    """A function that is a module with arrays, whose numbers are leaves one by one, as those of a `Closure` are.
+
+    - `numbers`: those of the arrays; `function`: the module without its arrays.
+    - `structure`, `shapes`: the tree of the arrays, and their shapes.
+
+    The attributes of the module are those of this one too.
+    """
+
+    numbers: tuple[Any, ...]
+    function: eqx.Module
+    # JAX's PyTreeDef, which type checkers take for a variable.
+    structure: Any = eqx.field(static=True)
+    shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, function: eqx.Module) -> "Held":
+        """A module whose arrays hold numbers of one function, not one for each lane."""
+        arrays, rest = eqx.partition(function, lambda leaf: eqx.is_array(leaf) and leaf.ndim > 0)
+        leaves, structure = jax.tree.flatten(arrays)
+        return cls(spread(leaves), rest, structure, tuple(leaf.shape for leaf in leaves))
+
+    def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
+        (scalars, structure), count = jax.tree.flatten(self), len(jax.tree.leaves(self))
+
+        def value(*numbers: Float[Array, ""]) -> Float[Array, ""]:
+            return jax.tree.unflatten(structure, numbers[:count]).whole(*numbers[count:])
+
+        return jnp.vectorize(value)(*scalars, *at)
+
+    @property
+    def whole(self) -> Any:
+        """The module with its arrays."""
+        return eqx.combine(jax.tree.unflatten(self.structure, gathered(self.numbers, self.shapes)), self.function)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name in ("numbers", "function", "structure", "shapes"):
+            raise AttributeError(name)
+        return getattr(self.whole, name)
+
+
+def spread(arrays: Sequence[Array]) -> tuple[Array, ...]:
+    """The numbers of some arrays, one by one."""
+    return tuple(number for array in arrays for number in (jnp.unstack(array.ravel()) if array.ndim else (array,)))
+
+
+def gathered(numbers: Sequence[Array], shapes: Sequence[tuple[int, ...]]) -> list[Array]:
+    """The arrays of some shapes that were `spread`."""
+    arrays, begin = [], 0
+    for shape in shapes:
+        end = begin + math.prod(shape)
+        arrays.append(jnp.stack(numbers[begin:end]).reshape(shape) if shape else numbers[begin])
+        begin = end
+    return arrays
 
 
 def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module:
@@ -67,9 +122,11 @@ def as_function(value: Any, name: str, arguments: tuple[str, ...]) -> eqx.Module
         shown = ", ".join(map(str, results))
         raise ValueError(f"{name} = {value!r} must return one number for numbers {', '.join(arguments)}, not {shown}")
     if isinstance(value, eqx.Module):
-        return value
+        # A function of numbers in each lane has as many results.
+        arrays = results[0].shape == () and len(shapes) > 1 and not isinstance(value, Held)
+        return Held.of(value) if arrays else value
     closes_over = any(is_traced(constant) for constant in traced.consts)
-    return Closure(tuple(traced.consts), traced.jaxpr) if closes_over else Plain(value)
+    return Closure(spread(traced.consts), traced.jaxpr) if closes_over else Plain(value)
 
 
 def partials(function: Callable[..., Any], at: tuple[Any, ...]) -> tuple[Float[Array, "..."], ...]:

@@ -32,7 +32,7 @@ class HybridSamples(NamedTuple):
     """A hybrid run at given times, all floats.
 
     - `shown`: the output rows, NaN after the end of the run; `number`: of the mode at each time, or `BETWEEN`.
-    - `end_time`, `end_state`: when and where the run ended; `status`: the code of how.
+    - `end_time`, `end_state`, `end_mode`: when, where and in which mode the run ended; `status`: the code of how.
     - `steps`, `rejected`; `counts`: the counters.
     """
 
@@ -40,6 +40,7 @@ class HybridSamples(NamedTuple):
     number: Float[Array, " times"]
     end_time: Float[Array, ""]
     end_state: Float[Array, " components"]
+    end_mode: Float[Array, ""]
     status: Float[Array, ""]
     steps: Float[Array, ""]
     rejected: Float[Array, ""]
@@ -269,8 +270,8 @@ def _found(
     # The variation of a time stands behind that of the state; a horizon does not move.
     later = [ended.state[k * (size + 1) + size, 0] for k in range(1, count + 1)]
     later = [jnp.where(status == REACHED_END, 0.0, jnp.where(grazed, jnp.nan, delay)) for delay in later]
-    numbers = (status, ended.steps[0], ended.rejected[0], ended.counts[:-1, 0])
+    numbers = (ended.mode[0], status, ended.steps[0], ended.rejected[0], ended.counts[:-1, 0])
     others = (part.astype(float) for part in numbers)
     samples = HybridSamples(filled.shown, filled.number, end_time, ended.state[:size, 0], *others)
-    slopes = [HybridSamples(filled.variations[k] + late, UNCHANGED, later[k], *(UNCHANGED,) * 5) for k in range(count)]
+    slopes = [HybridSamples(filled.variations[k] + late, UNCHANGED, later[k], *(UNCHANGED,) * 6) for k in range(count)]
     return samples, slopes

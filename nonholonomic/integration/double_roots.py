@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .runge_kutta import Lanes, States, Step
+from .runge_kutta import Lanes, States, Step, weighted_sum
 
 #: A minimum of the event function within a step is checked if its estimate is below this fraction of the values at both
 #: ends. With a tenth of it one first crossing of 1279 in a cylinder is missed at a tolerance of 1e-7 and none at 1e-9;
@@ -29,9 +29,6 @@ SCATTER = 0.05
 
 #: A margin that changes by less in a step is round-off and has no minimum.
 FLAT = 1e-10
-
-#: Cells into which a step is divided in the search for minima of that polynomial.
-CELLS = 4
 
 
 def missed_double_root(
@@ -83,13 +80,13 @@ def missed_loss(
     suspect &= margins[0] > FLAT
 
     def first_minimum() -> Lanes:
-        edges = np.linspace(0.0, 1.0, CELLS + 1)
-        value, slope = _interpolated(places, edges, margins)
-        width = 1.0 / CELLS
-        at, least = _minimum(value[:-1], slope[:-1] * width, value[1:], slope[1:] * width)
-        place = edges[:-1, None, None] + width * at
-        error = SCATTER * spread * 4.0 * place * (1.0 - place)
-        return jnp.min(jnp.where(suspect & (at < 1.0) & (least < error), place, 2.0), axis=(0, 1))
+        # Of several margins only the least is searched: the step then ends there, and the others are looked at again.
+        known, width = _least_of(suspect, lowest, margins, spread)
+        low, fall, high, rise, begin, end = _first_valley(places, list(known))
+        part, least = _minimum(low, fall * (end - begin), high, rise * (end - begin))
+        place = begin + part * (end - begin)
+        error = SCATTER * width * 4.0 * place * (1.0 - place)
+        return jnp.where(jnp.any(suspect, axis=0) & (part < 1.0) & (least < error), place, 2.0)
 
     # A branch, because few steps come near a zero.
     return jax.lax.cond(jnp.any(suspect), first_minimum, lambda: jnp.full(free.shape, 2.0))
@@ -111,15 +108,35 @@ def _minimum(
     return jnp.where((fall < 0.0) & (rise > 0.0), at, 2.0), least
 
 
-def _interpolated(
-    places: Float[np.ndarray, " places"], edges: Float[np.ndarray, " edges"], values: Float[Array, "places ..."]
-) -> tuple[Float[Array, "edges ..."], Float[Array, "edges ..."]]:
-    """Values and derivatives at the edges of the polynomial through values at some places."""
+def _least_of(
+    suspect: Bool[Array, "margins lanes"],
+    lowest: Float[Array, "margins lanes"],
+    margins: Float[Array, "places margins lanes"],
+    spread: Float[Array, "margins lanes"],
+) -> tuple[Float[Array, "places lanes"], Lanes]:
+    """Of the suspect margins of each lane the one with the least known value: its values and their range."""
+    rank, known, width = jnp.where(suspect[0], lowest[0], jnp.inf), margins[:, 0], spread[0]
+    for k in range(1, len(lowest)):
+        lower = suspect[k] & (lowest[k] < rank)
+        rank, known = jnp.where(lower, lowest[k], rank), jnp.where(lower, margins[:, k], known)
+        width = jnp.where(lower, spread[k], width)
+    return known, width
+
+
+def _first_valley(places: Float[np.ndarray, " places"], values: list[Lanes]) -> tuple[Lanes, ...]:
+    """The first two neighbouring places between which the polynomial through all values has a minimum.
+
+    **Returns:** value and slope at the one, value and slope at the other, and the two places. Where there is no minimum they
+    are the first two places, between which the slope does not change from falling to rising.
+    """
     powers = np.arange(len(places))
-    per_power = np.linalg.inv(places[:, None] ** powers)
-    slopes = powers * edges[:, None] ** np.maximum(powers - 1, 0)
-
-    def weighted(weights: Float[np.ndarray, "edges places"]) -> Any:
-        return sum(weights[:, k].reshape(-1, *(1,) * (values.ndim - 1)) * values[k] for k in range(len(places)))
-
-    return weighted(edges[:, None] ** powers @ per_power), weighted(slopes @ per_power)
+    weights = (powers * places[:, None] ** np.maximum(powers - 1, 0)) @ np.linalg.inv(places[:, None] ** powers)
+    slopes = [weighted_sum(row, values) for row in weights]
+    valley: Any = (values[0], slopes[0], values[1], slopes[1], places[0], places[1])
+    earlier = (slopes[0] < 0.0) & (slopes[1] > 0.0)
+    for k in range(1, len(places) - 1):
+        here = (slopes[k] < 0.0) & (slopes[k + 1] > 0.0) & ~earlier
+        later = (values[k], slopes[k], values[k + 1], slopes[k + 1], places[k], places[k + 1])
+        valley = tuple(jnp.where(here, new, old) for new, old in zip(later, valley, strict=True))
+        earlier |= here
+    return valley

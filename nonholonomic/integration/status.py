@@ -49,6 +49,8 @@ class Status(enum.IntEnum):
     INVERTED = 7
     NOT_INVERTED = 8
     RANK_LOST = 9
+    REVERSED = 10
+    NOT_REVERSED = 11
 
     @property
     def word(self) -> str:

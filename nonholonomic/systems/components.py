@@ -2,7 +2,8 @@
 
 Users write functions of small matrices. Mapped over lanes, these are arrays with a short last axis, which compilers do
 not turn into vector instructions, and their zeros are multiplied like other numbers. Here each element of each array is
-a separate number: zeros and ones disappear, and repeated expressions are computed once.
+a separate number: zeros and ones disappear, and repeated expressions are computed once. A factor of zero that is not
+finite still makes a result NaN.
 """
 
 import functools
@@ -33,6 +34,16 @@ COSTLY = """
     acos acosh asin asinh atan atan2 atanh cbrt cos cosh erf exp exp2 expm1 log log1p logistic pow sin sinh tan tanh
 """
 
+#: Operations whose result may not be finite although their operands are, apart from overflow in sums and products.
+RISKY = """
+    acos acosh asin atanh cosh digamma div erf_inv exp exp2 expm1 integer_pow lgamma log log1p pow rem rsqrt sinh sqrt
+"""
+
+#: Operations whose result is not finite if an operand is not; for a quotient, if the dividend is not.
+TRANSPARENT = """
+    abs add add_any cbrt convert_element_type copy copy_p cos div log log1p mul neg sin sinh sqrt square stop_gradient sub tan
+"""
+
 #: A function with more scalar operations than this is left in arrays: it would take long to compile.
 MOST_OPERATIONS = 1500
 
@@ -58,9 +69,10 @@ def by_components(function: Callable[..., Any], *shapes: Any) -> Callable[..., A
 
     def evaluated(*args: Any) -> Any:
         closed, shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
-        leaves = [_elements(leaf) for leaf in jax.tree.leaves(args)]
-        results = Evaluation().of(closed.jaxpr, [_constants(const) for const in closed.consts], leaves)
-        return jax.tree.unflatten(jax.tree.structure(shape), [jnp.asarray(result.item()) for result in results])
+        leaves, evaluation = [_elements(leaf) for leaf in jax.tree.leaves(args)], Evaluation()
+        results = evaluation.of(closed.jaxpr, [_constants(const) for const in closed.consts], leaves)
+        numbers = evaluation.with_hidden([result.item() for result in results])
+        return jax.tree.unflatten(jax.tree.structure(shape), [jnp.asarray(number) for number in numbers])
 
     return evaluated
 
@@ -88,6 +100,10 @@ class Evaluation:
         self.computed: dict[Any, Any] = {}
         # Operands are identified by their address, so all of them must stay in memory.
         self.kept: list[Any] = []
+        # By address: what may not be finite, what makes a result not finite, and what was multiplied by zero.
+        self.risky: set[int] = set()
+        self.sources: dict[int, list[Any]] = {}
+        self.dropped: list[Any] = []
 
     def of(self, jaxpr: Jaxpr, consts: Sequence[Elements], args: Sequence[Elements]) -> list[Elements]:
         """The results of a traced function."""
@@ -136,6 +152,8 @@ class Evaluation:
         """A scalar operation: arithmetic, or the operation of an equation."""
         simple = _simplified(name, operands)
         if simple is not None:
+            if name == "mul" and _is_constant(simple):
+                self.dropped += [one for one in operands if id(one) in self.risky]
             return simple
         if all(map(_is_constant, operands)) and name in ("eq", "ne", "lt", "le", "gt", "ge"):
             return np.bool_(getattr(operator, name)(*operands))
@@ -154,8 +172,32 @@ class Evaluation:
             )
             result = bind(*full)
             # Joined with its operands: XLA would compute a result that stands alone again.
-            self.computed[key] = stored(result, full[0])[0] if name in COSTLY.split() else result
+            result = stored(result, full[0])[0] if name in COSTLY.split() else result
+            if _is_risky(name, operands, equation) or any(id(one) in self.risky for one in operands):
+                self.risky.add(id(result))
+            if name in TRANSPARENT.split():
+                self.sources[id(result)] = operands[:1] if name == "div" else operands
+            self.computed[key] = result
         return self.computed[key]
+
+    def with_hidden(self, results: list[Any]) -> list[Any]:
+        """The results, the first of which is NaN where a factor of zero is not finite and no result would show it.
+
+        A product of zero and what is not finite is NaN. Most such factors are terms of a result too, which is then not finite;
+        the others, which are rare, are added to the first result, times zero.
+        """
+        shown, waiting = set(), list(results)
+        while waiting:
+            one = waiting.pop()
+            if id(one) not in shown:
+                shown.add(id(one))
+                waiting += self.sources.get(id(one), [])
+        hidden = {id(one): one for one in self.dropped if id(one) not in shown}
+        place = next((k for k, result in enumerate(results) if jnp.issubdtype(result.dtype, jnp.floating)), None)
+        if not hidden or place is None:
+            return results
+        total = functools.reduce(operator.add, hidden.values())
+        return [result + 0.0 * total if k == place else result for k, result in enumerate(results)]
 
     def _sum(self, terms: Iterator[Any], name: str = "add") -> Any:
         return functools.reduce(lambda one, other: self._number(name, [one, other]), terms)
@@ -192,6 +234,15 @@ def _is_constant(number: Any) -> bool:
     return isinstance(number, np.generic)
 
 
+def _is_risky(name: str, operands: list[Any], equation: Any) -> bool:
+    """Whether the result of an operation may not be finite though its operands are."""
+    if name == "div" and _is_constant(operands[1]):
+        return operands[1] == 0.0
+    if name == "integer_pow":
+        return equation.params["y"] < 0
+    return name in RISKY.split()
+
+
 def _simplified(name: str, operands: list[Any]) -> Any:
     """The result of an operation that needs no computation; otherwise `None`."""
     if name == "select_n" and _is_constant(operands[0]):
@@ -211,7 +262,7 @@ def _simplified(name: str, operands: list[Any]) -> Any:
     if name == "sub":
         return operands[0] if right == 0.0 else None
     if name == "mul":
-        # The zeros of a matrix: the other factor is used elsewhere, too, or is not needed.
+        # The zeros of a matrix (`Evaluation.with_hidden`).
         if 0.0 in (left, right):
             return operands[0].dtype.type(0.0)
         return operands[1] if left == 1.0 else operands[0] if right == 1.0 else None

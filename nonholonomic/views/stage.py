@@ -104,7 +104,8 @@ class Arena(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """An arena and the runs on it, seen by one camera, which follows them where they go far or `follows` says so."""
+    """An arena and the runs on it, seen by one camera, which follows runs that go far, or all runs if `follows` is
+    true."""
 
     title: str
     arena: Arena

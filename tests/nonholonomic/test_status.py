@@ -10,7 +10,7 @@ import stroller
 import tippe
 from nonholonomic.sweeps import Table, Variable, axis, sweep
 from stroller.runs.table import WORDS as OF_RIDES
-from tippe.runs import cells
+from tippe.runs import run_kind
 from tippe.runs.trajectory_table import WORDS as OF_TRAJECTORIES
 
 pytestmark = pytest.mark.newest
@@ -37,6 +37,8 @@ def test_both_packages_hand_out_one_list_whose_integers_do_not_change():
         "inverted": 7,
         "not_inverted": 8,
         "rank_lost": 9,
+        "reversed": 10,
+        "not_reversed": 11,
     }
     assert all(Status.of(word) is status for word, status in zip(words, Status, strict=True))
 
@@ -48,14 +50,15 @@ def test_words_of_earlier_versions_are_understood_and_others_refused():
 
 
 def test_all_tables_use_words_of_the_list():
-    drivers = [one for one in vars(cells).values() if isinstance(one, cells.RunKind)]
-    assert len(drivers) == 6
+    drivers = [one for one in vars(run_kind).values() if isinstance(one, run_kind.RunKind)]
+    assert len(drivers) == 7
     known = {status.word for status in Status}
     for words in (OF_RIDES, OF_TRAJECTORIES, *(one.words for one in drivers)):
         assert known.issuperset(words)
         assert len(set(words)) == len(words)
     # Files say themselves what their integers mean; these are the ones that they have had from the beginning.
-    assert cells.WORDS == ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit")
+    words = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
+    assert words == run_kind.WORDS
     assert OF_TRAJECTORIES[:4] == ("completed", "contact_lost", "failed", "jammed")
     assert OF_RIDES == ("completed", "contact_lost", "rank_lost", "failed")
 

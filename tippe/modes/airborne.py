@@ -351,29 +351,3 @@ def modes(
     """The modes of runs, and the index of the mode in which each starts. **Arguments:** as for `sliding.modes`."""
     arguments = (scene, problem.scales, problem.cos_angle, with_quadratures)
     return (Slide(*arguments), Fly(*arguments)), jnp.zeros(problem.states.shape[1:], int)
-
-
-def on_the_ground(
-    scene: Scene[Top], state: Float[Array, "components cells"], mode: Int[Array, " cells"]
-) -> Float[Array, "14 cells"]:
-    """States of runs in the layout of a contact of the top's own sphere; for other modes, relative to the foot below
-    that sphere.
-    """
-    flies, flown = mode == FLYING, state[:OWN]
-    if scene.body.stem is not None:
-        on_stem = mode == ON_STEM
-        flies, flown = mode != SLIDING, jnp.where(on_stem, lift_off(scene, flown, False, balls(scene.body)[1]), flown)
-    flying = flight_state(flown)
-    ground = below(scene, flying)
-    return jnp.where(flies, in_contact(ground, as_free_body(scene, flying, ground)), state[:OWN])
-
-
-def loss(scene: Scene[Top], state: Float[Array, "components ..."]) -> Int[Array, "..."]:
-    """Why a contact ended, if it was not merely lost: a code in `LOSSES` (`tippe/model/dynamics.py`)."""
-    own, state = scene.dynamics, state[:OWN]
-    if scene.body.stem is None:
-        return own.loss(state)
-    # The domain margin of the touching sphere has vanished.
-    stem = standing(scene, balls(scene.body)[1])
-    on_stem = jnp.abs(stem.contact_margin(state)) < jnp.abs(own.contact_margin(state))
-    return jnp.where(on_stem, stem.loss(state), own.loss(state))

@@ -8,12 +8,13 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from nonholonomic.geometry import Vector, cross, dot, scale
 
 from ..model.body import Round
 from ..model.dynamics import Dynamics
+from ..model.scene import Scene
 from ..model.state import joined, parts
 from ..model.stick_slip import StickSlip
 from ..model.top import Top
@@ -125,6 +126,22 @@ def energy(body: Top, gravity: Float[ArrayLike, "..."], free: FreeBody) -> Float
     across = dot(free.momentum, free.momentum) - axial**2
     rotation = across / (2.0 * body.I1) + axial**2 / (2.0 * body.I3)
     return body.mass * (0.5 * dot(free.velocity, free.velocity) + gravity * free.height) + rotation
+
+
+def energy_in(
+    scene: Scene[Top], state: Float[Array, "components ..."], number: Int[Array, "..."]
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """The least and the greatest energy [J] that a state at the end of a mode, or of a flight from there, may have.
+
+    In flight its sphere is above the plane, and the state does not tell at which speed along the normal.
+
+    **Arguments:** `number`: of the mode of `sliding.py`; where both spheres touch, each tells the height.
+    """
+    main, stem = balls(scene.body)[0], balls(scene.body)[-1]
+    own = Ball(*(jnp.where(number == 1, of_stem, of_main) for of_stem, of_main in zip(stem, main, strict=True)))
+    free = as_free_body(scene.body, own, state)
+    whole = energy(scene.body, scene.gravity, free)
+    return whole - 0.5 * scene.body.mass * free.velocity[2] ** 2, whole
 
 
 def jellett(ball: Ball, free: FreeBody) -> Float[Array, "..."]:

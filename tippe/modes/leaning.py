@@ -15,7 +15,7 @@ with tau_j the torque per unit normal force of a law that has one. Then m u' = N
 t_j = f_j.(n x e) the momenta change by p' = sum N_j (a_j t_j + tau_j.n) and b' = sum N_j (R_j t_j + tau_j.e).
 
 The slips differ only across the direction of leaning. So m_1 - m_0 is (a_1 - a_0) (1 - c^2) without friction and with
-viscous friction; Coulomb's law can make it vanish if mu h is more than (a_1 - a_0) sin theta. The first of two normal
+viscous friction; Coulomb's law can make it vanish if mu h is more than (a_1 - a_0) sin theta. One of the two normal
 forces vanishes before that.
 """
 

@@ -24,6 +24,16 @@ from .trajectory_problem import TrajectoryProblem
 SLIPPING, ROLLING = range(2)
 
 
+def energy_in(
+    scene: Scene[Top], state: Float[Array, "components cells"], number: Int[Array, " cells"]
+) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
+    """The least and the greatest energy [J] that a state in a mode may have; here these are the same."""
+    assert isinstance(scene.dynamics, StickSlip)
+    rolls = scene.dynamics.rolling.carried_along(state)
+    total = scene.energy(jnp.where(number == ROLLING, rolls, state))
+    return total, total
+
+
 class StickSlipMode(AbstractBatchedMode):
     """Slipping or rolling until theta reaches an angle; with `last`, the last crossing counts.
 

@@ -30,14 +30,14 @@ from ..modes.airborne import (
     flight_state,
     in_contact,
     lift_off,
-    loss,
     standing,
 )
+from ..modes.airborne_ends import energy_in, lifted, loss
 from ..modes.airborne_stick_slip import modes as stick_slip_modes
 from ..modes.free_body import Ball, balls
 from ..modes.inversion_problem import InversionProblem
 from ..modes.trajectory_problem import TrajectoryProblem
-from .flight_trajectory import STATUS, HybridTrajectory, flights_of, sampled_flights
+from .flight_trajectory import STATUS, HybridTrajectory, flights_of, has_grown_between, sampled_flights
 from .observables import of_each_run
 
 #: A sphere is at the arena if its distance is below this fraction of its radius, at the end of a run.
@@ -52,12 +52,7 @@ class ArenaTrajectory(HybridTrajectory):
     @of_each_run
     def energy(self) -> Float[Array, " times"]:
         """Kinetic energy plus weight times the height of the centre of mass [J]."""
-        scene, (_, e, L, place) = self.scene, parts(self._states)
-        (distance, rate), n_up = self.above, scene.frame.vertical(place)[2]
-        # In contact, the velocity along n is that of the centre of mass about the sphere's centre.
-        about = -scene.body.offset * (L[0] * e[1] - L[1] * e[0]) / scene.body.I1
-        lifted = scene.gravity * distance * n_up + 0.5 * ((about + rate) ** 2 - about**2)
-        return scene.energy(self._states) + scene.body.mass * lifted
+        return self.scene.energy(self._states) + lifted(self.scene, self._states, *self.above)
 
     @of_each_run
     def theta_rate(self) -> Float[Array, " times"]:
@@ -189,4 +184,5 @@ def sampled_airborne(scene: Scene[Top], launch: Launch, times: Any, t1: Any, set
     checked."""
     samples = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, counters=1)
     codes = jnp.array([int(status) for status in LOSSES])
-    return sampled_flights(ArenaTrajectory, scene, times, samples, codes[loss(scene, samples.end_state)])
+    grown = has_grown_between(scene, arena_modes((scene, launch), settings.tolerance), samples, energy_in, settings)
+    return sampled_flights(ArenaTrajectory, scene, times, samples, codes[loss(scene, samples.end_state)], grown)

@@ -6,7 +6,7 @@ import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.hybrid import HybridOutcome
 from nonholonomic.integration import (
@@ -25,9 +25,9 @@ from nonholonomic.sweeps import Variable
 
 from ..model.dynamics import LOSSES
 from ..model.scene import Scene
-from ..modes import airborne
+from ..modes import airborne_ends
 from ..modes.inversion_problem import InversionProblem
-from .inversion import Inversions, is_inverted, with_contact_state
+from .inversion import Inversions, checked, is_inverted
 from .run_kind import COUNTED, HYBRID, WORDS, RunKind
 from .sensitivities import sensitivities_of_cells
 
@@ -37,19 +37,28 @@ NAMES = TIMES | {"end_time": "end of the run", "end_theta": "θ at the end of th
 
 # Compiled once for all chunks.
 _loss = eqx.filter_jit(lambda dynamics, state: dynamics.loss(state))
-_flight_loss = eqx.filter_jit(airborne.loss)
+_flight_loss = eqx.filter_jit(airborne_ends.loss)
 
 
 @eqx.filter_jit
 def _at_the_end(
-    scene: Scene, problem: InversionProblem, ended: Outcome | HybridOutcome, last: bool
-) -> tuple[Bool[Array, " cells"], Float[Array, " cells"]]:
-    """Which cells count as inverted, and theta [rad] at the end of each."""
-    return is_inverted(ended, problem, last), scene.theta(jnp.asarray(ended.state))
+    scene: Scene,
+    problem: InversionProblem,
+    outcome: Outcome | HybridOutcome,
+    last: bool,
+    tolerance: Float[Array, ""],
+) -> tuple[Int[Array, " cells"], Bool[Array, " cells"], Float[Array, " cells"]]:
+    """The status of all cells, which of them count as inverted, and theta [rad] at the end of each."""
+    outcome = checked(scene, problem, outcome, tolerance)
+    return outcome.status, is_inverted(outcome, problem, last), scene.theta(jnp.asarray(outcome.state))
 
 
-#: The word for the status of a run that has not inverted; `not_inverted` for all other codes.
-WORD_OF_STATUS = {LEFT_DOMAIN: WORDS.index("contact_lost"), FAILED: WORDS.index("failed"), UNRESOLVED: len(WORDS)}
+#: The word for a run's status if it has not inverted; `not_inverted` for all others.
+WORD_OF_STATUS = {
+    LEFT_DOMAIN: WORDS.index("contact_lost"),
+    FAILED: WORDS.index("failed"),
+    UNRESOLVED: WORDS.index("unresolved"),
+}
 
 
 def too_many_steps(t1: float, most: int, end: float) -> str:
@@ -132,11 +141,13 @@ class InversionRuns(NamedTuple):
             outcome = solve_by_diffrax(problem, jnp.asarray(self.t1), settings)
         else:
             outcome = solved(self.last)
-        variables = self._named(scene, problem, outcome)
+        variables = self._named(scene, problem, outcome, settings.tolerance)
         if self.crossing == "both":
             # With several modes, the first crossing needs a separate hybrid solve, which ends there.
             variables["first_time"] = (
-                np.asarray(outcome.first_crossing) if isinstance(outcome, Outcome) else _time_of_first(solved(False))
+                _time_of_first(checked(scene, problem, solved(False), settings.tolerance))
+                if isinstance(outcome, HybridOutcome)
+                else np.where(variables["status"] == WORDS.index("unresolved"), np.inf, outcome.first_crossing)
             )
         inverted = variables["status"] == WORDS.index("inverted")
         variables |= {name: np.where(inverted, slope, 0.0) for name, slope in slopes.items()}
@@ -144,18 +155,21 @@ class InversionRuns(NamedTuple):
             variables["grazes"] = (inverted & grazing).astype(np.int8)
         return variables
 
-    def _named(self, scene: Scene, problem: InversionProblem, outcome: Outcome | HybridOutcome) -> dict[str, Any]:
+    def _named(
+        self,
+        scene: Scene,
+        problem: InversionProblem,
+        outcome: Outcome | HybridOutcome,
+        tolerance: Float[Array, ""],
+    ) -> dict[str, Any]:
         """The variables that describe how the runs ended, but for the first of two times."""
-        state = jnp.asarray(outcome.state)
-        outcome = with_contact_state(scene, outcome)
-        inverted, theta = _at_the_end(scene, problem, outcome, self.last)
-        others = [np.asarray(outcome.status) == status for status in WORD_OF_STATUS]
+        ended, inverted, theta = _at_the_end(scene, problem, outcome, self.last, tolerance)
+        others = [np.asarray(ended) == status for status in WORD_OF_STATUS]
         code = np.select([np.asarray(inverted), *others], [0, *WORD_OF_STATUS.values()], 1)
         lost = code == WORDS.index("contact_lost")
         if lost.any():
-            code = np.where(
-                lost, np.array([WORDS.index(status.word) for status in LOSSES])[self._loss(scene, state)], code
-            )
+            words = np.array([WORDS.index(status.word) for status in LOSSES])
+            code = np.where(lost, words[self._loss(scene, jnp.asarray(outcome.state))], code)
         counts = zip(self.run_kind.counts, outcome.counts, strict=True) if isinstance(outcome, HybridOutcome) else ()
         return {
             self.times[-1]: np.where(inverted, outcome.crossing_time, np.inf),

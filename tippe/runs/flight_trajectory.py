@@ -1,13 +1,12 @@
 """One run through contacts, flights and impacts, with its path."""
 
-import dataclasses
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.hybrid import (
     BETWEEN,
@@ -25,17 +24,14 @@ from ..model.dynamics import NO_COSINE
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..model.top import Top
-from ..modes.free_body import Ball, FreeBody, as_free_body, balls, energy, standing_on
+from ..modes.free_body import Ball, FreeBody, as_free_body, balls, energy, energy_in, standing_on
 from ..modes.impact import approach
 from ..modes.inversion_problem import InversionProblem
 from ..modes.leaning import BOTH
 from ..modes.sliding import MOST_BOUNCES, modes
 from ..modes.trajectory_problem import TrajectoryProblem
+from .energy import has_grown, if_balanced, why_unbalanced
 from .observables import AbstractTrajectory, of_each_run
-
-#: The greatest energy residual of a run, relative to its energy and over its tolerance. Flights over ripples and in a
-#: spheroid stay below 1e-4 of this; a landing away from the arena gave a residual of 8e4 times this.
-BALANCED = 1e4
 
 #: The words for users, by the code of the integration.
 STATUS = {
@@ -49,19 +45,19 @@ STATUS = {
 class HybridTrajectory(AbstractTrajectory):
     """A run through contacts, flights and impacts; vectors are arrays (times, 3) in the fixed frame (x, y, z).
 
-    `status` is "completed", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a row
-    or 2000 contacts; sphere and stem on the plane together with so much friction that the forces are not determined;
-    sphere and stem at rest together on another arena, where the equations of both contacts at once are not implemented;
-    a flight that does not end at the arena; an energy residual beyond 1e4 times the tolerance, relative to the energy);
-    the run ends at `end_time`, and `print(run)` says why it is unresolved. `contact` is the sphere that touches at each
-    time: 0 the top's, 1 its stem's, 2 both, -1 none. At the time of an impact, values are those before the impact.
-    `distance` is the distance of the top's own sphere from the plane [m] with its rate [m/s]. `hops` has a row for each
-    flight until `end_time`, with its start and end [s]; a table counts only the flights before the inversion. Bounces
-    that shrink by the restitution e are followed down to a speed of 1e-5 sqrt(g R); after that the top counts as in
-    contact, although the remaining bounces would take e / (1 - e) of the last one's time. `work` is the work of
-    friction and of the impacts [J]. `stats` holds accepted and rejected steps, the greatest drift of |e|, the greatest
-    energy residual |E - E(0) - work| and the energy lost in impacts [J]. `rotation` and `angular_velocity` are those of
-    `Trajectory`.
+    `status` is "completed", "jammed" (as in `Trajectory`), "failed" or "unresolved" (more than 10 000 flights in a
+    row or 2000 contacts; sphere and stem on the plane together with so much friction that the forces are not
+    determined; sphere and stem at rest together on another arena, where the equations of both contacts at once are
+    not implemented; a flight that does not end at the arena; an energy that grows, or does not balance, by more than
+    1e4 times the tolerance, relative to the energy); the run ends at `end_time`, and `print(run)` says why it is
+    unresolved. `contact` is the sphere that touches at each time: 0 the top's, 1 its stem's, 2 both, -1 none. At the
+    time of an impact, values are those before the impact. `distance` is the distance of the top's own sphere from the
+    plane [m] with its rate [m/s]. `hops` has a row for each flight until `end_time`, with its start and end [s]; a
+    table counts only the flights before the inversion. Bounces that shrink by the restitution e are followed down to
+    a speed of 1e-5 sqrt(g R); after that the top counts as in contact, although the remaining bounces would take e /
+    (1 - e) of the last one's time. `work` is the work of friction and of the impacts [J]. `stats` holds accepted and
+    rejected steps, the greatest drift of |e|, the greatest energy residual |E - E(0) - work| and the energy lost in
+    impacts [J]. `rotation` and `angular_velocity` are those of `Trajectory`.
 
     Inside a transformation `status` is the integer of the `Status`; `hops` is `None`, `stats["hops"]` counts the
     flights. First derivatives by the scene and the launch go through flights and impacts; they are NaN after a grazing
@@ -178,7 +174,7 @@ class HybridTrajectory(AbstractTrajectory):
         """The reason for the status "unresolved"."""
         contacts = sum(segment.number != BETWEEN for segment in self.dense.segments)
         if self.dense.status != UNRESOLVED:
-            return f"the energy residual of {self.stats['energy_residual']:.1e} J is beyond what the tolerance allows"
+            return why_unbalanced(self)
         if self._flights >= MOST_BOUNCES or contacts >= MOST_ROUNDS:
             return "there were too many flights or changes of contact"
         return self.where_the_model_ends
@@ -226,17 +222,37 @@ def simulate_hybrid(
 def sampled_hybrid(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
     """Run one launch of a hybrid scene inside a transformation. **Arguments:** as for `simulate`, already checked."""
     samples = hybrid_samples(level_modes, (scene, launch), times, t1, settings, counters=1)
-    return sampled_flights(HybridTrajectory, scene, times, samples, jnp.asarray(int(Status.JAMMED)))
+    grown = has_grown_between(scene, level_modes((scene, launch), settings.tolerance), samples, energy_in, settings)
+    return sampled_flights(HybridTrajectory, scene, times, samples, jnp.asarray(int(Status.JAMMED)), grown)
+
+
+def has_grown_between(scene: Scene[Top], built: Any, samples: HybridSamples, energies: Any, settings: Settings) -> Any:
+    """Whether a sampled run has ended with more energy than it began with.
+
+    **Arguments:** `built`: modes, number of the first, and state; `energies`: gives the least and the greatest energy of a
+    state in a mode.
+    """
+    _, first, state = built
+    after, _ = energies(scene, samples.end_state[:, None], samples.end_mode[None].astype(int))
+    return has_grown(scene, energies(scene, state, first)[1], after, settings.tolerance)[0]
 
 
 def sampled_flights(
-    kind: type[HybridTrajectory], scene: Scene[Top], times: Any, samples: HybridSamples, lost: Int[Array, ""]
+    kind: type[HybridTrajectory],
+    scene: Scene[Top],
+    times: Any,
+    samples: HybridSamples,
+    lost: Int[Array, ""],
+    grown: Bool[Array, ""],
 ) -> Any:
-    """A trajectory of the given class from samples; `lost` is the code for a run that left its domain."""
+    """A trajectory of some kind from samples; `lost` is the code of how a run ended that left its domain, and `grown` whether
+    it has gained energy.
+    """
     states, place, spin_angle, work, distance = kind.parts_of(samples.shown)
     # After the end, no sphere touches.
     number = jnp.where(jnp.isnan(samples.number), BETWEEN, samples.number).astype(int)
     ended = {code: jnp.asarray(int(status)) for code, status in STATUS.items()} | {LEFT_DOMAIN: lost}
+    ended |= {code: jnp.where(grown, int(Status.UNRESOLVED), ended[code]) for code in (REACHED_END, LEFT_DOMAIN)}
     status = sum(jnp.where(samples.status == code, index, 0) for code, index in ended.items())
     stats = {"accepted": samples.steps - samples.rejected, "rejected": samples.rejected, "hops": samples.counts[0]}
     stats = {name: count.astype(int) for name, count in stats.items()}
@@ -264,7 +280,5 @@ def flights_of(
     in_contact = sum(kind.work_in(segment) for segment in path.segments)
     # The remaining work is that of the impacts.
     run = run.with_stats(path, impact_loss=float(in_contact - path.state[-1]))
-    size = float(np.max(np.abs(run.energy))) + float(scene.body.mass * scene.gravity * scene.body.radius)
-    if status != Status.FAILED.word and not run.stats["energy_residual"] <= BALANCED * tolerance * size:
-        run = dataclasses.replace(run, status=Status.UNRESOLVED.word)
+    run = if_balanced(run, tolerance)
     return run if times is None else run.resampled(np.asarray(times)[np.asarray(times) <= run.end_time])

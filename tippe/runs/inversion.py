@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from nonholonomic.derivatives import solve_ensemble_with_tangents, traced_solve_ensemble_with_tangents
 from nonholonomic.hybrid import (
@@ -22,11 +22,21 @@ from nonholonomic.hybrid import (
     traced_solve_hybrid,
     traced_solve_hybrid_with_tangents,
 )
-from nonholonomic.integration import CROSSED, REACHED_END, Outcome, Settings, solve_ensemble, traced_solve_ensemble
+from nonholonomic.integration import (
+    CROSSED,
+    FAILED,
+    REACHED_END,
+    UNRESOLVED,
+    Outcome,
+    Settings,
+    solve_ensemble,
+    traced_solve_ensemble,
+)
 
 from ..model.scene import Scene
-from ..modes import airborne
+from ..modes.airborne_ends import on_the_ground
 from ..modes.inversion_problem import InversionProblem
+from .energy import has_grown
 from .run_kind import RunKind, run_kind_of
 
 
@@ -120,14 +130,21 @@ class Inversions(eqx.Module):
 
 
 # Compiled once for all chunks.
-_on_the_ground = eqx.filter_jit(airborne.on_the_ground)
-
-
-def with_contact_state(scene: Scene[Any], outcome: Outcome | HybridOutcome) -> Outcome | HybridOutcome:
-    """The outcome with all states, including those of flight, in the layout of a contact."""
-    if not isinstance(outcome, HybridOutcome) or not run_kind_of(scene).flight_state:
-        return outcome
-    return outcome._replace(state=_on_the_ground(scene, outcome.state, outcome.mode))
+@eqx.filter_jit
+def checked(
+    scene: Scene[Any], problem: InversionProblem, outcome: Outcome | HybridOutcome, tolerance: Float[Array, ""]
+) -> Any:
+    """The outcome with all states in the layout of a contact, those of flight too, and unresolved where a run has ended with
+    more energy than it began with, which friction cannot do (`energy.py`).
+    """
+    kind = run_kind_of(scene)
+    first: Any = None if kind.modes is None else kind.modes(scene, problem, tolerance, False)[1]
+    mode: Any = outcome.mode if isinstance(outcome, HybridOutcome) else None
+    state = jnp.asarray(outcome.state)[: len(problem.states)]
+    before, after = kind.energy_in(scene, problem.states, first)[1], kind.energy_in(scene, state, mode)[0]
+    grown = has_grown(scene, before, after, tolerance) & (outcome.status != FAILED)
+    outcome = outcome._replace(status=jnp.where(grown, UNRESOLVED, outcome.status))
+    return outcome._replace(state=on_the_ground(scene, state, mode)) if kind.flight_state else outcome
 
 
 def is_inverted(outcome: Outcome | HybridOutcome, problem: InversionProblem, last: bool) -> Bool[Array, " cells"]:

@@ -23,8 +23,8 @@ from ..model.scene import Scene
 from ..modes.inversion_problem import InversionProblem
 from .cells import InversionRuns, too_many_steps
 from .checks import check_event, check_run, nan_if_illegal, permitted, warn_if_it_cannot_invert
-from .inversion import Inversions, is_inverted, traced, with_contact_state
-from .run_kind import check_differentiable, run_kind_of
+from .inversion import Inversions, checked, is_inverted, traced
+from .run_kind import check_differentiable, run_kind_of, why_unresolved
 
 
 @status_line("simulating")
@@ -56,7 +56,7 @@ def inversion_time(
       `nonholonomic.integration.Oscillatory8()`.
 
     **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before; NaN
-    if the integration failed, or if numbers inside a transformation are out of range.
+    if the integration failed, if the run is unresolved, or if numbers inside a transformation are out of range.
 
     With `contact="hybrid"` and `SetValuedCoulomb`, first derivatives include flights, impacts, stick and slip
     (`nonholonomic/hybrid/saltation.py`). If an earlier event is grazing, so that it may not happen within the
@@ -132,8 +132,10 @@ def explain_failure(
     if word == "failed" and cell["steps"] >= most:
         raise ValueError(too_many_steps(t1, most, cell["end_time"]))
     event = "reversal" if angle is None else "inversion"
+    why = f": {why_unresolved(runs.run_kind)}" if word == "unresolved" else ""
+    end = f"at {cell['end_time']:.6g} s, at {cell['end_theta']:.6g} rad"
     warnings.warn(
-        f"the {event} time is NaN: the run ended as {word!r} at {cell['end_time']:.6g} s, at {cell['end_theta']:.6g} rad",
+        f"the {event} time is NaN: the run ended as {word!r} {end}{why}",
         UserWarning,
         stacklevel=4,
     )
@@ -157,7 +159,7 @@ class InversionSolve(AbstractDifferentiableSolve):
         may, t1, tolerance = permitted(self.structure, self.unchecked, leaves)
         inversions = self._inversions((*leaves[: self.movable], tolerance), cells)
         outcome = inversions.solve(t1, cells, Settings(tolerance, self.solver), traced())
-        return self._times(leaves, may, inversions, outcome, [])[0]
+        return self._times(leaves, may, tolerance, inversions, outcome, [])[0]
 
     def value_and_tangents(
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
@@ -173,7 +175,7 @@ class InversionSolve(AbstractDifferentiableSolve):
             )
         settings, solvers = Settings(tolerance, self.solver), traced(one_kernel=not nested)
         outcome, slopes, _ = inversions.solve_with_tangents(tangents, t1, cells, settings, solvers)
-        return self._times(leaves, may, inversions, outcome, gather([*slopes]))
+        return self._times(leaves, may, tolerance, inversions, outcome, gather([*slopes]))
 
     def _modules(self, leaves: Sequence[Array]) -> Any:
         """Scene, launch, angle, horizon and tolerance; `None` for omitted leaves at the end."""
@@ -191,12 +193,13 @@ class InversionSolve(AbstractDifferentiableSolve):
         self,
         leaves: Sequence[Array],
         may: Bool[Array, "..."],
+        tolerance: Float[Array, ""],
         inversions: Inversions,
         outcome: Outcome | HybridOutcome,
         slopes: list[Float[Array, " cells"]],
     ) -> tuple[Float[Array, " cells"], list[Float[Array, " cells"]]]:
-        """The inversion times and their derivatives: infinite and 0 without inversion, NaN if the run failed."""
-        outcome = with_contact_state(self._modules(leaves)[0], outcome)
+        """The times of inversion and their derivatives: infinite and 0 where there is none, NaN where the run failed."""
+        outcome = checked(self._modules(leaves)[0], inversions.problem, outcome, tolerance)
         inverted = is_inverted(outcome, inversions.problem, self.last)
         good = may & (outcome.status != FAILED) & (outcome.status != UNRESOLVED)
         time = jnp.where(good, jnp.where(inverted, outcome.crossing_time, jnp.inf), jnp.nan)

@@ -5,28 +5,27 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import AbstractBatchedMode
 from nonholonomic.sweeps import Variable
 
 from ..model.scene import Scene
-from ..modes import airborne, airborne_stem, airborne_stick_slip
-from ..modes.sliding import modes as hybrid_modes
-from ..modes.sticking import modes as stick_slip_modes
+from ..modes import airborne, airborne_ends, airborne_stem, airborne_stick_slip, free_body, sliding, sticking
 
 
 class RunKind(NamedTuple):
     """How to run a kind of scene: its status words, its counters besides steps, and its modes.
 
-    `modes` takes (scene, problem, tolerance, last) and returns the modes and the index of each cell's first mode;
-    `None` for runs of one smooth motion. `flight_state` is whether states may be those of flight, which have a separate
-    layout.
+    `modes` takes (scene, problem, tolerance, last) and returns the modes and the number of each cell's first; `None`
+    for runs of one smooth motion. `energy_in` takes (scene, state, mode) and returns the least and the greatest energy [J] that
+    the state may have. `flight_state` is whether states may be those of flight, in a layout of their own.
     """
 
     words: tuple[str, ...]
     counts: tuple[str, ...]
     modes: Callable[..., tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]] | None
+    energy_in: Callable[..., tuple[Float[Array, " cells"], Float[Array, " cells"]]]
     flight_state: bool = False
 
     @property
@@ -49,16 +48,27 @@ class RunKind(NamedTuple):
 #: Descriptions of the counters of a run.
 COUNTED = {"steps": "steps", "rejected": "rejected steps", "hops": "flights", "sticks": "changes from slip to rolling"}
 
-#: The words of tables, in the order of the integers in files (older than `Status`).
-WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit")
 
-SMOOTH = RunKind(WORDS, (), None)
-REVERSAL = RunKind(("reversed", "not_reversed", *WORDS[2:]), (), None)
-STICK_SLIP = RunKind((*WORDS, "unresolved"), ("sticks",), stick_slip_modes)
-HYBRID = RunKind((*WORDS, "unresolved"), ("hops",), hybrid_modes)
-AIRBORNE = RunKind((*WORDS, "unresolved"), ("hops",), airborne.modes, flight_state=True)
-ON_STEM_TOO = RunKind((*WORDS, "unresolved"), ("hops",), airborne_stem.modes, flight_state=True)
-STICK_SLIP_FLY = RunKind((*WORDS, "unresolved"), ("hops", "sticks"), airborne_stick_slip.modes, flight_state=True)
+def energy_of_state(
+    scene: Scene[Any], state: Float[Array, "components cells"], mode: Any
+) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
+    """The least and the greatest energy [J] of a state of one smooth motion, which are the same."""
+    total = scene.energy(state)
+    return total, total
+
+
+#: The words of tables, in the order of the integers in their files, which is older than `Status`.
+WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_not_fit", "unresolved")
+
+SMOOTH = RunKind(WORDS, (), None, energy_of_state)
+REVERSAL = RunKind(("reversed", "not_reversed", *WORDS[2:]), (), None, energy_of_state)
+STICK_SLIP = RunKind(WORDS, ("sticks",), sticking.modes, sticking.energy_in)
+HYBRID = RunKind(WORDS, ("hops",), sliding.modes, free_body.energy_in)
+AIRBORNE = RunKind(WORDS, ("hops",), airborne.modes, airborne_ends.energy_in, flight_state=True)
+ON_STEM_TOO = RunKind(WORDS, ("hops",), airborne_stem.modes, airborne_ends.energy_in, flight_state=True)
+STICK_SLIP_FLY = RunKind(
+    WORDS, ("hops", "sticks"), airborne_stick_slip.modes, airborne_ends.energy_in, flight_state=True
+)
 
 
 def run_kind_of(scene: Scene[Any]) -> RunKind:
@@ -71,6 +81,16 @@ def run_kind_of(scene: Scene[Any]) -> RunKind:
     if scene.flies_in_closed_form:
         return HYBRID
     return AIRBORNE if scene.body.stem is None else ON_STEM_TOO
+
+
+def why_unresolved(kind: RunKind) -> str:
+    """Why a run of some kind may be unresolved."""
+    grown = (
+        "its energy has grown by more than the tolerance allows, although nothing drives the top: the law of friction pushes "
+        "it, or the arena's heights do not fit its normals"
+    )
+    others = "the model determines no motion from there on, or its mode changed too often, or"
+    return grown if kind.smooth else f"{others} {grown}; tippe.simulate says which"
 
 
 def check_differentiable(scene: Scene[Any]) -> None:

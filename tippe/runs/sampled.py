@@ -13,17 +13,23 @@ from ..model.dynamics import LOSSES
 from ..model.launch import Launch
 from ..model.scene import Scene
 from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
+from .energy import has_grown
 
 
 def ended(
     run: TrajectoryProblem,
+    scene: Scene,
     state: Float[Array, "components ..."],
     left_domain: Bool[Array, "..."],
     failed: Bool[Array, "..."],
+    tolerance: float | Float[Array, ""],
 ) -> Int[Array, "..."]:
-    """The `Status` of a run that ended in the given state, as an integer."""
-    lost = jnp.array([int(status) for status in LOSSES])[run.dynamics.loss(state[: len(run.state)])]
-    return jnp.where(left_domain, lost, jnp.where(failed, int(Status.FAILED), int(Status.COMPLETED)))
+    """The `Status` of a run that ended in some state, as an integer: unresolved if it has gained energy (`energy.py`)."""
+    state = state[: len(run.state)]
+    lost = jnp.array([int(status) for status in LOSSES])[run.dynamics.loss(state)]
+    grown = has_grown(scene, scene.energy(run.state), scene.energy(state), tolerance)
+    ended = jnp.where(grown, int(Status.UNRESOLVED), jnp.where(left_domain, lost, int(Status.COMPLETED)))
+    return jnp.where(failed, int(Status.FAILED), ended)
 
 
 class Found(NamedTuple):
@@ -55,6 +61,7 @@ def sampled(
         samples = sampled_run(trajectory_problem, (scene, launch), times, t1, settings)
     else:
         samples = sampled_run_by_diffrax(run, times, t1, settings, adjoint)
-    status = ended(run, samples.end_state, samples.status == LEFT_DOMAIN, samples.status == FAILED)
+    codes = (samples.status == LEFT_DOMAIN, samples.status == FAILED)
+    status = ended(run, scene, samples.end_state, *codes, settings.tolerance)
     assert samples.quadratures is not None
     return Found(samples.states.T, samples.quadratures.T, samples.end_time, status, samples.accepted, samples.rejected)

@@ -18,7 +18,7 @@ from ..model.scene import Scene
 from .cells import InversionRuns, too_many_steps
 from .checks import check_event, check_reversible, warn_if_it_cannot_invert
 from .launches import described, launches, rows
-from .run_kind import REVERSAL, check_differentiable, run_kind_of
+from .run_kind import REVERSAL, RunKind, check_differentiable, run_kind_of, why_unresolved
 from .sensitivities import sensitivity_names, sensitivity_variables
 from .time_error import errors_of, second_tolerance
 
@@ -83,18 +83,19 @@ def inversion_table(
       limit applies to each stay in a mode; `method="diffrax"` allows 100 000 steps at most.
 
     **Returns:** a `Table` with `time` [s] (infinite if not inverted), `status` ("inverted", "not_inverted" by `t1`,
-    "contact_lost", "failed", "jammed"), `end_time` [s] and `end_theta` [rad] at which the run ended (also if contact
-    was lost or jammed), `steps` and `rejected`. With `errors` also `time_error` [s], a bound that is infinite if the
-    two runs disagree on the status or failed, and 0 if both find no time; `Table.digits("time")` shows the correct
-    digits. The same for `end_time` and `end_theta`; `hops_error` and `sticks_error` are the differences of the two
-    runs, and `status_error` is 1 if the runs disagree on the status or failed. With `sensitivities` also the derivative
-    of `time` with respect to each parameter, `time_by_mu` for `"scene.friction.mu"`, 0 if the top did not invert. It
-    includes flights, impacts, stick and slip; `grazes` is 1 and the derivative is NaN if an earlier event, such as a
-    landing, was grazing, so that it may not happen within the tolerance (`SetValuedCoulomb` with `contact="hybrid"` has
-    none). With `contact="hybrid"`, a run continues through flights, and the angle also counts in flight; `hops` is the
-    number of flights until the run ended, and `status` may be "unresolved" (10 000 flights in a row, or sphere and stem
-    on the plane together with so much friction that the forces are undetermined). With `SetValuedCoulomb`, `sticks` is
-    the number of changes from slip to rolling outside impacts, and `status` may be "unresolved" (too many changes).
+    "contact_lost", "failed", "jammed", "unresolved" if the energy grows), `end_time` [s] and `end_theta` [rad] at
+    which the run ended (also if contact was lost or jammed), `steps` and `rejected`. With `errors` also `time_error`
+    [s], a bound that is infinite if the two runs disagree on the status or failed, and 0 if both find no time;
+    `Table.digits("time")` shows the correct digits. The same for `end_time` and `end_theta`; `hops_error` and
+    `sticks_error` are the differences of the two runs, and `status_error` is 1 if the runs disagree on the status or
+    failed. With `sensitivities` also the derivative of `time` with respect to each parameter, `time_by_mu` for
+    `"scene.friction.mu"`, 0 if the top did not invert. It includes flights, impacts, stick and slip; `grazes` is 1
+    and the derivative is NaN if an earlier event, such as a landing, was grazing, so that it may not happen within
+    the tolerance (`SetValuedCoulomb` with `contact="hybrid"` has none). With `contact="hybrid"`, a run continues
+    through flights, and the angle also counts in flight; `hops` is the number of flights until the run ended, and
+    `status` may be "unresolved" (10 000 flights in a row, or sphere and stem on the plane together with so much
+    friction that the forces are undetermined). With `SetValuedCoulomb`, `sticks` is the number of changes from slip
+    to rolling outside impacts, and `status` may be "unresolved" (too many changes).
 
     **Raises:** `ValueError` for arguments out of range or an unknown axis; `OSError` for a path that cannot be used;
     `RuntimeError` for an executor that breaks down, or a worker with other versions.
@@ -197,6 +198,8 @@ def event_table(
         grid = [Axis("cell", "cell", "1", np.arange(len(grid[0].values)), "cell")]
     table = sweep(job, grid, variables, request, path=path, progress=progress, executor=executor)
     warn_of_long_runs(table, float(t1), max_steps)
+    if run_kind.smooth:
+        warn_of_unresolved_runs(table, run_kind)
     return table
 
 
@@ -210,6 +213,16 @@ def warn_of_long_runs(table: Table, t1: float, most: int) -> None:
         warnings.warn(
             f"{long.sum()} of {long.size} runs have failed: {too_many_steps(t1, most, end)}", UserWarning, stacklevel=3
         )
+
+
+def warn_of_unresolved_runs(table: Table, run_kind: RunKind) -> None:
+    """Warn of runs that are unresolved and say why; a table that stays in its file is not looked at."""
+    if not isinstance(table.variables, dict):
+        return
+    unresolved = np.asarray(table.variables["status"] == "unresolved")
+    if unresolved.any():
+        number = f"{unresolved.sum()} of {unresolved.size} runs are unresolved"
+        warnings.warn(f"{number}: {why_unresolved(run_kind)}", UserWarning, stacklevel=3)
 
 
 class InversionJob(NamedTuple):

@@ -41,6 +41,7 @@ from ..model.scene import Scene
 from ..modes.trajectory_problem import TrajectoryProblem
 from .airborne_trajectory import sampled_airborne, simulate_airborne
 from .checks import check_run
+from .energy import if_balanced, why_unbalanced
 from .flight_trajectory import HybridTrajectory, sampled_hybrid, simulate_hybrid
 from .observables import AbstractTrajectory, of_each_run
 from .sampled import ended, sampled
@@ -55,7 +56,8 @@ class Trajectory(AbstractTrajectory):
     centre of mass for other bodies; `contact` is the contact point, and `normal` the arena's normal there. `rotation`
     (times, 3, 3) rotates the body's axes to the fixed frame, and `angular_velocity` is its rate.
 
-    `status` is the word of a `Status`: "completed", "contact_lost", "failed", "jammed" or "does_not_fit"; inside a
+    `status` is the word of a `Status`: "completed", "contact_lost", "failed", "jammed", "does_not_fit" or "unresolved" (its
+    energy grows, or does not balance, by more than 1e4 times the tolerance, relative to the energy); inside a
     transformation it is the integer; for numbers out of range it is `Status.ILLEGAL`, and everything is NaN. The run
     ends at `end_time`. The top does not fit where a curvature of the arena reaches that of its sphere, which then
     touches at other points, too. It is jammed if the equation for the normal force has no solution, because friction
@@ -138,6 +140,10 @@ class Trajectory(AbstractTrajectory):
         """Velocity of the contact point along the arena, in the moving frame [m/s]."""
         return self.scene.slip_velocity(self.states).T
 
+    def __str__(self) -> str:
+        unresolved = isinstance(self.status, str) and self.status == Status.UNRESOLVED.word
+        return super().__str__() + (f"\n  unresolved: {why_unbalanced(self)}" if unresolved else "")
+
     def resampled(self, times: Float[np.ndarray, " times"]) -> "Trajectory":
         """The same run at other times, without checking them."""
         arrays = on_device(times, *_parts(len(self.states), self.dense.at(times)))
@@ -208,7 +214,7 @@ def simulate(
     run = TrajectoryProblem.of(scene, launch)
     through = solve_stick_slip_dense if scene.friction.set_valued else follow
     path = through(run, float(t1), Settings(tolerance, solver))
-    trajectory = _as_trajectory(scene, run, path)
+    trajectory = _as_trajectory(scene, run, path, tolerance)
     if times is None:
         return trajectory
     reached = np.asarray(times)[np.asarray(times) <= float(trajectory.end_time)]
@@ -281,12 +287,15 @@ def _parts(lean: int, states: Any) -> tuple[Any, Any, Any, Any]:
 _ended = eqx.filter_jit(ended)
 
 
-def _as_trajectory(scene: Scene, run: TrajectoryProblem, path: DenseSolution | HybridPath) -> Trajectory:
-    # NumPy slices these: JAX would compile every slice again for every number of steps.
+def _as_trajectory(
+    scene: Scene, run: TrajectoryProblem, path: DenseSolution | HybridPath, tolerance: float | Float[Array, ""]
+) -> Trajectory:
+    # NumPy cuts these: JAX would compile every cut anew for every number of steps.
     states = np.asarray(path.states)
     times, end, last = on_device(path.times, path.times[-1], states[:, -1])
-    status = Status(int(_ended(run, last, jnp.asarray(path.left_domain), jnp.asarray(path.failed)))).word
+    codes = (jnp.asarray(path.left_domain), jnp.asarray(path.failed))
+    status = Status(int(_ended(run, scene, last, *codes, jnp.asarray(tolerance)))).word
     sticks = {"sticks": int(path.counts[0])} if isinstance(path, HybridPath) else {}
     lean, cyclic, spin_angle, work = on_device(*_parts(len(run.state), states))
     trajectory = Trajectory(times, scene, lean, cyclic, spin_angle, work, status, end, {}, path)
-    return trajectory.with_stats(path, **sticks)
+    return if_balanced(trajectory.with_stats(path, **sticks), tolerance)

@@ -78,7 +78,8 @@ def _followed(
     """The `Status` of the runs as integers, and the named quantities at the samples."""
     outcome, samples = solve_with_samples(problem, times, times[-1], count, settings, one_kernel=True)
     run = cast(TrajectoryProblem, problem.whole)
-    status = ended(run, outcome.state, outcome.status == LEFT_DOMAIN, outcome.status == FAILED)
+    codes = (outcome.status == LEFT_DOMAIN, outcome.status == FAILED)
+    status = ended(run, scene, outcome.state, *codes, settings.tolerance)
     return outcome, status, {name: _read(run, scene, times, samples, name) for name in names}
 
 

@@ -46,6 +46,25 @@ def test_zeros_are_not_computed_with():
     assert "add" not in [equation.primitive.name for equation in listed.eqns]
 
 
+def hidden_in_zeros(*parts):
+    """A root that only zeros of a matrix are multiplied by, and one that is a term elsewhere."""
+    vector = jnp.stack([jnp.sqrt(parts[0]), jnp.sqrt(parts[3]), parts[2]])
+    return tuple(jnp.array([[0.0, 0.0, 1.0], [0.0, 2.0, 3.0]]) @ vector)
+
+
+def test_a_number_that_is_not_finite_does_not_disappear_with_the_zeros_of_a_matrix():
+    """NaN times zero is NaN, as in arrays; in lanes where the roots are numbers nothing changes, and only one is added."""
+    parts = (jnp.array([4.0, -1.0, 4.0]), *LANES[1:3], jnp.array([9.0, 9.0, -1.0]), *LANES[4:])
+    parts = tuple(part[:3] for part in parts)
+    expected = np.array(jax.vmap(hidden_in_zeros)(*parts))
+    assert np.isnan(expected).tolist() == [[False, True, True], [False, True, True]]
+    results = np.array(by_components(hidden_in_zeros, *SCALARS)(*parts))
+    assert_close(results[:, 0], expected[:, 0], rtol=1e-15)
+    assert np.isnan(results).any(axis=0).tolist() == [False, True, True]
+    listed = jax.make_jaxpr(by_components(hidden_in_zeros, *SCALARS))(*parts)
+    assert [equation.primitive.name for equation in listed.eqns].count("mul") == 3
+
+
 def test_large_functions_and_loops_are_left_in_arrays():
     def large(*parts):
         matrix = jnp.sin(jnp.outer(jnp.arange(20.0), jnp.stack(parts)))

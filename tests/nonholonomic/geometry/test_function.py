@@ -1,0 +1,73 @@
+"""Functions of a ground that hold arrays: their numbers are parameters of the ground, not one for each lane."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from close import assert_close
+
+import tippe
+from nonholonomic import Graph
+from nonholonomic.parameters import numbers
+
+
+class Bowl(eqx.Module):
+    """A ground with an array of two axes, of which the sum counts, and a number."""
+
+    bends: jax.Array
+    height: float
+
+    def __call__(self, x, y):
+        return self.height * sum(self.bends[k, 0] * x * x + self.bends[k, 1] * y * y for k in range(2))
+
+
+BENDS = np.array([[0.1, 0.6], [0.3, 0.4]])
+
+
+def heights(x, y):
+    return 0.4 * x * x + 1.0 * y * y
+
+
+def test_arrays_of_a_function_are_not_taken_for_numbers_of_lanes():
+    """What the engine picks for one lane of many is the whole function; in lanes each has its own height."""
+    ground = Graph(Bowl(BENDS, 1.0))
+    assert all(leaf.ndim == 0 for leaf in jax.tree.leaves(ground))
+    x, y = jnp.array([0.1, 0.2, 0.3]), jnp.array([0.3, -0.2, 0.1])
+    assert_close(ground.ground(x, y), heights(x, y), rtol=1e-14)
+    assert_close(ground.height.bends, BENDS, rtol=0.0)
+    (name,) = (name for name in numbers("ground", ground) if name.endswith(".height"))
+    assert float(numbers("ground", ground)[name]) == 1.0
+    swept = eqx.tree_at(lambda one: one.height.function.height, ground, jnp.array([1.0, 2.0, 3.0]))
+    assert_close(swept.ground(x, y), np.array([1.0, 2.0, 3.0]) * heights(x, y), rtol=1e-14)
+
+
+@pytest.mark.parametrize("held", [True, False], ids=["module", "closure"])
+def test_the_numbers_in_an_array_have_their_derivatives(held):
+    x, y = jnp.array([0.1, 0.2, 0.3]), jnp.array([0.3, -0.2, 0.1])
+
+    def total(bends):
+        bowl = Bowl(bends, 1.0)
+        return jnp.sum(Graph(bowl if held else lambda x, y: bowl(x, y)).ground(x, y))
+
+    squares = np.array([np.sum(x * x), np.sum(y * y)])
+    assert_close(jax.jit(jax.grad(total))(jnp.asarray(BENDS)), np.array([squares, squares]), rtol=1e-14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("contact", ["stop", "hybrid"])
+def test_runs_over_a_ground_with_arrays_are_those_over_the_same_ground_without(contact):
+    """A table of a single cell took the first number of an array for all of them, and "hybrid" raised an error of JAX's."""
+    top = tippe.Top(0.02, 0.02, 0.006, 2.994e-6, 3.2e-6)
+    launch = tippe.Launch(0.1, 155.0, place=(0.02, 0.03))
+    place = {"axes": {"launch.place[0]": 0.02, "launch.place[1]": 0.03}, "tolerance": 1e-7}
+    ends = []
+    for ground in (heights, Bowl(BENDS, 1.0)):
+        scene = tippe.Scene(top, Graph(ground), tippe.Viscous(0.3), contact=contact)
+        ends.append([float(tippe.simulate(scene, launch, 0.3, tolerance=1e-7).theta[-1])])
+        ends[-1].append(float(tippe.inversion_table(scene, theta=0.1, spin=155.0, t1=0.3, **place).end_theta))
+        if contact == "stop":
+            table = tippe.trajectory_table(scene, theta=0.1, spin=155.0, times=[0.3], **place)
+            ends[-1].append(float(table.theta[0]))
+    assert_close(ends[0], np.full(len(ends[0]), 0.0857507), atol=1e-6)
+    assert_close(ends[1], ends[0], rtol=1e-12)

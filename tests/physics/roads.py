@@ -1,0 +1,189 @@
+"""A random search for roads that lead to different answers: `python roads.py KIND ...` prints what differs, scene by scene.
+
+The scenes of a kind (`random_scenes.py`) differ in numbers only, so that each road has one program for all of them. The roads
+are a table, a batch of inversion times under `jit`, a batch of runs under `jit`, and for some scenes a time and a run by
+themselves; where flights are possible, also the table of the same scenes with `contact="stop"`.
+"""
+
+import sys
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from random_scenes import Batch, batch
+
+import tippe
+from nonholonomic.parameters import with_numbers
+from nonholonomic.xla_cpu import compile_quickly
+from tippe.runs.cells import InversionRuns
+from tippe.runs.run_kind import run_kind_of
+from tippe.runs.time_error import errors_of, second_tolerance
+
+ANGLE, TOLERANCE = 0.95 * np.pi, 1e-9
+
+#: How long runs take [s], those with flights less: a batch advances from flight to flight of the slowest.
+HORIZON, HORIZON_OF_FLIGHTS = 8.0, 3.0
+
+#: Of runs with their path, whose frame does not turn with the top, so that they err more at the same tolerance.
+OF_PATHS = second_tolerance(TOLERANCE)
+
+#: Error bounds of a table by which another road may differ, which has an error of its own.
+APART = 2.0
+
+#: What theta may change by within a fraction of 1e-6 of the horizon [rad], and its greatest rate [rad/s].
+FASTEST = 400.0
+
+#: Of a batch of runs.
+CODES = {
+    word: int(tippe.Status.of(word)) for word in ("contact_lost", "jammed", "does_not_fit", "unresolved", "failed")
+}
+
+
+def table_of(scenes: Batch, count: int, t1: float) -> dict[str, np.ndarray]:
+    """What a table of these scenes has, with errors, and the status in words."""
+    kind = run_kind_of(scenes.scene)
+    runs = InversionRuns(kind, t1, ANGLE, "first", None, "ensemble", [])
+    roots = {"scene": scenes.scene, "launch": scenes.launch}
+    first, second = (
+        runs.results(roots, scenes.columns, tolerance, count) for tolerance in (TOLERANCE, second_tolerance(TOLERANCE))
+    )
+    silent = tuple(kind.words.index(word) for word in ("failed", "unresolved"))
+    words = np.array(kind.words)[first["status"]]
+    return first | errors_of(first, second, ("time",), kind.counts, silent) | {"word": words}
+
+
+def scene_and_launch(scenes: Batch, cell: int) -> tuple[tippe.Scene, tippe.Launch]:
+    """One of the scenes."""
+    numbers = {name: jnp.asarray(values[cell]) for name, values in scenes.columns.items()}
+    roots = with_numbers({"scene": scenes.scene, "launch": scenes.launch}, numbers)
+    return roots["scene"], roots["launch"]
+
+
+def apart(times: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Differences of times, 0 where both are infinite."""
+    return np.abs(np.subtract(times, others, where=times != others, out=np.zeros(times.shape)))
+
+
+def batch_of_times(scenes: Batch, t1: float) -> np.ndarray:
+    """The times of all scenes by `jit` of `vmap`."""
+
+    @jax.jit
+    @jax.vmap
+    def times(columns):
+        roots = with_numbers({"scene": scenes.scene, "launch": scenes.launch}, columns)
+        return tippe.inversion_time(roots["scene"], roots["launch"], t1, ANGLE, TOLERANCE)
+
+    return np.asarray(times({name: jnp.asarray(values) for name, values in scenes.columns.items()}))
+
+
+def batch_of_runs(scenes: Batch, ends: np.ndarray, t1: float) -> tuple[np.ndarray, ...]:
+    """Angle at a time of its own in each scene, end and code of the status of the runs, by `jit` of `vmap` of `simulate`."""
+
+    @jax.jit
+    @jax.vmap
+    def runs(columns, end):
+        roots = with_numbers({"scene": scenes.scene, "launch": scenes.launch}, columns)
+        run = tippe.simulate(roots["scene"], roots["launch"], t1, end[None], OF_PATHS)
+        return run.theta[0], run.end_time, run.status
+
+    columns = {name: jnp.asarray(values) for name, values in scenes.columns.items()}
+    return tuple(np.asarray(part) for part in runs(columns, jnp.asarray(ends)))
+
+
+class Findings:
+    """What differs, in words, and how many comparisons were made."""
+
+    def __init__(self, kind: str):
+        self.kind, self.lines, self.compared = kind, [], 0
+
+    def check(self, what: str, cells: Any, holds: Any, *shown: Any) -> None:
+        """Note each of some cells of which something does not hold."""
+        for cell in np.atleast_1d(cells):
+            at = [float(np.atleast_1d(values)[cell if np.size(values) > 1 else 0]) for values in shown]
+            self.compared += 1
+            if not np.atleast_1d(holds)[cell if np.size(holds) > 1 else 0]:
+                self.lines.append(f"{self.kind}, scene {cell}: {what}: {', '.join(f'{one:.12g}' for one in at)}")
+
+
+def compare_roads(kind: str, count: int, singles: int, seed: int = 5) -> tuple[Findings, int]:
+    """Compare the roads through random scenes of a kind.
+
+    **Returns:** what differs, and of how many scenes a table has an answer with an error.
+    """
+    found, scenes = Findings(kind), batch(kind, count, seed=seed)
+    flies = scenes.scene.contact == "hybrid"
+    t1 = HORIZON_OF_FLIGHTS if flies else HORIZON
+    table = table_of(scenes, count, t1)
+    time_error, end_error, end = table["time_error"], table["end_time_error"], table["end_time"]
+    known = (table["status_error"] == 0) & (time_error < 1e-3) & (end_error < 1e-3)
+    inverted, word = table["word"] == "inverted", table["word"]
+    stops = known & np.isin(word, list(CODES))
+
+    times = batch_of_times(scenes, t1)
+    found.check("a batch of times inverts, or not", np.flatnonzero(known), np.isfinite(times) == inverted, times)
+    near = apart(times, table["time"]) <= APART * time_error
+    found.check("time in a batch, in a table", np.flatnonzero(known & inverted), near, times, table["time"], time_error)
+
+    flat = FASTEST * (1e-6 * t1 + APART * end_error) + APART * table["end_theta_error"]
+    if not scenes.scene.friction.set_valued:
+        # Just before the run's end in the table, where each run still is.
+        theta, ended, status = batch_of_runs(scenes, end * (1.0 - 1e-6), t1)
+        codes = np.array([CODES.get(one, -1) for one in word])
+        found.check("status of a batch of runs, of a table", np.flatnonzero(stops), status == codes, status, codes)
+        near = np.abs(ended - end) <= APART * end_error
+        found.check("end in a batch of runs, in a table", np.flatnonzero(stops), near, ended, end, end_error)
+        near = np.abs(theta - table["end_theta"]) <= flat
+        found.check("theta in a batch, in a table", np.flatnonzero(known), near, theta, table["end_theta"], flat)
+
+    for cell in np.flatnonzero(known)[:singles]:
+        scene, launch = scene_and_launch(scenes, cell)
+        alone = float(tippe.inversion_time(scene, launch, t1, ANGLE, TOLERANCE))
+        same = alone == table["time"][cell] or abs(alone - table["time"][cell]) <= APART * time_error[cell]
+        found.check("time alone, in a table", cell, same, np.full(count, alone), table["time"], time_error)
+        run = tippe.simulate(scene, launch, min(t1, 1.001 * float(end[cell]) + 1e-3), tolerance=OF_PATHS)
+        here = run.at([min(float(end[cell]) * (1.0 - 1e-6), float(run.end_time))])
+        same = abs(float(here.theta[0]) - table["end_theta"][cell]) <= flat[cell]
+        theta = np.full(count, here.theta[0])
+        found.check("theta of a run alone, in a table", cell, same, theta, table["end_theta"], flat)
+        ends = stops[cell] == (run.status != "completed") and (not stops[cell] or run.status == word[cell])
+        found.check(f"{run.status} alone, {word[cell]} in a table", cell, ends, np.full(count, run.end_time), end)
+
+    if flies:
+        compare_with_stops(found, scenes, table, count, t1)
+    return found, int(known.sum())
+
+
+def compare_with_stops(found: Findings, scenes: Batch, flies: dict[str, np.ndarray], count: int, t1: float) -> None:
+    """A top that keeps its contact does the same whether or not it may fly; one that loses it in one flies in the other."""
+    scene, columns = scenes.scene, {name: one for name, one in scenes.columns.items() if "restitution" not in name}
+    stop = tippe.Scene(scene.body, scene.surface, scene.friction)
+    stops = table_of(scenes._replace(scene=stop, columns=columns), count, t1)
+    sure = (stops["status_error"] == 0) & (flies["status_error"] == 0)
+    kept = np.flatnonzero(sure & (stops["word"] != "contact_lost") & (flies["hops"] == 0))
+    same = (stops["word"] == flies["word"]) & (np.isfinite(stops["time"]) == np.isfinite(flies["time"]))
+    found.check("status with stop and hybrid", kept, same, stops["end_time"], flies["end_time"])
+    error = APART * (stops["time_error"] + flies["time_error"])
+    near = apart(stops["time"], flies["time"]) <= error
+    found.check("time with stop and hybrid", kept, near, stops["time"], flies["time"], error)
+    lost = np.flatnonzero(sure & (stops["word"] == "contact_lost") & (flies["end_time"] > stops["end_time"]))
+    found.check("flights of a top that loses its contact", lost, flies["hops"] > 0, flies["hops"])
+
+
+def main(kinds: list[str]) -> int:
+    """Search through some kinds of scenes and print what differs."""
+    differ = 0
+    for kind in kinds:
+        count, singles = (16, 1) if kind.endswith("hybrid") else (45, 3)
+        begun = time.process_time()
+        found, known = compare_roads(kind, count, singles)
+        differ += len(found.lines)
+        print(f"{kind}: {found.compared} comparisons, {known} of {count} scenes, {time.process_time() - begun:.0f} s")
+        print("".join(f"  {line}\n" for line in found.lines), end="", flush=True)
+    return differ
+
+
+if __name__ == "__main__":
+    compile_quickly()
+    sys.exit(main(sys.argv[1:]) > 0)

@@ -1,0 +1,51 @@
+"""The energy of runs as a check: without a drive it never grows, and friction takes what is missing."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from nonholonomic.integration import Status
+
+from ..model.scene import Scene
+
+#: The most by which an energy may be off, relative to its size and over the tolerance. Flights over ripples and in a spheroid
+#: stay below 1e-4 of this; a landing where no arena was had left a residual of 8e4 times it.
+BALANCED = 1e4
+
+
+def allowance(scene: Scene[Any], energy: Any, tolerance: Any) -> Any:
+    """By how much an energy of some size [J] may be off [J] at a tolerance."""
+    return BALANCED * tolerance * (abs(energy) + scene.body.mass * scene.gravity * scene.body.size)
+
+
+def has_grown(
+    scene: Scene[Any],
+    before: Float[Array, "..."],
+    after: Float[Array, "..."],
+    tolerance: float | Float[Array, "..."],
+) -> Bool[Array, "..."]:
+    """Whether the energy [J] at the end of a run is greater than at its start, by more than the tolerance allows: then the
+    arena's heights, the law of friction or the integration is wrong. NaN has not grown.
+    """
+    return jnp.asarray(after > before + allowance(scene, before, tolerance))
+
+
+def if_balanced(run: Any, tolerance: float | Float[Array, ""]) -> Any:
+    """A single run with its stats, "unresolved" if its energy has grown or is not what friction and impacts have left of it."""
+    energy = np.asarray(run.energy)
+    most = float(allowance(run.scene, np.max(np.abs(energy)), tolerance))
+    balanced = run.stats["energy_residual"] <= most and energy[-1] <= energy[0] + most
+    if balanced or run.status == Status.FAILED.word:
+        return run
+    return dataclasses.replace(run, status=Status.UNRESOLVED.word)
+
+
+def why_unbalanced(run: Any) -> str:
+    """Why such a run is "unresolved"."""
+    energy = np.asarray(run.energy)
+    if (gained := energy[-1] - energy[0]) > run.stats["energy_residual"]:
+        return f"the energy has grown by {gained:.1e} J, although nothing drives the top"
+    return f"the energy residual of {run.stats['energy_residual']:.1e} J is beyond what the tolerance allows"
