@@ -135,7 +135,8 @@ class Evaluation:
             return np.split(inputs[0], np.cumsum(params["sizes"])[:-1], axis=params["axis"])
         if name == "unstack":
             axis = params["axis"]
-            return [np.take(inputs[0], k, axis=axis) for k in range(inputs[0].shape[axis])]
+            # The ellipsis keeps an array, even where a single element is left.
+            return [inputs[0][(slice(None),) * axis + (k, ...)] for k in range(inputs[0].shape[axis])]
         if name in MOVES:
             return [MOVES[name](equation, *inputs)]
         raise TooLarge(name)

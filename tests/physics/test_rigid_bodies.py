@@ -330,8 +330,8 @@ def test_the_inertia_of_a_rattleback_is_found_from_its_motion():
     free = {"inertia.xy": -1.8e-5, "centre_of_mass[2]": -0.0101}
     fit = tippe.identify(rattleback(), data, free, progress=False)
     for name, value in (("scene.body.inertia.xy", -2e-5), ("scene.body.centre_of_mass[2]", -0.01)):
-        assert abs(fit.estimates[name] - value) < 4.0 * fit.errors[name]
-        assert fit.errors[name] < 0.02 * abs(value)
+        assert abs(fit.estimates[name] - value) < 4.0 * fit.standard_errors[name]
+        assert fit.standard_errors[name] < 0.02 * abs(value)
 
 
 # Refusals

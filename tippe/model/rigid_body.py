@@ -80,6 +80,9 @@ class Ellipsoid(AbstractRigidBody):
     It runs on a level or tilted plane, with every friction law except `SetValuedCoulomb`, or without slip (`NoSlip`).
     The part that never touches the plane does not matter: half an ellipsoid, or a boat, moves like the whole one.
 
+    At a `Launch`, the body's axes x, y and z are those of the arena (t1, t2, n), turned by theta about a horizontal axis so
+    that z leans in the direction `azimuth`. `spin` is the angular velocity about z.
+
     **Arguments:**
 
     - `mass`: mass [kg], positive.

@@ -64,6 +64,14 @@ class Attitude(NamedTuple):
         x, y, z = (scale(part, axis) for part, axis in zip(vector, self.axes, strict=True))
         return vector_of(sum_vectors(x, y, z))
 
+    @property
+    def axis_rates(self) -> tuple[Vector, Vector]:
+        """Rates of change of the body's axes x and z, which turn with it."""
+        (x, y, z), (w1, w2, w3) = self.axes, self.turning
+        return vector_of(w3 * b - w2 * c for b, c in zip(y, z, strict=True)), vector_of(
+            w2 * a - w1 * b for a, b in zip(x, y, strict=True)
+        )
+
     def in_body(self, vector: Vector) -> Vector:
         """A vector in the body's axes, from its components in the frame."""
         return vector_of(dot(vector, axis) for axis in self.axes)
@@ -180,10 +188,9 @@ class SlippingDynamics(AbstractRigidDynamics):
         (u1, u2), _, _, place = parts(state)
         attitude = self.attitude(state)
         up = self.frame.vertical(place[:-3])
-        w, r = attitude.in_frame(attitude.turning), attitude.in_frame(attitude.lever)
-        swing = cross(w, r)
+        r, swing = attitude.in_frame(attitude.lever), attitude.in_frame(cross(attitude.turning, attitude.lever))
         slip_x, slip_y = stored(u1 + swing[0], u2 + swing[1])
-        slip = Slip(slip_x, slip_y, w)
+        slip = Slip(slip_x, slip_y, attitude.in_frame(attitude.turning))
         friction = self.friction.per_normal_force(slip)
         f1, f2 = friction.force
         moment = vector_of(stored(*sum_vectors(cross(r, (f1, f2, 1.0)), friction.torque)))
@@ -202,8 +209,8 @@ class SlippingDynamics(AbstractRigidDynamics):
         along = attitude.in_frame(attitude.lever_rate)
         path = (slip_x + along[0], slip_y + along[1])
         place_rate = self.frame.frame_motion(place[:-3], path).place_rate
-        c, _, e = attitude.axes
-        rate = (u1_dot, u2_dot, *cross(w, e), *scale(N, moment), *place_rate, *cross(w, c))
+        c_dot, e_dot = attitude.axis_rates
+        rate = (u1_dot, u2_dot, *e_dot, *scale(N, moment), *place_rate, *c_dot)
         return Motion(rate, N, friction, slip, path, (None, None), attitude.turning[2], painleve_factor, None)
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
@@ -248,17 +255,17 @@ class RollingDynamics(AbstractRigidDynamics):
         push = attitude.in_frame(vector_of(scale(m, sum_vectors(turning, cross(r, w_dot)))))
         F = vector_of(stored(*push))
 
-        lever, spinning = attitude.in_frame(r), attitude.in_frame(w)
+        lever = attitude.in_frame(r)
         u1_dot = subtract(F[0] / m, multiply(self.gravity, up[0]))
         u2_dot = subtract(F[1] / m, multiply(self.gravity, up[1]))
         along = attitude.in_frame(attitude.lever_rate)
         path = (along[0], along[1])
         place_rate = self.frame.frame_motion(place[:-3], path).place_rate
-        c, _, e = attitude.axes
-        rate = (u1_dot, u2_dot, *cross(spinning, e), *cross(lever, F), *place_rate, *cross(spinning, c))
+        c_dot, e_dot = attitude.axis_rates
+        rate = (u1_dot, u2_dot, *e_dot, *cross(lever, F), *place_rate, *c_dot)
         still = jnp.zeros_like(F[2])
         load = ContactLoad((F[0] / F[2], F[1] / F[2]))
-        slip = Slip(still, still, spinning)
+        slip = Slip(still, still, attitude.in_frame(w))
         return Motion(rate, F[2], load, slip, path, (None, None), w[2], 1.0 + still, None)
 
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
