@@ -135,8 +135,8 @@ class Evaluation:
             return np.split(inputs[0], np.cumsum(params["sizes"])[:-1], axis=params["axis"])
         if name == "unstack":
             axis = params["axis"]
-            # Not `np.take`, which returns an element of a vector itself and not an array of it.
-            return [part.squeeze(axis) for part in np.split(inputs[0], inputs[0].shape[axis], axis=axis)]
+            # The ellipsis keeps an array, even where a single element is left.
+            return [inputs[0][(slice(None),) * axis + (k, ...)] for k in range(inputs[0].shape[axis])]
         if name in MOVES:
             return [MOVES[name](equation, *inputs)]
         raise TooLarge(name)

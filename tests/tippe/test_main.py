@@ -9,6 +9,7 @@ import pytest
 import xarray
 
 import tippe
+from nonholonomic.views import NO_VIEW
 from tippe import __main__ as job
 from tippe.__main__ import main
 from tippe.papers.tables import drawn, parser
@@ -68,6 +69,14 @@ def test_the_main_job_prints_writes_and_draws(tmp_path, capsys, monkeypatch, rut
     assert "window.live" in page
     assert "A tippe top climbs onto its stem" in page
     assert "data:image/png" in page
+    # The same again, without three.js: the tables are read, and the page says what is missing.
+    monkeypatch.setattr(job, "can_view", lambda: False)
+    assert main(arguments) == 0
+    assert capsys.readouterr().out.rstrip().endswith(NO_VIEW)
+    page = (tmp_path / "index.html").read_text()
+    assert "<td>18 deg</td>" in page
+    assert "window.live" not in page
+    assert "jupyter-threejs-sage is not installed" in page
 
 
 @pytest.mark.slow

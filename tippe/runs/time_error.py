@@ -7,9 +7,9 @@ from nonholonomic.integration import TIGHTEST
 
 #: Ratio of a tolerance to that of the second run, which with a pair of eighth order costs 1.8 times the first. The
 #: error of the second run is then a hundredth of that of the first, so the difference of the two is the error of the
-#: first. With a ratio of 10, three to five times as many errors exceed the bound; with a coarser second run, twenty
-#: times as many do at 1e-8 with a bound of twice the difference, which exceeds the error by more than a factor of 30 in
-#: a third of the cells.
+#: first. With a ratio of 10, three to five times as many errors exceed the bound; with a second run ten times coarser,
+#: twenty times as many do at 1e-8 with a bound of twice the difference, which exceeds the error by more than a factor
+#: of 30 in a third of the cells.
 FINER = 100.0
 
 #: Ratio of the bound to the difference of the two runs. With a ratio of 3, twice as many errors exceed the bound.
