@@ -107,7 +107,7 @@ class HybridPath(NamedTuple):
 
 
 @eqx.filter_jit
-def _problem(mode: AbstractBatchedMode, state: Float[Array, " components"]) -> AbstractProblem:
+def _problem(mode: AbstractBatchedMode, state: Float[Array | np.ndarray, " components"]) -> AbstractProblem:
     """The motion in a mode of one cell, as a problem without an axis of cells."""
     lone = jax.tree.map(lambda leaf: leaf[..., 0] if eqx.is_array(leaf) and leaf.ndim else leaf, mode)
     return lone.problem(state)
@@ -131,7 +131,7 @@ def _between(mode: AbstractBatchedMode, motion: Any, passed: Float[Array, " time
 def solve_hybrid_dense(
     modes: tuple[AbstractBatchedMode, ...],
     number: int,
-    state: Float[Array, " components"],
+    state: Float[Array | np.ndarray, " components"],
     t1: float,
     settings: Settings,
     *,
@@ -165,12 +165,9 @@ def solve_hybrid_dense(
         segments += _way(mode, transition, time)
         counts += np.asarray(transition.counts)[:, 0]
         # NumPy cuts these: JAX would compile every cut.
-        number, status, state, elapsed = (
-            np.asarray(part)[..., 0]
-            for part in (transition.mode, transition.status, transition.state, transition.elapsed)
-        )
-        number, status = int(number), int(status)
-        time = t1 if status == REACHED_END else time + float(elapsed)
+        transition = jax.tree.map(np.asarray, transition._replace(record=None))
+        number, status, state = int(transition.mode[0]), int(transition.status[0]), transition.state[:, 0]
+        time = t1 if status == REACHED_END else time + float(transition.elapsed[0])
         if not (np.isfinite(state).all() and np.isfinite(time)):
             status, time = FAILED, segments[-1].end
         if status != RUNNING:

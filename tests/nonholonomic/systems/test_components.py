@@ -25,7 +25,8 @@ def odds(*parts):
     table = jnp.pad(y.reshape(2, 3), ((1, 0), (0, 2)))
     ordered = jnp.where(jnp.arange(5) < 3, table[2, ::-1], table.T @ table @ jnp.ones(5))
     flat = jnp.concatenate([ordered, jnp.exp(y[:2]) ** 2, jnp.max(table, axis=0)[None, 1]])
-    return jnp.sum(flat), jnp.min(flat), jnp.sqrt(jnp.abs(flat[1])) + (y[0] > 0.5), jnp.arctan2(*y[:2])
+    first, second = jnp.unstack(y[:2])
+    return jnp.sum(flat), jnp.min(flat), jnp.sqrt(jnp.abs(flat[1])) + (y[0] > 0.5), jnp.arctan2(first, second)
 
 
 @pytest.mark.parametrize("function", [motion, odds])
