@@ -40,7 +40,7 @@ class SampledRun(NamedTuple):
     (`REACHED_END`, `LEFT_DOMAIN` or `FAILED`), and the numbers of accepted and rejected steps.
 
     `states` and `end_state` are the core components (the problem's `leading` ones), `quadratures` the passive quadratures,
-    `None` if there are none. If a program does not use `quadratures`, the ensemble runs without it.
+    `None` if there are none. If a program does not use `quadratures`, the ensemble runs without them.
     """
 
     states: Float[Array, "*cells times components"]

@@ -144,7 +144,7 @@ class Graph(AbstractOpen, AbstractLevel):
       with `jax.numpy` and without `if`. If it is an `equinox.Module`, its numbers are parameters of the scene, which
       you can sweep and differentiate.
 
-    **Raises:** `ValueError` for anything but such a function.
+    **Raises:** `ValueError` if `height` is not a function of x and y.
 
     **Example:**
 

@@ -33,7 +33,7 @@ class Implicit(AbstractLevel):
       arrays of any shape, one number per lane, so write it with `jax.numpy` and without `if`. If it is an
       `equinox.Module`, its numbers are parameters of the scene, which you can sweep and differentiate.
 
-    **Raises:** `ValueError` for anything but such a function.
+    **Raises:** `ValueError` if `function` is not a function of x, y and z.
 
     **Example:**
 

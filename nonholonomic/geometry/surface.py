@@ -120,7 +120,7 @@ class AbstractSurface(Bounded):
         )
 
     def offset(self, position: Vector) -> Component:
-        """Distance [m], to first order if that is cheaper: for positions close to the surface."""
+        """Distance [m] of a position close to the surface, exact or, where that is cheaper, to first order."""
         return self.distance(position)
 
     def distance(self, position: Vector) -> Component:

@@ -101,7 +101,7 @@ class AbstractHoppingMode(AbstractBatchedMode):
 
     @abc.abstractmethod
     def lost(self, state: Float[Array, "components cells"]) -> Any:
-        """The first stretch, from the states at the end of the mode."""
+        """The first stretch of motion after the mode, which starts from the states at its end."""
 
     @abc.abstractmethod
     def hop(self, stretch: Any, left: Float[Array, " cells"]) -> tuple[Any, Any]:

@@ -138,8 +138,8 @@ class Oscillatory8(diffrax.AbstractERK):
     """A Runge-Kutta pair of orders 8 and 7 with thirteen stages, for motions that oscillate or turn.
 
     Its dense output is the cubic through states and rates at both ends, far less accurate than its steps: it is for runs that
-    end, or are sampled, at the ends of steps, as those of tables are. Where Diffrax integrates, as in a single run by
-    `simulate`, it is refused.
+    end, or are sampled, at the ends of steps, as those of tables are. Functions that
+    interpolate within steps, such as `tippe.simulate` for a single run, therefore raise a `ValueError` for this solver.
 
     **Example:**
 

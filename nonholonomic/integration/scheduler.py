@@ -60,7 +60,7 @@ class Progress(NamedTuple):
 
 
 class LaneScheduler(eqx.Module):
-    """The cells of a problem at their starts, and how they are run.
+    """Runs the cells of a problem in lanes; holds their initial states and the settings.
 
     Leaves of `problem`, `t1`, `atols` and `fresh` are scalars or hold one number per cell in their last axis.
     """

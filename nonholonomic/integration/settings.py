@@ -103,8 +103,8 @@ def legal_run(
 
     A run of illegal numbers might never end, so it does not begin, and its tolerance does not affect its batch.
 
-    **Arguments:** `others`: whether all numbers are legal but `t1`, `tolerance` and the `times` of output (times,), which
-    must increase.
+    **Arguments:** `others`: whether all other numbers are legal; `t1`, `tolerance`, and the `times` of output (times,),
+    which must increase, are checked here.
     """
     may = jnp.asarray(others) & legal(run_bounds(t1, tolerance))
     if times is not None:
@@ -133,7 +133,7 @@ def require_adjoint(adjoint: Any) -> None:
 
 
 def lanes_for(cells: int, n_blocks: int = 1) -> int:
-    """Number of cells that should advance together, from their number and the number of equal blocks in the state.
+    """Number of lanes for a number of cells whose state has a number of equal blocks.
 
     On a CPU the lanes and their stages should fit the first caches; an accelerator is idle below tens of thousands.
     """

@@ -39,7 +39,7 @@ class Variable(NamedTuple):
 def axis(name: str, number: str, unit: str, values: Any, long_name: str = "") -> Axis:
     """An axis, checked.
 
-    **Raises:** `ValueError` that names the axis if the values are not a non-empty one-dimensional array of finite numbers.
+    **Raises:** `ValueError` that names the axis unless the values are finite numbers in a one-dimensional, non-empty array.
     """
     require(values, name)
     array = np.asarray(values, dtype=float)

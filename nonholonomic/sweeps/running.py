@@ -49,9 +49,9 @@ def sweep(
 
     **Arguments:**
 
-    - `job`: function from (full name of a parameter -> values of some cells, number of cells that count) to (name ->
-      results). Several threads may call it at once; the first call, in which no cell counts, compiles it. It is pickled
-      if the workers of the executor are other processes.
+    - `job`: function of a dictionary (full name of a parameter -> values of some cells) and of the number of cells that
+      count, the rest being padding. It returns a dictionary (name -> results). Several threads may call it at once; the
+      first call, in which no cell counts, compiles it. It is pickled if the workers of the executor are other processes.
     - `axes`: the grid, the last axis varying fastest.
     - `variables`: the results of `job`.
     - `request`: plain data that describes the computation; it is stored in the table, and only equal requests may

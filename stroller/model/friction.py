@@ -91,7 +91,7 @@ class Frictionless(AbstractFriction):
 
 
 class Damping(AbstractFriction):
-    """Viscous damping of the four free velocities, a Rayleigh function (`stroller.md`, section 7).
+    """Viscous damping of two speeds and two angular rates, by a Rayleigh function (`stroller.md`, section 7).
 
     **Arguments:**
 

@@ -160,7 +160,7 @@ class RollingRide(AbstractProblem):
         return jnp.concatenate([state, jnp.zeros((3, 1))]), jnp.concatenate([scales, jnp.ones((3, 1))])
 
     def field(self, time: Float[Array, "..."], state: State) -> State:
-        """The ride's field; each rear wheel rolls as fast as the ground passes below it, half a track from the middle."""
+        """The ride's field; each rear wheel, half a track from the middle, rolls as fast as the ground passes below it."""
         length = self.ride.dynamics.body.wheelbase
         motion = self.ride.dynamics.geometry(state[:-3]).motion
         aside = 0.5 * TRACK * length * motion.yaw_rate

@@ -179,7 +179,7 @@ class LeaningDynamics(eqx.Module):
         is one if m_1 - m_0 is positive: on both spheres if that takes two positive forces, else on the one with the
         positive force.
 
-        **Returns:** the body, at rest along the normal to the bit (`at_rest`); `BOTH`, or the number of the sphere that
+        **Returns:** the body, exactly at rest along the normal (`at_rest`); `BOTH`, or the number of the sphere that
         it stands on; and whether that is the only solution.
         """
         free = at_rest(self.body, free)

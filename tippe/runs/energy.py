@@ -34,7 +34,7 @@ def has_grown(
 
 
 def if_balanced(run: Any, tolerance: float | Float[Array, ""]) -> Any:
-    """A single run with its stats, "unresolved" if its energy has grown or is not what friction and impacts have left of it."""
+    """A single run, with the status "unresolved" if its energy has grown or differs from what friction and impacts leave."""
     energy = np.asarray(run.energy)
     most = float(allowance(run.scene, np.max(np.abs(energy)), tolerance))
     balanced = run.stats["energy_residual"] <= most and energy[-1] <= energy[0] + most
