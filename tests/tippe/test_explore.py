@@ -280,7 +280,7 @@ def test_flights_of_curved_arenas_and_sticking_are_refused(rutstam_scene):
         tippe.explore(tippe.presets.classroom(tippe.Cylinder(0.3)), launch)
     with pytest.raises(ValueError, match="SetValuedCoulomb must be a law without modes"):
         tippe.explore(tippe.Scene(rutstam_top(), friction=tippe.SetValuedCoulomb(0.3)), launch)
-    with pytest.raises(ValueError, match="offset changes what is drawn"):
+    with pytest.raises(ValueError, match="offset changes the drawn arena or body"):
         tippe.explore(tippe.presets.classroom(), launch, sliders={"body.offset": (0.001, 0.002)})
 
 
