@@ -30,11 +30,11 @@ class Mistaken(tippe.Paraboloid):
 
 
 def pushed(**options):
-    return tippe.Scene(rutstam_top(), friction=Pushes(0.3), **options)
+    return tippe.Scene(rutstam_top(), friction=Pushes(0.1), **options)
 
 
 def test_a_table_and_a_time_say_that_the_energy_has_grown():
-    """A tenth more energy within a second; the same launch under the law as it should be does not invert, and says so."""
+    """The slip grows by exp(3.4) within a second, and the energy with it."""
     with pytest.warns(UserWarning, match=f"1 of 1 runs are unresolved: .*{WHY}"):
         table = tippe.inversion_table(pushed(), theta=0.1, spin=155.0, t1=1.0, tolerance=1e-6)
     assert str(table.status) == "unresolved"
