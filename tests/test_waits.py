@@ -13,6 +13,7 @@ import stroller
 import tippe
 from nonholonomic.identification import Identification, LogDensity, Measurements, identify
 from nonholonomic.views import Viewable
+from tippe.runs.observables import AbstractTrajectory
 
 pytestmark = pytest.mark.newest
 
@@ -63,7 +64,11 @@ CALLS = {
         "stroller.runs.trajectory",
         "table_of_one",
     ),
-    "words on a run": (lambda: tippe.Trajectory.__str__(SimpleNamespace(t=0.0)), "tippe.runs.observables", "is_traced"),
+    "words on a run": (
+        lambda: AbstractTrajectory.__str__(SimpleNamespace(t=0.0)),
+        "tippe.runs.observables",
+        "is_traced",
+    ),
     "words on a ride": (
         lambda: stroller.Trajectory.__str__(SimpleNamespace(t=0.0)),
         "stroller.runs.trajectory",

@@ -98,7 +98,7 @@ def test_the_page_opens_and_rides_anew(browser, tmp_path):
     ("sliders", "message"),
     [
         ({"steering": (-0.5, 0.5)}, "could be"),
-        ({"wheelbase": (0.5, 0.9)}, "changes what is drawn"),
+        ({"wheelbase": (0.5, 0.9)}, "changes the drawn arena or body"),
         ({"speed": (3.0, 4.0)}, "must contain the parameter's own value, 2"),
     ],
 )

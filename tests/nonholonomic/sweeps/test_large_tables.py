@@ -84,7 +84,7 @@ def test_a_number_that_changed_in_the_file_is_refused_when_it_is_asked_for(tmp_p
     image[image.index(np.float64(499.0 + X.values[7]).tobytes())] ^= 1
     path.write_bytes(image)
     assert table.status.shape == (500, 1000)
-    with pytest.raises(OSError, match=r"damaged: 1 of its 123 blocks"):
+    with pytest.raises(OSError, match=r"damaged: 1 of its 123 chunks"):
         _ = Table.load(path).value
 
 
