@@ -189,6 +189,38 @@ return [...document.querySelectorAll('#explore button, #explore input, #explore 
 """
 
 
+def fingers(browser, kind, *points):
+    """Send one event of a touch screen, at places [px] of the window."""
+    points = [{"x": float(x), "y": float(y)} for x, y in points]
+    browser.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+
+def test_fingers_move_a_slider_and_the_point_on_the_map(browser, page):
+    """By events of a touch screen, which the browser would take for scrolling if the page let it."""
+    reset(browser)
+    box_of = """const element = document.querySelector(arguments[0]); element.scrollIntoView({ block: 'center' });
+        const box = element.getBoundingClientRect(); return [box.x, box.y, box.width, box.height]"""
+    browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": True})
+    try:
+        x, y, width, height = browser.execute_script(box_of, "input[name=spin]")
+        start = (x + (155.0 - 60.0) / 140.0 * width, y + height / 2.0)
+        fingers(browser, "touchStart", start)
+        for k in range(1, 6):
+            fingers(browser, "touchMove", (start[0] - 0.06 * k * width, start[1]))
+        fingers(browser, "touchEnd")
+        assert browser.execute_script("return live.values()[1]") == pytest.approx(155.0 - 0.3 * 140.0, abs=5.0)
+        x, y, width, height = browser.execute_script(box_of, "#map canvas")
+        fingers(browser, "touchStart", (x + 0.5 * width, y + 0.5 * height))
+        fingers(browser, "touchMove", (x + 0.7 * width, y + 0.35 * height))
+        fingers(browser, "touchMove", (x + 0.8 * width, y + 0.2 * height))
+        fingers(browser, "touchEnd")
+        theta, spin = browser.execute_script("return live.values()")
+        assert 0.35 < theta < 0.5
+        assert 150.0 < spin < 200.0
+    finally:
+        browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": False})
+
+
 def test_a_phone_in_portrait_shows_all_controls(browser, page):
     screen = {"width": 400, "height": 800, "deviceScaleFactor": 1, "mobile": True}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
@@ -248,7 +280,7 @@ def test_flights_of_curved_arenas_and_sticking_are_refused(rutstam_scene):
         tippe.explore(tippe.presets.classroom(tippe.Cylinder(0.3)), launch)
     with pytest.raises(ValueError, match="SetValuedCoulomb must be a law without modes"):
         tippe.explore(tippe.Scene(rutstam_top(), friction=tippe.SetValuedCoulomb(0.3)), launch)
-    with pytest.raises(ValueError, match="offset changes what is drawn"):
+    with pytest.raises(ValueError, match="offset changes the drawn arena or body"):
         tippe.explore(tippe.presets.classroom(), launch, sliders={"body.offset": (0.001, 0.002)})
 
 

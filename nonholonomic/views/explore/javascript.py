@@ -111,13 +111,8 @@ def javascript(name: str, function: Callable[..., Any], *arguments: Any) -> str:
     results = _flat(block.call(jax.make_jaxpr(function)(*arguments), values))
     written = [f"out[{k}] = {_text(number)};" for k, number in enumerate(results)]
     heads = ", ".join([*(f"a{number}" for number in range(len(arguments))), "out"])
-    lines = [
-        f"function {name}({heads}) {{",
-        *_indented([*block.leading_to(results)[0], *written, "return out;"]),
-        "}",
-        "",
-    ]
-    return "\n".join(lines)
+    inside = _indented([*block.leading_to(results)[0], *written, "return out;"])
+    return "\n".join([f"function {name}({heads}) {{", *inside, "}", ""])
 
 
 def _text(number: Number) -> str:
@@ -185,9 +180,8 @@ class _Block:
             return inputs
         if name in ("while", "cond", "scan"):
             return getattr(self, f"{name}_")(inputs, **parameters)
-        for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
-            if key in parameters:
-                return self.call(parameters[key], inputs)
+        if inner := [parameters[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in parameters]:
+            return self.call(inner[0], inputs)
         if name in MOVES:
             moved = MOVES[name](*inputs, **{key: parameters[key] for key in parameters if key != "sharding"})
             return moved if isinstance(moved, list) else [np.asarray(moved, object)]
@@ -215,8 +209,8 @@ class _Block:
             power = " * ".join(["{0}"] * abs(parameters["y"])) or "1"
             return power if parameters["y"] >= 0 else f"1 / ({power})"
         if name == "select_n":
-            chain = "".join(f"{{0}} == {k - 1} ? {{{k}}} : " for k in range(1, len(types))) + "NaN"
-            return CHOICE if types[0] == np.bool_ else chain
+            chain = (f"{{0}} == {k - 1} ? {{{k}}} : " for k in range(1, len(types)))
+            return CHOICE if types[0] == np.bool_ else "".join(chain) + "NaN"
         if name == "not":
             return "!{}" if types[0] == np.bool_ else "~{}"
         if name == "div" and np.issubdtype(types[0], np.integer):
@@ -227,8 +221,8 @@ class _Block:
             cut = np.issubdtype(parameters["new_dtype"], np.integer) and np.issubdtype(types[0], np.floating)
             return "Math.trunc({})" if cut else "+{}" if types[0] == np.bool_ else "{}"
         if name not in ELEMENTWISE:
-            known = ", ".join(sorted(ELEMENTWISE))
-            raise ValueError(f"the primitive {name!r} of JAX cannot be written in JavaScript; use some of {known}")
+            known = f"use some of {', '.join(sorted(ELEMENTWISE))}"
+            raise ValueError(f"the primitive {name!r} of JAX cannot be written in JavaScript; {known}")
         return name
 
     def each(self, kind: str, *values: Value) -> Value:
@@ -267,8 +261,8 @@ class _Block:
             is_better = self.each(kind, other[1], best[1])
             return [self.each(CHOICE, is_better, *pair) for pair in zip(best, other, strict=True)]
 
-        rows = [[_value(np.full(row.shape, number)), row] for number, row in enumerate(_rows(value, axis))]
-        return functools.reduce(better, rows)[0]
+        rows = enumerate(_rows(value, axis))
+        return functools.reduce(better, ([_value(np.full(row.shape, number)), row] for number, row in rows))[0]
 
     def indexed(self, equation: Any, inputs: Values, indices: Sequence[int]) -> Values:
         """Elements at indices that may be known only in JavaScript, which then selects among all possible indices."""
@@ -297,8 +291,8 @@ class _Block:
 
     def loop(self, head: str, carry: Values, step: Callable[["_Block", Values], Values]) -> Values:
         """A loop: each iteration computes the next values of the loop variables."""
-        variables = self.variables(carry)
-        names, starts, block = _flat(variables), _flat(carry), self.inner()
+        variables, starts, block = self.variables(carry), _flat(carry), self.inner()
+        names = _flat(variables)
         # A loop variable may become another one, so read all of them before writing any.
         after = [
             block.name(f"({number})", number) if number in names and number != name else number
@@ -306,8 +300,8 @@ class _Block:
         ]
         moved = [f"{name} = {_text(number)};" for name, number in zip(names, after, strict=True) if name != number]
         inside, reads = block.leading_to([*after, LEAVES])
-        begin = [f"let {name} = {_text(start)};" for name, start in zip(names, starts, strict=True)]
-        lines = [*begin, f"{head} {{", *_indented([*inside, *moved]), "}"]
+        lines = [f"let {name} = {_text(start)};" for name, start in zip(names, starts, strict=True)]
+        lines += [f"{head} {{", *_indented([*inside, *moved]), "}"]
         self.statements.append((names, reads.union(_strings(starts)), lines))
         return variables
 
