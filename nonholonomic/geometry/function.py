@@ -40,43 +40,57 @@ class Closure(eqx.Module):
         return jnp.vectorize(value)(*self.numbers, *at)
 
 
+class Numbers(eqx.Module):
+    """The numbers of an array, each of them a leaf, and its shape."""
+
+    numbers: tuple[Any, ...]
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def array(self) -> Array:
+        """The array."""
+        return gathered(self.numbers, [self.shape])[0]
+
+
 class Held(eqx.Module):
     """A function that is a module with arrays, whose numbers are leaves one by one, as those of a `Closure` are.
 
-    - `numbers`: those of the arrays; `function`: the module without its arrays.
-    - `structure`, `shapes`: the tree of the arrays, and their shapes.
-
-    The attributes of the module are those of this one too.
+    `function` is the module with `Numbers` in place of its arrays. The attributes of the module are those of this one too.
     """
 
-    numbers: tuple[Any, ...]
     function: eqx.Module
-    # JAX's PyTreeDef, which type checkers take for a variable.
-    structure: Any = eqx.field(static=True)
-    shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
     @classmethod
     def of(cls, function: eqx.Module) -> "Held":
         """A module whose arrays hold numbers of one function, not one for each lane."""
-        arrays, rest = eqx.partition(function, lambda leaf: eqx.is_array(leaf) and leaf.ndim > 0)
-        leaves, structure = jax.tree.flatten(arrays)
-        return cls(spread(leaves), rest, structure, tuple(leaf.shape for leaf in leaves))
+
+        def parted(leaf: Any) -> Any:
+            return Numbers(spread([leaf]), leaf.shape) if eqx.is_array(leaf) and leaf.ndim else leaf
+
+        return cls(jax.tree.map(parted, function))
 
     def __call__(self, *at: Float[Array, "..."]) -> Float[Array, "..."]:
-        (scalars, structure), count = jax.tree.flatten(self), len(jax.tree.leaves(self))
+        scalars, structure = jax.tree.flatten(self)
 
         def value(*numbers: Float[Array, ""]) -> Float[Array, ""]:
-            return jax.tree.unflatten(structure, numbers[:count]).whole(*numbers[count:])
+            return jax.tree.unflatten(structure, numbers[: len(scalars)]).whole(*numbers[len(scalars) :])
 
         return jnp.vectorize(value)(*scalars, *at)
 
     @property
     def whole(self) -> Any:
         """The module with its arrays."""
-        return eqx.combine(jax.tree.unflatten(self.structure, gathered(self.numbers, self.shapes)), self.function)
+
+        def joined(leaf: Any) -> Any:
+            return leaf.array if isinstance(leaf, Numbers) else leaf
+
+        return jax.tree.map(joined, self.function, is_leaf=lambda leaf: isinstance(leaf, Numbers))
+
+    def __repr__(self) -> str:
+        return repr(self.whole)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("_") or name in ("numbers", "function", "structure", "shapes"):
+        if name.startswith("_") or name == "function":
             raise AttributeError(name)
         return getattr(self.whole, name)
 

@@ -23,10 +23,10 @@ class Pushes(tippe.Viscous):
 
 
 class Mistaken(tippe.Paraboloid):
-    """A bowl that states twice its heights, so that a top that climbs its wall gains energy."""
+    """A bowl that states ten times its heights, so that a top that climbs its wall gains energy."""
 
     def elevation(self, position):
-        return 2.0 * position[2]
+        return 10.0 * position[2]
 
 
 def pushed(**options):

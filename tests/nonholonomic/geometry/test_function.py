@@ -1,5 +1,8 @@
 """Functions of a ground that hold arrays: their numbers are parameters of the ground, not one for each lane."""
 
+import json
+import pickle
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +12,7 @@ from close import assert_close
 
 import tippe
 from nonholonomic import Graph
-from nonholonomic.parameters import numbers
+from nonholonomic.parameters import description, numbers
 
 
 class Bowl(eqx.Module):
@@ -40,6 +43,16 @@ def test_arrays_of_a_function_are_not_taken_for_numbers_of_lanes():
     assert float(numbers("ground", ground)[name]) == 1.0
     swept = eqx.tree_at(lambda one: one.height.function.height, ground, jnp.array([1.0, 2.0, 3.0]))
     assert_close(swept.ground(x, y), np.array([1.0, 2.0, 3.0]) * heights(x, y), rtol=1e-14)
+
+
+def test_a_ground_with_arrays_is_described_printed_and_sent_as_others_are():
+    """As the request of a table, which is JSON; as text; and to another process."""
+    ground = Graph(Bowl(BENDS, 1.0))
+    described = json.loads(json.dumps(description("ground", ground)))
+    assert described["ground.height.function"] == "Bowl"
+    assert described["ground.height.function.bends.numbers"] == BENDS.ravel().tolist()
+    assert repr(ground.height).startswith("Bowl(")
+    assert_close(pickle.loads(pickle.dumps(ground)).ground(0.1, 0.3), heights(0.1, 0.3), rtol=1e-14)
 
 
 @pytest.mark.parametrize("held", [True, False], ids=["module", "closure"])
