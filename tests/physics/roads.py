@@ -175,7 +175,7 @@ def main(kinds: list[str]) -> int:
     """Search through some kinds of scenes and print what differs."""
     differ = 0
     for kind in kinds:
-        count, singles = (16, 1) if kind.endswith("hybrid") else (45, 3)
+        count, singles = (45, 3) if kind.endswith("stop") else (16, 1) if kind.startswith("plane") else (4, 1)
         begun = time.process_time()
         found, known = compare_roads(kind, count, singles)
         differ += len(found.lines)

@@ -25,7 +25,7 @@ def test_all_roads_lead_to_the_same_answer():
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [*SMOOTH, *IN_PHASES, *AIRBORNE])
 def test_all_roads_lead_to_the_same_answer_on_every_arena_and_under_every_law(kind):
-    """649 scenes in all, in a process of each kind that compiles quickly, because compiling is most of the work."""
+    """625 scenes in all, in a process of each kind that compiles quickly, because compiling is most of the work."""
     script = Path(__file__).with_name("roads.py")
     paths = [str(script.parents[1] / "shared"), str(script.parents[2]), os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
