@@ -333,14 +333,14 @@ def test_the_browser_flies_as_the_table_does(browser, kind):
         }})"""
     status, time, end, hops = np.array(browser.execute_script(script), dtype=float).T
     assert [tippe.Status(int(code)).word for code in status] == list(np.ravel(table.status))
-    # Round-off grows through hundreds of bounces: such runs depend on the tolerance, too.
+    # Through hundreds of bounces even round-off grows: where tables depend on the tolerance as much, no digit is certain.
     finer = tippe.inversion_table(scene, **grid, t1=5.0, tolerance=0.1 * TOLERANCE, progress=False)
     for in_page, *in_tables in ((time, table.time, finer.time), (end, table.end_time, finer.end_time)):
         finite = np.isfinite(in_page)
         in_page, at_tolerance, with_less = (np.ravel(values)[finite] for values in (in_page, *in_tables))
-        off = np.abs(in_page - at_tolerance)
-        assert np.all(off <= CLOSE * in_page + np.abs(with_less - at_tolerance))
-        assert np.mean(off <= CLOSE * in_page) > 0.9
+        certain = np.abs(with_less - at_tolerance) < 1e-3 * at_tolerance
+        assert np.mean(certain) > 0.8
+        np.testing.assert_allclose(in_page[certain], at_tolerance[certain], rtol=CLOSE)
     assert np.max(hops) > 10
     assert len(set(status)) > 1
 
