@@ -135,8 +135,8 @@ def _first_valley(places: Float[np.ndarray, " places"], values: list[Lanes]) -> 
     valley: Any = (values[0], slopes[0], values[1], slopes[1], places[0], places[1])
     earlier = (slopes[0] < 0.0) & (slopes[1] > 0.0)
     for k in range(1, len(places) - 1):
-        here = (slopes[k] < 0.0) & (slopes[k + 1] > 0.0) & ~earlier
+        turns = (slopes[k] < 0.0) & (slopes[k + 1] > 0.0) & ~earlier
         later = (values[k], slopes[k], values[k + 1], slopes[k + 1], places[k], places[k + 1])
-        valley = tuple(jnp.where(here, new, old) for new, old in zip(later, valley, strict=True))
-        earlier |= here
+        valley = tuple(jnp.where(turns, new, old) for new, old in zip(later, valley, strict=True))
+        earlier |= turns
     return valley

@@ -154,19 +154,19 @@ class Evaluation:
         simple = _simplified(name, operands)
         if simple is not None:
             if name == "mul" and _is_constant(simple):
-                self.dropped += [one for one in operands if id(one) in self.risky]
+                self.dropped += [operand for operand in operands if id(operand) in self.risky]
             return simple
         if all(map(_is_constant, operands)) and name in ("eq", "ne", "lt", "le", "gt", "ge"):
             return np.bool_(getattr(operator, name)(*operands))
         if name == "convert_element_type" and _is_constant(operands[0]):
             return np.dtype(equation.params["new_dtype"]).type(operands[0])
-        keys = tuple((float(one), str(one.dtype)) if _is_constant(one) else id(one) for one in operands)
+        keys = tuple((float(x), str(x.dtype)) if _is_constant(x) else id(x) for x in operands)
         key = (name, "" if name in FUNCTIONS else str(equation.params), keys)
         if key not in self.computed:
             if len(self.computed) > MOST_OPERATIONS:
                 raise TooLarge(name)
             shape = np.broadcast_shapes(*map(np.shape, operands))
-            full = [jnp.broadcast_to(jnp.asarray(one), shape) for one in operands]
+            full = [jnp.broadcast_to(jnp.asarray(operand), shape) for operand in operands]
             self.kept += operands
             bind = (
                 FUNCTIONS[name] if name in FUNCTIONS else functools.partial(equation.primitive.bind, **equation.params)
@@ -174,7 +174,7 @@ class Evaluation:
             result = bind(*full)
             # Joined with its operands: XLA would compute a result that stands alone again.
             result = stored(result, full[0])[0] if name in COSTLY.split() else result
-            if _is_risky(name, operands, equation) or any(id(one) in self.risky for one in operands):
+            if _is_risky(name, operands, equation) or any(id(operand) in self.risky for operand in operands):
                 self.risky.add(id(result))
             if name in TRANSPARENT.split():
                 self.sources[id(result)] = operands[:1] if name == "div" else operands
@@ -189,11 +189,11 @@ class Evaluation:
         """
         shown, waiting = set(), list(results)
         while waiting:
-            one = waiting.pop()
-            if id(one) not in shown:
-                shown.add(id(one))
-                waiting += self.sources.get(id(one), [])
-        hidden = {id(one): one for one in self.dropped if id(one) not in shown}
+            number = waiting.pop()
+            if id(number) not in shown:
+                shown.add(id(number))
+                waiting += self.sources.get(id(number), [])
+        hidden = {id(factor): factor for factor in self.dropped if id(factor) not in shown}
         place = next((k for k, result in enumerate(results) if jnp.issubdtype(result.dtype, jnp.floating)), None)
         if not hidden or place is None:
             return results
@@ -201,7 +201,7 @@ class Evaluation:
         return [result + 0.0 * total if k == place else result for k, result in enumerate(results)]
 
     def _sum(self, terms: Iterator[Any], name: str = "add") -> Any:
-        return functools.reduce(lambda one, other: self._number(name, [one, other]), terms)
+        return functools.reduce(lambda total, term: self._number(name, [total, term]), terms)
 
     def _reduced(self, name: str, elements: Elements, axes: Sequence[int]) -> Elements:
         kept = [k for k in range(elements.ndim) if k not in axes]
@@ -224,10 +224,10 @@ class Evaluation:
         rows = np.transpose(left, (*batch, *free, *sums)).reshape(*shapes[0], *shapes[1], count)
         others = np.transpose(right, (*right_batch, *right_free, *right_sums)).reshape(*shapes[0], *shapes[2], count)
         results = np.empty([*shapes[0], *shapes[1], *shapes[2]], object)
-        for both, one, other in itertools.product(*(list(np.ndindex(*shape)) for shape in shapes)):
-            pairs = zip(rows[(*both, *one)], others[(*both, *other)], strict=True)
+        for lane, row, column in itertools.product(*(list(np.ndindex(*shape)) for shape in shapes)):
+            pairs = zip(rows[(*lane, *row)], others[(*lane, *column)], strict=True)
             terms = (self._number("mul", list(pair)) for pair in pairs)
-            results[(*both, *one, *other)] = self._sum(terms) if count else np.float64(0.0)
+            results[(*lane, *row, *column)] = self._sum(terms) if count else np.float64(0.0)
         return results
 
 

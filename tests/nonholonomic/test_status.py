@@ -50,10 +50,10 @@ def test_words_of_earlier_versions_are_understood_and_others_refused():
 
 
 def test_all_tables_use_words_of_the_list():
-    drivers = [one for one in vars(run_kind).values() if isinstance(one, run_kind.RunKind)]
-    assert len(drivers) == 7
+    kinds = [kind for kind in vars(run_kind).values() if isinstance(kind, run_kind.RunKind)]
+    assert len(kinds) == 7
     known = {status.word for status in Status}
-    for words in (OF_RIDES, OF_TRAJECTORIES, *(one.words for one in drivers)):
+    for words in (OF_RIDES, OF_TRAJECTORIES, *(kind.words for kind in kinds)):
         assert known.issuperset(words)
         assert len(set(words)) == len(words)
     # Files say themselves what their integers mean; these are the ones that they have had from the beginning.

@@ -68,9 +68,9 @@ class Rattleback:
             system[8, :6], right[8] = acceleration[2], -known[2]
             for k in range(2):
                 system[6 + k, 6 + k], system[6 + k, 8] = 1.0, -along[k]
-        found = np.linalg.solve(system, right)
+        solution = np.linalg.solve(system, right)
         q_dot = 0.5 * np.concatenate(([-w @ q[1:]], q[0] * w + np.cross(w, q[1:])))
-        return np.concatenate((u, found[:3], q_dot, found[3:6])), found[6:]
+        return np.concatenate((u, solution[:3], q_dot, solution[3:6])), solution[6:]
 
     def start(self, theta, azimuth, spin, turning=(0.0, 0.0, 0.0), velocity=(0.0, 0.0)):
         """The launch of `tippe.Launch` with the contact at the origin: the body is turned by theta about a horizontal axis."""

@@ -104,7 +104,7 @@ class Findings:
             at = [float(np.atleast_1d(values)[cell if np.size(values) > 1 else 0]) for values in shown]
             self.compared += 1
             if not np.atleast_1d(holds)[cell if np.size(holds) > 1 else 0]:
-                self.lines.append(f"{self.kind}, scene {cell}: {what}: {', '.join(f'{one:.12g}' for one in at)}")
+                self.lines.append(f"{self.kind}, scene {cell}: {what}: {', '.join(f'{value:.12g}' for value in at)}")
 
 
 def compare_roads(kind: str, count: int, singles: int, seed: int = 5) -> tuple[Findings, int]:
@@ -112,7 +112,7 @@ def compare_roads(kind: str, count: int, singles: int, seed: int = 5) -> tuple[F
 
     **Returns:** what differs, and of how many scenes a table has an answer with an error.
     """
-    found, scenes = Findings(kind), batch(kind, count, seed=seed)
+    findings, scenes = Findings(kind), batch(kind, count, seed=seed)
     flies = scenes.scene.contact == "hybrid"
     t1 = HORIZON_OF_FLIGHTS if flies else HORIZON
     table = table_of(scenes, count, t1)
@@ -122,53 +122,58 @@ def compare_roads(kind: str, count: int, singles: int, seed: int = 5) -> tuple[F
     stops = known & np.isin(word, list(CODES))
 
     times = batch_of_times(scenes, t1)
-    found.check("a batch of times inverts, or not", np.flatnonzero(known), np.isfinite(times) == inverted, times)
+    findings.check("a batch of times inverts, or not", np.flatnonzero(known), np.isfinite(times) == inverted, times)
     near = apart(times, table["time"]) <= APART * time_error
-    found.check("time in a batch, in a table", np.flatnonzero(known & inverted), near, times, table["time"], time_error)
+    findings.check(
+        "time in a batch, in a table", np.flatnonzero(known & inverted), near, times, table["time"], time_error
+    )
 
     flat = FASTEST * (1e-6 * t1 + APART * end_error) + APART * table["end_theta_error"]
     if not scenes.scene.friction.set_valued:
         # Just before the run's end in the table, where each run still is.
         theta, ended, status = batch_of_runs(scenes, end * (1.0 - 1e-6), t1)
-        codes = np.array([CODES.get(one, -1) for one in word])
-        found.check("status of a batch of runs, of a table", np.flatnonzero(stops), status == codes, status, codes)
+        codes = np.array([CODES.get(name, -1) for name in word])
+        findings.check("status of a batch of runs, of a table", np.flatnonzero(stops), status == codes, status, codes)
         near = np.abs(ended - end) <= APART * end_error
-        found.check("end in a batch of runs, in a table", np.flatnonzero(stops), near, ended, end, end_error)
+        findings.check("end in a batch of runs, in a table", np.flatnonzero(stops), near, ended, end, end_error)
         near = np.abs(theta - table["end_theta"]) <= flat
-        found.check("theta in a batch, in a table", np.flatnonzero(known), near, theta, table["end_theta"], flat)
+        findings.check("theta in a batch, in a table", np.flatnonzero(known), near, theta, table["end_theta"], flat)
 
     for cell in np.flatnonzero(known)[:singles]:
         scene, launch = scene_and_launch(scenes, cell)
         alone = float(tippe.inversion_time(scene, launch, t1, ANGLE, TOLERANCE))
         same = alone == table["time"][cell] or abs(alone - table["time"][cell]) <= APART * time_error[cell]
-        found.check("time alone, in a table", cell, same, np.full(count, alone), table["time"], time_error)
+        findings.check("time alone, in a table", cell, same, np.full(count, alone), table["time"], time_error)
         run = tippe.simulate(scene, launch, min(t1, 1.001 * float(end[cell]) + 1e-3), tolerance=OF_PATHS)
-        here = run.at([min(float(end[cell]) * (1.0 - 1e-6), float(run.end_time))])
-        same = abs(float(here.theta[0]) - table["end_theta"][cell]) <= flat[cell]
-        theta = np.full(count, here.theta[0])
-        found.check("theta of a run alone, in a table", cell, same, theta, table["end_theta"], flat)
+        state = run.at([min(float(end[cell]) * (1.0 - 1e-6), float(run.end_time))])
+        same = abs(float(state.theta[0]) - table["end_theta"][cell]) <= flat[cell]
+        theta = np.full(count, state.theta[0])
+        findings.check("theta of a run alone, in a table", cell, same, theta, table["end_theta"], flat)
         ends = stops[cell] == (run.status != "completed") and (not stops[cell] or run.status == word[cell])
-        found.check(f"{run.status} alone, {word[cell]} in a table", cell, ends, np.full(count, run.end_time), end)
+        findings.check(f"{run.status} alone, {word[cell]} in a table", cell, ends, np.full(count, run.end_time), end)
 
     if flies:
-        compare_with_stops(found, scenes, table, count, t1)
-    return found, int(known.sum())
+        compare_with_stops(findings, scenes, table, count, t1)
+    return findings, int(known.sum())
 
 
-def compare_with_stops(found: Findings, scenes: Batch, flies: dict[str, np.ndarray], count: int, t1: float) -> None:
+def compare_with_stops(findings: Findings, scenes: Batch, flies: dict[str, np.ndarray], count: int, t1: float) -> None:
     """A top that keeps its contact does the same whether or not it may fly; one that loses it in one flies in the other."""
-    scene, columns = scenes.scene, {name: one for name, one in scenes.columns.items() if "restitution" not in name}
+    scene, columns = (
+        scenes.scene,
+        {name: values for name, values in scenes.columns.items() if "restitution" not in name},
+    )
     stop = tippe.Scene(scene.body, scene.surface, scene.friction)
     stops = table_of(scenes._replace(scene=stop, columns=columns), count, t1)
     sure = (stops["status_error"] == 0) & (flies["status_error"] == 0)
     kept = np.flatnonzero(sure & (stops["word"] != "contact_lost") & (flies["hops"] == 0))
     same = (stops["word"] == flies["word"]) & (np.isfinite(stops["time"]) == np.isfinite(flies["time"]))
-    found.check("status with stop and hybrid", kept, same, stops["end_time"], flies["end_time"])
+    findings.check("status with stop and hybrid", kept, same, stops["end_time"], flies["end_time"])
     error = APART * (stops["time_error"] + flies["time_error"])
     near = apart(stops["time"], flies["time"]) <= error
-    found.check("time with stop and hybrid", kept, near, stops["time"], flies["time"], error)
+    findings.check("time with stop and hybrid", kept, near, stops["time"], flies["time"], error)
     lost = np.flatnonzero(sure & (stops["word"] == "contact_lost") & (flies["end_time"] > stops["end_time"]))
-    found.check("flights of a top that loses its contact", lost, flies["hops"] > 0, flies["hops"])
+    findings.check("flights of a top that loses its contact", lost, flies["hops"] > 0, flies["hops"])
 
 
 def main(kinds: list[str]) -> int:
@@ -177,10 +182,12 @@ def main(kinds: list[str]) -> int:
     for kind in kinds:
         count, singles = (45, 3) if kind.endswith("stop") else (16, 1) if kind.startswith("plane") else (4, 1)
         begun = time.process_time()
-        found, known = compare_roads(kind, count, singles)
-        differ += len(found.lines)
-        print(f"{kind}: {found.compared} comparisons, {known} of {count} scenes, {time.process_time() - begun:.0f} s")
-        print("".join(f"  {line}\n" for line in found.lines), end="", flush=True)
+        findings, known = compare_roads(kind, count, singles)
+        differ += len(findings.lines)
+        print(
+            f"{kind}: {findings.compared} comparisons, {known} of {count} scenes, {time.process_time() - begun:.0f} s"
+        )
+        print("".join(f"  {line}\n" for line in findings.lines), end="", flush=True)
     return differ
 
 

@@ -83,13 +83,13 @@ def test_kane_and_levinsons_rattleback_reverses_when_two_programs_say():
 def test_a_body_of_revolution_moves_as_it_does_by_its_own_equations(body, tilt):
     """Rates, forces, energies and -L.r at 50 states, under sliding, drilling and rolling friction."""
     law, arena = tippe.Rolling(1e-3, 2.0, tippe.Contensou(0.3, 2e-3, 0.05)), tippe.Plane(tilt)
-    one, other = tippe.Scene(body, arena, law), tippe.Scene(as_ellipsoid(body), arena, law)
-    states = random_states(one, 50)
+    round_scene, rigid = tippe.Scene(body, arena, law), tippe.Scene(as_ellipsoid(body), arena, law)
+    states = random_states(round_scene, 50)
     longer = turned_anyhow(states)
     for name in ("field", "normal_force", "slip_velocity", "energy", "jellett", "spin", "friction_power"):
-        expected = np.atleast_2d(getattr(one, name)(states))
+        expected = np.atleast_2d(getattr(round_scene, name)(states))
         size = np.abs(expected).max(axis=1, keepdims=True)
-        assert_close(np.atleast_2d(getattr(other, name)(longer))[: len(size)] / size, expected / size, atol=1e-13)
+        assert_close(np.atleast_2d(getattr(rigid, name)(longer))[: len(size)] / size, expected / size, atol=1e-13)
 
 
 @pytest.mark.parametrize("law", [LAW, tippe.NoSlip()], ids=["sliding", "rolling"])
@@ -119,11 +119,11 @@ def test_accelerations_and_forces_are_those_of_an_independent_program(rolls):
     states = scene.dynamics.carried_along(any_states(20))
     motion = scene.dynamics.motion(states)
     f1, f2 = motion.friction.force
-    found = np.asarray(scene.dynamics.field(states))
+    rate = np.asarray(scene.dynamics.field(states))
     slide = None if rolls else lambda v: -0.3 * v / math.hypot(*v, 0.05)
     reference = Rattleback(*ODD, ODD_INERTIA, slide)
     turning = np.stack(scene.angular_velocity(states))
-    rise = np.asarray(jax.jvp(scene.path_from_frame, (states,), (jnp.asarray(found),))[1][2])
+    rise = np.asarray(jax.jvp(scene.path_from_frame, (states,), (jnp.asarray(rate),))[1][2])
     for k, state in enumerate(np.asarray(states).T):
         Q = np.stack([state[8:11], np.cross(state[2:5], state[8:11]), state[2:5]], axis=1)
         y = np.concatenate([np.zeros(3), (*state[:2], rise[k]), quaternion(Q), turning[:, k]])
@@ -133,8 +133,8 @@ def test_accelerations_and_forces_are_those_of_an_independent_program(rolls):
         assert_close(np.array([f1[k] * N, f2[k] * N, N]) / size, force / size, atol=1e-11)
         # L' = r x F, and u' = F / m.
         torque = np.cross(reference.lever(Q)[0], force)
-        assert_close(found[5:8, k] / size, torque / size, atol=1e-13)
-        assert_close(found[:2, k] / size, rates[3:5] / size, atol=1e-9)
+        assert_close(rate[5:8, k] / size, torque / size, atol=1e-13)
+        assert_close(rate[:2, k] / size, rates[3:5] / size, atol=1e-9)
 
 
 def quaternion(Q) -> np.ndarray:
@@ -208,10 +208,10 @@ def test_a_run_is_that_of_an_independent_program(run):
     reference = Rattleback(1.0, SHAPE, CENTRE, INERTIA)
     times = np.array([0.1, 0.3])
     expected = reference.run(reference.start(0.02, 0.0, -5.0), times, rtol=1e-10)
-    found = run.at(times)
-    assert_close(found.position, expected[:, :3], atol=1e-9)
-    assert_close(found.velocity, expected[:, 3:6], atol=1e-8)
-    assert_close(found.angular_velocity, expected[:, 10:], atol=1e-7)
+    states = run.at(times)
+    assert_close(states.position, expected[:, :3], atol=1e-9)
+    assert_close(states.velocity, expected[:, 3:6], atol=1e-8)
+    assert_close(states.angular_velocity, expected[:, 10:], atol=1e-7)
 
 
 def test_what_is_drawn_stands_on_the_plane(run):
@@ -259,12 +259,12 @@ def test_limits_have_the_same_times_to_a_nanosecond():
         (rutstam_top(), tippe.Launch(0.1, 155.0), 0.95 * math.pi),
         (rising, tippe.Launch(1.8, 0.0, angular_velocity=(0.0, 0.0, 140.0)), 2.6),
     ):
-        one, other = (
-            float(tippe.inversion_time(tippe.Scene(some, friction=law), launch, 8.0, angle, tolerance=1e-13))
-            for some in (body, as_ellipsoid(body))
+        round_time, rigid_time = (
+            float(tippe.inversion_time(tippe.Scene(shape, friction=law), launch, 8.0, angle, tolerance=1e-13))
+            for shape in (body, as_ellipsoid(body))
         )
-        assert math.isfinite(one)
-        assert_close(other, one, atol=1e-9)
+        assert math.isfinite(round_time)
+        assert_close(rigid_time, round_time, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -273,8 +273,8 @@ def test_reversals_are_those_of_an_independent_program():
     reference = Rattleback(1.0, SHAPE, CENTRE, INERTIA)
     for spin in (-5.0, 5.0):
         expected = reference.reversal(reference.start(TILT, AZIMUTH, spin), 12.0)
-        found = tippe.reversal_time(rattleback(), tippe.Launch(TILT, spin, azimuth=AZIMUTH), 12.0, tolerance=1e-13)
-        assert_close(found, expected, atol=1e-8)
+        time = tippe.reversal_time(rattleback(), tippe.Launch(TILT, spin, azimuth=AZIMUTH), 12.0, tolerance=1e-13)
+        assert_close(time, expected, atol=1e-8)
 
 
 def time_of_reversal(numbers, tolerance: float = 1e-11):

@@ -16,10 +16,10 @@ AIRBORNE = ["cylinder-viscous-hybrid", "sphere-coulomb-hybrid"]
 
 def test_all_roads_lead_to_the_same_answer():
     """The short form: 24 tops on the plane, of which two run by themselves as well."""
-    found, known = compare_roads("plane-viscous-stop", 24, 2)
+    findings, known = compare_roads("plane-viscous-stop", 24, 2)
     assert known > 20
-    assert found.lines == []
-    assert found.compared > 60
+    assert findings.lines == []
+    assert findings.compared > 60
 
 
 @pytest.mark.slow

@@ -159,8 +159,8 @@ class AbstractRigidDynamics(eqx.Module):
         fall = 1.0 - axis[2]
         c = (1.0 - fall * x * x, -fall * x * y, -axis[0])
         axes = (c, cross(axis, c), axis)
-        momentum = self.body.inertia.tensor.times(vector_of(dot(turning, one) for one in axes))
-        x, y, z = (scale(part, one) for part, one in zip(momentum, axes, strict=True))
+        momentum = self.body.inertia.tensor.times(vector_of(dot(turning, axis) for axis in axes))
+        x, y, z = (scale(part, axis) for part, axis in zip(momentum, axes, strict=True))
         state = joined(launch.velocity or (zero, zero), axis, sum_vectors(x, y, z), place, c)
         return self.carried_along(state)
 

@@ -94,8 +94,8 @@ def reversal_table(
     Axes have names such as `"scene.body.inertia.xy"` and `"scene.body.semi_axes[0]"`.
 
     **Returns:** a `Table` like that of `inversion_table`, with the time [s] at which the spin about the arena's normal
-    first vanishes,
-    infinite if it does not, and `status`: "reversed", "not_reversed" by `t1`, "contact_lost", "failed", "jammed".
+    first vanishes, infinite if it does not, and `status`: "reversed", "not_reversed" by `t1`, "contact_lost", "failed",
+    "jammed".
 
     **Raises:** as for `inversion_table`, and `ValueError` for another body and a launch without spin.
 
