@@ -83,6 +83,7 @@ def fields() -> Iterator[tuple[str, Problems]]:
         "rattleback": tippe.Scene(RATTLEBACK, friction=viscous),
         "rattleback, rolling": tippe.Scene(RATTLEBACK, friction=rolling),
     }
+    tops |= {"rattleback, set-valued": tippe.Scene(RATTLEBACK, friction=LAWS["set-valued"])}
     tops |= {"rattleback, sphere": tippe.Scene(RATTLEBACK, tippe.Sphere(3.0), viscous)}
     tops |= {"top, sphere, with flights": tippe.Scene(top, tippe.Sphere(0.3), viscous, contact="hybrid")}
     tops |= {"top with a stem": tippe.Scene(ON_A_STEM, tippe.Plane(), LAWS["Coulomb"], contact="hybrid")}

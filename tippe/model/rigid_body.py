@@ -82,8 +82,8 @@ UNITS = {"mass": "kg", "centre_of_mass": "m"} | {f"centre_of_mass[{k}]": "m" for
 class Ellipsoid(AbstractRigidBody):
     """An ellipsoid with any inertia and any centre of mass inside: a rattleback, or an unbalanced sphere.
 
-    It runs on every arena, with every friction law except `SetValuedCoulomb`, or without slip (`NoSlip`). On a curved arena, a
-    run ends as "does_not_fit" where the body is not more curved than the arena; a second contact elsewhere is not noticed.
+    It runs on every arena, with every friction law, or without slip (`NoSlip`). On a curved arena, a run ends
+    as "does_not_fit" where the body is not more curved than the arena; a second contact elsewhere is not noticed.
     The part that never touches the plane does not matter: half an ellipsoid, or a boat, moves like the whole one.
 
     At a `Launch`, the body's axes x, y and z are those of the arena (t1, t2, n), turned by theta about a horizontal axis so

@@ -60,11 +60,11 @@ class TrajectoryProblem(AbstractProblem):
         path, across = cyclic[:-3], cyclic[-3:]
         _, e, L, _ = parts(lean)
         path_rate = self.dynamics.frame.cyclic_rate(path, motion.velocity, motion.turning)
-        if isinstance(self.dynamics, AbstractRigidDynamics):
+        if isinstance(self.dynamics, Dynamics):
+            falls = -dot(cross(L, e), across) * self.dynamics.per_transverse
+        else:
             turns = sum_vectors(motion.rate[2:5], scale(-1.0, carried(e, motion.turning)))
             falls = -dot(turns, across)
-        else:
-            falls = -dot(cross(L, e), across) * self.dynamics.per_transverse
         across_rate = sum_vectors(scale(falls, e), carried(across, motion.turning))
         quadratures = (*path_rate, *across_rate, motion.spin_momentum / self.axial, motion.friction_power)
         return stacked((*motion.rate, *quadratures), state)
