@@ -27,13 +27,14 @@ from nonholonomic.geometry import (
     dot,
     multiply,
     scale,
+    stacked,
     subtract,
     sum_vectors,
     vector_of,
 )
 from nonholonomic.xla_cpu import least, stored
 
-from .dynamics import JAMMED, Motion, stacked
+from .dynamics import JAMMED, Motion
 from .friction import AbstractFriction, ContactLoad, NoSlip, Slip
 from .inertia import SymmetricMatrix
 from .launch import Launch
