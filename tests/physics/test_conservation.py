@@ -102,10 +102,10 @@ def test_a_frictionless_run_goes_back_to_its_start():
 
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Frictionless())
     run = trajectory_problem((scene, tippe.Launch(0.3, 60.0, eta=0.5)))
-    there = follow(run, 1.0, Settings(1e-12)).states[:10, -1]
+    end_state = follow(run, 1.0, Settings(1e-12)).states[:10, -1]
     sign = np.array([-1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0, 1.0])
     start = run.problem.states
-    back = eqx.tree_at(lambda run: run.problem.states, run, jnp.asarray(there * sign))
+    back = eqx.tree_at(lambda run: run.problem.states, run, jnp.asarray(end_state * sign))
     home = follow(back, 1.0, Settings(1e-12)).states[:10, -1] * sign
     assert_close(home[2:5], start[2:5], atol=1e-8)
     assert_close(home[8:], start[8:], atol=1e-8)
