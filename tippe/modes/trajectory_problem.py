@@ -45,7 +45,7 @@ class Quadratures(AbstractPassive):
         c, turning = (c1, c2, c3), (None, None) if self.of_mass else motion.turning
         path_rate = u if self.of_mass else dynamics.frame.cyclic_rate(tuple(path), motion.velocity, turning)
         if self.of_mass or isinstance(dynamics, AbstractRigidDynamics):
-            falls = dot(motion.rate[2:5], c)
+            falls = dot(sum_vectors(motion.rate[2:5], scale(-1.0, carried(e, turning))), c)
         else:
             # In a frame that turns, the components of the axis have another rate than the axis.
             falls = dot(cross(L, e), c) * dynamics.per_transverse

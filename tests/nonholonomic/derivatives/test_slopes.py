@@ -128,7 +128,7 @@ def test_padding_and_cells_beyond_the_event_have_no_slope(cells):
 def test_runs_longer_than_what_is_kept_are_repeated(kept, monkeypatch):
     """Periods of two iterations, of which the starts of a few are kept: the slopes are the same to the last digit."""
     _, whole, _ = found_and_expected(solver=diffrax.Dopri8())
-    monkeypatch.setattr(adjoint, "PERIOD", 2)
+    monkeypatch.setattr(adjoint.StepRecorder, "period", 2)
     monkeypatch.setattr(adjoint, "KEPT", kept)
     _, segments, expected = found_and_expected(solver=diffrax.Dopri8())
     for whole_slope, segment_slope, expected_slope in zip(whole, segments, expected, strict=True):
