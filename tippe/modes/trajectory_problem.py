@@ -44,10 +44,10 @@ class Quadratures(AbstractPassive):
         motion, (*path, c1, c2, c3, _, _) = dynamics.motion(state), passive
         c, turning = (c1, c2, c3), (None, None) if self.of_mass else motion.turning
         path_rate = u if self.of_mass else dynamics.frame.cyclic_rate(tuple(path), motion.velocity, turning)
+        # In a frame that turns, the components of the axis have another rate than the axis.
         if self.of_mass or isinstance(dynamics, AbstractRigidDynamics):
             falls = dot(sum_vectors(motion.rate[2:5], scale(-1.0, carried(e, turning))), c)
         else:
-            # In a frame that turns, the components of the axis have another rate than the axis.
             falls = dot(cross(L, e), c) * dynamics.per_transverse
         rates = (*path_rate, *c_rate(c, e, falls, turning), motion.spin_momentum / self.axial)
         return stacked((*motion.rate, *rates, motion.friction_power), state)
