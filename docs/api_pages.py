@@ -203,7 +203,7 @@ def missing() -> list[str]:
 
 def text(page: Page) -> str:
     """The page in reStructuredText: a table of all names, then an entry for each."""
-    introduction = re.sub(r"(:\w+:`[^`]+`)|(`[^`]+`)", lambda found: found[1] or f"`{found[2]}`", page.introduction)
+    introduction = re.sub(r"(:\w+:`[^`]+`)|(`[^`]+`)", lambda match: match[1] or f"`{match[2]}`", page.introduction)
     lines = [page.title, "=" * len(page.title), "", introduction, ""]
     lines += [".. autosummary::", "   :nosignatures:", "", *(f"   {name}" for name in page.names), ""]
     for name in page.names:

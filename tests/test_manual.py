@@ -35,10 +35,10 @@ def test_the_gallery_has_a_card_with_a_thumbnail_for_every_picture():
 def test_every_section_of_a_derivation_that_a_docstring_cites_exists():
     """The manual links "`tippe.md`, section 3" to the heading with that number."""
     cited = {
-        found
+        citation
         for folder in ("nonholonomic", "tippe", "stroller", "tests", "benchmarks")
         for path in (ROOT / folder).rglob("*.py")
-        for found in re.findall(r"(tippe|stroller)\.md`?,\s+sections? (\d+)", path.read_text())
+        for citation in re.findall(r"(tippe|stroller)\.md`?,\s+sections? (\d+)", path.read_text())
     }
     assert len(cited) > 10
     for model, number in cited:

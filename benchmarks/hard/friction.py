@@ -123,8 +123,8 @@ def ball_that_rolls() -> Row:
     slip = steady * -np.expm1(-decay * times)
     # V = V(0) - mu g int v dt.
     expected = start - mu * GRAVITY * steady * (times + np.expm1(-decay * times) / decay)
-    found = np.asarray(scene.slip_velocity(jnp.asarray(run.result.states[:8])))[0]
-    error = max(float(np.max(np.abs(velocity - expected))), float(np.max(np.abs(found - slip))))
+    slip_velocity = np.asarray(scene.slip_velocity(jnp.asarray(run.result.states[:8])))[0]
+    error = max(float(np.max(np.abs(velocity - expected))), float(np.max(np.abs(slip_velocity - slip))))
     return Row(
         "ball rolling against rolling resistance",
         f"slows by (5/7) g delta / R = {5.0 / 7.0 * GRAVITY * delta / 0.02:.3f} m/s^2",

@@ -61,6 +61,8 @@ from .runge_kutta import over_stages as over_stages
 from .runge_kutta import stages_to_look as stages_to_look
 from .runge_kutta import watched_places as watched_places
 from .samples import solve_with_samples as solve_with_samples
+from .scheduler import AbstractRecorder as AbstractRecorder
+from .scheduler import InLanes as InLanes
 from .scheduler import LaneScheduler as LaneScheduler
 from .scheduler import Outcome as Outcome
 from .scheduler import Progress as Progress

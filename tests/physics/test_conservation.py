@@ -103,9 +103,9 @@ def test_a_frictionless_run_goes_back_to_its_start():
 
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.3), tippe.Frictionless())
     run = TrajectoryProblem.of(scene, tippe.Launch(0.3, 60.0, eta=0.5))
-    there = follow(run, 1.0, Settings(1e-12)).states[:10, -1]
+    end_state = follow(run, 1.0, Settings(1e-12)).states[:10, -1]
     sign = np.array([-1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0, 1.0])
-    back = replace(run, state=jnp.asarray(there * sign))
+    back = replace(run, state=jnp.asarray(end_state * sign))
     home = follow(back, 1.0, Settings(1e-12)).states[:10, -1] * sign
     assert_close(home[2:5], run.state[2:5], atol=1e-8)
     assert_close(home[8:], run.state[8:], atol=1e-8)

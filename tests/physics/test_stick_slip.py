@@ -148,8 +148,8 @@ def test_a_ball_that_friction_cannot_hold_slips_down_through_a_turn_of_its_slip(
     launch = tippe.Launch(np.pi / 2.0, spin, 0.8, np.pi / 2.0)
     run = tippe.simulate(scene, launch, 0.1, tolerance=1e-10)
     assert not any(kinds(run.dense))
-    found = [run.cyclic[0, -1], run.velocity[-1] @ np.array([np.cos(state[0]), 0.0, np.sin(state[0])]), run.spin[-1]]
-    assert_close(found, state, atol=1e-9)
+    end = [run.cyclic[0, -1], run.velocity[-1] @ np.array([np.cos(state[0]), 0.0, np.sin(state[0])]), run.spin[-1]]
+    assert_close(end, state, atol=1e-9)
 
 
 def test_a_table_is_what_its_runs_are():

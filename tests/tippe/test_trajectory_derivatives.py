@@ -22,8 +22,8 @@ def axis_x(theta, solver=None, adjoint=None):
 
 def extrapolated(function, at, step):
     """A central difference, extrapolated from two steps."""
-    one, two = ((function(at + h) - function(at - h)) / (2.0 * h) for h in (step, 2.0 * step))
-    return (4.0 * one - two) / 3.0
+    fine, coarse = ((function(at + h) - function(at - h)) / (2.0 * h) for h in (step, 2.0 * step))
+    return (4.0 * fine - coarse) / 3.0
 
 
 @pytest.mark.slow
@@ -131,11 +131,11 @@ def thetas_of_a_top_that_starts_along_the_normal(theta=0.0, azimuth=0.0, mu=0.3,
 def test_theta_by_theta_at_the_pole_is_the_one_sided_derivative_forward_and_unknown_backward():
     """In all azimuths alike, against launches beside the pole; by mu, which does not move the axis, it is 0."""
     by_theta = jax.jit(jax.vmap(jax.jacfwd(thetas_of_a_top_that_starts_along_the_normal), (None, 0)))
-    found = by_theta(0.0, jnp.array([0.0, 1.0]))
+    slopes = by_theta(0.0, jnp.array([0.0, 1.0]))
     beside = thetas_of_a_top_that_starts_along_the_normal(1e-5, 1.0) / 1e-5
-    assert_close(found[0], found[1], rtol=1e-7)
-    assert_close(found[1], beside, rtol=1e-6)
-    assert_close(found[0, [1, -1]], [0.606, 0.334], atol=6e-4)
+    assert_close(slopes[0], slopes[1], rtol=1e-7)
+    assert_close(slopes[1], beside, rtol=1e-6)
+    assert_close(slopes[0, [1, -1]], [0.606, 0.334], atol=6e-4)
     backward = jax.grad(
         lambda *numbers: thetas_of_a_top_that_starts_along_the_normal(numbers[0], 1.0, numbers[1])[-1], (0, 1)
     )

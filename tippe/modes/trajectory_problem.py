@@ -61,7 +61,8 @@ class TrajectoryProblem(AbstractProblem):
         _, e, L, _ = parts(lean)
         path_rate = self.dynamics.frame.cyclic_rate(path, motion.velocity, motion.turning)
         if isinstance(self.dynamics, AbstractRigidDynamics):
-            falls = -dot(motion.rate[2:5], across)
+            turns = sum_vectors(motion.rate[2:5], scale(-1.0, carried(e, motion.turning)))
+            falls = -dot(turns, across)
         else:
             falls = -dot(cross(L, e), across) * self.dynamics.per_transverse
         across_rate = sum_vectors(scale(falls, e), carried(across, motion.turning))

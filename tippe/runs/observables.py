@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.geometry import Component, Vector, dot, scale, sum_vectors
+from nonholonomic.geometry import Component, Vector, carried, dot, scale, sum_vectors
 from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import DenseSolution, Status, few_trials, padded
 from nonholonomic.progress import status_line
@@ -177,8 +177,10 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         """Velocity of the point whose path is `position` [m/s]."""
         motion = self.scene.dynamics.motion(self.states)
         rate = stacked(motion.rate, self.states)
-        beside = jax.jvp(self.scene.path_from_frame, (self.states,), (rate,))[1]
-        return self._fixed(sum_vectors((*motion.velocity, self.above[1]), beside))
+        beside, change = jax.jvp(self.scene.path_from_frame, (self.states,), (rate,))
+        # The frame turns while the components of the vector change.
+        turned = scale(-1.0, carried(beside, motion.turning))
+        return self._fixed(sum_vectors((*motion.velocity, self.above[1]), change, turned))
 
     @of_each_run
     def position(self) -> Float[Array, "times 3"]:

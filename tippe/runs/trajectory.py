@@ -132,7 +132,7 @@ class Trajectory(AbstractTrajectory):
     def contact(self) -> Float[Array, "times 3"]:
         """The point at which the top touches the arena [m]."""
         frame, where = self.scene.frame, (self._place, self._path)
-        foot = sum_vectors(frame.position(*where), scale(-self.scene.body.size, frame.axes(*where)[2]))
+        foot = sum_vectors(frame.position(*where), scale(-frame.distance, frame.axes(*where)[2]))
         return jnp.stack(foot, axis=-1)
 
     @of_each_run

@@ -35,8 +35,8 @@ class Oscillators(AbstractProblem):
     floor: jax.Array
 
     def start(self):
-        one = jnp.ones_like(self.frequency)
-        return jnp.stack([one, 0.0 * one]), jnp.stack([one, one])
+        ones = jnp.ones_like(self.frequency)
+        return jnp.stack([ones, 0.0 * ones]), jnp.stack([ones, ones])
 
     def field(self, time, state):
         return jnp.stack([self.frequency * state[1], -self.frequency * state[0]])

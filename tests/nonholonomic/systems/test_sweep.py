@@ -22,11 +22,11 @@ def table(tmp_path_factory):
     """The third bounces of balls, whose table is kept in a file."""
     path = tmp_path_factory.mktemp("balls") / "balls.h5"
     axes = {"start[0]": HEIGHTS, "restitution": RESTITUTIONS}
-    given = {"axes": axes, "sensitivities": ["restitution", "modes[0].gravity"], "path": path, "progress": False}
-    first = sweep(BALL, [1.0, 0.0, 0.0], 1.4, **given)
-    again = sweep(BALL, [1.0, 0.0, 0.0], 1.4, **given)
-    assert_close(again.time, first.time)
-    return again
+    arguments = {"axes": axes, "sensitivities": ["restitution", "modes[0].gravity"], "path": path, "progress": False}
+    first = sweep(BALL, [1.0, 0.0, 0.0], 1.4, **arguments)
+    second_table = sweep(BALL, [1.0, 0.0, 0.0], 1.4, **arguments)
+    assert_close(second_table.time, first.time)
+    return second_table
 
 
 def test_a_table_of_bounces_and_its_derivatives(table):
