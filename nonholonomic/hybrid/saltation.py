@@ -27,7 +27,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..derivatives.slopes import tangents_of
 from ..derivatives.variation import VariationalProblem, in_groups, where_active
-from ..integration import CROSSED, REACHED_END, AbstractProblem, Settings
+from ..integration import (
+    CROSSED,
+    REACHED_END,
+    AbstractPassive,
+    AbstractProblem,
+    ExtendedProblem,
+    Lanes,
+    Settings,
+    States,
+)
 from ..integration.scheduler import Numbers
 from .ensemble import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid
 from .traced_ensemble import traced_solve_hybrid
@@ -43,35 +52,11 @@ NEARLY = 1e-6
 UNMEASURED = 1e9
 
 
-class Clocked(AbstractProblem):
-    """A problem with the time since its mode began behind its state; the clock's variation is that of the beginning."""
+class Clock(AbstractPassive):
+    """The time since a mode began, which is passive; the clock's variation is that of the beginning."""
 
-    problem: AbstractProblem
-    began: Float[Array, " cells"]
-
-    @property
-    def direction_decides(self) -> bool:
-        return self.problem.direction_decides
-
-    @property
-    def fits_one_kernel(self) -> bool:
-        return self.problem.fits_one_kernel
-
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        states, scales = self.problem.start()
-        return with_row(states, self.began), with_row(scales, jnp.full_like(self.began, UNMEASURED))
-
-    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return with_row(self.problem.field(time, state[:-1]), jnp.ones_like(state[-1]))
-
-    def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"] | None:
-        return self.problem.event_function(state[:-1])
-
-    def domain_margin(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.problem.domain_margin(time, state[:-1])
-
-    def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.problem.margins(time, state[:-1])
+    def rates(self, problem: AbstractProblem, time: Lanes, state: States, passive: States) -> States:
+        return jnp.concatenate([problem.field(time, state), jnp.ones_like(passive)])
 
 
 def with_row(state: Float[Array, "components cells"], row: Float[Array, " cells"]) -> Float[Array, "more cells"]:
@@ -97,8 +82,11 @@ class VariationalMode(AbstractBatchedMode):
         at, *variations = self.parts(state)
         numbers, build = self._moving()
 
-        def clocked(state: Float[Array, "components cells"], *numbers: Array) -> Clocked:
-            return Clocked(build(*numbers).problem(state[:-1]), state[-1])
+        def clocked(state: Float[Array, "components cells"], *numbers: Array) -> ExtendedProblem:
+            began = state[-1:]
+            return ExtendedProblem(
+                build(*numbers).problem(state[:-1]), Clock(), began, jnp.full_like(began, UNMEASURED)
+            )
 
         point = (with_row(at[:-1], jnp.zeros_like(at[-1])), *numbers)
         tangents = [(variation, *rates) for variation, rates in zip(variations, self._rates(), strict=True)]

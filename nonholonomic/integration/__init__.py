@@ -44,6 +44,8 @@ from .dense import sample as sample
 from .ensemble import solve_ensemble as solve_ensemble
 from .ensemble import traced_solve_ensemble as traced_solve_ensemble
 from .ensemble import with_crossing_times as with_crossing_times
+from .extended import AbstractPassive as AbstractPassive
+from .extended import ExtendedProblem as ExtendedProblem
 from .midpoint import ImplicitMidpoint as ImplicitMidpoint
 from .oscillatory import Oscillatory8 as Oscillatory8
 from .problem import AbstractProblem as AbstractProblem

@@ -36,13 +36,14 @@ from nonholonomic.geometry import (
     dot,
     multiply,
     scale,
+    stacked,
     subtract,
     sum_vectors,
     vector_of,
 )
 from nonholonomic.xla_cpu import least, stored
 
-from .dynamics import FITS, JAMMED, Motion, stacked
+from .dynamics import FITS, JAMMED, Motion
 from .friction import AbstractFriction, ContactLoad, NoSlip, Slip
 from .inertia import SymmetricMatrix
 from .launch import Launch
