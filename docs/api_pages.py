@@ -107,7 +107,7 @@ PAGES = {
             "nonholonomic.integration",
             *of(
                 "nonholonomic.integration",
-                "AbstractProblem CoreProblem Settings solve_ensemble traced_solve_ensemble solve_with_samples Outcome "
+                "AbstractProblem CoreProblem AbstractPassive ExtendedProblem Settings solve_ensemble traced_solve_ensemble solve_with_samples Outcome "
                 "crossing_time LaneState solve_by_diffrax follow DenseSolution padded sample explicit_tableau legal_run "
                 "run_bounds times_bounds tolerance_bound require_adaptive require_adjoint few_trials halved sign_changes",
             ),
@@ -170,6 +170,7 @@ MEMBERS = {
     "nonholonomic.AbstractSystem": "dimension metric potential constraints frame force lagrangian energy",
     "nonholonomic.integration.AbstractProblem": "leading direction_decides fits_one_kernel start field event_function "
     "crossing_along domain_margin margins",
+    "nonholonomic.integration.AbstractPassive": "rates",
     "nonholonomic.integration.Settings": "for_lanes for_single_runs for_steps_alone with_tolerance",
     "nonholonomic.integration.DenseSolution": "at",
     "nonholonomic.hybrid.AbstractBatchedMode": "problem reset_map shown between",
