@@ -275,6 +275,14 @@ def solve_hybrid_with_tangents(
 
     **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event, or it is at the start.
     Source: implicit function theorem at the event, saltation at every change of mode.
+
+    **Example:** by the restitution.
+
+    >>> from nonholonomic.hybrid import solve_hybrid_with_tangents
+    >>> tangents = (((Bounce(jnp.ones(2)),), None),)
+    >>> _, sensitivities = solve_hybrid_with_tangents(modes, tangents, first, start, 5.0, 2, settings, counters=1)
+    >>> print(sensitivities.slopes.round(6))  # the time of the fall
+    [[0.451524 0.451524]]
     """
     varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
     start, n_blocks = np.asarray(variational_start(jnp.asarray(state), tangents)), 1 + len(tangents)
@@ -296,7 +304,16 @@ def traced_solve_hybrid_with_tangents(
     counters: int,
     ends_on_event: bool = True,
 ) -> tuple[HybridOutcome[Array], Slopes[Array]]:
-    """`solve_hybrid_with_tangents` inside other transformed functions; arguments and results are traced."""
+    """`solve_hybrid_with_tangents` inside other transformed functions; arguments and results are traced.
+
+    **Example:** as for `solve_hybrid_with_tangents`.
+
+    >>> from nonholonomic.hybrid import traced_solve_hybrid_with_tangents
+    >>> tangents, options = (((Bounce(jnp.ones(2)),), None),), (jnp.asarray(first), jnp.asarray(start), 5.0, 2, settings)
+    >>> _, sensitivities = traced_solve_hybrid_with_tangents(modes, tangents, *options, counters=1)
+    >>> print(sensitivities.slopes.round(6))
+    [[0.451524 0.451524]]
+    """
 
     def run(group: tuple[Any, ...]) -> tuple[tuple[HybridOutcome[Array], Array], list[Float[Array, " cells"]]]:
         varied = variational_modes(modes, group, settings.tolerance, ends_on_event)

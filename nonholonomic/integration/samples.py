@@ -133,6 +133,16 @@ def solve_with_samples(
 
     **Returns:** the `Outcome`, without crossing times; and the states at the times, (cells, times, components), NaN
     after the end of a run.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import solve_with_samples
+    >>> times = jnp.array([0.1, 0.3])
+    >>> _, states = solve_with_samples(problem, times, jnp.asarray(5.0), jnp.asarray(3), settings)
+    >>> print(states[..., 0].round(6))
+    [[0.904837 0.740818]
+     [0.818731 0.548812]
+     [0.67032       nan]]
     """
     scheduler = LaneScheduler.of(problem, t1, cells, settings, n_blocks=n_blocks, one_kernel=one_kernel)
     recorder = SampleRecorder.of(times, scheduler.capacity)

@@ -41,6 +41,12 @@ class Outcome(NamedTuple, Generic[Numbers]):
     `status` is one of the codes of `status.py`; `first_crossing` and `crossing_time` [s] are the times of the first and
     the last event, the same where runs end on it, infinite if there was none; `end_time` [s] and `state` are those at
     which the run ended; `steps` counts accepted and rejected steps, `rejected` the latter.
+
+    **Example:** the outcome of the room's example, whose runs end on the event.
+
+    >>> from nonholonomic.integration import CROSSED
+    >>> print(outcome.status == CROSSED, outcome.state.shape)
+    [ True  True  True] (1, 3)
     """
 
     status: Int[Numbers, " cells"]
