@@ -183,7 +183,7 @@ def _status(path: SampledSolution, t1: Float[Array, ""]) -> Int[Array, ""]:
 
 
 class BlockSampling(AbstractSampling):
-    """Samples by an ensemble solve, with passive quadratures or (`alone`) without."""
+    """Samples by an ensemble solve, with passive quadratures or, if `alone`, without them."""
 
     movable: int
     spec: ProblemSpec

@@ -33,7 +33,7 @@ def tangent_scale(number: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 class VariationalProblem(AbstractProblem):
-    """A problem and its first variations along several tangents, which follow the state.
+    """A problem whose state is followed by its first variations along several tangents.
 
     A tangent of the problem is the same tree, with the rate at which each number moves, `None` where no tangent moves
     it. A variation's absolute tolerance is that of the state, so a tangent should move a number by about its own size
