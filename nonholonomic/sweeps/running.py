@@ -69,6 +69,14 @@ def sweep(
     `OSError` or `ValueError` if the file cannot be written or holds another request; `RuntimeError` if the executor
     breaks down or a worker has other versions: what had finished is in the file. `KeyboardInterrupt` after Ctrl-C, with
     a message that says how many cells are saved.
+
+    **Example:** in another thread, by any executor.
+
+    >>> from concurrent.futures import ThreadPoolExecutor
+    >>> with ThreadPoolExecutor(1) as executor:
+    ...     again = sweep(half_lives, axes, variables, {"system": "decay"}, progress=False, executor=executor)
+    >>> np.array_equal(again.time, table.time)
+    True
     """
     require_flag(progress, "progress")
     if executor is not None and not isinstance(executor, Executor):
@@ -227,6 +235,12 @@ def chunk_for(cells: int) -> int:
     cores share the work.
 
     It does not depend on the number of cores, so that a file can be resumed on another machine.
+
+    **Example:**
+
+    >>> from nonholonomic.sweeps import chunk_for
+    >>> chunk_for(100_000) >= chunk_for(4)
+    True
     """
     if jax.default_backend() != "cpu":
         return 65536 if cells > 4096 else 4096
