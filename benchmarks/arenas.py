@@ -45,14 +45,14 @@ RUNS = 9
 def rows() -> list[dict[str, str]]:
     """Steps per second on every arena, and the cost of a step relative to the plane."""
     grid.workers = lambda: 1
-    found, plane = [], None
+    entries, plane = [], None
     for name, surface in ARENAS.items():
         scene = tippe.Scene(tippe.Top(*TOP), surface, tippe.Viscous(0.3))
-        given = {"theta": np.linspace(0.05, 0.3, 64), "spin": np.linspace(80.0, 120.0, 8), "t1": 8.0}
+        arguments = {"theta": np.linspace(0.05, 0.3, 64), "spin": np.linspace(80.0, 120.0, 8), "t1": 8.0}
         axes = {f"launch.place[{k}]": 0.0 for k in range(3)} if name == "implicit" else None
 
-        def run(tolerance=1e-9, scene=scene, axes=axes, given=given):
-            return tippe.inversion_table(scene, axes=axes, progress=False, tolerance=tolerance, **given)
+        def run(tolerance=1e-9, scene=scene, axes=axes, arguments=arguments):
+            return tippe.inversion_table(scene, axes=axes, progress=False, tolerance=tolerance, **arguments)
 
         measured = timed(run, RUNS)
         times, exact = measured.result.time, run(1e-11).time
@@ -68,14 +68,14 @@ def rows() -> list[dict[str, str]]:
             "inverted": str(int(both.sum())),
             "error": f"{np.max(np.abs(times / np.where(both, exact, 1.0) - 1.0)[both]):.0e}" if both.any() else "",
         }
-        found.append(columns)
+        entries.append(columns)
         print(*columns.values(), flush=True)
-    return found
+    return entries
 
 
 def drifts() -> list[dict[str, str]]:
     """Greatest distance of the foot from the arena in 1000 s."""
-    times, found = np.linspace(0.0, 1000.0, 501), []
+    times, entries = np.linspace(0.0, 1000.0, 501), []
     for name in ("paraboloid", "torus", "graph"):
         scene = tippe.Scene(tippe.Top(*TOP), ARENAS[name], tippe.Viscous(0.02))
         launch = tippe.Launch(0.3, 20.0, place=(0.1, 0.05) if name != "torus" else (0.0, 0.3), velocity=(0.2, 0.1))
@@ -83,10 +83,10 @@ def drifts() -> list[dict[str, str]]:
             run = tippe.simulate(scene, launch, 1000.0, times, tolerance)
             foot = tuple(jnp.asarray(run.states[8:11]))
             off = float(jnp.max(jnp.abs(scene.surface.offset(foot))) / scene.body.radius)
-            found.append(
+            entries.append(
                 {"arena": name, "tolerance": f"{tolerance:g}", "status": run.status, "drift / R": f"{off:.1e}"}
             )
-    return found
+    return entries
 
 
 if __name__ == "__main__":

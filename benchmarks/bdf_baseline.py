@@ -78,8 +78,8 @@ def measure(options: argparse.Namespace) -> tuple[float, list[Measured]]:
             return kind(rate, 0.0, start, options.t1, rtol=rtol, atol=0.1 * rtol * scales, **more)
 
         begin = time.perf_counter()
-        found, evaluations, steps = inversion_with(make, highest_order, options.t1)
-        return Measured(name, rtol, found, evaluations, steps, time.perf_counter() - begin)
+        inversion_time, evaluations, steps = inversion_with(make, highest_order, options.t1)
+        return Measured(name, rtol, inversion_time, evaluations, steps, time.perf_counter() - begin)
 
     # The smallest tolerance that SciPy accepts is a hundred rounding units.
     reference = run("DOP853", DOP853, 3e-14).time
@@ -101,8 +101,8 @@ def ours(scene: tippe.Scene, launch: tippe.Launch, rtol: float, t1: float) -> Me
 
     call()
     begin = time.perf_counter()
-    found = call()
-    return Measured("tippe.inversion_time", rtol, found, 0, 0, time.perf_counter() - begin)
+    inversion_time = call()
+    return Measured("tippe.inversion_time", rtol, inversion_time, 0, 0, time.perf_counter() - begin)
 
 
 def draw(reference: float, rows: list[Measured], path: str) -> None:

@@ -56,9 +56,9 @@ def predictions(density: LogDensity, coordinates: np.ndarray) -> np.ndarray:
 def log_posterior(density: LogDensity, tables: Measurements, coordinates: Any, predicted: Any) -> np.ndarray:
     """The log density of every draw from the posterior of its table."""
 
-    def of_table(table: Measurements, at: Float[Array, "draws k"], there: Float[Array, "draws n"]) -> Any:
-        own = eqx.tree_at(lambda one: one.measurements, density, table)
-        return jax.vmap(own.of_prediction)(at, there)
+    def of_table(table: Measurements, at: Float[Array, "draws k"], predictions: Float[Array, "draws n"]) -> Any:
+        own = eqx.tree_at(lambda node: node.measurements, density, table)
+        return jax.vmap(own.of_prediction)(at, predictions)
 
     return np.asarray(jax.jit(jax.vmap(of_table))(tables, jnp.asarray(coordinates), jnp.asarray(predicted)))
 
@@ -68,15 +68,15 @@ def main() -> None:
     parser.add_argument("--tables", type=int, default=200)
     parser.add_argument("--draws", type=int, default=64)
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    spent, random = time.process_time(), np.random.default_rng(given.seed)
+    options = parser.parse_args()
+    spent, random = time.process_time(), np.random.default_rng(options.seed)
     free = {name: Free(prior[0], 0.0, prior=prior) for name, prior in PRIORS.items()}
     launches = tippe.Launch(THETA, SPIN)
     data = tippe.InversionTimes(launches, np.full(len(THETA), 10.0), ERROR, t1=60.0, angle=ANGLE)
     model = SceneModel(scene(0.3, 0.0035), (data,), data.seen, TOLERANCE)
     density = LogDensity.of(model, data.measurements, free)
     mean, deviation = np.array(list(PRIORS.values())).T
-    truth = np.log(mean + deviation * random.normal(size=(given.tables, len(mean))))
+    truth = np.log(mean + deviation * random.normal(size=(options.tables, len(mean))))
     exact = predictions(density, truth)
     noisy = exact + ERROR * random.normal(size=exact.shape)
     # Beyond the horizon, a time is only known to be later.
@@ -86,11 +86,13 @@ def main() -> None:
         flush=True,
     )
     problem = Problem(model, tuple(free.items()), STEP)
-    ends = minimise(problem, np.tile(np.log(mean), (given.tables, 1)), tables)
-    there = linearise(problem, ends.coordinates, tables)
+    ends = minimise(problem, np.tile(np.log(mean), (options.tables, 1)), tables)
+    linearised = linearise(problem, ends.coordinates, tables)
     print(f"fitted: {np.mean(ends.converged):.3f} converged; {time.process_time() - spent:.0f} s of CPU", flush=True)
-    roots = np.stack([np.linalg.cholesky(coordinate_covariance(one)) for one in there.whole_information])
-    shape = (given.tables, given.draws, len(mean))
+    roots = np.stack(
+        [np.linalg.cholesky(coordinate_covariance(information)) for information in linearised.whole_information]
+    )
+    shape = (options.tables, options.draws, len(mean))
     points = random.normal(size=shape) / np.sqrt(random.chisquare(FREEDOM, (*shape[:2], 1)) / FREEDOM)
     drawn = ends.coordinates[:, None] + WIDER * np.einsum("tij,tdj->tdi", roots, points)
     predicted = predictions(density, drawn.reshape(-1, len(mean))).reshape(*shape[:2], -1)

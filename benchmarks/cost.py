@@ -52,6 +52,12 @@ LAWS = {
 }
 
 EGG = tippe.SpheroidBody(mass=0.05, equatorial=0.02, polar=0.028, I1=1.184e-5, I3=8e-6, offset=0.003)
+RATTLEBACK = tippe.Ellipsoid(
+    mass=1.0,
+    semi_axes=(0.2, 0.03, 0.02),
+    centre_of_mass=(0.0, 0.0, -0.01),
+    inertia=((2e-4, -2e-5, 0.0), (-2e-5, 1.6e-3, 0.0), (0.0, 0.0, 1.7e-3)),
+)
 ON_A_STEM = tippe.Top(6e-3, 0.015, 3e-3, 8e-7, 7e-7, stem=tippe.Stem(radius=5e-3, offset=0.016))
 
 GROUNDS = {
@@ -67,11 +73,17 @@ GROUNDS = {
 
 
 def fields() -> Iterator[tuple[str, Problems]]:
-    """Every field by name: of tops on every arena and under every law, with derivatives, and of strollers."""
+    """Every field by name: of tops and a rattleback on arenas and under laws, with derivatives, and of strollers."""
     top, viscous = tippe.Top(*TOP), tippe.Viscous(0.3)
     tops = {f"top, {name}": tippe.Scene(top, arena, viscous) for name, arena in ARENAS.items()}
     tops |= {f"top, plane, {name}": tippe.Scene(top, tippe.Plane(), law) for name, law in LAWS.items()}
     tops |= {"egg": tippe.Scene(EGG, tippe.Plane(), viscous)}
+    rolling = tippe.NoSlip()
+    tops |= {
+        "rattleback": tippe.Scene(RATTLEBACK, friction=viscous),
+        "rattleback, rolling": tippe.Scene(RATTLEBACK, friction=rolling),
+    }
+    tops |= {"rattleback, sphere": tippe.Scene(RATTLEBACK, tippe.Sphere(3.0), viscous)}
     tops |= {"top, sphere, with flights": tippe.Scene(top, tippe.Sphere(0.3), viscous, contact="hybrid")}
     tops |= {"top with a stem": tippe.Scene(ON_A_STEM, tippe.Plane(), LAWS["Coulomb"], contact="hybrid")}
     for name, scene in tops.items():

@@ -36,9 +36,9 @@ VARIABLES |= {name: Variable("1", np.int64) for name in ("steps", "rejected")}
 
 def results(columns, count):
     """Numbers that cost nearly nothing."""
-    found = {name: columns["x"] for name in NAMES}
+    variables = {name: columns["x"] for name in NAMES}
     whole = np.zeros(len(columns["x"]), int)
-    return found | {"status": whole.astype(np.int8), "steps": whole, "rejected": whole}
+    return variables | {"status": whole.astype(np.int8), "steps": whole, "rejected": whole}
 
 
 class Sleepers(Executor):
@@ -64,9 +64,9 @@ class Sleepers(Executor):
                 self._sent[last] = pickle.dumps(function(sent, needed, first, count, mark))
             self.blocks += 1
         time.sleep(count * self._each)
-        found = pickle.loads(self._sent[last])
+        message = pickle.loads(self._sent[last])
         self.done = time.perf_counter()
-        return found
+        return message
 
 
 class Took(NamedTuple):
@@ -85,16 +85,16 @@ def run(cells: int, workers: int, each: float, folder: Path) -> Took:
     x, y = axis("x", "x", "1", np.linspace(0.0, 1.0, 1 << 12)), axis("y", "y", "1", np.arange(cells >> 12))
     sleepers, fed = Sleepers(workers, each, cells), []
 
-    def handed_out(*arguments, once=running.handed_out):
-        yield from once(*arguments)
+    def handed_out(*arguments, original=running.handed_out):
+        yield from original(*arguments)
         fed.extend([time.perf_counter(), time.process_time()])
 
-    running.handed_out, once = handed_out, running.handed_out
+    running.handed_out, original = handed_out, running.handed_out
     start, processor = time.perf_counter(), time.process_time()
     try:
         table = sweep(results, [y, x], VARIABLES, {"what": "nothing"}, path=folder / "table.h5", executor=sleepers)
     finally:
-        running.handed_out = once
+        running.handed_out = original
         sleepers.shutdown()
     end = time.perf_counter()
     assert isinstance(table, Table)
@@ -108,10 +108,10 @@ def cost_of_a_cell() -> float:
     inertia = 0.02 * 0.02**2
     scene = tippe.Scene(tippe.Top(0.02, 0.02, 0.006, 131 / 350 * inertia, 0.4 * inertia), friction=tippe.Viscous(0.3))
     launches = {"theta": np.linspace(0.05, 0.4, 64), "spin": np.linspace(60.0, 160.0, 64), "t1": 30.0}
-    with ThreadPoolExecutor(1) as one:
-        tippe.inversion_table(scene, executor=one, **launches)
+    with ThreadPoolExecutor(1) as thread:
+        tippe.inversion_table(scene, executor=thread, **launches)
         start = time.process_time()
-        tippe.inversion_table(scene, executor=one, **launches)
+        tippe.inversion_table(scene, executor=thread, **launches)
     return (time.process_time() - start) / 4096
 
 
@@ -143,11 +143,11 @@ def main() -> None:
         print(f"so one parent feeds {rate * options.each:.0f} workers that take {options.each:g} s a cell")
         # Every worker gets the same number of chunks of the same size, whatever the number of workers.
         size = -(-cells // took.blocks // 512) * 512
-        running.chunks_together, once = lambda layout, chunk: size // chunk, running.chunks_together
+        running.chunks_together, original = lambda layout, chunk: size // chunk, running.chunks_together
         few = size * options.workers * 8 >> 12 << 12
         ideal = few * options.each / options.workers
         took = run(few, options.workers, options.each, Path(folder))
-        running.chunks_together = once
+        running.chunks_together = original
         print(f"{few:.3g} cells in {took.blocks} blocks, {options.workers} workers that sleep for {ideal:.1f} s each:")
         print(
             f"  the last was done after {took.worked:.1f} s: they waited for {100 * (took.worked / ideal - 1):.1f} % of that"

@@ -109,7 +109,7 @@ def diffrax(launches: int, folder: Path) -> dict[str, float]:
     @jax.jit
     @jax.vmap
     def times(start: Any) -> Any:
-        found = diffrax.diffeqsolve(
+        solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda t, y, args: jnp.stack(task.field(y, task.numbers, functions))),
             diffrax.Dopri8(),
             0.0,
@@ -120,7 +120,7 @@ def diffrax(launches: int, folder: Path) -> dict[str, float]:
             event=diffrax.Event(lambda t, y, args, **_: y[4] - cosine, optimistix.Newton(1e-12, 1e-12)),
             max_steps=100_000,
         )
-        return found.ts[0]
+        return solution.ts[0]
 
     answer = float(times(jnp.asarray(task.starts.T))[-1])
     return phases_of_jax(begin, imported, spent) | {"answer": answer}

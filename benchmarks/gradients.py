@@ -47,9 +47,11 @@ def loss_of(scene: tippe.Scene, theta: np.ndarray, paths: list[str]) -> tuple[Ca
     known |= {f"scene.body.{name}": getattr(scene.body, name) for name in ("offset", "I1", "I3")}
 
     def loss(values: list[Any], tolerance: Any) -> Any:
-        def time(one: Any) -> Any:
-            given = dict(zip(paths, values, strict=True)) | ({"launch.theta": one} if "launch.theta" in paths else {})
-            roots = with_numbers({"scene": scene, "launch": tippe.Launch(one, 100.0)}, given)
+        def time(angle: Any) -> Any:
+            numbers = dict(zip(paths, values, strict=True)) | (
+                {"launch.theta": angle} if "launch.theta" in paths else {}
+            )
+            roots = with_numbers({"scene": scene, "launch": tippe.Launch(angle, 100.0)}, numbers)
             return tippe.inversion_time(roots["scene"], roots["launch"], 30.0, tolerance=tolerance)
 
         angles = values[paths.index("launch.theta")] if "launch.theta" in paths else jnp.asarray(theta)
@@ -62,10 +64,10 @@ def differences(scene: tippe.Scene, theta: float) -> tuple[float, float]:
     """The derivative of one launch's time with respect to mu from extrapolated central differences, and its error."""
     mu = float(scene.friction.mu)
     steps = 1e-3 * mu / RATIO ** np.arange(16)
-    found = tippe.inversion_table(
+    times = tippe.inversion_table(
         scene, theta=theta, spin=100.0, mu=np.concatenate([mu + steps, mu - steps]), t1=30.0, tolerance=1e-13
     ).time
-    return extrapolated((found[:16] - found[16:]) / (2.0 * steps))
+    return extrapolated((times[:16] - times[16:]) / (2.0 * steps))
 
 
 def rows_of(name: str, scene: tippe.Scene, launches: int) -> list[dict[str, str]]:
@@ -77,8 +79,8 @@ def rows_of(name: str, scene: tippe.Scene, launches: int) -> list[dict[str, str]
     for label, paths in (("two", [*ONE, SIX[1]]), ("all", SIX)):
         loss, values = loss_of(scene, np.linspace(theta[0], theta[-1], OF_LOSS), paths)
         losses[label] = (values, jax.jit(loss), jax.jit(jax.grad(loss)))
-    given = (losses, exact, (slope, doubt))
-    rows = [row_of(name, scene, theta, tolerance, *given) for tolerance in (1e-6, 1e-8, 1e-10, 1e-12)]
+    references = (losses, exact, (slope, doubt))
+    rows = [row_of(name, scene, theta, tolerance, *references) for tolerance in (1e-6, 1e-8, 1e-10, 1e-12)]
     print(table(rows), flush=True)
     return rows
 
@@ -115,7 +117,7 @@ def row_of(
         "by six": f"{runs['six'].cpu / base:.2f} x",
         "reverse, two": f"{runs['gradient of two'].cpu / runs['loss of two'].cpu:.2f} x",
         "reverse, six": f"{runs['gradient of all'].cpu / runs['loss of all'].cpu:.2f} x",
-        "first call s": ", ".join(f"{runs[one].first:.1f}" for one in ("one", "six", "gradient of all")),
+        "first call s": ", ".join(f"{runs[kind].first:.1f}" for kind in ("one", "six", "gradient of all")),
         "error by mu": f"{np.max(np.abs(slopes / exact - 1.0)):.1e}",
         "against differences": f"{abs(slopes[0] / slope - 1.0):.1e} (they: {doubt / abs(slope):.0e})",
     }

@@ -32,15 +32,15 @@ def main() -> int:
     options = command.parse_args()
     started = time.perf_counter()
     print(machine())
-    found = {}
+    rows = {}
     for name in options.only or functions:
         print(f"{time.perf_counter() - started:6.0f} s: {name}", file=sys.stderr, flush=True)
-        found[name] = functions[name]()
-    cells = [row.cells(name) for name, row in found.items()]
+        rows[name] = functions[name]()
+    cells = [row.cells(name) for name, row in rows.items()]
     print(table(cells))
     if options.csv is not None:
         write_csv(options.csv, cells)
-    broken = [name for name, row in found.items() if not row.ok]
+    broken = [name for name, row in rows.items() if not row.ok]
     print(f"\n{time.perf_counter() - started:.0f} s in all; {', '.join(broken) or 'no row'} broke its bound")
     return 1 if broken else 0
 

@@ -46,15 +46,17 @@ def machine() -> str:
         model = next(
             (line.split(":")[1].strip() for line in info.read_text().splitlines() if "model name" in line), model
         )
-    found = []
+    versions = []
     for name in PACKAGES:
         try:
-            found.append(f"{name} {version(name)}")
+            versions.append(f"{name} {version(name)}")
         except PackageNotFoundError:
-            found.append(f"{name} missing")
+            versions.append(f"{name} missing")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
-    return f"{model}, {cores} cores{load}, {platform.system()}, Python {platform.python_version()}\n{', '.join(found)}"
+    return (
+        f"{model}, {cores} cores{load}, {platform.system()}, Python {platform.python_version()}\n{', '.join(versions)}"
+    )
 
 
 def one_core() -> None:

@@ -93,7 +93,7 @@ def _states(problem: AbstractProblem) -> Any:
 def _of_program(program: Jaxpr) -> Operations:
     total = NONE
     for equation in program.eqns:
-        inner = [_of_program(getattr(one, "jaxpr", one)) for one in _programs(equation)]
+        inner = [_of_program(getattr(subprogram, "jaxpr", subprogram)) for subprogram in _programs(equation)]
         if equation.primitive.name == "cond":
             total += min(inner) if len(inner) == 2 else sum(inner, NONE).times(1.0 / len(inner))
         else:

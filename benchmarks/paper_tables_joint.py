@@ -39,7 +39,7 @@ def times(numbers: jax.Array, law: str) -> jax.Array:
     """Times of all rows [s], (sets, rows), for numbers (unknowns, sets) in the order of `NAMES`."""
     sets = numbers.shape[1]
 
-    def one(theta, eta, mass, radius, alpha, ratio, inertia, cylinder, azimuth, mu, slip_speed=None):
+    def single_time(theta, eta, mass, radius, alpha, ratio, inertia, cylinder, azimuth, mu, slip_speed=None):
         mass, radius = mass * paper.GRAM, radius * 1e-3
         I3 = inertia * mass * radius**2
         top = tippe.Top(mass, radius, alpha * radius, ratio * I3, I3)
@@ -49,7 +49,7 @@ def times(numbers: jax.Array, law: str) -> jax.Array:
         return tippe.extended_inversion_time(scene, launch, HORIZON, ANGLE, 1e-6)
 
     cells = jnp.repeat(numbers, len(ROWS), axis=1)
-    return jax.vmap(one)(np.tile(THETA, sets), np.tile(ETA, sets), *cells).reshape(sets, -1)
+    return jax.vmap(single_time)(np.tile(THETA, sets), np.tile(ETA, sets), *cells).reshape(sets, -1)
 
 
 def deviances(numbers: np.ndarray, law: str, run) -> tuple[np.ndarray, np.ndarray]:
@@ -82,10 +82,10 @@ def main() -> None:
 
     random = np.random.default_rng(options.seed)
     drawn = [random.uniform(low, high, (members, unknowns)) for _ in range(options.draws)]
-    bent = np.concatenate([deviances(one.T, options.law, run)[1] for one in drawn])
+    bent = np.concatenate([deviances(parameters.T, options.law, run)[1] for parameters in drawn])
     first = np.concatenate(drawn)[np.argsort(bent)[:members]]
     print(f"best of {bent.size} random sets: {bent.min():.1f}, {time.perf_counter() - begin:.0f} s", flush=True)
-    found = differential_evolution(
+    search = differential_evolution(
         lambda numbers: deviances(numbers, options.law, run)[1],
         list(zip(low, high, strict=True)),
         strategy="currenttobest1bin",
@@ -100,7 +100,7 @@ def main() -> None:
         callback=stop,
         rng=random,
     )
-    last = found.population.T
+    last = search.population.T
     exact, _ = deviances(last, options.law, run)
     reached = np.asarray(run(jnp.asarray(last)))
     order = np.argsort(exact)

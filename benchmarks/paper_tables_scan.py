@@ -89,8 +89,8 @@ def rows(
     cells, angles = np.repeat(numbers, shape[1], axis=0).T, np.tile(theta, shape[0])
     time_, status = np.empty(total), np.empty(total, int)
     for begin in range(0, total, BLOCK):
-        here = np.minimum(np.arange(begin, begin + BLOCK), total - 1)
-        scene, launch = scene_and_launch(cells[:, here], table, angles[here], options.law)
+        indices = np.minimum(np.arange(begin, begin + BLOCK), total - 1)
+        scene, launch = scene_and_launch(cells[:, indices], table, angles[indices], options.law)
         count = min(BLOCK, total - begin)
         outcome, _ = solve_ensemble(
             InversionProblem.of(scene, launch, ANGLE, BLOCK),
@@ -113,16 +113,16 @@ def run(numbers: np.ndarray, table: paper.Table, options: argparse.Namespace) ->
     """Run the rows of a table for every set; those that must reverse come first, one at a time."""
     theta, wanted = inclinations_and_times(table)
     reversing = np.isfinite(wanted)
-    found, lost = np.full((len(numbers), len(theta)), np.inf), np.zeros((len(numbers), len(theta)), bool)
+    inversion_times, lost = np.full((len(numbers), len(theta)), np.inf), np.zeros((len(numbers), len(theta)), bool)
     failed, alive = np.zeros(len(numbers), bool), np.arange(len(numbers))
     for group in (*np.flatnonzero(reversing)[:, None], np.flatnonzero(~reversing)):
         time_, status = rows(numbers[alive], table, theta[group], options)
-        found[np.ix_(alive, group)], lost[np.ix_(alive, group)] = time_, status == LEFT_DOMAIN
+        inversion_times[np.ix_(alive, group)], lost[np.ix_(alive, group)] = time_, status == LEFT_DOMAIN
         failed[alive] = np.any(status == FAILED, axis=1)
         right = np.all(np.isfinite(time_) == reversing[group], axis=1)
         alive = alive[right & ~failed[alive]]
     pattern = np.isin(np.arange(len(numbers)), alive)
-    return Rows(found, pattern, pattern & ~np.any(lost, axis=1), failed)
+    return Rows(inversion_times, pattern, pattern & ~np.any(lost, axis=1), failed)
 
 
 def worst_error(runs: Rows, table: paper.Table, wanted_sets: np.ndarray) -> np.ndarray:
@@ -196,7 +196,7 @@ def confirm(numbers: np.ndarray, options: argparse.Namespace) -> None:
             tolerance=1e-10,
         )
         cells = zip(np.asarray(result.time), np.asarray(result.status), strict=True)
-        words = [f"{found:.2f}" if np.isfinite(found) else str(word) for found, word in cells]
+        words = [f"{time:.2f}" if np.isfinite(time) else str(word) for time, word in cells]
         print(f"    the same at 1e-10 on Table {name}: {', '.join(words)}")
 
 

@@ -23,5 +23,5 @@ def peak() -> float:
 
     run = jax.jit(lambda values: jax.lax.fori_loop(0, rounds, lambda _, now: links(now), values))
     values = jnp.linspace(0.0, 0.5, elements)
-    found = timed(lambda: run(values), 3)
-    return 2.0 * CHAINS * LINKS * elements * rounds / (found.cpu if on_cpu else found.wall)
+    measurement = timed(lambda: run(values), 3)
+    return 2.0 * CHAINS * LINKS * elements * rounds / (measurement.cpu if on_cpu else measurement.wall)

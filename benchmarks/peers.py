@@ -70,16 +70,18 @@ def heyoka_scalar(task: Task) -> Callable[[float], Any]:
     import heyoka
 
     system, variables = _heyoka_system(heyoka, task)
-    made = {}
+    integrators = {}
 
     def run(tolerance: float) -> Any:
-        if tolerance not in made:
+        if tolerance not in integrators:
             events = []
             if task.angle is not None:
                 falling = heyoka.event_direction.negative
                 events = [heyoka.t_event(variables[E3] - math.cos(task.angle), direction=falling)]
-            made[tolerance] = heyoka.taylor_adaptive(system, [1.0] * len(variables), tol=tolerance, t_events=events)
-        integrator, answers = made[tolerance], []
+            integrators[tolerance] = heyoka.taylor_adaptive(
+                system, [1.0] * len(variables), tol=tolerance, t_events=events
+            )
+        integrator, answers = integrators[tolerance], []
         for start in task.starts.T:
             if task.angle is not None:
                 integrator.reset_cooldowns()
@@ -97,22 +99,22 @@ def heyoka_batch(task: Task) -> Callable[[float], Any]:
 
     system, variables = _heyoka_system(heyoka, task)
     # The callback stores the values outside, not in the integrator's copy.
-    width, made, ends = heyoka.recommended_simd_size(), {}, {}
+    width, integrators, ends = heyoka.recommended_simd_size(), {}, {}
 
-    def found(integrator, time, sign, lane):
+    def record_event(integrator, time, sign, lane):
         if lane not in ends:
             integrator.update_d_output(np.full(width, time))
             ends[lane] = (time, integrator.d_output[:, lane].copy())
 
     def run(tolerance: float) -> Any:
-        if tolerance not in made:
+        if tolerance not in integrators:
             events = []
             if task.angle is not None:
                 falling = heyoka.event_direction.negative
-                events = [heyoka.nt_event_batch(variables[E3] - math.cos(task.angle), found, direction=falling)]
+                events = [heyoka.nt_event_batch(variables[E3] - math.cos(task.angle), record_event, direction=falling)]
             blank = np.ones((len(variables), width))
-            made[tolerance] = heyoka.taylor_adaptive_batch(system, blank, tol=tolerance, nt_events=events)
-        integrator, answers = made[tolerance], []
+            integrators[tolerance] = heyoka.taylor_adaptive_batch(system, blank, tol=tolerance, nt_events=events)
+        integrator, answers = integrators[tolerance], []
         for first in range(0, task.launches, width):
             lanes = np.minimum(np.arange(first, first + width), task.launches - 1)
             ends.clear()
@@ -133,7 +135,7 @@ def heyoka_batch(task: Task) -> Callable[[float], Any]:
 def _heyoka_system(heyoka: Any, task: Task) -> tuple[Any, Any]:
     variables = heyoka.make_vars(*(f"y{i}" for i in range(len(task.starts))))
     rates = task.field(variables, task.numbers, Functions(heyoka.sqrt))
-    return [(one, rate + 0.0 * one) for one, rate in zip(variables, rates, strict=True)], variables
+    return [(variable, rate + 0.0 * variable) for variable, rate in zip(variables, rates, strict=True)], variables
 
 
 def scipy_with(method: str, compiled: bool) -> Callable[[Task], Callable[[float], Any]]:
@@ -152,7 +154,7 @@ def scipy_with(method: str, compiled: bool) -> Callable[[Task], Callable[[float]
         def run(tolerance: float) -> Any:
             answers = []
             for start, scales in zip(task.starts.T, task.scales.T, strict=True):
-                found = solve_ivp(
+                solution = solve_ivp(
                     rate,
                     (0.0, task.t1),
                     start,
@@ -161,7 +163,7 @@ def scipy_with(method: str, compiled: bool) -> Callable[[Task], Callable[[float]
                     atol=0.1 * tolerance * scales,
                     events=None if task.angle is None else reached,
                 )
-                answers.append((found.t[-1], found.y[:, -1]))
+                answers.append((solution.t[-1], solution.y[:, -1]))
             return Ends.from_pairs(task, answers)
 
         return run
@@ -209,8 +211,8 @@ def cvode(task: Task) -> Callable[[float], Any]:
         answers = []
         for start, scales in zip(task.starts.T, task.scales.T, strict=True):
             solver = CVODE(right_side, atol=0.1 * tolerance * scales, **options)
-            found = solver.solve(np.array([0.0, task.t1]), start)
-            answers.append((found.t[-1], found.y[-1]))
+            solution = solver.solve(np.array([0.0, task.t1]), start)
+            answers.append((solution.t[-1], solution.y[-1]))
         return Ends.from_pairs(task, answers)
 
     return run
@@ -227,10 +229,10 @@ def cyrk(task: Task) -> Callable[[float], Any]:
     def run(tolerance: float) -> Any:
         answers = []
         for start, scales in zip(task.starts.T, task.scales.T, strict=True):
-            found = pysolve_ivp(
+            solution = pysolve_ivp(
                 rate, (0.0, task.t1), start.copy(), method="DOP853", rtol=tolerance, atol=0.1 * tolerance * scales
             )
-            answers.append((task.t1, found.y[:, -1]))
+            answers.append((task.t1, solution.y[:, -1]))
         return Ends.from_pairs(task, answers)
 
     return run
@@ -251,9 +253,9 @@ def vmapped_diffrax(task: Task) -> Callable[[float], Any]:
         newton = optimistix.Newton(1e-13, 1e-13)
         event = diffrax.Event(lambda t, y, args, **_: y[E3] - cosine, newton, direction=False)
 
-    def one(start, scales, tolerance):
+    def solve_single(start, scales, tolerance):
         control = diffrax.PIDController(tolerance, 0.1 * tolerance * scales)
-        found = diffrax.diffeqsolve(
+        solution = diffrax.diffeqsolve(
             term,
             diffrax.Dopri8(),
             0.0,
@@ -265,9 +267,9 @@ def vmapped_diffrax(task: Task) -> Callable[[float], Any]:
             max_steps=100_000,
             throw=False,
         )
-        return found.ts[0], found.ys[0]
+        return solution.ts[0], solution.ys[0]
 
-    batched = jax.jit(jax.vmap(one, (1, 1, None)))
+    batched = jax.jit(jax.vmap(solve_single, (1, 1, None)))
     starts, scales = jnp.asarray(task.starts), jnp.asarray(task.scales)
 
     def run(tolerance: float) -> Any:

@@ -57,14 +57,14 @@ def by_blackjax(density: InPoints, starts: Any, warmup: int, draws: int) -> tupl
             blackjax.nuts, density, is_mass_matrix_diagonal=False, max_num_doublings=DEEPEST
         )
         first, then = jax.random.split(key)
-        (state, found), _ = adaptation.run(first, start, warmup)
-        step = blackjax.nuts(density, **found).step
+        (state, parameters), _ = adaptation.run(first, start, warmup)
+        step = blackjax.nuts(density, **parameters).step
 
-        def one(state: Any, key: Any) -> Any:
+        def advance(state: Any, key: Any) -> Any:
             state, info = step(key, state)
             return state, (state.position, info.num_integration_steps)
 
-        return jax.lax.scan(one, state, jax.random.split(then, draws))[1]
+        return jax.lax.scan(advance, state, jax.random.split(then, draws))[1]
 
     points, steps = jax.jit(jax.vmap(chain))(jax.random.split(jax.random.key(1), len(starts)), starts)
     return np.asarray(points), int(np.sum(steps))

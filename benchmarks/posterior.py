@@ -47,29 +47,29 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=500)
     parser.add_argument("--warmup", type=int, default=25)
     parser.add_argument("--tolerance", type=float, default=1e-8)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     print(machine())
-    data, free = film() if given.data == "film" else (measured(), free_numbers())
+    data, free = film() if arguments.data == "film" else (measured(), free_numbers())
     start = scene(0.3, 0.0035)
     began, spent = time.perf_counter(), time.process_time()
 
     def clock(what: str) -> None:
         print(f"{what}: {time.process_time() - spent:.0f} s of CPU, {time.perf_counter() - began:.0f} s", flush=True)
 
-    fit = tippe.identify(start, data, free, tolerance=given.tolerance, progress=False)
+    fit = tippe.identify(start, data, free, tolerance=arguments.tolerance, progress=False)
     clock("fit")
-    density = tippe.log_density(start, data, free, tolerance=given.tolerance)
-    if given.plain:
-        found, leaps = plain(given.plain, density, fit, given.warmup, given.draws)
-        print(f"{leaps / found.coordinates.shape[0] / given.draws:.1f} leaps a draw")
+    density = tippe.log_density(start, data, free, tolerance=arguments.tolerance)
+    if arguments.plain:
+        posterior, leaps = plain(arguments.plain, density, fit, arguments.warmup, arguments.draws)
+        print(f"{leaps / posterior.coordinates.shape[0] / arguments.draws:.1f} leaps a draw")
     else:
-        options = {"warmup": given.warmup, "draws": given.draws, "progress": False}
-        found = sample(density, fit.coordinates, fit.coordinate_covariance, **options)
+        options = {"warmup": arguments.warmup, "draws": arguments.draws, "progress": False}
+        posterior = sample(density, fit.coordinates, fit.coordinate_covariance, **options)
     clock("fit and draws")
-    print(found)
-    ratio = found.values["scene.body.I1"] / float(start.body.I3)
+    print(posterior)
+    ratio = posterior.values["scene.body.I1"] / float(start.body.I3)
     print(f"I1 / I3 = {np.mean(ratio):.5f} +- {np.std(ratio):.5f}, of the data {I1 / float(start.body.I3):.5f}")
-    print(f"worst: R-hat {max(found.r_hat.values()):.4f}, ESS {min(found.ess.values()):.0f}")
+    print(f"worst: R-hat {max(posterior.r_hat.values()):.4f}, ESS {min(posterior.ess.values()):.0f}")
 
 
 if __name__ == "__main__":

@@ -56,16 +56,16 @@ def cpu_row(scene: tippe.Scene, launches: int, cores: int, operations: float, mo
     for workers in sorted({1, cores}):
         with_workers(workers)
         times[workers] = timed(lambda: times_of(scene, launches), 2 if launches <= 100_000 else 1)
-    one, all_ = times[1], times[cores]
+    single_core, all_cores = times[1], times[cores]
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return {
         "launches": str(launches),
-        "cpu ms per launch, one core": f"{one.cpu / launches * 1e3:.3f}",
-        "of peak": f"{100.0 * operations * one.result.steps.sum() / one.cpu / most:.0f} %",
-        "wall s, one core": f"{one.wall:.2f}",
-        f"wall s, {cores} cores": f"{all_.wall:.2f}",
-        "ratio": f"{one.wall / all_.wall:.2f}",
-        "first call s": f"{one.first:.1f}",
+        "cpu ms per launch, one core": f"{single_core.cpu / launches * 1e3:.3f}",
+        "of peak": f"{100.0 * operations * single_core.result.steps.sum() / single_core.cpu / most:.0f} %",
+        "wall s, one core": f"{single_core.wall:.2f}",
+        f"wall s, {cores} cores": f"{all_cores.wall:.2f}",
+        "ratio": f"{single_core.wall / all_cores.wall:.2f}",
+        "first call s": f"{single_core.first:.1f}",
         "peak memory GiB": f"{memory:.2f}",
     }
 

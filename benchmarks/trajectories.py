@@ -52,9 +52,9 @@ def by_diffrax(thetas: Any, times: Any) -> Any:
     top = scene()
     dynamics = top.turning_dynamics
 
-    def one(theta: Any) -> Any:
+    def sampled_theta(theta: Any) -> Any:
         launch = tippe.Launch(theta, SPIN)
-        found = diffrax.diffeqsolve(
+        solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda time, state, _: dynamics.field(state)),
             diffrax.Dopri8(),
             0.0,
@@ -65,9 +65,9 @@ def by_diffrax(thetas: Any, times: Any) -> Any:
             stepsize_controller=diffrax.PIDController(TOLERANCE, ABSOLUTE * TOLERANCE * top.scales(launch)),
             max_steps=100_000,
         )
-        return jax.vmap(top.theta)(found.ys)
+        return jax.vmap(top.theta)(solution.ys)
 
-    return jax.vmap(one)(thetas)
+    return jax.vmap(sampled_theta)(thetas)
 
 
 def tabled(thetas: Any, times: Any, tolerance: float = TOLERANCE, **options: Any) -> tippe.Table:
@@ -88,15 +88,15 @@ def main() -> None:
     print(machine())
     launches, thetas, times = options.launches, np.linspace(0.05, 0.15, options.launches), None
     times = np.linspace(0.0, HORIZON, options.samples)
-    given = (jnp.asarray(thetas), jnp.asarray(times))
-    one, ones = jnp.asarray(MU), jnp.ones((launches, options.samples))
+    inputs = (jnp.asarray(thetas), jnp.asarray(times))
+    mu_value, ones = jnp.asarray(MU), jnp.ones((launches, options.samples))
 
     def forward(mu: Any) -> Any:
-        return jax.jvp(lambda mu: simulated(*given, mu), (mu,), (jnp.ones(()),))
+        return jax.jvp(lambda mu: simulated(*inputs, mu), (mu,), (jnp.ones(()),))
 
     def reverse(mu: Any) -> Any:
-        found, back = jax.vjp(lambda mu: simulated(*given, mu), mu)
-        return found, back(ones)
+        samples, back = jax.vjp(lambda mu: simulated(*inputs, mu), mu)
+        return samples, back(ones)
 
     refine, wide, obvious = jax.jit(simulated), compiled_alone(simulated), jax.jit(by_diffrax)
     along, back_through = jax.jit(forward), jax.jit(reverse)
@@ -107,14 +107,14 @@ def main() -> None:
         ),
         "trajectory_table": (lambda: tabled(thetas, times).theta, 5),
         "trajectory_table, position": (lambda: tabled(thetas, times, quantities=("position",)).position, 3),
-        "jit(vmap(simulate))": (lambda: refine(*given), 3),
-        "vmap(simulate), wide vectors": (lambda: wide(*given), 3),
+        "jit(vmap(simulate))": (lambda: refine(*inputs), 3),
+        "vmap(simulate), wide vectors": (lambda: wide(*inputs), 3),
     }
     if not options.quick:
         ways |= {
-            "vmap(diffeqsolve)": (lambda: obvious(*given), 1),
-            "samples and forward derivative": (lambda: along(one), 2),
-            "samples and reverse derivative": (lambda: back_through(one), 2),
+            "vmap(diffeqsolve)": (lambda: obvious(*inputs), 1),
+            "samples and forward derivative": (lambda: along(mu_value), 2),
+            "samples and reverse derivative": (lambda: back_through(mu_value), 2),
         }
     rows, theta = [], {}
     for name, (run, runs) in ways.items():
@@ -126,13 +126,15 @@ def main() -> None:
             {"way": name, "cpu ms per launch": cost, "first call [s]": measured.first, "table = 1": cost / float(first)}
         )
         print(rows[-1], flush=True)
-    print(table([{key: one if key == "way" else f"{one:.3g}" for key, one in row.items()} for row in rows]))
+    print(
+        table([{key: mu_value if key == "way" else f"{mu_value:.3g}" for key, mu_value in row.items()} for row in rows])
+    )
     tight = tabled(thetas, times, TIGHT).theta
     worst = 0
     print("error of theta against tolerance 1e-13: the way, the greatest over the samples, at the end")
-    for name, found in theta.items():
-        if not isinstance(found, tuple) and found.shape == tight.shape:
-            errors = np.max(np.abs(np.asarray(found) - tight), axis=0)
+    for name, angles in theta.items():
+        if not isinstance(angles, tuple) and angles.shape == tight.shape:
+            errors = np.max(np.abs(np.asarray(angles) - tight), axis=0)
             worst = int(errors.argmax()) if name == "trajectory_table" else worst
             print(f"  {name}: {errors.max():.1e} (at {times[errors.argmax()]:.2f} s), {errors[-1]:.1e}")
     sampled = np.max(np.abs(theta["trajectory_table"] - tight), axis=0)

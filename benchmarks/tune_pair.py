@@ -99,9 +99,9 @@ def shown(aim: Aim, unknowns: Unknowns, height: float) -> str:
     pair, sizes = pair_of(unknowns), zip(aim.motions, aim.sizes(unknowns), strict=True)
     ninth = jnp.linalg.norm(error_coefficients(pair.stages, pair.eighth, 9))
     eighth = jnp.linalg.norm(error_coefficients(pair.stages, pair.seventh, 8))
-    found = ", ".join(f"{name} {size:.3f}" for (name, _, _), size in sizes)
+    listing = ", ".join(f"{name} {size:.3f}" for (name, _, _), size in sizes)
     largest = f"largest weights {jnp.abs(pair.stages).max():.1f}, {jnp.abs(pair.eighth).max():.2f}"
-    return f"aim {height:.2f}; {found}; T9 {ninth:.1e}, T8 of the seventh order {eighth:.1e}, {largest}"
+    return f"aim {height:.2f}; {listing}; T9 {ninth:.1e}, T8 of the seventh order {eighth:.1e}, {largest}"
 
 
 def main() -> None:
@@ -116,10 +116,12 @@ def main() -> None:
     aim, best = Aim(motions(options.launches), options.seed), []
     for start in range(options.starts):
         first = neighbour(best[random.integers(min(3, len(best)))][1], random) if best else PLAIN
-        found, height = descended(aim, first)
-        best = sorted([*best, (height, found)], key=lambda one: one[0])[:3]
-        if best[0][1] is found:
-            print(f"{time.perf_counter() - started:5.0f} s, start {start}: {shown(aim, found, height)}", flush=True)
+        parameters, height = descended(aim, first)
+        best = sorted([*best, (height, parameters)], key=lambda candidate: candidate[0])[:3]
+        if best[0][1] is parameters:
+            print(
+                f"{time.perf_counter() - started:5.0f} s, start {start}: {shown(aim, parameters, height)}", flush=True
+            )
     for name, rows in pair_of(best[0][1])._asdict().items():
         print(name, *(repr(row.tolist()) for row in np.atleast_2d(np.asarray(rows))), sep="\n")
 

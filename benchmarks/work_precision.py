@@ -66,8 +66,8 @@ def obvious_diffrax(task: Task, launches: int) -> Any:
         )
         return N * f / p.mass, e_dot, N * moment
 
-    def one(y0):
-        found = diffrax.diffeqsolve(
+    def solve_single(y0):
+        solution = diffrax.diffeqsolve(
             diffrax.ODETerm(field),
             diffrax.Dopri8(),
             0.0,
@@ -78,7 +78,7 @@ def obvious_diffrax(task: Task, launches: int) -> Any:
             event=diffrax.Event(lambda t, y, args, **_: y[1][2] - cosine < 0.0),
             max_steps=100_000,
         )
-        return found.ts[0]
+        return solution.ts[0]
 
     starts = task.starts[:, np.arange(launches) % task.launches]
     y0 = (
@@ -86,7 +86,7 @@ def obvious_diffrax(task: Task, launches: int) -> Any:
         jnp.asarray(starts[2:5].T),
         jnp.asarray(starts[5:8].T),
     )
-    batched = jax.jit(jax.vmap(one))
+    batched = jax.jit(jax.vmap(solve_single))
     return lambda: batched(y0)
 
 
@@ -96,9 +96,9 @@ def spread(launches: int, most: int) -> Any:
     return ((np.arange(count) + 0.5) * launches / count).astype(int)
 
 
-def errors(task: Task, found: Ends, reference: Ends) -> tuple[float, float]:
+def errors(task: Task, ends: Ends, reference: Ends) -> tuple[float, float]:
     """The greatest errors over the launches: of the time [s], or of the end where the horizon ends a run; of the end."""
-    time, end = (float(np.max(np.abs(one - other))) for one, other in zip(found, reference, strict=True))
+    time, end = (float(np.max(np.abs(value - other))) for value, other in zip(ends, reference, strict=True))
     return (end if task.angle is None else time), end
 
 
@@ -155,9 +155,9 @@ def measure(name: str, case: Case, quick: bool) -> list[dict[str, str]]:
 def cost_at(rows: list[dict[str, str]], scene: str, program: str, error: float) -> float:
     """CPU time per launch [ms] at a given error, between the measured points (logarithms); infinite if out of reach."""
     points = [
-        (math.log(float(one["error"]) + 1e-300), math.log(float(one["cpu ms per launch"])))
-        for one in rows
-        if one["scene"] == scene and one["program"] == program and math.isfinite(float(one["error"]))
+        (math.log(float(row["error"]) + 1e-300), math.log(float(row["cpu ms per launch"])))
+        for row in rows
+        if row["scene"] == scene and row["program"] == program and math.isfinite(float(row["error"]))
     ]
     points = sorted(points)
     if not points or math.log(error) < points[0][0]:
@@ -167,15 +167,15 @@ def cost_at(rows: list[dict[str, str]], scene: str, program: str, error: float) 
 
 def summary(rows: list[dict[str, str]]) -> list[dict[str, str]]:
     """The README's table: CPU time per launch at two errors, for every scene and program."""
-    found = []
-    for scene in dict.fromkeys(one["scene"] for one in rows):
-        for program in dict.fromkeys(one["program"] for one in rows if one["scene"] == scene):
+    entries = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        for program in dict.fromkeys(row["program"] for row in rows if row["scene"] == scene):
             costs = [cost_at(rows, scene, program, error) for error in (1e-6, 1e-8)]
             shown = [f"{cost:.3g}" if math.isfinite(cost) else "-" for cost in costs]
-            found.append(
+            entries.append(
                 {"scene": scene, "program": program, "ms at error 1e-6": shown[0], "ms at error 1e-8": shown[1]}
             )
-    return found
+    return entries
 
 
 def draw(rows: list[dict[str, str]], path: Path) -> None:
@@ -183,8 +183,8 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 
-    names = list(dict.fromkeys(one["scene"] for one in rows))
-    programs = list(dict.fromkeys(one["program"] for one in rows))
+    names = list(dict.fromkeys(row["scene"] for row in rows))
+    programs = list(dict.fromkeys(row["program"] for row in rows))
     columns = min(len(names) + 1, 3)
     lines = -(-(len(names) + 1) // columns)
     figure = Figure(figsize=(4.6 * columns, 3.9 * lines), layout="constrained")
@@ -193,9 +193,9 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
     for drawing, name in zip(drawings, names, strict=True):
         for number, program in enumerate(programs):
             points = [
-                (float(one["error"]), float(one["cpu ms per launch"]))
-                for one in rows
-                if one["scene"] == name and one["program"] == program and math.isfinite(float(one["error"]))
+                (float(row["error"]), float(row["cpu ms per launch"]))
+                for row in rows
+                if row["scene"] == name and row["program"] == program and math.isfinite(float(row["error"]))
             ]
             style = "-" if program.startswith("nonholonomic") else "--"
             drawing.loglog(
@@ -235,11 +235,11 @@ def main() -> None:
     if not options.quick and "plane, viscous" in (options.scenes or described):
         task = described["plane, viscous"].task
         mine = next(
-            float(one["cpu ms per launch"])
-            for one in rows
-            if one["program"] == "nonholonomic Oscillatory8"
-            and one["tolerance"] == "1e-09"
-            and one["scene"] == "plane, viscous"
+            float(row["cpu ms per launch"])
+            for row in rows
+            if row["program"] == "nonholonomic Oscillatory8"
+            and row["tolerance"] == "1e-09"
+            and row["scene"] == "plane, viscous"
         )
         for launches in (1024, 4096):
             measured = timed(obvious_diffrax(task, launches), 1)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import api_pages
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -64,18 +65,18 @@ def statements(node: ast.AST, asked: bool = False) -> Iterator[tuple[ast.Import 
 
 def arrows_of(file: str) -> Iterator[Arrow]:
     """The imports of this project's modules in a file; a module that is imported whole has no names."""
-    here = Path(file).parts[:-1]
+    folder = Path(file).parts[:-1]
     for node, asked in statements(ast.parse((ROOT / file).read_text())):
         if isinstance(node, ast.Import):
-            found = [(name.name, ()) for name in node.names]
+            targets = [(name.name, ()) for name in node.names]
         else:
-            above = here[: len(here) - node.level + 1] if node.level else ()
+            above = folder[: len(folder) - node.level + 1] if node.level else ()
             module = ".".join([*above, *([node.module] if node.module else [])])
             whole = [name.name for name in node.names if is_module(f"{module}.{name.name}")]
-            found = [(f"{module}.{name}", ()) for name in whole]
+            targets = [(f"{module}.{name}", ()) for name in whole]
             rest = tuple(name.name for name in node.names if name.name not in whole)
-            found += [(module, rest)] if rest else []
-        yield from (Arrow(file, module, names, asked) for module, names in found if module.split(".")[0] in PACKAGES)
+            targets += [(module, rest)] if rest else []
+        yield from (Arrow(file, module, names, asked) for module, names in targets if module.split(".")[0] in PACKAGES)
 
 
 def is_module(name: str) -> bool:
@@ -99,23 +100,27 @@ ALL_ARROWS = ARROWS + [arrow for file in files("tests", "benchmarks", "examples"
 def allowed(arrow: Arrow) -> bool:
     """Whether an import inside the packages points the right way."""
     start, end = room(arrow.file), room(arrow.module)
-    (package, _, here), (target, _, there) = start.partition("/"), end.partition("/")
+    (package, _, start_room), (target, _, end_room) = start.partition("/"), end.partition("/")
     if target != package:
         return target == "nonholonomic"
-    if start == end or arrow.file == f"{package}/__init__.py" or not there:
+    if start == end or arrow.file == f"{package}/__init__.py" or not end_room:
         return True
     if package != "nonholonomic":
-        return VEHICLE_HEIGHT.get(there, -1) < VEHICLE_HEIGHT.get(here, len(VEHICLE_HEIGHT))
-    if not here:
+        return VEHICLE_HEIGHT.get(end_room, -1) < VEHICLE_HEIGHT.get(start_room, len(VEHICLE_HEIGHT))
+    if not start_room:
         return False
     # Something may show itself when it is asked to.
-    return HEIGHT[there] < HEIGHT[here] or HEIGHT[there] == HEIGHT[here] == 0 or (there == "views" and arrow.asked)
+    return (
+        HEIGHT[end_room] < HEIGHT[start_room]
+        or HEIGHT[end_room] == HEIGHT[start_room] == 0
+        or (end_room == "views" and arrow.asked)
+    )
 
 
 def circle(edges: set[tuple[str, str]]) -> list[str]:
     """What is left when everything that imports nothing left is taken away again and again: circles and what needs them."""
     left = {end for edge in edges for end in edge}
-    while free := {one for one in left if not any(start == one and end in left for start, end in edges)}:
+    while free := {node for node in left if not any(start == node and end in left for start, end in edges)}:
         left -= free
     return sorted(left)
 
@@ -159,9 +164,13 @@ def test_modules_close_no_circle(package):
 def test_witnesses_and_papers_are_not_needed_to_compute_anything():
     wrong = []
     for arrow in ARROWS:
-        here, there = room(arrow.file).rpartition("/")[2], room(arrow.module).rpartition("/")[2]
-        by_right = here == there or (here, there) == ("papers", "witnesses") or arrow.file.endswith("/__main__.py")
-        if there in CHECKS and not by_right:
+        file_room, module_room = room(arrow.file).rpartition("/")[2], room(arrow.module).rpartition("/")[2]
+        by_right = (
+            file_room == module_room
+            or (file_room, module_room) == ("papers", "witnesses")
+            or arrow.file.endswith("/__main__.py")
+        )
+        if module_room in CHECKS and not by_right:
             wrong.append(str(arrow))
     assert wrong == []
 
@@ -172,6 +181,24 @@ def test_private_modules_and_names_stay_in_their_rooms():
         return any(part.startswith("_") and not part.endswith("__") for part in parts)
 
     assert [str(arrow) for arrow in ALL_ARROWS if private(arrow) and room(arrow.file) != room(arrow.module)] == []
+
+
+def test_the_vehicles_use_only_the_public_engine():
+    """What they import from its rooms is on a page of the API, so that others can write models as fast as theirs."""
+    public = {id(api_pages.resolve(name)) for page in api_pages.PAGES.values() for name in page.names}
+
+    def is_private(name: str) -> bool:
+        return name not in api_pages.CONSTANTS and id(api_pages.resolve(name)) not in public
+
+    used = {
+        f"{arrow.module}.{name}": str(arrow)
+        for arrow in ARROWS
+        if arrow.file.split("/")[0] in ("tippe", "stroller") and arrow.module.startswith(api_pages.ENGINE_ROOMS)
+        for name in arrow.names
+    }
+    assert {"nonholonomic.integration.AbstractProblem", "nonholonomic.hybrid.Transition"} <= set(used)
+    assert [arrow for name, arrow in used.items() if is_private(name)] == []
+    assert is_private("nonholonomic.integration.LaneScheduler")
 
 
 def test_what_is_imported_at_once_is_required():

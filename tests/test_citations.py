@@ -14,7 +14,7 @@ FOLDERS = ("nonholonomic", "tippe", "stroller", "tests", "benchmarks", "examples
 
 TEXTS = [
     *ROOT.glob("*.md"),
-    *(path for one in FOLDERS for path in (ROOT / one).rglob("*") if path.suffix in (".py", ".md")),
+    *(path for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".md")),
 ]
 
 #: Every file, and every folder with a stroke at its end, by each ending of its path.

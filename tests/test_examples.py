@@ -48,8 +48,8 @@ def test_example_runs(path, capsys, tmp_path, monkeypatch):
     names = runpy.run_path(str(path))
     if "draw" in names:
         # A picture or a page of the manual's gallery.
-        found = names["draw"]()
-        assert found.axes if hasattr(found, "axes") else "facts" in found.html
+        figure = names["draw"]()
+        assert figure.axes if hasattr(figure, "axes") else "facts" in figure.html
     if "main" in names:
         with pytest.warns(FitWarning, match=WARNED[path.stem]) if path.stem in WARNED else contextlib.nullcontext():
             names["main"]()

@@ -20,10 +20,10 @@ from tippe.modes.free_body import FreeBody, balls
 from tippe.modes.impact import Impact, approach
 from tippe.modes.inversion_problem import InversionProblem
 from tippe.modes.sticking import contact_modes
+from tippe.modes.trajectory_problem import trajectory_problem
 from tippe.runs.airborne_trajectory import arena_modes
 from tippe.runs.flight_trajectory import level_modes
 from tippe.runs.run_kind import run_kind_of
-from tippe.runs.trajectory import TrajectoryProblem
 
 #: 16 to 44 ns for each number on a CPU, where a product takes one.
 SLOW = {"sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2", "expm1"}
@@ -37,13 +37,13 @@ def is_program(parameter):
 
 def primitives(jaxpr):
     """The names of all primitives of a program, those of the functions that it calls included."""
-    found = set()
+    kinds = set()
     for equation in jaxpr.eqns:
-        found.add(equation.primitive.name)
+        kinds.add(equation.primitive.name)
         for inner in jax.tree.leaves(equation.params, is_leaf=is_program):
             if is_program(inner):
-                found |= primitives(getattr(inner, "jaxpr", inner))
-    return found
+                kinds |= primitives(getattr(inner, "jaxpr", inner))
+    return kinds
 
 
 def slow_in(function, *arguments):
@@ -84,7 +84,7 @@ def trajectory_problems(scene, launch):
         modes_of = level_modes if scene.flies_in_closed_form else arena_modes
         modes, _, state = modes_of((scene, launch), 1e-9)
     else:
-        run = TrajectoryProblem.of(scene, launch)
+        run = trajectory_problem((scene, launch))
         if not scene.friction.set_valued:
             return (run,)
         modes, _, state = contact_modes(run, 1e-9)
@@ -165,10 +165,10 @@ def test_fields_of_a_top_with_a_stem(arena):
 @pytest.mark.parametrize("law", LAWS, ids=name_of)
 def test_fields_of_impacts(law):
     def impact(body):
-        one = jnp.ones(1)
-        (ball,), free = balls(body), FreeBody((one, one, -one), one, (one, one, one), (one, one, one))
-        found = Impact(body, law, approach(body, ball, free), ball.radius, one)
-        return Skid(found, law.mu, one) if law.set_valued else found
+        ones = jnp.ones(1)
+        (ball,), free = balls(body), FreeBody((ones, ones, -ones), ones, (ones, ones, ones), (ones, ones, ones))
+        outcome = Impact(body, law, approach(body, ball, free), ball.radius, ones)
+        return Skid(outcome, law.mu, ones) if law.set_valued else outcome
 
     assert slow_in_problem(eqx.filter_eval_shape(impact, rutstam_top())) == set()
 

@@ -172,7 +172,7 @@ def test_an_error_within_a_quantity_of_a_run_is_not_hidden():
 def test_what_the_function_of_a_ground_holds_may_be_lists_in_tables_too():
     scene = tippe.Scene(rutstam_top(), tippe.Graph(Hill(jnp.array([0.05, 0.1]))), tippe.Viscous(0.3))
     _, grid, _ = launches(scene, {"theta": 0.1, "spin": [100.0, 120.0]}, None, 1.0, 1e-9)
-    assert [one.name for one in grid] == ["spin"]
+    assert [axis.name for axis in grid] == ["spin"]
     with pytest.raises(ValueError, match=r"scene\.gravity must be one number, not of shape"):
         launches(eqx.tree_at(lambda s: s.gravity, scene, jnp.ones(2)), {"theta": 0.1, "spin": 1.0}, None, 1.0, 1e-9)
 
@@ -352,8 +352,10 @@ OPTIONAL = {
 @pytest.mark.parametrize("name", OPTIONAL)
 def test_an_optional_package_is_looked_for_before_the_work_begins(name, monkeypatch):
     call, package, extra = OPTIONAL[name]
-    found = nonholonomic.validation.find_spec
-    monkeypatch.setattr("nonholonomic.validation.find_spec", lambda one: None if one == package else found(one))
+    original = nonholonomic.validation.find_spec
+    monkeypatch.setattr(
+        "nonholonomic.validation.find_spec", lambda module: None if module == package else original(module)
+    )
     monkeypatch.setattr("tippe.Trajectory.to_table", lambda *_: pytest.fail("it was read off"))
     monkeypatch.setattr("tippe.Trajectory.stages", lambda *_: pytest.fail("it was drawn"))
     with pytest.raises(ModuleNotFoundError, match=rf"needs {package}: pip install 'nonholonomic\[{extra}\]'"):
@@ -361,7 +363,7 @@ def test_an_optional_package_is_looked_for_before_the_work_begins(name, monkeypa
     extras = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"][
         "optional-dependencies"
     ]
-    assert any(one.replace("-", "_").startswith(package) for one in extras[extra])
+    assert any(module.replace("-", "_").startswith(package) for module in extras[extra])
     assert extra in re.findall(r"\w+", extras["all"][0])
 
 
@@ -371,7 +373,7 @@ def stem_top():
 
 def axes_of(scene, axes):
     _, grid, _ = launches(scene, {"theta": 0.1, "spin": 155.0, "mu": None}, axes, 1.0, 1e-9)
-    return {one.name: one.number for one in grid}
+    return {axis.name: axis.number for axis in grid}
 
 
 def test_an_axis_may_be_named_by_its_end():
@@ -420,7 +422,7 @@ def test_only_what_can_be_varied_is_suggested():
 
 def test_the_axes_of_rides_may_be_named_by_their_ends_too(monkeypatch):
     table = importlib.import_module("stroller.runs.table")
-    monkeypatch.setattr(table, "computed", lambda job, grid, *_, **__: [one.number for one in grid])
+    monkeypatch.setattr(table, "computed", lambda job, grid, *_, **__: [axis.number for axis in grid])
     assert stroller.sweep(PRAM, RIDE, 1.0, axes={"speed": [1.0, 2.0], "place[1]": [0.0, 1.0], "wheelbase": [0.6]}) == [
         "launch.speed",
         "launch.place[1]",

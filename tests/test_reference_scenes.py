@@ -48,9 +48,11 @@ def test_bounds_are_far_below_the_values():
     """At most 1e-6 of the largest value, and 1e-6 s."""
     for scene in SCENES.values():
         quantities = [value for name, value in scene["states"].items() if name != "times"]
-        assert all(one["bound"] < 1e-6 * np.max(np.abs(one["values"])) for one in quantities), scene["name"]
+        assert all(quantity["bound"] < 1e-6 * np.max(np.abs(quantity["values"])) for quantity in quantities), scene[
+            "name"
+        ]
         assert all(event["bound"] < 1e-6 for event in scene["events"]), scene["name"]
-        assert all(len(one["values"]) == len(scene["states"]["times"]) for one in quantities)
+        assert all(len(quantity["values"]) == len(scene["states"]["times"]) for quantity in quantities)
 
 
 @pytest.mark.parametrize("name", QUICK)

@@ -199,7 +199,7 @@ def standing_matrix(scene: Scene, spin: Float[ArrayLike, ""], inverted: bool = F
 
 def _places_across(scene: Scene) -> range:
     """Which components of a state are places that differ near the arena's lowest point."""
-    count = max(len(scene.frame.place_scales) - 1, 0)
+    count = max(len(scene.frame.place_scales(1.0)) - 1, 0)
     if isinstance(scene.frame, CarriedFrame):
         # The foot (x, y, z), whose z is along n, and the first tangent, which is only the frame's choice of axes.
         count = 1 if isinstance(scene.surface, Torus) else 2

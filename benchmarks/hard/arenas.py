@@ -24,7 +24,7 @@ REFERENCE = list(
 
 def over_the_crest() -> Row:
     """Over the crest of a wave at 2.1 m/s: the time at which contact is lost, and the axis then."""
-    row = next(one for one in REFERENCE if one["arena"] == "graph" and one["status"] == "contact_lost")
+    row = next(case for case in REFERENCE if case["arena"] == "graph" and case["status"] == "contact_lost")
     number = {name: float(value) for name, value in row.items() if name not in ("arena", "status")}
     waves = tippe.Graph(lambda x, y: number["p1"] * jnp.sin(number["p2"] * x) * jnp.cos(number["p2"] * y))
     scene = tippe.Scene(rutstam_top(), waves, tippe.Coulomb(number["mu"], number["slip_speed"]))

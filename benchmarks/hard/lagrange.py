@@ -22,7 +22,7 @@ def theta_by_lagrange(scene: tippe.Scene, launch: tippe.Launch, times: np.ndarra
         return np.asarray(euler_angles.state_rate(euler_angles.by_lagrange(scene, angles), angles))
 
     start = euler_angles.from_vector_state(scene, scene.state(launch))
-    found = solve_ivp(rate, (0.0, times[-1]), start, "DOP853", times, rtol=1e-13, atol=1e-14 * SIZES)
-    assert found.success
+    solution = solve_ivp(rate, (0.0, times[-1]), start, "DOP853", times, rtol=1e-13, atol=1e-14 * SIZES)
+    assert solution.success
     # Past a pole the chart's theta goes on with the other sign.
-    return np.arccos(np.cos(found.y[1]))
+    return np.arccos(np.cos(solution.y[1]))

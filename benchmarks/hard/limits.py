@@ -78,10 +78,12 @@ def spins_of_all_sizes() -> Row:
         return [tippe.simulate(scene, tippe.Launch(0.8, spin), 0.5, times, tolerance=1e-12) for spin in spins]
 
     run, error = timed(nutations, 1), 0.0
-    for spin, found in zip(spins, run.result, strict=True):
+    for spin, trajectory in zip(spins, run.result, strict=True):
         start = scene.state(tippe.Launch(0.8, spin))
         motion = swing(FrictionlessNutation.of(scene, start), start[4], jnp.zeros(()))
-        error = max(error, float(jnp.max(jnp.abs(jnp.cos(motion.theta(jnp.asarray(times))) - jnp.cos(found.theta)))))
+        error = max(
+            error, float(jnp.max(jnp.abs(jnp.cos(motion.theta(jnp.asarray(times))) - jnp.cos(trajectory.theta))))
+        )
     case = "spins 0, 1, 10, ..., 1e4 rad/s without friction, 0.5 s"
     return of_runs(case, "swings or nutates", error, 4e-10, "quadrature [cos(theta)]", run)
 
@@ -118,12 +120,12 @@ def against_lagrange(case: str, tops: list[tippe.Top], arena: Any, launch: tippe
     """theta(t) of some tops by the vector form and by Lagrange's equations."""
     scenes, times = [tippe.Scene(top, arena, VISCOUS) for top in tops], np.linspace(0.05 * end, end, 20)
     run = timed(lambda: [tippe.simulate(scene, launch, end, times, tolerance=1e-12) for scene in scenes], 1)
-    found = [np.asarray(one.theta) for one in run.result]
+    angles = [np.asarray(trajectory.theta) for trajectory in run.result]
     gaps = [
         np.max(np.abs(theta - theta_by_lagrange(scene, launch, times[: len(theta)])))
-        for scene, theta in zip(scenes, found, strict=True)
+        for scene, theta in zip(scenes, angles, strict=True)
     ]
-    happens = "theta comes to " + ", ".join(f"{theta[-1]:.3f}" for theta in found) + " rad"
+    happens = "theta comes to " + ", ".join(f"{theta[-1]:.3f}" for theta in angles) + " rad"
     return of_runs(case, happens, max(gaps), 4e-10, "Lagrange in Euler angles [rad]", run)
 
 
@@ -136,7 +138,7 @@ def huge_cylinder() -> Row:
 
     flat = np.asarray(run(tippe.Plane()).axis[0])
     runs = timed(lambda: [run(tippe.Cylinder(0.02 * factor)) for factor in (1e2, 1e3, 1e4, 1e5, 1e15)], 1)
-    gaps = np.array([np.linalg.norm(np.asarray(one.axis[0]) - flat) for one in runs.result])
+    gaps = np.array([np.linalg.norm(np.asarray(trajectory.axis[0]) - flat) for trajectory in runs.result])
     orders = np.log10(gaps[:3] / gaps[1:4])
     error = np.abs(orders[-1] - 1.0) if gaps[4] < 1e-10 else math.nan
     happens = f"departs by {gaps[3]:.1e} at 1e5 radii, {gaps[4]:.0e} at 1e15"

@@ -60,5 +60,5 @@ def of_table(case: str, happens: str, error: Any, bound: float, against: str, ru
 def of_runs(case: str, happens: str, error: Any, bound: float, against: str, run: Timed) -> Row:
     """The row of one or more trajectories: the steps of all of them, the status of the first."""
     runs = run.result if isinstance(run.result, list) else [run.result]
-    steps = sum(one.stats["accepted"] + one.stats["rejected"] for one in runs)
+    steps = sum(trajectory.stats["accepted"] + trajectory.stats["rejected"] for trajectory in runs)
     return Row(case, happens, float(error), bound, against, steps, run.cpu, runs[0].status)

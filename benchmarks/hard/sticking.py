@@ -49,11 +49,11 @@ def regularised(slip_speed: float, solver: diffrax.AbstractSolver, tolerance: fl
     explicit = isinstance(solver, diffrax.Dopri8)
     other = final_theta(friction, implicit() if explicit else diffrax.Dopri8(), 1e-9)
     run = timed(lambda: final_theta(friction, solver, tolerance), 1)
-    found = float(run.result.theta[-1])
+    theta = float(run.result.theta[-1])
     return of_runs(
         f"Cohen's top, Coulomb regularised by {slip_speed:g} m/s, {'explicit' if explicit else 'implicit'}",
-        f"theta(0.5 s) = {found:.6f} rad",
-        abs(found - float(other.theta[-1])),
+        f"theta(0.5 s) = {theta:.6f} rad",
+        abs(theta - float(other.theta[-1])),
         bound,
         f"{'Kvaerno5' if explicit else 'Dopri8'} at 1e-9 [rad]",
         run,
@@ -93,11 +93,11 @@ def implicit_at_a_ten_thousandth() -> Row:
 def implicit_at_the_limit() -> Row:
     """Slip speed 1e-5 m/s, Kvaerno5, against the law itself: the regularisation is the error."""
     run = timed(lambda: final_theta(tippe.Coulomb(0.3, 1e-5), implicit(), 1e-7), 1)
-    found = float(run.result.theta[-1])
+    theta = float(run.result.theta[-1])
     return of_runs(
         "Cohen's top, Coulomb regularised by 1e-05 m/s, implicit",
-        f"theta(0.5 s) = {found:.6f} rad",
-        abs(found - by_events()),
+        f"theta(0.5 s) = {theta:.6f} rad",
+        abs(theta - by_events()),
         4e-4,
         "SciPy by events, without a slip speed [rad]",
         run,
@@ -115,12 +115,12 @@ def by_events() -> float:
 def the_law_itself() -> Row:
     """SetValuedCoulomb: the slip ends and the top rolls."""
     run = timed(lambda: final_theta(tippe.SetValuedCoulomb(0.3), diffrax.Dopri8(), 1e-9), 1)
-    found = float(run.result.theta[-1])
+    theta = float(run.result.theta[-1])
     slip = run.result.dense.mode_segments[0]
     return of_runs(
         "Cohen's top under Coulomb's law itself",
-        f"slips to {slip.end:.5f} s, then rolls; theta(0.5 s) = {found:.6f} rad",
-        abs(found - by_events()),
+        f"slips to {slip.end:.5f} s, then rolls; theta(0.5 s) = {theta:.6f} rad",
+        abs(theta - by_events()),
         1e-8,
         "SciPy by events [rad]",
         run,

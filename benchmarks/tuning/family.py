@@ -73,13 +73,23 @@ def equations(unknowns: Unknowns) -> Float[Array, " equations"]:
     A, b, h = pair_of(unknowns)
     c = A.sum(axis=1)
     poor, rich = slice(3, 5), slice(5, None)
-    found = [(A @ c - c**2 / 2.0)[2:], (A @ c**2 - c**3 / 3.0)[3:], (A @ c**3 - c**4 / 4.0)[rich], c[11:] - 1.0, h[12:]]
+    residuals = [
+        (A @ c - c**2 / 2.0)[2:],
+        (A @ c**2 - c**3 / 3.0)[3:],
+        (A @ c**3 - c**4 / 4.0)[rich],
+        c[11:] - 1.0,
+        h[12:],
+    ]
     for w, order in ((b, 8), (h, 7)):
-        found += [w @ A - w * (1.0 - c), jnp.stack([w @ c**k - 1.0 / (k + 1) for k in range(order)])]
-        found += [((w * c) @ A)[poor], jnp.atleast_1d((w * c) @ A @ c**4 - 1.0 / 35.0)]
-    found += [((b * c**2) @ A)[poor], ((b * (1.0 - c)) @ A @ A)[poor]]
-    found += [(b * c**2) @ A @ c**4 - 1.0 / 40.0, (b * c) @ A @ c**5 - 1.0 / 48.0, (b * c) @ A @ A @ c**4 - 1.0 / 240.0]
-    return jnp.concatenate([jnp.atleast_1d(one) for one in found])
+        residuals += [w @ A - w * (1.0 - c), jnp.stack([w @ c**k - 1.0 / (k + 1) for k in range(order)])]
+        residuals += [((w * c) @ A)[poor], jnp.atleast_1d((w * c) @ A @ c**4 - 1.0 / 35.0)]
+    residuals += [((b * c**2) @ A)[poor], ((b * (1.0 - c)) @ A @ A)[poor]]
+    residuals += [
+        (b * c**2) @ A @ c**4 - 1.0 / 40.0,
+        (b * c) @ A @ c**5 - 1.0 / 48.0,
+        (b * c) @ A @ A @ c**4 - 1.0 / 240.0,
+    ]
+    return jnp.concatenate([jnp.atleast_1d(residual) for residual in residuals])
 
 
 _slopes = jax.jit(jax.jacfwd(equations))

@@ -40,10 +40,10 @@ def motions(launches: int) -> dict[str, Case]:
     top, theta = tippe.Top(*TOP), np.linspace(0.05, 0.6, launches)
     ball = tippe.Scene(top, tippe.Sphere(0.3), tippe.Viscous(0.3))
     dry = tippe.Scene(top, friction=tippe.Coulomb(0.3, 1e-2))
-    found = {name: case for name, case in scenes(launches).items() if name != "cylinder, Coulomb 1e-3"}
-    found["sphere, viscous"] = of_top(ball, tippe.Launch(theta, 120.0, eta=0.2), 3.0, None)
-    found["plane, Coulomb 1e-2"] = of_top(dry, tippe.Launch(theta, 150.0, eta=0.5), 3.0, ANGLE, False)
-    return found
+    cases = {name: case for name, case in scenes(launches).items() if name != "cylinder, Coulomb 1e-3"}
+    cases["sphere, viscous"] = of_top(ball, tippe.Launch(theta, 120.0, eta=0.2), 3.0, None)
+    cases["plane, Coulomb 1e-2"] = of_top(dry, tippe.Launch(theta, 150.0, eta=0.5), 3.0, ANGLE, False)
+    return cases
 
 
 def steps_of(case: Case, seed: int) -> list[Steps]:
@@ -58,14 +58,14 @@ def steps_of(case: Case, seed: int) -> list[Steps]:
         ends, error = moved(PLAIN, problem, starts, lengths)
         ratio = error / (absolute + TOLERANCE * jnp.maximum(jnp.abs(starts), jnp.abs(ends)))
         lengths = lengths * jnp.clip(0.9 * jnp.mean(ratio**2, axis=0) ** (-1.0 / 16.0), 0.2, 5.0)
-    found = []
+    counts = []
     for stretch in STRETCHES:
         ends = starts
         for _ in range(16):
             ends, _ = moved(PLAIN, problem, ends, stretch * lengths / 16.0)
         units = absolute + TOLERANCE * jnp.maximum(jnp.abs(starts), jnp.abs(ends))
-        found.append(shared(Steps(problem, starts, stretch * lengths, ends, units, jnp.ones(launches))))
-    return found
+        counts.append(shared(Steps(problem, starts, stretch * lengths, ends, units, jnp.ones(launches))))
+    return counts
 
 
 @eqx.filter_jit
@@ -83,7 +83,7 @@ def moved(unknowns: Unknowns, problem: AbstractProblem, starts: States, lengths:
 
 
 def _sum(weights: Float[Array, " stages"], rates: list[States]) -> States:
-    return sum((weight * one for weight, one in zip(weights, rates, strict=False)), jnp.zeros_like(rates[0]))
+    return sum((weight * rate for weight, rate in zip(weights, rates, strict=False)), jnp.zeros_like(rates[0]))
 
 
 @eqx.filter_jit

@@ -17,10 +17,12 @@ Tree = tuple[Any, ...]
 
 def trees(order: int) -> list[list[Tree]]:
     """All trees with 1, 2, ..., `order` vertices."""
-    found: list[list[Tree]] = [[()]]
+    trees_by_size: list[list[Tree]] = [[()]]
     for vertices in range(2, order + 1):
-        found.append(sorted({tuple(sorted(some)) for some in _forests(found, vertices - 1, vertices - 1)}))
-    return found
+        trees_by_size.append(
+            sorted({tuple(sorted(forest)) for forest in _forests(trees_by_size, vertices - 1, vertices - 1)})
+        )
+    return trees_by_size
 
 
 def _forests(known: list[list[Tree]], vertices: int, largest: int) -> list[list[Tree]]:

@@ -21,6 +21,8 @@ from jaxtyping import Array, Bool, Float, Int
 from ..integration import (
     RUNNING,
     AbstractProblem,
+    AbstractRecorder,
+    InLanes,
     Lanes,
     LaneScheduler,
     LaneState,
@@ -37,12 +39,6 @@ from ..integration import (
 from ..xla_cpu import uncounted, written_by_component, written_in_place
 from .variation import VariationalProblem
 
-#: Iterations per period: as many as fit in the caches with their record.
-PERIOD = 128
-
-#: Cost of refilling the lanes, in steps of all lanes; a period ends with a refill.
-REFILL = 2.0
-
 #: Number of checkpoints. With more periods, some checkpoints are dropped and computed again from an earlier one. With
 #: the 64 lanes of a CPU the checkpoints take 5 MB, with the 32768 of an accelerator 2 GB.
 KEPT = 256
@@ -58,6 +54,26 @@ class StepRecord(NamedTuple):
     time: Float[Array, "iterations lanes"]
     state: Float[Array, "iterations components lanes"]
     length: Float[Array, "iterations lanes"]
+
+
+class StepRecorder(AbstractRecorder):
+    """Records where each step began, and its length."""
+
+    # As many iterations as fit in the caches with their record; a period ends with a refill.
+    period = 128
+    refill_cost = 2.0
+
+    def begin(self, lane_state: LaneState, collected: None) -> StepRecord:
+        leaves = (lane_state.time, _without_probe(lane_state).state, lane_state.length)
+        return StepRecord(*(jnp.zeros((self.period, *leaf.shape), leaf.dtype) for leaf in leaves))
+
+    def step(
+        self, in_lanes: InLanes, lane_state: LaneState, record: StepRecord, iteration: Int[Array, ""]
+    ) -> tuple[LaneState, StepRecord]:
+        after = try_step(*in_lanes, lane_state)
+        length = jnp.where(after.time > lane_state.time, length_to_try(in_lanes[1], lane_state), 0.0)
+        entry = StepRecord(lane_state.time, _without_probe(lane_state).state, length)
+        return after, jax.tree.map(functools.partial(written_in_place, at=iteration), record, entry)
 
 
 class Checkpoints(NamedTuple):
@@ -168,13 +184,12 @@ def solve_with_adjoint(
 
     def period(run: Backward) -> Backward:
         index, before = run.kept.latest()
-        after, record, count = _recorded(scheduler, before)
+        after, record = scheduler.run(before, StepRecorder())
         outcome = scheduler.store(run.outcome, after.lane_state)
         refilled = scheduler.refill(after)
         back = ~scheduler.unfinished(refilled) | (index + 1 == run.needed)
-        adjoint = _taken_back(
-            scheduler, moving, measured, after.lane_state, record, jnp.where(back, count, 0), run.adjoint
-        )
+        count = jnp.where(back, after.iterations - before.iterations, 0)
+        adjoint = _taken_back(scheduler, moving, measured, after.lane_state, record, count, run.adjoint)
         # A cell that had made no step was at its start.
         began = back & (before.lane_state.steps == 0) & (before.lane_state.cell < cells)
         to = jnp.where(began, before.lane_state.cell, size)
@@ -196,35 +211,6 @@ def solve_with_adjoint(
     run = jax.lax.while_loop(lambda run: uncounted(run.needed > 0, run.outcome.steps[0]), period, run)
     by_number = jax.tree.unflatten(jax.tree.structure(numbers), list(run.gradient[components:]))
     return run.outcome._replace(state=run.outcome.state[:components]), run.gradient[:components], by_number
-
-
-def _recorded(scheduler: LaneScheduler, progress: Progress) -> tuple[Progress, StepRecord, Int[Array, ""]]:
-    """Advance the lanes by a period and record their steps; also return the number of iterations."""
-    in_lanes = scheduler.in_lanes(progress.lane_state)
-
-    def going(carry: Any) -> Bool[Array, ""]:
-        lane_state, _, idle, count = carry
-        return scheduler.goes_on(lane_state, idle, progress.loaded, REFILL) & (count < PERIOD)
-
-    def step(carry: Any) -> Any:
-        lane_state, record, idle, count = carry
-        after = try_step(*in_lanes, lane_state)
-        length = jnp.where(after.time > lane_state.time, length_to_try(in_lanes[1], lane_state), 0.0)
-        step_record = StepRecord(lane_state.time, _without_probe(lane_state).state, length)
-        record = jax.tree.map(functools.partial(written_in_place, at=count), record, step_record)
-        return after, record, idle + scheduler.idle(lane_state), count + 1
-
-    def loop(start: LaneState) -> Any:
-        empty = StepRecord(
-            *(
-                jnp.zeros((PERIOD, *leaf.shape), leaf.dtype)
-                for leaf in (start.time, _without_probe(start).state, start.length)
-            )
-        )
-        return jax.lax.while_loop(going, step, (start, empty, jnp.zeros((), int), jnp.zeros((), int)))
-
-    lane_state, record, _, count = scheduler.in_kernel(loop)(progress.lane_state)
-    return Progress(lane_state, progress.loaded, progress.iterations + count), record, count
 
 
 def _without_probe(lane_state: LaneState) -> LaneState:

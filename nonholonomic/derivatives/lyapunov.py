@@ -98,13 +98,21 @@ def growth(
 
     **Arguments:**
 
-    - `problem`: as for `ensemble_solve`.
+    - `problem`: as for `solve_ensemble`.
     - `tangents`: in the problem's own units.
     - `t1`: horizon [s].
     - `stretches`: number of time intervals; the growth is returned for each.
     - `settings`: with an explicit Runge-Kutta solver of Diffrax.
 
     **Returns:** the `Growth`; nothing grows in a cell after its run has ended.
+
+    **Example:** neighbouring runs of a decay approach each other.
+
+    >>> from nonholonomic.derivatives import growth
+    >>> result = growth(Decays(jnp.array([1.0, 2.0])), jnp.ones((1, 2)), 8.0, 2, settings)
+    >>> print(result.logarithm.round(6))
+    [[-4. -8.]
+     [-4. -8.]]
     """
     start, magnitudes = problem.start()
     size, cells = start.shape
@@ -146,6 +154,14 @@ def exponent_of(
     **Arguments:** `logarithm`: as in `Growth`, the number of intervals a multiple of 8; `t1`: time [s] that it spans.
 
     **Returns:** exponent and error [1/s].
+
+    **Example:** growth by a factor of e per second.
+
+    >>> import numpy as np
+    >>> from nonholonomic.derivatives import exponent_of
+    >>> exponent, error = exponent_of(np.ones((16, 1)), t1=16.0)
+    >>> print(exponent, error.round(3))
+    [1.] [0.087]
     """
     count = logarithm.shape[0]
     rates = logarithm / (t1 / count)

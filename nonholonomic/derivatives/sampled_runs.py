@@ -41,6 +41,12 @@ class SampledRun(NamedTuple):
 
     `states` and `end_state` are the core components (the problem's `leading` ones), `quadratures` the passive quadratures,
     `None` if there are none. If a program does not use `quadratures`, the ensemble runs without them.
+
+    **Example:** as for `sampled_run`.
+
+    >>> from nonholonomic.derivatives import SampledRun
+    >>> SampledRun._fields[:3]
+    ('states', 'quadratures', 'end_time')
     """
 
     states: Float[Array, "*cells times components"]
@@ -74,6 +80,14 @@ def sampled_run(
     - `grid`: the ends of the steps [s], concrete, for a solver without an error estimate.
 
     **Returns:** a `SampledRun`; its states and the time of its end have derivatives.
+
+    **Example:**
+
+    >>> from nonholonomic.derivatives import sampled_run
+    >>> def final(rate):
+    ...     return sampled_run(build, (rate,), jnp.array([0.1, 0.3]), jnp.asarray(0.3), settings).states[-1, 0]
+    >>> print(f"{jax.grad(final)(2.0):.6f}")  # -0.3 exp(-0.6)
+    -0.164643
     """
     scalars = all(leaf.ndim == 0 for leaf in jax.tree.leaves(modules) if eqx.is_inexact_array(leaf))
     kind = BlockSampling if scalars and isinstance(settings.for_lanes, diffrax.AbstractERK) else SingleSampling
@@ -142,6 +156,17 @@ def sampled_run_by_diffrax(
     Fixed steps (`grid`) need no probe.
 
     **Arguments:** as for `sampled_run`; `adjoint`: how Diffrax differentiates.
+
+    **Returns:** a `SampledRun`.
+
+    **Example:**
+
+    >>> import diffrax
+    >>> from nonholonomic.derivatives import sampled_run_by_diffrax
+    >>> times, adjoint = jnp.array([0.1, 0.3]), diffrax.ForwardMode()
+    >>> run = sampled_run_by_diffrax(Decays(jnp.asarray(2.0)), times, jnp.asarray(0.3), settings, adjoint)
+    >>> print(run.states[:, 0].round(6))
+    [0.818731 0.548812]
     """
     size = len(problem.start()[0])
     leading = size if problem.leading is None else problem.leading

@@ -41,6 +41,7 @@ from .vector import dot as dot
 from .vector import multiply as multiply
 from .vector import none_if_zero as none_if_zero
 from .vector import scale as scale
+from .vector import stacked as stacked
 from .vector import subtract as subtract
 from .vector import sum_vectors as sum_vectors
 from .vector import tangents as tangents

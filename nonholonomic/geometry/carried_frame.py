@@ -16,7 +16,19 @@ from jaxtyping import Array, ArrayLike, Float
 from ..validation import Bound, as_number
 from ..xla_cpu import stored
 from .cylinder import Cylinder
-from .frames import AbstractFrame, CylinderFrame, Fixed, FrameMotion, Place, PlaneFrame, SphereFrame, Tangent, along
+from .frames import (
+    AbstractFrame,
+    CylinderFrame,
+    Fixed,
+    FrameMotion,
+    Place,
+    PlaneFrame,
+    SphereFrame,
+    Tangent,
+    TangentOperator,
+    along,
+    contact_velocity,
+)
 from .planar_length import planar_length
 from .plane import Plane
 from .quadric import Sphere
@@ -85,7 +97,7 @@ class CarriedFrame(AbstractFrame):
     ) -> "CarriedFrame":
         """The frame of a ball on a surface. **Arguments:** the fields except `up`."""
         # Computed once: a tilted plane stores its tilt as an angle, and no step should compute the sine.
-        return cls(surface, distance, pull, surface.up, side)
+        return cls(surface=surface, distance=distance, pull=pull, up=surface.up, side=side)
 
     def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
         eta = as_number(eta)
@@ -111,30 +123,45 @@ class CarriedFrame(AbstractFrame):
         normal = scale(self.side, self.surface.normal(foot))
         return vector_of(jnp.broadcast_to(0.0 if x is None else x, jnp.shape(foot[0])) for x in normal)
 
-    @property
-    def place_scales(self) -> tuple[Component, ...]:
-        return (self.distance,) * 3 + (1.0,) * 3
+    def place_scales(self, size: Component) -> tuple[Component, ...]:
+        return (size,) * 3 + (1.0,) * 3
 
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
-        foot, R = place[:3], self.distance
-        # Stored: otherwise the values below, and above all their derivatives, would each compute these again.
-        n = stored(*self.normal(foot))
-        # If the first tangent has drifted, only its direction along the surface counts.
-        t1 = stored(*along(n, place[3:])[0])
-        t2 = cross(n, t1)
-        S11, S12, S22 = stored(*self._shape(foot, t1, t2))
+        axes, (S11, S12, S22) = self._bent(place)
+        R = self.distance
         A11, A12, A22 = 1.0 - R * S11, -R * S12, 1.0 - R * S22
         determinant = A11 * A22 - A12 * A12
         q1 = (A22 * velocity[0] - A12 * velocity[1]) / determinant
         q2 = (A11 * velocity[1] - A12 * velocity[0]) / determinant
-        o1, o2, *up = stored(S11 * q1 + S12 * q2, S12 * q1 + S22 * q2, *self._seen(t1, t2, n))
-        back = -self.pull * self.side * self.surface.offset(foot)
-        moved = sum_vectors(scale(q1, t1), scale(q2, t2), scale(back, n))
         # Both are positive if both values 1 - R k are; when the first of these vanishes, so does the determinant.
         room = jnp.minimum(determinant, 0.5 * (A11 + A22))
+        return self._moved(place[:3], axes, (q1, q2), (S11 * q1 + S12 * q2, S12 * q1 + S22 * q2), room)
+
+    def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
+        axes, shape = self._bent(place)
+        foot_velocity, turning, room = contact_velocity(shape, radii, velocity)
+        return self._moved(place[:3], axes, foot_velocity, turning, room), foot_velocity
+
+    def _bent(self, place: Place) -> tuple[tuple[Fixed, Fixed, Fixed], TangentOperator]:
+        """The vectors t1, t2 and n in the surface's axes, and the shape operator of the arena."""
+        # Stored: otherwise the values below, and above all their derivatives, would each compute these again.
+        n = stored(*self.normal(place[:3]))
+        # If the first tangent has drifted, only its direction along the surface counts.
+        t1 = stored(*along(n, place[3:])[0])
+        t2 = cross(n, t1)
+        return (t1, t2, n), stored(*self._shape(place[:3], t1, t2))
+
+    def _moved(
+        self, foot: Fixed, axes: tuple[Fixed, Fixed, Fixed], velocity: Tangent, turning: Tangent, room: Component
+    ) -> FrameMotion:
+        """The motion of the frame. **Arguments:** `velocity`: of the foot, along the axes."""
+        t1, t2, n = axes
+        o1, o2, *up = stored(*turning, *self._seen(t1, t2, n))
+        back = -self.pull * self.side * self.surface.offset(foot)
+        moved = sum_vectors(scale(velocity[0], t1), scale(velocity[1], t2), scale(back, n))
         return FrameMotion((o1, o2), vector_of(up), (*moved, *scale(o1, n)), room)
 
-    def _shape(self, foot: Fixed, t1: Fixed, t2: Fixed) -> tuple[Component, Component, Component]:
+    def _shape(self, foot: Fixed, t1: Fixed, t2: Fixed) -> TangentOperator:
         """The shape operator of the arena, n' = -S_a q', as (S11, S12, S22)."""
         bending, zero = scale(-self.side, self.surface.bending(foot, t1, t2)), jnp.zeros_like(foot[0])
         return vector_of(zero if S is None else S for S in bending)

@@ -5,6 +5,9 @@ With V the velocity of the centre, the frame turns as t1' = o1 n, t2' = o2 n, n'
 V and S is the shape operator of the parallel surface, positive where it is concave towards the ball. The frame does not
 turn about n, so the components of a fixed vector change as `carried` states.
 
+The frame of a convex body of any shape moves with its contact point: R = 0, and V is that point's velocity along the surface
+(`AbstractFrame.convex_motion`).
+
 Plane, cylinder and sphere have their own frames, with fewer numbers than the general one (`carried_frame.py`). A sphere
 or cylinder is the same from both sides, except for the sign of its radius, which is positive inside.
 """
@@ -17,12 +20,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..validation import as_number
+from ..xla_cpu import least
 from .planar_length import planar_length
-from .vector import Component, Vector, cross, dot, multiply, scale, subtract, sum_vectors, tangents
+from .vector import Component, Vector, add, cross, dot, multiply, scale, subtract, sum_vectors, tangents
 
 #: The numbers that a frame integrates, as components along axis 0 of a state.
 Place = tuple[Component, ...]
 Tangent = tuple[Component, Component]
+#: The components 11, 12 and 22 of a symmetric operator on the tangent plane.
+TangentOperator = tuple[Component, Component, Component]
 #: A vector's three components in the fixed frame (x, y, z), z up.
 Fixed = tuple[Any, Any, Any]
 
@@ -31,6 +37,30 @@ def carried(vector: tuple[Component, ...], turning: Tangent) -> tuple[Component,
     """Rate of the components of a fixed vector in a moving frame with t1' = o1 n, t2' = o2 n, n' = -(o1 t1 + o2 t2)."""
     along_normal = dot(turning, vector[:2])
     return (multiply(turning[0], vector[2]), multiply(turning[1], vector[2]), subtract(None, along_normal))
+
+
+def contact_velocity(
+    shape: TangentOperator, radii: TangentOperator, velocity: Tangent
+) -> tuple[Tangent, Tangent, Component]:
+    """Velocity q' of the contact point of a convex body along a surface, with (1 - H S) q' = V.
+
+    **Arguments:** `shape`: S [1/m] of the surface; `radii`: H [m], whose eigenvalues are the body's principal radii of
+    curvature; `velocity`: V [m/s], the velocity of the contact point if the surface did not bend away.
+
+    **Returns:** q' [m/s]; S q' [rad/s]; the room: 1 on a flat surface, and 0 where the body no longer touches at one
+    point alone.
+    """
+    (S11, S12, S22), (H11, H12, H22), (V1, V2) = shape, radii, velocity
+    # B = H S.
+    B11, B12 = add(multiply(H11, S11), multiply(H12, S12)), add(multiply(H11, S12), multiply(H12, S22))
+    B21, B22 = add(multiply(H12, S11), multiply(H22, S12)), add(multiply(H12, S12), multiply(H22, S22))
+    A11, A22 = subtract(1.0, B11), subtract(1.0, B22)
+    determinant = subtract(A11 * A22, multiply(B12, B21))
+    q1 = add(multiply(A22, V1), multiply(B12, V2)) / determinant
+    q2 = add(multiply(A11, V2), multiply(B21, V1)) / determinant
+    turning = add(multiply(S11, q1), multiply(S12, q2)), add(multiply(S12, q1), multiply(S22, q2))
+    # H S has real eigenvalues k; both values 1 - k are positive if these are.
+    return (q1, q2), turning, least(determinant, 0.5 * (A11 + A22))
 
 
 class FrameMotion(NamedTuple):
@@ -54,6 +84,9 @@ class AbstractFrame(eqx.Module):
     only to draw it.
     """
 
+    #: Distance R [m] from the foot to the point with which the frame moves.
+    distance: eqx.AbstractVar[Float[Array, "..."]]
+
     @abc.abstractmethod
     def at_angle(self, eta: Float[ArrayLike, "..."]) -> tuple[Place, Place]:
         """Place and cyclic coordinates at the angle `eta` [rad] from the lowest point, in the x-z plane."""
@@ -62,14 +95,20 @@ class AbstractFrame(eqx.Module):
     def at_foot(self, foot: Fixed) -> tuple[Place, Place]:
         """Place and cyclic coordinates of a ball that touches the surface at a point [m], given in the surface's axes."""
 
-    @property
     @abc.abstractmethod
-    def place_scales(self) -> tuple[Component, ...]:
-        """Magnitudes of the place's components."""
+    def place_scales(self, size: Component) -> tuple[Component, ...]:
+        """Magnitudes of the place's components. **Arguments:** `size`: of the body [m]."""
 
     @abc.abstractmethod
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
         """Motion of the frame while the centre moves with the velocity (V1, V2) [m/s]."""
+
+    @abc.abstractmethod
+    def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
+        """Motion of the frame of a convex body, and the velocity of its contact point along the surface [m/s].
+
+        **Arguments:** `velocity`, `radii`: as for `contact_velocity`; the frame has R = 0.
+        """
 
     @abc.abstractmethod
     def vertical(self, place: Place) -> Vector:
@@ -116,12 +155,14 @@ class PlaneFrame(AbstractFrame):
     def _along(self, x: Component, y: Component) -> tuple[Place, Place]:
         return ((), (x, y)) if self.slope is None else ((x,), (y,))
 
-    @property
-    def place_scales(self) -> tuple[Component, ...]:
-        return () if self.slope is None else (self.distance,)
+    def place_scales(self, size: Component) -> tuple[Component, ...]:
+        return () if self.slope is None else (size,)
 
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
         return FrameMotion((None, None), self.vertical(place), () if self.slope is None else velocity[:1])
+
+    def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
+        return self.frame_motion(place, velocity), velocity
 
     def vertical(self, place: Place) -> Vector:
         return (None, None, 1.0) if self.slope is None else (self.slope[0], None, self.slope[1])
@@ -176,14 +217,17 @@ class CylinderFrame(AbstractFrame):
     def _side(self) -> float:
         return 1.0 if self.inside else -1.0
 
-    @property
-    def place_scales(self) -> tuple[Component, ...]:
+    def place_scales(self, size: Component) -> tuple[Component, ...]:
         return (1.0, 1.0)
 
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
         sine, cosine = place
         rate = velocity[0] / self.radius
         return FrameMotion((rate, None), self.vertical(place), (multiply(rate, cosine), -multiply(rate, sine)))
+
+    def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
+        along, _, room = contact_velocity((1.0 / self.radius, None, None), radii, velocity)
+        return self.frame_motion(place, along)._replace(room=room), along
 
     def vertical(self, place: Place) -> Vector:
         sine, cosine = place
@@ -235,13 +279,17 @@ class SphereFrame(AbstractFrame):
     def _side(self) -> float:
         return 1.0 if self.inside else -1.0
 
-    @property
-    def place_scales(self) -> tuple[Component, ...]:
+    def place_scales(self, size: Component) -> tuple[Component, ...]:
         return (1.0, 1.0, 1.0)
 
     def frame_motion(self, place: Place, velocity: Tangent) -> FrameMotion:
         turning = (velocity[0] / self.radius, velocity[1] / self.radius)
         return FrameMotion(turning, self.vertical(place), carried(place, turning))
+
+    def convex_motion(self, place: Place, velocity: Tangent, radii: TangentOperator) -> tuple[FrameMotion, Tangent]:
+        curvature = 1.0 / self.radius
+        along, _, room = contact_velocity((curvature, None, curvature), radii, velocity)
+        return self.frame_motion(place, along)._replace(room=room), along
 
     def vertical(self, place: Place) -> Vector:
         return (place[0], place[1], place[2])

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from ..validation import as_number, is_traced
 
@@ -84,6 +85,12 @@ def cross(left: Vector, right: Vector) -> Vector:
 def sum_vectors(*vectors: tuple[Component, ...]) -> tuple[Component, ...]:
     """Sum of vectors of the same length."""
     return tuple(add(*components) for components in zip(*vectors, strict=True))
+
+
+def stacked(vector: tuple[Component, ...], like: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
+    """The components along axis 0, in the shape of those of `like`, with zeros for those that vanish identically."""
+    zero = jnp.zeros_like(like[0])
+    return jnp.stack([zero if part is None else jnp.broadcast_to(part, zero.shape) for part in vector])
 
 
 def tangents(normal: Vector) -> tuple[Vector, Vector]:

@@ -25,6 +25,13 @@ class Segment(NamedTuple):
 
     `motion` is the `DenseSolution` in the mode, its times counted from `begin`, or one stretch of a `TransitionPath`;
     `shown` holds the default output times [s].
+
+    **Example:** as for `solve_hybrid_dense`.
+
+    >>> from nonholonomic.hybrid import solve_hybrid_dense
+    >>> path = solve_hybrid_dense((Bounce(jnp.array([0.6])),), 0, start[:, 0], 0.4, settings, counters=1)
+    >>> [(segment.begin, segment.end, segment.number) for segment in path.segments]
+    [(0.0, 0.4, 0)]
     """
 
     begin: float
@@ -46,6 +53,13 @@ class HybridPath(NamedTuple):
     """A hybrid run: its segments in order, how and when [s] it ended, its final state, and its cost.
 
     `status` is one of the codes of a `HybridOutcome`; `counts` holds the counters.
+
+    **Example:** as for `solve_hybrid_dense`.
+
+    >>> from nonholonomic.hybrid import solve_hybrid_dense
+    >>> path = solve_hybrid_dense((Bounce(jnp.array([0.6])),), 0, start[:, 0], 0.4, settings, counters=1)
+    >>> path.failed, path.end_time, path.counts.tolist()
+    (False, 0.4, [0])
     """
 
     segments: list[Segment]
@@ -141,13 +155,30 @@ def solve_hybrid_dense(
 
     **Arguments:**
 
-    - `modes`: as for `solve_hybrid`, of one cell; the path includes the transitions that the modes record.
+    - `modes`: as for `solve_hybrid`, of one cell, each of which begins with a positive margin; the path includes the
+      transitions that the modes record.
     - `number`, `state`: initial mode and state.
     - `t1`: horizon [s].
     - `settings`: as for `follow`; the most steps are those of the whole run.
     - `counters`: number of counters, the rows of `Transition.counts`.
 
     **Returns:** a `HybridPath`.
+
+    **Example:** a ball that rises in closed form, recorded as a transition, and falls from 0.722438 s on.
+
+    >>> from nonholonomic.hybrid import TransitionPath, solve_hybrid_dense
+    >>> class Rise(Bounce):
+    ...     def reset_map(self, state, left):
+    ...         rise = -self.restitution * state[1] / 9.81
+    ...         apex = jnp.stack([0.5 * 9.81 * rise**2, 0.0 * rise])
+    ...         record = TransitionPath(rise[None], rise[None], jnp.full((1, 1), 3))
+    ...         return super().reset_map(state, left)._replace(state=apex, elapsed=rise, record=record)
+    ...     def between(self, rise, passed):
+    ...         return 9.81 * jnp.stack([rise * passed - 0.5 * passed**2, rise - passed])
+    >>> path = solve_hybrid_dense((Rise(jnp.array([0.6])),), 0, start[:, 0], 1.0, settings, counters=1)
+    >>> times = np.array([0.6, 0.8])
+    >>> print(path.at(times)[0].round(5), path.numbers(times))
+    [0.28647 0.33049] [-1  0]
     """
     segments, counts, time, accepted, rejected = [], np.zeros(counters, int), 0.0, 0, 0
     status, state = RUNNING, jnp.asarray(state)

@@ -27,7 +27,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..derivatives.slopes import tangents_of
 from ..derivatives.variation import VariationalProblem, in_groups, where_active
-from ..integration import CROSSED, REACHED_END, AbstractProblem, Settings
+from ..integration import (
+    CROSSED,
+    REACHED_END,
+    AbstractPassive,
+    AbstractProblem,
+    ExtendedProblem,
+    Lanes,
+    Settings,
+    States,
+)
 from ..integration.scheduler import Numbers
 from .ensemble import AbstractBatchedMode, HybridOutcome, Transition, solve_hybrid
 from .traced_ensemble import traced_solve_hybrid
@@ -43,35 +52,11 @@ NEARLY = 1e-6
 UNMEASURED = 1e9
 
 
-class Clocked(AbstractProblem):
-    """A problem with the time since its mode began behind its state; the clock's variation is that of the beginning."""
+class Clock(AbstractPassive):
+    """The time since a mode began, which is passive; the clock's variation is that of the beginning."""
 
-    problem: AbstractProblem
-    began: Float[Array, " cells"]
-
-    @property
-    def direction_decides(self) -> bool:
-        return self.problem.direction_decides
-
-    @property
-    def fits_one_kernel(self) -> bool:
-        return self.problem.fits_one_kernel
-
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        states, scales = self.problem.start()
-        return with_row(states, self.began), with_row(scales, jnp.full_like(self.began, UNMEASURED))
-
-    def field(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return with_row(self.problem.field(time, state[:-1]), jnp.ones_like(state[-1]))
-
-    def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"] | None:
-        return self.problem.event_function(state[:-1])
-
-    def domain_margin(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.problem.domain_margin(time, state[:-1])
-
-    def margins(self, time: Float[Array, " lanes"], state: Float[Array, "components lanes"]) -> Any:
-        return self.problem.margins(time, state[:-1])
+    def rates(self, problem: AbstractProblem, time: Lanes, state: States, passive: States) -> States:
+        return jnp.concatenate([problem.field(time, state), jnp.ones_like(passive)])
 
 
 def with_row(state: Float[Array, "components cells"], row: Float[Array, " cells"]) -> Float[Array, "more cells"]:
@@ -97,8 +82,11 @@ class VariationalMode(AbstractBatchedMode):
         at, *variations = self.parts(state)
         numbers, build = self._moving()
 
-        def clocked(state: Float[Array, "components cells"], *numbers: Array) -> Clocked:
-            return Clocked(build(*numbers).problem(state[:-1]), state[-1])
+        def clocked(state: Float[Array, "components cells"], *numbers: Array) -> ExtendedProblem:
+            began = state[-1:]
+            return ExtendedProblem(
+                build(*numbers).problem(state[:-1]), Clock(), began, jnp.full_like(began, UNMEASURED)
+            )
 
         point = (with_row(at[:-1], jnp.zeros_like(at[-1])), *numbers)
         tangents = [(variation, *rates) for variation, rates in zip(variations, self._rates(), strict=True)]
@@ -287,6 +275,14 @@ def solve_hybrid_with_tangents(
 
     **Returns:** the `HybridOutcome`, and the `Slopes`, 0 where there is no event, or it is at the start.
     Source: implicit function theorem at the event, saltation at every change of mode.
+
+    **Example:** by the restitution.
+
+    >>> from nonholonomic.hybrid import solve_hybrid_with_tangents
+    >>> tangents = (((Bounce(jnp.ones(2)),), None),)
+    >>> _, sensitivities = solve_hybrid_with_tangents(modes, tangents, first, start, 5.0, 2, settings, counters=1)
+    >>> print(sensitivities.slopes.round(6))  # the time of the fall
+    [[0.451524 0.451524]]
     """
     varied = variational_modes(modes, tangents, settings.tolerance, ends_on_event)
     start, n_blocks = np.asarray(variational_start(jnp.asarray(state), tangents)), 1 + len(tangents)
@@ -308,7 +304,16 @@ def traced_solve_hybrid_with_tangents(
     counters: int,
     ends_on_event: bool = True,
 ) -> tuple[HybridOutcome[Array], Slopes[Array]]:
-    """`solve_hybrid_with_tangents` inside other transformed functions; arguments and results are traced."""
+    """`solve_hybrid_with_tangents` inside other transformed functions; arguments and results are traced.
+
+    **Example:** as for `solve_hybrid_with_tangents`.
+
+    >>> from nonholonomic.hybrid import traced_solve_hybrid_with_tangents
+    >>> tangents, options = (((Bounce(jnp.ones(2)),), None),), (jnp.asarray(first), jnp.asarray(start), 5.0, 2, settings)
+    >>> _, sensitivities = traced_solve_hybrid_with_tangents(modes, tangents, *options, counters=1)
+    >>> print(sensitivities.slopes.round(6))
+    [[0.451524 0.451524]]
+    """
 
     def run(group: tuple[Any, ...]) -> tuple[tuple[HybridOutcome[Array], Array], list[Float[Array, " cells"]]]:
         varied = variational_modes(modes, group, settings.tolerance, ends_on_event)

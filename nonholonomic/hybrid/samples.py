@@ -34,6 +34,12 @@ class HybridSamples(NamedTuple):
     - `shown`: the output rows, NaN after the end of the run; `number`: of the mode at each time, or `BETWEEN`.
     - `end_time`, `end_state`, `end_mode`: when, where and in which mode the run ended; `status`: the code of how.
     - `steps`, `rejected`; `counts`: the counters.
+
+    **Example:** as for `hybrid_samples`.
+
+    >>> from nonholonomic.hybrid import HybridSamples
+    >>> HybridSamples._fields[:3]
+    ('shown', 'number', 'end_time')
     """
 
     shown: Float[Array, "shown times"]
@@ -60,7 +66,8 @@ def hybrid_samples(
 
     **Arguments:**
 
-    - `build`: compared by identity, so do not create a new function for each call.
+    - `build`: (modules, tolerance) -> the modes of one cell, the index of the first, (1,), and the start,
+      (components, 1); compared by identity, so do not create a new function for each call.
     - `modules`: the tree whose numbers are differentiable, once.
     - `times`: of the samples [s], growing; `t1`: horizon [s]. Neither is differentiable.
     - `settings`: with an explicit Runge-Kutta solver; the tolerance may be traced.
@@ -69,6 +76,18 @@ def hybrid_samples(
     **Returns:** `HybridSamples`; the output rows and the end time have derivatives, NaN after a grazing event.
 
     **Raises:** `ValueError` for derivatives by the times, and for second derivatives.
+
+    **Example:** the height at 0.8 s, after a bounce, and its derivative by the restitution: v (t - T) with the speed v at
+    the ground, and the time T of the bounce.
+
+    >>> from nonholonomic.hybrid import hybrid_samples
+    >>> def build(restitution, tolerance):
+    ...     return (Bounce(restitution),), jnp.zeros(1, int), jnp.array([[1.0], [0.0]])
+    >>> def height(restitution):
+    ...     return hybrid_samples(build, restitution, jnp.array([0.8]), jnp.asarray(1.0), settings, 1).shown[0, 0]
+    >>> slope, speed = jax.grad(height)(0.6), np.sqrt(2 * 9.81)
+    >>> print(f"{slope:.6f} {speed * (0.8 - speed / 9.81):.6f}")
+    1.543558 1.543558
     """
     sampling = functools.partial(HybridSampling, counters=counters)
     return solve_for_samples(sampling, build, modules, _fixed(times), t1, settings)
@@ -84,7 +103,8 @@ def _fixed(times: Float[Array, " times"]) -> Float[Array, " times"]:
 def _refused(primals: Any, tangents: Any) -> Any:
     if tangents[0] is not None:
         raise ValueError(
-            "derivatives with respect to times are not available for runs of several modes: contact = 'hybrid'"
+            "derivatives with respect to times or t1 are not available for runs with resets; differentiate by the start or "
+            "the parameters"
         )
     return primals[0], jnp.zeros_like(primals[0])
 
@@ -109,7 +129,9 @@ class HybridSampling(AbstractSampling):
         self, active: tuple[int, ...], nested: bool, cells: int, *leaves: Float[Array, "..."]
     ) -> tuple[HybridSamples, list[HybridSamples]]:
         if nested:
-            raise ValueError("second derivatives are not available through changes of mode: contact = 'hybrid'")
+            raise ValueError(
+                "second derivatives are not available through changes of mode; take differences of a gradient instead"
+            )
         numbers, (*horizon, tolerance), spec = self._sorted(leaves)
         settings = spec.settings.with_tolerance(tolerance)
 

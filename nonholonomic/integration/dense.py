@@ -27,7 +27,15 @@ LOOKS = np.arange(1, 8) / 8.0
 
 
 class DenseSolution(NamedTuple):
-    """A run: its times and states, the segments of its dense output, how it ended and how many steps it took."""
+    """A run: its times and states, the segments of its dense output, how it ended and how many steps it took.
+
+    **Example:** as for `follow`.
+
+    >>> from nonholonomic.integration import follow
+    >>> path = follow(Decays(jnp.asarray(2.0)), 1.0, settings)
+    >>> path.left_domain, path.failed, path.accepted == len(path.times) - 1
+    (False, False, True)
+    """
 
     times: Float[np.ndarray, " times"]
     states: Float[np.ndarray, "components times"]
@@ -52,6 +60,13 @@ class DenseSolution(NamedTuple):
 def padded(values: Float[np.ndarray, "... times"], least: int) -> Float[np.ndarray, "... more"]:
     """Values with those of the last time repeated, up to a power of two of at least `least`: one program serves many
     sizes.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from nonholonomic.integration import padded
+    >>> padded(np.array([1.0, 2.0, 3.0]), least=3)
+    array([1., 2., 3., 3.])
     """
     more = (1 << (least - 1).bit_length()) - values.shape[-1]
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)], mode="edge")
@@ -155,6 +170,14 @@ def follow(
 
     **Returns:** a `DenseSolution` with the accepted steps; it ends where the domain margin reaches zero, located on the
     dense output.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from nonholonomic.integration import follow
+    >>> path = follow(Decays(jnp.asarray(2.0)), 1.0, settings)
+    >>> print(path.at(np.array([0.5, 1.0])).round(6))  # exp(-1), exp(-2)
+    [[0.367879 0.135335]]
     """
     state, scales, margin = _start(problem, jnp.asarray(t0, float))
     time = jnp.asarray(t0, state.dtype)
@@ -254,6 +277,12 @@ def sample(
     differentiates, by default in forward mode.
 
     **Returns:** a `SampledSolution`.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import sample
+    >>> print(sample(Decays(jnp.asarray(2.0)), jnp.array([0.5, 1.0]), jnp.asarray(1.0), settings).states.round(6))
+    [[0.367879 0.135335]]
     """
     state, scales = problem.start()
     margin = problem.domain_margin(jnp.zeros_like(t1), state)

@@ -45,6 +45,15 @@ def ensemble_solve(
     - `n_blocks`: number of equal blocks of the state, as for `LaneScheduler.of`.
 
     **Returns:** the `Outcome`, and the number of iterations, each of which advanced all lanes.
+
+    **Example:** with `nonterminal`, the runs continue to `t1`; here inside `jit`, with `traced_solve_ensemble`.
+
+    >>> from nonholonomic.integration import traced_solve_ensemble
+    >>> def solve(problem, t1):
+    ...     return traced_solve_ensemble(problem, t1, jnp.asarray(3), settings, nonterminal=True)[0]
+    >>> continued = jax.jit(solve)(problem, jnp.asarray(2.0))
+    >>> print(continued.crossing_time.round(6), continued.end_time)
+    [0.693147 0.346574 0.173287] [2. 2. 2.]
     """
     options = {"nonterminal": nonterminal, "one_kernel": one_kernel, "n_blocks": n_blocks}
     outcome, iterations = LaneScheduler.of(problem, t1, cells, settings, **options).outcome()
@@ -63,7 +72,9 @@ def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
 
 
 #: `ensemble_solve`, compiled on its own, for use outside of other transformed functions.
-solve_ensemble = compiled_alone(functools.partial(ensemble_solve, one_kernel=True))
+solve_ensemble = compiled_alone(
+    functools.update_wrapper(functools.partial(ensemble_solve, one_kernel=True), ensemble_solve)
+)
 
 #: `ensemble_solve`, for use inside other transformed functions.
 traced_solve_ensemble = eqx.filter_jit(ensemble_solve)

@@ -15,7 +15,14 @@ from .runge_kutta import Lanes, States, lesser
 class AbstractProblem(eqx.Module):
     """An initial value problem: a field, an event function, and a domain margin that ends the run where it vanishes.
 
-    The leaves of a problem are scalars, or hold one number per cell in their last axis.
+    The leaves of a problem are scalars, or hold one number per cell in their last axis. Its functions receive one
+    number per lane, or scalars for a single run.
+
+    **Example:** the problem of the room's example, at its start.
+
+    >>> start, scales = problem.start()
+    >>> print(problem.event_function(start), problem.field(0.0, start)[0])
+    [0.5 0.5 0.5] [-1. -2. -4.]
     """
 
     @property
@@ -69,7 +76,19 @@ class AbstractProblem(eqx.Module):
 
 
 class CoreProblem(AbstractProblem):
-    """The core state of a problem: the leading components, on which the others do not act."""
+    """The core state of a problem: the leading components, on which the others do not act.
+
+    **Arguments:**
+
+    - `whole`: the problem.
+    - `size`: number of leading components.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import CoreProblem
+    >>> CoreProblem(problem, size=1).start()[0].shape
+    (1, 3)
+    """
 
     whole: AbstractProblem
     size: int = eqx.field(static=True)
@@ -122,7 +141,23 @@ def side_of(problem: AbstractProblem, side: Lanes) -> Callable[[States, States],
 
 
 def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes:
-    """Time at which the event function vanishes, for a state close to the event (`event_time`)."""
+    """Time [s] at which the event function vanishes, for a state close to the event.
+
+    The time is differentiable by the numbers of the problem and by the state (implicit function theorem).
+
+    **Arguments:**
+
+    - `problem`: with an event.
+    - `time`, `state`: close to the event, (cells,) and (components, cells).
+
+    **Returns:** the times, (cells,), to third order in the distance.
+
+    **Example:** a state that is 1e-4 s before the event.
+
+    >>> from nonholonomic.integration import crossing_time
+    >>> print(f"{crossing_time(Decays(jnp.asarray(2.0)), 0.3465, jnp.exp(jnp.array([-0.693]))):.8f}")
+    0.34657359
+    """
     return event_time(problem, problem.event_function, time, state)
 
 

@@ -39,6 +39,13 @@ def explicit_tableau(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau:
     """The tableau of an explicit, embedded Runge-Kutta solver of Diffrax.
 
     **Raises:** `ValueError` for any other solver.
+
+    **Example:**
+
+    >>> import diffrax
+    >>> from nonholonomic.integration import explicit_tableau
+    >>> explicit_tableau(diffrax.Dopri8()).num_stages
+    14
     """
     tableau = getattr(solver, "tableau", None)
     if not isinstance(solver, diffrax.AbstractERK) or not isinstance(tableau, diffrax.ButcherTableau):

@@ -1,27 +1,23 @@
 """Sample many runs at given times, with the lanes that also locate event times.
 
 Steps end on the requested times, so a sample has the accuracy of the method; between two samples the steps have even
-lengths. The loop works in periods: a period records the state after each iteration, and then stores its samples
-together.
+lengths. The state is recorded after each iteration, and the samples of a period are stored together.
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..xla_cpu import written_in_place
 from .problem import AbstractProblem
 from .runge_kutta import Lanes
-from .scheduler import LaneScheduler, Outcome, Progress
+from .scheduler import AbstractRecorder, InLanes, LaneScheduler, Outcome
 from .settings import Settings
 from .status import FAILED, REACHED_END, RUNNING
 from .step import LaneState, try_step
-
-#: Iterations per period: as many as fit the caches with their record.
-PERIOD = 64
 
 #: Largest factor by which a step is stretched to end on a sample: its error stays below the tolerance, because steps
 #: are proposed with a margin of `step.SAFETY`.
@@ -37,13 +33,85 @@ class Reached(NamedTuple):
     sample: Int[Array, "iterations lanes"]
 
 
-class Sampling(NamedTuple):
-    """Progress of an ensemble solve with samples: `sample` is the number of the next sample in every lane."""
+class Collected(NamedTuple):
+    """The number of the next sample in every lane, and the samples so far."""
 
-    progress: Progress
     sample: Int[Array, " lanes"]
-    outcome: Outcome
     samples: Samples
+
+
+class SampleRecorder(AbstractRecorder):
+    """Lets steps end on the samples of every cell, and collects these.
+
+    `times` [s] are those of the samples; `first` is the number of each cell's first sample after its start.
+    """
+
+    times: Float[Array, "times *cells"]
+    first: Int[Array, " cells"]
+
+    # As many iterations as fit the caches with their record.
+    period = 64
+
+    @classmethod
+    def of(cls, times: Float[Array, "times *cells"], cells: int) -> "SampleRecorder":
+        """The recorder of the samples of some cells."""
+        return cls(times, jnp.broadcast_to(jnp.sum(times <= 0.0, axis=0), (cells,)))
+
+    def at_start(self, lane_state: LaneState, starts: Float[Array, "components cells"]) -> Collected:
+        """The samples at the start."""
+        early = (self.times <= 0.0).reshape(len(self.times), -1).T[..., None]
+        return Collected(self._begin(lane_state), jnp.where(early, starts.T[:, None], jnp.nan))
+
+    def begin(self, lane_state: LaneState, collected: Collected) -> tuple[Bool[Array, " lanes"], Array, Reached]:
+        room = jnp.zeros((self.period, *lane_state.state.shape), lane_state.state.dtype)
+        empty = Reached(room, jnp.full((self.period, *collected.sample.shape), len(self.times)))
+        return jnp.ones(collected.sample.shape, bool), collected.sample, empty
+
+    def step(
+        self,
+        in_lanes: InLanes,
+        lane_state: LaneState,
+        record: tuple[Bool[Array, " lanes"], Array, Reached],
+        iteration: Int[Array, ""],
+    ) -> tuple[LaneState, tuple[Bool[Array, " lanes"], Array, Reached]]:
+        """Whether the last step was accepted, and the number of the next sample, are part of the record."""
+        (problem, control, atol), (accepted, sample, reached) = in_lanes, record
+        count, horizon = len(self.times), jnp.broadcast_to(control.t1, lane_state.time.shape)
+        next_time = self._time_of(sample, lane_state)
+        stop = jnp.where(sample < count, jnp.minimum(next_time, horizon), horizon)
+        even = _even(lane_state.length, stop - lane_state.time, lane_state.bracketing)
+        # After a step that was not accepted the next one is shorter on purpose: it may have to end on a minimum of a margin.
+        length = jnp.where(accepted, even, jnp.minimum(even, lane_state.length))
+        lane_state = lane_state._replace(length=length)
+        after = try_step(problem, control._replace(t1=stop), atol, lane_state)
+        stopped = (lane_state.status == RUNNING) & (after.status == REACHED_END)
+        is_sample = stopped & (sample < count) & (after.time >= next_time)
+        goes_on = stopped & (after.time < horizon)
+        status = jnp.where(after.steps < control.max_steps, RUNNING, FAILED)
+        after = after._replace(status=jnp.where(goes_on, status, after.status))
+        entry = Reached(after.state, jnp.where(is_sample, sample, count))
+        reached = jax.tree.map(functools.partial(written_in_place, at=iteration), reached, entry)
+        return after, (after.time > lane_state.time, sample + is_sample, reached)
+
+    def collect(
+        self, collected: Collected, record: tuple[Array, Array, Reached], ended: LaneState, refilled: LaneState
+    ) -> Collected:
+        _, sample, reached = record
+        rows, cell = jnp.moveaxis(reached.state, 1, -1), self._cell(ended)[None]
+        samples = collected.samples.at[cell, reached.sample].set(rows, mode="drop", unique_indices=True)
+        return Collected(jnp.where(refilled.cell != ended.cell, self._begin(refilled), sample), samples)
+
+    def _cell(self, lane_state: LaneState) -> Int[Array, " lanes"]:
+        return jnp.minimum(lane_state.cell, len(self.first) - 1)
+
+    def _begin(self, lane_state: LaneState) -> Int[Array, " lanes"]:
+        """The number of the first sample after the start in every lane."""
+        return self.first[self._cell(lane_state)]
+
+    def _time_of(self, sample: Int[Array, " lanes"], lane_state: LaneState) -> Lanes:
+        """The time of a sample in every lane."""
+        inside = jnp.minimum(sample, len(self.times) - 1)
+        return self.times[inside] if self.times.ndim == 1 else self.times[inside, self._cell(lane_state)]
 
 
 def solve_with_samples(
@@ -65,84 +133,22 @@ def solve_with_samples(
 
     **Returns:** the `Outcome`, without crossing times; and the states at the times, (cells, times, components), NaN
     after the end of a run.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import solve_with_samples
+    >>> times = jnp.array([0.1, 0.3])
+    >>> _, states = solve_with_samples(problem, times, jnp.asarray(5.0), jnp.asarray(3), settings)
+    >>> print(states[..., 0].round(6))
+    [[0.904837 0.740818]
+     [0.818731 0.548812]
+     [0.67032       nan]]
     """
     scheduler = LaneScheduler.of(problem, t1, cells, settings, n_blocks=n_blocks, one_kernel=one_kernel)
-    count, starts = times.shape[0], scheduler.fresh.state
-    of_cell = jnp.broadcast_to(times.reshape(count, -1), (count, scheduler.capacity)).T
-    first = jnp.sum(of_cell <= 0.0, axis=1)
-    own_times = times.ndim == 2
-
-    def period(run: Sampling) -> Sampling:
-        cell = jnp.minimum(run.progress.lane_state.cell, scheduler.capacity - 1)
-        lane_times = of_cell[cell].T if own_times else times
-        progress, sample, record = _recorded(scheduler, lane_times, run.progress, run.sample)
-        outcome = scheduler.store(run.outcome, progress.lane_state)
-        refilled = scheduler.refill(progress)
-        fresh = refilled.lane_state.cell != progress.lane_state.cell
-        begin = first[jnp.minimum(refilled.lane_state.cell, scheduler.capacity - 1)]
-        rows = jnp.moveaxis(record.state, 1, -1)
-        samples = run.samples.at[cell[None], record.sample].set(rows, mode="drop", unique_indices=True)
-        return Sampling(refilled, jnp.where(fresh, begin, sample), outcome, samples)
-
-    progress = scheduler.start()
-    at_start = jnp.where(of_cell[..., None] <= 0.0, starts.T[:, None], jnp.nan)
-    run = Sampling(
-        progress, first[jnp.minimum(progress.lane_state.cell, scheduler.capacity - 1)], scheduler.empty(), at_start
-    )
-    run = jax.lax.while_loop(lambda run: scheduler.unfinished(run.progress), period, run)
-    return scheduler.store(run.outcome, run.progress.lane_state), run.samples
-
-
-def _recorded(
-    scheduler: LaneScheduler, times: Float[Array, "times ..."], progress: Progress, sample: Int[Array, " lanes"]
-) -> tuple[Progress, Int[Array, " lanes"], Reached]:
-    """Advance the lanes by a period and record their samples."""
-    problem, control, atol = scheduler.in_lanes(progress.lane_state)
-    count = times.shape[0]
-    horizon = jnp.broadcast_to(control.t1, progress.lane_state.time.shape)
-
-    def going(carry: Any) -> Any:
-        lane_state, _, _, _, idle, iteration = carry
-        return scheduler.goes_on(lane_state, idle, progress.loaded) & (iteration < PERIOD)
-
-    def step(carry: Any) -> Any:
-        lane_state, accepted, sample, record, idle, iteration = carry
-        idle = idle + scheduler.idle(lane_state)
-        next_time = _next_time(times, sample)
-        stop = jnp.where(sample < count, jnp.minimum(next_time, horizon), horizon)
-        even = _even(lane_state.length, stop - lane_state.time, lane_state.bracketing)
-        # After a step that was not accepted the next one is shorter on purpose: it may have to end on a minimum of a margin.
-        length = jnp.where(accepted, even, jnp.minimum(even, lane_state.length))
-        lane_state = lane_state._replace(length=length)
-        after = try_step(problem, control._replace(t1=stop), atol, lane_state)
-        reached = (lane_state.status == RUNNING) & (after.status == REACHED_END)
-        is_sample = reached & (sample < count) & (after.time >= next_time)
-        goes_on = reached & (after.time < horizon)
-        status = jnp.where(after.steps < control.max_steps, RUNNING, FAILED)
-        after = after._replace(status=jnp.where(goes_on, status, after.status))
-        sampled = Reached(after.state, jnp.where(is_sample, sample, count))
-        record = jax.tree.map(functools.partial(written_in_place, at=iteration), record, sampled)
-        return after, after.time > lane_state.time, sample + is_sample, record, idle, iteration + 1
-
-    def loop(start: tuple[LaneState, Int[Array, " lanes"]]) -> Any:
-        lane_state, sample = start
-        empty = Reached(
-            jnp.zeros((PERIOD, *lane_state.state.shape), lane_state.state.dtype),
-            jnp.full((PERIOD, *sample.shape), count),
-        )
-        accepted = jnp.ones(sample.shape, bool)
-        return jax.lax.while_loop(
-            going, step, (lane_state, accepted, sample, empty, jnp.zeros((), int), jnp.zeros((), int))
-        )
-
-    lane_state, _, sample, record, _, iterations = scheduler.in_kernel(loop)((progress.lane_state, sample))
-    return Progress(lane_state, progress.loaded, progress.iterations + iterations), sample, record
-
-
-def _next_time(times: Float[Array, "times ..."], sample: Int[Array, " lanes"]) -> Lanes:
-    """The time of the next sample in every lane."""
-    inside = jnp.minimum(sample, times.shape[0] - 1)
-    return times[inside] if times.ndim == 1 else jnp.take_along_axis(times, inside[None], axis=0)[0]
+    recorder = SampleRecorder.of(times, scheduler.capacity)
+    at_start = recorder.at_start(scheduler.start().lane_state, scheduler.fresh.state)
+    outcome, _, collected = scheduler.recorded(recorder, at_start)
+    return outcome, collected.samples
 
 
 def _even(length: Lanes, left: Lanes, bracketing: Array) -> Lanes:

@@ -1,11 +1,12 @@
 """The cells of a problem, and the lanes that run them.
 
 A lane whose run has ended takes the next cell of the queue, so cheap and expensive cells share the lanes without
-waiting for one another.
+waiting for one another. All ensemble solves share this loop; a recorder says what is kept of the steps.
 """
 
+import abc
 from collections.abc import Callable
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -40,6 +41,12 @@ class Outcome(NamedTuple, Generic[Numbers]):
     `status` is one of the codes of `status.py`; `first_crossing` and `crossing_time` [s] are the times of the first and
     the last event, the same where runs end on it, infinite if there was none; `end_time` [s] and `state` are those at
     which the run ended; `steps` counts accepted and rejected steps, `rejected` the latter.
+
+    **Example:** the outcome of the room's example, whose runs end on the event.
+
+    >>> from nonholonomic.integration import CROSSED
+    >>> print(outcome.status == CROSSED, outcome.state.shape)
+    [ True  True  True] (1, 3)
     """
 
     status: Int[Numbers, " cells"]
@@ -57,6 +64,49 @@ class Progress(NamedTuple):
     lane_state: LaneState
     loaded: Int[Array, ""]
     iterations: Int[Array, ""]
+
+
+#: Problem, control and absolute tolerances of the cells in the lanes.
+InLanes = tuple[AbstractProblem, Control, States]
+
+
+class AbstractRecorder(eqx.Module):
+    """What a solve keeps of the steps between two refills of the lanes (a period), beside the `Outcome`.
+
+    `period`: the greatest number of iterations of a period, `None` for any number; `refill_cost`: in steps of all lanes.
+    """
+
+    period: ClassVar[int | None] = None
+    refill_cost: ClassVar[float] = REFILL
+
+    @abc.abstractmethod
+    def begin(self, lane_state: LaneState, collected: Any) -> Any:
+        """The record at the start of a period, from what earlier periods have collected."""
+
+    @abc.abstractmethod
+    def step(
+        self, in_lanes: InLanes, lane_state: LaneState, record: Any, iteration: Int[Array, ""]
+    ) -> tuple[LaneState, Any]:
+        """Try a step in every lane, and record it."""
+
+    def collect(self, collected: Any, record: Any, ended: LaneState, refilled: LaneState) -> Any:
+        """What has been collected, with the record of a period added.
+
+        **Arguments:** `ended`, `refilled`: the lanes at the end of the period and after the refill.
+        """
+        return collected
+
+
+class Unrecorded(AbstractRecorder):
+    """Keeps nothing of the steps."""
+
+    def begin(self, lane_state: LaneState, collected: None) -> None:
+        return None
+
+    def step(
+        self, in_lanes: InLanes, lane_state: LaneState, record: None, iteration: Int[Array, ""]
+    ) -> tuple[LaneState, None]:
+        return try_step(*in_lanes, lane_state), None
 
 
 class LaneScheduler(eqx.Module):
@@ -110,7 +160,7 @@ class LaneScheduler(eqx.Module):
         inside = jnp.minimum(cell, self.capacity - 1)
         return jax.tree.map(lambda leaf: leaf if jnp.ndim(leaf) == 0 else leaf[..., inside], tree)
 
-    def in_lanes(self, lane_state: LaneState) -> tuple[AbstractProblem, Control, Float[Array, "components lanes"]]:
+    def in_lanes(self, lane_state: LaneState) -> InLanes:
         """Problem, control and absolute tolerances of the cells in the lanes."""
         control = self.control._replace(t1=self.pick(self.control.t1, lane_state.cell))
         return self.pick(self.problem, lane_state.cell), control, self.pick(self.atols, lane_state.cell)
@@ -120,15 +170,25 @@ class LaneScheduler(eqx.Module):
 
         **Returns:** the `Outcome`, whose crossing times are those of nonterminal events, and the number of iterations.
         """
+        outcome, iterations, _ = self.recorded(Unrecorded(), None)
+        return outcome, iterations
 
-        def period(carry: tuple[Progress, Outcome]) -> tuple[Progress, Outcome]:
-            progress, outcome = carry
-            progress = self.run(progress)
-            return self.refill(progress), self.store(outcome, progress.lane_state)
+    def recorded(self, recorder: AbstractRecorder, collected: Any) -> tuple[Outcome, Int[Array, ""], Any]:
+        """Run every cell, as `outcome` does, and also return what a recorder has collected.
 
-        carry = (self.start(), self.empty())
-        progress, outcome = jax.lax.while_loop(lambda carry: self.unfinished(carry[0]), period, carry)
-        return self.store(outcome, progress.lane_state), progress.iterations
+        **Arguments:** `recorder`; `collected`: by it before the first step.
+        """
+
+        def period(carry: tuple[Progress, Outcome, Any]) -> tuple[Progress, Outcome, Any]:
+            progress, outcome, collected = carry
+            progress, record = self.run(progress, recorder, collected)
+            refilled = self.refill(progress)
+            collected = recorder.collect(collected, record, progress.lane_state, refilled.lane_state)
+            return refilled, self.store(outcome, progress.lane_state), collected
+
+        carry = (self.start(), self.empty(), collected)
+        progress, outcome, collected = jax.lax.while_loop(lambda carry: self.unfinished(carry[0]), period, carry)
+        return self.store(outcome, progress.lane_state), progress.iterations, collected
 
     def start(self) -> Progress:
         """The first cells, one in each lane."""
@@ -139,38 +199,35 @@ class LaneScheduler(eqx.Module):
         """Whether a lane is running or a cell waiting."""
         return jnp.any(progress.lane_state.status == RUNNING) | (progress.loaded < self.cells)
 
-    def idle(self, lane_state: LaneState) -> Int[Array, ""]:
-        """Number of idle lanes."""
-        return jnp.sum(lane_state.status != RUNNING)
+    def run(self, progress: Progress, recorder: AbstractRecorder, collected: Any = None) -> tuple[Progress, Any]:
+        """Advance the lanes by a period: until they should be refilled, have all ended, or the record is full.
 
-    def goes_on(
-        self, lane_state: LaneState, idle: Int[Array, ""], loaded: Int[Array, ""], price: float = REFILL
-    ) -> Bool[Array, ""]:
-        """Whether the loop continues; while cells wait it stops for a refill as soon as the refill pays off.
+        While cells wait, the loop stops for a refill as soon as the refill pays off.
 
-        **Arguments:** `idle`: steps that idle lanes have missed since the last refill; `loaded`: how many cells have
-        left the queue; `price`: cost of a refill, in steps of all lanes.
+        **Returns:** the `Progress`, and the record of the period.
         """
-        refill = (loaded < self.cells) & (idle >= price * self.lanes)
-        return jnp.any(lane_state.status == RUNNING) & ~refill
-
-    def run(self, progress: Progress) -> Progress:
-        """Advance the lanes until they should be refilled, or all have ended."""
         in_lanes = self.in_lanes(progress.lane_state)
 
-        def goes_on(carry: tuple[LaneState, Int[Array, ""], Int[Array, ""]]) -> Bool[Array, ""]:
-            lane_state, idle, _ = carry
-            return self.goes_on(lane_state, idle, progress.loaded)
+        def goes_on(carry: tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]]) -> Bool[Array, ""]:
+            lane_state, _, missed, count = carry
+            refill = (progress.loaded < self.cells) & (missed >= recorder.refill_cost * self.lanes)
+            going = jnp.any(lane_state.status == RUNNING) & ~refill
+            return going if recorder.period is None else going & (count < recorder.period)
 
         def step(
-            carry: tuple[LaneState, Int[Array, ""], Int[Array, ""]],
-        ) -> tuple[LaneState, Int[Array, ""], Int[Array, ""]]:
-            lane_state, idle, iterations = carry
-            return try_step(*in_lanes, lane_state), idle + self.idle(lane_state), iterations + 1
+            carry: tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]],
+        ) -> tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]]:
+            # `missed` counts the steps that idle lanes have missed since the last refill.
+            lane_state, record, missed, count = carry
+            after, record = recorder.step(in_lanes, lane_state, record, count)
+            return after, record, missed + jnp.sum(lane_state.status != RUNNING), count + 1
 
-        start = (progress.lane_state, jnp.zeros((), int), progress.iterations)
-        lane_state, _, iterations = self.in_kernel(lambda carry: jax.lax.while_loop(goes_on, step, carry))(start)
-        return Progress(lane_state, progress.loaded, iterations)
+        def loop(lane_state: LaneState) -> tuple[LaneState, Any, Int[Array, ""], Int[Array, ""]]:
+            zero = jnp.zeros((), int)
+            return jax.lax.while_loop(goes_on, step, (lane_state, recorder.begin(lane_state, collected), zero, zero))
+
+        lane_state, record, _, count = self.in_kernel(loop)(progress.lane_state)
+        return Progress(lane_state, progress.loaded, progress.iterations + count), record
 
     def in_kernel(self, loop: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """A loop over steps, compiled into a single kernel if `one_kernel` is set."""

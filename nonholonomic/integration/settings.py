@@ -37,6 +37,12 @@ class Settings(eqx.Module):
     - `absolute`: absolute tolerance as a fraction of the relative one, in units of the problem's magnitudes.
     - `max_steps`: a run that needs more steps fails.
     - `lanes`: number of cells that advance together; by default as many as suit the machine (`lanes_for`).
+
+    **Example:**
+
+    >>> from nonholonomic.integration import Settings
+    >>> type(Settings(1e-9).for_lanes).__name__, type(Settings(1e-9).for_single_runs).__name__
+    ('Oscillatory8', 'Dopri8')
     """
 
     tolerance: Float[Array, ""] = eqx.field(converter=as_number)
@@ -77,18 +83,41 @@ class Settings(eqx.Module):
 
 
 def tolerance_bound(tolerance: Any) -> Bound:
-    """The range of the relative tolerance."""
+    """The range of the relative tolerance.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import tolerance_bound
+    >>> tolerance_bound(1.0).require()
+    Traceback (most recent call last):
+    ValueError: tolerance = 1.0 must be at most 0.01
+    """
     return Bound(tolerance, "tolerance", at_least=TIGHTEST, at_most=LOOSEST)
 
 
 def run_bounds(t1: Any, tolerance: Any) -> Iterator[Bound]:
-    """The ranges of the horizon [s] and of the tolerance."""
+    """The ranges of the horizon [s] and of the tolerance.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import run_bounds
+    >>> [bound.name for bound in run_bounds(t1=5.0, tolerance=1e-9)]
+    ['t1', 'tolerance']
+    """
     yield Bound(t1, "t1", above=0.0)
     yield tolerance_bound(tolerance)
 
 
 def times_bounds(times: Any, t1: Any) -> Iterator[Bound]:
-    """The range of the times of output [s]."""
+    """The range of the times of output [s].
+
+    **Example:**
+
+    >>> from nonholonomic.integration import times_bounds
+    >>> next(times_bounds(times=jnp.array([1.0, 6.0]), t1=5.0)).require()
+    Traceback (most recent call last):
+    ValueError: times ...
+    """
     yield Bound(times, "times", at_least=0.0, at_most=t1)
 
 
@@ -105,6 +134,15 @@ def legal_run(
 
     **Arguments:** `others`: whether all other numbers are legal; `t1`, `tolerance`, and the `times` of output (times,),
     which must increase, are checked here.
+
+    **Returns:** whether the run is legal, its horizon and its tolerance.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import legal_run
+    >>> legal, t1, tolerance = legal_run(True, t1=-1.0, tolerance=1e-9)
+    >>> print(legal, t1, tolerance)
+    False 0.0 0.01
     """
     may = jnp.asarray(others) & legal(run_bounds(t1, tolerance))
     if times is not None:
@@ -116,6 +154,12 @@ def require_adaptive(solver: Any, others: str = "") -> None:
     """Raise `ValueError` unless this is `None` or a solver of Diffrax that estimates its errors and takes one field.
 
     Solvers with two fields add a stiff part or noise. **Arguments:** `others`: what else the message should allow.
+
+    **Example:**
+
+    >>> import diffrax
+    >>> from nonholonomic.integration import require_adaptive
+    >>> require_adaptive(diffrax.Tsit5())
     """
     structure = getattr(solver, "term_structure", None)
     adaptive = isinstance(solver, diffrax.AbstractAdaptiveSolver) and isinstance(structure, type)
@@ -127,7 +171,14 @@ def require_adaptive(solver: Any, others: str = "") -> None:
 
 
 def require_adjoint(adjoint: Any) -> None:
-    """Raise `ValueError` unless this is `None` or an adjoint method of Diffrax."""
+    """Raise `ValueError` unless this is `None` or an adjoint method of Diffrax.
+
+    **Example:**
+
+    >>> import diffrax
+    >>> from nonholonomic.integration import require_adjoint
+    >>> require_adjoint(diffrax.DirectAdjoint())
+    """
     if not isinstance(adjoint, diffrax.AbstractAdjoint | None):
         raise ValueError(f"adjoint = {adjoint!r} must be one of Diffrax, such as RecursiveCheckpointAdjoint(), or None")
 

@@ -51,6 +51,12 @@ class LaneState(NamedTuple):
     - `first_crossing`, `crossing_time`: of the first and the last event passed [s], infinite if there was none.
     - `bracketing`: whether the lane is locating an event; `bracket`: the current bracket.
     - `steps`: number of tried steps; `rejected`: of those rejected by step-size control.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import LaneState
+    >>> LaneState._fields[:5]
+    ('cell', 'status', 'time', 'state', 'rate')
     """
 
     cell: Int[Array, " lanes"]

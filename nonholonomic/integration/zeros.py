@@ -31,6 +31,13 @@ def halved(
     - `low`, `high`: the brackets, of any shape.
 
     **Returns:** the last value at which the condition held and the next one, at which it does not.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import halved
+    >>> low, high = halved(lambda x: x**2 < 2.0, jnp.asarray(1.0), jnp.asarray(2.0))
+    >>> print(f"{low:.6f}")
+    1.414214
     """
 
     def halve(_, bracket):
@@ -48,6 +55,12 @@ def sign_changes(
     """Zeros of a function between neighbours of a grid at which it has different signs, to round-off.
 
     **Arguments:** `function`: of an array of numbers, element by element; `grid`: growing numbers.
+
+    **Example:**
+
+    >>> from nonholonomic.integration import sign_changes
+    >>> print(sign_changes(jnp.cos, jnp.arange(0.5, 7.0)).round(6))
+    [1.570796 4.712389]
     """
     values = function(grid)
     changes = np.flatnonzero(np.sign(values[:-1]) != np.sign(values[1:]))
@@ -67,6 +80,14 @@ def few_trials(
 
     - `function`: of NumPy arrays, element by element; it is not traced.
     - `low`, `high`: the brackets; `at_low`, `at_high`: the function there, of opposite signs.
+
+    **Example:**
+
+    >>> import numpy as np
+    >>> from nonholonomic.integration import few_trials
+    >>> low, high = np.array([1.0]), np.array([2.0])
+    >>> few_trials(lambda x: x**2 - 2.0, low, high, low**2 - 2.0, high**2 - 2.0).round(6)
+    array([1.414214])
     """
     guess = low
     for trial in range(MOST_TRIALS if low.size else 0):

@@ -144,9 +144,9 @@ class Evaluation:
     def _by_element(self, equation: Any, inputs: list[Elements]) -> Elements:
         shape = equation.outvars[0].aval.shape
         results, name = np.empty(shape, object), equation.primitive.name
-        broadcast = [np.broadcast_to(one, shape) for one in inputs]
+        broadcast = [np.broadcast_to(value, shape) for value in inputs]
         for index in np.ndindex(shape):
-            results[index] = self._number(name, [one[index] for one in broadcast], equation)
+            results[index] = self._number(name, [value[index] for value in broadcast], equation)
         return results
 
     def _number(self, name: str, operands: list[Any], equation: Any = None) -> Any:
@@ -250,14 +250,14 @@ def _simplified(name: str, operands: list[Any]) -> Any:
         return operands[1 + int(operands[0])]
     if name in ("copy", "copy_p", "stop_gradient") and _is_constant(operands[0]):
         return operands[0]
-    if name not in ARITHMETIC or not all(np.issubdtype(one.dtype, np.floating) for one in operands):
+    if name not in ARITHMETIC or not all(np.issubdtype(operand.dtype, np.floating) for operand in operands):
         return None
     if all(map(_is_constant, operands)):
         with np.errstate(all="ignore"):
             return operands[0].dtype.type(ARITHMETIC[name](*operands))
     if name == "neg":
         return None
-    left, right = ((float(one) if _is_constant(one) else None) for one in operands)
+    left, right = ((float(operand) if _is_constant(operand) else None) for operand in operands)
     if name in ("add", "add_any"):
         return operands[1] if left == 0.0 else operands[0] if right == 0.0 else None
     if name == "sub":

@@ -49,7 +49,8 @@ def event_time(
 
     Derivatives with respect to the start and every number of the system and of the event are exact: they use the
     implicit function theorem at the event and the saltation matrix at every reset (`nonholonomic/hybrid/saltation.py`).
-    They are 0 if the time is infinite.
+    They are 0 if the time is infinite. Without resets, there are second derivatives, by `jax.hessian` (forward over
+    reverse mode).
 
     **Arguments:**
 

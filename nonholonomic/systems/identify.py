@@ -130,7 +130,7 @@ def identify(
 
     - `system`: a `Hybrid`, or an `AbstractSystem`, with the values of the numbers that are not free.
     - `data`: a `Recording`, or a list of several to be fitted together.
-    - `free`: full name of a number -> a `nonholonomic.identification.Free` or only the start value:
+    - `free`: full name of a number -> a `nonholonomic.Free` or only the start value:
       `"system.modes[0].drag"`, or `"drag"` if no other name ends so; `"start[0]"`, `"start.q[0]"`. A start, or `"t0"`,
       the reading of a recording's clock at the start, is the same in all recordings; `"data[1].start[0]"` is that of
       the second, and `"data[*].t0"` stands for one of each. In systems with resets, `"t0"` cannot be free.

@@ -89,9 +89,9 @@ def test_an_entry_that_is_cut_while_it_is_used_costs_a_compilation_too(tmp_path)
 
 
 def test_other_flags_have_another_folder(tmp_path):
-    one, _ = run(SMALL, tmp_path)
-    other, _ = run(SMALL, tmp_path, XLA_FLAGS="--xla_cpu_enable_fast_min_max=true")
-    assert one["folder"] != other["folder"]
+    first, _ = run(SMALL, tmp_path)
+    second, _ = run(SMALL, tmp_path, XLA_FLAGS="--xla_cpu_enable_fast_min_max=true")
+    assert first["folder"] != second["folder"]
 
 
 @pytest.mark.parametrize("forbidden", [False, True])
@@ -133,9 +133,9 @@ def test_those_who_start_together_all_have_the_folder(unset, tmp_path):
         return [enable_compilation_cache(tmp_path) for _ in range(20)]
 
     with concurrent.futures.ThreadPoolExecutor(threads) as pool:
-        found = {folder for some in pool.map(start, range(threads)) for folder in some}
-    assert found == {tmp_path / environment_name()}
-    assert [one.name for one in (tmp_path / environment_name()).iterdir()] == [LOOKED_AT]
+        folders = {folder for group in pool.map(start, range(threads)) for folder in group}
+    assert folders == {tmp_path / environment_name()}
+    assert [path.name for path in (tmp_path / environment_name()).iterdir()] == [LOOKED_AT]
 
 
 @pytest.mark.parametrize("folder", [5, True, b"x", ""])

@@ -81,4 +81,4 @@ def test_no_public_object_shows_the_shapes_of_its_arrays():
         "LogDensity of scene.body.offset, given 2 measurements",
         "ImplicitMidpoint(step_length=0.01 s)",
     ]
-    assert not any("f64[" in one for one in shown)
+    assert not any("f64[" in text for text in shown)

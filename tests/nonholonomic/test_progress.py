@@ -200,8 +200,8 @@ def test_a_notebook_without_widgets_has_a_line_of_text_and_no_warning(widgets, m
     monkeypatch.setattr(progress, "find_spec", lambda name: ModuleSpec(name, None) if widgets else None)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = progress.bar_class()
-    assert found.__module__ == ("tqdm.notebook" if widgets else "tqdm.std")
+        bar = progress.bar_class()
+    assert bar.__module__ == ("tqdm.notebook" if widgets else "tqdm.std")
 
 
 def test_what_few_processes_need_is_not_imported_with_the_package():

@@ -127,13 +127,13 @@ def follow(case, rtol=1e-13, longest=1e-3):
 def row(case):
     """What the file holds of a case."""
     samples, hops, place = follow(case)
-    found = dict(zip(("q1", "q2", "q3"), place, strict=True))
-    found |= {"hops": len(hops), "first": hops[0][0], "landing": hops[0][1]}
+    entry = dict(zip(("q1", "q2", "q3"), place, strict=True))
+    entry |= {"hops": len(hops), "first": hops[0][0], "landing": hops[0][1]}
     # What the bounces take that are too short to be followed, if they shrink by the restitution.
-    found["rest"] = hops[-1][1] + (hops[-1][1] - hops[-1][0]) * RESTITUTION / (1.0 - RESTITUTION)
+    entry["rest"] = hops[-1][1] + (hops[-1][1] - hops[-1][0]) * RESTITUTION / (1.0 - RESTITUTION)
     for k, y in enumerate(samples, 1):
-        found |= {f"O{i}_{k}": y[i] for i in range(3)} | {f"e{i}_{k}": y[6 + i] for i in range(3)}
-    return {name: repr(float(value)) for name, value in found.items()}
+        entry |= {f"O{i}_{k}": y[i] for i in range(3)} | {f"e{i}_{k}": y[6 + i] for i in range(3)}
+    return {name: repr(float(value)) for name, value in entry.items()}
 
 
 def recorded():

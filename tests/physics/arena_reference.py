@@ -187,14 +187,14 @@ def row(case):
         dense_output=True,
     )
     end = run.t[-1]
-    found = {"status": "contact_lost" if run.t_events[0].size else "completed", "end_time": end}
-    found |= dict(zip(("q1", "q2", "q3"), place, strict=True))
+    entry = {"status": "contact_lost" if run.t_events[0].size else "completed", "end_time": end}
+    entry |= dict(zip(("q1", "q2", "q3"), place, strict=True))
     for k in range(1, SAMPLES + 1):
         y = run.sol(min(k * case.t1 / SAMPLES, end) if case.t1 / SAMPLES * k <= end else end)
         top.near = y[:3]
         N = top.motion(y)[1]
-        found |= {f"O{i}_{k}": y[i] for i in range(3)} | {f"e{i}_{k}": y[6 + i] for i in range(3)} | {f"N_{k}": N}
-    return {name: value if isinstance(value, str) else repr(float(value)) for name, value in found.items()}
+        entry |= {f"O{i}_{k}": y[i] for i in range(3)} | {f"e{i}_{k}": y[6 + i] for i in range(3)} | {f"N_{k}": N}
+    return {name: value if isinstance(value, str) else repr(float(value)) for name, value in entry.items()}
 
 
 def recorded():
@@ -215,20 +215,20 @@ ARENAS = {
 
 def cases():
     """Both laws on every arena, from launches with nothing special about them."""
-    random, found = np.random.default_rng(20260), []
+    random, rows = np.random.default_rng(20260), []
     for arena, (p1, p2, near) in ARENAS.items():
         for slip_speed in (0.0, 0.02):
             theta, azimuth, spin = random.uniform(0.1, 2.5), random.uniform(-3.0, 3.0), random.uniform(60.0, 120.0)
             v, w = random.uniform(-0.2, 0.2, 2), random.uniform(-10.0, 10.0, 3)
             mu = random.uniform(0.1, 0.3)
-            found.append(Case(arena, p1, p2, mu, slip_speed, theta, azimuth, spin, *near, *v, *w, 0.6))
+            rows.append(Case(arena, p1, p2, mu, slip_speed, theta, azimuth, spin, *near, *v, *w, 0.6))
     # Two that lose their contact: over the crest of a wave, and down the side of an egg.
     turning = (3.0, -5.0, 2.0)
-    found.append(Case("graph", 0.04, 12.0, 0.2, 0.02, 0.8, 0.5, 90.0, -0.07, 0.05, -0.03, 2.1, -0.2, *turning, 0.15))
-    found.append(
+    rows.append(Case("graph", 0.04, 12.0, 0.2, 0.02, 0.8, 0.5, 90.0, -0.07, 0.05, -0.03, 2.1, -0.2, *turning, 0.15))
+    rows.append(
         Case("outside of a spheroid", 0.3, 0.5, 0.2, 0.02, 0.8, 0.5, 90.0, 0.05, 0.08, 0.48, 0.9, -0.2, *turning, 0.15)
     )
-    return found
+    return rows
 
 
 if __name__ == "__main__":

@@ -160,14 +160,14 @@ def follow(case):
 def row(case):
     """What the file holds of a case."""
     samples, place, landings, hops = follow(case)
-    found = dict(zip(("q1", "q2", "q3"), place, strict=True)) | {"hops": len(hops), "landings": len(landings)}
-    found |= {f"landings_{k}": sum(one == k for _, one, _ in landings) for k in (0, 1)}
-    found |= {"blows": sum(blows for *_, blows in landings), "last": landings[-1][0]}
+    entry = dict(zip(("q1", "q2", "q3"), place, strict=True)) | {"hops": len(hops), "landings": len(landings)}
+    entry |= {f"landings_{k}": sum(sphere == k for _, sphere, _ in landings) for k in (0, 1)}
+    entry |= {"blows": sum(blows for *_, blows in landings), "last": landings[-1][0]}
     for k, (y, force, slip) in enumerate(samples, 1):
-        found |= {f"N_{k}": force, f"slip_{k}": slip}
+        entry |= {f"N_{k}": force, f"slip_{k}": slip}
         centre = y[:3] + case.offset * y[6:9]
-        found |= {f"O{i}_{k}": centre[i] for i in range(3)} | {f"e{i}_{k}": y[6 + i] for i in range(3)}
-    return {name: repr(float(value)) for name, value in found.items()}
+        entry |= {f"O{i}_{k}": centre[i] for i in range(3)} | {f"e{i}_{k}": y[6 + i] for i in range(3)}
+    return {name: repr(float(value)) for name, value in entry.items()}
 
 
 def recorded():

@@ -53,9 +53,9 @@ def struck(body: Body, state: np.ndarray, restitution: float) -> tuple[np.ndarra
     new = np.concatenate([state[:3], frame.T @ after.velocity, frame.T @ after.turning, state[9:]])
     if bounces:
         return new, "flying"
-    there = Contact(body, new)
-    if np.linalg.norm(there.along(there.v)) > 1e-7 * np.linalg.norm(contact.v):
-        return slip_to(body, new, there.along(there.v)), "slipping"
+    new_contact = Contact(body, new)
+    if np.linalg.norm(new_contact.along(new_contact.v)) > 1e-7 * np.linalg.norm(contact.v):
+        return slip_to(body, new, new_contact.along(new_contact.v)), "slipping"
     return settled(body, slip_to(body, new, np.zeros(3)))
 
 
@@ -87,7 +87,7 @@ def follow(
         "rolling": [event(lambda x: Contact(body, x).reserve())],
         "flying": [event(lambda x: gap(body, x))],
     }
-    kind, t, found = "slipping", 0.0, []
+    kind, t, stretches = "slipping", 0.0, []
     while t < t1:
         rate = free_rate(body) if kind == "flying" else rate_of(body, kind)
         # A slip that has just begun is stiff.
@@ -97,7 +97,7 @@ def follow(
         first = 1e-6 if kind == "flying" else None
         run = solve_ivp(rate, (t, to), state, method, rtol=rtol, atol=atol, events=ends[kind], first_step=first)
         assert run.success, run.message
-        found.append(Stretch(kind, t, run.t[-1], run.y[:, -1]))
+        stretches.append(Stretch(kind, t, run.t[-1], run.y[:, -1]))
         t, state = run.t[-1], run.y[:, -1]
         if run.status == 0:
             continue
@@ -109,4 +109,4 @@ def follow(
             kind = "flying"
         else:
             state, kind = settled(body, slip_to(body, state, np.zeros(3)))
-    return found
+    return stretches

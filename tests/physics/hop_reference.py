@@ -119,7 +119,7 @@ def contact(case, state, balls):
     rises = np.array([centre_acceleration(state, ball, *free) for ball in balls])
     pushed = [accelerations(case, state, [unit]) for unit in units]
     matrix = [
-        [centre_acceleration(state, ball, *one) - rise for one in pushed]
+        [centre_acceleration(state, ball, *pushing_force) - rise for pushing_force in pushed]
         for ball, rise in zip(balls, rises, strict=True)
     ]
     forces = np.linalg.solve(matrix, -rises) if balls else rises
@@ -319,7 +319,7 @@ def limit(rows):
 
     def beyond(three, name):
         """The t of t + A q^n, n the landings; the angle at which a run ends does not change."""
-        n, (a, b, c) = np.array([one["landings"] for one in three]), (one[name] for one in three)
+        n, (a, b, c) = np.array([row["landings"] for row in three]), (row[name] for row in three)
         if not np.isfinite(c) or abs(c - b) < 1e-13 * abs(c):
             return c
         n = n - n[0]
@@ -327,7 +327,7 @@ def limit(rows):
         return c - (c - b) * q ** n[2] / (q ** n[2] - q ** n[1])
 
     # What is left out after a landing of the one ball is not what is left out after one of the other.
-    assert np.all(np.diff([one["landings"] for one in rows]) % 2 == 0)
+    assert np.all(np.diff([row["landings"] for row in rows]) % 2 == 0)
     names = ("time", "end_theta", "end_energy", "leans", "parted", "last_landing")
     first, last = ({name: beyond(three, name) for name in names} for three in (rows[:3], rows[1:]))
     error = max(abs(first[name] / last[name] - 1) for name in names[:3] if np.isfinite(last[name]))

@@ -109,8 +109,8 @@ def resolve_impact(body, axis, velocity, turning, law, restitution):
         span = (impulse[2], impulse[2] + 1e6)
         options = {"method": "Radau", "rtol": 1e-10, "atol": 1e-13, "jac": jacobian_of_rate}
         run = solve_ivp(rate, span, impulse, events=events, **options)
-        least = min(matrix[2] @ rate(0.0, one) for one in run.y.T)
-        ends = [one[0] for one in run.y_events if len(one)]
+        least = min(matrix[2] @ rate(0.0, state) for state in run.y.T)
+        ends = [state[0] for state in run.y_events if len(state)]
         assert ends, "an impact without an end"
         return ends[0], least
 

@@ -230,18 +230,18 @@ def solver(scene, t0, state, t1, rtol, pole, first=None):
     return DOP853(rate, t0, state, t1, rtol=np.array((3e-14,) * 3 + (rtol,) * 5), atol=absolute, first_step=first)
 
 
-def crossing(gap, ends, run, again):
+def crossing(gap, ends, run, state_at):
     """First fall of `gap` through zero in the last step of `run`, or inf. Bracketed on the dense output, then
-    polished by integrating `again` from the step's start: the time is as accurate as the steps themselves."""
+    polished with `state_at`, which integrates anew from the start of the step: as accurate as the steps themselves."""
     dense, (times, piece) = run.dense_output(), np.linspace(run.t_old, run.t, SUBDIVISIONS + 1, retstep=True)
     values = [ends[0], *(gap(dense(t)) for t in times[1:-1]), ends[1]]
     k = next((k for k in range(1, SUBDIVISIONS + 1) if values[k] < -TOUCH), 0)
     if k == 0:
         return inf
     low, high = max(run.t_old, times[k - 1] - piece), min(run.t, times[k] + piece)
-    if gap(again(low)) <= 0.0 or gap(again(high)) >= 0.0:  # no more than a touch away from here
+    if gap(state_at(low)) <= 0.0 or gap(state_at(high)) >= 0.0:  # no more than a touch away from here
         return float(times[k])
-    return brentq(lambda t: gap(again(t)), low, high, xtol=1e-15, rtol=1e-15)
+    return brentq(lambda t: gap(state_at(t)), low, high, xtol=1e-15, rtol=1e-15)
 
 
 def follow(scene, t1, angle=0.95 * pi, rtol=1e-12, pole="x", closest=0.3):
@@ -253,7 +253,7 @@ def follow(scene, t1, angle=0.95 * pi, rtol=1e-12, pole="x", closest=0.3):
     if min(old) < -TOUCH:
         return names[int(old[0] >= -TOUCH)], 0.0, scene.theta, spare
 
-    def again(t):
+    def state_at(t):
         part = solver(scene, run.t_old, state, t, rtol, pole)
         while part.status == "running" and t > run.t_old:
             part.step()
@@ -266,14 +266,14 @@ def follow(scene, t1, angle=0.95 * pi, rtol=1e-12, pole="x", closest=0.3):
             return "failed", run.t, tilt(scene, state, pole), spare
         new = gaps(scene, angle, run.y, pole)
         times = [
-            crossing(lambda x, k=k, pole=pole: gaps(scene, angle, x, pole)[k], (old[k], new[k]), run, again)
+            crossing(lambda x, k=k, pole=pole: gaps(scene, angle, x, pole)[k], (old[k], new[k]), run, state_at)
             if min(old[k], new[k]) < NEAR[k]
             else inf
             for k in (0, 1)
         ]
         time = min(times)
         if time < inf:
-            return names[times.index(time)], time, tilt(scene, again(time), pole), spare
+            return names[times.index(time)], time, tilt(scene, state_at(time), pole), spare
         state, old, spare = run.y, new, np.minimum(spare, new)
         if sin(state[1]) < closest and run.status == "running":
             state, pole = best_chart(state, pole)

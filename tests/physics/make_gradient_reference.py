@@ -42,8 +42,8 @@ def roots_of(row: dict[str, str]) -> dict[str, Any]:
 
 def columns_of(rows: list[dict[str, str]]) -> dict[str, np.ndarray]:
     """Path of every number -> its values in the rows."""
-    given = [name for name in NUMBERS if rows[0].get(name)]
-    return {NUMBERS[name]: np.array([float(row[name]) for row in rows]) for name in given}
+    parameters = [name for name in NUMBERS if rows[0].get(name)]
+    return {NUMBERS[name]: np.array([float(row[name]) for row in rows]) for name in parameters}
 
 
 def times_of(row: dict[str, str], columns: dict[str, np.ndarray], t1: float) -> np.ndarray:
@@ -81,15 +81,15 @@ def derivatives(rows: list[dict[str, str]]) -> list[dict[str, Any]]:
             cells[path].append(np.outer(values, factors if path == moved else np.ones_like(factors)))
     spread = {path: np.stack(values).reshape(-1) for path, values in cells.items()}
     times = times_of(rows[0], spread, 8.0).reshape(len(MOVED), len(rows), len(factors))
-    found = []
+    derivative_rows = []
     for index, row in enumerate(rows):
         result = {name: row.get(name, "") for name in ("family", *NUMBERS)} | {"time": repr(float(times[0, index, 0]))}
         for number, (name, path) in enumerate(MOVED.items()):
             up, down = times[number, index, 1 : 1 + STEPS], times[number, index, 1 + STEPS :]
             slope, error = extrapolated((up - down) / (2.0 * shrunk * columns[path][index]))
             result |= {f"by_{name}": repr(float(slope)), f"error_{name}": f"{error / abs(slope):.1e}"}
-        found.append(result)
-    return found
+        derivative_rows.append(result)
+    return derivative_rows
 
 
 def spheres() -> list[dict[str, str]]:
@@ -117,7 +117,9 @@ if __name__ == "__main__":
     drawn = list(csv.DictReader((HERE / "inversion_reference.csv").read_text().splitlines()))
     drawn = [row for row in drawn if row["status"] == "inverted"] + spheres()
     families = dict.fromkeys(row["family"] for row in drawn)
-    written = [found for one in families for found in derivatives([row for row in drawn if row["family"] == one])]
+    written = [
+        result for family in families for result in derivatives([row for row in drawn if row["family"] == family])
+    ]
     with (HERE / "gradient_reference.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(written[0]))
         writer.writeheader()

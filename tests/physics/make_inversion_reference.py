@@ -95,10 +95,10 @@ def draw(rng, family):
     return Scene(**{name: five_digits(value) for name, value in values.items()})
 
 
-def difference(one, other):
+def difference(first, second):
     """Largest relative difference of the times and angles of two outcomes."""
-    times = 0.0 if one[1] == other[1] else abs(one[1] / other[1] - 1)
-    return max(times, abs(one[2] / other[2] - 1))
+    times = 0.0 if first[1] == second[1] else abs(first[1] / second[1] - 1)
+    return max(times, abs(first[2] / second[2] - 1))
 
 
 def judge(scene, wanted):

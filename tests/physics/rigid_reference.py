@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 UP = np.array((0.0, 0.0, 1.0))
 
@@ -22,6 +23,11 @@ def rotation(q):
     """The rotation matrix of a quaternion (scalar first) of any length."""
     s, v = q[0], q[1:]
     return np.eye(3) + 2.0 * (s * skew(v) + skew(v) @ skew(v)) / (q @ q)
+
+
+def quaternion(Q):
+    """A unit quaternion, scalar first, of a rotation matrix."""
+    return np.roll(Rotation.from_matrix(Q).as_quat(), 1)
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,7 @@ def instant(level: Level, vehicle: Vehicle, t: float, y: Array) -> Instant:
 
 def ride(level: Level, vehicle: Vehicle, start: Array, times: Array) -> tuple[Array, list[Instant]]:
     """States (times, 12) of a ride from (r, r', e, yaw rate, phi, phi') at time 0, and what is known at each."""
-    found = solve_ivp(
+    solution = solve_ivp(
         lambda t, y: instant(level, vehicle, t, y).rate,
         (0.0, times[-1]),
         start,
@@ -136,7 +136,7 @@ def ride(level: Level, vehicle: Vehicle, start: Array, times: Array) -> tuple[Ar
         rtol=1e-12,
         atol=1e-12,
     )
-    return found.y.T, [instant(level, vehicle, t, y) for t, y in zip(times, found.y.T, strict=True)]
+    return solution.y.T, [instant(level, vehicle, t, y) for t, y in zip(times, solution.y.T, strict=True)]
 
 
 def started(

@@ -87,11 +87,11 @@ def test_a_ball_comes_to_rest():
 @pytest.mark.slow
 def test_a_flat_graph_is_the_plane():
     """Rutstam's top at spins at which it hops: times and flights are those of the plane's closed forms."""
-    found = []
+    motions = []
     for surface in (tippe.Plane(), tippe.Graph(lambda x, y: 0.0 * x)):
         scene = tippe.Scene(rutstam_top(), surface, tippe.Viscous(0.3), contact="hybrid")
-        found.append(tippe.inversion_table(scene, theta=0.1, spin=[180.0, 200.0], t1=8.0, tolerance=1e-10))
-    plane, graph = found
+        motions.append(tippe.inversion_table(scene, theta=0.1, spin=[180.0, 200.0], t1=8.0, tolerance=1e-10))
+    plane, graph = motions
     assert plane.hops.min() > 0
     np.testing.assert_array_equal(graph.hops, plane.hops)
     np.testing.assert_array_equal(graph.status, plane.status)

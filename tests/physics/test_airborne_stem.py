@@ -82,8 +82,8 @@ def test_both_spheres_bounce_in_a_cylinder():
 def test_a_top_that_leans_ends_as_unresolved():
     """In a huge cylinder it rocks from sphere to sphere until both are at rest, when it would on the plane."""
     number = next(k for k, case in enumerate(ON_THE_PLANE) if case.theta == 2.4)
-    case, found = ON_THE_PLANE[number], FOUND_ON_THE_PLANE[number]
-    scene, leans = stem_scene(tippe.Cylinder(1e3), NONE_TO_SPEAK_OF), float(found["leans"])
+    case, expected = ON_THE_PLANE[number], FOUND_ON_THE_PLANE[number]
+    scene, leans = stem_scene(tippe.Cylinder(1e3), NONE_TO_SPEAK_OF), float(expected["leans"])
     # As in the test above, a place, a velocity and an angular velocity are given: the program is the same.
     launch = tippe.Launch(
         case.theta, case.spin, place=(0.0, 0.0, -1e3), velocity=(0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)
@@ -110,13 +110,13 @@ def test_a_batch_is_its_single_runs():
         return tippe.simulate(scene, tippe.Launch(theta, 180.0), 0.05, times, 1e-10)
 
     def seen(theta):
-        found = run(theta)
-        return found.theta, found.contact, found.stats["hops"]
+        outcome = run(theta)
+        return outcome.theta, outcome.contact, outcome.stats["hops"]
 
     batch = jax.jit(jax.vmap(seen))(jnp.array([0.1, 2.3]))
-    for theta, found, contact, hops in zip((0.1, 2.3), *batch, strict=True):
+    for theta, inclination, contact, hops in zip((0.1, 2.3), *batch, strict=True):
         single = run(theta)
-        assert_close(found, single.theta, atol=1e-8)
+        assert_close(inclination, single.theta, atol=1e-8)
         np.testing.assert_array_equal(contact, single.contact)
         assert hops == len(single.hops)
     assert set(np.asarray(batch[1]).ravel()) == {0, 1}
@@ -130,13 +130,13 @@ def test_both_spheres_bounce_in_a_bowl():
 @pytest.mark.slow
 def test_a_huge_cylinder_is_the_plane():
     """Tables: what differs falls as the curvature does, to 1e-7 of the times."""
-    given = {"theta": 0.1, "spin": [180.0, 190.0], "t1": 1.6, "tolerance": 1e-11}
+    arguments = {"theta": 0.1, "spin": [180.0, 190.0], "t1": 1.6, "tolerance": 1e-11}
     friction, errors = tippe.Coulomb(0.3, 0.05), []
-    plane = tippe.inversion_table(tippe.Scene(TOP, friction=friction, contact="hybrid"), **given)
+    plane = tippe.inversion_table(tippe.Scene(TOP, friction=friction, contact="hybrid"), **arguments)
     assert (plane.status == "inverted").any()
     for radius in (1e3, 1e4):
         scene = tippe.Scene(TOP, tippe.Cylinder(radius), friction, contact="hybrid")
-        table = tippe.inversion_table(scene, **given)
+        table = tippe.inversion_table(scene, **arguments)
         np.testing.assert_array_equal(table.status, plane.status)
         errors.append(np.abs(table.end_theta - plane.end_theta).max() + np.abs(table.end_time - plane.end_time).max())
     assert errors[1] < 0.2 * errors[0]
@@ -146,18 +146,20 @@ def test_a_huge_cylinder_is_the_plane():
 @pytest.mark.slow
 def test_slopes_go_through_the_blows_of_both():
     """Derivatives of inversion times in a cylinder, against central differences."""
-    given = {"theta": 2.3, "angle": 2.7, "t1": 0.7, "progress": False}
+    arguments = {"theta": 2.3, "angle": 2.7, "t1": 0.7, "progress": False}
     scene = tippe.Scene(TOP, tippe.Cylinder(0.3), tippe.Coulomb(0.3, 0.05), contact="hybrid", restitution=0.2)
-    table = tippe.inversion_table(scene, spin=[180.0, 200.0], tolerance=1e-11, sensitivities=["spin", "mu"], **given)
+    table = tippe.inversion_table(
+        scene, spin=[180.0, 200.0], tolerance=1e-11, sensitivities=["spin", "mu"], **arguments
+    )
     assert (table.status == "inverted").all()
     assert (table.hops > 0).all()
     assert (table.grazes == 0).all()
     step, other = 2e-3, 3e-6
     spins = [spin + d for spin in (180.0, 200.0) for d in (-step, step)]
-    time = tippe.inversion_table(scene, spin=spins, tolerance=1e-12, **given).time.reshape(2, 2)
+    time = tippe.inversion_table(scene, spin=spins, tolerance=1e-12, **arguments).time.reshape(2, 2)
     assert_close(table.time_by_spin, np.diff(time, axis=1)[:, 0] / (2.0 * step), rtol=1e-5)
     mus = [0.3 - other, 0.3 + other]
-    time = tippe.inversion_table(scene, spin=[180.0, 200.0], mu=mus, tolerance=1e-12, **given).time
+    time = tippe.inversion_table(scene, spin=[180.0, 200.0], mu=mus, tolerance=1e-12, **arguments).time
     assert_close(table.time_by_mu, np.diff(time.reshape(2, 2), axis=0)[0] / (2.0 * other), rtol=1e-4)
 
 

@@ -148,23 +148,23 @@ def test_what_changes_and_what_stays(name):
     scene, where, state = Start.at_random(ARENAS[name], body, law)
     motion = scene.dynamics.motion(state)
     rates = (scene.field(state), scene.frame.cyclic_rate(where[1], motion.velocity, motion.turning))
-    found, rate = jax.jvp(lambda *both: seen(scene, *both), (state, where[1]), rates)
+    quantities, rate = jax.jvp(lambda *both: seen(scene, *both), (state, where[1]), rates)
     rubs, balls = by_lanes(1, 0, 0) > 0, by_lanes(0, 0, 1) > 0
 
-    assert_close(rate.place, found.velocity, atol=1e-12)
-    assert_close(inner(rate.axis, found.axis), 0.0, atol=1e-10)
+    assert_close(rate.place, quantities.velocity, atol=1e-12)
+    assert_close(inner(rate.axis, quantities.axis), 0.0, atol=1e-10)
     power = np.asarray(scene.friction_power(state))
-    assert_close(rate.energy, power, atol=1e-11 * np.max(np.abs(found.energy)))
+    assert_close(rate.energy, power, atol=1e-11 * np.max(np.abs(quantities.energy)))
     assert np.all((power * np.sign(motion.normal_force) < 0.0) == rubs)
 
     torque = motion.normal_force * in_space(scene, where, motion.friction.torque)
-    by_turning = RADIUS * inner(found.momentum, rate.normal)
+    by_turning = RADIUS * inner(quantities.momentum, rate.normal)
     assert name.endswith("plane") == bool(np.all(by_turning == 0.0))
-    by_torque = inner(torque, body.offset * found.axis - RADIUS * found.normal)
+    by_torque = inner(torque, body.offset * quantities.axis - RADIUS * quantities.normal)
     assert np.all((by_torque != 0.0) == rubs)
-    assert_close(rate.jellett, by_turning - by_torque, atol=1e-11 * np.max(np.abs(found.jellett)))
+    assert_close(rate.jellett, by_turning - by_torque, atol=1e-11 * np.max(np.abs(quantities.jellett)))
 
-    s, bend, own = (np.asarray(part) for part in (found.place, rate.velocity, rate.momentum[2]))
+    s, bend, own = (np.asarray(part) for part in (quantities.place, rate.velocity, rate.momentum[2]))
     size = 0.02 * np.max(np.abs(s)) * (9.81 + np.max(np.abs(bend)))
     orbital = 0.02 * (s[0] * bend[1] - s[1] * bend[0])
     mode_segments = np.max(np.abs(orbital + own)[~rubs]) < 1e-12 * size

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from arena_reference import SAMPLES, cases, recorded
 from close import assert_close
-from hypothesis import given, settings
-from hypothesis import strategies as some
+from hypothesis import given, settings, strategies
 from make_gradient_reference import extrapolated
 from tops import rutstam_top
 
@@ -82,9 +81,9 @@ def test_clairauts_constant_of_a_whole_motion():
     scene = scene_on(Ground(bowl=1.0 / 0.3), mu=0.0)
     run = tippe.simulate(scene, launched((0.1, -0.06), (0.2, 0.3), (4.0, -6.0, 2.0), 0.6), 2.0, tolerance=1e-11)
     assert run.status == "completed"
-    found = moments(run)
+    values = moments(run)
     assert np.ptp(run.position, axis=0).min() > 0.01
-    assert_close(found, found[0], atol=1e-9 * np.max(np.abs(found)))
+    assert_close(values, values[0], atol=1e-9 * np.max(np.abs(values)))
     assert_close(run.energy, run.energy[0], rtol=1e-9)
 
 
@@ -157,7 +156,7 @@ def test_a_table_says_where_the_ball_no_longer_fits():
 
 
 @settings(max_examples=12, deadline=None, derandomize=True)
-@given(some.integers(0, 2**32 - 1))
+@given(strategies.integers(0, 2**32 - 1))
 def test_on_random_ground_energy_never_grows(seed):
     """Finite or flagged; what energy is lost friction has taken."""
     random = np.random.default_rng(seed)
@@ -209,12 +208,12 @@ def test_derivatives_of_the_forces_by_ground_friction_and_launch():
 
     @jax.jit
     def forces(*values):
-        made = with_numbers(roots, dict(zip(NUMBERS, values, strict=True)))
-        state = made["scene"].state(made["launch"])
-        return jnp.append(made["scene"].field(state), made["scene"].normal_force(state))
+        copies = with_numbers(roots, dict(zip(NUMBERS, values, strict=True)))
+        state = copies["scene"].state(copies["launch"])
+        return jnp.append(copies["scene"].field(state), copies["scene"].normal_force(state))
 
     at = tuple(NUMBERS.values())
-    found = np.stack(jax.jit(jax.jacfwd(forces, tuple(range(len(at)))))(*at))
+    jacobian = np.stack(jax.jit(jax.jacfwd(forces, tuple(range(len(at)))))(*at))
     for k, value in enumerate(at):
 
         def difference(step, k=k):
@@ -223,8 +222,8 @@ def test_derivatives_of_the_forces_by_ground_friction_and_launch():
 
         steps = 1e-2 * value / 1.6 ** np.arange(8)
         differences = np.stack([difference(step) for step in steps])
-        expected, error = np.transpose([extrapolated(one) for one in differences.T])
+        expected, error = np.transpose([extrapolated(column) for column in differences.T])
         size = np.max(np.abs(expected))
         assert size > 1e-3
-        assert_close(found[k], expected, atol=1e-9 * size)
+        assert_close(jacobian[k], expected, atol=1e-9 * size)
         assert np.max(error) < 1e-9 * size

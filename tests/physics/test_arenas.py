@@ -52,8 +52,8 @@ def scene_of(case, place):
     """Scene and launch of a case."""
     surface, side = surface_of(case)
     scene = tippe.Scene(rutstam_top(), surface, AnyLaw(case.mu, case.slip_speed), side=side)
-    given = {"place": place, "velocity": (case.v1, case.v2), "angular_velocity": (case.w1, case.w2, case.w3)}
-    return scene, tippe.Launch(case.theta, case.spin, azimuth=case.azimuth, **given)
+    arguments = {"place": place, "velocity": (case.v1, case.v2), "angular_velocity": (case.w1, case.w2, case.w3)}
+    return scene, tippe.Launch(case.theta, case.spin, azimuth=case.azimuth, **arguments)
 
 
 @pytest.mark.slow
@@ -104,7 +104,7 @@ OWN = {
 SLOWER = ("plane", "cylinder", "outside of a sphere")
 
 
-@pytest.mark.parametrize("name", [pytest.param(one, marks=[pytest.mark.slow] * (one in SLOWER)) for one in OWN])
+@pytest.mark.parametrize("name", [pytest.param(arena, marks=[pytest.mark.slow] * (arena in SLOWER)) for arena in OWN])
 def test_the_forms_of_their_own_move_as_the_general_one(name):
     """The same launch under both equations for 0.3 s: axis and centre in the fixed frame, and the spin."""
     surface, side, place = OWN[name]
@@ -116,7 +116,7 @@ def test_the_forms_of_their_own_move_as_the_general_one(name):
     centre, normal = scene.frame.position(own_place, own_path), axes[2]
     foot = tuple(c - scene.body.radius * n for c, n in zip(centre, normal, strict=True))
     first = (*surface.in_own_axes(foot), *surface.in_own_axes(axes[0]))
-    found = []
+    motions = []
     for frame, start, path in ((scene.frame, own_place, own_path), (general, first, ())):
         dynamics = Dynamics.of(scene.body, frame, scene.friction, scene.gravity)
         size = 8 + len(start)
@@ -134,8 +134,8 @@ def test_the_forms_of_their_own_move_as_the_general_one(name):
         where = (tuple(y[8:size]), tuple(y[size:]))
         axes = np.array(frame.axes(*map(lambda part: tuple(map(jnp.asarray, part)), where)), dtype=float)
         centre = np.array(frame.position(*map(lambda part: tuple(map(jnp.asarray, part)), where)), dtype=float)
-        found.append(np.concatenate([y[2:5] @ axes, centre, y[5:8] @ axes / float(scene.body.I3 * 100.0)]))
-    assert_close(found[0], found[1], atol=1e-10)
+        motions.append(np.concatenate([y[2:5] @ axes, centre, y[5:8] @ axes / float(scene.body.I3 * 100.0)]))
+    assert_close(motions[0], motions[1], atol=1e-10)
 
 
 def test_what_an_arena_does_not_have_is_refused():

@@ -34,13 +34,13 @@ def by_support(body: tippe.SpheroidBody) -> tippe.ConvexBody:
     return tippe.ConvexBody(body.mass, lambda c: jnp.sqrt(square + excess * c * c) - offset * c, body.I1, body.I3)
 
 
-def same_motion(one: tippe.Scene, other: tippe.Scene) -> None:
+def same_motion(first: tippe.Scene, second: tippe.Scene) -> None:
     """Whether two scenes give the same rates, forces, energies and Jellett's quantities at 50 states."""
-    states = random_states(one, 50)
+    states = random_states(first, 50)
     for name in ("field", "normal_force", "slip_velocity", "energy", "jellett"):
-        expected = np.atleast_2d(getattr(one, name)(states))
+        expected = np.atleast_2d(getattr(first, name)(states))
         size = np.abs(expected).max(axis=1, keepdims=True)
-        assert_close(getattr(other, name)(states) / size, expected / size, atol=1e-12)
+        assert_close(getattr(second, name)(states) / size, expected / size, atol=1e-12)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
@@ -60,9 +60,9 @@ def test_a_spheroid_tends_to_the_sphere():
     for change in (1e-5, 1e-6):
         body = egg(0.02 * (1.0 + change), 0.004)
         top = tippe.Top(body.mass, 0.02, 0.004, body.I1, body.I3)
-        scenes = [tippe.Scene(one, friction=LAWS["coulomb"]) for one in (body, top)]
+        scenes = [tippe.Scene(shape, friction=LAWS["coulomb"]) for shape in (body, top)]
         states = random_states(scenes[0], 50)
-        off.append(np.abs(np.subtract(*(np.asarray(one.normal_force(states)) for one in scenes))).max())
+        off.append(np.abs(np.subtract(*(np.asarray(scene.normal_force(states)) for scene in scenes))).max())
     assert 9.0 < off[0] / off[1] < 11.0
 
 
@@ -88,9 +88,9 @@ def test_rates_of_energy_and_jellett_at_random_states(law, tilt):
     r = jnp.stack(lever.contact(tuple(e)))
     expected = -lever.growth * rates[4] * (motion.spin_momentum - e[2] * L[2])
     expected -= motion.normal_force * jnp.sum(torque * r, axis=0)
-    found = jax.jvp(scene.jellett, (states,), (rates,))[1]
+    rate = jax.jvp(scene.jellett, (states,), (rates,))[1]
     size = float(scene.body.size * scene.body.I3) * 1e4
-    assert_close(found / size, expected / size, atol=1e-13)
+    assert_close(rate / size, expected / size, atol=1e-13)
     if law == "frictionless":
         axial = jnp.sum(rates[2:5] * L + e * rates[5:8], axis=0)
         assert_close(axial / 1e-2, 0.0, atol=1e-12)
@@ -117,14 +117,14 @@ def run() -> tippe.Trajectory:
 def test_an_independent_program_sees_the_same_motion(run):
     """Newton-Euler with a multiplier: centre of mass, rotation, velocities and N to 1e-8."""
     times = np.linspace(0.05, 0.15, 3)
-    found, expected = run.at(times), REFERENCE.run(REFERENCE.start(**START, turning=TURNING, velocity=VELOCITY), times)
-    assert_close(found.position, expected[:, :3], atol=1e-9)
-    assert_close(found.velocity, expected[:, 3:6], atol=1e-8)
-    assert_close(found.rotation, expected[:, 6:15].reshape(-1, 3, 3), atol=1e-8)
-    assert_close(found.angular_velocity, expected[:, 15:18], atol=1e-6)
+    motion, expected = run.at(times), REFERENCE.run(REFERENCE.start(**START, turning=TURNING, velocity=VELOCITY), times)
+    assert_close(motion.position, expected[:, :3], atol=1e-9)
+    assert_close(motion.velocity, expected[:, 3:6], atol=1e-8)
+    assert_close(motion.rotation, expected[:, 6:15].reshape(-1, 3, 3), atol=1e-8)
+    assert_close(motion.angular_velocity, expected[:, 15:18], atol=1e-6)
     _, N, r = zip(*map(REFERENCE.motion, expected), strict=True)
-    assert_close(found.normal_force, N, atol=1e-8)
-    assert_close(found.contact, expected[:, :3] + np.array(r), atol=1e-9)
+    assert_close(motion.normal_force, N, atol=1e-8)
+    assert_close(motion.contact, expected[:, :3] + np.array(r), atol=1e-9)
     assert np.ptp(run.normal_force) > 0.02
 
 
@@ -254,8 +254,8 @@ def test_rising_times_of_fast_eggs():
     body = egg()
     scene, off = tippe.Scene(body, friction=tippe.Viscous(0.3)), []
     for spin in (100.0, 140.0, 200.0):
-        found = tippe.inversion_time(scene, balanced(body, spin, 0.1), 5.0, tolerance=1e-8)
-        off.append(float(found) / slow_rise(body, lambda v: -0.3 * v, spin, 0.1, 0.95 * math.pi) - 1.0)
+        time = tippe.inversion_time(scene, balanced(body, spin, 0.1), 5.0, tolerance=1e-8)
+        off.append(float(time) / slow_rise(body, lambda v: -0.3 * v, spin, 0.1, 0.95 * math.pi) - 1.0)
     assert 0.0 < off[2] < off[1] < off[0] < 0.025
     assert off[2] < 0.006
     assert tippe.simulate(scene, balanced(body, 280.0, 0.1), 5.0, tolerance=1e-8).status == "contact_lost"
@@ -272,8 +272,8 @@ def test_derivatives_of_rising_times(make):
         return tippe.inversion_time(tippe.Scene(body, friction=tippe.Viscous(mu)), launch, 3.0, 2.6, 1e-11)
 
     at = (jnp.asarray(0.028), jnp.asarray(0.3), jnp.asarray(140.0))
-    found = jax.grad(time, argnums=(0, 1, 2))(*at)
+    gradient = jax.grad(time, argnums=(0, 1, 2))(*at)
     for k in range(3):
         sides = [time(*at[:k], at[k] * (1.0 + step), *at[k + 1 :]) for step in (1e-5, -1e-5)]
         difference = (sides[0] - sides[1]) / (2e-5 * at[k])
-        assert_close(found[k], difference, rtol=1e-5)
+        assert_close(gradient[k], difference, rtol=1e-5)

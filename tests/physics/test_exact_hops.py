@@ -75,16 +75,16 @@ def check_against_reference(run: tippe.HybridTrajectory, arena: float | None) ->
     expected = follow(body, start(body, THETA, SPIN), T1, restitution)
     kinds = {"slipping": SLIPPING, "rolling": ROLLING, "flying": FLYING}
     # The reference follows the beginning of a slip by another method, and has no bounces that are too short to see.
-    events = [one for k, one in enumerate(expected[1:]) if one.kind != expected[k].kind]
+    events = [event for k, event in enumerate(expected[1:]) if event.kind != expected[k].kind]
     mode_segments = run.dense.mode_segments
     numbers = [piece.number for piece in mode_segments]
-    assert numbers == [kinds[one.kind] for one in (expected[0], *events)]
+    assert numbers == [kinds[event.kind] for event in (expected[0], *events)]
     begins = {piece.begin if piece.number != SLIPPING else None for piece in mode_segments[1:]} - {None}
-    for before, one in zip(expected, expected[1:], strict=False):
-        if one.kind not in ("slipping", before.kind):
+    for before, event in zip(expected, expected[1:], strict=False):
+        if event.kind not in ("slipping", before.kind):
             # A slip is stopped where the way that is left is within the tolerance, earlier by its speed over its deceleration.
-            early = 1e-6 if (before.kind, one.kind) == ("slipping", "rolling") else 2e-9
-            assert min(abs(one.begin - time) for time in begins) < early
+            early = 1e-6 if (before.kind, event.kind) == ("slipping", "rolling") else 2e-9
+            assert min(abs(event.begin - time) for time in begins) < early
     assert_close(run.axis[-1], expected[-1].state[:3], atol=2e-8)
     assert_close(run.position[-1] - run.position[0], expected[-1].state[9:] - start(body, THETA, SPIN)[9:], atol=1e-9)
     assert_close(run.spin[-1], expected[-1].state[6:9] @ expected[-1].state[:3], rtol=1e-8)

@@ -40,10 +40,10 @@ def test_landings_by_brute_force():
     values = np.asarray(jax.jit(lambda d, t: d.value(t))(descent, time))
     assert np.max(np.abs(values)) < 1e-15
     for i in range(300):
-        one = [float(number[i]) for number in descent]
+        coefficients = [float(number[i]) for number in descent]
 
-        def value(t, one=one):
-            start, speed, gravity, rate, cosine, sine = one
+        def value(t, coefficients=coefficients):
+            start, speed, gravity, rate, cosine, sine = coefficients
             swing = cosine * (1.0 - np.cos(rate * t)) + sine * (rate * t - np.sin(rate * t))
             return start + speed * t - gravity * t * t / 2.0 - swing
 
@@ -57,11 +57,11 @@ def test_a_flight_that_begins_with_the_third_power_of_time():
     """From N = 0 the distance is c (W t)^3 / 6 - g t^2 (W t)^2 / 24 at first: a graze of 1e-9 m and its landing are seen."""
     rate, gravity = 200.0, 9.81
     slopes = -(10.0 ** np.linspace(-7.0, -5.0, 300))
-    one = np.ones(300)
+    ones = np.ones(300)
     descent = Descent(
-        *map(jnp.asarray, (0 * one, 0 * one, gravity * one, rate * one, -gravity / rate**2 * one, slopes))
+        *map(jnp.asarray, (0 * ones, 0 * ones, gravity * ones, rate * ones, -gravity / rate**2 * ones, slopes))
     )
-    time, lost = search(descent, jnp.asarray(one))
+    time, lost = search(descent, jnp.asarray(ones))
     assert not np.asarray(lost).any()
     first_order = 4.0 * -slopes * rate / gravity
     assert_close(time, first_order, rtol=2e-2)
@@ -81,9 +81,9 @@ def test_flight_is_the_free_motion():
         cos_angle = cone(body, free).along[2] + 0.01
         reached = angle_reached(body, free, cos_angle, 0.5 * jnp.ones(6), last)
         assert np.isfinite(reached).all()
-        there, onwards = jax.jvp(lambda t: flown(body, 9.81, free, t).axis[2], (reached,), (jnp.ones(6),))
-        assert_close(there, cos_angle, atol=1e-12)
-        assert np.all(onwards < 0.0)
+        height, height_rate = jax.jvp(lambda t: flown(body, 9.81, free, t).axis[2], (reached,), (jnp.ones(6),))
+        assert_close(height, cos_angle, atol=1e-12)
+        assert np.all(height_rate < 0.0)
 
 
 # Impact
@@ -119,11 +119,11 @@ def test_impacts(slip_speed):
     assert full[:40].all()
     assert full.sum() > 50
     assert np.all((rebound <= restitution * approach + 1e-12) & (full | (np.abs(lost) < 1e-9)))
-    before, found = state_of(body, free), state_of(body, after)
+    before, end_state = state_of(body, free), state_of(body, after)
     for i in np.flatnonzero(full)[::6]:
-        one = Case(**{**case.__dict__, "restitution": float(restitution[i])})
-        expected, _ = reference_impact(one, before[:, i], (0.006, 0.02))
-        assert_close(found[:, i], expected, rtol=1e-9, atol=1e-9)
+        single_case = Case(**{**case.__dict__, "restitution": float(restitution[i])})
+        expected, _ = reference_impact(single_case, before[:, i], (0.006, 0.02))
+        assert_close(end_state[:, i], expected, rtol=1e-9, atol=1e-9)
 
 
 def state_of(body: tippe.Top, free: FreeBody) -> np.ndarray:

@@ -22,9 +22,11 @@ def relative_errors(family: str, tolerance: float) -> np.ndarray:
     names = list(MOVED.values())
     options = {"count": len(rows), "size": len(rows), "last": False}
     settings = Settings(tolerance, Oscillatory8())
-    _, found, _ = sensitivities_of_cells(roots_of(rows[0]), columns_of(rows), names, ANGLE, 8.0, settings, **options)
+    _, derivatives, _ = sensitivities_of_cells(
+        roots_of(rows[0]), columns_of(rows), names, ANGLE, 8.0, settings, **options
+    )
     expected = np.array([[float(row[f"by_{name}"]) for row in rows] for name in MOVED])
-    return np.abs(np.stack(list(found.values())) / expected - 1.0)
+    return np.abs(np.stack(list(derivatives.values())) / expected - 1.0)
 
 
 @pytest.mark.parametrize(
@@ -32,8 +34,8 @@ def relative_errors(family: str, tolerance: float) -> np.ndarray:
     [
         pytest.param("plane-viscous", marks=pytest.mark.newest),
         *(
-            pytest.param(one, marks=pytest.mark.slow)
-            for one in ("cylinder-Coulomb", "plane-Coulomb", "cylinder-viscous", "sphere-viscous")
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("cylinder-Coulomb", "plane-Coulomb", "cylinder-viscous", "sphere-viscous")
         ),
     ],
 )

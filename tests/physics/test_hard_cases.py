@@ -32,8 +32,8 @@ ROWS = [
 )
 @pytest.mark.parametrize("row", ROWS)
 def test_the_row_keeps_its_bound(row):
-    found = row()
-    assert found.ok, found
+    entry = row()
+    assert entry.ok, entry
 
 
 @pytest.mark.parametrize(("error", "status"), [(0.5, 0), (2.0, 1), (math.nan, 1), (math.inf, 1)])

@@ -26,9 +26,9 @@ def thrown(surface: tippe.Graph | tippe.Spheroid | tippe.Paraboloid, launch: tip
 
 def flown(run, time: float):
     """The path of the sphere's centre in the flight that is under way at a time [s], in closed form."""
-    there = run.at([time])
-    e, L = (np.asarray(part)[0] for part in (there.axis, there.angular_momentum))
-    centre, u = (np.asarray(part)[0] for part in (there.position, there.velocity))
+    sample = run.at([time])
+    e, L = (np.asarray(part)[0] for part in (sample.axis, sample.angular_momentum))
+    centre, u = (np.asarray(part)[0] for part in (sample.position, sample.velocity))
     rate = np.linalg.norm(L) / I1
     direction = L / np.linalg.norm(L)
     along, ahead = (direction @ e) * direction, np.cross(direction, e)

@@ -35,8 +35,8 @@ def scene_of(case: Case, restitution: float | None = None) -> tippe.Scene:
         disc = tippe.Contensou(case.mu, case.contact_radius, case.slip_speed)
         friction = tippe.Rolling(case.resistance, case.turning_speed, disc)
     top = tippe.Top(case.mass, case.radius, case.offset, case.I1, case.I3, stem)
-    given = case.restitution if restitution is None else restitution
-    return tippe.Scene(top, tippe.Plane(), friction, case.gravity, contact="hybrid", restitution=given)
+    coefficient = case.restitution if restitution is None else restitution
+    return tippe.Scene(top, tippe.Plane(), friction, case.gravity, contact="hybrid", restitution=coefficient)
 
 
 def check_against_reference(table: tippe.Table, place: tuple[int, ...], expected: dict[str, str]) -> None:
@@ -89,9 +89,9 @@ def test_coulomb_hops_and_the_stem(number):
 @pytest.mark.slow
 def test_the_reference_is_what_its_program_writes():
     for number in (5, 7):
-        found = row(CASES[number])
-        assert_close(found["time"], float(REFERENCE[number]["time"]), rtol=1e-9)
-        assert found["flights"] == float(REFERENCE[number]["flights"])
+        entry = row(CASES[number])
+        assert_close(entry["time"], float(REFERENCE[number]["time"]), rtol=1e-9)
+        assert entry["flights"] == float(REFERENCE[number]["flights"])
 
 
 @pytest.mark.slow
@@ -170,19 +170,19 @@ def test_energy_falls_and_jellett_stays_through_hops(ride):
 
 def test_a_ride_at_other_times_is_the_same(ride):
     ends = np.sort(ride.hops.ravel())
-    some, middles = ride.t[::7], ride.hops.mean(axis=1)
-    times = np.unique(np.concatenate([some, middles, ends, ends + 1e-9]))
-    again = ride.at(times)
+    sampled_times, middles = ride.t[::7], ride.hops.mean(axis=1)
+    times = np.unique(np.concatenate([sampled_times, middles, ends, ends + 1e-9]))
+    samples = ride.at(times)
 
     def places(of):
         return np.searchsorted(times, of)
 
     for name in ("theta", "energy", "spin_angle"):
-        assert_close(getattr(again, name)[places(some)], getattr(ride, name)[::7], rtol=1e-12, atol=1e-12)
-    assert np.all(again.contact[places(middles)] == -1)
+        assert_close(getattr(samples, name)[places(sampled_times)], getattr(ride, name)[::7], rtol=1e-12, atol=1e-12)
+    assert np.all(samples.contact[places(middles)] == -1)
     # Positions are continuous, also where velocities are not.
     for name, atol in (("position", 1e-8), ("rotation", 1e-6)):
-        shown = getattr(again, name)
+        shown = getattr(samples, name)
         assert_close(shown[places(ends + 1e-9)], shown[places(ends)], atol=atol)
     assert "flights" in str(ride)
     with pytest.raises(ValueError, match=r"must be at most .* \(the run ends there\)"):
@@ -193,8 +193,8 @@ def test_the_rotation_goes_with_the_angular_velocity(ride):
     """In a flight, on the sphere and on the stem: R' = w x R."""
     small, moments = 1e-6, []
     for number in (-1, 0, 1):
-        here = np.flatnonzero((ride.contact[1:] == number) & (ride.contact[:-1] == number))
-        longest = here[np.argmax(np.diff(ride.t)[here])]
+        steps = np.flatnonzero((ride.contact[1:] == number) & (ride.contact[:-1] == number))
+        longest = steps[np.argmax(np.diff(ride.t)[steps])]
         moments.append(ride.t[longest : longest + 2].mean())
     run = ride.at(np.add.outer(sorted(moments), [-small, 0.0, small]).ravel())
     rotation = np.asarray(run.rotation).reshape(3, 3, 3, 3)

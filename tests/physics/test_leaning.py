@@ -188,15 +188,15 @@ def test_a_top_leans_and_falls_back(ride):
     assert_close(piece.end, leans.t[-1], atol=5e-8)
     assert len(leans.t_events[1]) == 1
     own, other = case.balls
-    again = watched(lambda y: gap(other, y) + 1e-12, -1.0)
+    return_event = watched(lambda y: gap(other, y) + 1e-12, -1.0)
     to = (leans.t[-1], leans.t[-1] + 0.5)
-    stands = solve_ivp(lambda _, y: rate(case, y, [own]), to, leans.y[:, -1], events=again, **options)
+    stands = solve_ivp(lambda _, y: rate(case, y, [own]), to, leans.y[:, -1], events=return_event, **options)
     assert stands.t[-1] == to[1]
-    there = ride.at([to[1]])
-    assert there.contact.tolist() == [0]
-    found = states_of_the_reference(ride.scene, there.states)[:, 0]
-    assert_close(found[2:9], stands.y[2:9, -1], atol=1e-8)
-    assert_close(found[9:], stands.y[9:, -1], atol=1e-6)
+    sample = ride.at([to[1]])
+    assert sample.contact.tolist() == [0]
+    reference_states = states_of_the_reference(ride.scene, sample.states)[:, 0]
+    assert_close(reference_states[2:9], stands.y[2:9, -1], atol=1e-8)
+    assert_close(reference_states[9:], stands.y[9:, -1], atol=1e-6)
 
 
 @pytest.mark.slow

@@ -62,9 +62,9 @@ def test_the_eigenvalues_of_the_benchmark_bicycle(bicycle, speed):
     assert_close(acceleration, 0.0, atol=1e-12)
     tangent = null_space(held)
     assert tangent.shape == (18, 10)
-    found = np.linalg.eigvals(np.linalg.lstsq(tangent, motion @ tangent)[0])
+    eigenvalues = np.linalg.eigvals(np.linalg.lstsq(tangent, motion @ tangent)[0])
     for eigenvalue in EIGENVALUES[speed]:
-        assert np.min(np.abs(found - eigenvalue)) < 1e-9
+        assert np.min(np.abs(eigenvalues - eigenvalue)) < 1e-9
 
 
 class Disc2D(AbstractMode):

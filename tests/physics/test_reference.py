@@ -17,7 +17,7 @@ FAMILIES = sorted({row["family"] for row in ROWS})
 
 def computed(rows: list[dict[str, str]]) -> list[tippe.Table]:
     """Every row by `inversion_table` at tolerance 1e-10; the scenes differ in numbers only, so one program serves."""
-    found = []
+    times = []
     for row in rows:
         number = {name: float(value) for name, value in row.items() if name not in ("family", "status") and value}
         arena = tippe.Cylinder(number["surface_radius"]) if "surface_radius" in number else tippe.Plane()
@@ -27,8 +27,8 @@ def computed(rows: list[dict[str, str]]) -> list[tippe.Table]:
         top = tippe.Top(*(number[name] for name in ("mass", "radius", "offset", "I1", "I3")))
         launch = {name: number[name] for name in ("theta", "spin", "eta", "azimuth")}
         scene = tippe.Scene(top, arena, law, number["gravity"])
-        found.append(tippe.inversion_table(scene, t1=number["t1"], tolerance=1e-10, **launch))
-    return found
+        times.append(tippe.inversion_table(scene, t1=number["t1"], tolerance=1e-10, **launch))
+    return times
 
 
 @pytest.mark.parametrize("family", FAMILIES)

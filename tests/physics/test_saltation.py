@@ -17,14 +17,14 @@ def test_a_table_through_flights_and_impacts():
 
     The steps are from the middle of a range over which the differences agree.
     """
-    scene, given = scene_of(CASES[0], 0.1), {"theta": 0.1, "t1": 20.0, "angle": 1.9, "progress": False}
+    scene, arguments = scene_of(CASES[0], 0.1), {"theta": 0.1, "t1": 20.0, "angle": 1.9, "progress": False}
     step, other, bounces = 1e-3, 1e-5, np.array([0.2, 0.3])
     # As many cells and the same axes as in `test_hops`: the programs are those.
     spins, axes = [200.0 - step, 200.0 + step], {"scene.restitution": [b + d for b in bounces for d in (-other, other)]}
-    around = tippe.inversion_table(scene, spin=spins, axes=axes, tolerance=1e-11, **given)
+    around = tippe.inversion_table(scene, spin=spins, axes=axes, tolerance=1e-11, **arguments)
     time = around.time.reshape(2, 2, 2)
-    given |= {"spin": [200.0], "axes": {"scene.restitution": list(bounces)}, "solver": diffrax.Tsit5()}
-    table = tippe.inversion_table(scene, tolerance=1e-9, sensitivities=["spin", "restitution"], **given)
+    arguments |= {"spin": [200.0], "axes": {"scene.restitution": list(bounces)}, "solver": diffrax.Tsit5()}
+    table = tippe.inversion_table(scene, tolerance=1e-9, sensitivities=["spin", "restitution"], **arguments)
     assert (table.status == "inverted").all()
     assert (table.hops > 20).all()
     assert (table.grazes == 0).all()
@@ -34,21 +34,21 @@ def test_a_table_through_flights_and_impacts():
 
 def scanned(function, at, steps):
     """Central differences, each extrapolated from two steps: the one that differs least from that of the next step."""
-    found = []
+    estimates = []
     for step in steps:
         ends = [np.asarray(function(at + k * step)) for k in (-2, -1, 1, 2)]
-        found.append((8.0 * (ends[2] - ends[1]) - (ends[3] - ends[0])) / (12.0 * step))
-    found = np.array(found)
-    best = np.argmin(np.abs(np.diff(found, axis=0)), axis=0)
-    return np.take_along_axis(found, best[None], axis=0)[0]
+        estimates.append((8.0 * (ends[2] - ends[1]) - (ends[3] - ends[0])) / (12.0 * step))
+    estimates = np.array(estimates)
+    best = np.argmin(np.abs(np.diff(estimates, axis=0)), axis=0)
+    return np.take_along_axis(estimates, best[None], axis=0)[0]
 
 
-def differences(scene, variable, at, step, **given):
+def differences(scene, variable, at, step, **arguments):
     """Central differences of an inversion time by one number, for that step and four more, each a tenth of the last."""
     steps = step * 0.1 ** np.arange(5)
     points = at + np.outer(steps, (-2, -1, 1, 2)).ravel()
-    given |= {"axes": {"scene.friction.mu": points}} if variable == "mu" else {variable: points}
-    t = tippe.inversion_table(scene, tolerance=1e-12, progress=False, **given).time.reshape(-1, 4).T
+    arguments |= {"axes": {"scene.friction.mu": points}} if variable == "mu" else {variable: points}
+    t = tippe.inversion_table(scene, tolerance=1e-12, progress=False, **arguments).time.reshape(-1, 4).T
     return (8.0 * (t[2] - t[1]) - (t[3] - t[0])) / (12.0 * steps)
 
 
@@ -57,16 +57,16 @@ def differences(scene, variable, at, step, **given):
 def test_a_time_through_sticks_and_slips(theta, spin, sticks):
     """Tops in a cylinder that stick and slip until they reach 0.4 rad: the slopes by friction and by the launch."""
     scene = tippe.Scene(rutstam_top(), tippe.Cylinder(0.2), tippe.SetValuedCoulomb(0.1))
-    given = {"theta": theta, "spin": [spin], "t1": 8.0, "angle": 0.4}
+    arguments = {"theta": theta, "spin": [spin], "t1": 8.0, "angle": 0.4}
     names = ["spin", "friction.mu", "theta"]
-    table = tippe.inversion_table(scene, sensitivities=names, tolerance=1e-10, progress=False, **given)
+    table = tippe.inversion_table(scene, sensitivities=names, tolerance=1e-10, progress=False, **arguments)
     assert table.sticks[0] >= sticks
     assert table.grazes[0] == 0
     slopes = {"spin": table.time_by_spin, "mu": table.time_by_mu, "theta": table.time_by_theta}
     at = {"spin": (spin, 1e-2), "mu": (0.1, 1e-4), "theta": (theta, 1e-4)}
     for name, slope in slopes.items():
-        found = differences(scene, name, *at[name], **given)
-        best = found[np.argmin(np.abs(np.diff(found)))]
+        estimates = differences(scene, name, *at[name], **arguments)
+        best = estimates[np.argmin(np.abs(np.diff(estimates)))]
         assert_close(np.ravel(slope)[0], best, rtol=2e-6)
 
 
@@ -85,13 +85,15 @@ def test_samples_through_flights_and_impacts():
     def told(spin):
         return tippe.simulate(scene, tippe.Launch(0.1, spin), 5.3, times=times, tolerance=1e-12)
 
-    found, slopes, (contact, status, hops) = jax.jit(lambda spin: jax.jvp(traced, (spin,), (1.0,), has_aux=True))(200.0)
+    samples, slopes, (contact, status, hops) = jax.jit(lambda spin: jax.jvp(traced, (spin,), (1.0,), has_aux=True))(
+        200.0
+    )
     whole = told(200.0)
     np.testing.assert_array_equal(contact, whole.contact)
     assert set(whole.contact) == {-1, 0}
     assert status == 0
     assert hops == len(whole.hops)
-    assert_close(found, seen(whole), rtol=1e-6, atol=1e-8)
+    assert_close(samples, seen(whole), rtol=1e-6, atol=1e-8)
     expected = scanned(lambda spin: seen(told(spin)), 200.0, [1e-2, 1e-3, 1e-4, 1e-5])
     sizes = np.max(np.abs(expected), axis=1, keepdims=True)
     assert np.max(np.abs(slopes - expected) / sizes) < 1e-4
@@ -105,7 +107,7 @@ def test_a_time_inside_a_transformation():
         scene, launch = scene_of(CASES[0], restitution), tippe.Launch(0.1, spin)
         return tippe.inversion_time(scene, launch, 20.0, 1.9, 1e-10, solver=diffrax.Tsit5())
 
-    found, slopes = jax.jit(jax.value_and_grad(time, (0, 1)))(200.0, 0.3)
+    inversion_time, slopes = jax.jit(jax.value_and_grad(time, (0, 1)))(200.0, 0.3)
     table = tippe.inversion_table(
         scene_of(CASES[0], 0.3),
         theta=0.1,
@@ -116,7 +118,7 @@ def test_a_time_inside_a_transformation():
         solver=diffrax.Tsit5(),
         sensitivities=["spin", "restitution"],
     )
-    assert_close(found, table.time, rtol=1e-8)
+    assert_close(inversion_time, table.time, rtol=1e-8)
     assert_close(slopes, (table.time_by_spin, table.time_by_restitution), rtol=1e-5)
     with pytest.raises(ValueError, match="second derivatives are not available through changes of mode"):
         jax.hessian(time)(200.0, 0.3)

@@ -115,9 +115,9 @@ def first_loss(body: Body, state: np.ndarray, t1: float) -> float:
         forces = [normal_force(body, run.sol(time)) for time in looks]
         least = int(np.argmin(forces))
         bounds = looks[max(least - 1, 0)], looks[min(least + 1, 30)]
-        found = minimize_scalar(lambda time: normal_force(body, run.sol(time)), bounds=bounds, method="bounded")
-        if found.fun < 0.0:
-            low, high = begin, found.x
+        minimum = minimize_scalar(lambda time: normal_force(body, run.sol(time)), bounds=bounds, method="bounded")
+        if minimum.fun < 0.0:
+            low, high = begin, minimum.x
             for _ in range(50):
                 middle = 0.5 * (low + high)
                 low, high = (middle, high) if normal_force(body, run.sol(middle)) > 0.0 else (low, middle)

@@ -83,8 +83,10 @@ def test_everything_is_regular_through_the_jackknife(jackknife):
     assert np.all(np.isfinite(run.side_force))
     assert float(run.speed[0]) < 0.0 < float(run.speed[-1])
     at = float(run.jackknifed_at[0])
-    again = stroller.simulate(scene, Launch((0.0, 0.0), 0.0, -1.2, 0.1, 0.05), 20.0, times=[at], tolerance=1e-12)
-    np.testing.assert_allclose(again.steering[0] % np.pi, np.pi / 2, atol=1e-10)
+    single_sample = stroller.simulate(
+        scene, Launch((0.0, 0.0), 0.0, -1.2, 0.1, 0.05), 20.0, times=[at], tolerance=1e-12
+    )
+    np.testing.assert_allclose(single_sample.steering[0] % np.pi, np.pi / 2, atol=1e-10)
     assert f"jackknifed      at {at:.6g} s" in str(run)
 
 

@@ -47,11 +47,11 @@ def test_straight_ride_is_a_geodesic_of_geographiclib(flattening):
     earth = Geodesic(radius, flattening)
     latitude = np.degrees(np.arctan(np.tan(0.2) / polar))
     for k in range(20, 201, 60):
-        there = earth.Direct(latitude, np.degrees(0.3), 90.0 - np.degrees(0.7), float(run.t[k]))
-        eta, mu = np.arctan(polar * np.tan(np.radians(there["lat2"]))), np.radians(there["lon2"])
+        destination = earth.Direct(latitude, np.degrees(0.3), 90.0 - np.degrees(0.7), float(run.t[k]))
+        eta, mu = np.arctan(polar * np.tan(np.radians(destination["lat2"]))), np.radians(destination["lon2"])
         expected = [np.cos(eta) * np.cos(mu), np.cos(eta) * np.sin(mu), polar * np.sin(eta)]
         np.testing.assert_allclose(run.position[k], expected, atol=3e-12)
-        turned = np.radians(90.0 - there["azi2"]) - run.heading[k]
+        turned = np.radians(90.0 - destination["azi2"]) - run.heading[k]
         np.testing.assert_allclose(np.angle(np.exp(1j * turned)), 0.0, atol=3e-12)
 
 

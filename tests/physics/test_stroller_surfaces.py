@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import stroller_reference as reference
-from hypothesis import given, settings
-from hypothesis import strategies as some
+from hypothesis import given, settings, strategies
 from scipy.integrate import solve_ivp
 
 import stroller
@@ -51,7 +50,7 @@ def scene(surface, gravity=9.81, damping=(0.0, 0.0, 0.0, 0.0)):
     """One kind of scene, inside where there is an inside, so that a surface needs one program."""
     side = "inside" if "inside" in surface.sides else None
     body = Stroller(1.7, 0.3, 0.4, 0.05, steering_spring=0.2)
-    return Scene(body, surface, Damping(*(jnp.asarray(one) for one in damping)), gravity, side, "absolute")
+    return Scene(body, surface, Damping(*(jnp.asarray(number) for number in damping)), gravity, side, "absolute")
 
 
 def ride(scene, launch, force=0.0, torque=0.0):
@@ -83,8 +82,8 @@ def test_a_steered_ride_is_that_of_a_rigid_body_with_multipliers(name):
     np.testing.assert_allclose(run.direction, states[:, 6:9], atol=1e-8)
     np.testing.assert_allclose(np.stack([run.yaw_rate, run.steering, run.steering_rate], 1), states[:, 9:], atol=1e-8)
     np.testing.assert_allclose(run.speed, np.sum(states[:, 3:6] * states[:, 6:9], axis=1), atol=1e-8)
-    np.testing.assert_allclose(run.normal_force, [one.normal_force for one in known], atol=1e-7)
-    np.testing.assert_allclose(run.side_force, [(one.rear, one.front) for one in known], atol=1e-7)
+    np.testing.assert_allclose(run.normal_force, [state.normal_force for state in known], atol=1e-7)
+    np.testing.assert_allclose(run.side_force, [(state.rear, state.front) for state in known], atol=1e-7)
     np.testing.assert_allclose(run.energy_residual, 0.0, atol=1e-9)
     assert np.ptp(run.steering) > 0.3
     assert np.ptp(run.position, axis=0).min() > 0.1
@@ -158,7 +157,7 @@ LOCKED = 0.3 / np.tan(0.5)
 def locked(scene):
     """The scene with a fork too heavy to turn, and no spring."""
     numbers = (jnp.asarray(1e12, float), jnp.asarray(0.0, float))
-    return eqx.tree_at(lambda one: (one.body.steering_inertia, one.body.steering_spring), scene, numbers)
+    return eqx.tree_at(lambda node: (node.body.steering_inertia, node.body.steering_spring), scene, numbers)
 
 
 def test_a_cylinder_unrolls_and_a_huge_torus_does_so_nearly():
@@ -178,7 +177,7 @@ def test_a_cylinder_unrolls_and_a_huge_torus_does_so_nearly():
 
 
 def test_a_graph_of_zero_is_a_plane():
-    flat = scene(Graph(eqx.tree_at(lambda one: one.height, HILLS, jnp.asarray(0.0, float))))
+    flat = scene(Graph(eqx.tree_at(lambda node: node.height, HILLS, jnp.asarray(0.0, float))))
     run = ride(locked(flat), Launch((0.2, 0.1), 0.7, 1.1, 0.5))
     np.testing.assert_allclose(run.place, circle(np.array([0.2, 0.1]), 0.7, LOCKED, 1.1 * TIMES), atol=1e-10)
     np.testing.assert_allclose(run.normal_force, 1.7 * 9.81, rtol=1e-12)
@@ -188,16 +187,16 @@ def test_a_graph_of_zero_is_a_plane():
 
 
 def within(*bounds):
-    return some.floats(*bounds, allow_subnormal=False)
+    return strategies.floats(*bounds, allow_subnormal=False)
 
 
 @settings(max_examples=25, deadline=None)
 @given(
     height=within(0.0, 1.0),
-    waves=some.lists(within(-2.0, 2.0), min_size=16, max_size=16),
-    damping=some.tuples(*(within(0.0, 3.0),) * 4),
+    waves=strategies.lists(within(-2.0, 2.0), min_size=16, max_size=16),
+    damping=strategies.tuples(*(within(0.0, 3.0),) * 4),
     gravity=within(0.0, 20.0),
-    launch=some.tuples(*(within(-3.0, 3.0),) * 6),
+    launch=strategies.tuples(*(within(-3.0, 3.0),) * 6),
 )
 def test_on_random_hills_energy_never_grows(height, waves, damping, gravity, launch):
     """Finite or flagged; the stroller stays on the ground, does not slip, and without a drive loses energy to friction only."""

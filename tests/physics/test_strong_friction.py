@@ -196,9 +196,9 @@ def test_every_road_tells_of_the_jam():
     assert list(table.status) == 3 * ["jammed"]
     assert_close(table.end_time[0], exact[0], rtol=1e-8)
 
-    found = tippe.lyapunov_exponent(scene, launch_, 0.1)
-    assert found.status == "jammed"
-    assert_close(float(found.end_time), exact[0], rtol=1e-8)
+    exponents = tippe.lyapunov_exponent(scene, launch_, 0.1)
+    assert exponents.status == "jammed"
+    assert_close(float(exponents.end_time), exact[0], rtol=1e-8)
 
     def traced(spin):
         run = tippe.simulate(scene, tippe.Launch(THETA, spin), 0.1, times=[0.0, 0.01, 0.05])

@@ -42,7 +42,7 @@ def test_impacts_with_torques():
     for i in falling[:20]:
         body = Body(*(float(getattr(falls.body, name)[i]) for name in Body._fields))
         motion = falls.axis[:, i], falls.velocity[:, i], falls.turning[:, i]
-        expected = reference_impact(body, *motion, Law(*(float(one[i]) for one in numbers)), falls.restitution[i])
+        expected = reference_impact(body, *motion, Law(*(float(number[i]) for number in numbers)), falls.restitution[i])
         speed = np.linalg.norm(motion[1]) + body.radius * np.linalg.norm(motion[2])
         assert_close(velocity[:, i], expected.velocity, atol=1e-9 * speed)
         assert_close(turning[:, i], expected.turning, atol=1e-9 * speed / body.radius)

@@ -76,12 +76,12 @@ def from_vector_form(scene, state):
     return chart, rate[3:], scene.normal_force(state), jnp.stack([metric, 1.0, scene.body.radius])
 
 
-def relative_error(found, expected, lengths):
+def relative_error(value, expected, lengths):
     """Largest error of the accelerations, as a share of the largest acceleration of the same state, all in 1/s^2."""
     metric, y, radius = lengths.T
-    one = jnp.ones_like(radius)
-    units = jnp.stack([metric / radius, y / radius, one, one, one], axis=1)
-    return jnp.max(jnp.abs(found - expected) * units, axis=1) / jnp.max(jnp.abs(expected) * units, axis=1)
+    ones = jnp.ones_like(radius)
+    units = jnp.stack([metric / radius, y / radius, ones, ones, ones], axis=1)
+    return jnp.max(jnp.abs(value - expected) * units, axis=1) / jnp.max(jnp.abs(expected) * units, axis=1)
 
 
 @pytest.mark.parametrize(
@@ -96,10 +96,10 @@ def test_lagrange_poincare_and_the_corrected_paper_give_the_accelerations_of_the
     scenes, states = legal_cases(arena, friction)
     chart, expected, normal_force, lengths = from_vector_form(scenes, states)
     for formulation_ in (euler_angles.by_lagrange, euler_angles.by_equation_11, poincare.by_equation_2):
-        found = eqx.filter_jit(eqx.filter_vmap(formulation_))(scenes, chart)
-        assert jnp.max(relative_error(found.second_rates, expected, lengths)) < 1e-10
+        acceleration = eqx.filter_jit(eqx.filter_vmap(formulation_))(scenes, chart)
+        assert jnp.max(relative_error(acceleration.second_rates, expected, lengths)) < 1e-10
         weight = scenes.body.mass * scenes.gravity
-        assert jnp.max(jnp.abs(found.normal_force - normal_force) / (weight + normal_force)) < 1e-10
+        assert jnp.max(jnp.abs(acceleration.normal_force - normal_force) / (weight + normal_force)) < 1e-10
 
 
 @pytest.mark.parametrize("friction", POINT)
@@ -116,9 +116,9 @@ def test_rutstam_and_the_jellett_reduction_give_the_accelerations_of_the_vector_
         rutstam = (reduced.rutstam_rate(scene, chart) - expected) / small
 
         chart, expected = jax.jvp(lambda s: reduced.jellett_state(scene, s), (state,), (rate,))
-        found = reduced.jellett_rate(scene, chart, scene.jellett(state))
+        jellett_rate = reduced.jellett_rate(scene, chart, scene.jellett(state))
         small = reduced.JellettState(1.0, 1.0, scene.body.I3, scene.body.radius, scene.body.radius)
-        jellett = jnp.stack(jax.tree.map(lambda a, b, unit: (a - b) / unit, found, expected, small))
+        jellett = jnp.stack(jax.tree.map(lambda a, b, unit: (a - b) / unit, jellett_rate, expected, small))
         # Rates in 1/s^2, as a share of the squared angular velocity and of g / R together.
         w = jnp.linalg.norm(state[5:8]) / scene.body.I1
         whole = w**2 + scene.gravity / scene.body.radius
@@ -164,9 +164,9 @@ def test_the_general_reduction_by_a_cyclic_angle_gives_the_accelerations_of_the_
         reduced_system = formulation.Routhian(full, poincare.PSI, full.metric(q)[poincare.PSI] @ rate)
         return formulation.Hamel(reduced_system).acceleration(0.0, q[: poincare.PSI], rate[: poincare.PSI])
 
-    found = accelerations(scenes, chart)
+    acceleration = accelerations(scenes, chart)
     # psi'' is not among the equations; it follows from the momentum.
-    whole = jnp.concatenate([found, expected[:, poincare.PSI :]], axis=1)
+    whole = jnp.concatenate([acceleration, expected[:, poincare.PSI :]], axis=1)
     assert jnp.max(relative_error(whole, expected, lengths)) < 1e-10
 
 
@@ -268,10 +268,10 @@ def test_trajectories_of_all_formulations_on_the_plane_agree_for_five_seconds(fr
     )
     theta, spin = scene.theta(vector), scene.spin(vector)
     assert theta[-1] > 1.0
-    for found in (rutstam[0], routh[0], lagrange[1], second[1]):
-        np.testing.assert_allclose(found, theta, rtol=0.0, atol=1e-8)
-    for found in (rutstam[3], routh[2] / scene.body.I3):
-        np.testing.assert_allclose(found, spin, rtol=0.0, atol=1e-8 * 100.0)
+    for trajectory in (rutstam[0], routh[0], lagrange[1], second[1]):
+        np.testing.assert_allclose(trajectory, theta, rtol=0.0, atol=1e-8)
+    for trajectory in (rutstam[3], routh[2] / scene.body.I3):
+        np.testing.assert_allclose(trajectory, spin, rtol=0.0, atol=1e-8 * 100.0)
     np.testing.assert_allclose(scene.jellett(vector), constant, rtol=1e-11)
 
 
@@ -297,9 +297,9 @@ def test_trajectories_of_all_formulations_in_the_cylinder_agree_for_five_seconds
     )
     expected = jax.vmap(lambda s: euler_angles.from_vector_state(scene, s), in_axes=1, out_axes=1)(jnp.asarray(vector))
     assert np.max(np.abs(expected[0])) > 0.3
-    for found in (lagrange, printed, second):
+    for trajectory in (lagrange, printed, second):
         for row in (0, 1, 3, 4):
-            np.testing.assert_allclose(found[row], expected[row], rtol=0.0, atol=1e-8)
+            np.testing.assert_allclose(trajectory[row], expected[row], rtol=0.0, atol=1e-8)
 
 
 def test_jelletts_quantity_in_the_cylinder_drifts_by_r_times_l_dot_n_prime():

@@ -21,8 +21,8 @@ def sideways(torque, scene=DAMPED, steering=0.0, t1=10.0, **options):
 
 def extrapolated(function, at, step):
     """A central difference, extrapolated from two steps."""
-    one, two = ((function(at + h) - function(at - h)) / (2.0 * h) for h in (step, 2.0 * step))
-    return (4.0 * one - two) / 3.0
+    fine, coarse = ((function(at + h) - function(at - h)) / (2.0 * h) for h in (step, 2.0 * step))
+    return (4.0 * fine - coarse) / 3.0
 
 
 def test_a_torque_on_a_steering_at_rest():
@@ -116,11 +116,11 @@ def test_random_rides_with_components_at_rest():
     sizes = np.where(points == 0.0, 1.0, np.abs(points))
     for k in (0, 3, 7, 8, 9, 10):
         step = 1e-4 * sizes[:, k]
-        one, two = (
+        fine, coarse = (
             (ends(points.at[:, k].add(h)) - ends(points.at[:, k].add(-h))) / (2.0 * h) for h in (step, 2.0 * step)
         )
         scale = np.max(np.abs(gradients), axis=1)
-        error = np.abs(gradients[:, k] - (4.0 * one - two) / 3.0)
+        error = np.abs(gradients[:, k] - (4.0 * fine - coarse) / 3.0)
         assert np.all(error < 1e-6 * scale / sizes[:, k].clip(max=1.0)), (k, error / scale)
 
 
@@ -134,7 +134,7 @@ def test_the_midpoint_rule_is_differentiated_by_either_way(transform, options):
     def end(torque, **more):
         return sideways(torque, t1=1.0, solver=stroller.ImplicitMidpoint(0.1), **more)
 
-    found = transform(lambda torque: end(torque, **options))(0.1)
-    np.testing.assert_allclose(found, extrapolated(end, 0.1, 1e-4), rtol=1e-7)
+    derivative = transform(lambda torque: end(torque, **options))(0.1)
+    np.testing.assert_allclose(derivative, extrapolated(end, 0.1, 1e-4), rtol=1e-7)
     # How many steps there are is known while JAX traces.
-    assert jax.eval_shape(jax.jit(end), 0.1).shape == found.shape
+    assert jax.eval_shape(jax.jit(end), 0.1).shape == derivative.shape

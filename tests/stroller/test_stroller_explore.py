@@ -61,7 +61,7 @@ def test_ten_rides_end_where_those_of_the_table_end(browser, name):
         }})"""
     rows = np.array(browser.execute_script(script), dtype=float)
     code, distance, end_time = rows[:, :3].T
-    assert [stroller.Status(int(one)).word for one in code] == list(np.ravel(table.status))
+    assert [stroller.Status(int(number)).word for number in code] == list(np.ravel(table.status))
     np.testing.assert_allclose(end_time, 2.0)
     speed, steering, energy, _ = rows[:, 9:].T
     np.testing.assert_allclose(speed, np.ravel(table.end_speed), atol=CLOSE)

@@ -65,7 +65,7 @@ LAUNCH = Launch((-2.0, 0.3), 0.1, 2.5, 0.2)
         (Graph(Hill(0.8)), (0.4, -0.3)),
         (Implicit(Ball(1.4, 1.0)), (1.4 * np.cos(0.4), 1.4 * np.sin(0.4), 0.0)),
     ],
-    ids=lambda one: type(one).__name__,
+    ids=lambda value: type(value).__name__,
 )
 def test_a_place_may_be_a_point_in_space(surface, place):
     """Moved to the surface if it is off by round-off, refused if by more."""
@@ -85,7 +85,7 @@ def test_a_place_may_be_a_point_in_space(surface, place):
 def test_numbers_of_a_place_are_named_as_the_surface_names_them():
     def names(surface, place):
         numbers = {f"launch.place[{k}]": [0.1] for k in range(len(place))}
-        return [(one.name, one.unit) for one in named_axes(numbers, surface, Launch(place, 0.0, 1.0))]
+        return [(axis.name, axis.unit) for axis in named_axes(numbers, surface, Launch(place, 0.0, 1.0))]
 
     assert names(Cylinder(1.0), (0.0, 0.0)) == [("y0", "m"), ("eta0", "rad")]
     assert names(Torus(2.0, 1.0), (0.0, 0.0)) == [("mu0", "rad"), ("eta0", "rad")]
@@ -115,12 +115,12 @@ def test_what_a_surface_has_not_is_refused(build, message):
 def test_lanes_with_their_own_places_and_hills_are_single_scenes():
     """The field of a table's cells, of which every number of launch, surface and body is its own."""
     heights, places = np.array([0.5, 0.9, -0.4]), np.array([[-2.0, 0.1, 1.0], [0.3, 0.2, -0.5]])
-    many = eqx.tree_at(lambda one: one.surface.height.height, HILL, jnp.asarray(heights))
+    many = eqx.tree_at(lambda hill: hill.surface.height.height, HILL, jnp.asarray(heights))
     problem = RideProblem.of(many, Launch(tuple(places), 0.1, 2.5, 0.2), None, 3, True)
     field = eqx.filter_jit(lambda problem: problem.field(jnp.zeros(3), problem.states))(problem)
     for k, height in enumerate(heights):
-        one = eqx.tree_at(lambda scene: scene.surface.height.height, HILL, jnp.asarray(height))
-        single = RideProblem.single(one, Launch(tuple(places[:, k]), 0.1, 2.5, 0.2), None)
+        hill = eqx.tree_at(lambda scene: scene.surface.height.height, HILL, jnp.asarray(height))
+        single = RideProblem.single(hill, Launch(tuple(places[:, k]), 0.1, 2.5, 0.2), None)
         np.testing.assert_allclose(problem.states[:, k], single.states, atol=1e-14)
         np.testing.assert_allclose(field[:, k], single.field(jnp.zeros(()), single.states), atol=1e-13)
 
@@ -128,9 +128,9 @@ def test_lanes_with_their_own_places_and_hills_are_single_scenes():
 def test_command_line_knows_every_named_surface():
     for side in ("inside", "outside"):
         options = parser().parse_args(["--surface", *GROUNDS, "--side", side])
-        found = scenes(options)
-        assert len(found) == 2 * len(GROUNDS)
-        for scene, launch in found.values():
+        surfaces = scenes(options)
+        assert len(surfaces) == 2 * len(GROUNDS)
+        for scene, launch in surfaces.values():
             scene.check(launch)
             assert float(scene.contact(scene.state(launch))) > 0.0
 
@@ -142,8 +142,8 @@ def test_table_over_places_and_hills(tmp_path):
     table = stroller.sweep(HILL, LAUNCH, 2.0, axes=axes, path=tmp_path / "hills.h5")
     assert list(table.coords) == ["height", "y0"]
     assert json.loads(table.attributes["request"])["scene.surface.height"] == "Hill"
-    one = eqx.tree_at(lambda scene: scene.surface.height.height, HILL, jnp.asarray(0.9))
-    run = stroller.simulate(one, Launch((-2.0, -0.6), 0.1, 2.5, 0.2), 2.0)
+    hill = eqx.tree_at(lambda scene: scene.surface.height.height, HILL, jnp.asarray(0.9))
+    run = stroller.simulate(hill, Launch((-2.0, -0.6), 0.1, 2.5, 0.2), 2.0)
     np.testing.assert_allclose([float(table[name][1, 1]) for name in "xyz"], run.position[-1], atol=1e-7)
 
 
@@ -171,8 +171,8 @@ def test_a_hill_is_found_from_a_ride_over_it():
     times = np.linspace(0.2, 2.0, 10)
     path = stroller.simulate(HILL, LAUNCH, 2.0, times=times).position
     recording = stroller.Recording(LAUNCH, times, path, 1e-3)
-    found = stroller.identify(HILL, recording, {"scene.surface.height.height": 0.6}, progress=False)
-    np.testing.assert_allclose(found.estimates["scene.surface.height.height"], 0.8, atol=1e-5)
+    fit = stroller.identify(HILL, recording, {"scene.surface.height.height": 0.6}, progress=False)
+    np.testing.assert_allclose(fit.estimates["scene.surface.height.height"], 0.8, atol=1e-5)
 
 
 @pytest.mark.slow

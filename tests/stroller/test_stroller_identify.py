@@ -23,13 +23,13 @@ def test_damping_from_recorded_speeds(tmp_path, caplog):
     path.write_text("t,v\n" + "\n".join(f"{t},{3.6 * v:.12g}" for t, v in zip(clock, speeds, strict=True)))
     columns = {"time": ("t", "s"), "speed": ("v", "km/h")}
     data = stroller.read_recording(path, columns, launch=LAUNCH, error={"speed": (0.036, "km/h")})
-    found = stroller.identify(scene(), data, {"rolling": 1.0, "t0": 0.8})
-    assert found.status == "converged"
-    assert_close(list(found.estimates.values()), [2.0, 0.9], rtol=1e-4)
+    fit = stroller.identify(scene(), data, {"rolling": 1.0, "t0": 0.8})
+    assert fit.status == "converged"
+    assert_close(list(fit.estimates.values()), [2.0, 0.9], rtol=1e-4)
     with jax.log_compiles():
-        again = stroller.identify(scene(), data, {"rolling": 1.5, "t0": 0.85}, tolerance=1e-7)
+        second_fit = stroller.identify(scene(), data, {"rolling": 1.5, "t0": 0.85}, tolerance=1e-7)
     assert not [text for text in caplog.messages if "Finished XLA compilation" in text]
-    assert_close(list(again.estimates.values()), [2.0, 0.9], rtol=1e-4)
+    assert_close(list(second_fit.estimates.values()), [2.0, 0.9], rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -37,10 +37,10 @@ def test_damping_and_wheelbase_from_an_exact_path():
     path = stroller.simulate(scene(), LAUNCH, 1.5, times=TIMES).position
     data = stroller.Recording(LAUNCH, TIMES, path, 0.01)
     free = {"rolling": 1.0, "scene.body.wheelbase": 1.2}
-    found = stroller.identify(scene(), data, free, tolerance=1e-7)
-    assert found.status == "converged"
-    assert_close(list(found.estimates.values()), [2.0, 0.7], rtol=1e-4)
-    assert found.residuals[0].label == "x(0.5 s)"
+    fit = stroller.identify(scene(), data, free, tolerance=1e-7)
+    assert fit.status == "converged"
+    assert_close(list(fit.estimates.values()), [2.0, 0.7], rtol=1e-4)
+    assert fit.residuals[0].label == "x(0.5 s)"
 
 
 def test_what_cannot_be_fitted_is_refused():

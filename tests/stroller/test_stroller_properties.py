@@ -106,10 +106,10 @@ def growth_of(maps):
     """
     total = np.broadcast_to(np.eye(maps[0].shape[-1]), maps[0].shape)
     most = row_norms(total).max(axis=-1)
-    for one in maps:
-        total = total @ one
+    for matrix in maps:
+        total = total @ matrix
         most = np.maximum(most, row_norms(total).max(axis=-1))
-    followed = np.max([row_norms(one).max(axis=-1) for one in maps], axis=0)
+    followed = np.max([row_norms(matrix).max(axis=-1) for matrix in maps], axis=0)
     return np.where(NUDGE * followed < SMALL, most, np.inf)
 
 
@@ -192,11 +192,11 @@ def check_units(scene: Scene, launch: Launch, exponents: tuple[int, int, int]):
     units |= {Sphere: {"radius": length}, Spheroid: {"equatorial": length, "polar": length}, Plane: {}}
 
     def converted(part):
-        found = {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
+        values = {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
         return type(part)(
             **{
                 name: value if value is None else value * units[type(part)].get(name, 1.0)
-                for name, value in found.items()
+                for name, value in values.items()
             }
         )
 
@@ -247,13 +247,13 @@ def check_reversal(scene: Scene, launch: Launch):
     if isinstance(scene.friction, RollingResistance):
         smooth = eqx.tree_at(lambda scene: scene.friction.speed, smooth, scene.friction.speed)
     signs = signs_of(scene, (1, 1, 1), (1, 1, 1), (1, -1, -1, 1, 1, 1))
-    there = ride(smooth, launch, tolerance)
-    back = ride(smooth, launch, tolerance, signs * there.state)
+    arrival = ride(smooth, launch, tolerance)
+    back = ride(smooth, launch, tolerance, signs * arrival.state)
     knots = signs * knots_of(smooth, launch, STRETCHES)
     growth = growth_of([map_of(smooth, launch, a, b) for a, b in zip(knots[1:], knots[:-1], strict=True)])
-    steps = there.steps + back.steps
+    steps = arrival.steps + back.steps
     missed, told = missed_by(smooth, launch, smooth.state(launch), signs * back.state, tolerance, steps, growth)
-    stays = told & reached(there, back)
+    stays = told & reached(arrival, back)
     return np.where(stays, missed, 0.0), stays
 
 
@@ -276,11 +276,11 @@ def check_moving(scene: Scene, launch: Launch, angle: float, knots, kink):
         return state
 
     states = scene.state(launch)
-    here, there = ride(scene, launch, tolerance, states), ride(scene, launch, tolerance, moved(states))
+    plain_ride, moved_ride = ride(scene, launch, tolerance, states), ride(scene, launch, tolerance, moved(states))
     growth = growth_of([map_of(scene, launch, a, b) for a, b in zip(knots[:-1], knots[1:], strict=True)][::-1])
-    steps = here.steps + there.steps
-    missed, told = missed_by(scene, launch, moved(here.state), there.state, tolerance, steps, growth)
-    stays = told & reached(here, there) & ~kink
+    steps = plain_ride.steps + moved_ride.steps
+    missed, told = missed_by(scene, launch, moved(plain_ride.state), moved_ride.state, tolerance, steps, growth)
+    stays = told & reached(plain_ride, moved_ride) & ~kink
     return np.where(stays, missed, 0.0), stays
 
 

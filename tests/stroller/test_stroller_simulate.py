@@ -99,9 +99,9 @@ def test_a_ride_by_the_midpoint_rule_can_be_kept_on_disk():
     """JAX keeps no program that calls Python back, as Diffrax's checks of given steps do."""
     problem, grid = RideProblem.single(FULL, LAUNCH, None), jnp.linspace(0.0, 0.1, 3)
     settings = Settings(1e-9, ImplicitMidpoint(0.05))
-    given = jax.make_jaxpr(lambda t1: sample(problem, None, t1, settings, grid=grid).states)(0.1)
+    program = jax.make_jaxpr(lambda t1: sample(problem, None, t1, settings, grid=grid).states)(0.1)
     asked = jax.make_jaxpr(lambda t1: sample(problem, grid, t1, settings, grid=grid).states)(0.1)
-    assert "callback" not in str(given)
+    assert "callback" not in str(program)
     assert "callback" in str(asked)
 
 
@@ -180,7 +180,7 @@ def test_illegal_numbers_in_a_batch_of_rides_give_nothing_that_looks_right():
     good = (1.7, 0.2, -0.6, 0.3, 1e-9)
     columns = [good]
     for which, values in ((0, (-1.7, np.nan)), (1, (np.pi / 2,)), (2, (2.0,)), (3, (-0.3,)), (4, (-1.0, np.nan))):
-        columns += [tuple(value if i == which else one for i, one in enumerate(good)) for value in values]
+        columns += [tuple(value if i == which else number for i, number in enumerate(good)) for value in values]
     rides = jax.jit(jax.vmap(ride))(*jnp.array(columns).T)
     assert rides.stats.finished.tolist() == [True] + 7 * [False]
     assert jax.vmap(ride)(*jnp.array(columns).T[:, :0]).speed.shape == (0, 2)
@@ -284,10 +284,10 @@ def test_a_function_that_is_defined_again_does_not_compile_again(reference, capl
 
     first = ride(jnp.array(2.0))
     with jax.log_compiles():
-        again, other = ride(jnp.array(2.0)), ride(jnp.array(3.0))
+        second_ride, third_ride = ride(jnp.array(2.0)), ride(jnp.array(3.0))
     assert not [text for text in caplog.messages if "Finished XLA compilation" in text]
-    np.testing.assert_array_equal(again.position, first.position)
-    assert abs(float(other.speed[1] - first.speed[1])) > 0.1
+    np.testing.assert_array_equal(second_ride.position, first.position)
+    assert abs(float(third_ride.speed[1] - first.speed[1])) > 0.1
 
 
 def test_what_happened_in_a_traced_ride_is_found_by_riding_again():
@@ -355,10 +355,10 @@ BAD = [
     ),
     *(
         (
-            lambda given=given: stroller.simulate(FULL, LAUNCH, 1.0, solver=given),
+            lambda solver=solver: stroller.simulate(FULL, LAUNCH, 1.0, solver=solver),
             "solver = .* must be an adaptive solver of Diff.*or an Impl",
         )
-        for given in (ImplicitMidpoint, diffrax.Euler(), diffrax.KenCarp4(), "dopri8")
+        for solver in (ImplicitMidpoint, diffrax.Euler(), diffrax.KenCarp4(), "dopri8")
     ),
     (lambda: stroller.simulate(FULL, LAUNCH, 1.0, times=0.5), r"times = .* must be a list"),
     (lambda: stroller.simulate(FULL, LAUNCH, 1.0, tolerance=0.0), r"tolerance = 0\.0 must be at least 1e-14"),

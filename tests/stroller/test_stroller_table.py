@@ -129,7 +129,7 @@ def test_a_map_shows_its_values_and_is_grey_only_where_there_is_none(places):
 
 def test_axes_of_one_name_are_told_apart():
     grid = named_axes({"launch.steering": [0.1], "scene.friction.steering": [0.2]}, stroller.Plane(), LAUNCH)
-    assert [(one.name, one.unit) for one in grid] == [("launch_steering", "rad"), ("friction_steering", "N m s")]
+    assert [(axis.name, axis.unit) for axis in grid] == [("launch_steering", "rad"), ("friction_steering", "N m s")]
 
 
 @pytest.mark.parametrize(
@@ -149,9 +149,9 @@ def test_axes_of_one_name_are_told_apart():
     ],
 )
 def test_bad_sweeps_are_refused(change, message):
-    given = {"launch": LAUNCH, "t1": 1.0} | change
+    arguments = {"launch": LAUNCH, "t1": 1.0} | change
     with pytest.raises(ValueError, match=message):
-        stroller.sweep(BOWL, **given)
+        stroller.sweep(BOWL, **arguments)
 
 
 @pytest.mark.slow

@@ -59,11 +59,11 @@ def end(scene, mu):
 
 
 def pair(function):
-    return lambda scene, mu: jax.vmap(lambda one: function(scene, one))(jnp.array([mu, mu + 0.01]))
+    return lambda scene, mu: jax.vmap(lambda number: function(scene, number))(jnp.array([mu, mu + 0.01]))
 
 
 def slope(function):
-    return lambda scene, mu: jax.grad(lambda one: function(scene, one))(mu)
+    return lambda scene, mu: jax.grad(lambda number: function(scene, number))(mu)
 
 
 def slopes(scene, mu):
@@ -82,10 +82,10 @@ CALLS = {
     "time, grad": slope(time),
     "time, grad by two": slopes,
     "time, vmap": pair(time),
-    "time, vmap of grad": lambda scene, mu: jax.vmap(jax.grad(lambda one: time(scene, one)))(
+    "time, vmap of grad": lambda scene, mu: jax.vmap(jax.grad(lambda number: time(scene, number)))(
         jnp.array([mu, mu + 0.01])
     ),
-    "time, hessian": lambda scene, mu: jax.hessian(lambda one: time(scene, one))(mu),
+    "time, hessian": lambda scene, mu: jax.hessian(lambda number: time(scene, number))(mu),
     "last time": last_time,
     "last time, grad": slope(last_time),
     "extended": extended,

@@ -139,12 +139,12 @@ def test_a_slider_simulates_anew(browser, page, rutstam_scene):
     theta, spin = browser.execute_script("return live.values()")
     assert (theta, spin) == pytest.approx((0.1, 95.0))
     time = float(tippe.inversion_time(rutstam_scene, tippe.Launch(theta, spin), 7.0))
-    found = browser.execute_script("return Number.isFinite(live.outcome.value) ? live.outcome.value : 1e300")
-    assert found == pytest.approx(min(time, 1e300), rel=CLOSE)
+    shown_time = browser.execute_script("return Number.isFinite(live.outcome.value) ? live.outcome.value : 1e300")
+    assert shown_time == pytest.approx(min(time, 1e300), rel=CLOSE)
     # The drawn top is that of the new run.
     drawn = browser.execute_script("player.seek(1.0); return player.matrix(0, 0, 0)")
-    there = tippe.simulate(rutstam_scene, tippe.Launch(theta, spin), 1.0, times=[1.0])
-    np.testing.assert_allclose(np.array(drawn).reshape(4, 4)[3, :3], there.position[0], atol=1e-4)
+    run = tippe.simulate(rutstam_scene, tippe.Launch(theta, spin), 1.0, times=[1.0])
+    np.testing.assert_allclose(np.array(drawn).reshape(4, 4)[3, :3], run.position[0], atol=1e-4)
 
 
 def test_the_address_holds_the_sliders(browser, page):
@@ -302,12 +302,12 @@ def test_in_the_browser_the_wooden_top_hops_and_climbs_onto_its_stem(browser):
     assert (tippe.Status(status).word, end) == ("inverted", 4.0)
     assert time == pytest.approx(run.inversion_time, rel=CLOSE)
     assert hops == len(run.hops) >= 3
-    there, rows = run.at(times), np.array(rows)
-    np.testing.assert_allclose(rows[:, 3:6], there.position, atol=CLOSE)
+    samples, rows = run.at(times), np.array(rows)
+    np.testing.assert_allclose(rows[:, 3:6], samples.position, atol=CLOSE)
     theta, energy, _, force = rows[:, -5:-1].T
-    np.testing.assert_allclose(theta, there.theta, atol=5e-6)
-    np.testing.assert_allclose(energy, there.energy, rtol=CLOSE)
-    np.testing.assert_allclose(force, there.normal_force, atol=1e-5 * float(there.normal_force[0]))
+    np.testing.assert_allclose(theta, samples.theta, atol=5e-6)
+    np.testing.assert_allclose(energy, samples.energy, rtol=CLOSE)
+    np.testing.assert_allclose(force, samples.normal_force, atol=1e-5 * float(samples.normal_force[0]))
 
 
 @pytest.mark.slow

@@ -93,9 +93,11 @@ def test_forces_and_torques_agree_with_lagranges_equations_in_plain_numpy(arena)
         spin = state[2:5] @ state[5:8] / numbers["I3"]
         angles, rate = lagrange_top.in_angles(axis, turning, spin)
         chart = [eta if arena else 0.0, *angles, velocity[0] / path_radius, velocity[1], *rate]
-        found = lagrange_top.accelerations(reference, [float(number) for number in chart], "z")
-        spin_rate = found[4] + found[3] * np.cos(chart[1]) - chart[6] * chart[5] * np.sin(chart[1])
-        assert_close([*found[:2], spin_rate, found[5]], [*expected[:, k], scene.normal_force(state)], rtol=1e-11)
+        acceleration = lagrange_top.accelerations(reference, [float(number) for number in chart], "z")
+        spin_rate = acceleration[4] + acceleration[3] * np.cos(chart[1]) - chart[6] * chart[5] * np.sin(chart[1])
+        assert_close(
+            [*acceleration[:2], spin_rate, acceleration[5]], [*expected[:, k], scene.normal_force(state)], rtol=1e-11
+        )
 
 
 def test_the_reduced_forms_refuse_a_torque():

@@ -39,20 +39,20 @@ TIMES = [5.66331761386296, 5.535023378573557, 5.520036180091712, math.inf]
 
 @pytest.mark.slow
 def test_the_times_are_those_of_the_independent_program():
-    found = [independent_time(0.3 * float(rutstam_top().radius), a, w, 6.0) for a, w in LAUNCHES]
-    assert_close(found, TIMES, rtol=1e-9)
+    times = [independent_time(0.3 * float(rutstam_top().radius), a, w, 6.0) for a, w in LAUNCHES]
+    assert_close(times, TIMES, rtol=1e-9)
 
 
 @pytest.fixture(scope="module")
-def found(rutstam_scene):
+def exact_fit(rutstam_scene):
     """Friction from three exact times and a launch too slow to invert; at the start two more do not invert by `t1`."""
     times = TIMES
     data = tippe.InversionTimes(LAUNCH, times, 0.05, t1=6.0)
     return times, tippe.identify(rutstam_scene, data, {"friction.mu": 0.2}, tolerance=1e-8)
 
 
-def test_friction_from_exact_times(found):
-    times, result = found
+def test_friction_from_exact_times(exact_fit):
+    times, result = exact_fit
     assert result.status == "converged"
     assert_close(result.estimates["scene.friction.mu"], 0.3, rtol=1e-4)
     assert [row.censored for row in result.residuals] == [False, False, False, True]
@@ -63,30 +63,30 @@ def test_friction_from_exact_times(found):
     assert "theta 0.3, spin 110" in str(result)
 
 
-def test_another_start_other_bounds_data_and_tolerance_compile_nothing(found, rutstam_scene, caplog):
-    times, _ = found
+def test_another_start_other_bounds_data_and_tolerance_compile_nothing(exact_fit, rutstam_scene, caplog):
+    times, _ = exact_fit
     other = tippe.InversionTimes(LAUNCH, [1.01 * time for time in times], 0.04, t1=6.5, angle=0.94 * math.pi)
     with jax.log_compiles():
-        again = tippe.identify(rutstam_scene, other, {"friction.mu": Free(0.25, 0.05)}, tolerance=1e-7)
+        second_fit = tippe.identify(rutstam_scene, other, {"friction.mu": Free(0.25, 0.05)}, tolerance=1e-7)
     assert not [text for text in caplog.messages if "Finished XLA compilation" in text]
     # Each of these numbers counted.
-    assert again.problem.unknowns[0].lower == 0.05
-    assert again.estimates["scene.friction.mu"] < 0.298
+    assert second_fit.problem.unknowns[0].lower == 0.05
+    assert second_fit.estimates["scene.friction.mu"] < 0.298
 
 
-def test_noisy_times_give_unbiased_friction_within_its_errors(found):
+def test_noisy_times_give_unbiased_friction_within_its_errors(exact_fit):
     """Twelve tables, in short for the 200 below; what the launches have in common is compiled once.
 
     The errors are small against the steps of the times' staircase, over which the slope at one place says little.
     """
-    times, result = found
+    times, result = exact_fit
     exact, error, z = np.where(np.isfinite(times), times, 6.0), 0.002, []
     for draw in np.random.default_rng(7).normal(size=(12, 4)):
         noisy = Measurements(exact + error * draw, error, np.isinf(times))
         ends = minimise(result.problem, result.coordinates[None], noisy)
-        there = linearise(result.problem, ends.coordinates, noisy)
+        linearised = linearise(result.problem, ends.coordinates, noisy)
         z.append(
-            (ends.coordinates[0, 0] - math.log(0.3)) / math.sqrt(coordinate_covariance(there.information[0])[0, 0])
+            (ends.coordinates[0, 0] - math.log(0.3)) / math.sqrt(coordinate_covariance(linearised.information[0])[0, 0])
         )
     assert abs(np.mean(z)) < 3.0 / math.sqrt(12.0)
     assert 0.4 < np.std(z) < 1.7
@@ -95,7 +95,7 @@ def test_noisy_times_give_unbiased_friction_within_its_errors(found):
 
 def extended_times(scene, theta, spin, t1, angle):
     """Times of four launches, as a batch."""
-    return batch_of_times(scene, *(jnp.asarray(one, float) for one in (theta, spin, t1, angle)))
+    return batch_of_times(scene, *(jnp.asarray(value, float) for value in (theta, spin, t1, angle)))
 
 
 @eqx.filter_jit
@@ -234,16 +234,18 @@ def test_two_hundred_noisy_tables_give_unbiased_estimates_and_intervals_that_cov
     noisy = Measurements(exact + error * draw.normal(size=(200, 10)), error)
     starts = true + 0.05 * draw.uniform(-1.0, 1.0, (200, 2))
     ends = minimise(problem, starts, noisy)
-    there = linearise(problem, ends.coordinates, noisy)
-    errors = np.array([np.sqrt(np.diag(coordinate_covariance(np.asarray(one)))) for one in there.jacobian])
+    linearised = linearise(problem, ends.coordinates, noisy)
+    errors = np.array(
+        [np.sqrt(np.diag(coordinate_covariance(np.asarray(jacobian)))) for jacobian in linearised.jacobian]
+    )
     z = (np.asarray(ends.coordinates) - true) / errors
     bias, covered = z.mean(axis=0), np.mean(np.abs(z) < 1.96, axis=0)
     with capsys.disabled():
         print("\nbias / error", bias, "covered", covered, "steps", np.percentile(ends.steps, [50, 100]))
-        print("mean deviance", np.mean(there.deviance), "of 8 degrees; converged", np.mean(ends.converged))
+        print("mean deviance", np.mean(linearised.deviance), "of 8 degrees; converged", np.mean(ends.converged))
     # One in a hundred may go to and fro on a step of the time's staircase until its steps are used up.
     assert np.mean(ends.converged) >= 0.99
-    assert np.all(there.deviance < TOO_MUCH)
+    assert np.all(linearised.deviance < TOO_MUCH)
     assert np.all(np.abs(bias) < 0.2)
     assert np.all((covered > 0.92) & (covered < 0.98))
 
@@ -261,13 +263,15 @@ def test_single_starts_a_factor_two_off_find_the_truth(experiment, capsys):
     noisy = np.repeat(exact + error * np.random.default_rng(1).normal(size=(tables, 10)), len(off), axis=0)
     each = Measurements(noisy, error)
     ends = minimise(problem, np.tile(true + off, (tables, 1)), each)
-    there = linearise(problem, ends.coordinates, each)
-    errors = np.array([np.sqrt(np.diag(coordinate_covariance(np.asarray(one)))) for one in there.jacobian])
+    linearised = linearise(problem, ends.coordinates, each)
+    errors = np.array(
+        [np.sqrt(np.diag(coordinate_covariance(np.asarray(jacobian)))) for jacobian in linearised.jacobian]
+    )
     deviations = np.abs(np.asarray(ends.coordinates) - true) / errors
     of_truth = np.sum(((noisy - exact) / error) ** 2, axis=1)
-    found = (np.asarray(there.deviance) <= of_truth) & np.all(deviations < 5.0, axis=1)
+    successes = (np.asarray(linearised.deviance) <= of_truth) & np.all(deviations < 5.0, axis=1)
     with capsys.disabled():
-        print("\nfound by", np.sum(found), "of", len(found), "starts; converged", np.mean(ends.converged))
+        print("\nfound by", np.sum(successes), "of", len(successes), "starts; converged", np.mean(ends.converged))
         print("steps", np.percentile(ends.steps, [50, 90, 100]), "off / error", np.max(deviations))
-    assert found.mean() >= 0.95
+    assert successes.mean() >= 0.95
     assert np.mean(ends.converged) >= 0.95

@@ -26,8 +26,8 @@ class Waves(eqx.Module):
 
 def film(arena: str) -> tuple[Case, tippe.Recording]:
     """A row of `arena_reference.csv` with viscous friction: centre and axis at six times, as a recording."""
-    found = zip(cases(), recorded(), strict=True)
-    case, row = next((case, row) for case, row in found if case.arena == arena and case.slip_speed == 0.0)
+    films = zip(cases(), recorded(), strict=True)
+    case, row = next((case, row) for case, row in films if case.arena == arena and case.slip_speed == 0.0)
     launch = tippe.Launch(
         case.theta,
         case.spin,
@@ -46,10 +46,10 @@ def test_the_height_of_waves():
     """From waves a tenth too high, by differences, which need no derivative of the run; of exact data nothing is left."""
     case, recording = film("graph")
     scene = tippe.Scene(rutstam_top(), tippe.Graph(Waves(1.1 * case.p1, case.p2)), tippe.Viscous(case.mu))
-    found = tippe.identify(scene, recording, {"tall": 1.1 * case.p1}, slopes="differences", progress=False)
-    assert found.status == "converged"
-    assert_close(list(found.estimates.values()), case.p1, rtol=1e-6)
-    assert max(abs(row.residual) for row in found.residuals) < 1e-4
+    fit = tippe.identify(scene, recording, {"tall": 1.1 * case.p1}, slopes="differences", progress=False)
+    assert fit.status == "converged"
+    assert_close(list(fit.estimates.values()), case.p1, rtol=1e-6)
+    assert max(abs(row.residual) for row in fit.residuals) < 1e-4
 
 
 @pytest.mark.slow
@@ -60,10 +60,10 @@ def test_friction_and_shape(arena):
     surface = tippe.Paraboloid(1.1 * case.p1) if arena == "paraboloid" else tippe.Graph(Waves(1.1 * case.p1, case.p2))
     name = "surface.p" if arena == "paraboloid" else "tall"
     free = {"mu": 1.3 * case.mu, name: 1.1 * case.p1}
-    found = tippe.identify(tippe.Scene(rutstam_top(), surface, tippe.Viscous(0.2)), recording, free, progress=False)
-    assert found.status == "converged"
-    assert_close(list(found.estimates.values()), [case.mu, case.p1], rtol=1e-5)
-    assert 0.0 < found.standard_errors["scene.friction.mu"] < 0.1 * case.mu
+    fit = tippe.identify(tippe.Scene(rutstam_top(), surface, tippe.Viscous(0.2)), recording, free, progress=False)
+    assert fit.status == "converged"
+    assert_close(list(fit.estimates.values()), [case.mu, case.p1], rtol=1e-5)
+    assert 0.0 < fit.standard_errors["scene.friction.mu"] < 0.1 * case.mu
 
 
 #: Launches at a place of the bowl z = (x^2 + y^2) / (2 p), p = 0.25 m, and when theta is 0.6 pi there (`independent_time`).
@@ -99,8 +99,8 @@ def test_the_shape_of_a_bowl_from_inversion_times():
     launch = tippe.Launch(theta=THETA, spin=SPIN, place=PLACE)
     data = tippe.InversionTimes(launch, TIMES, error=0.01, t1=6.0, angle=ANGLE)
     scene = tippe.Scene(rutstam_top(), tippe.Paraboloid(1.1 * BOWL), tippe.Viscous(0.3))
-    found = tippe.identify(scene, data, {"surface.p": 1.1 * BOWL}, progress=False)
-    assert found.status == "converged"
-    assert_close(found.estimates["scene.surface.p"], BOWL, rtol=1e-6)
-    assert max(abs(row.residual) for row in found.residuals) < 1e-3
-    assert 0.0 < found.standard_errors["scene.surface.p"] < 0.01 * BOWL
+    fit = tippe.identify(scene, data, {"surface.p": 1.1 * BOWL}, progress=False)
+    assert fit.status == "converged"
+    assert_close(fit.estimates["scene.surface.p"], BOWL, rtol=1e-6)
+    assert max(abs(row.residual) for row in fit.residuals) < 1e-3
+    assert 0.0 < fit.standard_errors["scene.surface.p"] < 0.01 * BOWL

@@ -74,8 +74,8 @@ def test_arrays_of_numpy_in_a_batch_inside_jit(time):
         return jax.vmap(lambda theta: time(scene, tippe.Launch(theta, 155.0), 8.0, tolerance=1e-6))(thetas)
 
     # The refusal comes while JAX traces.
-    for found in (times, lambda mu: jax.jvp(times, (mu,), (jnp.ones(()),)), jax.jacrev(times)):
-        assert all(part.shape == (2,) for part in jax.tree.leaves(jax.eval_shape(jax.jit(found), 0.3)))
+    for function in (times, lambda mu: jax.jvp(times, (mu,), (jnp.ones(()),)), jax.jacrev(times)):
+        assert all(part.shape == (2,) for part in jax.tree.leaves(jax.eval_shape(jax.jit(function), 0.3)))
 
 
 def test_second_derivative():
@@ -264,7 +264,7 @@ def test_a_frame_that_turns_with_the_top_saves_digits_and_changes_none(rutstam_s
     launch = tippe.Launch(np.array([0.1, 0.4, 0.2, 1.0]), np.array([150.0, -180.0, 200.0, 40.0]), azimuth=1.0)
 
     def problems(law):
-        scene = eqx.tree_at(lambda one: one.friction, rutstam_scene, law)
+        scene = eqx.tree_at(lambda node: node.friction, rutstam_scene, law)
         tables = dataclasses.replace(InversionProblem.of(scene, launch, jnp.pi, 4), cos_angle=jnp.asarray(-2.0))
         return tables, dataclasses.replace(tables, dynamics=scene.dynamics)
 
@@ -282,12 +282,12 @@ def test_a_frame_that_turns_with_the_top_saves_digits_and_changes_none(rutstam_s
         assert_close(ends(tables, 1e-13) / sizes, exact / sizes, atol=1e-9)
     # The fast ones under viscous friction, where nothing but the turning limits the steps.
     wrong = {
-        name: np.abs((ends(one, 1e-8) - exact) / sizes).max(axis=0)[:3]
-        for name, one in (("turning", tables), ("rest", at_rest))
+        name: np.abs((ends(problem, 1e-8) - exact) / sizes).max(axis=0)[:3]
+        for name, problem in (("turning", tables), ("rest", at_rest))
     }
     assert (2.0 * wrong["turning"] < wrong["rest"]).all(), wrong
     # The frame has turned: only what has no direction is the same.
-    turned, fixed = (one.dynamics.field(tables.states + 0.1 * tables.scales) for one in (tables, at_rest))
+    turned, fixed = (problem.dynamics.field(tables.states + 0.1 * tables.scales) for problem in (tables, at_rest))
     assert not np.allclose(turned[2], fixed[2])
 
 

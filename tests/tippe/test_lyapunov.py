@@ -15,21 +15,21 @@ def test_the_rise_of_an_upright_top_is_the_greatest_eigenvalue():
     """theta(0) = 0: the variational equation is that of the standing top; 1.2057 /s at 155 rad/s (`tippe.md`, section 8)."""
     scene = tippe.Scene(rutstam_top(), tippe.Plane(), tippe.Viscous(0.3))
     spins = np.array([155.0, 80.0])
-    found = tippe.lyapunov_exponent(scene, tippe.Launch(0.0, spins), 30.0)
-    assert found.status.tolist() == ["completed"] * 2
+    exponents = tippe.lyapunov_exponent(scene, tippe.Launch(0.0, spins), 30.0)
+    assert exponents.status.tolist() == ["completed"] * 2
     expected = [float(steady.growth_rate(steady.standing_matrix(scene, spin))) for spin in spins]
     assert_close(expected[0], 1.2057, atol=5e-5)
-    assert_close(found.exponent, expected, rtol=1e-6)
+    assert_close(exponents.exponent, expected, rtol=1e-6)
 
 
 def test_orderly_motion_on_the_plane():
     """Without friction the top on the plane is integrable: nearby runs part linearly, so the exponent falls as ln t / t."""
     scene = tippe.Scene(rutstam_top())
-    found = tippe.lyapunov_exponent(scene, tippe.Launch([0.3, 1.0, 2.0], [100.0, 60.0, 80.0]), 100.0)
-    assert (np.abs(found.exponent) < 2.0 * found.error).all()
-    assert (found.running[-1] < (2.0 + math.log(100.0)) / 100.0).all()
-    assert found.running.shape == (32, 3)
-    assert_close(found.times[-1], 100.0)
+    exponents = tippe.lyapunov_exponent(scene, tippe.Launch([0.3, 1.0, 2.0], [100.0, 60.0, 80.0]), 100.0)
+    assert (np.abs(exponents.exponent) < 2.0 * exponents.error).all()
+    assert (exponents.running[-1] < (2.0 + math.log(100.0)) / 100.0).all()
+    assert exponents.running.shape == (32, 3)
+    assert_close(exponents.times[-1], 100.0)
 
 
 #: A launch without spin in a cylinder of three radii that parts at 2 /s, and one with spin that does not.
@@ -49,13 +49,13 @@ def test_chaos_in_a_cylinder():
     """
     theta, spin, eta, azimuth = (np.repeat(pair, [15, 1]) for pair in (THETA, SPIN, ETA, AZIMUTH))
     theta[:15] += 1e-9 * np.arange(15)
-    found = tippe.lyapunov_exponent(cylinder_scene(), tippe.Launch(theta, spin, eta, azimuth), 100.0)
-    assert found.status.tolist() == ["completed"] * 16
-    chaotic, ordered = found.exponent[:15], found.exponent[15]
+    exponents = tippe.lyapunov_exponent(cylinder_scene(), tippe.Launch(theta, spin, eta, azimuth), 100.0)
+    assert exponents.status.tolist() == ["completed"] * 16
+    chaotic, ordered = exponents.exponent[:15], exponents.exponent[15]
     assert_close(chaotic.mean(), 1.9, atol=0.4)
     # A launch whose own error is large is no sign of order.
-    assert np.mean(chaotic > 2.0 * found.error[:15]) >= 0.7
-    assert abs(ordered) < 2.0 * found.error[15]
+    assert np.mean(chaotic > 2.0 * exponents.error[:15]) >= 0.7
+    assert abs(ordered) < 2.0 * exponents.error[15]
 
 
 @pytest.mark.slow
@@ -66,14 +66,14 @@ def test_lagranges_equations_part_as_fast():
     body = rutstam_top()
     numbers = {name: float(getattr(body, name)) for name in ("mass", "radius", "offset", "I1", "I3")}
     numbers |= {"spin": SPIN[0], "eta": ETA[0], "azimuth": AZIMUTH[0], "surface_radius": 0.06}
-    found = tippe.lyapunov_exponent(cylinder_scene(), tippe.Launch(THETA[0], SPIN[0], ETA[0], AZIMUTH[0]), 7.0)
-    assert found.exponent.shape == ()
-    times, parted = found.times[4:], []
+    exponents = tippe.lyapunov_exponent(cylinder_scene(), tippe.Launch(THETA[0], SPIN[0], ETA[0], AZIMUTH[0]), 7.0)
+    assert exponents.exponent.shape == ()
+    times, parted = exponents.times[4:], []
     for time in times:
         near, far = (inversion(numbers | {"theta": THETA[0] + d}, time, math.pi, 1e-12) for d in (0.0, 1e-7))
         assert near[0] == far[0] == "not_inverted"
         parted.append(math.log(abs(near[2] - far[2]) / 1e-7))
-    expected, rate = (np.polyfit(times, logarithm, 1)[0] for logarithm in (parted, times * found.running[4:]))
+    expected, rate = (np.polyfit(times, logarithm, 1)[0] for logarithm in (parted, times * exponents.running[4:]))
     assert_close(rate, expected, rtol=0.15)
 
 
@@ -84,22 +84,22 @@ def test_the_error_covers_the_spread_of_chaotic_runs():
     Three quarters are within two of their errors: the motion may linger near orderly motion for longer than the run.
     """
     theta = THETA[0] + 1e-9 * np.arange(32)
-    found = tippe.lyapunov_exponent(cylinder_scene(), tippe.Launch(theta, SPIN[0], ETA[0], AZIMUTH[0]), 300.0)
-    away = np.abs(found.exponent - 1.84) / found.error
-    assert_close(found.exponent.mean(), 1.84, atol=0.25)
+    exponents = tippe.lyapunov_exponent(cylinder_scene(), tippe.Launch(theta, SPIN[0], ETA[0], AZIMUTH[0]), 300.0)
+    away = np.abs(exponents.exponent - 1.84) / exponents.error
+    assert_close(exponents.exponent.mean(), 1.84, atol=0.25)
     assert np.mean(away < 2.0) > 0.7
     assert np.max(away) < 5.0
-    assert np.mean(found.exponent > 2.0 * found.error) > 0.8
+    assert np.mean(exponents.exponent > 2.0 * exponents.error) > 0.8
 
 
 @pytest.mark.slow
 def test_contact_loss_is_told():
     """On the wall at the top of the cylinder the contact is lost: no exponent, and when it was."""
-    found = tippe.lyapunov_exponent(cylinder_scene(), tippe.Launch([2.0, 0.3], 0.0, [2.5, 0.3], 0.5), 100.0)
-    assert found.status.tolist() == ["contact_lost", "completed"]
-    assert np.isnan(found.exponent[0])
-    assert found.end_time[0] < 1.0
-    assert np.isfinite(found.exponent[1])
+    exponents = tippe.lyapunov_exponent(cylinder_scene(), tippe.Launch([2.0, 0.3], 0.0, [2.5, 0.3], 0.5), 100.0)
+    assert exponents.status.tolist() == ["contact_lost", "completed"]
+    assert np.isnan(exponents.exponent[0])
+    assert exponents.end_time[0] < 1.0
+    assert np.isfinite(exponents.exponent[1])
 
 
 BAD = [

@@ -43,7 +43,7 @@ def by_quadrature(shape: dict[str, float], density: float) -> tuple[float, float
         r, dr = edge[:, None] * (nodes + 1.0) / 2.0, edge[:, None] / 2.0 * weights
         ring = sign * density * 2.0 * np.pi * r * dr * dz[:, None]
         height = z[:, None] + 0.0 * r
-        sums += [np.sum(ring * one) for one in (1.0 + 0.0 * r, height, r**2 / 2.0 + height**2, r**2)]
+        sums += [np.sum(ring * weight) for weight in (1.0 + 0.0 * r, height, r**2 / 2.0 + height**2, r**2)]
     mass, moment, transverse, axial = sums
     return mass, moment / mass, transverse - moment**2 / mass, axial
 

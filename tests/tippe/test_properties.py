@@ -196,12 +196,12 @@ def check_reversal(scene: tippe.Scene, launch: tippe.Launch):
     tolerance, smooth = 1e-11, without_friction(scene)
     signs = np.ones((smooth.state(launch).shape[0], 1))
     signs[:2] = signs[5:8] = -1.0
-    there = ends(smooth, launch, tolerance)
-    back = ends(smooth, launch, tolerance, signs * there.state)
-    stays = (np.asarray(there.status) == REACHED_END) & (np.asarray(back.status) == REACHED_END)
+    arrival = ends(smooth, launch, tolerance)
+    back = ends(smooth, launch, tolerance, signs * arrival.state)
+    stays = (np.asarray(arrival.status) == REACHED_END) & (np.asarray(back.status) == REACHED_END)
     missed = departure(smooth, launch, signs * back.state, smooth.state(launch))
-    growth = 1.0 + sensitivity(smooth, launch, signs * there.state, tolerance)
-    return np.where(stays, missed / (tolerance * growth * np.asarray(there.steps)), 0.0), stays
+    growth = 1.0 + sensitivity(smooth, launch, signs * arrival.state, tolerance)
+    return np.where(stays, missed / (tolerance * growth * np.asarray(arrival.steps)), 0.0), stays
 
 
 def check_turning(scene: tippe.Scene, launch: tippe.Launch, angle: float):
@@ -246,7 +246,7 @@ MANY = settings(COMMON, max_examples=180, print_blob=True)
 
 
 @pytest.mark.parametrize(
-    "arena", [*(pytest.param(one, marks=pytest.mark.slow) for one in ("plane", "cylinder")), "sphere"]
+    "arena", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("plane", "cylinder")), "sphere"]
 )
 def test_properties(arena):
     """Finite or flagged, energy, Jellett's constant, mirrors, units, time reversal, turning."""

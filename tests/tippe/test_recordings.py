@@ -118,19 +118,19 @@ def test_files_that_cannot_be_read_are_refused(tmp_path, text, columns, fps, mes
     ],
 )
 def test_bad_recordings_are_refused(change, message):
-    given = {"times": [0.0, 1.0], "value": [1.0, 1.1], "error": 0.1} | change
+    arguments = {"times": [0.0, 1.0], "value": [1.0, 1.1], "error": 0.1} | change
     with pytest.raises(ValueError, match=message):
-        tippe.Recording(tippe.Launch(0.1, 9.0), **given)
+        tippe.Recording(tippe.Launch(0.1, 9.0), **arguments)
 
 
 def test_names_of_one_film_of_each_and_of_all(rutstam_scene):
     film = tippe.Recording(tippe.Launch(0.1, 9.0), [0.0, 1.0], [0.1, 0.2], 0.1)
     times = tippe.InversionTimes(tippe.Launch(0.1, [9.0, 10.0]), [1.0, 2.0], 0.1, t1=5.0)
-    found = unknowns_of(
+    unknowns = unknowns_of(
         rutstam_scene, (film, times, film), {"data[*].t0": 0.0, "mu": 0.3, "data[1].launch.azimuth": 0.1}
     )
-    assert list(found) == ["data[0].t0", "data[2].t0", "scene.friction.mu", "data[1].launch.azimuth"]
-    assert found["scene.friction.mu"].lower == 0.0
+    assert list(unknowns) == ["data[0].t0", "data[2].t0", "scene.friction.mu", "data[1].launch.azimuth"]
+    assert unknowns["scene.friction.mu"].lower == 0.0
     for free, message in (
         ({"data[1].t0": 0.0}, r"'data\[1\].t0' must be one of"),
         ({"data[0].launch.velocity[0]": 0.0}, "must be one of"),

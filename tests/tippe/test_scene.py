@@ -122,8 +122,8 @@ def test_traced_numbers_pass_the_checks():
 )
 def test_what_constructors_refuse_a_trace_knows_to_be_illegal(make, good, bad):
     """One statement of every range serves both."""
-    found = jax.vmap(lambda number: legal(all_bounds(make(number))))(jnp.array([good, bad]))
-    assert found.tolist() == [True, False]
+    legality = jax.vmap(lambda number: legal(all_bounds(make(number))))(jnp.array([good, bad]))
+    assert legality.tolist() == [True, False]
     make(good)
     with pytest.raises(ValueError, match="must be"):
         make(bad)
@@ -153,7 +153,9 @@ def test_the_field_costs_what_the_lean_one_does(arena, law):
     equations = jax.make_jaxpr(lambda state: dynamics.motion(state).rate)(states).jaxpr.eqns
     moves = {"squeeze", "slice", "broadcast_in_dim", "neg", "unstack"}
     arithmetic = {"add", "sub", "mul", "div", "sqrt"}
-    results = [(one.primitive.name, result.aval.shape) for one in equations for result in one.outvars[:1]]
+    results = [
+        (equation.primitive.name, result.aval.shape) for equation in equations for result in equation.outvars[:1]
+    ]
     on_lanes = Counter(name for name, shape in results if shape == (7,))
     assert set(on_lanes) <= arithmetic | moves
     assert sum(count for name, count in on_lanes.items() if name in arithmetic) <= YARDSTICK[arena, law] + 2
@@ -177,8 +179,8 @@ def test_the_margin_of_a_contact_has_its_slope_however_it_is_compiled(rutstam_sc
 
     @jax.jit
     def slopes(state, way):
-        one = jax.grad(margin)(state) @ way
-        return one, (margin(state + 1e-6 * way) - margin(state - 1e-6 * way)) / 2e-6
+        slope = jax.grad(margin)(state) @ way
+        return slope, (margin(state + 1e-6 * way) - margin(state - 1e-6 * way)) / 2e-6
 
-    found, expected = jax.vmap(slopes, in_axes=-1)(states, ways)
-    assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    derivatives, expected = jax.vmap(slopes, in_axes=-1)(states, ways)
+    assert_close(derivatives, expected, rtol=1e-5, atol=1e-5)

@@ -27,14 +27,14 @@ def scene(alpha, gamma, mu=0.3, surface=None):
 
 @eqx.filter_jit
 @eqx.filter_vmap(in_axes=(0, 0, None))
-def standing_growth(one, spin, inverted):
-    return steady.growth_rate(steady.standing_matrix(one, spin, inverted))
+def standing_growth(top_scene, spin, inverted):
+    return steady.growth_rate(steady.standing_matrix(top_scene, spin, inverted))
 
 
 @eqx.filter_jit
 @eqx.filter_vmap
-def tumbling_growth(one, motion):
-    return steady.growth_rate(steady.tumbling_matrix(one, motion))
+def tumbling_growth(top_scene, motion):
+    return steady.growth_rate(steady.tumbling_matrix(top_scene, motion))
 
 
 def many(count, alpha, gamma):
@@ -57,8 +57,8 @@ def lanes_of_group_two(count):
 @pytest.mark.parametrize("inverted", [False, True], ids=["upright", "inverted"])
 def test_a_standing_top_is_a_zero_of_the_field(surface, inverted):
     """At the lowest point, at any spin, to 1e-12."""
-    one = scene(0.3, 0.94, surface=surface)
-    np.testing.assert_allclose(one.field(steady.standing_state(one, 80.0, inverted)), 0.0, atol=1e-12)
+    top_scene = scene(0.3, 0.94, surface=surface)
+    np.testing.assert_allclose(top_scene.field(steady.standing_state(top_scene, 80.0, inverted)), 0.0, atol=1e-12)
 
 
 def test_a_tumbling_top_is_a_zero_of_the_field_seen_while_precessing():
@@ -67,15 +67,15 @@ def test_a_tumbling_top_is_a_zero_of_the_field_seen_while_precessing():
     motion = steady.tumbling(scenes, RNG.uniform(0.05, 3.09, 300))
 
     @jax.vmap
-    def residual(one, motion):
-        state = steady.tumbling_state(one, motion)
+    def residual(top_scene, motion):
+        state = steady.tumbling_state(top_scene, motion)
         turned = motion.precession * steady.quarter_turn(state)
-        scales = one.scales(tippe.Launch(motion.theta, motion.spin))
-        still = jnp.abs(one.field(state) - turned) / scales / motion.precession
+        scales = top_scene.scales(tippe.Launch(motion.theta, motion.spin))
+        still = jnp.abs(top_scene.field(state) - turned) / scales / motion.precession
         return (
             jnp.max(still),
-            one.jellett(state) / motion.jellett - 1.0,
-            one.normal_force(state) / one.body.mass / one.gravity,
+            top_scene.jellett(state) / motion.jellett - 1.0,
+            top_scene.normal_force(state) / top_scene.body.mass / top_scene.gravity,
         )
 
     still, jellett, weights = residual(scenes, motion)
@@ -105,12 +105,12 @@ def test_eigenvalues_of_a_standing_top_change_sign_at_the_critical_spin(inverted
 )
 def test_a_standing_top_feels_only_the_curvature_of_the_arena(surface, same):
     """Arenas of one curvature at the lowest point have the same eigenvalues, whatever frame the equations are in."""
-    found, expected = (
-        np.linalg.eigvals(steady.standing_matrix(scene(0.3, 0.94, surface=one), 100.0, inverted=True))
-        for one in (surface, same)
+    matrices, expected = (
+        np.linalg.eigvals(steady.standing_matrix(scene(0.3, 0.94, surface=arena), 100.0, inverted=True))
+        for arena in (surface, same)
     )
-    assert len(found) == len(expected)
-    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(expected), rtol=1e-6, atol=1e-6)
+    assert len(matrices) == len(expected)
+    np.testing.assert_allclose(np.sort_complex(matrices), np.sort_complex(expected), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,9 @@ def test_a_standing_top_is_as_stable_whether_or_not_it_may_fly(surface, growth):
     """Inverted, 100 rad/s: "hybrid" and "stop" agree, and no direction of symmetry counts as marginal."""
     stops = scene(0.3, 0.94, surface=surface)
     flies = dataclasses.replace(stops, contact="hybrid", restitution=0.5)
-    rates = [float(steady.growth_rate(steady.standing_matrix(one, 100.0, inverted=True))) for one in (stops, flies)]
+    rates = [
+        float(steady.growth_rate(steady.standing_matrix(variant, 100.0, inverted=True))) for variant in (stops, flies)
+    ]
     assert rates[0] == rates[1]
     assert rates[0] < -1e-3
     if growth is not None:
@@ -138,10 +140,10 @@ def test_tops_of_groups_one_and_three_have_no_critical_spin():
     """Group I stands upright at every spin; group III never stands inverted: 1000 rad/s and more make no difference."""
     alpha, spins = 0.3, np.linspace(1.0, 3000.0, 50)
     for gamma, inverted, name in ((0.65, False, "I"), (1.35, True, "III")):
-        one = scene(alpha, gamma)
-        assert steady.group(one.body) == name
-        assert (steady.inverted_critical_spin if inverted else steady.upright_critical_spin)(one) == jnp.inf
-        lanes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, spins.shape), one)
+        top_scene = scene(alpha, gamma)
+        assert steady.group(top_scene.body) == name
+        assert (steady.inverted_critical_spin if inverted else steady.upright_critical_spin)(top_scene) == jnp.inf
+        lanes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, spins.shape), top_scene)
         growth = standing_growth(lanes, jnp.asarray(spins), inverted)
         assert jnp.all(growth > 0.0) if inverted else jnp.all(growth < 0.0)
     assert steady.group(body(alpha, 0.94)) == "II"
@@ -153,7 +155,10 @@ def test_a_tumbling_top_is_stable_where_jelletts_constant_grows_with_the_angle()
     theta = jnp.asarray(RNG.uniform(0.05, 3.09, 600))
     motion = steady.tumbling(scenes, theta)
     growth = tumbling_growth(scenes, motion)
-    slope = jax.vmap(jax.grad(lambda angle, one: steady.tumbling(one, angle).jellett))(theta, scenes) / motion.jellett
+    slope = (
+        jax.vmap(jax.grad(lambda angle, top_scene: steady.tumbling(top_scene, angle).jellett))(theta, scenes)
+        / motion.jellett
+    )
     clear = jnp.abs(slope) > 1e-4
     stable = steady.tumbling_is_stable(scenes, theta)
     assert jnp.sum(clear & stable) > 100
@@ -164,14 +169,14 @@ def test_a_tumbling_top_is_stable_where_jelletts_constant_grows_with_the_angle()
 
 def test_the_growth_rate_of_a_tumbling_top_vanishes_at_the_fold_of_jelletts_constant():
     """alpha = 0.3, gamma = 0.75: the sign changes within 1e-6 in spin of the extremum of J over theta."""
-    one = scene(0.3, 0.75)
-    assert steady.folds(one.body)
-    slope = jax.jit(jax.vmap(jax.grad(lambda theta: steady.tumbling(one, theta).jellett)))
+    top_scene = scene(0.3, 0.75)
+    assert steady.folds(top_scene.body)
+    slope = jax.jit(jax.vmap(jax.grad(lambda theta: steady.tumbling(top_scene, theta).jellett)))
     folds = sign_changes(slope, jnp.linspace(0.01, 3.13, 500))
     assert folds.size > 0
     beside = jnp.concatenate([folds - 3e-8, folds + 3e-8])
-    motion = steady.tumbling(one, beside)
-    lanes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, beside.shape), one)
+    motion = steady.tumbling(top_scene, beside)
+    lanes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, beside.shape), top_scene)
     before, after = jnp.split(tumbling_growth(lanes, motion), 2)
     assert jnp.all(before * after < 0.0)
     spins = motion.spin.reshape(2, -1)
@@ -183,7 +188,7 @@ def test_jelletts_constant_has_a_fold_exactly_where_the_classification_says():
     count = 2000
     scenes = lanes_of_group_two(count)
     theta = jnp.linspace(1e-4, np.pi - 1e-4, 4001)
-    stable = jax.jit(jax.vmap(lambda one: jnp.all(steady.tumbling_is_stable(one, theta))))(scenes)
+    stable = jax.jit(jax.vmap(lambda top_scene: jnp.all(steady.tumbling_is_stable(top_scene, theta))))(scenes)
     expected = [steady.folds(jax.tree.map(lambda leaf, lane=lane: leaf[lane], scenes.body)) for lane in range(count)]
     assert 100 < sum(expected) < count - 100
     assert np.array_equal(~np.asarray(stable), expected)
@@ -191,43 +196,45 @@ def test_jelletts_constant_has_a_fold_exactly_where_the_classification_says():
 
 def test_thresholds_of_rutstams_top():
     """lambda_thres = 3.4575e-6 kg m^3/s, upright unstable above 27.41 rad/s (Rutstam, SIGMA 8 (2012) 019)."""
-    one = scene(0.3, 235 / 250)
-    upright, inverted = steady.jellett_thresholds(one)
+    top_scene = scene(0.3, 235 / 250)
+    upright, inverted = steady.jellett_thresholds(top_scene)
     np.testing.assert_allclose(inverted, 3.4575e-6, rtol=2e-5)
-    np.testing.assert_allclose(steady.upright_critical_spin(one), 27.41, rtol=2e-4)
-    np.testing.assert_allclose(inverted / (one.body.I3 * (one.body.radius - one.body.offset)), 77.18, rtol=2e-4)
+    np.testing.assert_allclose(steady.upright_critical_spin(top_scene), 27.41, rtol=2e-4)
+    np.testing.assert_allclose(
+        inverted / (top_scene.body.I3 * (top_scene.body.radius - top_scene.body.offset)), 77.18, rtol=2e-4
+    )
     # A standing top has the constant of the tumbling tops next to it.
-    near = steady.tumbling(one, jnp.array([1e-6, np.pi - 1e-6])).jellett
+    near = steady.tumbling(top_scene, jnp.array([1e-6, np.pi - 1e-6])).jellett
     np.testing.assert_allclose(near, [upright, inverted], rtol=1e-9)
 
 
 def test_cohens_top_with_a_smaller_axial_inertia_tumbles_at_an_intermediate_angle():
     """I3 = 0.8 I1, 100 rad/s from theta = 0.1: theta = 2.077 rad, phi' = 55.8, psi' = -11.16 rad/s (Cohen 1977)."""
     I1 = 0.4 * 0.015 * 0.025**2
-    one = tippe.Scene(tippe.Top(0.015, 0.025, 0.005, I1, 0.8 * I1), friction=tippe.Viscous(0.3))
-    assert steady.group(one.body) == "III"
-    angles = steady.tumbling_angles(one, float(one.jellett(one.state(tippe.Launch(0.1, 100.0)))))
-    ends = [theta for theta in angles if steady.tumbling_is_stable(one, theta)]
-    motion = steady.tumbling(one, ends[0])
+    top_scene = tippe.Scene(tippe.Top(0.015, 0.025, 0.005, I1, 0.8 * I1), friction=tippe.Viscous(0.3))
+    assert steady.group(top_scene.body) == "III"
+    angles = steady.tumbling_angles(top_scene, float(top_scene.jellett(top_scene.state(tippe.Launch(0.1, 100.0)))))
+    ends = [theta for theta in angles if steady.tumbling_is_stable(top_scene, theta)]
+    motion = steady.tumbling(top_scene, ends[0])
     psi_dot = motion.spin - motion.precession * jnp.cos(motion.theta)
     np.testing.assert_allclose([*ends, motion.precession, psi_dot], [2.07687, 55.784, -11.157], rtol=1e-4)
 
 
 def test_the_steady_motions_are_the_extrema_of_the_effective_energy():
     """Minima where the tumbling top is stable, maxima where it is not, at the same Jellett constant."""
-    one = scene(0.3, 0.75)
-    energy = jax.grad(lambda theta, jellett: steady.effective_energy(one, theta, jellett))
+    top_scene = scene(0.3, 0.75)
+    energy = jax.grad(lambda theta, jellett: steady.effective_energy(top_scene, theta, jellett))
     curvature = jax.grad(energy)
     seen = set()
     for theta in np.linspace(0.1, 3.0, 30):
-        motion = steady.tumbling(one, theta)
-        stable = bool(steady.tumbling_is_stable(one, theta))
+        motion = steady.tumbling(top_scene, theta)
+        stable = bool(steady.tumbling_is_stable(top_scene, theta))
         seen.add(stable)
         # The effective energy has its extremum there, and the angles found from J include it.
         assert abs(energy(motion.theta, motion.jellett)) < 1e-14
         assert (curvature(motion.theta, motion.jellett) > 0.0) == stable
     assert seen == {True, False}
-    several = steady.tumbling_angles(one, float(motion.jellett))
+    several = steady.tumbling_angles(top_scene, float(motion.jellett))
     assert any(abs(theta - 3.0) < 1e-9 for theta in several)
 
 

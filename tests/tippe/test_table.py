@@ -71,8 +71,8 @@ def test_scattered_cells_are_those_of_the_grid(table, rutstam_scene_module, tmp_
         np.testing.assert_array_equal(cells[name], values)
     np.testing.assert_array_equal(cells.time, table.time[tuple(which.T)])
     assert cells.units["theta"] == "rad"
-    again = tippe.inversion_table(rutstam_scene_module, **columns, **arguments)
-    np.testing.assert_array_equal(again.time, cells.time)
+    second_table = tippe.inversion_table(rutstam_scene_module, **columns, **arguments)
+    np.testing.assert_array_equal(second_table.time, cells.time)
     with pytest.raises(ValueError, match="another run: cells is"):
         tippe.inversion_table(rutstam_scene_module, **columns | {"theta": columns["theta"][::-1]}, **arguments)
 
@@ -296,9 +296,9 @@ def test_both_crossings_have_no_one_derivative():
 def test_lists_of_places_on_a_closed_surface():
     """By (x, y, z), of which (0, 0, 0) is no place: where the top starts is checked cell by cell."""
     scene = tippe.Scene(rutstam_top(), tippe.Sphere(0.3), tippe.Viscous(0.3))
-    given = {"theta": 0.1, "spin": 100.0, "t1": 0.01, "tolerance": 1e-6}
+    arguments = {"theta": 0.1, "spin": 100.0, "t1": 0.01, "tolerance": 1e-6}
     places = {"launch.place[0]": [0.18, -0.18], "launch.place[2]": -0.24}
-    table = tippe.inversion_table(scene, axes=places, **given)
+    table = tippe.inversion_table(scene, axes=places, **arguments)
     assert (table.status == "not_inverted").all()
     with pytest.raises(ValueError, match="distance"):
-        tippe.inversion_table(scene, axes=places | {"launch.place[0]": [0.18, 0.2]}, **given)
+        tippe.inversion_table(scene, axes=places | {"launch.place[0]": [0.18, 0.2]}, **arguments)

@@ -78,15 +78,15 @@ def test_an_interrupted_sweep_resumes_and_recomputes_no_finished_block(rutstam_s
         tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
     part = tippe.Table.load(path)
     assert (part.status == "pending").sum() == 16
-    again = written_blocks.recorded(monkeypatch)
+    second_writes = written_blocks.recorded(monkeypatch)
     whole = tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
-    assert sorted(again + done) == [0, 1, 2]
+    assert sorted(second_writes + done) == [0, 1, 2]
     monkeypatch.setattr(sweeping.ChunkStore, "write", written_blocks.WRITE)
     fresh = tippe.inversion_table(rutstam_scene_module, **arguments)
     np.testing.assert_array_equal(whole.status, fresh.status)
     assert_close(whole.end_theta, fresh.end_theta, atol=1e-12)
     tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
-    assert sorted(again + done) == [0, 1, 2]
+    assert sorted(second_writes + done) == [0, 1, 2]
 
 
 KILLED = """
@@ -136,10 +136,10 @@ def test_a_table_killed_again_and_again_is_the_one_that_was_not(tmp_path, monkey
     path, random, finished = tmp_path / "table.h5", np.random.default_rng(0), set()
     for _ in range(5):
         process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.DEVNULL)
-        enough, found = len(finished) + int(random.integers(1, 30)), finished
-        while len(found) < enough and process.poll() is None:
+        enough, blocks = len(finished) + int(random.integers(1, 30)), finished
+        while len(blocks) < enough and process.poll() is None:
             time.sleep(random.uniform(0.0, 0.02))
-            found = blocks_of(path)
+            blocks = blocks_of(path)
         os.kill(process.pid, signal.SIGKILL)
         process.communicate()
         cells = tippe.Table.load(path).status.reshape(200, 4)
@@ -194,12 +194,12 @@ def test_unwritable_corrupt_and_foreign_files_are_named(rutstam_scene_module, tm
 def test_a_file_has_one_writer(rutstam_scene_module, tmp_path):
     """While one sweep computes a file, another is refused."""
     path, arguments = tmp_path / "table.h5", {"theta": THETA, "spin": SPIN, "t1": 0.1}
-    once = sweeping.ChunkStore.write
+    original = sweeping.ChunkStore.write
 
     def and_try_again(self, block, values):
         with pytest.raises(OSError, match="another process is writing it"):
             tippe.inversion_table(rutstam_scene_module, path=path, **arguments)
-        once(self, block, values)
+        original(self, block, values)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sweeping.ChunkStore, "write", and_try_again)

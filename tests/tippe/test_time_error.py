@@ -181,11 +181,11 @@ def test_agreement_on_no_answer_is_no_agreement(monkeypatch):
 
     monkeypatch.setattr(InversionRuns, "results", results)
     runs = InversionRuns(run_kind_of(scene), 1.0, ANGLE, "both", None, "ensemble", [])
-    found = InversionJob(runs, {"scene": scene}, 1e-9, errors=True)({}, len(words))
+    outcome = InversionJob(runs, {"scene": scene}, 1e-9, errors=True)({}, len(words))
     for name in ("first_time", "last_time"):
-        doubtful = np.isinf(found[f"{name}_error"])
+        doubtful = np.isinf(outcome[f"{name}_error"])
         assert {word for word, doubt in zip(words, doubtful, strict=True) if doubt} == {"failed", "unresolved"}
-    assert concise_strings(found["last_time"], found["last_time_error"], np.array(words))[-1] == "unresolved?"
+    assert concise_strings(outcome["last_time"], outcome["last_time_error"], np.array(words))[-1] == "unresolved?"
 
 
 def test_the_file_keeps_the_errors(tmp_path):

@@ -14,7 +14,7 @@ from tops import rutstam_top
 import tippe
 from nonholonomic.integration import Settings, follow
 from nonholonomic.integration.dense import PIECE
-from tippe.runs.trajectory import TrajectoryProblem
+from tippe.modes.trajectory_problem import trajectory_problem
 
 LAUNCH = tippe.Launch(0.1, 155.0)
 
@@ -28,14 +28,20 @@ def test_a_run_prints_what_it_took(rutstam_scene):
 def test_given_times_and_dense_output_agree(rutstam_scene):
     times = np.linspace(0.0, 1.0, 11)
     whole = tippe.simulate(rutstam_scene, LAUNCH, 1.0)
-    given = tippe.simulate(rutstam_scene, LAUNCH, 1.0, times=times)
-    assert_close(given.t, times)
-    assert_close(given.theta, whole.at(times).theta)
-    assert given.axis.shape == given.angular_momentum.shape == given.velocity.shape == given.position.shape == (11, 3)
-    assert given.slip.shape == (11, 2)
-    assert_close(given.theta[0], 0.1, rtol=1e-12)
-    assert_close(given.spin[0], 155.0, rtol=1e-12)
-    assert_close(given.velocity[0], 0.0, atol=1e-15)
+    sampled_run = tippe.simulate(rutstam_scene, LAUNCH, 1.0, times=times)
+    assert_close(sampled_run.t, times)
+    assert_close(sampled_run.theta, whole.at(times).theta)
+    assert (
+        sampled_run.axis.shape
+        == sampled_run.angular_momentum.shape
+        == sampled_run.velocity.shape
+        == sampled_run.position.shape
+        == (11, 3)
+    )
+    assert sampled_run.slip.shape == (11, 2)
+    assert_close(sampled_run.theta[0], 0.1, rtol=1e-12)
+    assert_close(sampled_run.spin[0], 155.0, rtol=1e-12)
+    assert_close(sampled_run.velocity[0], 0.0, atol=1e-15)
     with pytest.raises(ValueError, match=r"times = .* must be at most 1\.0 \(the run ends there\)"):
         whole.at([0.5, 1.5])
 
@@ -64,7 +70,7 @@ def test_illegal_numbers_in_a_batch_of_runs_give_nothing_that_looks_right(rutsta
     bad = ((0, (-0.3, math.nan)), (1, (10.0, -0.1)), (2, (-0.05, 0.01, math.nan)), (3, (-1.0, 0.0, math.nan)))
     columns = [good]
     for which, values in bad:
-        columns += [tuple(value if i == which else one for i, one in enumerate(good)) for value in values]
+        columns += [tuple(value if i == which else number for i, number in enumerate(good)) for value in values]
     runs = jax.jit(jax.vmap(run))(*jnp.array(columns).T)
     assert runs.status.tolist() == [0] + 10 * [4]
     assert jax.vmap(run)(*jnp.array(columns).T[:, :0]).theta.shape == (0, 2)
@@ -109,7 +115,7 @@ def test_more_steps_than_a_piece_holds(rutstam_scene):
 
 def test_a_run_of_too_many_steps_fails(rutstam_scene):
     """It says so and ends where it is, rather than go on for ever."""
-    path = follow(TrajectoryProblem.of(rutstam_scene, LAUNCH), 1e6, Settings(3e-14, max_steps=3000))
+    path = follow(trajectory_problem((rutstam_scene, LAUNCH)), 1e6, Settings(3e-14, max_steps=3000))
     assert path.failed
     assert not path.left_domain
     assert 3000 <= path.accepted + path.rejected < 3000 + PIECE
@@ -154,9 +160,9 @@ def test_a_batch_of_runs_says_which_lost_contact():
     assert_close(runs.end_time[1], 0.79, atol=6e-3)
     assert_close(runs.end_time[1], tippe.simulate(scene, tippe.Launch(0.1, 155.0), 1.0).end_time, rtol=1e-8)
     assert np.isfinite(runs.theta[0]).all()
-    one = tippe.simulate(scene, tippe.Launch(0.1, 100.0), 1.0, times=times)
-    assert_close(runs.theta[0], one.theta, rtol=1e-7)
-    assert_close(runs.position[0], one.position, atol=1e-8)
+    single_run = tippe.simulate(scene, tippe.Launch(0.1, 100.0), 1.0, times=times)
+    assert_close(runs.theta[0], single_run.theta, rtol=1e-7)
+    assert_close(runs.position[0], single_run.position, atol=1e-8)
     assert not np.isfinite(runs.theta[1][times > runs.end_time[1]]).any()
     assert "lost contact at 0.79" in str(jax.tree.map(lambda leaf: leaf[1], runs))
 

@@ -22,8 +22,8 @@ def axis_x(theta, solver=None, adjoint=None):
 
 def extrapolated(function, at, step):
     """A central difference, extrapolated from two steps."""
-    one, two = ((function(at + h) - function(at - h)) / (2.0 * h) for h in (step, 2.0 * step))
-    return (4.0 * one - two) / 3.0
+    fine, coarse = ((function(at + h) - function(at - h)) / (2.0 * h) for h in (step, 2.0 * step))
+    return (4.0 * fine - coarse) / 3.0
 
 
 @pytest.mark.slow
@@ -136,11 +136,11 @@ def test_theta_by_theta_at_the_pole_is_the_one_sided_derivative_forward_and_unkn
     equations in the fixed frame.
     """
     by_theta = jax.jit(jax.vmap(jax.jacfwd(thetas_of_a_top_that_starts_along_the_normal), (None, 0)))
-    found = by_theta(0.0, jnp.array([0.0, 1.0]))
+    slopes = by_theta(0.0, jnp.array([0.0, 1.0]))
     beside = thetas_of_a_top_that_starts_along_the_normal(1e-5, 1.0) / 1e-5
-    assert_close(found[0], found[1], rtol=1e-7)
-    assert_close(found[1], beside, rtol=3e-6)
-    assert_close(found[0], [1.0, 0.6063867, 0.3341863, 0.3490659, 0.2998009], atol=1e-7)
+    assert_close(slopes[0], slopes[1], rtol=1e-7)
+    assert_close(slopes[1], beside, rtol=3e-6)
+    assert_close(slopes[0], [1.0, 0.6063867, 0.3341863, 0.3490659, 0.2998009], atol=1e-7)
     backward = jax.grad(
         lambda *numbers: thetas_of_a_top_that_starts_along_the_normal(numbers[0], 1.0, numbers[1])[-1], (0, 1)
     )

@@ -107,9 +107,9 @@ def test_every_quantity_is_that_of_a_single_run_and_comes_back_from_a_file(arena
     for i, theta in enumerate((0.1, 0.3)):
         run = tippe.simulate(scene, tippe.Launch(theta, 120.0, 0.2), TIMES[-1], TIMES)
         for name in names:
-            found, expected = table.variables[name][i], np.asarray(getattr(run, name))
-            assert found.shape == expected.shape
-            assert_close(found, expected, atol=1e-6 * np.abs(expected).max())
+            values, expected = table.variables[name][i], np.asarray(getattr(run, name))
+            assert values.shape == expected.shape
+            assert_close(values, expected, atol=1e-6 * np.abs(expected).max())
     assert table.dims("position") == ("launch.theta", "time", "component")
     assert table.dims("slip") == ("launch.theta", "time", "tangent")
     assert table.dims("energy") == ("launch.theta", "time")
@@ -130,12 +130,12 @@ def test_further_axes_and_none(scene):
     assert list(turned.coords) == ["launch.azimuth", "offset", "time"]
     # The plane looks the same in every direction.
     assert_close(turned.theta, np.broadcast_to(turned.theta[0], turned.theta.shape), atol=1e-7)
-    one = tippe.trajectory_table(scene, theta=0.2, spin=100.0, times=TIMES)
-    assert one.shape == ()
-    assert one.theta.shape == (31,)
-    assert one.status == "completed"
-    assert_close(one.theta, turned.theta[0, 1], atol=1e-7)
-    assert "theta [rad] x time (31)" in str(one)
+    single_table = tippe.trajectory_table(scene, theta=0.2, spin=100.0, times=TIMES)
+    assert single_table.shape == ()
+    assert single_table.theta.shape == (31,)
+    assert single_table.status == "completed"
+    assert_close(single_table.theta, turned.theta[0, 1], atol=1e-7)
+    assert "theta [rad] x time (31)" in str(single_table)
 
 
 def test_the_file_opens_in_xarray_as_the_table_does(table):
@@ -171,16 +171,16 @@ def test_an_interrupted_table_resumes_and_a_damaged_block_is_computed_again(scen
     assert np.isfinite(part.theta[part.status == "completed"]).all()
     assert np.isnan(part.theta[part.status == "pending"]).all()
 
-    again = written_blocks.recorded(monkeypatch)
+    second_writes = written_blocks.recorded(monkeypatch)
     whole = tippe.trajectory_table(scene, path=path, **arguments)
-    assert sorted(done + again) == [0, 1, 2]
+    assert sorted(done + second_writes) == [0, 1, 2]
     with h5py.File(path, "r+") as file:
         file["theta"][9, 1, 3, 7] += 1e-12
     with pytest.raises(OSError, match="1 of its 3 chunks do not match"):
         tippe.Table.load(path)
     with pytest.warns(RuntimeWarning, match="1 finished chunks"):
         mended = tippe.trajectory_table(scene, path=path, **arguments)
-    assert sorted(done + again) == [0, 0, 1, 1, 2, 2]
+    assert sorted(done + second_writes) == [0, 0, 1, 1, 2, 2]
     fresh = tippe.trajectory_table(scene, **arguments)
     for table in (whole, mended, tippe.Table.load(path)):
         np.testing.assert_array_equal(table.theta, fresh.theta)

@@ -23,6 +23,7 @@ from nonholonomic.geometry import (
     dot,
     multiply,
     scale,
+    stacked,
     subtract,
     sum_vectors,
 )
@@ -216,9 +217,3 @@ class Dynamics(eqx.Module):
 def turned(vector: Vector, rate: Float[Array, "..."]) -> Vector:
     """Rate of the components of a fixed vector in a frame that turns about n at a given rate [rad/s]."""
     return rate * vector[1], -(rate * vector[0]), None
-
-
-def stacked(rate: tuple[Component, ...], state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-    """Stack components along axis 0, with zeros for those that vanish identically."""
-    zero = jnp.zeros_like(state[0])
-    return jnp.stack([zero if component is None else jnp.broadcast_to(component, zero.shape) for component in rate])

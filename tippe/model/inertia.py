@@ -55,9 +55,9 @@ class Inertia(Bounded):
             unequal = np.abs(np.asarray(values) - np.asarray(values).T)
             if np.any(unequal > 1e-12 * np.max(np.abs(values))):
                 row, column = np.unravel_index(np.argmax(unequal), (3, 3))
-                one, other = float(values[row, column]), float(values[column, row])
+                entry, mirrored = float(values[row, column]), float(values[column, row])
                 raise ValueError(
-                    f"inertia must be symmetric: inertia[{row}][{column}] = {one:g}, inertia[{column}][{row}] = {other:g}"
+                    f"inertia must be symmetric: inertia[{row}][{column}] = {entry:g}, inertia[{column}][{row}] = {mirrored:g}"
                 )
         values = 0.5 * (values + values.T)
         (xx, xy, xz), (_, yy, yz), (_, _, zz) = values

@@ -1,6 +1,6 @@
 """Bodies of any shape and any inertia: an unbalanced top, a rattleback.
 
-A strictly convex body touches a plane at the point that is farthest against the plane's normal. In the body's own axes
+A strictly convex body touches an arena at the point that is farthest against the arena's normal. In the body's own axes
 this point is p(d) = grad h at d = -normal. The support function h(d), extended to all vectors with degree 1, is the
 distance from the origin of the axes to the plane that the body touches with the outward normal d.
 
@@ -45,6 +45,11 @@ class AbstractRigidBody(Bounded):
     def size(self) -> Float[Array, "..."]:
         """A length of the body [m], the unit for places and velocities."""
 
+    @property
+    @abc.abstractmethod
+    def half_widths(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Half the least and half the greatest distance [m] of parallel planes that touch the body."""
+
     @abc.abstractmethod
     def surface_point(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
         """The point at which the body touches a plane.
@@ -77,7 +82,8 @@ UNITS = {"mass": "kg", "centre_of_mass": "m"} | {f"centre_of_mass[{k}]": "m" for
 class Ellipsoid(AbstractRigidBody):
     """An ellipsoid with any inertia and any centre of mass inside: a rattleback, or an unbalanced sphere.
 
-    It runs on a level or tilted plane, with every friction law except `SetValuedCoulomb`, or without slip (`NoSlip`).
+    It runs on every arena, with every friction law except `SetValuedCoulomb`, or without slip (`NoSlip`). On a curved arena, a
+    run ends as "does_not_fit" where the body is not more curved than the arena; a second contact elsewhere is not noticed.
     The part that never touches the plane does not matter: half an ellipsoid, or a boat, moves like the whole one.
 
     At a `Launch`, the body's axes x, y and z are those of the arena (t1, t2, n), turned by theta about a horizontal axis so
@@ -136,6 +142,11 @@ class Ellipsoid(AbstractRigidBody):
     def size(self) -> Float[Array, "..."]:
         a, b, c = self.semi_axes
         return jnp.maximum(jnp.maximum(a, b), c)
+
+    @property
+    def half_widths(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        a, b, c = self.semi_axes
+        return jnp.minimum(jnp.minimum(a, b), c), self.size
 
     def surface_point(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
         # p = -A n / q with q^2 = n.A n, A the squares of the semi-axes.
@@ -214,6 +225,16 @@ class RigidBody(AbstractRigidBody):
     @property
     def size(self) -> Float[Array, "..."]:
         return jnp.max(self._samples()[0], axis=0)
+
+    @property
+    def half_widths(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        def half_width(normal: Float[Array, "3"]) -> Any:
+            still = tuple(jnp.zeros(3))
+            (low, _), (high, _) = (self.surface_point(tuple(sign * normal), still) for sign in (1.0, -1.0))
+            return 0.5 * dot(tuple(normal), vector_of(sum_vectors(high, scale(-1.0, low))))
+
+        half_widths = jax.vmap(half_width)(evenly_spread(SAMPLES)[0])
+        return jnp.min(half_widths, axis=0), jnp.max(half_widths, axis=0)
 
     def surface_point(self, normal: Vector, rate: Vector) -> tuple[Vector, Vector]:
         leaves, structure = jax.tree.flatten(self.support)

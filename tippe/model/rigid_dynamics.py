@@ -1,4 +1,4 @@
-"""The equations of motion of a body of any shape and inertia on a plane, free of trigonometry and of coordinate
+"""The equations of motion of a body of any shape and inertia on an arena, free of trigonometry and of coordinate
 singularities.
 
 The state is that of a top (`state.py`) with an additional vector: in the arena's frame (t1, t2, n) the velocity (u1,
@@ -7,9 +7,12 @@ arena's place, and the body's x axis c. With d = e x c, the components of n in t
 which determine the contact
 (`rigid_body.py`).
 
-On a plane, n is fixed. With r from the centre of mass to the contact, the laws of motion are L' = r x F + N tau and m
-u' = F - m g z; the contact persists if the height of the centre of mass is -r.n. Source: Newton and Euler; for rolling,
-Garcia and Hubbard, Proc. R. Soc. A 418 (1988) 165, and Kane and Levinson, Int. J. Non-Linear Mechanics 17 (1982) 175.
+With r from the centre of mass to the contact, the laws of motion are L' = r x F + N tau and m u' = F - m g z; the contact
+persists if the contact point has no velocity along n. The frame moves with the contact point, whose velocity along the arena
+is q' = (1 - H S)^-1 (v - H (n x w)), with the slip velocity v, the shape operator S of the arena, and the operator H whose
+eigenvalues are the body's principal radii of curvature; n' = -S q'. Source: Newton and Euler; for the contact, Montana, Int. J.
+Robotics Research 7 (1988) 17; for rolling, Garcia and Hubbard, Proc. R. Soc. A 418 (1988) 165, and Kane and Levinson, Int. J.
+Non-Linear Mechanics 17 (1982) 175.
 """
 
 import abc
@@ -21,19 +24,26 @@ from jaxtyping import Array, Float, Int
 
 from nonholonomic.geometry import (
     AbstractFrame,
+    Component,
+    FrameMotion,
+    Place,
+    PlaneFrame,
+    Tangent,
     Vector,
     add,
+    carried,
     cross,
     dot,
     multiply,
     scale,
+    stacked,
     subtract,
     sum_vectors,
     vector_of,
 )
 from nonholonomic.xla_cpu import least, stored
 
-from .dynamics import JAMMED, Motion, stacked
+from .dynamics import FITS, JAMMED, Motion
 from .friction import AbstractFriction, ContactLoad, NoSlip, Slip
 from .inertia import SymmetricMatrix
 from .launch import Launch
@@ -45,19 +55,17 @@ class Attitude(NamedTuple):
     """The attitude and rotation of a body, and its contact point.
 
     - `axes`: the body's axes x, y and z in the frame (t1, t2, n).
-    - `normal`, `momentum`, `turning`: n, angular momentum and angular velocity in the body's axes; `normal_rate`: rate of
-      change of the components of n.
-    - `lever`, `lever_rate`: the vector r from the centre of mass to the contact [m] in the body's axes, and the rate of change
-      of its components.
+    - `normal`, `momentum`, `turning`: n, angular momentum and angular velocity in the body's axes.
+    - `lever`: the vector r from the centre of mass to the contact [m] in the body's axes.
+    - `fixed_rates`: rates of change of the components of n and of r if n is fixed, as on a plane.
     """
 
     axes: tuple[Vector, Vector, Vector]
     normal: Vector
-    normal_rate: Vector
     momentum: Vector
     turning: Vector
     lever: Vector
-    lever_rate: Vector
+    fixed_rates: tuple[Vector, Vector]
 
     def in_frame(self, vector: Vector) -> Vector:
         """A vector in the frame, from its components in the body's axes."""
@@ -77,6 +85,19 @@ class Attitude(NamedTuple):
         return vector_of(dot(vector, axis) for axis in self.axes)
 
 
+class ContactMotion(NamedTuple):
+    """The motion of the contact point.
+
+    - `normal_rate`, `lever_rate`: rates of change of the components of n and of r in the body's axes.
+    - `along`: velocity of the contact point along the arena [m/s]; `frame`: motion of the frame.
+    """
+
+    normal_rate: Vector
+    lever_rate: Vector
+    along: Tangent
+    frame: FrameMotion
+
+
 class AbstractRigidDynamics(eqx.Module):
     """A scene with a rigid body, with the precomputed combinations of its numbers; in place of `Dynamics`."""
 
@@ -94,9 +115,11 @@ class AbstractRigidDynamics(eqx.Module):
         **Returns:** a `Motion`, whose `spin_momentum` is the angular velocity about the body's z axis.
         """
 
-    @abc.abstractmethod
     def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
         """Like `Dynamics.margins`."""
+        motion = self.motion(state)
+        lost, jammed = motion.normal_force / (self.body.mass * self.gravity) + 1e-12, motion.painleve_factor - JAMMED
+        return (lost, jammed) if motion.room is None else (lost, jammed, motion.room - FITS)
 
     def field(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """Rate of change of the state, (components, ...)."""
@@ -108,7 +131,9 @@ class AbstractRigidDynamics(eqx.Module):
 
     def loss(self, state: Float[Array, "components ..."]) -> Int[Array, "..."]:
         """How a contact with zero margin has ended: a code in `LOSSES`."""
-        return jnp.argmin(jnp.stack([jnp.maximum(margin, 0.0) for margin in self.margins(state)]), axis=0)
+        lost, *others = self.margins(state)
+        # As in `Dynamics.loss`.
+        return len(others) - jnp.argmin(jnp.stack([*others[::-1], jnp.maximum(lost, 0.0)]), axis=0)
 
     def attitude(self, state: Float[Array, "components ..."]) -> Attitude:
         """The attitude and rotation of the body, and its contact point."""
@@ -119,7 +144,25 @@ class AbstractRigidDynamics(eqx.Module):
         momentum = vector_of(dot(L, axis) for axis in axes)
         turning = vector_of(stored(*self.inverse.times(momentum)))
         normal_rate = cross(n, turning)
-        return Attitude(axes, n, normal_rate, momentum, turning, *self.body.contact(n, normal_rate))
+        lever, lever_rate = self.body.contact(n, normal_rate)
+        return Attitude(axes, n, momentum, turning, lever, (normal_rate, lever_rate))
+
+    def contact_motion(self, place: Place, attitude: Attitude, slip: Tangent) -> ContactMotion:
+        """The motion of the contact point. **Arguments:** `place`: of the frame; `slip`: velocity v along the arena [m/s]."""
+        normal_rate, lever_rate = attitude.fixed_rates
+        over_body = attitude.in_frame(lever_rate)
+        along = (add(slip[0], over_body[0]), add(slip[1], over_body[1]))
+        if isinstance(self.frame, PlaneFrame):
+            return ContactMotion(normal_rate, lever_rate, along, self.frame.frame_motion(place, along))
+        # If n turns along a tangent, the contact moves against it over the body, by H.
+        tangents = [vector_of(axis[k] for axis in attitude.axes) for k in (0, 1)]
+        first, second = (attitude.in_frame(self.body.contact(attitude.normal, t)[1]) for t in tangents)
+        H11, H12, H22, *along = stored(-first[0], -first[1], -second[1], *along)
+        frame, path = self.frame.convex_motion(place, (along[0], along[1]), (H11, H12, H22))
+        path = stored(*path)
+        turned = attitude.in_body((subtract(None, frame.turning[0]), subtract(None, frame.turning[1]), None))
+        moved = attitude.in_body((subtract(path[0], slip[0]), subtract(path[1], slip[1]), None))
+        return ContactMotion(vector_of(sum_vectors(normal_rate, turned)), moved, path, frame)
 
     def angular_velocity(self, state: Float[Array, "components ..."]) -> Vector:
         """Angular velocity of the body in the frame [rad/s]."""
@@ -137,14 +180,35 @@ class AbstractRigidDynamics(eqx.Module):
         attitude, place = self.attitude(state), place[:-3]
         rising = -dot(attitude.turning, cross(attitude.lever, attitude.normal))
         rotation = 0.5 * dot(attitude.turning, attitude.momentum)
-        foot = subtract(self.frame.height(place), multiply(self.body.size, self.frame.vertical(place)[2]))
-        height = add(foot, dot(self.mass_from_contact(state), self.frame.vertical(place)))
+        height = add(self.frame.height(place), dot(self.mass_from_contact(state), self.frame.vertical(place)))
         return self.body.mass * (0.5 * (u1**2 + u2**2 + rising**2) + self.gravity * height) + rotation
 
     def normal_spin(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
         """Angular velocity about the arena's normal [rad/s]."""
         attitude = self.attitude(state)
         return dot(attitude.turning, attitude.normal)
+
+    def carried_rates(
+        self,
+        state: Float[Array, "components ..."],
+        attitude: Attitude,
+        contact: ContactMotion,
+        push: Tangent,
+        rise: Component,
+        torque: tuple[Component, ...],
+    ) -> tuple[Component, ...]:
+        """Rate of change of the state's components, in the frame that moves with the contact.
+
+        **Arguments:** `push`: force along the arena, over the mass [m/s^2]; `rise`: velocity of the centre of mass along n
+        [m/s]; `torque`: L' [N m].
+        """
+        _, e, L, place = parts(state)
+        o, up, place_rate, _ = contact.frame
+        x_rate, z_rate = attitude.axis_rates
+        u1_dot = add(push[0], multiply(-self.gravity, up[0]), multiply(o[0], rise))
+        u2_dot = add(push[1], multiply(-self.gravity, up[1]), multiply(o[1], rise))
+        e_dot, L_dot = sum_vectors(z_rate, carried(e, o)), sum_vectors(torque, carried(L, o))
+        return (u1_dot, u2_dot, *e_dot, *L_dot, *place_rate, *sum_vectors(x_rate, carried(place[-3:], o)))
 
     def start(
         self, launch: Launch, place: tuple[Float[Array, "..."], ...], axis: Vector, turning: Vector
@@ -182,40 +246,35 @@ class SlippingDynamics(AbstractRigidDynamics):
     def motion(self, state: Float[Array, "components ..."]) -> Motion:
         """Evaluate the equations of motion, solving for the normal force with friction included.
 
-        With q = r x n and J the inertia, all in the body's axes, the centre of mass rises at -w.q. So the second rate of the
-        height gives N (1 + m (J^-1 q).M) = m (g z.n - (J^-1 q).(L x w) - w.q'), M the moment per unit normal force.
+        With q = r x n and J the inertia, all in the body's axes, the centre of mass rises at u.n = -w.q. Its second rate gives
+        N (1 + m (J^-1 q).M) = m (g z.n + u.S q' - (J^-1 q).(L x w) - w.q'), M the moment per unit normal force.
         """
         (u1, u2), _, _, place = parts(state)
         attitude = self.attitude(state)
-        up = self.frame.vertical(place[:-3])
         r, swing = attitude.in_frame(attitude.lever), attitude.in_frame(cross(attitude.turning, attitude.lever))
         slip_x, slip_y = stored(u1 + swing[0], u2 + swing[1])
+        contact = self.contact_motion(place[:-3], attitude, (slip_x, slip_y))
+        o, up, _, room = contact.frame
         slip = Slip(slip_x, slip_y, attitude.in_frame(attitude.turning))
         friction = self.friction.per_normal_force(slip)
         f1, f2 = friction.force
         moment = vector_of(stored(*sum_vectors(cross(r, (f1, f2, 1.0)), friction.torque)))
 
         lever, normal = attitude.lever, attitude.normal
-        arm = self.inverse.times(cross(lever, normal))
-        moved = sum_vectors(cross(attitude.lever_rate, normal), cross(lever, attitude.normal_rate))
+        rise = cross(lever, normal)
+        arm = self.inverse.times(rise)
+        moved = sum_vectors(cross(contact.lever_rate, normal), cross(lever, contact.normal_rate))
         bend = dot(arm, cross(attitude.momentum, attitude.turning)) + dot(attitude.turning, vector_of(moved))
         mass = self.body.mass
         painleve_factor = 1.0 + mass * dot(arm, attitude.in_body(moment))
-        N = mass * (multiply(self.gravity, up[2]) - bend) / painleve_factor
+        pull = add(multiply(self.gravity, up[2]), dot((u1, u2), o))
+        N = mass * (pull - bend) / painleve_factor
 
         thrust = N * self.per_mass
-        u1_dot = add(multiply(thrust, f1), multiply(-self.gravity, up[0]))
-        u2_dot = add(multiply(thrust, f2), multiply(-self.gravity, up[1]))
-        along = attitude.in_frame(attitude.lever_rate)
-        path = (slip_x + along[0], slip_y + along[1])
-        place_rate = self.frame.frame_motion(place[:-3], path).place_rate
-        c_dot, e_dot = attitude.axis_rates
-        rate = (u1_dot, u2_dot, *e_dot, *scale(N, moment), *place_rate, *c_dot)
-        return Motion(rate, N, friction, slip, path, (None, None), attitude.turning[2], painleve_factor, None)
-
-    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
-        motion = self.motion(state)
-        return motion.normal_force / (self.body.mass * self.gravity) + 1e-12, motion.painleve_factor - JAMMED
+        push = (multiply(thrust, f1), multiply(thrust, f2))
+        u3 = None if o == (None, None) else -dot(attitude.turning, rise)
+        rates = self.carried_rates(state, attitude, contact, push, u3, scale(N, moment))
+        return Motion(rates, N, friction, slip, contact.along, o, attitude.turning[2], painleve_factor, room)
 
 
 class RollingDynamics(AbstractRigidDynamics):
@@ -237,9 +296,10 @@ class RollingDynamics(AbstractRigidDynamics):
         (J + m (r^2 - r r^T)) w' = L x w + m r x (r' x w + g z), and F = m (r' x w + r x w' + g z).
         """
         place, attitude = parts(state).place, self.attitude(state)
-        up = self.frame.vertical(place[:-3])
         m, r, w = self.body.mass, attitude.lever, attitude.turning
-        r_dot = sum_vectors(attitude.lever_rate, cross(w, r))
+        contact = self.contact_motion(place[:-3], attitude, (None, None))
+        o, up, _, room = contact.frame
+        r_dot = sum_vectors(contact.lever_rate, cross(w, r))
         turning = sum_vectors(cross(vector_of(r_dot), w), scale(self.gravity, attitude.in_body(up)))
         torque = sum_vectors(cross(attitude.momentum, w), scale(m, cross(r, vector_of(turning))))
         square, inertia = dot(r, r), self.body.inertia
@@ -252,24 +312,16 @@ class RollingDynamics(AbstractRigidDynamics):
             inertia.yz - m * r[1] * r[2],
         )
         w_dot = about_contact.solve(vector_of(stored(*torque)))
-        push = attitude.in_frame(vector_of(scale(m, sum_vectors(turning, cross(r, w_dot)))))
-        F = vector_of(stored(*push))
+        reaction = attitude.in_frame(vector_of(scale(m, sum_vectors(turning, cross(r, w_dot)))))
+        F = vector_of(stored(*reaction))
 
-        lever = attitude.in_frame(r)
-        u1_dot = subtract(F[0] / m, multiply(self.gravity, up[0]))
-        u2_dot = subtract(F[1] / m, multiply(self.gravity, up[1]))
-        along = attitude.in_frame(attitude.lever_rate)
-        path = (along[0], along[1])
-        place_rate = self.frame.frame_motion(place[:-3], path).place_rate
-        c_dot, e_dot = attitude.axis_rates
-        rate = (u1_dot, u2_dot, *e_dot, *cross(lever, F), *place_rate, *c_dot)
-        still = jnp.zeros_like(F[2])
+        push = (F[0] / m, F[1] / m)
+        u3 = None if o == (None, None) else dot(attitude.normal, cross(r, w))
+        rates = self.carried_rates(state, attitude, contact, push, u3, cross(attitude.in_frame(r), F))
         load = ContactLoad((F[0] / F[2], F[1] / F[2]))
+        still = jnp.zeros_like(F[2])
         slip = Slip(still, still, attitude.in_frame(w))
-        return Motion(rate, F[2], load, slip, path, (None, None), w[2], 1.0 + still, None)
-
-    def margins(self, state: Float[Array, "components ..."]) -> tuple[Float[Array, "..."], ...]:
-        return (self.motion(state).normal_force / (self.body.mass * self.gravity) + 1e-12,)
+        return Motion(rates, F[2], load, slip, contact.along, o, w[2], 1.0 + still, room)
 
     def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """The state with the velocity r x w of the centre of mass."""
@@ -281,7 +333,7 @@ class RollingDynamics(AbstractRigidDynamics):
 def rigid_dynamics(
     body: AbstractRigidBody, frame: AbstractFrame, friction: AbstractFriction, gravity: Float[Array, "..."]
 ) -> AbstractRigidDynamics:
-    """The equations of motion of a body on a plane; arguments as for `Dynamics.of`."""
+    """The equations of motion of a body on an arena; arguments as for `Dynamics.of`."""
     inverse = body.inertia.tensor.inverse
     if isinstance(friction, NoSlip):
         return RollingDynamics(frame, body, gravity, inverse)

@@ -17,6 +17,7 @@ from nonholonomic.geometry import (
     Component,
     Plane,
     PlaneFrame,
+    Sphere,
     Vector,
     cross,
     dot,
@@ -63,8 +64,8 @@ class Scene(Bounded, Generic[Body]):
 
     **Arguments:**
 
-    - `body`: a `Top`; or a `SpheroidBody`, `ConvexBody`, `Ellipsoid` or `RigidBody`, on a plane, with `contact="stop"` and a
-      friction law with a single mode.
+    - `body`: a `Top`; or an `Ellipsoid` or a `RigidBody`, with `contact="stop"` and a friction law with a single mode; or a
+      `SpheroidBody` or a `ConvexBody`, likewise and on a plane.
     - `surface`: the arena: `Plane(tilt)`, `Cylinder(radius)`, `Sphere(radius)`, `Spheroid(equatorial, polar)`, `Torus(ring,
       tube)`, `Paraboloid(p)`, `Graph(height)` or `Implicit(function)`.
     - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
@@ -140,8 +141,9 @@ class Scene(Bounded, Generic[Body]):
         """Raise `ValueError` for options that need a sphere, whose contact follows from the place of its centre."""
         kind = type(self.body).__name__
         kind = f"an {kind}" if kind[0] in "AEIOU" else f"a {kind}"
-        if not isinstance(self.surface, Plane):
-            raise ValueError(f"surface = {self.surface!r} must be a Plane for {kind}; a Top runs on any arena")
+        if not isinstance(self.surface, Plane) and isinstance(self.body, AbstractBody):
+            others = "a Top runs on any arena, as an Ellipsoid or a RigidBody does"
+            raise ValueError(f"surface = {self.surface!r} must be a Plane for {kind}; {others}")
         if self.contact != "stop":
             raise ValueError(f"contact = {self.contact!r} must be 'stop' for {kind}; only a Top can fly")
         if self.friction.set_valued:
@@ -151,9 +153,18 @@ class Scene(Bounded, Generic[Body]):
 
     def bounds(self) -> Iterator[Bound]:
         yield Bound(self.gravity, "gravity", above=0.0)
-        yield from room_bounds(self.surface, self.surface.sign(self.side, "inside"), self.body.size)
+        if not isinstance(self.surface, Plane):
+            yield from room_bounds(self.surface, self.surface.sign(self.side, "inside"), self._least_room)
         if self.restitution is not None:
             yield Bound(self.restitution, "restitution", at_least=0.0, at_most=1.0)
+
+    @property
+    def _least_room(self) -> Float[Array, "..."]:
+        """The radius [m] that a closed arena must exceed so that the body can be inside."""
+        if not isinstance(self.body, AbstractRigidBody):
+            return self.body.size
+        least, greatest = self.body.half_widths
+        return greatest if isinstance(self.surface, Sphere) else least
 
     def suspicion(self) -> str | None:
         for name, value in numbers("surface", self.surface, functions=False).items():
@@ -171,12 +182,13 @@ class Scene(Bounded, Generic[Body]):
 
     @property
     def frame(self) -> AbstractFrame:
-        """The moving frame of the body on the arena."""
+        """The moving frame of the body on the arena; that of an `Ellipsoid` or a `RigidBody` moves with the contact point."""
+        distance = jnp.zeros(()) if isinstance(self.body, AbstractRigidBody) else self.body.size
         side, pull = self.surface.sign(self.side, "inside"), PULL * jnp.sqrt(self.gravity / self.body.size)
         if self.contact == "hybrid" and not self.flies_in_closed_form:
             # A flight can take the top anywhere, so use the frame that stores its position.
-            return CarriedFrame.of(self.surface, self.body.size, pull, side)
-        return frame_of(self.surface, side, self.body.size, pull)
+            return CarriedFrame.of(self.surface, distance, pull, side)
+        return frame_of(self.surface, side, distance, pull)
 
     @property
     def level(self) -> bool:
@@ -292,7 +304,7 @@ class Scene(Bounded, Generic[Body]):
         if launch.angular_velocity is not None:
             turning = launch.angular_velocity
             momentum = jnp.maximum(momentum, I1 * jnp.sqrt(dot(turning, turning)))
-        place = scale(ones, self.frame.place_scales)
+        place = scale(ones, self.frame.place_scales(self.body.size))
         tilt = jnp.sin(launch.theta) / NEARLY_UPRIGHT
         # A top that stands exactly upright has no growth to resolve.
         tilt = jnp.where(tilt > 0.0, jnp.clip(tilt, 1e-280, 1.0), 1.0)
@@ -374,6 +386,5 @@ class Scene(Bounded, Generic[Body]):
     def path_from_frame(self, state: Float[Array, "components ..."]) -> Vector:
         """From the point that the frame carries to the one whose path is reported [m], in the moving frame."""
         if isinstance(self.body, AbstractRigidBody):
-            x, y, z = self.dynamics.mass_from_contact(state)
-            return (x, y, z - self.body.size)
+            return self.dynamics.mass_from_contact(state)
         return self.body.path_from_frame(parts(state).axis)

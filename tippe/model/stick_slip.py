@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.geometry import AbstractFrame
+from nonholonomic.geometry import AbstractFrame, stacked
 from nonholonomic.xla_cpu import greatest, least
 
-from .dynamics import FITS, Dynamics, Motion, stacked
+from .dynamics import FITS, Dynamics, Motion
 from .friction import AbstractFriction, Frictionless, SetValuedCoulomb, Slip, length
 from .rolling import RollingDynamics
 from .slip_onset import Onset, begin

@@ -28,10 +28,10 @@ from .airborne import (
     SLIDING,
     STRIKING,
     Below,
-    Contact,
     Flight,
     FlightState,
     Fly,
+    QuadraturesInFlight,
     as_free_body,
     below,
     flight_state,
@@ -49,6 +49,7 @@ from .flying_mode import AbstractFlyingMode
 from .free_body import Ball, FreeBody, balls, energy, gap_rate
 from .impact import CLOSING_SPEED, TOUCHING, resolve_impact
 from .inversion_problem import InversionProblem
+from .trajectory_problem import Quadratures
 
 #: Largest overlap of the other sphere with the arena while it lifts off, as a fraction of R: its landing may be located
 #: slightly late.
@@ -63,10 +64,15 @@ class OneOfTwo(AbstractProblem):
     """
 
     scene: Scene[Top]
-    contact: Contact
+    contact: InversionProblem
     own: Ball
     other: Ball
     on_stem: Bool[Array, ""]
+
+    @property
+    def dynamics(self) -> Any:
+        """The equations of motion of the sphere that slides."""
+        return self.contact.dynamics
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.contact.start()
@@ -76,7 +82,7 @@ class OneOfTwo(AbstractProblem):
 
     def event_function(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         # The angle from the normal below the top's own sphere; it is that of the state if that sphere slides.
-        flying = flight_state(lift_off(self.scene, state[:OWN], False, self.own))
+        flying = flight_state(lift_off(self.scene, state, False, self.own))
         apart = dot(flying.axis, below(self.scene, flying, self.other).axes[2])
         return jnp.where(self.on_stem, apart, state[COS_THETA]) - self.contact.cos_angle
 
@@ -108,8 +114,9 @@ class SlideOnOne(AbstractFlyingMode):
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         own, other = self.spheres
-        contact = Contact(standing(self.scene, own), self.cos_angle, state, self.scales, self.axial)
-        return OneOfTwo(self.scene, contact, own, other, self.number == 1)
+        contact = InversionProblem(standing(self.scene, own), self.cos_angle, state[:OWN], self.scales[:OWN])
+        problem = OneOfTwo(self.scene, contact, own, other, self.number == 1)
+        return self.extended(problem, Quadratures(self.scene.body.I3), state)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         flight = Fly(self.scene, self.scales, self.cos_angle, self.with_quadratures)
@@ -165,7 +172,8 @@ class FlyBoth(Fly):
     strikes: Bool[Array, ""]
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        return FlightToBlow(self.flight(state), self.strikes)
+        problem = FlightToBlow(self.flight(state), self.strikes)
+        return self.extended(problem, QuadraturesInFlight(self.scene.body), state)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Strike the arena with the sphere that is there; rebound, or slide on that sphere if the rebound would be

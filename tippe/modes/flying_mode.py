@@ -4,6 +4,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from nonholonomic.hybrid import AbstractBatchedMode
+from nonholonomic.integration import AbstractPassive, AbstractProblem, ExtendedProblem
 
 from ..model.scene import Scene
 from ..model.top import Top
@@ -22,7 +23,11 @@ class AbstractFlyingMode(AbstractBatchedMode):
     cos_angle: Float[Array, "..."]
     with_quadratures: bool = eqx.field(static=True)
 
-    @property
-    def axial(self) -> Float[Array, "..."] | None:
-        """The moment of inertia about the axis [kg m^2], `None` without passive quadratures."""
-        return self.scene.body.I3 if self.with_quadratures else None
+    def extended(
+        self, problem: AbstractProblem, passive: AbstractPassive, state: Float[Array, "components cells"]
+    ) -> AbstractProblem:
+        """The problem of some states, with the passive quadratures behind them if there are any."""
+        size = len(problem.start()[0])
+        if not self.with_quadratures:
+            return problem
+        return ExtendedProblem(problem, passive, state[size:], self.scales[size:])

@@ -25,10 +25,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.geometry import Component, add, cross, dot, multiply, scale, subtract, sum_vectors
+from nonholonomic.geometry import Component, add, cross, dot, multiply, scale, stacked, subtract, sum_vectors
 from nonholonomic.xla_cpu import least
 
-from ..model.dynamics import stacked
 from ..model.friction import AbstractFriction, Slip
 from ..model.state import angular_velocity, parts
 from ..model.top import Top

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
-from nonholonomic.integration import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem
+from nonholonomic.integration import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem, ExtendedProblem
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import NO_COSINE, Dynamics
@@ -18,7 +18,7 @@ from ..model.state import COS_THETA
 from ..model.stick_slip import AT_REST, Change, ContactMode, StickSlip
 from ..model.top import Top
 from .inversion_problem import InversionProblem
-from .trajectory_problem import TrajectoryProblem
+from .trajectory_problem import Quadratures, TrajectoryProblem
 
 #: The numbers of the two modes.
 SLIPPING, ROLLING = range(2)
@@ -37,15 +37,15 @@ def energy_in(
 class StickSlipMode(AbstractBatchedMode):
     """Slipping or rolling until theta reaches an angle; with `last`, the last crossing counts.
 
-    For a single run whose path is kept, the passive quadratures of a `TrajectoryProblem` follow the first `size`
-    components: `axial` is then the moment of inertia about the axis [kg m^2]. For the cells of a table both are `None`.
+    For a single run whose path is kept, `passive` quadratures follow the first `size` components. For the cells of a
+    table both are `None`.
     """
 
     kind: ContactMode
     cos_angle: Float[Array, "..."]
     scales: Float[Array, "components cells"]
     last: bool = eqx.field(static=True)
-    axial: Float[Array, ""] | None = None
+    passive: Quadratures | None = None
     size: int | None = eqx.field(static=True, default=None)
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
@@ -82,7 +82,7 @@ class StickSlipMode(AbstractBatchedMode):
             status=status,
             crossing_time=jnp.where(crosses, crossing, jnp.inf),
             counts=(change.rolls & ~change.lost & (not self.kind.rolls)).astype(int)[None],
-            record=None if self.axial is None else _recorded(change),
+            record=None if self.passive is None else _recorded(change),
         )
 
     def _size(self, state: Float[Array, "components ..."]) -> int:
@@ -91,10 +91,11 @@ class StickSlipMode(AbstractBatchedMode):
 
     def _under(self, equations: Dynamics | ContactMode, state: Float[Array, "components cells"]) -> AbstractProblem:
         """The motion from some states under given equations."""
-        if self.axial is None:
-            return InversionProblem(equations, self.cos_angle, state, self.scales)
-        own, path, rest = jnp.split(state, (self._size(state), len(state) - 2))
-        return TrajectoryProblem(equations, self.axial, own, path, self.scales, rest)
+        size = self._size(state)
+        problem = InversionProblem(equations, self.cos_angle, state[:size], self.scales[:size])
+        if self.passive is None:
+            return problem
+        return ExtendedProblem(problem, self.passive, state[size:], self.scales[size:], ends_on_event=False)
 
 
 def _recorded(change: Change) -> TransitionPath:
@@ -109,7 +110,7 @@ def modes(
     problem: InversionProblem,
     tolerance: float,
     last: bool,
-    axial: Float[Array, ""] | None = None,
+    passive: Quadratures | None = None,
     size: int | None = None,
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the index of the mode in which each starts.
@@ -118,12 +119,12 @@ def modes(
 
     - `problem`: of launches in a scene with `SetValuedCoulomb`; contains everything needed of the scene.
     - `tolerance`: relative tolerance of the integration; `last`: whether the last crossing counts.
-    - `axial`, `size`: as for `StickSlipMode`.
+    - `passive`, `size`: as for `StickSlipMode`.
     """
     both = problem.dynamics
     assert isinstance(both, StickSlip)
     kinds = (ContactMode(both, jnp.asarray(tolerance, float), rolls) for rolls in (False, True))
-    both_modes = tuple(StickSlipMode(kind, problem.cos_angle, problem.scales, last, axial, size) for kind in kinds)
+    both_modes = tuple(StickSlipMode(kind, problem.cos_angle, problem.scales, last, passive, size) for kind in kinds)
     return both_modes, _first_mode(both, problem.states)
 
 
@@ -140,6 +141,7 @@ def contact_modes(
 
     **Arguments:** `run`: of a scene with `SetValuedCoulomb`; `tolerance`: relative, of the integration.
     """
-    state, scales = run.start()
-    problem = InversionProblem(run.dynamics, jnp.asarray(NO_COSINE), run.state[:, None], scales[:, None])
-    return (*modes(None, problem, tolerance, False, run.axial, len(run.state)), state[:, None])
+    state, scales = (values[:, None] for values in run.start())
+    problem = InversionProblem(run.problem.dynamics, jnp.asarray(NO_COSINE), state[: run.leading], scales)
+    assert isinstance(run.passive, Quadratures)
+    return (*modes(None, problem, tolerance, False, run.passive, run.leading), state)

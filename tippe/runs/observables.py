@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.geometry import Component, Vector, dot, scale, sum_vectors
+from nonholonomic.geometry import Component, Vector, carried, dot, scale, stacked, sum_vectors
 from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import DenseSolution, Status, few_trials, padded
 from nonholonomic.progress import status_line
@@ -20,7 +20,6 @@ from nonholonomic.sweeps import Table, Tabular
 from nonholonomic.validation import is_traced, require, require_increasing
 from nonholonomic.views import Stage, Viewable
 
-from ..model.dynamics import stacked
 from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.top import Top
@@ -177,8 +176,10 @@ class AbstractTrajectory(Viewable, Tabular, eqx.Module):
         """Velocity of the point whose path is `position` [m/s]."""
         motion = self.scene.dynamics.motion(self.states)
         rate = stacked(motion.rate, self.states)
-        beside = jax.jvp(self.scene.path_from_frame, (self.states,), (rate,))[1]
-        return self._fixed(sum_vectors((*motion.velocity, self.above[1]), beside))
+        beside, change = jax.jvp(self.scene.path_from_frame, (self.states,), (rate,))
+        # The frame turns while the components of the vector change.
+        turned = scale(-1.0, carried(beside, motion.turning))
+        return self._fixed(sum_vectors((*motion.velocity, self.above[1]), change, turned))
 
     @of_each_run
     def position(self) -> Float[Array, "times 3"]:

@@ -17,8 +17,8 @@ class Shears(AbstractProblem):
     end: jax.Array
 
     def start(self):
-        one = jnp.ones_like(self.a)
-        return jnp.stack([one, one, 0.0 * one]), jnp.stack([one, one, one])
+        ones = jnp.ones_like(self.a)
+        return jnp.stack([ones, ones, 0.0 * ones]), jnp.stack([ones, ones, ones])
 
     def field(self, time, state):
         return jnp.stack([self.a * state[0] + state[1], self.b * state[1], jnp.ones_like(state[2])])
@@ -36,8 +36,8 @@ class Lorenz(AbstractProblem):
     x: jax.Array
 
     def start(self):
-        one = jnp.ones_like(self.x)
-        return jnp.stack([self.x, 1.0 + self.x, 20.0 * one]), jnp.stack([10.0 * one] * 3)
+        ones = jnp.ones_like(self.x)
+        return jnp.stack([self.x, 1.0 + self.x, 20.0 * ones]), jnp.stack([10.0 * ones] * 3)
 
     def field(self, time, state):
         x, y, z = state
@@ -58,24 +58,24 @@ def follow(problem, t1, cells, stretches=32):
 def test_known_rates_and_a_run_that_ends():
     """The greatest of a, b and 0, whichever it is; the growth to the very end; nothing after the guard."""
     a, b, end = np.array([0.5, -0.3, -0.3, 0.5]), np.array([0.2, 0.8, -0.2, 0.2]), np.array([1e3, 1e3, 1e3, 17.0])
-    found = follow(Shears(*map(jnp.asarray, (a, b, end))), 40.0, 4)
-    assert found.status.tolist() == [REACHED_END] * 3 + [LEFT_DOMAIN]
-    assert_close(found.end_time, [40.0, 40.0, 40.0, 17.0], rtol=1e-9)
-    exponent, error = exponent_of(found.logarithm, 40.0)
+    outcome = follow(Shears(*map(jnp.asarray, (a, b, end))), 40.0, 4)
+    assert outcome.status.tolist() == [REACHED_END] * 3 + [LEFT_DOMAIN]
+    assert_close(outcome.end_time, [40.0, 40.0, 40.0, 17.0], rtol=1e-9)
+    exponent, error = exponent_of(outcome.logarithm, 40.0)
     assert_close(exponent[:3], [0.5, 0.8, 0.0], atol=2e-3)
     assert (np.abs(exponent[:3] - [0.5, 0.8, 0.0]) < error[:3]).all()
     # The closed form of the direction (0.3, -0.7, 0.5) after a time.
-    for cell, time in enumerate(found.end_time):
+    for cell, time in enumerate(outcome.end_time):
         y = -0.7 * np.exp(b[cell] * time)
         x = 0.3 * np.exp(a[cell] * time) - 0.7 * (np.exp(a[cell] * time) - np.exp(b[cell] * time)) / (a[cell] - b[cell])
         expected = np.log(np.linalg.norm([x, y, 0.5]) / np.linalg.norm([0.3, -0.7, 0.5]))
-        assert_close(found.logarithm[:, cell].sum(), expected, atol=1e-6)
+        assert_close(outcome.logarithm[:, cell].sum(), expected, atol=1e-6)
 
 
 def test_lorenz():
     """0.9056 (Sprott, Chaos and Time-Series Analysis, 2003), by the mean of 32 runs, and each within three of its errors."""
-    found = follow(Lorenz(jnp.linspace(0.5, 12.0, 32)), 100.0, 32)
-    exponent, error = exponent_of(found.logarithm, 100.0)
+    outcome = follow(Lorenz(jnp.linspace(0.5, 12.0, 32)), 100.0, 32)
+    exponent, error = exponent_of(outcome.logarithm, 100.0)
     assert_close(exponent.mean(), 0.9056, atol=0.02)
     assert (np.abs(exponent - 0.9056) < 3.0 * error).all()
     assert np.median(error) < 0.2

@@ -50,7 +50,8 @@ def found_and_expected(names=MANY, patience=1e3, heights=HEIGHTS, cells=100, **o
     """Outcome, slopes by the named numbers, and what they should be; rate and height differ from cell to cell."""
     point = (jnp.asarray(RATES), jnp.asarray(heights), jnp.asarray(0.7))
     tangents = [
-        tuple(jnp.full_like(one, name == moved) for one, moved in zip(point, MOVED, strict=True)) for name in names
+        tuple(jnp.full_like(component, name == moved) for component, moved in zip(point, MOVED, strict=True))
+        for name in names
     ]
 
     @eqx.filter_jit
@@ -58,15 +59,15 @@ def found_and_expected(names=MANY, patience=1e3, heights=HEIGHTS, cells=100, **o
         def build(*numbers):
             return Decays(*numbers, jnp.asarray(patience))
 
-        given = (jnp.asarray(50.0), jnp.asarray(cells), Settings(1e-11, options.pop("solver", diffrax.Dopri8())))
+        arguments = (jnp.asarray(50.0), jnp.asarray(cells), Settings(1e-11, options.pop("solver", diffrax.Dopri8())))
         directions = tangents_of(build, point, tangents)
         return slopes.ensemble_solve_with_tangents(
-            build(*point), directions, *given, **({"one_kernel": True} | options)
+            build(*point), directions, *arguments, **({"one_kernel": True} | options)
         )
 
-    outcome, found = run(point, tangents)
+    outcome, derivatives = run(point, tangents)
     every = jax.vmap(jax.grad(time_of_decay, (0, 1, 2)), (0, 0, None))(*point)
-    return outcome, found, [every[MOVED.index(name)] for name in names]
+    return outcome, derivatives, [every[MOVED.index(name)] for name in names]
 
 
 @pytest.mark.parametrize(
@@ -83,10 +84,10 @@ def found_and_expected(names=MANY, patience=1e3, heights=HEIGHTS, cells=100, **o
 )
 def test_the_slopes_are_those_of_the_closed_form(names, nonterminal, solver):
     """For a field that depends on time, more cells than lanes, methods whose last stage is and is not their end."""
-    outcome, found, expected = found_and_expected(names, solver=solver, nonterminal=nonterminal)
+    outcome, derivatives, expected = found_and_expected(names, solver=solver, nonterminal=nonterminal)
     assert_close(outcome.crossing_time, time_of_decay(RATES, HEIGHTS, 0.7), rtol=1e-9)
-    for one, other in zip(found, expected, strict=True):
-        assert_close(one, other, rtol=1e-7)
+    for slope, expected_slope in zip(derivatives, expected, strict=True):
+        assert_close(slope, expected_slope, rtol=1e-7)
 
 
 @pytest.mark.parametrize(("count", "backward"), [(1, False), (2, False), (4, False), (5, True)])
@@ -94,9 +95,9 @@ def test_few_directions_are_integrated_forward_and_many_backward(count, backward
     """The forward passes of two numbers cost half as much as the backward one; those of six twice as much."""
     passes = []
 
-    def solve_with_adjoint(*given, **options):
+    def solve_with_adjoint(*arguments, **options):
         passes.append("backward")
-        return adjoint.solve_with_adjoint(*given, **options)
+        return adjoint.solve_with_adjoint(*arguments, **options)
 
     monkeypatch.setattr(slopes, "solve_with_adjoint", solve_with_adjoint)
     jax.eval_shape(lambda: found_and_expected(MANY[:count], solver=diffrax.Dopri8())[1])
@@ -104,35 +105,35 @@ def test_few_directions_are_integrated_forward_and_many_backward(count, backward
 
 
 def test_a_cell_that_ends_otherwise_has_no_slope_and_leaves_the_others_theirs():
-    outcome, found, expected = found_and_expected(patience=1.0, solver=diffrax.Dopri8())
+    outcome, derivatives, expected = found_and_expected(patience=1.0, solver=diffrax.Dopri8())
     late = np.asarray(time_of_decay(RATES, HEIGHTS, 0.7)) > 1.0
     assert 20 < late.sum() < 80
     assert (np.asarray(outcome.status) == np.where(late, LEFT_DOMAIN, CROSSED)).all()
-    for one, other in zip(found, expected, strict=True):
-        assert_close(one, np.where(late, 0.0, other), rtol=1e-7)
+    for slope, expected_slope in zip(derivatives, expected, strict=True):
+        assert_close(slope, np.where(late, 0.0, expected_slope), rtol=1e-7)
 
 
 @pytest.mark.parametrize("cells", [0, pytest.param(1, marks=pytest.mark.slow), 70])
 def test_padding_and_cells_beyond_the_event_have_no_slope(cells):
     """Some cells start beyond the event, and of the cells only some are run: fewer than lanes, and none."""
     heights = np.where(np.arange(100) % 3 == 0, 0.4, HEIGHTS)
-    outcome, found, expected = found_and_expected(heights=heights, cells=cells, solver=diffrax.Dopri8())
+    outcome, derivatives, expected = found_and_expected(heights=heights, cells=cells, solver=diffrax.Dopri8())
     run = np.arange(100) < cells
     assert (np.asarray(outcome.status)[run] == CROSSED).all()
-    for one, other in zip(found, expected, strict=True):
-        assert_close(one, np.where(run & (heights > 0.5), other, 0.0), rtol=1e-7)
+    for slope, expected_slope in zip(derivatives, expected, strict=True):
+        assert_close(slope, np.where(run & (heights > 0.5), expected_slope, 0.0), rtol=1e-7)
 
 
 @pytest.mark.parametrize("kept", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_runs_longer_than_what_is_kept_are_repeated(kept, monkeypatch):
     """Periods of two iterations, of which the starts of a few are kept: the slopes are the same to the last digit."""
     _, whole, _ = found_and_expected(solver=diffrax.Dopri8())
-    monkeypatch.setattr(adjoint, "PERIOD", 2)
+    monkeypatch.setattr(adjoint.StepRecorder, "period", 2)
     monkeypatch.setattr(adjoint, "KEPT", kept)
     _, segments, expected = found_and_expected(solver=diffrax.Dopri8())
-    for one, other, third in zip(whole, segments, expected, strict=True):
-        assert_close(one, other, rtol=1e-12)
-        assert_close(other, third, rtol=1e-7)
+    for whole_slope, segment_slope, expected_slope in zip(whole, segments, expected, strict=True):
+        assert_close(whole_slope, segment_slope, rtol=1e-12)
+        assert_close(segment_slope, expected_slope, rtol=1e-7)
 
 
 def test_the_starts_that_are_kept_are_spread_out(monkeypatch):
@@ -181,10 +182,10 @@ def test_a_component_at_rest_has_its_tangent_integrated(names):
     @eqx.filter_jit
     def run():
         directions = tangents_of(AtRest, point, tangents)
-        given = (jnp.asarray(5.0), jnp.asarray(4), Settings(1e-10))
-        return slopes.ensemble_solve_with_tangents(AtRest(*point), directions, *given, one_kernel=True)
+        arguments = (jnp.asarray(5.0), jnp.asarray(4), Settings(1e-10))
+        return slopes.ensemble_solve_with_tangents(AtRest(*point), directions, *arguments, one_kernel=True)
 
-    _, found = run()
+    _, derivatives = run()
     expected = {"rest": -(1.0 - 1.0 / 500.0), "push": -1.0}
-    for name, slope in zip(names, found, strict=True):
+    for name, slope in zip(names, derivatives, strict=True):
         assert_close(slope, np.full(4, expected[name]), rtol=1e-8)

@@ -93,28 +93,32 @@ def balls():
         states = jnp.stack([height, 0.0 * height, 0.0 * height])
         return (Falls(gravity, restitution, level, jnp.asarray(float(bounces))),), states
 
-    tangents = [tuple(jnp.full_like(one, j == k) for j, one in enumerate(numbers)) for k in range(len(numbers))]
+    tangents = [tuple(jnp.full_like(number, j == k) for j, number in enumerate(numbers)) for k in range(len(numbers))]
     modes, states = build(*numbers)
     expected = jax.vmap(jax.grad(time_of_level, (0, 1, 2, 3)), (0, None, 0, None, None))(*numbers, bounces)
-    given = (modes, tangents_of(build, numbers, tangents), np.zeros(CELLS, int), np.asarray(states))
-    return given, time_of_level(*numbers, bounces), np.stack([np.broadcast_to(one, CELLS) for one in expected])
+    arguments = (modes, tangents_of(build, numbers, tangents), np.zeros(CELLS, int), np.asarray(states))
+    return (
+        arguments,
+        time_of_level(*numbers, bounces),
+        np.stack([np.broadcast_to(number, CELLS) for number in expected]),
+    )
 
 
 @pytest.mark.slow
 def test_a_bouncing_ball(balls):
     """By the height, gravity, the restitution and the level, through five impacts and what follows each."""
-    given, times, expected = balls
-    hybrid_outcome, found = solve_hybrid_with_tangents(*given, 50.0, CELLS, settings_of(1e-10), counters=1)
+    arguments, times, expected = balls
+    hybrid_outcome, sensitivities = solve_hybrid_with_tangents(*arguments, 50.0, CELLS, settings_of(1e-10), counters=1)
     assert (hybrid_outcome.status == CROSSED).all()
     assert (hybrid_outcome.counts == 5).all()
-    assert not found.grazing.any()
+    assert not sensitivities.grazing.any()
     assert_close(hybrid_outcome.crossing_time, times, rtol=1e-9)
-    assert_close(found.slopes, expected, rtol=1e-9)
+    assert_close(sensitivities.slopes, expected, rtol=1e-9)
 
 
 def test_a_bouncing_ball_inside_a_transformation(balls):
     """At the horizon, without an event there, the variations say the same; some of the balls rise then, in closed form."""
-    given, times, expected = balls
+    arguments, times, expected = balls
 
     @eqx.filter_jit
     def run(modes, directions, first, states, times):
@@ -124,11 +128,11 @@ def test_a_bouncing_ball_inside_a_transformation(balls):
             modes, directions, first, states, times, CELLS, settings, counters=1, ends_on_event=False
         )
 
-    hybrid_outcome, found = run(*given, times)
+    hybrid_outcome, sensitivities = run(*arguments, times)
     assert (hybrid_outcome.status == REACHED_END).all()
     assert (hybrid_outcome.counts == 5).all()
-    assert not found.grazing.any()
-    assert_close(found.slopes, expected, rtol=1e-8)
+    assert not sensitivities.grazing.any()
+    assert_close(sensitivities.slopes, expected, rtol=1e-8)
 
 
 class Over(AbstractProblem):
@@ -183,11 +187,11 @@ def test_a_grazing_event_is_seen():
             modes, directions, first, states, jnp.asarray(9.0), len(heights), settings_of(tolerance), counters=1
         )
 
-    hybrid_outcome, found = jax.tree.map(np.asarray, run(modes, directions, first, states))
+    hybrid_outcome, sensitivities = jax.tree.map(np.asarray, run(modes, directions, first, states))
     assert (hybrid_outcome.status == CROSSED).all()
     assert (hybrid_outcome.counts == 1).all()
-    assert found.grazing[heights < 1e-8].all()
-    assert not found.grazing[heights > 1e-7].any()
-    good = ~found.grazing
+    assert sensitivities.grazing[heights < 1e-8].all()
+    assert not sensitivities.grazing[heights > 1e-7].any()
+    good = ~sensitivities.grazing
     assert_close(hybrid_outcome.crossing_time[good], 3.0 + np.cbrt(heights[good]), rtol=1e-9)
-    assert_close(found.slopes[0][good], np.cbrt(heights[good]) / heights[good] / 3.0, rtol=1e-2)
+    assert_close(sensitivities.slopes[0][good], np.cbrt(heights[good]) / heights[good] / 3.0, rtol=1e-2)

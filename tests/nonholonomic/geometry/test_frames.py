@@ -56,8 +56,8 @@ def foot_of(name):
     near = (jnp.asarray(x), jnp.asarray(y), jnp.asarray(-0.29))
     if name.endswith("torus"):
         near = (jnp.asarray(x + 0.4), jnp.asarray(y), jnp.asarray(-0.16))
-    found = surface.nearest(near)
-    return tuple(jnp.zeros(()) if part is None else part for part in found)
+    foot = surface.nearest(near)
+    return tuple(jnp.zeros(()) if part is None else part for part in foot)
 
 
 def moved(frame, start, velocity, time, steps=200):
@@ -107,27 +107,27 @@ def test_the_frame_is_orthonormal_and_turns_as_stated(name):
 @pytest.mark.parametrize("name", OWN)
 def test_a_frame_of_its_own_is_the_carried_one_in_fewer_numbers(name):
     """From the same foot, and t1 along it, both are at the same place with the same axes later, and say the same rates."""
-    velocity, found = (jnp.asarray(0.3), jnp.asarray(-0.2)), []
+    velocity, positions = (jnp.asarray(0.3), jnp.asarray(-0.2)), []
     own, general = frame_of(*SURFACES[name], DISTANCE, PULL), carried_frame(*SURFACES[name])
     start = own.at_foot(foot_of(name))
     place, _ = general.at_foot(foot_of(name))
     first = SURFACES[name][0].in_own_axes(own.axes(*start)[0])
     for frame, begin in ((own, start), (general, ((*place[:3], *first), ()))):
-        here = moved(frame, begin, velocity, 0.2)
-        frame_motion = frame.frame_motion(here[0], velocity)
-        height = float(frame.height(here[0]) - frame.height(begin[0]))
-        found.append(
+        arrival = moved(frame, begin, velocity, 0.2)
+        frame_motion = frame.frame_motion(arrival[0], velocity)
+        height = float(frame.height(arrival[0]) - frame.height(begin[0]))
+        positions.append(
             np.concatenate(
                 [
-                    np.ravel(np.array(frame.axes(*here), dtype=float)),
-                    np.ravel(np.array(frame.position(*here), dtype=float)),
+                    np.ravel(np.array(frame.axes(*arrival), dtype=float)),
+                    np.ravel(np.array(frame.position(*arrival), dtype=float)),
                     numbers(frame_motion.turning),
                     numbers(frame_motion.vertical),
                     [height],
                 ]
             )
         )
-    assert_close(found[0], found[1], atol=1e-10)
+    assert_close(positions[0], positions[1], atol=1e-10)
 
 
 def test_the_foot_is_drawn_back_to_the_surface():

@@ -41,7 +41,7 @@ def test_arrays_of_a_function_are_not_taken_for_numbers_of_lanes():
     assert_close(ground.height.bends, BENDS, rtol=0.0)
     (name,) = (name for name in numbers("ground", ground) if name.endswith(".height"))
     assert float(numbers("ground", ground)[name]) == 1.0
-    swept = eqx.tree_at(lambda one: one.height.function.height, ground, jnp.array([1.0, 2.0, 3.0]))
+    swept = eqx.tree_at(lambda node: node.height.function.height, ground, jnp.array([1.0, 2.0, 3.0]))
     assert_close(swept.ground(x, y), np.array([1.0, 2.0, 3.0]) * heights(x, y), rtol=1e-14)
 
 

@@ -77,23 +77,23 @@ def directions(count=LANES):
     return RNG.uniform(-1.0, 1.0, (2, count))
 
 
-@pytest.mark.parametrize("surface", SURFACES, ids=lambda one: type(one).__name__)
+@pytest.mark.parametrize("surface", SURFACES, ids=lambda value: type(value).__name__)
 def test_chart_normal_and_places_belong_together(surface):
     """East and north are unit vectors with n = east x north, and a place comes back from its position, in space too."""
     place = places(surface)
-    r, east, north, normal, back, again, off, above = asked(surface, place)
-    position, east, north, normal = (columns(one) for one in (r, east, north, normal))
+    r, east, north, normal, back, chart_position, off, above = asked(surface, place)
+    position, east, north, normal = (columns(value) for value in (r, east, north, normal))
     np.testing.assert_allclose(np.sum(east**2, axis=0), 1.0, atol=1e-14)
     np.testing.assert_allclose(np.cross(east, north, axis=0), normal, atol=1e-13)
     np.testing.assert_allclose(off, 0.0, atol=1e-13)
-    np.testing.assert_allclose(columns(again), position, atol=1e-13)
+    np.testing.assert_allclose(columns(chart_position), position, atol=1e-13)
     if not isinstance(surface, Implicit):
         np.testing.assert_allclose(np.exp(1j * np.stack(back)), np.exp(1j * np.stack(place)), atol=1e-13)
     # The height is that in space but for its zero.
     assert np.ptp(np.asarray(above)) < 1e-13
 
 
-@pytest.mark.parametrize("surface", CURVED, ids=lambda one: type(one).__name__)
+@pytest.mark.parametrize("surface", CURVED, ids=lambda value: type(value).__name__)
 def test_rate_of_the_normal_and_curvature_are_derivatives(surface):
     """Against central differences of the normal, K = n . (n'(east) x n'(north)), and moving along keeps to the surface."""
     r, east, north = surface.chart(places(surface))
@@ -108,10 +108,10 @@ def test_rate_of_the_normal_and_curvature_are_derivatives(surface):
     near, far = normal_at(step) - normal_at(-step), normal_at(2.0 * step) - normal_at(-2.0 * step)
     np.testing.assert_allclose(rate, (8.0 * near - far) / (12.0 * step), atol=2e-10)
     normal = columns(surface.normal(r))
-    along = [columns(surface.normal_rate(r, one)) for one in (east, north)]
+    along = [columns(surface.normal_rate(r, value)) for value in (east, north)]
     K = np.sum(normal * np.cross(*along, axis=0), axis=0)
-    given = surface.gaussian_curvature(r)
-    np.testing.assert_allclose(0.0 if given is None else given, K, atol=1e-12 * np.max(np.abs(K)) + 1e-14)
+    curvature = surface.gaussian_curvature(r)
+    np.testing.assert_allclose(0.0 if curvature is None else curvature, K, atol=1e-12 * np.max(np.abs(K)) + 1e-14)
     # The chart runs along the surface: its derivatives have no part along n.
     charted = surface.chart(surface.place_at(tuple(columns(r) + 1e-6 * velocity)))[0]
     np.testing.assert_allclose(np.sum(normal * (columns(charted) - columns(r)), axis=0), 0.0, atol=1e-10)
@@ -129,7 +129,7 @@ def lifted(surface, place, d):
 
 
 @pytest.mark.parametrize(
-    "surface", [Plane(0.3), *(CURVED[k] for k in (0, 1, 3, 5, 7, 9))], ids=lambda one: type(one).__name__
+    "surface", [Plane(0.3), *(CURVED[k] for k in (0, 1, 3, 5, 7, 9))], ids=lambda value: type(value).__name__
 )
 def test_distance_is_along_the_normal(surface):
     """A point moved by d along n is at the distance d, of either sign, whose derivative is n; (x, y, z) names where it was."""
@@ -162,22 +162,22 @@ LIMITS = [
 @pytest.mark.parametrize("case", [*SAME, *((a, b, 1.0, tolerance) for a, b, tolerance in LIMITS)], ids=str)
 def test_two_descriptions_of_a_surface_agree(case):
     """Normal, its rate, curvature and distance at the same points in space."""
-    one, other, sign, tolerance = (*case, 2e-14)[:4]
-    r, east, north = one.chart(places(one))
-    in_space, a, b = one.in_fixed_frame(r), *directions()
-    velocity = tuple(a * columns(one.in_fixed_frame(east)) + b * columns(one.in_fixed_frame(north)))
+    first, second, sign, tolerance = (*case, 2e-14)[:4]
+    r, east, north = first.chart(places(first))
+    in_space, a, b = first.in_fixed_frame(r), *directions()
+    velocity = tuple(a * columns(first.in_fixed_frame(east)) + b * columns(first.in_fixed_frame(north)))
     np.testing.assert_allclose(
-        sign * columns(other.normal(in_space)), columns(one.in_fixed_frame(columns(one.normal(r)))), atol=tolerance
+        sign * columns(second.normal(in_space)), columns(first.in_fixed_frame(columns(first.normal(r)))), atol=tolerance
     )
-    rate = columns(one.normal_rate(r, one.in_own_axes(velocity)))
+    rate = columns(first.normal_rate(r, first.in_own_axes(velocity)))
     np.testing.assert_allclose(
-        sign * columns(other.normal_rate(in_space, velocity)), columns(one.in_fixed_frame(rate)), atol=tolerance
+        sign * columns(second.normal_rate(in_space, velocity)), columns(first.in_fixed_frame(rate)), atol=tolerance
     )
-    K = one.gaussian_curvature(r)
+    K = first.gaussian_curvature(r)
     np.testing.assert_allclose(
-        other.gaussian_curvature(in_space), np.zeros(LANES) if K is None else K, atol=10.0 * tolerance
+        second.gaussian_curvature(in_space), np.zeros(LANES) if K is None else K, atol=10.0 * tolerance
     )
-    np.testing.assert_allclose(other.offset(in_space), 0.0, atol=10.0 * tolerance)
+    np.testing.assert_allclose(second.offset(in_space), 0.0, atol=10.0 * tolerance)
 
 
 def test_a_huge_torus_is_a_cylinder():
@@ -191,12 +191,12 @@ def test_a_huge_torus_is_a_cylinder():
         moved = (r[0] + ring, *columns(r)[1:])
         off = [columns(torus.normal(moved)) - columns(tube.normal(r))]
         off += [columns(torus.normal_rate(moved, velocity)) - columns(tube.normal_rate(r, velocity))]
-        far.append([np.max(np.abs(one)) for one in off] + [np.max(np.abs(torus.gaussian_curvature(moved)))])
+        far.append([np.max(np.abs(error)) for error in off] + [np.max(np.abs(torus.gaussian_curvature(moved)))])
     np.testing.assert_allclose(np.array(far[0]) / np.array(far[1]), 10.0, rtol=2e-2)
 
 
 def test_gaussian_curvature_of_the_oblate_spheroid():
-    """`stroller.md`, section 0: K = sinh^2(xi) / (a^2 D^2), D = sinh^2(xi) + sin^2(eta)."""
+    """`stroller.md`, section 1: K = sinh^2(xi) / (a^2 D^2), D = sinh^2(xi) + sin^2(eta)."""
     a, xi, eta = 2.0, 0.8, -0.4
     ground = Spheroid.from_oblate(a, xi)
     D = math.sinh(xi) ** 2 + math.sin(eta) ** 2
@@ -216,13 +216,13 @@ def test_gaussian_curvature_of_torus_and_paraboloid():
     np.testing.assert_allclose(bowl.gaussian_curvature(r), expected, rtol=1e-13)
 
 
-@pytest.mark.parametrize("surface", [one for one in SURFACES if not isinstance(one, Implicit)], ids=str)
+@pytest.mark.parametrize("surface", [shape for shape in SURFACES if not isinstance(shape, Implicit)], ids=str)
 def test_elevation_is_the_height_in_the_fixed_frame(surface):
     r = surface.chart(places(surface))[0]
     lowest = {Cylinder: "radius", Torus: "tube", Sphere: "radius", Spheroid: "polar"}.get(type(surface))
     above = surface.in_fixed_frame(r)[2] + (0.0 if lowest is None else getattr(surface, lowest))
-    given = surface.elevation(r)
-    np.testing.assert_allclose(0.0 if given is None else given, above, atol=1e-14)
+    elevation = surface.elevation(r)
+    np.testing.assert_allclose(0.0 if elevation is None else elevation, above, atol=1e-14)
 
 
 def test_east_is_along_y_where_the_normal_is_along_x():
@@ -246,11 +246,11 @@ def test_numbers_of_a_function_are_numbers_of_the_surface():
         valley = Graph(lambda x, y: steep * x * x)
         return [surface.elevation(surface.chart((0.5, -0.2))[0]) for surface in (waves, valley)]
 
-    found, slopes = jax.jvp(heights, (0.3, 2.0), (1.0, 1.0))
-    np.testing.assert_allclose(slopes, (found[0] / 0.3, 0.25), rtol=1e-13)
+    values, slopes = jax.jvp(heights, (0.3, 2.0), (1.0, 1.0))
+    np.testing.assert_allclose(slopes, (values[0] / 0.3, 0.25), rtol=1e-13)
     many = Graph(Waves(np.linspace(0.1, 0.3, LANES), 1.1, np.array([0.4, 0.2])))
     position = many.chart((jnp.asarray(0.5), jnp.asarray(-0.2)))[0]
-    np.testing.assert_allclose(position[2][-1], found[0], rtol=1e-14)
+    np.testing.assert_allclose(position[2][-1], values[0], rtol=1e-14)
     assert jnp.shape(many.normal(position)[0]) == (LANES,)
 
 

@@ -36,61 +36,63 @@ def regression():
 
 def test_linear_regression_is_that_of_the_textbook(regression):
     """Weighted least squares: (A^T W A)^-1 A^T W y and (A^T W A)^-1."""
-    value, found = regression
+    value, fit = regression
     A, W = np.stack([np.ones_like(X), X], axis=1), np.diag(ERROR**-2)
     covariance = np.linalg.inv(A.T @ W @ A)
-    assert_close(list(found.estimates.values()), covariance @ A.T @ W @ value, rtol=1e-7)
-    assert_close(found.covariance, covariance, rtol=1e-9)
-    assert_close(list(found.standard_errors.values()), np.sqrt(np.diag(covariance)), rtol=1e-9)
-    assert found.statuses == ("converged",) * 3
-    assert found.degrees == 10
-    assert "slope" in str(found)
-    low, high = found.interval("slope")
-    assert_close(high - low, 2.0 * 1.96 * found.standard_errors["slope"], rtol=1e-9)
+    assert_close(list(fit.estimates.values()), covariance @ A.T @ W @ value, rtol=1e-7)
+    assert_close(fit.covariance, covariance, rtol=1e-9)
+    assert_close(list(fit.standard_errors.values()), np.sqrt(np.diag(covariance)), rtol=1e-9)
+    assert fit.statuses == ("converged",) * 3
+    assert fit.degrees == 10
+    assert "slope" in str(fit)
+    low, high = fit.interval("slope")
+    assert_close(high - low, 2.0 * 1.96 * fit.standard_errors["slope"], rtol=1e-9)
 
 
 def test_it_says_on_a_terminal_what_it_does(regression, monkeypatch):
-    value, found = regression
+    value, fit = regression
     monkeypatch.setattr("nonholonomic.progress.INTERVAL", 0.01)
     # All is compiled by now; the first thing that a fit does is made to take its time.
     compiled = levenberg_marquardt.linearise
-    monkeypatch.setattr(levenberg_marquardt, "linearise", lambda *given: (time.sleep(0.2), compiled(*given))[1])
+    monkeypatch.setattr(levenberg_marquardt, "linearise", lambda *arguments: (time.sleep(0.2), compiled(*arguments))[1])
     for progress in (True, False):
         stream = Terminal()
         monkeypatch.setattr(sys, "stderr", stream)
-        again = identify(line, Measurements(value, ERROR), {"height": 0.5, "slope": 0.0}, starts=3, progress=progress)
-        assert again.estimates == found.estimates
+        second_fit = identify(
+            line, Measurements(value, ERROR), {"height": 0.5, "slope": 0.0}, starts=3, progress=progress
+        )
+        assert second_fit.estimates == fit.estimates
         assert [text.startswith("compiling") for _, text in stream.lines[:1]] == [True] * progress
 
 
 def test_a_model_without_derivatives_is_fitted_by_differences(regression):
     """In NumPy, with a step in it that is far below the errors and far above round-off."""
-    value, found = regression
+    value, fit = regression
 
     class Model:
         on_host = True
 
         def __call__(self, numbers):
-            return np.round(line({name: np.asarray(one) for name, one in numbers.items()}), 4)
+            return np.round(line({name: np.asarray(number) for name, number in numbers.items()}), 4)
 
     free = {"height": 0.5, "slope": -1.0}
-    again = identify(Model(), Measurements(value, ERROR), free, slopes="differences")
-    for name, expected in found.estimates.items():
-        assert abs(again.estimates[name] - expected) < 0.05 * found.standard_errors[name]
-    assert_close(list(again.standard_errors.values()), list(found.standard_errors.values()), rtol=0.05)
+    difference_fit = identify(Model(), Measurements(value, ERROR), free, slopes="differences")
+    for name, expected in fit.estimates.items():
+        assert abs(difference_fit.estimates[name] - expected) < 0.05 * fit.standard_errors[name]
+    assert_close(list(difference_fit.standard_errors.values()), list(fit.standard_errors.values()), rtol=0.05)
     with pytest.raises(ValueError, match="slopes = 'none' must be one of 'exact', 'differences'"):
         identify(line, Measurements(value, ERROR), free, slopes="none")
 
 
 def test_profile_of_a_linear_model_is_a_parabola(regression):
-    _, found = regression
-    profile = found.profile("slope")
-    deviations = (profile.values - found.estimates["slope"]) / found.standard_errors["slope"]
+    _, fit = regression
+    profile = fit.profile("slope")
+    deviations = (profile.values - fit.estimates["slope"]) / fit.standard_errors["slope"]
     assert_close(profile.deviance, deviations**2, atol=1e-7)
     assert profile.converged.all()
     # The other number follows along the regression line.
-    follows = found.covariance[0, 1] / found.covariance[1, 1] * (profile.values - found.estimates["slope"])
-    assert_close(profile.estimates["height"], found.estimates["height"] + follows, rtol=1e-6)
+    follows = fit.covariance[0, 1] / fit.covariance[1, 1] * (profile.values - fit.estimates["slope"])
+    assert_close(profile.estimates["height"], fit.estimates["height"] + follows, rtol=1e-6)
 
 
 def test_a_lower_limit_has_the_one_sided_likelihood():
@@ -109,15 +111,15 @@ def test_censored_mean_is_that_of_scipy():
     value = np.random.default_rng(2).normal(0.7, 0.5, 60)
     hidden = value > 1.0
     data = Measurements(np.minimum(value, 1.0), 0.5, hidden)
-    found = identify(lambda p: jnp.repeat(p["mean"][:, None], 60, axis=1), data, {"mean": 0.0})
+    fit = identify(lambda p: jnp.repeat(p["mean"][:, None], 60, axis=1), data, {"mean": 0.0})
 
     def deviance(mean):
         seen = scipy.stats.norm.logpdf(value[~hidden], mean, 0.5).sum()
         return -2.0 * (seen + hidden.sum() * scipy.stats.norm.logsf(1.0, mean, 0.5))
 
     best = scipy.optimize.minimize_scalar(deviance, (0.0, 1.0), tol=1e-12)
-    assert_close(found.estimates["mean"], best.x, atol=1e-5)
-    assert found.residuals[int(np.argmax(hidden))].censored
+    assert_close(fit.estimates["mean"], best.x, atol=1e-5)
+    assert fit.residuals[int(np.argmax(hidden))].censored
 
 
 def test_missing_predictions_are_a_penalty_without_slope():
@@ -131,21 +133,21 @@ def test_missing_predictions_are_a_penalty_without_slope():
 def test_bounds_are_kept_and_positive_numbers_are_fitted_in_logarithms():
     data = Measurements(np.array([4.0, 4.1]), 0.1)
     with pytest.warns(FitWarning, match="residuals are too large"):
-        found = identify(lambda p: jnp.repeat(p["x"][:, None], 2, axis=1), data, {"x": Free(1.0, 0.0, 3.0)})
-    assert 2.99 < found.estimates["x"] < 3.0
+        fit = identify(lambda p: jnp.repeat(p["x"][:, None], 2, axis=1), data, {"x": Free(1.0, 0.0, 3.0)})
+    assert 2.99 < fit.estimates["x"] < 3.0
     for free in (Free(2.0), Free(2.0, 0.0), Free(2.0, -1.0, 3.0), Free(2.0, upper=5.0)):
         assert_close(free.value(free.coordinate(2.5)), 2.5, rtol=1e-12)
-    found = identify(lambda p: jnp.repeat(p["x"][:, None], 2, axis=1), data, {"x": Free(1.0, 0.0)})
-    assert_close(np.sqrt(found.coordinate_covariance[0, 0]), 0.1 / np.sqrt(2.0) / 4.05, rtol=1e-4)
+    fit = identify(lambda p: jnp.repeat(p["x"][:, None], 2, axis=1), data, {"x": Free(1.0, 0.0)})
+    assert_close(np.sqrt(fit.coordinate_covariance[0, 0]), 0.1 / np.sqrt(2.0) / 4.05, rtol=1e-4)
 
 
 def test_a_prior_is_one_more_measurement():
     data = Measurements(np.array([4.0]), 0.3)
-    found = identify(lambda p: p["x"][:, None], data, {"x": Free(1.0, prior=(3.0, 0.6))})
-    assert_close(found.estimates["x"], (4.0 / 0.09 + 3.0 / 0.36) / (1.0 / 0.09 + 1.0 / 0.36), rtol=1e-8)
-    assert_close(found.standard_errors["x"], (1.0 / 0.09 + 1.0 / 0.36) ** -0.5, rtol=1e-9)
+    fit = identify(lambda p: p["x"][:, None], data, {"x": Free(1.0, prior=(3.0, 0.6))})
+    assert_close(fit.estimates["x"], (4.0 / 0.09 + 3.0 / 0.36) / (1.0 / 0.09 + 1.0 / 0.36), rtol=1e-8)
+    assert_close(fit.standard_errors["x"], (1.0 / 0.09 + 1.0 / 0.36) ** -0.5, rtol=1e-9)
     # What the data alone fix does not change.
-    assert_close(found.identifiability.singular_values, 1.0 / 0.3, rtol=1e-9)
+    assert_close(fit.identifiability.singular_values, 1.0 / 0.3, rtol=1e-9)
 
 
 def test_a_direction_that_the_data_cannot_see_is_named():
@@ -157,18 +159,18 @@ def test_a_direction_that_the_data_cannot_see_is_named():
 
     data = Measurements(6.0 * np.exp(-0.5 * t), 0.01)
     with pytest.warns(FitWarning, match="the data do not determine a [+-]1 %, b [+-]1 %"):
-        found = identify(model, data, {"a": Free(1.0, 0.0), "b": Free(2.0, 0.0), "c": 0.4})
-    assert found.identifiability.singular_values[2] < 1e-6 * found.identifiability.singular_values[0]
-    assert_close(np.abs(found.identifiability.directions[2]), [0.5**0.5, 0.5**0.5, 0.0], atol=1e-6)
-    assert len(found.identifiability.unseen) == 1
-    assert found.identifiability.unseen[0] in ("a +1 %, b -1 %", "a -1 %, b +1 %")
-    assert np.isinf(found.standard_errors["a"])
-    assert np.isinf(found.standard_errors["b"])
-    assert found.standard_errors["c"] < 0.01
-    assert_close(found.estimates["a"] * found.estimates["b"], 6.0, rtol=1e-6)
-    assert "UNDETERMINED" in str(found)
+        fit = identify(model, data, {"a": Free(1.0, 0.0), "b": Free(2.0, 0.0), "c": 0.4})
+    assert fit.identifiability.singular_values[2] < 1e-6 * fit.identifiability.singular_values[0]
+    assert_close(np.abs(fit.identifiability.directions[2]), [0.5**0.5, 0.5**0.5, 0.0], atol=1e-6)
+    assert len(fit.identifiability.unseen) == 1
+    assert fit.identifiability.unseen[0] in ("a +1 %, b -1 %", "a -1 %, b +1 %")
+    assert np.isinf(fit.standard_errors["a"])
+    assert np.isinf(fit.standard_errors["b"])
+    assert fit.standard_errors["c"] < 0.01
+    assert_close(fit.estimates["a"] * fit.estimates["b"], 6.0, rtol=1e-6)
+    assert "UNDETERMINED" in str(fit)
     with pytest.raises(ValueError, match="'a', whose standard error is infinite"):
-        found.profile("a")
+        fit.profile("a")
     assert_close(coordinate_covariance(np.array([[2.0, 0.0]])), [[0.25, 0.0], [0.0, np.inf]])
 
 
@@ -198,10 +200,10 @@ def test_bad_arguments_are_named(change, message):
         identify(**(arguments | change))
 
 
-@pytest.mark.parametrize("given", [(1.0, 1.0), ([1.0], 0.0), ([np.nan], 1.0), ([1.0, 2.0], [1.0, 2.0, 3.0])])
-def test_bad_measurements_are_refused(given):
+@pytest.mark.parametrize("measurements", [(1.0, 1.0), ([1.0], 0.0), ([np.nan], 1.0), ([1.0, 2.0], [1.0, 2.0, 3.0])])
+def test_bad_measurements_are_refused(measurements):
     with pytest.raises(ValueError, match=r"value|error"):
-        Measurements(*given)
+        Measurements(*measurements)
 
 
 def test_names_are_paths_or_their_ends():

@@ -21,14 +21,14 @@ def test_between_two_limits_it_is_the_probability_of_lying_there(half):
         -np.expm1(phi.logcdf(-half - np.abs(z)) - phi.logcdf(half - np.abs(z)))
     )
     most = np.log(phi.cdf(half) - phi.cdf(-half))
-    found = between(jnp.asarray(z), half)
-    assert_close(found**2, -2.0 * (lower - most), rtol=1e-5, atol=1e-8)
-    assert np.all(np.diff(found) >= 0.0)
+    probability = between(jnp.asarray(z), half)
+    assert_close(probability**2, -2.0 * (lower - most), rtol=1e-5, atol=1e-8)
+    assert np.all(np.diff(probability) >= 0.0)
     # A narrow interval is a measurement; and in its middle the slope is finite.
     slope = jax.grad(between)(0.0, half)
     assert np.isfinite(slope)
     if half < 0.01:
-        assert_close(found, z, rtol=1e-4, atol=1e-6)
+        assert_close(probability, z, rtol=1e-4, atol=1e-6)
         assert_close(slope, 1.0, rtol=1e-4)
 
 

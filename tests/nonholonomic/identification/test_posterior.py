@@ -79,16 +79,16 @@ def draws():
 
 @pytest.mark.slow
 def test_draws_have_the_mean_and_the_covariance_of_the_regression(draws):
-    fit, density, found = draws
-    assert all(value < 1.02 for value in found.r_hat.values())
-    assert all(value > 400.0 for value in found.ess.values())
+    fit, density, posterior = draws
+    assert all(value < 1.02 for value in posterior.r_hat.values())
+    assert all(value > 400.0 for value in posterior.ess.values())
     # Straight predictions are polynomials, and proposals are only a little wider than the density.
-    assert found.accepted > 0.8
-    for name, value in found.values.items():
+    assert posterior.accepted > 0.8
+    for name, value in posterior.values.items():
         error = fit.standard_errors[name]
-        assert abs(value.mean() - fit.estimates[name]) < 4.0 * error / np.sqrt(found.ess[name])
+        assert abs(value.mean() - fit.estimates[name]) < 4.0 * error / np.sqrt(posterior.ess[name])
         assert_close(value.std(), error, rtol=0.1)
-    flat = found.coordinates.reshape(-1, 2)
+    flat = posterior.coordinates.reshape(-1, 2)
     replicas = density.replicate(flat, seed=1)
     spread = np.sqrt(ERROR**2 + np.var(np.asarray(density.predict(jnp.asarray(flat))), axis=0))
     assert_close(replicas.std(axis=0), spread, rtol=0.1)
@@ -104,10 +104,12 @@ def test_a_single_unknown_is_drawn_profiled_and_shown_like_several():
     # As many starts as the profile has points, so that they share a program.
     fit = identify(level, data, {"height": 0.5}, starts=13)
     density = LogDensity.of(level, data, {"height": 0.5})
-    found = sample(density, fit.coordinates, fit.coordinate_covariance, chains=2, draws=100, warmup=5, progress=False)
-    assert found.values["height"].shape == (2, 100)
-    assert abs(found.values["height"].mean() - np.mean(data.value)) < 4.0 * error / np.sqrt(found.ess["height"])
-    assert f"R-hat {found.r_hat['height']:.4f}, ESS {found.ess['height']:.0f}" in str(found)
+    posterior = sample(
+        density, fit.coordinates, fit.coordinate_covariance, chains=2, draws=100, warmup=5, progress=False
+    )
+    assert posterior.values["height"].shape == (2, 100)
+    assert abs(posterior.values["height"].mean() - np.mean(data.value)) < 4.0 * error / np.sqrt(posterior.ess["height"])
+    assert f"R-hat {posterior.r_hat['height']:.4f}, ESS {posterior.ess['height']:.0f}" in str(posterior)
     profile = fit.profile("height")
     assert_close(profile.deviance, ((profile.values - np.mean(data.value)) / error) ** 2, atol=1e-9)
     assert profile.estimates == {}
@@ -160,14 +162,14 @@ def test_draws_are_from_a_density_that_the_surrogate_misses():
     error, free = 0.2, {"height": Free(1.0, 0.0, prior=(1.0, 0.3)), "rate": Free(1.0, 0.0, prior=(1.0, 0.4))}
     exact = np.asarray(decay({"height": jnp.array([1.2]), "rate": jnp.array([0.7])}))[0]
     density = LogDensity.of(rough, Measurements(exact, error), free)
-    found = sample(density, density.start, np.diag([0.1, 0.2]), progress=False)
+    posterior = sample(density, density.start, np.diag([0.1, 0.2]), progress=False)
     grid = np.stack(np.meshgrid(np.linspace(-1.5, 1.5, 101), np.linspace(-3.0, 2.0, 401), indexing="ij"), axis=-1)
     flat = jnp.asarray(grid.reshape(-1, 2))
     logs = np.asarray(jax.vmap(density.of_prediction)(flat, density.predict(flat)))
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     values = {name: np.asarray(value) for name, value in density.values(flat).items()}
-    assert found.accepted < 0.8
+    assert posterior.accepted < 0.8
     # The roughness itself: its share of the density, which a smooth stand-in would give as 0.
     for name, of in (
         *((name, lambda v, n=name: v[n]) for name in values),
@@ -175,19 +177,19 @@ def test_draws_are_from_a_density_that_the_surrogate_misses():
     ):
         mean = np.sum(weights * of(values))
         spread = np.sqrt(np.sum(weights * (of(values) - mean) ** 2))
-        ess = min(found.ess.values())
-        assert abs(np.mean(of(found.values)) - mean) < 4.0 * spread / np.sqrt(ess), name
-        assert_close(np.std(of(found.values)), spread, rtol=0.1)
+        ess = min(posterior.ess.values())
+        assert abs(np.mean(of(posterior.values)) - mean) < 4.0 * spread / np.sqrt(ess), name
+        assert_close(np.std(of(posterior.values)), spread, rtol=0.1)
     assert abs(np.sum(weights * np.sin(40.0 * values["rate"]))) > 0.2
 
 
 @pytest.mark.slow
 def test_numpyro_draws_the_same(draws):
     """The other library, whose figures stand beside in `benchmarks/posterior.py`, on the same density in the same points."""
-    fit, density, found = draws
+    fit, density, posterior = draws
     other, leaps = plain("numpyro", density, fit, 50, 250)
     assert leaps > 1000
-    for name, value in found.values.items():
+    for name, value in posterior.values.items():
         error = fit.standard_errors[name]
         assert abs(other.values[name].mean() - value.mean()) < 5.0 * error / np.sqrt(other.ess[name])
         assert_close(other.values[name].std(), error, rtol=0.15)

@@ -28,12 +28,12 @@ def recorded(error=0.5):
 @pytest.mark.parametrize("positive", [1, 3, 5])
 def test_few_runs_are_as_improbable_as_counting_says(positive):
     signs = np.array([1.0] * positive + [-1.0] * (7 - positive))
-    orders = [np.array(one) for one in set(itertools.permutations(signs))]
-    runs = np.array([1 + np.sum(one[1:] != one[:-1]) for one in orders])
-    for one, count in list(zip(orders, runs, strict=True))[:12]:
-        found = runs_of_signs(one)
-        assert found.runs == count
-        assert_close(found.p_value, np.mean(runs <= count), rtol=1e-12)
+    orders = [np.array(order) for order in set(itertools.permutations(signs))]
+    runs = np.array([1 + np.sum(order[1:] != order[:-1]) for order in orders])
+    for order, count in list(zip(orders, runs, strict=True))[:12]:
+        outcome = runs_of_signs(order)
+        assert outcome.runs == count
+        assert_close(outcome.p_value, np.mean(runs <= count), rtol=1e-12)
 
 
 def test_a_good_fit_has_nothing_against_it_and_its_p_value_is_that_of_chi_squared():

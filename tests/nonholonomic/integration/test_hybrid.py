@@ -150,28 +150,28 @@ def single(ball, t1, bounces=np.inf):
 def test_the_times_of_bounces_of_many_balls():
     """Each ends at a bounce of its own, the first to the fourth, before it would come to rest."""
     bounces = 1 + np.arange(CELLS) % 4
-    found = table(50.0, bounces)
+    outcome = table(50.0, bounces)
     times = [ball.bounce(number) for ball, number in zip(BALLS, bounces, strict=True)]
-    assert (found.status[:CELLS] == CROSSED).all()
-    assert_close(found.end_time[:CELLS], times, rtol=2e-14)
-    assert_close(found.crossing_time[:CELLS], times, rtol=2e-14)
-    assert_close(found.state[0, :CELLS], 0.0, atol=1e-14)
+    assert (outcome.status[:CELLS] == CROSSED).all()
+    assert_close(outcome.end_time[:CELLS], times, rtol=2e-14)
+    assert_close(outcome.crossing_time[:CELLS], times, rtol=2e-14)
+    assert_close(outcome.state[0, :CELLS], 0.0, atol=1e-14)
     speeds = [ball.speed * ball.restitution**number for ball, number in zip(BALLS, bounces, strict=True)]
-    assert_close(found.state[1, :CELLS], speeds, rtol=2e-14)
-    assert found.counts[0, :CELLS].tolist() == found.state[2, :CELLS].tolist() == bounces.tolist()
+    assert_close(outcome.state[1, :CELLS], speeds, rtol=2e-14)
+    assert outcome.counts[0, :CELLS].tolist() == outcome.state[2, :CELLS].tolist() == bounces.tolist()
 
 
 @pytest.mark.parametrize("t1", [0.2, 0.9, 1.7, 30.0])
 def test_the_states_of_many_balls_at_a_horizon(t1):
     """Falling, rising or at rest after up to 80 bounces, each cell in a mode of its own."""
-    found = table(t1, np.full(CELLS, np.inf))
+    outcome = table(t1, np.full(CELLS, np.inf))
     expected = np.array([ball.state(t1) for ball in BALLS]).T
-    assert (found.status == REACHED_END).all()
-    assert (found.end_time[:CELLS] == t1).all()
-    assert_close(found.state[:, :CELLS], expected, atol=2e-13)
-    assert found.counts[0, :CELLS].tolist() == expected[2].tolist()
+    assert (outcome.status == REACHED_END).all()
+    assert (outcome.end_time[:CELLS] == t1).all()
+    assert_close(outcome.state[:, :CELLS], expected, atol=2e-13)
+    assert outcome.counts[0, :CELLS].tolist() == expected[2].tolist()
     rests = [ball.rests_after == count for ball, count in zip(BALLS, expected[2], strict=True)]
-    assert (found.mode[:CELLS] == np.where(rests, RESTING, FALLING)).all()
+    assert (outcome.mode[:CELLS] == np.where(rests, RESTING, FALLING)).all()
     assert all(rests) == (t1 == 30.0)
 
 
@@ -196,19 +196,19 @@ def test_a_single_ball_at_any_time():
 
 def test_a_single_ball_ends_as_it_does_in_a_table():
     bounces = np.full(CELLS, 3)
-    found = table(1.2, bounces)
-    assert set(found.status) == {CROSSED, REACHED_END}
+    outcome = table(1.2, bounces)
+    assert set(outcome.status) == {CROSSED, REACHED_END}
     for number in (0, 20, 39):
         path = single(BALLS[number], 1.2, 3)
-        assert path.status == found.status[number]
-        assert_close(path.end_time, found.end_time[number], rtol=1e-14)
-        assert_close(path.state, found.state[:, number], atol=1e-13)
-        assert path.counts.tolist() == [found.counts[0, number]]
+        assert path.status == outcome.status[number]
+        assert_close(path.end_time, outcome.end_time[number], rtol=1e-14)
+        assert_close(path.state, outcome.state[:, number], atol=1e-13)
+        assert path.counts.tolist() == [outcome.counts[0, number]]
 
 
 def test_what_needs_too_many_rounds_is_given_up():
-    found = table(30.0, np.full(CELLS, np.inf), most_rounds=10)
+    outcome = table(30.0, np.full(CELLS, np.inf), most_rounds=10)
     # One round for each fall, and one for the rest.
     tired = [ball.rests_after + 1 > 10 for ball in BALLS]
-    assert (found.status[:CELLS] == np.where(tired, UNRESOLVED, REACHED_END)).all()
+    assert (outcome.status[:CELLS] == np.where(tired, UNRESOLVED, REACHED_END)).all()
     assert 0 < sum(tired) < CELLS

@@ -21,7 +21,7 @@ TOP = tippe.Top(0.02, 0.02, 0.006, 131.0 / 350.0 * 8e-6, 0.4 * 8e-6)
 
 def test_there_are_as_many_trees_as_the_literature_counts():
     """Hairer, Norsett and Wanner, Solving ODEs I, Table II.2.3."""
-    assert [len(some) for some in trees(9)] == [1, 1, 2, 4, 9, 20, 48, 115, 286]
+    assert [len(group) for group in trees(9)] == [1, 1, 2, 4, 9, 20, 48, 115, 286]
 
 
 @pytest.mark.parametrize("order", range(1, 9))
@@ -44,13 +44,13 @@ def test_its_errors_along_a_motion_are_small_and_could_not_be_found_by_chance():
     plain = unknowns_of(diffrax.Dopri8().tableau)
     assert max(aim.sizes(OWN)) < 0.6
     assert min(aim.sizes(plain)) > 0.8
-    found, height = descended(aim, plain, passes=2)
+    coefficients, height = descended(aim, plain, passes=2)
     assert height < aim(plain) - 0.1
-    assert np.abs(equations(found)).max() < 1e-10
+    assert np.abs(equations(coefficients)).max() < 1e-10
 
 
 def test_it_is_no_more_than_of_eighth_order_and_no_worse_in_ninth_than_the_pair_it_replaces():
-    ninth, plain = (jnp.linalg.norm(error_coefficients(one.stages, one.eighth, 9)) for one in (PAIR, PLAIN))
+    ninth, plain = (jnp.linalg.norm(error_coefficients(pair.stages, pair.eighth, 9)) for pair in (PAIR, PLAIN))
     assert 1e-7 < ninth < plain
     np.testing.assert_allclose(plain, 4.51e-6, rtol=1e-2)  # Prince and Dormand's own figure
 
@@ -73,8 +73,8 @@ def test_off_the_plane_it_reaches_the_same_error_in_fewer_steps(arena):
     problem = InversionProblem.of(scene, tippe.Launch(np.linspace(0.05, 0.15, 8), 100.0, eta=0.3), 3.0, 8)
 
     def run(solver, tolerance):
-        found, _ = solve_ensemble(problem, jnp.asarray(1.5), jnp.asarray(8), Settings(tolerance, solver))
-        return np.asarray(found.state[2:5]), float(np.mean(found.steps))
+        outcome, _ = solve_ensemble(problem, jnp.asarray(1.5), jnp.asarray(8), Settings(tolerance, solver))
+        return np.asarray(outcome.state[2:5]), float(np.mean(outcome.steps))
 
     reference, _ = run(None, 1e-12)
     (own, steps), (plain, more) = run(None, 1e-9), run(diffrax.Dopri8(), 1e-9)
@@ -99,7 +99,7 @@ def test_a_rotation_keeps_its_amplitude_and_its_phase():
 
 
 def test_a_table_by_diffrax_refuses_it_before_anything_is_written(tmp_path):
-    given = {"theta": [0.1], "spin": 155.0, "t1": 1.0, "method": "diffrax", "path": tmp_path / "table.h5"}
+    arguments = {"theta": [0.1], "spin": 155.0, "t1": 1.0, "method": "diffrax", "path": tmp_path / "table.h5"}
     with pytest.raises(ValueError, match="solver = Oscillatory8"):
-        tippe.inversion_table(tippe.Scene(TOP), solver=Oscillatory8(), **given)
+        tippe.inversion_table(tippe.Scene(TOP), solver=Oscillatory8(), **arguments)
     assert not list(tmp_path.iterdir())

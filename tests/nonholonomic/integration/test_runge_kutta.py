@@ -19,7 +19,7 @@ def field(time, state):
 @pytest.mark.parametrize(
     "solver",
     [Oscillatory8(), diffrax.Dopri8(), diffrax.Tsit5(), diffrax.Bosh3(), diffrax.Heun()],
-    ids=lambda one: type(one).__name__,
+    ids=lambda value: type(value).__name__,
 )
 def test_a_step_is_that_of_diffrax(solver):
     """In three lanes: where it leads, its error estimate, and what was seen on the way."""
@@ -70,12 +70,12 @@ def test_an_accelerator_gets_the_stages_written_out(monkeypatch):
 
         return jax.jit(step)
 
-    here = compiled()(state)
+    outcome = compiled()(state)
     assert "while" in compiled().lower(state).as_text()
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert "while" not in compiled().lower(state).as_text()
     for name, value in compiled()(state)._asdict().items():
-        np.testing.assert_allclose(getattr(here, name), value, rtol=1e-13, atol=1e-15, err_msg=name)
+        np.testing.assert_allclose(getattr(outcome, name), value, rtol=1e-13, atol=1e-15, err_msg=name)
 
 
 @pytest.mark.parametrize("order", [2, 3, 4, 5, 8])

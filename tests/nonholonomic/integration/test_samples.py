@@ -18,8 +18,8 @@ class Oscillators(AbstractProblem):
     least: jnp.ndarray
 
     def start(self):
-        one = jnp.ones_like(self.rate)
-        return jnp.stack([one, 0.0 * one]), jnp.stack([one, self.rate])
+        ones = jnp.ones_like(self.rate)
+        return jnp.stack([ones, 0.0 * ones]), jnp.stack([ones, self.rate])
 
     def field(self, time, state):
         return jnp.stack([state[1], -(self.rate**2) * state[0]])
@@ -36,8 +36,8 @@ RATES = jnp.linspace(1.0, 9.0, CELLS)
 
 def run(times, least=-2.0, tolerance=1e-10):
     problem = Oscillators(RATES, jnp.full(CELLS, least))
-    given = (jnp.asarray(10.0), jnp.asarray(CELLS), Settings(tolerance, lanes=16))
-    return eqx.filter_jit(solve_with_samples)(problem, jnp.asarray(times), *given)
+    arguments = (jnp.asarray(10.0), jnp.asarray(CELLS), Settings(tolerance, lanes=16))
+    return eqx.filter_jit(solve_with_samples)(problem, jnp.asarray(times), *arguments)
 
 
 @pytest.mark.parametrize("count", [3, 701])

@@ -75,18 +75,18 @@ def finished_blocks(table: Table) -> set[int]:
     np.testing.assert_array_equal(table.coords["x"], X)
     right = expected(X)
     words = np.array(VARIABLES["status"].words)[right["status"]]
-    found = set()
+    blocks = set()
     for block, first in enumerate(range(0, CELLS, BLOCK)):
-        here = slice(first, first + BLOCK)
-        if (table.status[here] == "pending").all():
-            assert np.isnan(table.value[here]).all()
-            assert (table.count[here] == -1).all()
+        cells = slice(first, first + BLOCK)
+        if (table.status[cells] == "pending").all():
+            assert np.isnan(table.value[cells]).all()
+            assert (table.count[cells] == -1).all()
         else:
-            np.testing.assert_array_equal(table.value[here], right["value"][here])
-            np.testing.assert_array_equal(table.status[here], words[here])
-            np.testing.assert_array_equal(table.count[here], right["count"][here])
-            found.add(block)
-    return found
+            np.testing.assert_array_equal(table.value[cells], right["value"][cells])
+            np.testing.assert_array_equal(table.status[cells], words[cells])
+            np.testing.assert_array_equal(table.count[cells], right["count"][cells])
+            blocks.add(block)
+    return blocks
 
 
 def resumed(path: Path) -> set[int]:

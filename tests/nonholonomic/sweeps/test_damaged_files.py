@@ -44,9 +44,9 @@ def check_flips(images, folder, places_of):
             changed = bytearray(image)
             changed[place] ^= 1 << bit
             path.write_bytes(changed)
-            found = contents(path)
-            refused += found is None
-            assert found in (None, right), place
+            content = contents(path)
+            refused += content is None
+            assert content in (None, right), place
     return refused
 
 
@@ -83,11 +83,11 @@ def check_flips_of_blocks(folder, places_of):
             changed = bytearray(file.read_bytes())
             changed[place] ^= 1 << bit
             (folder / "now" / "table.h5.blocks" / file.name).write_bytes(changed)
-            found = contents(path)
-            assert found in (None, right), (file.name, place)
-            refused += found is None
+            content = contents(path)
+            assert content in (None, right), (file.name, place)
+            refused += content is None
             if file.suffix == ".npz":
-                assert len(resumed(path)) == 4 + (found is None)
+                assert len(resumed(path)) == 4 + (content is None)
     return refused
 
 

@@ -49,11 +49,11 @@ def dask():
         yield client.get_executor()
 
 
-def assert_same_bits(one: Table, other: Table):
-    assert list(one.variables) == list(other.variables)
-    for name, values in one.variables.items():
-        assert values.dtype == other.variables[name].dtype
-        assert values.tobytes() == other.variables[name].tobytes(), name
+def assert_same_bits(first: Table, second: Table):
+    assert list(first.variables) == list(second.variables)
+    for name, values in first.variables.items():
+        assert values.dtype == second.variables[name].dtype
+        assert values.tobytes() == second.variables[name].tobytes(), name
 
 
 @pytest.fixture
@@ -105,12 +105,12 @@ def test_mpi_gives_the_same_bits_too(tmp_path, by_threads):
 
 def test_trajectories_and_rides_from_other_processes_have_the_same_bits(processes, many_blocks):
     asked = {"theta": [0.1, 0.2, 1.6], "spin": [100.0, 250.0], "mu": [0.2, 0.3], "times": np.linspace(0.0, 1.5, 31)}
-    mine, theirs = (tippe.trajectory_table(TOP, executor=one, **asked) for one in (None, processes))
+    mine, theirs = (tippe.trajectory_table(TOP, executor=pool, **asked) for pool in (None, processes))
     assert_same_bits(mine, theirs)
     scene = stroller.Scene(stroller.Stroller(1.7, 0.7, 0.4, 0.05), stroller.Plane())
     axes = {"launch.place[0]": [0.0, 1.0, 2.0], "launch.place[1]": np.linspace(0.0, 8.0, 9)}
     launch = stroller.Launch((0.0, 0.0), 0.5, 1.0, 0.3)
-    mine, theirs = (stroller.sweep(scene, launch, 2.0, axes=axes, executor=one) for one in (None, processes))
+    mine, theirs = (stroller.sweep(scene, launch, 2.0, axes=axes, executor=pool) for pool in (None, processes))
     assert_same_bits(mine, theirs)
 
 
@@ -132,11 +132,11 @@ def test_a_block_that_three_workers_die_of_is_failed_and_the_others_are_not(way,
         table = cheap_sweep(path, job=job, executor=request.getfixturevalue(way))
     # Dask blames blocks that only waited at a worker that died, too; nobody else kills workers here.
     assert len(set(job.begun(2))) == len(job.begun(2)) == 3
-    for found in (table, Table.load(path)):
-        failed = found.status == "failed"
+    for copy in (table, Table.load(path)):
+        failed = copy.status == "failed"
         assert np.flatnonzero(failed).tolist() == list(range(16, 24))
-        assert np.isnan(found.value[failed]).all()
-        np.testing.assert_array_equal(found.value[~failed], np.sin(found.coords["x"][~failed]))
+        assert np.isnan(copy.value[failed]).all()
+        np.testing.assert_array_equal(copy.value[~failed], np.sin(copy.coords["x"][~failed]))
 
 
 def test_a_pool_that_breaks_ends_the_sweep_and_another_goes_on(processes, tmp_path):
@@ -232,13 +232,13 @@ def test_a_user_s_system_is_computed_by_other_processes(processes, monkeypatch):
 
 def test_local_processes_have_their_cores_and_settings(processes):
     futures = [processes.submit(place) for _ in range(4)]
-    found = {process: rest for process, *rest in (future.result() for future in futures)}
+    settings_by_process = {process: rest for process, *rest in (future.result() for future in futures)}
     mine = os.sched_getaffinity(0)
-    for cores, platforms, cache in found.values():
+    for cores, platforms, cache in settings_by_process.values():
         assert len(cores) == 1
         assert cores <= mine
         assert (platforms, cache) == ("cpu", jax.config.jax_compilation_cache_dir)
-    assert os.getpid() not in found
+    assert os.getpid() not in settings_by_process
 
 
 BAD = [(0, 1, "n = 0"), (1, -1, "threads = -1"), (1.5, 1, "n = 1.5"), ("2", 1, "n = '2'")]

@@ -128,10 +128,10 @@ def check_power_cuts(tmp_path, monkeypatch, rounds):
             if place == path or moment < len(done) or random.integers(2):
                 place.write_bytes(content)
         begun = path.exists() or (blocks / "table.h5").exists()
-        found = finished_blocks(Table.load(path)) if begun else set()
-        assert confirmed <= len(found) <= confirmed + 1
-        seen.add(len(found))
-        assert resumed(path) == set(range(7)) - found
+        finished = finished_blocks(Table.load(path)) if begun else set()
+        assert confirmed <= len(finished) <= confirmed + 1
+        seen.add(len(finished))
+        assert resumed(path) == set(range(7)) - finished
         assert list(tmp_path.iterdir()) == [path]
     return seen
 

@@ -110,7 +110,7 @@ def test_a_small_grid_is_checked_whole_and_a_large_one_at_its_edges_and_corners(
     (small,) = cells_to_check([X, axis("z", "z", "1", [1.0, 2.0])])
     assert len(small["x"]) == 2000
     looked_at = list(cells_to_check([X, Y, axis("z", "z", "1", [3.0, 1.0, 2.0])]))
-    assert sum(len(one["x"]) for one in looked_at) == 1000 + 500 + 3 + 8
+    assert sum(len(chunk["x"]) for chunk in looked_at) == 1000 + 500 + 3 + 8
     assert set(zip(*looked_at[-1].values(), strict=True)) == set(
         itertools.product((0.0, 1.0), (0.0, 499.0), (1.0, 3.0))
     )

@@ -102,17 +102,17 @@ def test_a_file_names_its_variables_and_shows_nothing_else(table, tmp_path):
         assert set(data.variables) == {"theta", "mu", "spin", "time", "status"}
         assert data["time"].attrs["long_name"] == "inversion time"
         assert data["theta"].attrs == {"units": "rad", "long_name": "θ(0)"}
-    again = Table.load(tmp_path / "table.h5")
-    assert again.long_names == table.long_names
-    assert again.to_xarray()["time"].attrs == {"units": "s", "long_name": "inversion time"}
-    assert "long_names" not in again.to_xarray().attrs
+    loaded_table = Table.load(tmp_path / "table.h5")
+    assert loaded_table.long_names == table.long_names
+    assert loaded_table.to_xarray()["time"].attrs == {"units": "s", "long_name": "inversion time"}
+    assert "long_names" not in loaded_table.to_xarray().attrs
 
 
 def test_a_sweeps_file_too(tmp_path):
     path = tmp_path / "sweep.h5"
-    found = cheap_sweep(path)
+    table = cheap_sweep(path)
     with xarray.open_dataset(path, engine="h5netcdf") as data:
-        assert set(data.variables) == {*found.coords, *found.variables}
+        assert set(data.variables) == {*table.coords, *table.variables}
 
 
 def test_a_table_goes_to_pandas_a_row_for_each_cell():
@@ -129,6 +129,6 @@ def test_a_table_goes_to_pandas_a_row_for_each_cell():
     slip = np.arange(12.0).reshape(2, 3, 2)
     frame = Table(coords, {"time": time, "slip": slip}, {}, {}, inner={"slip": ("component",)}).to_dataframe()
     assert len(frame) == 12
-    one = frame[(frame.theta == 0.2) & (frame.mu == 0.5) & (frame.component == "y")]
-    assert (one.time.item(), one.slip.item()) == (5.0, 11.0)
+    rows = frame[(frame.theta == 0.2) & (frame.mu == 0.5) & (frame.component == "y")]
+    assert (rows.time.item(), rows.slip.item()) == (5.0, 11.0)
     assert len(Table({}, {"time": np.array(3.0)}, {}, {}).to_dataframe()) == 1

@@ -9,6 +9,7 @@ import pytest
 from close import assert_close
 from own_modes import GRAVITY, Ball, Bounces, Sleigh, bounce
 
+import nonholonomic
 from nonholonomic import AbstractMode, Hybrid, sweep
 from nonholonomic.systems.numbers import Named
 from nonholonomic.systems.sweep import SweepJob
@@ -22,11 +23,11 @@ def table(tmp_path_factory):
     """The third bounces of balls, whose table is kept in a file."""
     path = tmp_path_factory.mktemp("balls") / "balls.h5"
     axes = {"start[0]": HEIGHTS, "restitution": RESTITUTIONS}
-    given = {"axes": axes, "sensitivities": ["restitution", "modes[0].gravity"], "path": path, "progress": False}
-    first = sweep(BALL, [1.0, 0.0, 0.0], 1.4, **given)
-    again = sweep(BALL, [1.0, 0.0, 0.0], 1.4, **given)
-    assert_close(again.time, first.time)
-    return again
+    arguments = {"axes": axes, "sensitivities": ["restitution", "modes[0].gravity"], "path": path, "progress": False}
+    first = sweep(BALL, [1.0, 0.0, 0.0], 1.4, **arguments)
+    second_table = sweep(BALL, [1.0, 0.0, 0.0], 1.4, **arguments)
+    assert_close(second_table.time, first.time)
+    return second_table
 
 
 def test_a_table_of_bounces_and_its_derivatives(table):
@@ -98,3 +99,10 @@ def test_long_steps_leave_no_error_in_the_times_of_bounces():
     heights = np.linspace(0.5, 2.0, 512)
     table = sweep(BALL, [1.0, 0.0, 0.0], 20.0, axes={"start[0]": heights}, progress=False)
     assert_close(table.time, bounce(heights, 0.8, GRAVITY, 3), rtol=1e-13)
+
+
+def test_what_a_user_of_own_systems_needs_has_public_names(table):
+    """The table in the file, and the unknowns of a fit, without imports from the rooms or the vehicles."""
+    assert nonholonomic.Table is type(table)
+    assert nonholonomic.Free(0.8, lower=0.0).lower == 0.0
+    assert issubclass(nonholonomic.FitWarning, UserWarning)

@@ -40,7 +40,7 @@ SURFACES = (
 )
 
 
-@pytest.mark.parametrize(("surface", "place"), SURFACES, ids=lambda one: type(one).__name__)
+@pytest.mark.parametrize(("surface", "place"), SURFACES, ids=lambda value: type(value).__name__)
 def test_an_arena_lies_on_its_surface_and_reaches_about_the_run(surface, place):
     place = (0.2, 0.3) if place is None else place
     point = np.array([float(part) for part in surface.in_fixed_frame(surface.chart(tuple(map(jnp.asarray, place)))[0])])
@@ -84,8 +84,8 @@ def test_turns_are_told_from_matrices_and_back():
     # Half turns, where the quaternion's last component is 0, among them.
     turning[:50, 3] = 0.0
     turning /= np.linalg.norm(turning, axis=-1, keepdims=True)
-    again = turned(matrices(turning))
-    np.testing.assert_allclose(np.abs(np.sum(again * turning, axis=-1)), 1.0, atol=1e-12)
+    rotation = turned(matrices(turning))
+    np.testing.assert_allclose(np.abs(np.sum(rotation * turning, axis=-1)), 1.0, atol=1e-12)
 
 
 def test_an_animation_moves(tmp_path):
@@ -162,4 +162,4 @@ def test_traces_of_several_runs_have_their_colours():
     (show,) = rolling().shows
     assert distinguished_by_colour((show,)) == (show,)
     both = distinguished_by_colour((show, show._replace(colour=0x2A6FB0)))
-    assert [one.traces[0].colour for one in both] == [0xC8412B, 0x2A6FB0]
+    assert [drawing.traces[0].colour for drawing in both] == [0xC8412B, 0x2A6FB0]

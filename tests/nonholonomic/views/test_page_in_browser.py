@@ -70,12 +70,12 @@ def test_nothing_is_missing_without_a_network(browser):
 
 def test_the_top_is_where_the_run_is(browser, top):
     times = np.array([0.0, 0.1234, 0.3, 0.5])
-    there = top.at(times)
+    samples = top.at(times)
     for number, at in enumerate(times):
         (pose,) = poses(browser, float(at), 0)
-        np.testing.assert_allclose(pose[:3, 3], there.position[number], atol=SINGLE)
+        np.testing.assert_allclose(pose[:3, 3], samples.position[number], atol=SINGLE)
         # Between frames it is turned the short way, so its axis cuts a corner.
-        np.testing.assert_allclose(pose[:3, 2], there.axis[number], atol=2e-3)
+        np.testing.assert_allclose(pose[:3, 2], samples.axis[number], atol=2e-3)
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=SINGLE)
 
 
@@ -142,9 +142,9 @@ def test_controls_lie_under_nothing_and_nothing_overflows(browser, stages):
             )
             browser.switch_to.frame(browser.find_element("css selector", "#box iframe"))
             wait(browser, "return !!window.player")
-        found = browser.execute_script(CENTRES)
-        assert len(found) > 15
-        assert set(found) == {True}
+        centres = browser.execute_script(CENTRES)
+        assert len(centres) > 15
+        assert set(centres) == {True}
         assert browser.execute_script("return document.documentElement.scrollWidth <= innerWidth")
     browser.switch_to.default_content()
     browser.execute_script("document.getElementById('box').remove(); scrollTo(0, 0)")

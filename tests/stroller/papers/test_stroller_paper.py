@@ -95,7 +95,7 @@ def test_scale_factors_are_those_of_the_position():
     def place(xi, eta, mu):
         return paper.position(paper.Parameters(P.m, P.l, P.J, P.J_f, P.a, xi, P.g), eta, mu)
 
-    lengths = [jnp.linalg.norm(one) for one in jax.jacfwd(place, argnums=(0, 1, 2))(P.xi, ETA, MU)]
+    lengths = [jnp.linalg.norm(column) for column in jax.jacfwd(place, argnums=(0, 1, 2))(P.xi, ETA, MU)]
     h_eta, h_mu = paper.scale_factors(P, ETA)
     np.testing.assert_allclose(lengths, [h_eta, h_eta, h_mu], rtol=1e-14)
 
@@ -133,11 +133,11 @@ def test_canonical_equations_on_the_plane():
     rate = allowed(paper.fields_plane, Q)
     velocity, push, force = canonical(PLANE, rate)
     momentum = PLANE.metric(Q) @ rate
-    found = paper.pchs_plane(P, Q, momentum, force)
-    np.testing.assert_allclose(found[0], velocity, rtol=1e-14)
-    np.testing.assert_allclose(found[1], push, atol=1e-14)
-    np.testing.assert_allclose(found[1] @ rate, 0.0, atol=1e-14)
-    printed = found[1].at[1].multiply(-1.0)
+    rates = paper.pchs_plane(P, Q, momentum, force)
+    np.testing.assert_allclose(rates[0], velocity, rtol=1e-14)
+    np.testing.assert_allclose(rates[1], push, atol=1e-14)
+    np.testing.assert_allclose(rates[1] @ rate, 0.0, atol=1e-14)
+    printed = rates[1].at[1].multiply(-1.0)
     assert abs(float(printed @ rate)) > 0.1
 
 
@@ -155,9 +155,9 @@ def test_canonical_equations_on_the_spheroid():
     rate = allowed(paper.fields_spheroid, Q)
     velocity, push, force = canonical(SPHEROID, rate)
     momentum = paper.masses_spheroid(P, ETA) * rate
-    found = paper.pchs_spheroid(P, Q, momentum, force)
-    np.testing.assert_allclose(found[0], velocity, rtol=1e-13)
-    np.testing.assert_allclose(found[1], push, atol=1e-12)
+    rates = paper.pchs_spheroid(P, Q, momentum, force)
+    np.testing.assert_allclose(rates[0], velocity, rtol=1e-13)
+    np.testing.assert_allclose(rates[1], push, atol=1e-12)
     bracket = momentum[0] ** 2 * jnp.cos(ETA) / D**1.5 - P.m * P.g * C * jnp.cos(ETA)
     printed = jnp.sin(ETA) / (2 * P.m * P.a) * bracket
     assert abs(float(printed - push[0])) > 0.1

@@ -54,8 +54,8 @@ def random_launches(scene, count):
     return Launch(place, spread(-3, 3), spread(-2, 2), steering, spread(-2, 2))
 
 
-def relative(found, expected):
-    return jnp.max(jnp.abs(found - expected)) / (1.0 + jnp.max(jnp.abs(expected)))
+def relative(value, expected):
+    return jnp.max(jnp.abs(value - expected)) / (1.0 + jnp.max(jnp.abs(expected)))
 
 
 @eqx.filter_jit
@@ -63,22 +63,22 @@ def disagreements(scene, push, states):
     """Per state: of the four accelerations with the P-form's, of the side and normal forces, energies, constraints."""
     chart = Chart(scene, push)
 
-    def one(state):
+    def errors_at(state):
         t = jnp.asarray(0.3)
         (q, rate), (_, expected) = jax.jvp(
             lambda state: coordinates_and_rates(scene, t, state, push),
             (state,),
             (scene.dynamics.field(t, state, push),),
         )
-        found = [relative(kind(chart).acceleration(t, q, rate), expected) for kind in FORMULATIONS]
+        errors = [relative(kind(chart).acceleration(t, q, rate), expected) for kind in FORMULATIONS]
         forces = Multipliers(chart).multipliers(t, q, rate)
         side = relative(jnp.concatenate(side_force(scene, t[None], state[:, None], push)), forces)
         normal = relative(scene.contact(state), chart.normal_force(q, rate))
         energy = relative(scene.energy(state), chart.energy(q, rate))
         slip = jnp.max(jnp.abs(chart.constraints(q) @ rate))
-        return jnp.stack([*found, side, normal, energy, slip])
+        return jnp.stack([*errors, side, normal, energy, slip])
 
-    return jax.vmap(one, in_axes=1)(states)
+    return jax.vmap(errors_at, in_axes=1)(states)
 
 
 @pytest.mark.parametrize(("ground", "fork"), CASES)
@@ -87,8 +87,8 @@ def test_accelerations_and_forces_agree_at_a_thousand_states(ground, fork):
     for friction, gain in ((Damping(0.0), 0.0), (Damping(0.3, 0.2, 0.1, 0.15), 0.7)):
         body = BODY if gain else eqx.tree_at(lambda body: body.steering_spring, BODY, jnp.zeros(()))
         scene = Scene(body, friction=friction, fork=fork, **GROUNDS[ground])
-        found = disagreements(scene, Push(jnp.asarray(gain)), scene.state(random_launches(scene, 1000), driven=True))
-        np.testing.assert_allclose(found, 0.0, atol=1e-11)
+        errors = disagreements(scene, Push(jnp.asarray(gain)), scene.state(random_launches(scene, 1000), driven=True))
+        np.testing.assert_allclose(errors, 0.0, atol=1e-11)
 
 
 @pytest.mark.slow
@@ -126,7 +126,7 @@ def test_trajectories_agree_over_ten_seconds(ground, fork, friction, launch):
     formulations = [kind(chart) for kind in FORMULATIONS]
 
     def field(t, states, args):
-        return [one.field(t, state) for one, state in zip(formulations, states, strict=True)]
+        return [formulation.field(t, state) for formulation, state in zip(formulations, states, strict=True)]
 
     sol = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
@@ -134,7 +134,7 @@ def test_trajectories_agree_over_ten_seconds(ground, fork, friction, launch):
         0.0,
         10.0,
         None,
-        [one.state(q, rate) for one in formulations],
+        [formulation.state(q, rate) for formulation in formulations],
         stepsize_controller=diffrax.PIDController(rtol=1e-12, atol=1e-12),
     )
     expected = coordinates(scene, run.state[-1])

@@ -83,11 +83,11 @@ def test_equations_7_8_and_10_hold_on_the_plane(on_the_plane):
     jellett, beta1 = PLANE.jellett(vector), TOP.I3 * PLANE.spin(vector)
     # (8) divides by R cos(theta) - a.
     clear = jnp.abs(TOP.radius * jnp.cos(theta) - TOP.offset) > 0.1 * TOP.radius
-    found = reduced.spin_momentum_from_jellett(PLANE, theta, phi_dot, jellett)
-    np.testing.assert_allclose(found[clear], beta1[clear], rtol=1e-9, atol=1e-16)
+    value = reduced.spin_momentum_from_jellett(PLANE, theta, phi_dot, jellett)
+    np.testing.assert_allclose(value[clear], beta1[clear], rtol=1e-9, atol=1e-16)
     np.testing.assert_allclose(reduced.spin_rate(PLANE, theta, phi_dot, beta1), psi_dot, rtol=1e-9, atol=1e-10)
-    found = reduced.spin_rate_from_jellett(PLANE, theta, phi_dot, jellett)
-    np.testing.assert_allclose(found[clear], psi_dot[clear], rtol=1e-9, atol=1e-9)
+    value = reduced.spin_rate_from_jellett(PLANE, theta, phi_dot, jellett)
+    np.testing.assert_allclose(value[clear], psi_dot[clear], rtol=1e-9, atol=1e-9)
 
 
 def test_equation_9_is_an_energy_but_no_routhian(on_the_plane):
@@ -126,12 +126,14 @@ def test_equation_12_needs_three_more_terms_in_the_cylinder_and_none_on_the_plan
     """The corrected form is N; the printed one is N on the plane, and far from it in the cylinder."""
     for scene, (vector, chart), right in ((PLANE, on_the_plane, True), (CYLINDER, in_the_cylinder, False)):
         exact = scene.normal_force(vector)
-        found = jax.jit(jax.vmap(lambda s, scene=scene: euler_angles.by_lagrange(scene, s), in_axes=1))(chart)
+        acceleration = jax.jit(jax.vmap(lambda s, scene=scene: euler_angles.by_lagrange(scene, s), in_axes=1))(chart)
         size = jnp.max(jnp.abs(exact))
         corrected = jax.vmap(lambda s, a, scene=scene: euler_angles.normal_force(scene, s, a), in_axes=(1, 0))
-        np.testing.assert_allclose(corrected(chart, found.second_rates), exact, rtol=0.0, atol=1e-11 * float(size))
+        np.testing.assert_allclose(
+            corrected(chart, acceleration.second_rates), exact, rtol=0.0, atol=1e-11 * float(size)
+        )
         printed = jax.vmap(lambda s, a, scene=scene: paper.printed_normal_force(scene, s, a), in_axes=(1, 0))
-        error = jnp.max(jnp.abs(printed(chart, found.second_rates[:, 2]) - exact)) / (TOP.mass * scene.gravity)
+        error = jnp.max(jnp.abs(printed(chart, acceleration.second_rates[:, 2]) - exact)) / (TOP.mass * scene.gravity)
         assert error < 1e-10 if right else error > 0.05
 
 
@@ -224,16 +226,16 @@ def test_one_top_gives_table_3_to_half_a_second_and_table_2_nearly():
     I3 = 0.4075 * mass * radius**2
     top = tippe.Top(mass, radius, 0.086495 * radius, 1.0533 * I3, I3)
     scene = tippe.Scene(top, tippe.Cylinder(84.428 * radius), tippe.Viscous(0.32573))
-    found = []
+    tables = []
     for table in (paper.TABLE_2, paper.TABLE_3):
         theta = [row.theta for row in table.rows]
         start = {"spin": float(paper.BETA1 / I3), "eta": min(table.eta, np.pi / 2.0 - 1e-6), "azimuth": 1.7971}
-        found.append(tippe.inversion_table(scene, theta=theta, **start, t1=30.0, tolerance=1e-9))
-    np.testing.assert_allclose(found[0].time[:3], [26.3, 26.3, 28.2], atol=0.05)
-    assert list(found[0].status[3:]) == ["not_inverted"] * 6
+        tables.append(tippe.inversion_table(scene, theta=theta, **start, t1=30.0, tolerance=1e-9))
+    np.testing.assert_allclose(tables[0].time[:3], [26.3, 26.3, 28.2], atol=0.05)
+    assert list(tables[0].status[3:]) == ["not_inverted"] * 6
     printed = [row.time for row in paper.TABLE_3.rows[:4]]
-    np.testing.assert_allclose(found[1].time[:4], printed, atol=0.5)
-    assert list(found[1].status[4:]) == ["contact_lost"] * 5
+    np.testing.assert_allclose(tables[1].time[:4], printed, atol=0.5)
+    assert list(tables[1].status[4:]) == ["contact_lost"] * 5
 
 
 # The page

@@ -21,9 +21,9 @@ def critical_spins():
 
     @jax.jit
     def growth(radius, sign, spins):
-        one = tippe.Scene(SCENE.body, tippe.Cylinder(radius), SCENE.friction)
-        upright = jax.vmap(lambda spin: steady.growth_rate(steady.standing_matrix(one, spin, False)))
-        inverted = jax.vmap(lambda spin: steady.growth_rate(steady.standing_matrix(one, spin, True)))
+        scene = tippe.Scene(SCENE.body, tippe.Cylinder(radius), SCENE.friction)
+        upright = jax.vmap(lambda spin: steady.growth_rate(steady.standing_matrix(scene, spin, False)))
+        inverted = jax.vmap(lambda spin: steady.growth_rate(steady.standing_matrix(scene, spin, True)))
         return jnp.where(sign > 0.0, upright(spins), inverted(spins))
 
     def find(ratio, inverted=False):
@@ -55,8 +55,8 @@ def test_growth_vanishes_all_along_the_marginal_curve(curves, inverted):
     np.testing.assert_allclose(curve.spin[0], plane, rtol=1e-7)
     assert curve.ratio[-1] > 0.2
     for ratio, spin, frequency in zip(*curve, strict=True):
-        one = tippe.Scene(SCENE.body, tippe.Cylinder(0.02 / ratio), SCENE.friction)
-        values = np.linalg.eigvals(np.asarray(steady.standing_matrix(one, spin, inverted)))
+        scene = tippe.Scene(SCENE.body, tippe.Cylinder(0.02 / ratio), SCENE.friction)
+        values = np.linalg.eigvals(np.asarray(steady.standing_matrix(scene, spin, inverted)))
         assert np.min(np.abs(values - 1j * frequency)) < 1e-6 * spin
 
 
@@ -98,6 +98,6 @@ def test_a_top_that_tumbles_steadily_on_the_plane_runs_down_in_a_cylinder():
 
 def test_a_top_without_a_critical_spin_has_no_marginal_curve_from_the_plane():
     """Group III never stands inverted."""
-    one = tippe.Scene(tippe.Top(0.02, 0.02, 0.006, 1.35 * 3.2e-6, 3.2e-6), friction=tippe.Viscous(0.3))
+    scene = tippe.Scene(tippe.Top(0.02, 0.02, 0.006, 1.35 * 3.2e-6, 3.2e-6), friction=tippe.Viscous(0.3))
     with pytest.raises(ValueError, match="no critical spin"):
-        marginal.marginal_curve(one, inverted=True)
+        marginal.marginal_curve(scene, inverted=True)
