@@ -49,6 +49,9 @@ def ensemble_solve_with_tangents(
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
     """Run every cell, and differentiate the time of its event along tangents.
 
+    `solve_ensemble_with_tangents` is compiled on its own, for use outside of other transformed functions;
+    `traced_solve_ensemble_with_tangents` is for use inside them.
+
     **Arguments:** as for `solve_ensemble`, and
 
     - `tangents`: tangents of the problem, as for `VariationalProblem`. Their variations, or a mixture of the
@@ -156,14 +159,13 @@ def _moving(problem: AbstractProblem, direction: Any) -> Any:
     )
 
 
-#: `ensemble_solve_with_tangents`, compiled on its own, for use outside of other transformed functions.
+# With its docstring.
 solve_ensemble_with_tangents = compiled_alone(
     functools.update_wrapper(
         functools.partial(ensemble_solve_with_tangents, one_kernel=True), ensemble_solve_with_tangents
     )
 )
 
-#: `ensemble_solve_with_tangents`, for use inside other transformed functions.
 traced_solve_ensemble_with_tangents = eqx.filter_jit(ensemble_solve_with_tangents)
 
 

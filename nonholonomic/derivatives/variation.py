@@ -128,11 +128,11 @@ def slopes_by_variations(
 
 
 def in_groups(run: Callable[..., tuple[Any, list[Any]]], tangents: tuple[Any, ...]) -> tuple[Any, list[Any]]:
-    """Apply `run` to many tangents, `TOGETHER` at a time, with one program.
+    """Apply `run` to many tangents, a few at a time, with one program.
 
     **Arguments:**
 
-    - `run`: a tuple of at most `TOGETHER` tangents -> a result that does not depend on them, and a derivative for each.
+    - `run`: a tuple of one or two tangents -> a result that does not depend on them, and a derivative for each.
     - `tangents`: any number of them.
 
     **Returns:** the result, and the derivatives.

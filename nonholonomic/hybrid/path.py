@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..integration.dense import DenseSolution, follow, padded
+from ..integration.dense import PIECE_OF_MODE, DenseSolution, follow, padded
 from ..integration.problem import AbstractProblem
 from ..integration.settings import Settings
 from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
@@ -185,7 +185,7 @@ def solve_hybrid_dense(
     for _ in range(MOST_ROUNDS):
         mode = modes[number]
         left = dataclasses.replace(settings, max_steps=settings.max_steps - accepted - rejected)
-        path = follow(_problem(mode, state), t1 - time, left)
+        path = follow(_problem(mode, state), t1 - time, left, piece=PIECE_OF_MODE)
         accepted, rejected = accepted + path.accepted, rejected + path.rejected
         segments.append(_stay(mode, number, path, time))
         time, state = segments[-1].end, jnp.asarray(path.states[:, -1])

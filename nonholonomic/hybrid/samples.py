@@ -201,9 +201,10 @@ def _followed(
     kinds_of_modes = alike(modes)
 
     def stay(
-        mode: VariationalMode, number: Array, run: HybridOutcome[Array], filled: Filled
+        mode: VariationalMode, number: Array, run: HybridOutcome[Array], filled: Filled, under_way: Bool[Array, ""]
     ) -> tuple[HybridOutcome[Array], Filled]:
-        since, left = times - run.end_time, greatest(t1 - run.end_time, 0.0)
+        # In a batch this branch is taken for all runs: those in another mode stay in this one for no time.
+        since, left = times - run.end_time, jnp.where(under_way, greatest(t1 - run.end_time, 0.0), 0.0)
         outcome, samples = solve_with_samples(
             mode.problem(run.state), since, left, jnp.asarray(1), settings, n_blocks=1 + count
         )
@@ -232,9 +233,11 @@ def _followed(
         for numbers in kinds_of_modes:
             under_way = (run.status[0] == RUNNING) & jnp.isin(at, jnp.asarray(numbers))
 
-            def advance(numbers: tuple[int, ...] = numbers, run: Any = run, filled: Any = filled) -> Any:
+            def advance(
+                numbers: tuple[int, ...] = numbers, run: Any = run, filled: Any = filled, under_way: Any = under_way
+            ) -> Any:
                 mode = selected(modes, numbers, at)
-                stayed = stay(mode, at, run, filled)
+                stayed = stay(mode, at, run, filled, under_way)
                 return jax.lax.cond(stayed[0].status[0] == LEFT_DOMAIN, lambda: change(mode, *stayed), lambda: stayed)
 
             run, filled = jax.lax.cond(under_way, advance, lambda run=run, filled=filled: (run, filled))

@@ -18,6 +18,10 @@ from .zeros import halved
 #: Steps that are integrated and stored at once; a longer run consists of several such segments.
 PIECE = 2048
 
+#: The same for a run of several modes, which may last for a few steps each: room is reserved, and the domain margin checked,
+#: for all steps of a segment. With 2048 a short flight of a top takes 37 ms and 5 MB, with 128 it takes 7 ms and 0.4 MB.
+PIECE_OF_MODE = 128
+
 #: Places in every step at which the domain margin is checked, besides the ends of the step.
 LOOKS = np.arange(1, 8) / 8.0
 
@@ -149,6 +153,7 @@ def follow(
     first: float | None = None,
     t0: float = 0.0,
     dense: bool = True,
+    piece: int = PIECE,
 ) -> DenseSolution:
     """Integrate one run step by step until `t1` or until the model ceases to hold.
 
@@ -161,6 +166,7 @@ def follow(
     - `first`: length of the first step [s], by default selected as Diffrax does.
     - `t0`: when the run starts [s].
     - `dense`: whether to keep dense output for states within the steps (`DenseSolution.at`).
+    - `piece`: how many steps are integrated at once.
 
     **Returns:** a `DenseSolution` with the accepted steps; it ends where the domain margin reaches zero, located on the
     dense output.
@@ -180,7 +186,7 @@ def follow(
     end, lost, failed = jnp.asarray(t1, state.dtype), False, False
     length = None if first is None else jnp.asarray(first, state.dtype)
     # The program is compiled for this number of steps, so it must not change with the number that is left.
-    each = dataclasses.replace(settings, max_steps=min(PIECE, settings.max_steps))
+    each = dataclasses.replace(settings, max_steps=min(piece, settings.max_steps))
     if margin is not None and float(margin) <= 0.0:
         return DenseSolution(times[0], states[0], [], True, False, 0, 0)
     while float(time) < t1 and not (lost or failed):

@@ -32,6 +32,9 @@ def ensemble_solve(
 ) -> tuple[Outcome, Int[Array, ""]]:
     """Run every cell of a problem from t = 0 to its event, to the end of the model's validity, or to `t1`.
 
+    `solve_ensemble` is compiled on its own, for use outside of other transformed functions; `traced_solve_ensemble` is for
+    use inside them.
+
     **Arguments:**
 
     - `problem`: the problem; the last axis of its `start()` counts the cells.
@@ -71,10 +74,9 @@ def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
     return outcome._replace(first_crossing=time, crossing_time=time)
 
 
-#: `ensemble_solve`, compiled on its own, for use outside of other transformed functions.
+# With its docstring.
 solve_ensemble = compiled_alone(
     functools.update_wrapper(functools.partial(ensemble_solve, one_kernel=True), ensemble_solve)
 )
 
-#: `ensemble_solve`, for use inside other transformed functions.
 traced_solve_ensemble = eqx.filter_jit(ensemble_solve)

@@ -70,6 +70,14 @@ def sweep(
     `OSError` or `ValueError` if the file cannot be written or holds another request; `RuntimeError` if the executor
     breaks down or a worker has other versions; the file then contains all finished chunks. `KeyboardInterrupt` after
     Ctrl-C, with the number of saved cells in the message.
+
+    **Example:** in another thread, by any executor.
+
+    >>> from concurrent.futures import ThreadPoolExecutor
+    >>> with ThreadPoolExecutor(1) as executor:
+    ...     again = sweep(half_lives, axes, variables, {"system": "decay"}, progress=False, executor=executor)
+    >>> np.array_equal(again.time, table.time)
+    True
     """
     require_flag(progress, "progress")
     if executor is not None and not isinstance(executor, Executor):
@@ -228,6 +236,12 @@ def chunk_for(cells: int) -> int:
     """Number of cells in a chunk. There are few different sizes, so that few programs are compiled, but many chunks, so
     that cores share the work. The size does not depend on the number of cores, so that another machine can resume a
     file.
+
+    **Example:**
+
+    >>> from nonholonomic.sweeps import chunk_for
+    >>> chunk_for(100_000) >= chunk_for(4)
+    True
     """
     if jax.default_backend() != "cpu":
         return 65536 if cells > 4096 else 4096
