@@ -20,10 +20,10 @@ from tippe.modes.free_body import FreeBody, balls
 from tippe.modes.impact import Impact, approach
 from tippe.modes.inversion_problem import InversionProblem
 from tippe.modes.sticking import contact_modes
+from tippe.modes.trajectory_problem import trajectory_problem
 from tippe.runs.airborne_trajectory import arena_modes
 from tippe.runs.flight_trajectory import level_modes
 from tippe.runs.run_kind import run_kind_of
-from tippe.runs.trajectory import TrajectoryProblem
 
 #: 16 to 44 ns for each number on a CPU, where a product takes one.
 SLOW = {"sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "exp2", "expm1"}
@@ -84,7 +84,7 @@ def trajectory_problems(scene, launch):
         modes_of = level_modes if scene.flies_in_closed_form else arena_modes
         modes, _, state = modes_of((scene, launch), 1e-9)
     else:
-        run = TrajectoryProblem.of(scene, launch)
+        run = trajectory_problem((scene, launch))
         if not scene.friction.set_valued:
             return (run,)
         modes, _, state = contact_modes(run, 1e-9)

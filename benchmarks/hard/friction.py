@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +18,7 @@ from hard.limits import rutstam_top
 from hard.row import Row, of_runs
 from nonholonomic.integration import DenseSolution, Settings, follow
 from tippe.model.friction import Slip
-from tippe.modes.trajectory_problem import TrajectoryProblem
+from tippe.modes.trajectory_problem import trajectory_problem
 
 GRAVITY = 9.81
 
@@ -75,9 +76,9 @@ def disc_by_quadrature() -> Row:
 
 def set_going(scene: tippe.Scene, launch: tippe.Launch, velocity: float, momentum: float, end: float) -> DenseSolution:
     """A run whose centre starts at a velocity along t1 and that has angular momentum about t2 [kg m^2/s]."""
-    run = TrajectoryProblem.of(scene, launch)
-    state = run.state.at[0].set(velocity).at[6].add(momentum)
-    run = TrajectoryProblem(run.dynamics, run.axial, state, run.cyclic, run.scales)
+    run = trajectory_problem((scene, launch))
+    state = run.problem.states.at[0].set(velocity).at[6].add(momentum)
+    run = eqx.tree_at(lambda run: run.problem.states, run, state)
     return follow(run, end, Settings(1e-12))
 
 

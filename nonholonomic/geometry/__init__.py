@@ -1,8 +1,8 @@
 """The surfaces that bodies move on, vectors in their frames, and small linear systems.
 
-A surface answers, for a position on it: the unit normal and its rate for a velocity, the height and the Gaussian curvature,
-and how a person names a place. A frame moves along one with a ball; `frame_of` says which. Components that vanish identically
-are `None`, so that nothing is computed for them.
+For a position on a surface, its methods return the unit normal and its rate, the height, the Gaussian curvature and the
+coordinates in which users name the place. A frame moves with a ball along a surface; `frame_of` chooses the frame.
+Components that vanish identically are `None`, so that nothing is computed for them.
 """
 
 from .carried_frame import CarriedFrame as CarriedFrame
@@ -41,6 +41,7 @@ from .vector import dot as dot
 from .vector import multiply as multiply
 from .vector import none_if_zero as none_if_zero
 from .vector import scale as scale
+from .vector import stacked as stacked
 from .vector import subtract as subtract
 from .vector import sum_vectors as sum_vectors
 from .vector import tangents as tangents

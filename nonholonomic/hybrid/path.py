@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..integration.dense import DenseSolution, follow, padded
+from ..integration.dense import PIECE_OF_MODE, DenseSolution, follow, padded
 from ..integration.problem import AbstractProblem
 from ..integration.settings import Settings
 from ..integration.status import FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED
@@ -25,6 +25,13 @@ class Segment(NamedTuple):
 
     `motion` is the `DenseSolution` in the mode, its times counted from `begin`, or one stretch of a `TransitionPath`;
     `shown` holds the default output times [s].
+
+    **Example:** as for `solve_hybrid_dense`.
+
+    >>> from nonholonomic.hybrid import solve_hybrid_dense
+    >>> path = solve_hybrid_dense((Bounce(jnp.array([0.6])),), 0, start[:, 0], 0.4, settings, counters=1)
+    >>> [(segment.begin, segment.end, segment.number) for segment in path.segments]
+    [(0.0, 0.4, 0)]
     """
 
     begin: float
@@ -45,7 +52,14 @@ class Segment(NamedTuple):
 class HybridPath(NamedTuple):
     """A hybrid run: its segments in order, how and when [s] it ended, its final state, and its cost.
 
-    `status` is one of the codes of a `HybridOutcome`; `counts` holds the counters.
+    `status` is a code as in a `HybridOutcome`; `counts` holds the counters.
+
+    **Example:** as for `solve_hybrid_dense`.
+
+    >>> from nonholonomic.hybrid import solve_hybrid_dense
+    >>> path = solve_hybrid_dense((Bounce(jnp.array([0.6])),), 0, start[:, 0], 0.4, settings, counters=1)
+    >>> path.failed, path.end_time, path.counts.tolist()
+    (False, 0.4, [0])
     """
 
     segments: list[Segment]
@@ -63,7 +77,7 @@ class HybridPath(NamedTuple):
 
     @property
     def failed(self) -> bool:
-        """Whether the run could not be finished."""
+        """Whether the integration failed."""
         return self.status in (FAILED, UNRESOLVED)
 
     @property
@@ -141,20 +155,37 @@ def solve_hybrid_dense(
 
     **Arguments:**
 
-    - `modes`: as for `solve_hybrid`, of one cell; the path includes the transitions that the modes record.
+    - `modes`: as for `solve_hybrid`, for one cell; each mode must begin with a positive margin. The path includes the
+      transitions that the modes record.
     - `number`, `state`: initial mode and state.
     - `t1`: horizon [s].
-    - `settings`: as for `follow`; the most steps are those of the whole run.
+    - `settings`: as for `follow`; `max_steps` limits the steps of the whole run.
     - `counters`: number of counters, the rows of `Transition.counts`.
 
     **Returns:** a `HybridPath`.
+
+    **Example:** a ball that rises in closed form, recorded as a transition, and falls from 0.722438 s on.
+
+    >>> from nonholonomic.hybrid import TransitionPath, solve_hybrid_dense
+    >>> class Rise(Bounce):
+    ...     def reset_map(self, state, left):
+    ...         rise = -self.restitution * state[1] / 9.81
+    ...         apex = jnp.stack([0.5 * 9.81 * rise**2, 0.0 * rise])
+    ...         record = TransitionPath(rise[None], rise[None], jnp.full((1, 1), 3))
+    ...         return super().reset_map(state, left)._replace(state=apex, elapsed=rise, record=record)
+    ...     def between(self, rise, passed):
+    ...         return 9.81 * jnp.stack([rise * passed - 0.5 * passed**2, rise - passed])
+    >>> path = solve_hybrid_dense((Rise(jnp.array([0.6])),), 0, start[:, 0], 1.0, settings, counters=1)
+    >>> times = np.array([0.6, 0.8])
+    >>> print(path.at(times)[0].round(5), path.numbers(times))
+    [0.28647 0.33049] [-1  0]
     """
     segments, counts, time, accepted, rejected = [], np.zeros(counters, int), 0.0, 0, 0
     status, state = RUNNING, jnp.asarray(state)
     for _ in range(MOST_ROUNDS):
         mode = modes[number]
         left = dataclasses.replace(settings, max_steps=settings.max_steps - accepted - rejected)
-        path = follow(_problem(mode, state), t1 - time, left)
+        path = follow(_problem(mode, state), t1 - time, left, piece=PIECE_OF_MODE)
         accepted, rejected = accepted + path.accepted, rejected + path.rejected
         segments.append(_stay(mode, number, path, time))
         time, state = segments[-1].end, jnp.asarray(path.states[:, -1])

@@ -29,6 +29,7 @@ from nonholonomic.geometry import (
     dot,
     multiply,
     scale,
+    stacked,
     subtract,
     sum_vectors,
 )
@@ -314,9 +315,3 @@ def padded(components: State) -> Vector:
     """Components as a vector; missing last components vanish identically."""
     vector = (*components, None, None)
     return vector[0], vector[1], vector[2]
-
-
-def stacked(rates: tuple[Component, ...], state: State) -> State:
-    """Stack components along axis 0, with zeros for those that vanish identically."""
-    zero = jnp.zeros_like(state[0])
-    return jnp.stack([zero if rate is None else jnp.broadcast_to(rate, zero.shape) for rate in rates])

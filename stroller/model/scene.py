@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane
+from nonholonomic.geometry import AbstractQuadric, AbstractSurface, Plane, stacked
 from nonholonomic.validation import (
     Bound,
     Bounded,
@@ -21,7 +21,7 @@ from nonholonomic.validation import (
     shown,
 )
 
-from .dynamics import Dynamics, State, stacked
+from .dynamics import Dynamics, State
 from .friction import AbstractFriction, Frictionless
 from .heading import Intrinsic, Projected
 from .launch import Launch

@@ -2,6 +2,7 @@
 
 import math
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,15 +12,15 @@ from tops import homogeneous_ball, rutstam_top
 
 import tippe
 from nonholonomic.integration import Settings, follow
-from tippe.runs.trajectory import TrajectoryProblem
+from tippe.modes.trajectory_problem import trajectory_problem
 
 GRAVITY = 9.81
 
 
 def thrown(scene: tippe.Scene, velocity: float, times, tolerance: float = 1e-11):
     """A ball thrown along t1 without spin: states at the given times. A launch starts at rest, so the run is made here."""
-    run = TrajectoryProblem.of(scene, tippe.Launch(theta=0.7, spin=0.0))
-    run = TrajectoryProblem(run.dynamics, run.axial, run.state.at[0].set(velocity), run.cyclic, run.scales)
+    run = trajectory_problem((scene, tippe.Launch(theta=0.7, spin=0.0)))
+    run = eqx.tree_at(lambda run: run.problem.states, run, run.problem.states.at[0].set(velocity))
     path = follow(run, float(times[-1]), Settings(tolerance))
     return jnp.asarray(path.at(np.asarray(times)))[:8]
 
@@ -54,13 +55,13 @@ def test_a_free_ball_turns_about_its_angular_momentum():
     mass, radius = 0.05, 0.02
     top = tippe.Top(mass, radius, 0.0, 0.4 * mass * radius**2, 0.5 * mass * radius**2)
     scene = tippe.Scene(top, tippe.Plane(), tippe.Frictionless())
-    run = TrajectoryProblem.of(scene, tippe.Launch(theta=0.7, spin=0.0))
+    run = trajectory_problem((scene, tippe.Launch(theta=0.7, spin=0.0)))
     momentum = np.array([1.0, -2.0, 3.0]) * 3e-4
-    run = TrajectoryProblem(run.dynamics, run.axial, run.state.at[5:8].set(momentum), run.cyclic, run.scales)
+    run = eqx.tree_at(lambda run: run.problem.states, run, run.problem.states.at[5:8].set(momentum))
     end = 2.0
     path = follow(run, end, Settings(1e-12))
     angle, axis = np.linalg.norm(momentum) / float(top.I1) * end, momentum / np.linalg.norm(momentum)
-    e = np.asarray(run.state[2:5])
+    e = np.asarray(run.problem.states[2:5])
     expected = e * math.cos(angle) + np.cross(axis, e) * math.sin(angle) + axis * (axis @ e) * (1.0 - math.cos(angle))
     assert_close(path.states[2:5, -1], expected, atol=2e-10)
 

@@ -1,6 +1,7 @@
 """Coulomb friction as it stands: Cohen's top, stick and slip, the limit of the regularised law (tippe.md, section 7)."""
 
 import coulomb_top
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,8 +14,8 @@ import tippe
 from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import Settings
 from tippe.modes.sticking import ROLLING
+from tippe.modes.trajectory_problem import trajectory_problem
 from tippe.runs.stick_slip_trajectory import solve_stick_slip_dense
-from tippe.runs.trajectory import TrajectoryProblem
 
 
 def cohen_top() -> tippe.Top:
@@ -82,8 +83,8 @@ def test_a_top_that_sticks_and_slips_again():
 def test_a_bowling_ball_slides_and_then_rolls():
     """v = v0 - mu g t until t* = 2 v0 / (7 mu g), then 5 v0 / 7 (row 2), with no error of a slip speed."""
     scene, end = scene_of(homogeneous_ball(), 0.3), 2.0 / (7.0 * 0.3 * 9.81)
-    run = TrajectoryProblem.of(scene, tippe.Launch(theta=0.7, spin=0.0))
-    run = TrajectoryProblem(run.dynamics, run.axial, run.state.at[0].set(1.0), run.cyclic, run.scales)
+    run = trajectory_problem((scene, tippe.Launch(theta=0.7, spin=0.0)))
+    run = eqx.tree_at(lambda run: run.problem.states, run, run.problem.states.at[0].set(1.0))
     path = solve_stick_slip_dense(run, 3.0 * end, Settings(1e-11))
     assert kinds(path) == [False, True]
     assert_close(path.mode_segments[0].end, end, atol=1e-7)

@@ -14,7 +14,7 @@ from tops import rutstam_top
 import tippe
 from nonholonomic.integration import Settings, follow
 from nonholonomic.integration.dense import PIECE
-from tippe.runs.trajectory import TrajectoryProblem
+from tippe.modes.trajectory_problem import trajectory_problem
 
 LAUNCH = tippe.Launch(0.1, 155.0)
 
@@ -115,7 +115,7 @@ def test_more_steps_than_a_piece_holds(rutstam_scene):
 
 def test_a_run_of_too_many_steps_fails(rutstam_scene):
     """It says so and ends where it is, rather than go on for ever."""
-    path = follow(TrajectoryProblem.of(rutstam_scene, LAUNCH), 1e6, Settings(3e-14, max_steps=3000))
+    path = follow(trajectory_problem((rutstam_scene, LAUNCH)), 1e6, Settings(3e-14, max_steps=3000))
     assert path.failed
     assert not path.left_domain
     assert 3000 <= path.accepted + path.rejected < 3000 + PIECE

@@ -20,12 +20,13 @@ from nonholonomic.geometry import (
     dot,
     multiply,
     scale,
+    stacked,
     subtract,
     sum_vectors,
 )
 from nonholonomic.xla_cpu import stored
 
-from .dynamics import Motion, stacked
+from .dynamics import Motion
 from .friction import ContactLoad, Slip, length
 from .state import AXIS, angular_velocity, joined, parts
 from .top import Top

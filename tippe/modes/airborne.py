@@ -1,22 +1,19 @@
-"""Contact lost and regained on any arena: the modes of sliding and of flight, for a top without a stem (see
-`airborne_stem.py` for one with a stem).
+"""Contact lost and regained on any arena: the modes of sliding and of flight, for a top without a stem (for a top with
+a stem, see `airborne_stem.py`).
 
 In contact the state is that of `tippe/model/state.py` with a `CarriedFrame`, 14 components. In flight it is, in the
 surface's axes, the position of the centre of mass [m], its velocity [m/s], the axis, the angular momentum about it, and
 two zeros. A flight ends where the distance of the centre of a sphere from the arena equals its radius again; then that
-sphere strikes the tangent plane there (`impact.py`). theta counts from the normal below the top's own sphere, whichever
 sphere strikes the tangent plane there (`impact.py`). theta is measured from the normal below the top's own sphere,
-whichever sphere touches.
-A single run whose path is kept has five more components: the vector c of `trajectory_problem.py`, in the frame in
-contact, in the surface's axes in flight; the rotation angle of the top about its axis [rad]; and the work of friction
-and impacts [J].
+whichever sphere touches. A single run whose path is kept has five more components: the vector c of
+`trajectory_problem.py`, in the frame in contact, in the surface's axes in flight; the rotation angle of the top about
+its axis [rad]; and the work of friction and impacts [J].
 """
 
 import dataclasses
 import functools
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -25,29 +22,29 @@ from nonholonomic.geometry import (
     Component,
     Vector,
     add,
-    carried,
-    cross,
     dot,
     scale,
+    stacked,
     subtract,
     sum_vectors,
     tangents,
     vector_of,
 )
 from nonholonomic.hybrid import Transition
-from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractProblem
+from nonholonomic.integration import FAILED, LEFT_DOMAIN, RUNNING, UNRESOLVED, AbstractPassive, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup, greatest
 
-from ..model.dynamics import Dynamics, stacked
+from ..model.dynamics import Dynamics
 from ..model.friction import SetValuedCoulomb
 from ..model.scene import Scene
-from ..model.state import COS_THETA, joined, parts
+from ..model.state import joined, parts
 from ..model.top import Top
 from .coulomb_impact import resolve_coulomb_impact
 from .flying_mode import AbstractFlyingMode
 from .free_body import Ball, FreeBody, axis_rate, balls, energy, gap_rate, standing_on, still_parting
 from .impact import CLOSING_SPEED, resolve_impact
 from .inversion_problem import InversionProblem
+from .trajectory_problem import Quadratures, c_rate
 
 #: The mode numbers. The last two are those of a top with a stem: the stem slides; or a sphere is about to strike, and
 #: the state is that of a flight.
@@ -84,7 +81,8 @@ class Below(NamedTuple):
 
 
 def below(scene: Scene[Top], flying: FlightState, ball: Ball | None = None) -> Below:
-    """The nearest point of the arena to the centre of a sphere, by default the top's own: theta is measured there."""
+    """The point of the arena nearest to the centre of a sphere, by default the top's own sphere, for which theta is
+    measured."""
     frame, ball = carried_frame(scene), balls(scene.body)[0] if ball is None else ball
     centre = centre_of(flying, ball)
     foot = vector_of(0.0 * centre[0] if part is None else part for part in scene.surface.nearest(centre))
@@ -94,8 +92,8 @@ def below(scene: Scene[Top], flying: FlightState, ball: Ball | None = None) -> B
 
 
 def landing_site(scene: Scene[Top], flying: FlightState, ball: Ball) -> Below:
-    """The point where a sphere lands: the nearest point of the arena at that time. Earlier, only the sign of the gap is
-    valid.
+    """The point where a sphere lands: the nearest point of the arena at the time of landing. Before that time, only the
+    sign of the gap is valid.
     """
     centre = centre_of(flying, ball)
     site, zero = scene.surface.ball_gap(centre, ball.radius, carried_frame(scene).side), jnp.zeros_like(flying.place[0])
@@ -144,7 +142,8 @@ def as_free_body(scene: Scene[Top], flying: FlightState, ground: Below, ball: Ba
 
 
 def in_contact(ground: Below, free: FreeBody) -> Float[Array, "14 ..."]:
-    """The state of a top in contact at the foot below it; in flight, the state that it would have without the gap."""
+    """The state of a top in contact, at the foot below it; in flight, the state that the top would have without the
+    gap."""
     return joined(free.velocity[:2], free.axis, free.momentum, ground.foot, ground.axes[0])
 
 
@@ -174,41 +173,6 @@ def gap_margin(scene: Scene[Top], flying: FlightState, ball: Ball, rounding: flo
     return ground.gap / body.radius + still_parting(rate, scene.gravity, body.radius, rounding)
 
 
-class Contact(AbstractProblem):
-    """Sliding until theta reaches an angle or the contact ends; `axial` [kg m^2] is `None` without passive quadratures."""
-
-    dynamics: Dynamics
-    cos_angle: Float[Array, "..."]
-    states: Float[Array, "components cells"]
-    scales: Float[Array, "components cells"]
-    axial: Float[Array, "..."] | None
-
-    def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
-        return self.states, self.scales
-
-    def field(self, time, state):
-        motion = self.dynamics.motion(state[:OWN])
-        if self.axial is None:
-            return stacked(motion.rate, state)
-        _, e, L, _ = parts(state[:OWN])
-        across = tuple(state[OWN + k] for k in range(3))
-        falls = -dot(cross(L, e), across) * self.dynamics.per_transverse
-        quadratures = (
-            *sum_vectors(scale(falls, e), carried(across, motion.turning)),
-            motion.spin_momentum / self.axial,
-        )
-        return stacked((*motion.rate, *quadratures, motion.friction_power), state)
-
-    def event_function(self, state):
-        return state[COS_THETA] - self.cos_angle
-
-    def domain_margin(self, time, state):
-        return self.dynamics.contact_margin(state[:OWN])
-
-    def margins(self, time, state):
-        return self.dynamics.margins(state[:OWN])
-
-
 class Flight(AbstractProblem):
     """Flying until theta reaches an angle or a sphere is back at the arena; `falls` is the acceleration [m/s^2]."""
 
@@ -217,7 +181,6 @@ class Flight(AbstractProblem):
     states: Float[Array, "components cells"]
     scales: Float[Array, "components cells"]
     falls: Vector
-    with_quadratures: bool = eqx.field(static=True)
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
@@ -225,12 +188,7 @@ class Flight(AbstractProblem):
     def field(self, time, state):
         flying, body = flight_state(state), self.scene.body
         turning = axis_rate(body, flying.axis, flying.momentum)
-        rates = (*flying.velocity, *self.falls, *turning, None, None, None, None, None)
-        if self.with_quadratures:
-            across = tuple(state[OWN + k] for k in range(3))
-            carry = scale(-1.0 * dot(turning, across), flying.axis)
-            rates = (*rates, *carry, dot(flying.momentum, flying.axis) / body.I3, None)
-        return stacked(rates, state)
+        return stacked((*flying.velocity, *self.falls, *turning, None, None, None, None, None), state)
 
     def event_function(self, state):
         flying = flight_state(state)
@@ -244,13 +202,28 @@ class Flight(AbstractProblem):
         return tuple(gap_margin(self.scene, flying, ball) for ball in balls(self.scene.body))
 
 
+class QuadraturesInFlight(AbstractPassive):
+    """The passive quadratures of a flight: the vector c, the spin angle, and the work, which does not change."""
+
+    body: Top
+
+    def rates(self, problem, time, state, passive):
+        flying = flight_state(state)
+        turning = axis_rate(self.body, flying.axis, flying.momentum)
+        spin = dot(flying.momentum, flying.axis) / self.body.I3
+        c = vector_of(passive[:3])
+        rates = (*c_rate(c, flying.axis, dot(turning, c)), spin, None)
+        return jnp.concatenate([problem.field(time, state), stacked(rates, passive)])
+
+
 class Slide(AbstractFlyingMode):
     """Sliding on the arena."""
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         dynamics = self.scene.dynamics
         assert isinstance(dynamics, Dynamics)
-        return Contact(dynamics, self.cos_angle, state, self.scales, self.axial)
+        problem = InversionProblem(dynamics, self.cos_angle, state[:OWN], self.scales[:OWN])
+        return self.extended(problem, Quadratures(self.scene.body.I3), state)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         return jnp.concatenate([state, jnp.zeros_like(state[:2])])
@@ -271,7 +244,7 @@ class Slide(AbstractFlyingMode):
 def lift_off(
     scene: Scene[Top], state: Float[Array, "components ..."], with_quadratures: bool, ball: Ball | None = None
 ) -> Float[Array, "components ..."]:
-    """The flight state of a top that has lost contact, from its state in contact, with its passive quadratures if any.
+    """The flight state of a top that has lost contact, from its state in contact, including passive quadratures.
 
     **Arguments:** `ball`: the sphere that touched, by default the top's own.
     """
@@ -294,16 +267,15 @@ class Fly(AbstractFlyingMode):
     """Flying over the arena."""
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        return self.flight(state)
+        return self.extended(self.flight(state), QuadraturesInFlight(self.scene.body), state)
 
     def flight(self, state: Float[Array, "components cells"]) -> Flight:
         """The motion in flight from given states."""
         velocity, momentum = self.scales[0], self.scales[7]
         ones = jnp.ones_like(velocity)
         rows = [ones * self.scene.body.radius] * 3 + [velocity] * 3 + [ones] * 3 + [momentum] * 3 + [ones] * 2
-        scales = jnp.concatenate([jnp.stack(rows), self.scales[OWN:]])
         falls = scale(-1.0 * self.scene.gravity, self.scene.surface.up)
-        return Flight(self.scene, self.cos_angle, state, scales, falls, self.with_quadratures)
+        return Flight(self.scene, self.cos_angle, state[:OWN], jnp.stack(rows), falls)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         flying = flight_state(state)

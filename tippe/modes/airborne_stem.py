@@ -1,5 +1,5 @@
-"""Contact lost and regained on any arena by a top with a stem: sliding on either sphere, flights, and the impacts of
-both.
+"""Contact lost and regained on any arena by a top with a stem: sliding on either sphere, flights, and impacts of both
+spheres.
 
 States are those of `airborne.py`. A top that slides on its stem has a separate frame, which moves with the stem's
 sphere: its origin is the foot below that sphere. On a curved arena, the two spheres have different feet with different
@@ -28,10 +28,10 @@ from .airborne import (
     SLIDING,
     STRIKING,
     Below,
-    Contact,
     Flight,
     FlightState,
     Fly,
+    QuadraturesInFlight,
     as_free_body,
     below,
     flight_state,
@@ -49,6 +49,7 @@ from .flying_mode import AbstractFlyingMode
 from .free_body import Ball, FreeBody, balls, energy, gap_rate
 from .impact import CLOSING_SPEED, TOUCHING, resolve_impact
 from .inversion_problem import InversionProblem
+from .trajectory_problem import Quadratures
 
 #: Largest overlap of the other sphere with the arena while it lifts off, as a fraction of R: its landing may be located
 #: slightly late.
@@ -63,10 +64,15 @@ class OneOfTwo(AbstractProblem):
     """
 
     scene: Scene[Top]
-    contact: Contact
+    contact: InversionProblem
     own: Ball
     other: Ball
     on_stem: Bool[Array, ""]
+
+    @property
+    def dynamics(self) -> Any:
+        """The equations of motion of the sphere that slides."""
+        return self.contact.dynamics
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.contact.start()
@@ -76,7 +82,7 @@ class OneOfTwo(AbstractProblem):
 
     def event_function(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
         # The angle from the normal below the top's own sphere; it is that of the state if that sphere slides.
-        flying = flight_state(lift_off(self.scene, state[:OWN], False, self.own))
+        flying = flight_state(lift_off(self.scene, state, False, self.own))
         apart = dot(flying.axis, below(self.scene, flying, self.other).axes[2])
         return jnp.where(self.on_stem, apart, state[COS_THETA]) - self.contact.cos_angle
 
@@ -108,8 +114,9 @@ class SlideOnOne(AbstractFlyingMode):
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         own, other = self.spheres
-        contact = Contact(standing(self.scene, own), self.cos_angle, state, self.scales, self.axial)
-        return OneOfTwo(self.scene, contact, own, other, self.number == 1)
+        contact = InversionProblem(standing(self.scene, own), self.cos_angle, state[:OWN], self.scales[:OWN])
+        problem = OneOfTwo(self.scene, contact, own, other, self.number == 1)
+        return self.extended(problem, Quadratures(self.scene.body.I3), state)
 
     def shown(self, state: Float[Array, "19 times"]) -> Float[Array, "21 times"]:
         flight = Fly(self.scene, self.scales, self.cos_angle, self.with_quadratures)
@@ -117,8 +124,8 @@ class SlideOnOne(AbstractFlyingMode):
         return jnp.where(self.number == 1, beside, jnp.concatenate([state, jnp.zeros_like(state[:2])]))
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
-        """Fly if the contact is lost, strike with the other sphere if that is at the arena, end if the contact jams or
-        the sphere does not fit. Counts the flights.
+        """Fly if the contact is lost, strike with the other sphere if it is at the arena, and end if the contact jams
+        or the sphere does not fit. Counts the flights.
         """
         own, other = self.spheres
         dynamics, zero = standing(self.scene, own), jnp.zeros_like(state[0])
@@ -135,7 +142,7 @@ class SlideOnOne(AbstractFlyingMode):
 
 
 class FlightToBlow(AbstractProblem):
-    """A flight that is over as it begins where a sphere is already at the arena (`strikes`)."""
+    """A flight; where a sphere is already at the arena (`strikes`), the flight ends at once."""
 
     flight: Flight
     strikes: Bool[Array, ""]
@@ -165,7 +172,8 @@ class FlyBoth(Fly):
     strikes: Bool[Array, ""]
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
-        return FlightToBlow(self.flight(state), self.strikes)
+        problem = FlightToBlow(self.flight(state), self.strikes)
+        return self.extended(problem, QuadraturesInFlight(self.scene.body), state)
 
     def reset_map(self, state: Float[Array, "components cells"], left: Float[Array, " cells"]) -> Transition:
         """Strike the arena with the sphere that is there; rebound, or slide on that sphere if the rebound would be
@@ -210,7 +218,7 @@ class ArenaImpact(NamedTuple):
 
     - `free`: the top after it, above the tangent plane.
     - `rebounds`: whether the top flies off; `throws`: whether the other sphere is thrown into the arena; `rests`:
-      whether the top is at rest on both; `fails`: whether the impact could not be computed.
+      whether the top is at rest on both spheres; `fails`: whether the computation of the impact failed.
     """
 
     free: FreeBody
@@ -223,8 +231,8 @@ class ArenaImpact(NamedTuple):
 def resolve_arena_impact(scene: Scene[Top], flying: FlightState, ground: Below, own: Ball, other: Ball) -> ArenaImpact:
     """The impact of one sphere on the tangent plane at its foot; a slow rebound closes the contact.
 
-    **Arguments:** `flying`: the top, its sphere `own` at the arena; `ground`: below that sphere; `other`: the other
-    one.
+    **Arguments:** `flying`: the top, whose sphere `own` is at the arena; `ground`: the arena below this sphere;
+    `other`: the other sphere.
     """
     body, closing = scene.body, CLOSING_SPEED * jnp.sqrt(scene.gravity * scene.body.radius)
     free = as_free_body(scene, flying, ground, own)
@@ -243,7 +251,7 @@ def resolve_arena_impact(scene: Scene[Top], flying: FlightState, ground: Below, 
 
 
 def own_and_other(scene: Scene[Top], number: Int[Array, "..."]) -> tuple[Ball, Ball]:
-    """The sphere of a top with a number, and the other one."""
+    """The sphere of a top with the given number, and the other sphere."""
     main, stem = balls(scene.body)
     own = Ball(*(jnp.where(number == 0, a, b) for a, b in zip(main, stem, strict=True)))
     return own, Ball(*(jnp.where(number == 0, b, a) for a, b in zip(main, stem, strict=True)))

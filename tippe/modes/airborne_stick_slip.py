@@ -20,6 +20,7 @@ from . import sticking
 from .airborne import FLYING, OWN, SLIDING, Fly, lift_off
 from .flying_mode import AbstractFlyingMode
 from .inversion_problem import InversionProblem
+from .trajectory_problem import Quadratures
 
 #: The mode numbers; flying has that of `airborne.py`.
 SLIPPING, ROLLING = SLIDING, 2
@@ -34,8 +35,8 @@ class Touch(AbstractFlyingMode):
     @property
     def contact_state(self) -> sticking.StickSlipMode:
         """The mode of runs that end where the contact is lost."""
-        size = OWN if self.with_quadratures else None
-        return sticking.StickSlipMode(self.kind, self.cos_angle, self.scales, self.last, self.axial, size)
+        passive, size = (Quadratures(self.scene.body.I3), OWN) if self.with_quadratures else (None, None)
+        return sticking.StickSlipMode(self.kind, self.cos_angle, self.scales, self.last, passive, size)
 
     def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         return self.contact_state.problem(state)

@@ -4,6 +4,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from nonholonomic.hybrid import AbstractBatchedMode
+from nonholonomic.integration import AbstractPassive, AbstractProblem, ExtendedProblem
 
 from ..model.scene import Scene
 from ..model.top import Top
@@ -13,7 +14,7 @@ class AbstractFlyingMode(AbstractBatchedMode):
     """A mode of runs that continue through flights.
 
     - `scene`: with `contact="hybrid"`; `scales`: magnitudes that scale absolute errors of the state.
-    - `cos_angle`: cosine of the angle of theta that is the event.
+    - `cos_angle`: cosine of the theta that is the event.
     - `with_quadratures`: whether this is a single run whose path is kept, with passive quadratures behind its state.
     """
 
@@ -22,7 +23,11 @@ class AbstractFlyingMode(AbstractBatchedMode):
     cos_angle: Float[Array, "..."]
     with_quadratures: bool = eqx.field(static=True)
 
-    @property
-    def axial(self) -> Float[Array, "..."] | None:
-        """The moment of inertia about the axis [kg m^2], `None` without passive quadratures."""
-        return self.scene.body.I3 if self.with_quadratures else None
+    def extended(
+        self, problem: AbstractProblem, passive: AbstractPassive, state: Float[Array, "components cells"]
+    ) -> AbstractProblem:
+        """The problem for given states, including the passive quadratures."""
+        size = len(problem.start()[0])
+        if not self.with_quadratures:
+            return problem
+        return ExtendedProblem(problem, passive, state[size:], self.scales[size:])

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nonholonomic.geometry import dot, multiply, scale
+from nonholonomic.geometry import dot
 from nonholonomic.hybrid import AbstractHoppingMode, Transition, TransitionPath
 from nonholonomic.integration import CROSSED, FAILED, LEFT_DOMAIN, REACHED_END, RUNNING, UNRESOLVED, AbstractProblem
 from nonholonomic.xla_cpu import compiled_setup, greatest, least
 
-from ..model.dynamics import Dynamics, stacked
+from ..model.dynamics import Dynamics
 from ..model.scene import Scene
 from ..model.state import COS_THETA, parts
 from ..model.top import Top
@@ -40,6 +40,7 @@ from .free_body import (
 from .impact import CLOSING_SPEED, TOUCHING, resolve_impact
 from .inversion_problem import InversionProblem
 from .leaning import LeaningDynamics, at_rest
+from .trajectory_problem import Quadratures
 
 Cells = Float[Array, " cells"]
 
@@ -56,8 +57,7 @@ SHOWN = 0.4
 class Sliding(AbstractProblem):
     """Sliding until theta reaches an angle, a contact is lost or jams, or a sphere that does not touch the plane lands.
 
-    `own` is the sphere that slides and `other` the one that does not; `None` if there is none. `axial` is the moment of
-    inertia about the axis [kg m^2], `None` without passive quadratures.
+    `own` is the sphere that slides, and `other` the other sphere; `None` without a stem.
     """
 
     dynamics: Dynamics | LeaningDynamics
@@ -66,19 +66,12 @@ class Sliding(AbstractProblem):
     cos_angle: Float[Array, "..."]
     states: Float[Array, "components cells"]
     scales: Float[Array, "components cells"]
-    axial: Float[Array, "..."] | None
 
     def start(self) -> tuple[Float[Array, "components cells"], Float[Array, "components cells"]]:
         return self.states, self.scales
 
     def field(self, time: Cells, state: Float[Array, "components cells"]) -> Float[Array, "components cells"]:
-        if self.axial is None:
-            return self.dynamics.field(state)
-        motion = self.dynamics.motion(state)
-        across, turning = tuple(state[OWN + 2 : OWN + 5]), motion.rate[2:5]
-        across_rate = scale(multiply(-1.0, dot(turning, across)), tuple(state[2:5]))
-        quadratures = (state[0], state[1], *across_rate, motion.spin_momentum / self.axial, motion.friction_power)
-        return stacked((*motion.rate, *quadratures), state)
+        return self.dynamics.field(state)
 
     def event_function(self, state: Float[Array, "components cells"]) -> Cells:
         return state[COS_THETA] - self.cos_angle
@@ -104,7 +97,7 @@ def clearance(dynamics: Dynamics, own: Ball, other: Ball, state: Float[Array, "c
 
 
 def height(own: Ball, other: Ball, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-    """Distance [m] of the other sphere from the plane, where a top stands on its own one."""
+    """Distance [m] of the other sphere from the plane, for a top that stands on the sphere `own`."""
     return own.radius - other.radius + (other.offset - own.offset) * state[COS_THETA]
 
 
@@ -120,10 +113,11 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
     number: Int[Array, ""]
     last: bool = eqx.field(static=True)
 
-    def problem(self, state: Float[Array, "components cells"]) -> Sliding:
+    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
         own, other = _own_and_other(balls(self.scene.body), self.number)
         dynamics = standing_on(self.scene.dynamics, own)
-        return Sliding(dynamics, own, other, self.cos_angle, state, self.scales, self.axial)
+        problem = Sliding(dynamics, own, other, self.cos_angle, state[:OWN], self.scales[:OWN])
+        return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         own, _ = _own_and_other(balls(self.scene.body), self.number)
@@ -168,7 +162,7 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
         return air.free, air.quadratures
 
     def closed(self, air: "Air") -> Transition:
-        """The transition of a top that is back on the plane, or whose run has ended."""
+        """The transition for a top that has returned to the plane, or whose run has ended."""
         status, state = jnp.where(air.open, UNRESOLVED, air.status), contact_state(air.free)
         if air.quadratures is not None:
             state = jnp.concatenate([state, air.quadratures])
@@ -179,8 +173,9 @@ class Slide(AbstractFlyingMode, AbstractHoppingMode):
 class Lean(AbstractFlyingMode):
     """Sliding on both spheres; numbered after the modes of the single spheres."""
 
-    def problem(self, state: Float[Array, "components cells"]) -> Sliding:
-        return Sliding(leaning(self.scene), None, None, self.cos_angle, state, self.scales, self.axial)
+    def problem(self, state: Float[Array, "components cells"]) -> AbstractProblem:
+        problem = Sliding(leaning(self.scene), None, None, self.cos_angle, state[:OWN], self.scales[:OWN])
+        return self.extended(problem, Quadratures(self.scene.body.I3, of_mass=True), state)
 
     def shown(self, state: Float[Array, "15 times"]) -> Float[Array, "17 times"]:
         return shown(self.scene.body, as_free_body(self.scene.body, balls(self.scene.body)[0], state), state[OWN:])
@@ -235,8 +230,8 @@ class Air(NamedTuple):
       of the mode.
     - `status`: `RUNNING`, or how the run ended, `LEFT_DOMAIN` if it has jammed; `crossing_time` [s] of the event,
       infinite if there was none.
-    - `flights`: so far; `open`: whether there is no contact and the run continues.
-    - `log_rates`: of the landings, as in `Transition`.
+    - `flights`: number of flights so far; `open`: whether there is no contact and the run continues.
+    - `log_rates`: logarithms of the rates at the landings, as in `Transition`.
     - `quadratures`: the passive quadratures of a single run.
     """
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from nonholonomic.hybrid import AbstractBatchedMode, Transition, TransitionPath
-from nonholonomic.integration import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem
+from nonholonomic.integration import CROSSED, LEFT_DOMAIN, REACHED_END, RUNNING, AbstractProblem, ExtendedProblem
 from nonholonomic.xla_cpu import compiled_setup
 
 from ..model.dynamics import NO_COSINE
@@ -18,7 +18,7 @@ from ..model.state import COS_THETA
 from ..model.stick_slip import AT_REST, Change, ContactMode, StickSlip
 from ..model.top import Top
 from .inversion_problem import InversionProblem
-from .trajectory_problem import TrajectoryProblem
+from .trajectory_problem import Quadratures, TrajectoryProblem
 
 #: The numbers of the two modes.
 SLIPPING, ROLLING = range(2)
@@ -37,9 +37,9 @@ def energy_in(
 class StickSlipMode(AbstractBatchedMode):
     """Slipping or rolling until theta reaches an angle; with `last`, the last crossing counts.
 
-    For a single run whose path is kept, the passive quadratures of a `TrajectoryProblem` follow the first `size`
-    components: `axial` is then the moment of inertia about the axis [kg m^2]. For the cells of a table both are `None`.
-    Without an angle, the runs end at a reversal of the spin about the normal, which is `spin` at the start.
+    For a single run whose path is kept, `passive` quadratures follow the first `size` components. For the cells of a
+    table both are `None`. Without an angle, a run ends when the spin about the normal reverses; `spin` is that at the
+    start.
     """
 
     kind: ContactMode
@@ -47,7 +47,7 @@ class StickSlipMode(AbstractBatchedMode):
     cos_angle: Any
     scales: Float[Array, "components cells"]
     last: bool = eqx.field(static=True)
-    axial: Float[Array, ""] | None = None
+    passive: Quadratures | None = None
     size: int | None = eqx.field(static=True, default=None)
     spin: Float[Array, "..."] | None = None
 
@@ -91,7 +91,7 @@ class StickSlipMode(AbstractBatchedMode):
             status=status,
             crossing_time=jnp.where(crosses, crossing, jnp.inf),
             counts=(change.rolls & ~change.lost & (not self.kind.rolls)).astype(int)[None],
-            record=None if self.axial is None else _recorded(change),
+            record=None if self.passive is None else _recorded(change),
         )
 
     def _event(self, state: Float[Array, "components cells"]) -> Float[Array, " cells"]:
@@ -106,10 +106,11 @@ class StickSlipMode(AbstractBatchedMode):
 
     def _under(self, equations: Any, state: Float[Array, "components cells"]) -> AbstractProblem:
         """The motion from some states under given equations."""
-        if self.axial is None:
-            return InversionProblem(equations, self.cos_angle, state, self.scales, self.spin)
-        own, path, rest = jnp.split(state, (self._size(state), len(state) - 2))
-        return TrajectoryProblem(equations, self.axial, own, path, self.scales, rest)
+        size = self._size(state)
+        problem = InversionProblem(equations, self.cos_angle, state[:size], self.scales[:size], self.spin)
+        if self.passive is None:
+            return problem
+        return ExtendedProblem(problem, self.passive, state[size:], self.scales[size:], ends_on_event=False)
 
 
 def _recorded(change: Change) -> TransitionPath:
@@ -124,21 +125,21 @@ def modes(
     problem: InversionProblem,
     tolerance: float,
     last: bool,
-    axial: Float[Array, ""] | None = None,
+    passive: Quadratures | None = None,
     size: int | None = None,
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, " cells"]]:
     """The modes of runs, and the index of the mode in which each starts.
 
     **Arguments:**
 
-    - `problem`: of launches in a scene with `SetValuedCoulomb`; contains everything needed of the scene.
+    - `problem`: the problem of launches in a scene with `SetValuedCoulomb`.
     - `tolerance`: relative tolerance of the integration; `last`: whether the last crossing counts.
-    - `axial`, `size`: as for `StickSlipMode`.
+    - `passive`, `size`: as for `StickSlipMode`.
     """
     both = problem.dynamics
     assert isinstance(both, StickSlip)
     kinds = (ContactMode(both, jnp.asarray(tolerance, float), rolls) for rolls in (False, True))
-    options = (problem.cos_angle, problem.scales, last, axial, size, problem.spin)
+    options = (problem.cos_angle, problem.scales, last, passive, size, problem.spin)
     both_modes = tuple(StickSlipMode(kind, *options) for kind in kinds)
     return both_modes, _first_mode(both, problem.states)
 
@@ -154,8 +155,9 @@ def contact_modes(
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]:
     """The modes of one run whose path is kept, the index of the first mode, and the initial state.
 
-    **Arguments:** `run`: of a scene with `SetValuedCoulomb`; `tolerance`: relative, of the integration.
+    **Arguments:** `run`: a run in a scene with `SetValuedCoulomb`; `tolerance`: relative tolerance of the integration.
     """
-    state, scales = run.start()
-    problem = InversionProblem(run.dynamics, jnp.asarray(NO_COSINE), run.state[:, None], scales[:, None])
-    return (*modes(None, problem, tolerance, False, run.axial, len(run.state)), state[:, None])
+    state, scales = (values[:, None] for values in run.start())
+    problem = InversionProblem(run.problem.dynamics, jnp.asarray(NO_COSINE), state[: run.leading], scales)
+    assert isinstance(run.passive, Quadratures)
+    return (*modes(None, problem, tolerance, False, run.passive, run.leading), state)

@@ -36,7 +36,7 @@ from ..modes.airborne_ends import energy_in, lifted, loss
 from ..modes.airborne_stick_slip import modes as stick_slip_modes
 from ..modes.free_body import Ball, balls
 from ..modes.inversion_problem import InversionProblem
-from ..modes.trajectory_problem import TrajectoryProblem
+from ..modes.trajectory_problem import trajectory_problem
 from .flight_trajectory import STATUS, HybridTrajectory, flights_of, has_grown_between, sampled_flights
 from .observables import of_each_run
 
@@ -147,7 +147,7 @@ def arena_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int
 @compiled_setup
 def _start(scene: Scene[Top], launch: Launch) -> InversionProblem:
     """The launch as one cell, with the passive quadratures."""
-    state, scales = TrajectoryProblem.of(scene, launch).start()
+    state, scales = trajectory_problem((scene, launch)).start()
     return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
 
 

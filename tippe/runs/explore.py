@@ -45,7 +45,7 @@ from ..model.scene import Scene
 from ..model.top import Top
 from ..modes.inversion_problem import InversionProblem
 from ..modes.sliding import Slide, modes
-from ..modes.trajectory_problem import TrajectoryProblem
+from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
 from .checks import check_revolution, check_run
 from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, UNITS
@@ -162,7 +162,7 @@ def smooth_simulators(
     asked = {"outcome": lambda values, problem, lane: outcome(problem, lane)}
     return (
         Simulator(lambda values: InversionProblem.of(*modules(values), ANGLE, 1), t1, settings, asked),
-        Simulator(lambda values: TrajectoryProblem.of(*modules(values), 1), t1, settings, {"frame": moment}),
+        Simulator(lambda values: trajectory_problem(modules(values), 1), t1, settings, {"frame": moment}),
     )
 
 
@@ -282,7 +282,7 @@ def _motion_at_start(scene: Scene[Top], launch: Launch) -> Motion[Array]:
 
 def smooth_frame(scene: Scene, problem: TrajectoryProblem, lane: LaneState) -> Frame:
     """The drawn quantities of a top at one time in contact."""
-    lean, rows = len(problem.state), lane.state
+    lean, rows = problem.leading, lane.state
     parts = (rows[:lean], rows[lean:-2], rows[-2], rows[-1])
     return frame(scene, Trajectory(lane.time, scene, *parts, status=0, end_time=lane.time[0], stats={}, dense=None))
 

@@ -15,7 +15,7 @@ from nonholonomic.derivatives import (
     in_groups,
     tangents_by,
 )
-from nonholonomic.integration import CROSSED, FAILED, MOST_STEPS, LaneScheduler, Settings, crossing_time
+from nonholonomic.integration import CROSSED, FAILED, MOST_STEPS, Settings, crossing_time, traced_solve_ensemble
 from nonholonomic.progress import status_line
 from nonholonomic.validation import as_number, is_traced
 from nonholonomic.xla_cpu import greatest, least
@@ -121,10 +121,9 @@ class ExtendedSolve(AbstractDifferentiableSolve):
         varied = VariationalProblem(problem, tangents, True)
         # A fit may try parameters that are far off.
         settings = Settings(tolerance, max_steps=MOST_STEPS)
-        queue = LaneScheduler.of(
+        outcome, _ = traced_solve_ensemble(
             varied, t1, jnp.asarray(cells), settings, one_kernel=not nested, n_blocks=1 + len(tangents)
         )
-        outcome, _ = queue.outcome()
         state, *variations = varied.parts(outcome.state)
         crossed = outcome.status == CROSSED
 

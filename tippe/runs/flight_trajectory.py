@@ -29,7 +29,7 @@ from ..modes.impact import approach
 from ..modes.inversion_problem import InversionProblem
 from ..modes.leaning import BOTH
 from ..modes.sliding import MOST_BOUNCES, modes
-from ..modes.trajectory_problem import TrajectoryProblem
+from ..modes.trajectory_problem import trajectory_problem
 from .energy import has_grown, if_balanced, why_unbalanced
 from .observables import AbstractTrajectory, of_each_run
 
@@ -196,7 +196,7 @@ def level_modes(modules: tuple[Scene, Launch], tolerance: Any) -> tuple[Any, Int
 @compiled_setup
 def _start(scene: Scene[Top], launch: Launch) -> InversionProblem:
     """The launch as one cell, with the passive quadratures, whose position is that of the centre of mass."""
-    state, scales = TrajectoryProblem.of(scene, launch).start()
+    state, scales = trajectory_problem((scene, launch)).start()
     place = state[8:10] - scene.body.offset * state[2:4]
     state = jnp.concatenate([state[:8], place, state[10:]])
     return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])

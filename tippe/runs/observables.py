@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from nonholonomic.geometry import Component, Vector, carried, dot, scale, sum_vectors
+from nonholonomic.geometry import Component, Vector, carried, dot, scale, stacked, sum_vectors
 from nonholonomic.hybrid import HybridPath
 from nonholonomic.integration import DenseSolution, Status, few_trials, padded
 from nonholonomic.progress import status_line
@@ -20,7 +20,6 @@ from nonholonomic.sweeps import Table, Tabular
 from nonholonomic.validation import is_traced, require, require_increasing
 from nonholonomic.views import Stage, Viewable
 
-from ..model.dynamics import stacked
 from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.top import Top

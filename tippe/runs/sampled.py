@@ -25,9 +25,9 @@ def ended(
     tolerance: float | Float[Array, ""],
 ) -> Int[Array, "..."]:
     """The `Status` of a run that ended in some state, as an integer: unresolved if it has gained energy (`energy.py`)."""
-    state = state[: len(run.state)]
-    lost = jnp.array([int(status) for status in LOSSES])[run.dynamics.loss(state)]
-    grown = has_grown(scene, scene.energy(run.state), scene.energy(state), tolerance)
+    state = state[: run.leading]
+    lost = jnp.array([int(status) for status in LOSSES])[run.problem.dynamics.loss(state)]
+    grown = has_grown(scene, scene.energy(run.problem.states), scene.energy(state), tolerance)
     ended = jnp.where(grown, int(Status.UNRESOLVED), jnp.where(left_domain, lost, int(Status.COMPLETED)))
     return jnp.where(failed, int(Status.FAILED), ended)
 
@@ -56,7 +56,7 @@ def sampled(
 
     **Arguments:** as for `simulate`.
     """
-    run = TrajectoryProblem.of(scene, launch)
+    run = trajectory_problem((scene, launch))
     if adjoint is None:
         samples = sampled_run(trajectory_problem, (scene, launch), times, t1, settings)
     else:

@@ -38,7 +38,7 @@ from nonholonomic.xla_cpu import on_device
 from ..model.friction import length
 from ..model.launch import Launch
 from ..model.scene import Scene
-from ..modes.trajectory_problem import TrajectoryProblem
+from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
 from .airborne_trajectory import sampled_airborne, simulate_airborne
 from .checks import check_run
 from .energy import if_balanced, why_unbalanced
@@ -211,7 +211,7 @@ def simulate(
     if scene.contact == "hybrid":
         solve_flights_dense = simulate_hybrid if scene.flies_in_closed_form else simulate_airborne
         return solve_flights_dense(scene, launch, float(t1), times, tolerance, solver)
-    run = TrajectoryProblem.of(scene, launch)
+    run = trajectory_problem((scene, launch))
     through = solve_stick_slip_dense if scene.friction.set_valued else follow
     path = through(run, float(t1), Settings(tolerance, solver))
     trajectory = _as_trajectory(scene, run, path, tolerance)
@@ -296,6 +296,6 @@ def _as_trajectory(
     codes = (jnp.asarray(path.left_domain), jnp.asarray(path.failed))
     status = Status(int(_ended(run, scene, last, *codes, jnp.asarray(tolerance)))).word
     sticks = {"sticks": int(path.counts[0])} if isinstance(path, HybridPath) else {}
-    lean, cyclic, spin_angle, work = on_device(*_parts(len(run.state), states))
+    lean, cyclic, spin_angle, work = on_device(*_parts(run.leading, states))
     trajectory = Trajectory(times, scene, lean, cyclic, spin_angle, work, status, end, {}, path)
     return if_balanced(trajectory.with_stats(path, **sticks), tolerance)

@@ -1,6 +1,5 @@
 """The cells of a table of trajectories: samples of many launches, and the quantities at the samples."""
 
-import dataclasses
 from typing import Any, cast
 
 import equinox as eqx
@@ -14,7 +13,7 @@ from nonholonomic.xla_cpu import compiled_alone
 
 from ..model.launch import Launch
 from ..model.scene import Scene
-from ..modes.trajectory_problem import TrajectoryProblem
+from ..modes.trajectory_problem import BEHIND_PATH, TrajectoryProblem, trajectory_problem
 from .quantities import QUANTITIES
 from .sampled import ended
 from .trajectory import Trajectory
@@ -34,11 +33,12 @@ def launches_with(scene: Scene, launch: Launch, cells: int, names: tuple[str, ..
     time. If no quantity has a direction, the frame turns on the level plane, and samples are about thirty times as
     accurate.
     """
-    run = TrajectoryProblem.of(scene, launch, cells)
+    run = trajectory_problem((scene, launch), cells)
     if scene.level and WITHOUT_DIRECTION.issuperset(names):
-        return CoreProblem(dataclasses.replace(run, dynamics=scene.turning_dynamics), len(run.state))
+        turning = eqx.tree_at(lambda run: run.problem.dynamics, run, scene.turning_dynamics)
+        return CoreProblem(turning, run.leading)
     needed = {"position"} if isinstance(scene.surface, Plane) else set(QUANTITIES) - OF_THE_STATE
-    return CoreProblem(run, run.leading if needed.isdisjoint(names) else run.up_to_path)
+    return CoreProblem(run, run.leading if needed.isdisjoint(names) else len(run.start()[0]) - BEHIND_PATH)
 
 
 def _read(
@@ -49,11 +49,12 @@ def _read(
     name: str,
 ) -> Float[Array, "cells times ..."]:
     """A quantity at every sample, NaN after the end of a run."""
-    quadratures = len(run.state) + len(run.cyclic) - samples.shape[-1]
+    # Of the spin angle and the work, nothing is read.
+    missing = len(run.start()[0]) - 2 - samples.shape[-1]
 
     def read_cell(scene: Scene, states: Float[Array, "times components"]) -> Float[Array, "times ..."]:
         nothing = jnp.zeros(len(times))
-        state, cyclic = jnp.split(jnp.pad(states.T, ((0, quadratures), (0, 0))), [len(run.state)])
+        state, cyclic = jnp.split(jnp.pad(states.T, ((0, missing), (0, 0))), [run.leading])
         values = getattr(Trajectory(times, scene, state, cyclic, nothing, nothing, None, times[-1], {}, None), name)
         # A quantity that does not depend on the state would be a number even after the end.
         reached = jnp.isfinite(states[:, 0]).reshape(-1, *[1] * (values.ndim - 1))

@@ -15,7 +15,9 @@ from nonholonomic.integration import (
     FAILED,
     LEFT_DOMAIN,
     REACHED_END,
+    AbstractPassive,
     AbstractProblem,
+    ExtendedProblem,
     Oscillatory8,
     Settings,
     explicit_tableau,
@@ -71,6 +73,26 @@ def test_the_first_crossing_is_located():
     assert (np.asarray(outcome.status) == CROSSED).all()
     assert_close(outcome.crossing_time, math.pi / 3.0 / frequency, rtol=1e-9)
     assert int(outcome.steps.sum()) <= int(iterations) * 8
+
+
+class Area(AbstractPassive):
+    """The integral of x^2."""
+
+    def rates(self, problem, time, state, passive):
+        return jnp.concatenate([problem.field(time, state), state[:1] ** 2])
+
+
+@pytest.mark.parametrize("ends_on_event", [True, False])
+def test_a_passive_integral_is_kept_behind_the_state(ends_on_event):
+    """The integral of cos^2(w t) is t/2 + sin(2 w t)/(4 w); event and margin are those of the state alone."""
+    frequency = jnp.asarray([0.5, 2.0, 3.0])
+    problem = Oscillators(frequency, jnp.asarray(0.5), jnp.asarray(2.0 if ends_on_event else 0.5))
+    extended = ExtendedProblem(problem, Area(), jnp.ones((1, 3)), jnp.ones((1, 3)), ends_on_event)
+    outcome, _ = solve_ensemble(extended, jnp.asarray(10.0), jnp.asarray(3), Settings(1e-10, SOLVER))
+    assert (np.asarray(outcome.status) == (CROSSED if ends_on_event else LEFT_DOMAIN)).all()
+    assert_close(outcome.end_time, (math.pi / 3.0 if ends_on_event else math.pi / 6.0) / frequency, rtol=1e-6)
+    time = outcome.end_time
+    assert_close(outcome.state[2], 1.0 + time / 2.0 + jnp.sin(2.0 * frequency * time) / (4.0 * frequency), rtol=1e-9)
 
 
 def test_cells_of_like_cost_leave_no_lane_idle():

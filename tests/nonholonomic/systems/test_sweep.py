@@ -9,6 +9,7 @@ import pytest
 from close import assert_close
 from own_modes import GRAVITY, Ball, Bounces, Sleigh, bounce
 
+import nonholonomic
 from nonholonomic import AbstractMode, Hybrid, sweep
 from nonholonomic.systems.numbers import Named
 from nonholonomic.systems.sweep import SweepJob
@@ -98,3 +99,10 @@ def test_long_steps_leave_no_error_in_the_times_of_bounces():
     heights = np.linspace(0.5, 2.0, 512)
     table = sweep(BALL, [1.0, 0.0, 0.0], 20.0, axes={"start[0]": heights}, progress=False)
     assert_close(table.time, bounce(heights, 0.8, GRAVITY, 3), rtol=1e-13)
+
+
+def test_what_a_user_of_own_systems_needs_has_public_names(table):
+    """The table in the file, and the unknowns of a fit, without imports from the rooms or the vehicles."""
+    assert nonholonomic.Table is type(table)
+    assert nonholonomic.Free(0.8, lower=0.0).lower == 0.0
+    assert issubclass(nonholonomic.FitWarning, UserWarning)
