@@ -102,8 +102,8 @@ def _root_of_ratio(value: Float[Array, "..."], excess: Float[Array, "..."]) -> F
 
 
 def upright_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
-    """Spin [rad/s] above which the upright top on the plane is unstable; infinite if the upright top is stable at every
-    spin. omega^2 = m g a (1 - alpha)^2 / (I3 (gamma - 1 + alpha)).
+    """Spin [rad/s] above which the upright top on the plane is unstable; infinite if there is none. omega^2 = m g a (1
+    - alpha)^2 / (I3 (gamma - 1 + alpha)).
 
     **Example:** with the scene of the module.
 
@@ -116,9 +116,9 @@ def upright_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
 
 
 def inverted_critical_spin(scene: Scene[Top]) -> Float[Array, "..."]:
-    """Spin [rad/s] above which the inverted top on the plane (on its stem, if any) is stable; infinite if the inverted
-    top is unstable at every spin. omega^2 = m g a (1 + alpha)^2 / (I3 (1 + alpha - gamma)), for a stem with its offset
-    and radius (`tippe.md`, sections 4, 6).
+    """Spin [rad/s] above which the inverted top on the plane (on its stem, if any) is stable; infinite if there is
+    none. omega^2 = m g a (1 + alpha)^2 / (I3 (1 + alpha - gamma)), for a stem with its offset and radius (`tippe.md`,
+    sections 4, 6).
 
     **Example:** with the scene of the module.
 
