@@ -80,8 +80,7 @@ def folds(body: Top) -> bool:
     """Whether Jellett's constant has an extremum over the tumbling angles of a top of group II, which causes
     hysteresis.
 
-    There is no extremum if gamma > 1 - delta, delta = (1 + 6 alpha + alpha^2 - (1 - alpha) sqrt(1 + 14 alpha +
-    alpha^2)) / 8.
+    There is none if gamma > 1 - delta, delta = (1 + 6 alpha + alpha^2 - (1 - alpha) sqrt(1 + 14 alpha + alpha^2)) / 8.
 
     **Example:** with the scene of the module.
 
