@@ -79,8 +79,8 @@ def size_of(axes: list[Axis]) -> int:
 def columns(axes: list[Axis], first: int, count: int) -> dict[str, Values]:
     """The parameters of some cells; the last axis varies fastest.
 
-    **Arguments:** `axes`: the grid; `first`: index of the first cell; `count`: number of cells. Beyond the end, the
-    last cell is repeated.
+    **Arguments:** `axes`: the grid; `first`: index of the first cell; `count`: number of cells. Beyond the end of the
+    grid, the last cell is repeated.
 
     **Returns:** full name of a parameter -> its value in every cell.
     """

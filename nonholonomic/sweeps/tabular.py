@@ -1,4 +1,4 @@
-"""The quantities of a run over its times, as a table, and what every run offers with it."""
+"""The quantities of a run over its times, as a table, and the methods that every run derives from this table."""
 
 import abc
 import json
@@ -50,8 +50,8 @@ def run_table(
 
     **Arguments:**
 
-    - `quantities`: name -> `Quantity`; `values`: name -> its values.
-    - `coords`: name -> values, those of the `axes` first.
+    - `quantities`: name -> `Quantity`; `values`: name -> values.
+    - `coords`: name -> values; the `axes` come first.
     - `request`: plain data that describes the run.
 
     **Returns:** the `Table`.
