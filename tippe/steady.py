@@ -361,7 +361,7 @@ def tumbling_matrix(scene: Scene[Top], motion: Tumbling) -> Float[Array, "5 5"]:
     **Arguments:**
 
     - `scene`: a `Scene` on the plane, with friction.
-    - `motion`: from `tumbling`.
+    - `motion`: a motion from `tumbling`.
 
     **Example:** with the scene of the module.
 

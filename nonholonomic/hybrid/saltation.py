@@ -70,8 +70,8 @@ class VariationalMode(AbstractBatchedMode):
 
     The mode's equations must not depend on time.
 
-    - `tangents`: of the mode, as for `VariationalProblem`.
-    - `ends_on_event`: as there; `tolerance`: relative tolerance of the integration.
+    - `tangents`: tangents of the mode, as for `VariationalProblem`.
+    - `ends_on_event`: as for `VariationalProblem`; `tolerance`: relative tolerance of the integration.
     """
 
     mode: AbstractBatchedMode

@@ -51,7 +51,7 @@ def identify(
     - `measurements`: `Measurements` of shape (n,).
     - `free`: name -> a `Free`, or only the start value.
     - `starts`: number of start points: the start values, and others drawn around them.
-    - `spread`: range of the drawn points, as a factor greater than 1 in either direction; `seed`: of the draw.
+    - `spread`: range of the drawn points, as a factor greater than 1 in either direction; `seed`: seed of the draw.
     - `max_steps`: a fit that needs more steps has not converged.
     - `slopes`: "exact", by automatic differentiation; or "differences", central differences of 1 % in every parameter,
       for a model without a derivative or with a rough one. Each step then takes 2 k + 1 runs for k parameters.

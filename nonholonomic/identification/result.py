@@ -143,7 +143,7 @@ class Identification:
     def interval(self, name: str, deviations: float = 1.96) -> tuple[float, float]:
         """The confidence interval of a parameter, symmetric in its coordinate and so within its bounds.
 
-        **Arguments:** `name`: of the parameter, or the end of its name; `deviations`: half the width in standard
+        **Arguments:** `name`: name of the parameter, or the end of its name; `deviations`: half the width in standard
         errors, 1.96 for 95 %.
 
         **Raises:** `ValueError` for a name that was not free.
@@ -161,7 +161,7 @@ class Identification:
 
         **Arguments:**
 
-        - `name`: of the parameter, or the end of its name.
+        - `name`: name of the parameter, or the end of its name.
         - `values`: values at which to hold the parameter, by default 13 within three standard errors.
 
         **Returns:** a `Profile`.

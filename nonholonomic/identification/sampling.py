@@ -107,7 +107,7 @@ def sample(
       `Identification`. Unknown errors, which are not among the unknowns of a fit, start from their first guess.
     - `chains`: number of chains, at least 2, because R-hat compares chains; `warmup`, `draws`: number of draws of each
       chain to discard and to keep, the latter at least 2. The chains start from draws of the surrogate.
-    - `seed`: of the draw; `progress`: whether to show progress, on a terminal or in a notebook.
+    - `seed`: seed of the draws; `progress`: whether to show progress, on a terminal or in a notebook.
 
     **Returns:** `Draws`.
 

@@ -103,7 +103,7 @@ def judge(
     - `degrees`: measurements and priors less unknowns, without limits.
     - `agreement`: numbers of starts that agree with the best, that ended elsewhere with nearly the same likelihood, and
       of all starts.
-    - `undetermined`: combinations of parameters, in words; `status`: of the fit.
+    - `undetermined`: combinations of parameters, in words; `status`: status of the fit.
 
     **Returns:** a `Verdict`.
     """

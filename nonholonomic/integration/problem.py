@@ -145,7 +145,7 @@ def crossing_time(problem: AbstractProblem, time: Lanes, state: States) -> Lanes
 
     **Arguments:**
 
-    - `problem`: with an event.
+    - `problem`: a problem with an event.
     - `time`, `state`: time and state close to the event, (cells,) and (components, cells).
 
     **Returns:** the times, (cells,), to third order in the distance.

@@ -73,7 +73,8 @@ InLanes = tuple[AbstractProblem, Control, States]
 class AbstractRecorder(eqx.Module):
     """What a solve keeps of the steps between two refills of the lanes (a period), beside the `Outcome`.
 
-    `period`: the greatest number of iterations of a period, `None` for any number; `refill_cost`: in steps of all lanes.
+    `period`: the greatest number of iterations of a period, `None` for any number; `refill_cost`: cost of a refill, in
+    steps of all lanes.
     """
 
     period: ClassVar[int | None] = None

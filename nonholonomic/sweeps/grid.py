@@ -52,7 +52,7 @@ class Variable(NamedTuple):
 def axis(name: str, number: str, unit: str, values: Any, long_name: str = "") -> Axis:
     """An axis, checked.
 
-    **Arguments:** `name`: in the table; `number`: full name of the varied parameter; `unit`; `values`, (values,);
+    **Arguments:** `name`: name in the table; `number`: full name of the varied parameter; `unit`; `values`, (values,);
     `long_name`: description.
 
     **Raises:** `ValueError` that names the axis unless the values are finite numbers in a one-dimensional, non-empty array.

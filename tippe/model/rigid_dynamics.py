@@ -147,7 +147,8 @@ class AbstractRigidDynamics(eqx.Module):
         return Attitude(axes, n, momentum, turning, lever, (normal_rate, lever_rate))
 
     def contact_motion(self, place: Place, attitude: Attitude, slip: Tangent) -> ContactMotion:
-        """The motion of the contact point. **Arguments:** `place`: of the frame; `slip`: velocity v along the arena [m/s]."""
+        """The motion of the contact point. **Arguments:** `place`: place of the frame; `slip`: velocity v along the
+        arena [m/s]."""
         normal_rate, lever_rate = attitude.fixed_rates
         over_body = attitude.in_frame(lever_rate)
         along = (add(slip[0], over_body[0]), add(slip[1], over_body[1]))
