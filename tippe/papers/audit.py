@@ -242,8 +242,6 @@ I is I₁ and J is Jellett's quantity λ.
   an equation of motion.
 * Friction changes the momentum β₁. Either β₁ or Jellett's quantity is constant, never both.
 * This package uses none of the paper's equations. The corrected equations agree with its vector form to 10⁻¹⁰.
-
-`python -m tippe.papers.audit` prints this page.
 """
 
 TABLES = """
