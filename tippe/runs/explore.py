@@ -21,7 +21,7 @@ from nonholonomic.integration import (
     Status,
     crossing_time,
 )
-from nonholonomic.parameters import numbers, with_numbers
+from nonholonomic.parameters import numbers, readable_unit, with_numbers
 from nonholonomic.progress import status_line
 from nonholonomic.validation import all_bounds, legal
 from nonholonomic.views import Page, Stage, arena
@@ -49,6 +49,7 @@ from ..modes.trajectory_problem import TrajectoryProblem, trajectory_problem
 from .checks import check_revolution, check_run
 from .flight_trajectory import HybridTrajectory, level_modes
 from .launches import LONG_NAMES, UNITS
+from .quantities import QUANTITIES
 from .trajectory import Trajectory, simulate
 from .view import AXIS, BESIDE, Motion, aside, show
 
@@ -146,7 +147,10 @@ def live_run(scene: Scene, launch: Launch, sliders: dict[str, tuple[float, float
         allowed=allowed,
         answer=Answer("inversion time", "s", answer),
         motion=motion,
-        summaries=(Summary("energy", "J", 1), Summary("Jellett's constant", "kg m²/s", 2)),
+        summaries=tuple(
+            Summary(QUANTITIES[name].long_name, readable_unit(QUANTITIES[name].unit), row)
+            for row, name in enumerate(("energy", "jellett"), start=1)
+        ),
     )
 
 

@@ -33,6 +33,7 @@ from ..model.body import AbstractBody
 from ..model.rigid_body import AbstractRigidBody
 from ..model.scene import Scene
 from ..model.top import Top
+from .quantities import QUANTITIES
 
 #: Approximate angle [rad] by which the top turns from frame to frame, and the greatest number of frames.
 TURN_PER_FRAME = 0.4
@@ -155,9 +156,7 @@ def show(scene: Scene, motion: Motion[np.ndarray], number: int, name: str) -> Sh
         arrows(motion, float(body.offset) if isinstance(body, Top) else 0.0, radius, weight),
         (
             Curve("θ, normal to axis [rad]", motion.theta),
-            Curve("energy [J]", motion.energy),
-            Curve("Jellett's quantity [kg m²/s]", motion.jellett),
-            Curve("normal force [N]", motion.normal_force),
+            *(Curve(QUANTITIES[name].label, getattr(motion, name)) for name in ("energy", "jellett", "normal_force")),
         ),
     )
 
