@@ -27,7 +27,7 @@ def of(package: str, names: str) -> list[str]:
 
 
 #: The rooms with the engine of the models.
-ENGINE_ROOMS = ("nonholonomic.integration", "nonholonomic.hybrid", "nonholonomic.derivatives")
+ENGINE_ROOMS = tuple(f"nonholonomic.{room}" for room in ("integration", "hybrid", "derivatives", "sweeps"))
 
 #: The public numbers of the engine; the docstrings of the rooms say what they mean.
 CONSTANTS = [
@@ -126,6 +126,11 @@ PAGES = {
                 "VariationalProblem AbstractDifferentiableSolve differentiable_solve tangents_by sampled_run "
                 "sampled_run_by_diffrax SampledRun growth exponent_of",
             ),
+            "nonholonomic.sweeps",
+            *of(
+                "nonholonomic.sweeps",
+                "sweep Axis axis Variable cells_to_check chunk_for saved_cells Quantity run_table Tabular",
+            ),
         ],
     ),
     "own_systems": Page(
@@ -179,6 +184,8 @@ MEMBERS = {
     "nonholonomic.hybrid.HybridPath": "left_domain failed mode_segments times states numbers at",
     "nonholonomic.hybrid.Segment": "at",
     "nonholonomic.derivatives.VariationalProblem": "parts",
+    "nonholonomic.sweeps.Quantity": "of",
+    "nonholonomic.sweeps.Tabular": "readable portrait_axes to_table to_xarray save portrait",
     "nonholonomic.derivatives.AbstractDifferentiableSolve": "in_blocks movable absent solve value_and_tangents for_parts",
     "nonholonomic.Trajectory": "status to_table to_xarray save portrait plot",
 }

@@ -33,7 +33,7 @@ def tangent_scale(number: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 class VariationalProblem(AbstractProblem):
-    """A problem and its first variation along each of some tangents, the variations stacked behind the state.
+    """A problem whose state is followed by its first variations along several tangents.
 
     A tangent of the problem is the same tree, with the rate at which each number moves, `None` where no tangent moves
     it. A variation's absolute tolerance is that of the state, so a tangent should move a number by about its own size
@@ -106,7 +106,8 @@ def slopes_by_variations(
     **Arguments:**
 
     - `problem`, `tangents`: as for `VariationalProblem`.
-    - `ends_on_event`: whether runs end on the event, or at the horizon, which is then the event's time.
+    - `ends_on_event`: whether runs end on the event; otherwise they end at the horizon, which then counts as the
+      event's time.
     - `options`, `one_kernel`: horizon, number of cells and settings, as for `LaneScheduler.of`.
 
     **Returns:** the `Outcome`, without crossing times, and for each tangent the derivative of the event's time.
@@ -127,11 +128,11 @@ def slopes_by_variations(
 
 
 def in_groups(run: Callable[..., tuple[Any, list[Any]]], tangents: tuple[Any, ...]) -> tuple[Any, list[Any]]:
-    """Apply `run` to many tangents, `TOGETHER` at a time, with one program.
+    """Apply `run` to many tangents, a few at a time, with one program.
 
     **Arguments:**
 
-    - `run`: a tuple of at most `TOGETHER` tangents -> a result that does not depend on them, and a derivative for each.
+    - `run`: a tuple of one or two tangents -> a result that does not depend on them, and a derivative for each.
     - `tangents`: any number of them.
 
     **Returns:** the result, and the derivatives.

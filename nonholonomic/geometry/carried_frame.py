@@ -38,8 +38,7 @@ from .vector import Component, Vector, cross, dot, scale, sum_vectors, tangents,
 
 
 def place_named(surface: AbstractSurface, place: Place) -> Place:
-    """A place in the form that `surface.chart` takes, from one in which the eta of a closed surface counts from the
-    lowest point.
+    """A place in the form for `surface.chart`, from a place whose eta counts from the lowest point of a closed surface.
 
     **Arguments:** `place`: numbers named by `surface.coordinates`, or (x, y, z).
     """

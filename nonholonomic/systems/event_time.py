@@ -49,8 +49,8 @@ def event_time(
 
     Derivatives with respect to the start and every number of the system and of the event are exact: they use the
     implicit function theorem at the event and the saltation matrix at every reset (`nonholonomic/hybrid/saltation.py`).
-    They are 0 if the time is infinite. Without resets, there are second derivatives, by `jax.hessian` (forward over
-    reverse mode).
+    Derivatives are 0 if the time is infinite. Without resets, there are second derivatives, by `jax.hessian` (forward
+    over reverse mode).
 
     **Arguments:**
 
@@ -63,9 +63,10 @@ def event_time(
       units of the largest component of the start if that is below 1.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default `nonholonomic.integration.Oscillatory8()`.
 
-    **Returns:** the time [s]; infinite if there is no event by `t1` or if the run ends before; NaN if the integration
-    failed, if resets follow one another without end, or if numbers inside a transformation are out of range. If the
-    margin of a mode only touches zero, so that the mode may or may not end within the tolerance, derivatives are NaN.
+    **Returns:** the time [s]; infinite if there is no event by `t1` or if the run ends before the event; NaN if the
+    integration failed, if resets follow one another without end, or if numbers inside a transformation are out of
+    range. If the margin of a mode only touches zero, so that the mode may or may not end within the tolerance,
+    derivatives are NaN.
 
     **Raises:** `ValueError` for arguments out of range, functions that return a wrong type or shape, and second
     derivatives through resets.
@@ -121,9 +122,8 @@ def _time(cells: Cells, t1: Float[Array, ""], settings: Settings) -> Float[Array
 class SmoothEvent(AbstractDifferentiableSolve):
     """Event times of cells with smooth runs.
 
-    The leaves are the numbers of `Cells`, floats first, the horizon and the tolerance.
-
-    `structure`: of the `Cells`; `places`: which of its leaves are floats; `settings`: without the tolerance.
+    The leaves are the numbers of `Cells`, floats first, the horizon and the tolerance. `structure`: structure of the
+    `Cells`; `places`: positions of the leaves that are floats; `settings`: without the tolerance.
     """
 
     movable: int

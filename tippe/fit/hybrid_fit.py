@@ -1,4 +1,4 @@
-"""Predictions for fits of runs with several modes, which use differences and run outside transformations."""
+"""Predictions for fits of runs with several modes. These fits use differences and run outside transformations."""
 
 from typing import Any, NamedTuple
 
@@ -19,10 +19,11 @@ from .recording import Recording
 
 
 class HybridModel(NamedTuple):
-    """Predictions of all data of a scene with flights, impacts, stick and slip, like `SceneModel` for smooth scenes.
+    """Predictions of all data for a scene with flights, impacts, stick and slip; `SceneModel` does the same for smooth
+    scenes.
 
-    Times are computed as in tables, in one ensemble; recordings are simulated one by one. Parameters that are illegal
-    in the scene have no predictions.
+    Times are computed as in tables, in one ensemble; recordings are simulated one by one. For parameters that are
+    illegal in the scene, there are no predictions.
     """
 
     scene: Scene

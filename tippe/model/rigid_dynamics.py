@@ -4,8 +4,7 @@ singularities.
 The state is that of a top (`state.py`) with an additional vector: in the arena's frame (t1, t2, n) the velocity (u1,
 u2) of the centre of mass along the arena, the body's z axis e, the angular momentum L about the centre of mass, the
 arena's place, and the body's x axis c. With d = e x c, the components of n in the body's axes are (c.n, d.n, e.n),
-which determine the contact
-(`rigid_body.py`).
+which determine the contact (`rigid_body.py`).
 
 With r from the centre of mass to the contact, the laws of motion are L' = r x F + N tau and m u' = F - m g z; the contact
 persists if the contact point has no velocity along n. The frame moves with the contact point, whose velocity along the arena
@@ -229,12 +228,12 @@ class AbstractRigidDynamics(eqx.Module):
         return self.carried_along(state)
 
     def carried_along(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
-        """The state with the velocity that the friction law imposes; only rolling imposes one."""
+        """The state with the velocity that the friction law imposes; only `NoSlip` imposes a velocity."""
         return state
 
 
 class SlippingDynamics(AbstractRigidDynamics):
-    """The equations of motion under a law of friction with a force at every slip."""
+    """The equations of motion under a friction law that determines the force from the slip."""
 
     frame: AbstractFrame
     body: AbstractRigidBody

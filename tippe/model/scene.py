@@ -64,8 +64,8 @@ class Scene(Bounded, Generic[Body]):
 
     **Arguments:**
 
-    - `body`: a `Top`; or an `Ellipsoid` or a `RigidBody`, with `contact="stop"` and a friction law with a single mode; or a
-      `SpheroidBody` or a `ConvexBody`, likewise and on a plane.
+    - `body`: a `Top`, an `Ellipsoid`, a `RigidBody`, a `SpheroidBody` or a `ConvexBody`. All but a `Top` need
+      `contact="stop"` and a friction law with a single mode; a `SpheroidBody` and a `ConvexBody` also need a plane.
     - `surface`: the arena: `Plane(tilt)`, `Cylinder(radius)`, `Sphere(radius)`, `Spheroid(equatorial, polar)`, `Torus(ring,
       tube)`, `Paraboloid(p)`, `Graph(height)` or `Implicit(function)`.
     - `friction`: `Frictionless()`, `Viscous(mu)`, `Coulomb(mu, slip_speed)`, `Contensou(mu, contact_radius, slip_speed)`
@@ -73,11 +73,12 @@ class Scene(Bounded, Generic[Body]):
       `SetValuedCoulomb(mu)`, for an `Ellipsoid` or a `RigidBody` also `NoSlip()`.
     - `gravity`: acceleration of free fall [m/s^2], positive.
     - `contact`: "stop" (the default): a run ends where the contact is lost; "hybrid": it continues through flights,
-      impacts, and changes to the stem and back (`modes/`). "stop" is faster to compile and works for every body and
-      law; a run that loses contact says so. A top with a stem needs "hybrid". If it comes to rest on its sphere and its
-      stem at once, it leans on both on the level plane; on any other arena its run ends there as "unresolved".
+      impacts, and changes to the stem and back (`modes/`). "stop" compiles faster and works for every body and law; the
+      status of a run that loses contact is "contact_lost". A top with a stem needs "hybrid". If such a top comes to
+      rest on its sphere and its stem at once, it leans on both on the level plane; on any other arena, the run ends
+      with the status "unresolved".
     - `restitution`: Newton's coefficient e_N of impacts [1], in [0, 1], for "hybrid" only; `None` is 0.
-    - `side`: "inside" or "outside" of a closed surface, "above" an open one; `None` means inside, or above.
+    - `side`: "inside" or "outside" of a closed surface, or "above" an open surface; `None` means inside, or above.
 
     **Raises:** `ValueError` if a part is of the wrong kind, if the top does not fit into the arena, if gravity is not
     positive, or if the arena, the body or the friction does not allow the contact.
@@ -216,7 +217,7 @@ class Scene(Bounded, Generic[Body]):
     def turning_dynamics(self) -> Any:
         """The equations of motion for angles, times, energies and forces, which are cheaper in a turning frame.
 
-        On a level plane under an isotropic law, the frame turns with the top; its direction is not known afterwards.
+        On a level plane under an isotropic law, the frame turns with the top; how far it has turned is not recorded.
         """
         equations, body = self.dynamics, self.body
         alike = self.level and self.friction.isotropic
@@ -384,7 +385,8 @@ class Scene(Bounded, Generic[Body]):
         return angular_velocity(self.body, e, L)
 
     def path_from_frame(self, state: Float[Array, "components ..."]) -> Vector:
-        """From the point that the frame carries to the one whose path is reported [m], in the moving frame."""
+        """Vector from the point with which the frame moves to the point whose path is reported [m], in the moving
+        frame."""
         if isinstance(self.body, AbstractRigidBody):
             return self.dynamics.mass_from_contact(state)
         return self.body.path_from_frame(parts(state).axis)

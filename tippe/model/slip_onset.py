@@ -1,4 +1,4 @@
-"""The onset of a slip: one implicit step from a contact at rest to a slipping one, as long as the tolerance allows.
+"""The onset of a slip: an implicit step from a contact at rest to a slipping contact, as long as the tolerance allows.
 
 Let G be the force that rolling requires beyond the friction cone. The slip velocity v changes as v' = M G, where M is
 the contact's inverse mass along the arena. Where rolling leaves the cone, G = 0, and so is the slip's acceleration;
@@ -11,9 +11,8 @@ A deviation of the slip's direction decays as exp(k / t), faster than any power,
 there. A collocation method can: it needs only the state at t = 0, and the polynomial of the smooth solution satisfies
 the equations at all nodes. This module takes one step of Radau IIA (Hairer and Wanner, Solving ODEs II, section IV.5).
 It solves the equations by Newton's method in the slip velocity, which alone is stiff, and by iteration in the other
-components. If the force of rolling is beyond the cone from the start, the contact begins with v = b t d + O(t^2), where
-d is the direction in which opposing friction lets the slip grow, close to that against the force of rolling; the same
-step applies.
+components. If the force of rolling is beyond the cone from the start, the slip begins as v = b t d + O(t^2), where d is
+the direction in which the slip grows against friction, nearly opposite to the force of rolling. The same step applies.
 """
 
 from collections.abc import Callable
@@ -70,7 +69,7 @@ class Onset(eqx.Module):
     """The beginning of a slip.
 
     - `start`: the state at the onset, (components, ...); `length`: its duration [s].
-    - `rates`: of the state at the step's stages, (components, stages, ...).
+    - `rates`: rates of the state at the step's stages, (components, stages, ...).
     - `found`: whether the step reached the tolerance.
     """
 
@@ -85,8 +84,8 @@ class Onset(eqx.Module):
         return self.start + self.length * jnp.einsum("ps,p...,cs...->c...", INTEGRALS, powers, self.rates)
 
     def falls_to(self, component: int, value: Float[Array, "..."], first: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The fraction of the step, after `first`, at which a component of the state has fallen to a value; 1 if it
-        does not."""
+        """The fraction of the step, after `first`, at which a component of the state falls to a value; 1 if it does not
+        fall so far."""
         onset = Onset(
             self.start[component : component + 1], self.length, self.rates[component : component + 1], self.found
         )
@@ -130,7 +129,7 @@ def begin(
     - `slipping`, `rolling`: the equations with slip and without; `mu`: coefficient of friction [1].
     - `field`: rate of the slipping state, including other integrated components.
     - `state`: at rest, (components, ...), of which the equations use the first `size`; `scales`: their magnitudes.
-    - `most`: longest duration [s]; `tolerance`: of the estimated error, relative to the magnitudes.
+    - `most`: longest duration [s]; `tolerance`: tolerance for the estimated error, relative to the magnitudes.
 
     **Returns:** an `Onset`.
     """

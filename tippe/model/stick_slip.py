@@ -1,11 +1,11 @@
-"""Stick and slip under exact Coulomb friction: the two kinds of motion, when each ends, and what follows.
+"""Stick and slip under exact Coulomb friction: both kinds of motion, their ends, and the motion that follows.
 
 Within the friction cone, rolling is the only motion near zero slip, and a slip reaches zero in finite time. There the
-direction of the slip has no limit, and steps shrink with its speed. Therefore an impulse stops the slip when the
+direction of the slip has no limit, and steps shrink with the slip speed. Therefore an impulse stops the slip when the
 remaining sliding distance, v^2 / (2 |v'|), is `LEFT` times the tolerance in units of R. Friction would have given the
 same impulse in the remaining time, so the state errs by this distance, in proportion to the tolerance. Rolling ends
 where mu N = |F_t|; there a separate step begins the slip (`slip_onset.py`), with an estimated error within the
-tolerance (`tests/physics/test_stick_slip.py` has the figures).
+tolerance (`tests/physics/test_stick_slip.py`).
 """
 
 import dataclasses
@@ -119,8 +119,8 @@ class StickSlip(eqx.Module):
     def stopped(self, state: Float[Array, "components ..."]) -> Float[Array, "components ..."]:
         """The state after the impulse that stops the slip, with the axis at unit length.
 
-        Step errors change the length of the axis, and the slip after the impulse is only as small as these errors;
-        where a slip begins, its direction tolerates only round-off.
+        Step errors change the length of the axis, so the slip after the impulse would be as large as these errors; but
+        where a slip begins, its direction tolerates only rounding errors.
         """
         nothing = jnp.zeros_like(state[0])
         axis = state[2:5]
@@ -131,8 +131,8 @@ class StickSlip(eqx.Module):
         """Whether a contact at rest separates at once: without a force at the contact point, the arena would have to
         pull.
 
-        Unless the contact jams, the normal forces of ending rolling, of the following slip and of no friction have the
-        same sign.
+        Unless the contact jams, the normal force has the same sign for the ending roll, for the following slip and
+        without friction.
         """
         return dataclasses.replace(self.slipping, friction=Frictionless()).motion(state).normal_force <= 0.0
 
@@ -200,7 +200,8 @@ class ContactMode(eqx.Module):
         return (*self.both.slipping.margins(state), self.slip_left(state))
 
     def slip_left(self, state: Float[Array, "components ..."]) -> Float[Array, "..."]:
-        """Slip speed above that at which a slip ends, in units of sqrt(g R). A slip that grows does not end."""
+        """Excess of the slip speed over the speed at which a slip ends, in units of sqrt(g R). A slip that grows does
+        not end."""
         speed, change = self._slowing(state)
         way = LEFT * self.tolerance * self.both.rolling.radius
         return (speed - jnp.sqrt(2.0 * way * greatest(-change, 0.0))) / self.both.speed
@@ -227,7 +228,7 @@ class ContactMode(eqx.Module):
 
         - `state`: (components, ...), at zero margin; the equations use the first `size` components.
         - `slipping`: rate of the whole state during slip; `scales`: its magnitudes.
-        - `left`: time [s] to the horizon, which the beginning of a slip does not exceed.
+        - `left`: time [s] to the horizon; the beginning of a slip is not longer.
         """
         both, own, rest = self.both, state[:size], state[size:]
         still = both.stopped(own)

@@ -117,7 +117,7 @@ def modes(
 
     **Arguments:**
 
-    - `problem`: of launches in a scene with `SetValuedCoulomb`; contains everything needed of the scene.
+    - `problem`: the problem of launches in a scene with `SetValuedCoulomb`.
     - `tolerance`: relative tolerance of the integration; `last`: whether the last crossing counts.
     - `passive`, `size`: as for `StickSlipMode`.
     """
@@ -139,7 +139,7 @@ def contact_modes(
 ) -> tuple[tuple[AbstractBatchedMode, ...], Int[Array, "1"], Float[Array, "components 1"]]:
     """The modes of one run whose path is kept, the index of the first mode, and the initial state.
 
-    **Arguments:** `run`: of a scene with `SetValuedCoulomb`; `tolerance`: relative, of the integration.
+    **Arguments:** `run`: a run in a scene with `SetValuedCoulomb`; `tolerance`: relative tolerance of the integration.
     """
     state, scales = (values[:, None] for values in run.start())
     problem = InversionProblem(run.problem.dynamics, jnp.asarray(NO_COSINE), state[: run.leading], scales)

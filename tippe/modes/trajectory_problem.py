@@ -59,7 +59,7 @@ def c_rate(c: Vector, axis: Vector, falls: Component, turning: Tangent = (None, 
 
 
 def trajectory_problem(modules: tuple[Scene, Launch], cells: int | None = None) -> TrajectoryProblem:
-    """The run of one launch, or the runs of some cells, whose numbers are scalars or one per cell."""
+    """The run of one launch, or the runs of several cells; numbers are scalars or arrays with one number per cell."""
     return _problem(*modules, cells)
 
 
