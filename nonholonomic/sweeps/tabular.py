@@ -5,7 +5,7 @@ import json
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
-from ..parameters import likely, text_as_html
+from ..parameters import likely, readable_unit, text_as_html
 from ..validation import require_package
 from .layout import Values
 from .table import Table
@@ -28,6 +28,11 @@ class Quantity(NamedTuple):
     long_name: str
     components: str | None = None
     read: Callable[[Any], Any] | None = None
+
+    @property
+    def label(self) -> str:
+        """The description with the unit, as beside a curve."""
+        return f"{self.long_name} [{readable_unit(self.unit) or '1'}]"
 
     def of(self, name: str, run: Any) -> Any:
         """The values of the quantity in a run."""

@@ -140,9 +140,9 @@ class LeaningDynamics(eqx.Module):
         """The end of rocking: the total effect of all remaining impacts on a top whose spheres are both at the plane.
 
         The top rocks from sphere to sphere with decreasing amplitude, and infinitely many impacts take a finite time T.
-        Sphere j gets the impulse P_j (f_j, 1), and P_j tau_j if the law has a torque, in addition to those of leaning
-        for T, and the sum stops both speeds along the normal, g + G P = 0. During T, both slips change only by the
-        order of the speeds g, so the error is of the order of their square.
+        In addition to the impulses of leaning for T, sphere j gets the impulse P_j (f_j, 1), and P_j tau_j if the law
+        has a torque. Together, these stop both speeds along the normal, g + G P = 0. During T, both slips change only
+        by the order of the speeds g, so the error is of the order of their square.
 
         **Returns:** the body after these impulses, before `at_rest`; and whether their friction dissipates energy. One
         P_j is negative, the reduction of that sphere's load in T; if its friction adds energy now, it dissipates some

@@ -1,4 +1,4 @@
-r"""Audit of the paper: each numbered equation as printed, the verdict, the correct form, and the tests that show it.
+r"""Audit of the paper: each numbered equation as printed, the verdict, the correct form, and the tests for both.
 
 `python -m tippe.papers.audit` prints the page `docs/development/tippe_paper.md`. In its formulas eta is the angle of the
 position from the lowest line, r the arena's radius, rho = r - R the radius of the centre's path, and phi the direction of the
@@ -16,7 +16,7 @@ class Equation(NamedTuple):
     - `subject`: what the statement is about.
     - `printed`: as printed, in TeX.
     - `verdict`: right, right on the plane, misprint, incomplete, wrong, meaningless or lost.
-    - `reason`: why, in a few sentences.
+    - `reason`: the reason for the verdict, in a few sentences.
     - `correct`: the correct formulas, in TeX; empty where there are none.
     - `code`: the functions that compute the correct form.
     - `tests`: the tests that show verdict and correct form, as pytest names them.

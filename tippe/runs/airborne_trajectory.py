@@ -45,8 +45,8 @@ NEAR = 1e-6
 
 class ArenaTrajectory(HybridTrajectory):
     """A `HybridTrajectory` over any arena: `theta` and `azimuth` refer to the frame at the foot, the point of the arena
-    nearest to the centre of the top's own sphere, and `distance` is the distance of this sphere from the arena. `slip`
-    refers to the frame at the foot of the touching sphere."""
+    nearest to the centre of the top's own sphere, and `distance` is the distance of this sphere from the arena and its
+    rate. `slip` refers to the frame at the foot of the touching sphere."""
 
     @of_each_run
     def energy(self) -> Float[Array, " times"]:
@@ -171,8 +171,8 @@ def simulate_airborne(scene: Scene[Top], launch: Launch, t1: float, times: Any, 
 
 
 def sampled_airborne(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> ArenaTrajectory:
-    """Simulate one launch of such a scene inside a transformation. **Arguments:** as for `simulate`, already
-    checked."""
+    """Simulate one launch of a hybrid scene inside a transformation, where flights are integrated. **Arguments:** as
+    for `simulate`, already checked."""
     samples = hybrid_samples(arena_modes, (scene, launch), times, t1, settings, counters=1)
     codes = jnp.array([int(status) for status in LOSSES])
     grown = has_grown_between(scene, arena_modes((scene, launch), settings.tolerance), samples, energy_in, settings)

@@ -1,4 +1,4 @@
-"""The cells of an inversion table: how they are run, and the variables of each."""
+"""The cells of an inversion table: run them, and compute the variables of each cell."""
 
 from typing import Any, NamedTuple
 
@@ -68,7 +68,8 @@ def too_many_steps(t1: float, most: int, end: float) -> str:
 
 
 class InversionRuns(NamedTuple):
-    """The requested variables of every cell of a table; see `inversion_table`. `angle` is `None` where reversals are timed."""
+    """The requested variables of every cell of a table; see `inversion_table`. `angle` is `None` for a table of
+    reversal times."""
 
     run_kind: RunKind
     t1: float

@@ -39,31 +39,32 @@ def inversion_time(
 ) -> Float[Array, ""]:
     """Time at which theta reaches an angle; works under `jit`, `vmap`, `grad`, `jvp` and their compositions.
 
-    The derivative is that of the event's time by the implicit function theorem; it is 0 if the result is infinite. The
-    time and its derivative with respect to one parameter cost about three times the time alone; two parameters cost
-    five times, three or four seven to ten times, and more parameters eight to thirteen times
-    (`nonholonomic/derivatives/slopes.py`); second derivatives take forward-mode passes.
+    The derivative comes from the implicit function theorem at the event; it is 0 if the result is infinite. Together
+    with derivatives, a time costs about three times as much for one parameter, five times for two, seven to ten times
+    for three or four, and eight to thirteen times for more (`nonholonomic/derivatives/slopes.py`). Second derivatives
+    take forward-mode passes.
 
     **Arguments:**
 
-    - `scene`, `launch`: as for `simulate`, every number a scalar.
+    - `scene`, `launch`: as for `simulate`; all numbers must be scalars.
     - `t1`: horizon [s], positive.
     - `angle`: angle [rad] to be reached, in (0, pi].
     - `tolerance`: relative tolerance of the integration, in [1e-14, 1e-2].
-    - `crossing`: "first" for the first time theta reaches the angle, "last" for the up-crossing after which theta stays
-      above it until `t1`.
+    - `crossing`: "first" for the first time theta reaches the angle, "last" for the crossing after which theta stays
+      above the angle until `t1`.
     - `solver`: an explicit Runge-Kutta solver of Diffrax, by default
       `nonholonomic.integration.Oscillatory8()`.
 
-    **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or has lost contact or jammed before; NaN
+    **Returns:** the time [s]; infinite if the top has not inverted by `t1`, or loses contact or jams before; NaN
     if the integration failed, if the run is unresolved, or if numbers inside a transformation are out of range.
 
     With `contact="hybrid"` and `SetValuedCoulomb`, first derivatives include flights, impacts, stick and slip
-    (`nonholonomic/hybrid/saltation.py`). If an earlier event is grazing, so that it may not happen within the
-    tolerance, the derivative is NaN; the variable `grazes` of `inversion_table` reports this.
+    (`nonholonomic/hybrid/saltation.py`). If an earlier event is grazing (within the tolerance, it may not happen), the
+    derivative is NaN; the variable `grazes` of `inversion_table` reports this.
 
     **Raises:** `ValueError` for arguments outside these ranges, for a run that needs more than 2 000 000 steps, for
-    second derivatives through changes of mode, and for derivatives with both, because an impact may stop a slip.
+    second derivatives through changes of mode, and for derivatives with both `contact="hybrid"` and `SetValuedCoulomb`,
+    because an impact may stop a slip.
 
     **Example:**
 
@@ -93,7 +94,7 @@ def first_or_last_time(
     crossing: str,
     settings: Settings,
 ) -> Float[Array, ""]:
-    """The time of a launch's event: that theta reaches an angle, or, without one, that the spin about the normal reverses.
+    """The time at which theta reaches an angle, or, without an angle, at which the spin about the normal reverses.
 
     **Arguments:** as for `inversion_time`, checked.
     """

@@ -17,9 +17,9 @@ from ..modes import airborne, airborne_ends, airborne_stem, airborne_stick_slip,
 class RunKind(NamedTuple):
     """How to run a kind of scene: its status words, its counters besides steps, and its modes.
 
-    `modes` takes (scene, problem, tolerance, last) and returns the modes and the number of each cell's first; `None`
-    for runs of one smooth motion. `energy_in` takes (scene, state, mode) and returns the least and the greatest energy [J] that
-    the state may have. `flight_state` is whether states may be those of flight, in a layout of their own.
+    `modes` is a function of (scene, problem, tolerance, last) that returns the modes and the index of each cell's first
+    mode; `None` for smooth runs. `energy_in` is a function of (scene, state, mode) that returns the least and the
+    greatest energy [J] that the state may have. `flight_state` is true if states in flight have another layout.
     """
 
     words: tuple[str, ...]
@@ -84,7 +84,7 @@ def run_kind_of(scene: Scene[Any]) -> RunKind:
 
 
 def why_unresolved(kind: RunKind) -> str:
-    """Why a run of some kind may be unresolved."""
+    """The reasons why a run of this kind may be unresolved."""
     grown = (
         "its energy has grown by more than the tolerance allows, although nothing drives the top: the law of friction pushes "
         "it, or the arena's heights do not fit its normals"

@@ -20,10 +20,9 @@ from .run_kind import run_kind_of
 def theta_over_time(
     scene: Scene, launch: Launch, times: Float[np.ndarray, " times"], tolerance: float, axes: Sequence[str]
 ) -> Float[np.ndarray, " times"]:
-    """theta [rad] of one launch at some times, also in flight.
-
-    Each time has a separate run that ends there, and all runs are cells of a table. So a job that has computed a table
-    compiles nothing more for its plot, while `simulate` needs fifty programs.
+    """theta [rad] of one launch at the given times, also in flight. A separate run ends at each time, and all runs are
+    cells of a table. A program that has computed a table therefore compiles nothing more for its plot, whereas
+    `simulate` compiles fifty programs.
 
     **Arguments:** `axes`: full names of the parameters along the axes of that table, such as "launch.theta".
     """

@@ -56,13 +56,13 @@ class Trajectory(AbstractTrajectory):
     centre of mass for other bodies; `contact` is the contact point, and `normal` the arena's normal there. `rotation`
     (times, 3, 3) rotates the body's axes to the fixed frame, and `angular_velocity` is its rate.
 
-    `status` is the word of a `Status`: "completed", "contact_lost", "failed", "jammed", "does_not_fit" or "unresolved" (its
-    energy grows, or does not balance, by more than 1e4 times the tolerance, relative to the energy); inside a
+    `status` is the word of a `Status`: "completed", "contact_lost", "failed", "jammed", "does_not_fit" or "unresolved"
+    (its energy grows, or does not balance, by more than 1e4 times the tolerance, relative to the energy); inside a
     transformation it is the integer; for numbers out of range it is `Status.ILLEGAL`, and everything is NaN. The run
-    ends at `end_time`. The top does not fit where a curvature of the arena reaches that of its sphere, which then
-    touches at other points, too. It is jammed if the equation for the normal force has no solution, because friction
-    pulls the top into the arena as strongly as the normal force pushes it out; this needs strong friction, a large
-    offset and a slip along the axis. `stats` holds accepted and rejected steps, the greatest drift of |e| and the
+    ends at `end_time`. The top does not fit where a curvature of the arena reaches that of the top's sphere, which
+    would then touch at other points, too. It is jammed if the equation for the normal force has no solution, because
+    friction pulls the top into the arena as strongly as the normal force pushes it out; this needs strong friction, a
+    large offset and a slip along the axis. `stats` holds accepted and rejected steps, the greatest drift of |e| and the
     greatest energy residual |E - E(0) - work of friction| [J]; with `SetValuedCoulomb` also `sticks`, the number of
     changes from slip to rolling.
 
@@ -96,7 +96,7 @@ class Trajectory(AbstractTrajectory):
 
     @property
     def above(self) -> tuple[None, None]:
-        """No distance from the arena: the contact persists."""
+        """`None`: the contact persists, so there is no distance from the arena."""
         return None, None
 
     @of_each_run
@@ -163,22 +163,23 @@ def simulate(
     """Simulate one launch until `t1`, or until contact is lost or jams; with `contact="hybrid"`, through flights and
     impacts.
 
-    Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run, given by
-    `status` and `end_time`, are then NaN. A batch from `vmap` is solved as one ensemble, like the cells of a table. If
+    Inside a transformation (`jit`, `vmap`, `grad`) `times` must be given; entries after the end of the run (see
+    `status` and `end_time`) are then NaN. A batch from `vmap` is solved as one ensemble, like the cells of a table. If
     a program under `jit` does not use path, rotation or work, they are not integrated.
 
     **Arguments:**
 
-    - `scene`, `launch`: every number a scalar.
+    - `scene`, `launch`: all their numbers must be scalars.
     - `t1`: horizon [s].
     - `times`: times of the result [s], increasing, within [0, t1]; by default those of the accepted steps. Outside
       transformations, times after the end of the run are omitted; `Trajectory.at` returns the run at other times.
     - `tolerance`: relative tolerance, in [1e-14, 1e-2]; absolute tolerances are `tolerance`/10 in units of `Scene.scales`.
     - `solver`: any adaptive solver of Diffrax for ordinary differential equations; by default `Dopri8()`, or inside
       transformations without `adjoint` `nonholonomic.integration.Oscillatory8()`.
-    - `adjoint`: by default the derivatives are the package's own, forward and reverse, at the cost of about one run for
-      each parameter; with one of Diffrax's, such as `RecursiveCheckpointAdjoint()`, Diffrax integrates a traced run,
-      which is cheaper for a loss with many parameters, but can miss a loss of contact shorter than a step.
+    - `adjoint`: an adjoint method of Diffrax, such as `RecursiveCheckpointAdjoint()`, with which Diffrax integrates a
+      traced run. This is cheaper for a loss function with many parameters, but can miss a loss of contact shorter than
+      a step. By default, this package computes forward and reverse derivatives, at the cost of about one run for each
+      parameter.
 
     **Returns:** a `Trajectory`, or a `HybridTrajectory` for a hybrid scene.
 
