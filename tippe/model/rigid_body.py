@@ -83,7 +83,7 @@ UNITS = {"mass": "kg", "centre_of_mass": "m"} | {f"centre_of_mass[{k}]": "m" for
 class Ellipsoid(AbstractRigidBody):
     """An ellipsoid with any inertia and any centre of mass inside: a rattleback, or an unbalanced sphere.
 
-    The scene can have any arena, and any friction law except `SetValuedCoulomb`; `NoSlip` is rolling without slip. On a
+    The scene can have any arena, and any friction law; `NoSlip` is rolling without slip. On a
     curved arena, a run ends with the status "does_not_fit" where the body is not more strongly curved than the arena;
     the program does not notice a second contact elsewhere. The part of the surface that never touches the arena does
     not matter: half an ellipsoid, such as a boat, moves like the whole ellipsoid. At a `Launch`, the body's axes x, y

@@ -28,6 +28,8 @@ from nonholonomic.xla_cpu import greatest
 
 from .dynamics import Dynamics
 from .friction import Slip, length
+from .rigid_dynamics import RollingDynamics as RigidRolling
+from .rigid_dynamics import SlippingDynamics
 from .rolling import RollingDynamics
 
 #: Stages of the step. Its error is of the order of this plus one in its length, its estimate of this order.
@@ -83,23 +85,25 @@ class Onset(eqx.Module):
         powers = jnp.stack([fraction**k for k in range(STAGES + 1)])
         return self.start + self.length * jnp.einsum("ps,p...,cs...->c...", INTEGRALS, powers, self.rates)
 
-    def falls_to(self, component: int, value: Float[Array, "..."], first: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The fraction of the step, after `first`, at which a component of the state falls to a value; 1 if it does not
-        fall so far."""
-        onset = Onset(
-            self.start[component : component + 1], self.length, self.rates[component : component + 1], self.found
-        )
+    def of_components(self, chosen: slice) -> "Onset":
+        """The same step of some components alone."""
+        return Onset(self.start[chosen], self.length, self.rates[chosen], self.found)
+
+    def falls_to_zero(
+        self, event: Callable[[Float[Array, "components ..."]], Float[Array, "..."]], first: Float[Array, "..."]
+    ) -> Float[Array, "..."]:
+        """The fraction of the step, after `first`, at which a function of the state falls to zero; 1 if it does not fall
+        so far."""
 
         def halved(_, bracket):
             low, high = bracket
             middle = 0.5 * (low + high)
-            above = onset.at(middle)[0] > value
+            above = event(self.at(middle)) > 0.0
             return jnp.where(above, middle, low), jnp.where(above, high, middle)
 
         fraction = jax.lax.stop_gradient(jax.lax.fori_loop(0, 52, halved, (first, jnp.ones_like(first)))[1])
         # Halving has no derivative; the implicit function theorem gives it.
-        height, rise = jax.jvp(lambda at: onset.at(at)[0], (fraction,), (jnp.ones_like(fraction),))
-        missing = height - value
+        missing, rise = jax.jvp(lambda at: event(self.at(at)), (fraction,), (jnp.ones_like(fraction),))
         inside = (fraction < 1.0) & (rise != 0.0)
         shift = (missing - jax.lax.stop_gradient(missing)) / jax.lax.stop_gradient(jnp.where(inside, rise, 1.0))
         return fraction - jnp.where(inside, shift, 0.0)
@@ -112,8 +116,8 @@ class Onset(eqx.Module):
 
 
 def begin(
-    slipping: Dynamics,
-    rolling: RollingDynamics,
+    slipping: Dynamics | SlippingDynamics,
+    rolling: RollingDynamics | RigidRolling,
     mu: Float[Array, "..."],
     field: Callable[[Float[Array, "components ..."]], Float[Array, "components ..."]],
     state: Float[Array, "components ..."],
@@ -203,7 +207,7 @@ class _Contact(eqx.Module):
     @classmethod
     def of(
         cls,
-        rolling: RollingDynamics,
+        rolling: RollingDynamics | RigidRolling,
         mu: Float[Array, "..."],
         state: Float[Array, "components ..."],
         rate: Float[Array, "components ..."],
@@ -221,9 +225,9 @@ class _Contact(eqx.Module):
         lifted = jnp.stack([b * h - c * f, b * f - a * h]) / determinant
         yields = d[0] * (a * d[0] + b * d[1] + mu * f) + d[1] * (b * d[0] + c * d[1] + mu * h)
         rise = (greatest(-grip, 0.0) * weight / yields, greatest(-falls, 0.0) * weight / (2.0 * yields))
-        speed = jnp.sqrt(rolling.gravity * rolling.radius)
+        speed = jnp.sqrt(rolling.gravity * rolling.size)
         spin = jnp.sqrt(sum(x * x for x in rolling.angular_velocity(state)))
-        unit = 1.0 / jnp.maximum(spin, speed / rolling.radius)
+        unit = 1.0 / jnp.maximum(spin, speed / rolling.size)
         inverse_mass = (c / determinant, -b / determinant, a / determinant)
         return cls(d, rise, inverse_mass, lifted, mu, N + lifted[0] * F1 + lifted[1] * F2, speed, unit)
 

@@ -48,7 +48,7 @@ class InversionProblem(AbstractProblem):
 
     def event_function(self, state: Float[Array, "components lanes"]) -> Float[Array, " lanes"]:
         if self.cos_angle is None:
-            assert isinstance(self.dynamics, AbstractRigidDynamics)
+            assert not isinstance(self.dynamics, Dynamics)
             assert self.spin is not None
             return self.dynamics.normal_spin(state) / self.spin
         return state[COS_THETA] - self.cos_angle

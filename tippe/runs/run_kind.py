@@ -63,12 +63,18 @@ WORDS = ("inverted", "not_inverted", "contact_lost", "failed", "jammed", "does_n
 SMOOTH = RunKind(WORDS, (), None, energy_of_state)
 REVERSAL = RunKind(("reversed", "not_reversed", *WORDS[2:]), (), None, energy_of_state)
 STICK_SLIP = RunKind(WORDS, ("sticks",), sticking.modes, sticking.energy_in)
+STICK_SLIP_REVERSAL = STICK_SLIP._replace(words=REVERSAL.words)
 HYBRID = RunKind(WORDS, ("hops",), sliding.modes, free_body.energy_in)
 AIRBORNE = RunKind(WORDS, ("hops",), airborne.modes, airborne_ends.energy_in, flight_state=True)
 ON_STEM_TOO = RunKind(WORDS, ("hops",), airborne_stem.modes, airborne_ends.energy_in, flight_state=True)
 STICK_SLIP_FLY = RunKind(
     WORDS, ("hops", "sticks"), airborne_stick_slip.modes, airborne_ends.energy_in, flight_state=True
 )
+
+
+def reversal_kind_of(scene: Scene[Any]) -> RunKind:
+    """The run kind of a scene until the spin about the normal reverses."""
+    return STICK_SLIP_REVERSAL if scene.friction.set_valued else REVERSAL
 
 
 def run_kind_of(scene: Scene[Any]) -> RunKind:

@@ -18,7 +18,7 @@ from ..model.scene import Scene
 from .cells import InversionRuns, too_many_steps
 from .checks import check_event, check_reversible, warn_if_it_cannot_invert
 from .launches import described, launches, rows
-from .run_kind import REVERSAL, RunKind, check_differentiable, run_kind_of, why_unresolved
+from .run_kind import RunKind, check_differentiable, reversal_kind_of, run_kind_of, why_unresolved
 from .sensitivities import sensitivity_names, sensitivity_variables
 from .time_error import errors_of, second_tolerance
 
@@ -162,7 +162,7 @@ def event_table(
     integrator = settings.for_single_runs if method == "diffrax" else settings.for_lanes
     explicit_tableau(integrator)
     paths = sensitivity_names(roots, sensitivities)
-    run_kind = run_kind_of(scene) if angle is not None else REVERSAL
+    run_kind = run_kind_of(scene) if angle is not None else reversal_kind_of(scene)
     if paths:
         check_differentiable(scene)
     if not run_kind.smooth and method == "diffrax":
