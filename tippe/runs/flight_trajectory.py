@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -202,21 +201,14 @@ def _start(scene: Scene[Top], launch: Launch) -> InversionProblem:
     return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
 
 
-def simulate_hybrid(
-    scene: Scene[Top],
-    launch: Launch,
-    t1: float,
-    times: Any,
-    tolerance: float | Float[Array, ""],
-    solver: diffrax.AbstractSolver | None,
-) -> HybridTrajectory:
+def simulate_hybrid(scene: Scene[Top], launch: Launch, t1: float, times: Any, settings: Settings) -> HybridTrajectory:
     """Run one launch of a hybrid scene until `t1`. **Arguments:** as for `simulate`, already checked."""
-    batched_modes, first, state = level_modes((scene, launch), tolerance)
+    batched_modes, first, state = level_modes((scene, launch), settings.tolerance)
     start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
-    path = solve_hybrid_dense(batched_modes, *start, t1, Settings(tolerance, solver), counters=1)
+    path = solve_hybrid_dense(batched_modes, *start, t1, settings, counters=1)
     flights = [(segment.begin, segment.end) for segment in path.segments if segment.number == BETWEEN]
     hops = np.array(flights).reshape(-1, 2)
-    return flights_of(HybridTrajectory, scene, path, STATUS[path.status].word, hops, times, tolerance)
+    return flights_of(HybridTrajectory, scene, path, STATUS[path.status].word, hops, times, settings.tolerance)
 
 
 def sampled_hybrid(scene: Scene[Top], launch: Launch, times: Any, t1: Any, settings: Settings) -> HybridTrajectory:
