@@ -230,7 +230,8 @@ class VariationalMode(AbstractBatchedMode):
 
 
 def delay(function: Any, state: Float[Array, "components cells"], rates: Float[Array, "components cells"]) -> Any:
-    """Zero, with the variation of the time at which a function of the state vanishes (implicit function theorem)."""
+    """A number that is zero, and whose variation is that of the time at which a function of the state vanishes
+    (implicit function theorem)."""
     value, rate = jax.jvp(function, (state,), (rates,))
     return -(value - stop_gradient(value)) / stop_gradient(jnp.where(rate == 0.0, jnp.inf, rate))
 

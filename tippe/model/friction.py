@@ -204,7 +204,8 @@ class Coulomb(AbstractFriction):
 
 
 class Contensou(AbstractFriction):
-    """Coulomb friction on a small contact disc: sliding and drilling share its limit (`tippe.md`, section 3).
+    """Coulomb friction on a small contact disc, with one limit for sliding and drilling together (`tippe.md`, section
+    3).
 
     F = -mu N v_s / Q and the torque -mu N Rb^2 w_n n / Q with Q = sqrt(v_s^2 + Rb^2 w_n^2 + slip_speed^2) and
     Rb = 3 pi / 16 contact_radius. The load is the gradient of the potential mu N Q, an ellipsoid that has the limits of
