@@ -66,7 +66,7 @@ def with_row(state: Float[Array, "components cells"], row: Float[Array, " cells"
 
 
 class VariationalMode(AbstractBatchedMode):
-    """A mode whose state is followed by its first variations, and by that of the time at which the mode began.
+    """A mode whose state is followed by its first variations, and by the variation of the time at which the mode began.
 
     The mode's equations must not depend on time.
 
@@ -268,7 +268,7 @@ def solve_hybrid_with_tangents(
     counters: int,
     ends_on_event: bool = True,
 ) -> tuple[HybridOutcome[np.ndarray], Slopes[np.ndarray]]:
-    """Run every cell through its modes to its event, and differentiate the event's time along some tangents.
+    """Run every cell through its modes to its event, and differentiate the event's time along tangents.
 
     **Arguments:** as for `solve_hybrid`, and
 

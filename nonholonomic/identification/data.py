@@ -38,7 +38,8 @@ def series_units(data: tuple[Any, ...]) -> tuple[str, ...]:
 
 
 def of_data(parameters: dict[str, Any], k: int) -> dict[str, Any]:
-    """The parameters of one set of data: the shared ones, and its own without the prefix `data[k].`."""
+    """The parameters of one set of data: the shared parameters, and its own parameters without the prefix
+    `data[k].`."""
     prefix = f"data[{k}]."
     shared = {name: value for name, value in parameters.items() if not name.startswith("data[")}
     own = {name.removeprefix(prefix): value for name, value in parameters.items() if name.startswith(prefix)}

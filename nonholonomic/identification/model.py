@@ -53,7 +53,8 @@ class AbstractDataModel(eqx.Module):
 def as_sources(data: Any, kinds: Any, expected: str) -> tuple[Any, ...]:
     """Sets of data as a tuple.
 
-    **Raises:** `ValueError`, with what was expected, unless there is at least one set and all are of these kinds.
+    **Raises:** `ValueError` that names the allowed kinds, unless there is at least one set of data and all sets are of
+    these kinds.
     """
     sources = tuple(data) if isinstance(data, list | tuple) else (data,)
     if not sources or not all(isinstance(source, kinds) for source in sources):

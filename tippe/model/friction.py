@@ -349,9 +349,9 @@ class SetValuedCoulomb(AbstractFriction):
     the arena up to mu N while it sticks (`tippe.md`, section 3).
 
     A run consists of modes. During a slip, the force has its full size. When the slip stops, the top rolls, with the
-    equations of `tippe/model/rolling.py`, if the required force is within the friction cone; the top slips again when
-    it no longer is. Rolling keeps the energy constant. With `contact="hybrid"`, a top without a stem flies when contact
-    is lost, and slips, rolls or rebounds after an impact (`tippe/modes/airborne_stick_slip.py`).
+    equations of `tippe/model/rolling.py`, if the required force is within the friction cone, and slips again when the
+    required force leaves the cone. Rolling keeps the energy constant. With `contact="hybrid"`, a top without a stem
+    flies when contact is lost, and slips, rolls or rebounds after an impact (`tippe/modes/airborne_stick_slip.py`).
 
     **Arguments:**
 
