@@ -1,7 +1,7 @@
 """Forward and adjoint derivatives of the end of a run, and the rate at which neighbouring runs diverge.
 
 With few tangents the variations are integrated along with the run; with more, each run is differentiated by one
-backward pass. Both hold step lengths fixed. `sampled_run` gives a run at given times, with its derivatives. Hybrid runs
+backward pass. Both hold step lengths fixed. `sampled_run` returns a run at given times, with derivatives. Hybrid runs
 are in `nonholonomic.hybrid`.
 
 **Example:** a decay, whose half-life can be differentiated.

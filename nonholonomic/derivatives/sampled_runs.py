@@ -36,11 +36,11 @@ NOT_DIFFERENTIATED: tuple[Any, ...] = (None,) * 4
 
 
 class SampledRun(NamedTuple):
-    """A run at given times, all floats: its states, NaN after its end; when and where it ended, the status code
-    (`REACHED_END`, `LEFT_DOMAIN` or `FAILED`), and the numbers of accepted and rejected steps.
+    """A run at given times, as floats: its states, NaN after its end; when and where it ended; the status code
+    (`REACHED_END`, `LEFT_DOMAIN` or `FAILED`); and the numbers of accepted and rejected steps.
 
-    `states` and `end_state` are the core components (the problem's `leading` ones), `quadratures` the passive quadratures,
-    `None` if there are none. If a program does not use `quadratures`, the ensemble runs without them.
+    `states` and `end_state` are the core components (the problem's `leading` ones), and `quadratures` are the passive
+    quadratures, `None` if there are none. If a program does not use `quadratures`, the ensemble runs without them.
 
     **Example:** as for `sampled_run`.
 
@@ -73,9 +73,10 @@ def sampled_run(
 
     **Arguments:**
 
-    - `build`: makes the problem from the modules; compared by identity, so do not create a new function for each call.
+    - `build`: function from the modules to the problem. Functions are compared by identity, so do not create a new one
+      for each call.
     - `modules`: the tree whose numbers are differentiable.
-    - `times`: of the samples [s], increasing; `t1`: horizon [s].
+    - `times`: times of the samples [s], increasing; `t1`: horizon [s].
     - `settings`: the tolerance may be traced.
     - `grid`: the ends of the steps [s], concrete, for a solver without an error estimate.
 
@@ -151,9 +152,8 @@ def sampled_run_by_diffrax(
     adjoint: diffrax.AbstractAdjoint,
     grid: Float[Array, " steps"] | None = None,
 ) -> SampledRun:
-    """Run a problem and let Diffrax differentiate its steps, which a probe keeps short enough for tangents.
-
-    Fixed steps (`grid`) need no probe.
+    """Run a problem and let Diffrax differentiate its steps. A probe (`probed`) keeps the steps short enough for
+    tangents; fixed steps (`grid`) need none.
 
     **Arguments:** as for `sampled_run`; `adjoint`: how Diffrax differentiates.
 
@@ -183,7 +183,7 @@ def _status(path: SampledSolution, t1: Float[Array, ""]) -> Int[Array, ""]:
 
 
 class BlockSampling(AbstractSampling):
-    """Samples by an ensemble solve, with the passive quadratures or without (`alone`)."""
+    """Samples by an ensemble solve, with passive quadratures or, if `alone`, without them."""
 
     movable: int
     spec: ProblemSpec

@@ -1,7 +1,7 @@
 """Derivatives of the event times of many cells along tangents of a problem.
 
-Up to `MOST_FORWARD` tangents are integrated forward, as variations beside the run (`variation.py`); more of them take
-one backward pass of every run (`_adjoint.py`).
+Up to `MOST_FORWARD` tangents are integrated forward, as variations beside the run (`variation.py`); for more tangents,
+each run takes one backward pass (`_adjoint.py`).
 """
 
 import functools
@@ -47,17 +47,17 @@ def ensemble_solve_with_tangents(
     nonterminal: bool = False,
     one_kernel: bool = False,
 ) -> tuple[Outcome, list[Float[Array, " cells"]]]:
-    """Run every cell, and differentiate the time of its event along some tangents.
+    """Run every cell, and differentiate the time of its event along tangents.
 
     `solve_ensemble_with_tangents` is compiled on its own, for use outside of other transformed functions;
     `traced_solve_ensemble_with_tangents` is for use inside them.
 
     **Arguments:** as for `solve_ensemble`, and
 
-    - `tangents`: of the problem, as for `VariationalProblem`. Their variations, or a mixture of them, take part in
-      step-size control.
-    - `one_kernel`: as for `solve_ensemble`. Without it, so that the result can be differentiated again, there is no
-      backward pass: all tangents are integrated forward, whatever their number.
+    - `tangents`: tangents of the problem, as for `VariationalProblem`. Their variations, or a mixture of the
+      variations, take part in step-size control.
+    - `one_kernel`: as for `solve_ensemble`. If it is false, all tangents are integrated forward, whatever their number,
+      so that the result can be differentiated again.
 
     **Returns:** the `Outcome`, and for each tangent the derivative of `crossing_time`, 0 where that is infinite.
     Source: implicit function theorem at the event; step lengths are held fixed.

@@ -33,7 +33,7 @@ def tangent_scale(number: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 class VariationalProblem(AbstractProblem):
-    """A problem and its first variation along each of some tangents, the variations stacked behind the state.
+    """A problem whose state is followed by its first variations along several tangents.
 
     A tangent of the problem is the same tree, with the rate at which each number moves, `None` where no tangent moves
     it. A variation's absolute tolerance is that of the state, so a tangent should move a number by about its own size
@@ -106,7 +106,8 @@ def slopes_by_variations(
     **Arguments:**
 
     - `problem`, `tangents`: as for `VariationalProblem`.
-    - `ends_on_event`: whether runs end on the event, or at the horizon, which is then the event's time.
+    - `ends_on_event`: whether runs end on the event; otherwise they end at the horizon, which then counts as the
+      event's time.
     - `options`, `one_kernel`: horizon, number of cells and settings, as for `LaneScheduler.of`.
 
     **Returns:** the `Outcome`, without crossing times, and for each tangent the derivative of the event's time.

@@ -32,8 +32,8 @@ class TransitionPath(NamedTuple):
     """Path of a single run from one mode to the next, as successive stretches of motion in closed form.
 
     - `ends`: when each stretch ends [s], counted from the end of the mode; infinite for unused entries.
-    - `motions`: the argument of `AbstractBatchedMode.between` for each, with the stretches on the first axis of every
-      leaf.
+    - `motions`: for each stretch the argument of `AbstractBatchedMode.between`; the first axis of every leaf counts the
+      stretches.
     - `shown`: number of default output times of each stretch.
 
     **Example:** a hop of 0.4 s in closed form, drawn with three points.
@@ -50,11 +50,11 @@ class TransitionPath(NamedTuple):
 class Transition(NamedTuple, Generic[Numbers]):
     """The result of a reset map, one number per cell.
 
-    `status` is `RUNNING` where the motion continues in the mode numbered `mode`, else how it ended; `state` is the new
-    state, `elapsed` [s] the duration of the transition, `crossing_time` [s] the (last) time of the event during the
-    transition, infinite if there was none; `counts` holds the counters, one per row. `record` is the path of a single
-    run (`path.py`); `None` for instantaneous transitions, or where no path is kept. `log_rates` is the sum of the
-    logarithms of the rates at which events on the way are met; `None` if there are none.
+    `status` is `RUNNING` where the motion continues in the mode numbered `mode`, otherwise the code for how it ended;
+    `state` is the new state, `elapsed` [s] the duration of the transition, `crossing_time` [s] the (last) time of the
+    event during the transition, infinite if there was none; `counts` holds the counters, one per row. `record` is the
+    path of a single run (`path.py`); `None` for instantaneous transitions, or where no path is kept. `log_rates` is the
+    sum of the logarithms of the rates at which events on the way are met; `None` if there are none.
 
     **Example:** the bounce of both balls at 5 m/s.
 
@@ -146,9 +146,9 @@ class AbstractHoppingMode(AbstractBatchedMode):
 
     @abc.abstractmethod
     def hop(self, stretch: Any, left: Float[Array, " cells"]) -> tuple[Any, Any]:
-        """Go through a stretch; `left` [s] is the time from the end of the mode to the horizon.
+        """Follow one stretch of motion; `left` [s] is the time from the end of the mode to the horizon.
 
-        **Returns:** the stretch at its end, before the jump; and the next one, behind the jump.
+        **Returns:** the stretch at its end, before the jump; and the next stretch, after the jump.
         """
 
     @abc.abstractmethod
@@ -161,7 +161,7 @@ class AbstractHoppingMode(AbstractBatchedMode):
 
 
 class HybridOutcome(NamedTuple, Generic[Numbers]):
-    """How every cell ended, as in `integration.Outcome`, in which mode, and the counters.
+    """How every cell ended, as in `integration.Outcome`, with the mode in which it ended, and the counters.
 
     **Example:** as for `solve_hybrid`.
 
@@ -230,9 +230,9 @@ def solve_hybrid(
 
     - `modes`: the modes; `mode` and `Transition.mode` are indices into them.
     - `mode`, `state`: initial mode and state of every cell.
-    - `t1`: horizon [s], one for all or one per cell.
-    - `cells`: how many cells to run; the rest is padding. With 0, the programs are compiled and nothing is run.
-    - `settings`: with an explicit Runge-Kutta solver of Diffrax.
+    - `t1`: horizon [s], one number for all cells or one per cell.
+    - `cells`: number of cells to run; the rest is padding. With 0, the programs are only compiled.
+    - `settings`: their solver must be an explicit Runge-Kutta solver of Diffrax.
     - `counters`: number of counters, the rows of `Transition.counts`.
     - `nonterminal`, `n_blocks`: as for `solve_ensemble`.
     - `most_rounds`: a cell that needs more ends as `UNRESOLVED`.

@@ -52,7 +52,7 @@ class Segment(NamedTuple):
 class HybridPath(NamedTuple):
     """A hybrid run: its segments in order, how and when [s] it ended, its final state, and its cost.
 
-    `status` is one of the codes of a `HybridOutcome`; `counts` holds the counters.
+    `status` is a code as in a `HybridOutcome`; `counts` holds the counters.
 
     **Example:** as for `solve_hybrid_dense`.
 
@@ -77,7 +77,7 @@ class HybridPath(NamedTuple):
 
     @property
     def failed(self) -> bool:
-        """Whether the run could not be finished."""
+        """Whether the integration failed."""
         return self.status in (FAILED, UNRESOLVED)
 
     @property
@@ -155,11 +155,11 @@ def solve_hybrid_dense(
 
     **Arguments:**
 
-    - `modes`: as for `solve_hybrid`, of one cell, each of which begins with a positive margin; the path includes the
+    - `modes`: as for `solve_hybrid`, for one cell; each mode must begin with a positive margin. The path includes the
       transitions that the modes record.
     - `number`, `state`: initial mode and state.
     - `t1`: horizon [s].
-    - `settings`: as for `follow`; the most steps are those of the whole run.
+    - `settings`: as for `follow`; `max_steps` limits the steps of the whole run.
     - `counters`: number of counters, the rows of `Transition.counts`.
 
     **Returns:** a `HybridPath`.

@@ -31,8 +31,8 @@ UNCHANGED: Any = None
 class HybridSamples(NamedTuple):
     """A hybrid run at given times, all floats.
 
-    - `shown`: the output rows, NaN after the end of the run; `number`: of the mode at each time, or `BETWEEN`.
-    - `end_time`, `end_state`, `end_mode`: when, where and in which mode the run ended; `status`: the code of how.
+    - `shown`: the output rows, NaN after the end of the run; `number`: index of the mode at each time, or `BETWEEN`.
+    - `end_time`, `end_state`, `end_mode`: when, where and in which mode the run ended; `status`: the status code.
     - `steps`, `rejected`; `counts`: the counters.
 
     **Example:** as for `hybrid_samples`.
@@ -66,11 +66,12 @@ def hybrid_samples(
 
     **Arguments:**
 
-    - `build`: (modules, tolerance) -> the modes of one cell, the index of the first, (1,), and the start,
-      (components, 1); compared by identity, so do not create a new function for each call.
-    - `modules`: the tree whose numbers are differentiable, once.
-    - `times`: of the samples [s], growing; `t1`: horizon [s]. Neither is differentiable.
-    - `settings`: with an explicit Runge-Kutta solver; the tolerance may be traced.
+    - `build`: function of the modules and the tolerance that returns the modes of one cell, the index of the first
+      mode, (1,), and the start, (components, 1). Functions are compared by identity, so do not create a new one for
+      each call.
+    - `modules`: the tree whose numbers are differentiable; there are no second derivatives.
+    - `times`: times of the samples [s], increasing; `t1`: horizon [s]. Neither is differentiable.
+    - `settings`: settings with an explicit Runge-Kutta solver; their tolerance may be traced.
     - `counters`: number of counters, the rows of `Transition.counts`.
 
     **Returns:** `HybridSamples`; the output rows and the end time have derivatives, NaN after a grazing event.
@@ -170,7 +171,7 @@ class Filled(NamedTuple):
     grazed: Float[Array, ""]
 
     def with_samples(self, at: Bool[Array, " times"], output: tuple[Array, Array], number: Array | int) -> "Filled":
-        """Fill in the samples at some times that have none yet."""
+        """Fill in missing samples."""
         at = at & jnp.isnan(self.number)
         shown, variations = (
             jnp.where(at, new, old) for new, old in zip(output, (self.shown, self.variations), strict=True)
@@ -246,7 +247,8 @@ def _followed(
 
 
 def alike(modes: tuple[AbstractBatchedMode, ...]) -> list[tuple[int, ...]]:
-    """The numbers of the modes, those together that differ in the values of their arrays only: one program serves them."""
+    """The numbers of the modes in groups. The modes of a group differ only in the values of their arrays, so they share
+    a program."""
     groups: list[list[int]] = []
     for number, mode in enumerate(modes):
         shape = _shape(mode)
@@ -264,7 +266,7 @@ def _shape(mode: AbstractBatchedMode) -> Any:
 
 
 def selected(modes: tuple[VariationalMode, ...], numbers: tuple[int, ...], at: Array) -> VariationalMode:
-    """The mode numbered `at`, one of some that are `alike`."""
+    """The mode numbered `at` in a group of modes that are `alike`."""
     mode = modes[numbers[0]]
     for number in numbers[1:]:
 

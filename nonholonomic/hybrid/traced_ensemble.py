@@ -36,7 +36,7 @@ def traced_solve_hybrid(
 ) -> HybridOutcome[Array]:
     """Run every cell through its modes to its event, to `t1`, or to where the model ends.
 
-    Cells are not gathered: in each round every mode runs all cells, those in another mode for no time.
+    In each round, every mode runs all cells, but the horizon is 0 for cells in another mode.
 
     **Arguments:** as for `solve_hybrid`.
 
@@ -119,13 +119,13 @@ def apply_reset(
 
 
 def padded(selected: Bool[Array, " cells"]) -> Int[Array, " cells"]:
-    """The numbers of the selected cells, and that of the first of them in place of the others, whose states may have another
-    meaning."""
+    """The numbers of the selected cells. The first selected cell replaces all others, because their states may have
+    another meaning."""
     return jnp.where(selected, jnp.arange(selected.size), jnp.argmax(selected))
 
 
 def chosen(
     selected: Bool[Array, " cells"], new: HybridOutcome[Array], old: HybridOutcome[Array]
 ) -> HybridOutcome[Array]:
-    """The new outcome of some cells and the old one of the others."""
+    """The new outcome for the selected cells, and the old outcome for the others."""
     return jax.tree.map(lambda a, b: jnp.where(selected, a, b), new, old)

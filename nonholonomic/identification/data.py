@@ -1,4 +1,4 @@
-"""Fit several sets of data together: joined measurements, and names for shared parameters and for those of a single
+"""Fit several sets of data together: join measurements, and name the parameters that are shared or belong to a single
 set."""
 
 import itertools
@@ -18,7 +18,7 @@ EACH = "data[*]."
 
 
 def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np.ndarray, " n"]]:
-    """The measurements of several sets of data, their labels, and a mask of the predictions that were measured.
+    """The joined measurements of several sets of data, their labels, and a mask of the predictions that were measured.
 
     **Arguments:** `data`: each with `measurements`, `labels`, `seen`, and `size`, the number of its predictions.
 
@@ -103,7 +103,7 @@ def free_numbers(
     - `free`: as for `scene_unknowns`.
     - `shared`: full names of the parameters of the model; `own`: names of the parameters of each set of data, without
       the prefix. A name of `own` without a prefix is shared, too.
-    - `check`: name -> number, without prefixes; it raises `ValueError` for illegal values.
+    - `check`: function of a dictionary (name without prefix -> number) that raises `ValueError` for illegal values.
 
     **Returns:** full name -> `Free`.
 

@@ -58,7 +58,7 @@ class DenseSolution(NamedTuple):
 
 
 def padded(values: Float[np.ndarray, "... times"], least: int) -> Float[np.ndarray, "... more"]:
-    """Values with those of the last time repeated, up to a power of two of at least `least`: one program serves many
+    """Values padded to a power of two of at least `least` by repeating the last one, so that one program serves many
     sizes.
 
     **Example:**
@@ -80,7 +80,7 @@ def _evaluate(
 
 
 def saved(solution: diffrax.Solution) -> tuple[Any, Any]:
-    """Times and states of a solution; Diffrax's types say that there may be none."""
+    """Times and states of a solution, which Diffrax's types declare as optional."""
     return solution.ts, solution.ys
 
 
@@ -159,14 +159,14 @@ def follow(
 
     **Arguments:**
 
-    - `problem`: with a `start()` of shape (components,).
+    - `problem`: a problem with a `start()` of shape (components,).
     - `t1`: horizon [s].
-    - `settings`: with any solver of Diffrax; a run that has not ended after `max_steps` steps, rejected ones included,
-      has failed.
+    - `settings`: their solver can be any solver of Diffrax. A run that needs more than `max_steps` steps, including
+      rejected ones, fails.
     - `first`: length of the first step [s], by default selected as Diffrax does.
-    - `t0`: when the run starts [s].
+    - `t0`: time at which the run starts [s].
     - `dense`: whether to keep dense output for states within the steps (`DenseSolution.at`).
-    - `piece`: how many steps are integrated at once.
+    - `piece`: number of steps that are integrated at once.
 
     **Returns:** a `DenseSolution` with the accepted steps; it ends where the domain margin reaches zero, located on the
     dense output.
@@ -270,11 +270,11 @@ def sample(
     """Integrate one run inside a transformation (`jit`, `vmap`, `grad`) and return its states at the given times.
 
     The domain margin is checked at the ends of steps, and the run ends where the margin is zero on the dense output.
-    Steps end on the requested times, where interpolation would lose a digit or two.
+    Steps end on the requested times, because interpolation would lose a digit or two.
 
-    **Arguments:** as for `follow`; `times`: growing, in [0, t1], or `None` for those of the grid; `grid`: the ends of
-    the steps [s], 0 the first and t1 the last, for a solver without an error estimate; `adjoint`: how Diffrax
-    differentiates, by default in forward mode.
+    **Arguments:** as for `follow`; `times`: increasing, in [0, t1], or `None` for the times of the grid; `grid`: the
+    ends of the steps [s], from 0 to t1, for a solver without an error estimate; `adjoint`: how Diffrax differentiates,
+    by default in forward mode.
 
     **Returns:** a `SampledSolution`.
 

@@ -37,11 +37,11 @@ def ensemble_solve(
 
     **Arguments:**
 
-    - `problem`: the number of cells is the last axis of its `start()`.
-    - `t1`: horizon [s], one for all or one per cell.
-    - `cells`: how many of the problem's cells to run; the rest is padding, so that one compiled program serves grids of
-      different sizes.
-    - `settings`: with an explicit Runge-Kutta solver of Diffrax.
+    - `problem`: the problem; the last axis of its `start()` counts the cells.
+    - `t1`: horizon [s], one number for all cells or one per cell.
+    - `cells`: number of cells to run; the other cells of the problem are padding, so that one compiled program serves
+      grids of different sizes.
+    - `settings`: settings with an explicit Runge-Kutta solver of Diffrax.
     - `nonterminal`: whether the event is nonterminal: a run continues through it, in either direction.
     - `one_kernel`: whether to compile the loop into a single kernel on a CPU, which halves its cost; not for programs
       that are differentiated again.
@@ -64,7 +64,7 @@ def ensemble_solve(
 
 
 def with_crossing_times(problem: AbstractProblem, outcome: Outcome) -> Outcome:
-    """The outcome with the event time of the cells that ended on the event, infinite in the others."""
+    """The outcome with the event time of the cells that ended on the event, and infinite times for the others."""
     if problem.event_function(outcome.state) is None:
         return outcome
     time = crossing_time(problem, outcome.end_time, outcome.state)

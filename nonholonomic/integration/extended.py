@@ -31,7 +31,8 @@ class AbstractPassive(eqx.Module):
 
     @abc.abstractmethod
     def rates(self, problem: AbstractProblem, time: Lanes, state: States, passive: States) -> States:
-        """Rates of change of the problem's state and, behind them, of the passive components: they share work."""
+        """Rates of change of the problem's state, followed by those of the passive components. Both are computed
+        together because they share work."""
 
 
 class ExtendedProblem(AbstractProblem, Generic[Core]):

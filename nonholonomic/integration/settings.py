@@ -32,8 +32,8 @@ class Settings(eqx.Module):
     **Arguments:**
 
     - `tolerance`: relative tolerance.
-    - `solver`: a solver of Diffrax, an explicit Runge-Kutta one for ensembles; `None` for `Oscillatory8` in ensembles
-      and `Dopri8` in single runs, which need its dense output.
+    - `solver`: a solver of Diffrax, which must be an explicit Runge-Kutta solver for ensembles; `None` for
+      `Oscillatory8` in ensembles and `Dopri8` in single runs, which need its dense output.
     - `absolute`: absolute tolerance as a fraction of the relative one, in units of the problem's magnitudes.
     - `max_steps`: a run that needs more steps fails.
     - `lanes`: number of cells that advance together; by default as many as suit the machine (`lanes_for`).
@@ -60,7 +60,7 @@ class Settings(eqx.Module):
     def for_single_runs(self) -> diffrax.AbstractSolver:
         """The solver for integration by Diffrax that locates events, and interpolates states, within steps.
 
-        **Raises:** `ValueError` for one whose dense output is less accurate than its steps.
+        **Raises:** `ValueError` for a solver whose dense output is less accurate than its steps.
         """
         if isinstance(self.solver, Oscillatory8):
             raise ValueError(
@@ -74,7 +74,7 @@ class Settings(eqx.Module):
         return diffrax.Dopri8() if self.solver is None else self.solver
 
     def with_tolerance(self, tolerance: Float[Array, ""] | None) -> Self:
-        """The same settings with another tolerance, or without one if the caller stores it."""
+        """The same settings with another tolerance, or without a tolerance if the caller stores it."""
         return eqx.tree_at(lambda settings: settings.tolerance, self, tolerance, is_leaf=lambda leaf: leaf is None)
 
     def lanes_of(self, cells: int, n_blocks: int = 1) -> int:
@@ -83,7 +83,7 @@ class Settings(eqx.Module):
 
 
 def tolerance_bound(tolerance: Any) -> Bound:
-    """The range of the relative tolerance.
+    """The legal range of the relative tolerance.
 
     **Example:**
 
@@ -127,13 +127,11 @@ def legal_run(
     tolerance: Float[ArrayLike, "..."],
     times: Any = None,
 ) -> tuple[Bool[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
-    """Whether the traced numbers of a run are legal, with its horizon and tolerance: if not, 0 and the largest
-    tolerance.
+    """Whether the traced numbers of a run are legal, and its horizon and tolerance. A run with illegal numbers might
+    never end, so it gets the horizon 0, and the largest tolerance, which does not affect its batch.
 
-    A run of illegal numbers might never end, so it does not begin, and its tolerance does not affect its batch.
-
-    **Arguments:** `others`: whether all other numbers are legal; `t1`, `tolerance`, and the `times` of output (times,),
-    which must increase, are checked here.
+    **Arguments:** `others`: whether all other numbers are legal. This function checks `t1`, `tolerance`, and the output
+    `times` (times,), which must increase.
 
     **Returns:** whether the run is legal, its horizon and its tolerance.
 
@@ -151,9 +149,8 @@ def legal_run(
 
 
 def require_adaptive(solver: Any, others: str = "") -> None:
-    """Raise `ValueError` unless this is `None` or a solver of Diffrax that estimates its errors and takes one field.
-
-    Solvers with two fields add a stiff part or noise. **Arguments:** `others`: what else the message should allow.
+    """Raise `ValueError` unless the solver is `None` or a solver of Diffrax that estimates its errors and integrates a
+    single field (others add a stiff part or noise). **Arguments:** `others`: what else the message lists as allowed.
 
     **Example:**
 
@@ -184,7 +181,7 @@ def require_adjoint(adjoint: Any) -> None:
 
 
 def lanes_for(cells: int, n_blocks: int = 1) -> int:
-    """Number of lanes for a number of cells whose state has a number of equal blocks.
+    """Number of lanes for cells whose state has the given number of equal blocks.
 
     On a CPU the lanes and their stages should fit the first caches; an accelerator is idle below tens of thousands.
     """

@@ -23,14 +23,14 @@ MOST_TRIALS = 60
 def halved(
     holds: Callable[[Float[Array, "..."]], Bool[Array, "..."]], low: Float[Array, "..."], high: Float[Array, "..."]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Halve brackets, inside transformations too, down to where a condition ceases to hold.
+    """Find where a condition ceases to hold, by halving brackets; also inside transformations.
 
     **Arguments:**
 
     - `holds`: the condition, true at `low` and false at `high`.
     - `low`, `high`: the brackets, of any shape.
 
-    **Returns:** the last value at which the condition held and the next one, at which it does not.
+    **Returns:** the last value at which the condition holds, and the next value, at which it does not.
 
     **Example:**
 
@@ -54,7 +54,7 @@ def sign_changes(
 ) -> Float[Array, " zeros"]:
     """Zeros of a function between neighbours of a grid at which it has different signs, to round-off.
 
-    **Arguments:** `function`: of an array of numbers, element by element; `grid`: growing numbers.
+    **Arguments:** `function`: function of an array, element by element; `grid`: increasing numbers.
 
     **Example:**
 
@@ -78,7 +78,7 @@ def few_trials(
 
     **Arguments:**
 
-    - `function`: of NumPy arrays, element by element; it is not traced.
+    - `function`: function of NumPy arrays, element by element; JAX does not trace it.
     - `low`, `high`: the brackets; `at_low`, `at_high`: the function there, of opposite signs.
 
     **Example:**

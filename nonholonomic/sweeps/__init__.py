@@ -1,7 +1,7 @@
 """Grids of named axes, computed in chunks by any executor, and the resulting labelled tables and files.
 
-`sweep` computes a grid and returns a `Table`; with a file it writes every finished chunk, and an interrupted sweep
-resumes. Any executor can compute the chunks; `local_processes` is one.
+`sweep` computes a grid and returns a `Table`. With a file, it writes every finished chunk, and can resume after an
+interruption. Any executor can compute the chunks, such as that of `local_processes`.
 
 **Example:** a table of half-lives by rate and level.
 

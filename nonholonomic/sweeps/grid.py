@@ -52,7 +52,7 @@ class Variable(NamedTuple):
 def axis(name: str, number: str, unit: str, values: Any, long_name: str = "") -> Axis:
     """An axis, checked.
 
-    **Arguments:** `name`: in the table; `number`: full name of the varied parameter; `unit`; `values`, (values,);
+    **Arguments:** `name`: name in the table; `number`: full name of the varied parameter; `unit`; `values`, (values,);
     `long_name`: description.
 
     **Raises:** `ValueError` that names the axis unless the values are finite numbers in a one-dimensional, non-empty array.
@@ -86,8 +86,8 @@ def size_of(axes: list[Axis]) -> int:
 def columns(axes: list[Axis], first: int, count: int) -> dict[str, Values]:
     """The parameters of some cells; the last axis varies fastest.
 
-    **Arguments:** `axes`: the grid; `first`: index of the first cell; `count`: number of cells. Beyond the end, the
-    last cell is repeated.
+    **Arguments:** `axes`: the grid; `first`: index of the first cell; `count`: number of cells. Beyond the end of the
+    grid, the last cell is repeated.
 
     **Returns:** full name of a parameter -> its value in every cell.
     """

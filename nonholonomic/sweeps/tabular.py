@@ -1,11 +1,11 @@
-"""The quantities of a run over its times, as a table, and what every run offers with it."""
+"""The quantities of a run over its times, as a table, and the methods that every run derives from this table."""
 
 import abc
 import json
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
-from ..parameters import likely, text_as_html
+from ..parameters import likely, readable_unit, text_as_html
 from ..validation import require_package
 from .layout import Values
 from .table import Table
@@ -29,6 +29,11 @@ class Quantity(NamedTuple):
     components: str | None = None
     read: Callable[[Any], Any] | None = None
 
+    @property
+    def label(self) -> str:
+        """The description with the unit, as beside a curve."""
+        return f"{self.long_name} [{readable_unit(self.unit) or '1'}]"
+
     def of(self, name: str, run: Any) -> Any:
         """The values of the quantity in a run."""
         return getattr(run, name) if self.read is None else self.read(run)
@@ -45,8 +50,8 @@ def run_table(
 
     **Arguments:**
 
-    - `quantities`: name -> `Quantity`; `values`: name -> its values.
-    - `coords`: name -> values, those of the `axes` first.
+    - `quantities`: name -> `Quantity`; `values`: name -> values.
+    - `coords`: name -> values; the `axes` come first.
     - `request`: plain data that describes the run.
 
     **Returns:** the `Table`.

@@ -1,4 +1,4 @@
-r"""Audit of the paper: each numbered equation as printed, the verdict, the correct form, and the tests that show it.
+r"""Audit of the paper: each numbered equation as printed, the verdict, the correct form, and the tests for both.
 
 `python -m tippe.papers.audit` prints the page `docs/development/tippe_paper.md`. In its formulas eta is the angle of the
 position from the lowest line, r the arena's radius, rho = r - R the radius of the centre's path, and phi the direction of the
@@ -12,11 +12,11 @@ from typing import NamedTuple
 class Equation(NamedTuple):
     """The verdict on one of the paper's statements.
 
-    - `number`: as the paper numbers it.
-    - `subject`: what the statement is about.
+    - `number`: the paper's number.
+    - `subject`: the subject of the statement.
     - `printed`: as printed, in TeX.
     - `verdict`: right, right on the plane, misprint, incomplete, wrong, meaningless or lost.
-    - `reason`: why, in a few sentences.
+    - `reason`: the reason for the verdict, in a few sentences.
     - `correct`: the correct formulas, in TeX; empty where there are none.
     - `code`: the functions that compute the correct form.
     - `tests`: the tests that show verdict and correct form, as pytest names them.
@@ -242,15 +242,14 @@ I is I₁ and J is Jellett's quantity λ.
   an equation of motion.
 * Friction changes the momentum β₁. Either β₁ or Jellett's quantity is constant, never both.
 * This package uses none of the paper's equations. The corrected equations agree with its vector form to 10⁻¹⁰.
-
-`python -m tippe.papers.audit` prints this page.
 """
 
 TABLES = """
 ## Can Tables 2 and 3 replace the lost Table 1?
 
-No. Tables 2 and 3 list for eighteen launches whether the top reverses, and six times. These depend on eight unknown
-parameters and an unknown friction law. Here a top counts as reversed if it reaches 0.95 pi within 40 s.
+No. Each table states for nine launches whether the top reverses, and if so, when; there are six such times in all. They
+depend on eight unknown parameters and an unknown friction law. Here a top counts as reversed if it reaches 0.95 pi
+within 40 s.
 
 * **Table 2** (`python benchmarks/paper_tables_scan.py`). Of 20 000 random tops under viscous friction, 294 reverse in the
   printed rows; the best of them, after optimisation, misses the times by 1.25 s.
