@@ -20,7 +20,8 @@ EACH = "data[*]."
 def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np.ndarray, " n"]]:
     """The joined measurements of several sets of data, their labels, and a mask of the predictions that were measured.
 
-    **Arguments:** `data`: each with `measurements`, `labels`, `seen`, and `size`, the number of its predictions.
+    **Arguments:** `data`: sets of data, each with `measurements`, `labels`, `seen`, and `size`, the number of its
+    predictions.
 
     **Example:**
 
@@ -38,7 +39,8 @@ def joined(data: tuple[Any, ...]) -> tuple[Measurements, tuple[str, ...], Int[np
 
 
 def series_units(data: tuple[Any, ...]) -> tuple[str, ...]:
-    """The unit of each series of the joined measurements. **Arguments:** `data`: each with `measurements`, `series_units`.
+    """The unit of each series of the joined measurements. **Arguments:** `data`: sets of data, each with `measurements`
+    and `series_units`.
 
     **Example:**
 
@@ -65,7 +67,7 @@ def of_data(parameters: dict[str, Any], k: int) -> dict[str, Any]:
 
 
 def scene_unknowns(free: Any, scene: Any, launch: Any, shared: list[str], own: list[list[str]]) -> dict[str, Free]:
-    """The unknowns of a scene, its launches and its data; scene and launch check their numbers.
+    """The unknowns of a scene, its launches and its data; the scene and the launches check their values.
 
     **Arguments:**
 
