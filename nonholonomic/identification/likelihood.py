@@ -41,6 +41,12 @@ class Measurements(eqx.Module):
       the series.
 
     **Raises:** `ValueError` for numbers that are not finite or shapes that do not match.
+
+    **Example:** two values, and a lower limit.
+
+    >>> from nonholonomic.identification import Measurements
+    >>> Measurements([1.0, 2.0, 3.0], 0.1, censored=[False, False, True]).upper.tolist()
+    [1.0, 2.0, inf]
     """
 
     value: Float[Array, "... n"]

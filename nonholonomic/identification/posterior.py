@@ -30,6 +30,12 @@ class LogDensity(eqx.Module):
     - `names`: names of the unknowns, in the order of the coordinates; `start`: (unknowns,), coordinates at which to
       start.
     - `units`: name of an unknown -> its unit, if known.
+
+    **Example:**
+
+    >>> from nonholonomic.identification import LogDensity
+    >>> LogDensity.of(Model(scene, data, jnp.arange(3)), data[0].measurements, free)
+    LogDensity of scene.rate, given 3 measurements
     """
 
     problem: Problem

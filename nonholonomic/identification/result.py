@@ -107,19 +107,10 @@ class Identification:
     - `verdict`: a `Verdict`, whether the fit can be believed.
     - `coordinates`, `coordinate_covariance`: estimates and covariance in the coordinates of the fit.
 
-    **Example:**
+    **Example:** the fit of the room's example.
 
-    ```
-    >>> import tippe
-    >>> top = tippe.Top(mass=0.02, radius=0.02, offset=0.006, I1=2.994e-6, I3=3.2e-6)
-    >>> scene = tippe.Scene(top, friction=tippe.Viscous(0.3))
-    >>> launch = tippe.Launch(theta=[0.2, 0.2, 0.3, 0.2], spin=[155.0, 140.0, 110.0, 60.0])
-    >>> data = tippe.InversionTimes(launch, time=[5.60, 5.53, 5.52, float("inf")], error=0.05, t1=8.0)
-    >>> found = tippe.identify(scene, data, {"friction.mu": 0.25}, progress=False)
-    >>> isinstance(found, tippe.Identification), found.degrees, list(found.estimates)
-    (True, 3, ['scene.friction.mu'])
-
-    ```
+    >>> fit.status, fit.degrees, list(fit.estimates)
+    ('converged', 2, ['scene.rate'])
     """
 
     estimates: dict[str, float]
