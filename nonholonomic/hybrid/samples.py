@@ -31,7 +31,7 @@ UNCHANGED: Any = None
 class HybridSamples(NamedTuple):
     """A hybrid run at given times, all floats.
 
-    - `shown`: the output rows, NaN after the end of the run; `number`: of the mode at each time, or `BETWEEN`.
+    - `shown`: the output rows, NaN after the end of the run; `number`: index of the mode at each time, or `BETWEEN`.
     - `end_time`, `end_state`, `end_mode`: when, where and in which mode the run ended; `status`: the status code.
     - `steps`, `rejected`; `counts`: the counters.
 
@@ -71,7 +71,7 @@ def hybrid_samples(
       each call.
     - `modules`: the tree whose numbers are differentiable; there are no second derivatives.
     - `times`: times of the samples [s], increasing; `t1`: horizon [s]. Neither is differentiable.
-    - `settings`: with an explicit Runge-Kutta solver; their tolerance may be traced.
+    - `settings`: settings with an explicit Runge-Kutta solver; their tolerance may be traced.
     - `counters`: number of counters, the rows of `Transition.counts`.
 
     **Returns:** `HybridSamples`; the output rows and the end time have derivatives, NaN after a grazing event.

@@ -102,35 +102,35 @@ def event_time(
     run = run_of(system, start, event)
     if not run.cells.form.has_event:
         raise ValueError("event = None: the system has no event of its own; pass event=, a function of time and state")
-    explicit_tableau(Settings(tolerance, solver).for_lanes)
-    return _time(run.cells, as_number(t1), as_number(tolerance), solver)
+    settings = Settings(tolerance, solver)
+    explicit_tableau(settings.for_lanes)
+    return _time(run.cells, as_number(t1), settings)
 
 
 # Compile the whole, so that further calls with the same functions need no tracing.
 @eqx.filter_jit
-def _time(
-    cells: Cells, t1: Float[Array, ""], tolerance: Float[Array, ""], solver: diffrax.AbstractERK | None
-) -> Float[Array, ""]:
+def _time(cells: Cells, t1: Float[Array, ""], settings: Settings) -> Float[Array, ""]:
     numbers, structure = jax.tree.flatten(cells)
     movable = [number for number in numbers if eqx.is_inexact_array(number)]
     others = [number for number in numbers if not eqx.is_inexact_array(number)]
     places = tuple(eqx.is_inexact_array(number) for number in numbers)
     solve = SmoothEvent if cells.form.traits.smooth else HybridEvent
-    return differentiable_solve(solve(len(movable), structure, places, solver), *movable, *others, t1, tolerance)
+    event = solve(len(movable), structure, places, settings.with_tolerance(None))
+    return differentiable_solve(event, *movable, *others, t1, settings.tolerance)
 
 
 class SmoothEvent(AbstractDifferentiableSolve):
     """Event times of cells with smooth runs.
 
     The leaves are the numbers of `Cells`, floats first, the horizon and the tolerance. `structure`: structure of the
-    `Cells`; `places`: positions of the leaves that are floats.
+    `Cells`; `places`: positions of the leaves that are floats; `settings`: without the tolerance.
     """
 
     movable: int
     # JAX's PyTreeDef, which type checkers take for a variable.
     structure: Any = eqx.field(static=True)
     places: tuple[bool, ...] = eqx.field(static=True)
-    solver: diffrax.AbstractERK | None
+    settings: Settings
 
     def absent(self, value: Float[Array, "..."]) -> Bool[Array, "..."]:
         return jnp.isinf(value)
@@ -141,14 +141,15 @@ class SmoothEvent(AbstractDifferentiableSolve):
         return jax.tree.unflatten(self.structure, [next(floats if is_float else others) for is_float in self.places])
 
     def permitted(self, leaves: tuple[Array, ...]) -> tuple[Bool[Array, "..."], Float[Array, "..."], Settings]:
-        """Which cells have a legal horizon, tolerance and start; their horizons (0 for the others); and the settings.
+        """A mask of the cells with a legal horizon, tolerance and start; the horizons, 0 for all other cells; and the
+        settings.
 
         A batch has one tolerance: the smallest.
         """
         *_, t1, tolerance = leaves
         finite = jnp.isfinite(jnp.asarray(sum(self.of_leaves(leaves).start)))
         may, t1, tolerance = legal_run(finite, t1, tolerance)
-        return may, t1, Settings(jnp.min(tolerance), self.solver)
+        return may, t1, self.settings.with_tolerance(jnp.min(tolerance))
 
     def solve(self, cells: int, *leaves: Float[Array, "..."]) -> Float[Array, " cells"]:
         may, t1, settings = self.permitted(leaves)

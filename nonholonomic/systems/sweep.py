@@ -104,7 +104,8 @@ def sweep(
     check_run(system, start, t1, tolerance)
     if not isinstance(axes, dict) or not all(isinstance(name, str) for name in axes):
         raise ValueError(f"axes = {axes!r} must be a dictionary, name of a number -> values")
-    explicit_tableau(Settings(tolerance, solver).for_lanes)
+    settings = Settings(tolerance, solver)
+    explicit_tableau(settings.for_lanes)
     if isinstance(system, Hybrid) and event is not None:
         system, event = dataclasses.replace(system, event=event), None
     mechanical = isinstance(system, AbstractSystem)
@@ -117,7 +118,7 @@ def sweep(
     for grid_axis in grid if has_checks(system) or has_checks(event) else ():
         for value in grid_axis.values:
             check_again(named.tree(named.replaced({grid_axis.number: jnp.asarray(value)})))
-    job = SweepJob(named, float(t1), float(tolerance), solver, tuple(by))
+    job = SweepJob(named, float(t1), settings, tuple(by))
     run = _run(named.tree(named.values))
     if by and not run.cells.form.has_event:
         raise ValueError("sensitivities are those of the event's time: pass event=, a function of time and state")
@@ -131,7 +132,7 @@ def sweep(
     request |= {
         "t1": float(t1),
         "tolerance": float(tolerance),
-        "solver": type(Settings(tolerance, solver).for_lanes).__name__,
+        "solver": type(settings.for_lanes).__name__,
     }
     cells = size_of(grid)
     chunk = max(LEAST_CHUNK, chunk_for(cells)) if cells > 4 * LEAST_CHUNK else None
@@ -154,8 +155,7 @@ class SweepJob(NamedTuple):
 
     named: Named
     t1: float
-    tolerance: float
-    solver: diffrax.AbstractERK | None
+    settings: Settings
     by: tuple[str, ...]
 
     @classmethod
@@ -185,7 +185,7 @@ class SweepJob(NamedTuple):
         """The variables of some cells, of which only the first `count` are run."""
         size = next((len(values) for values in columns.values()), 1)
         cells, begin, tangents, scales = _cells(self.named, columns, self.by, size)
-        settings, t1 = Settings(np.asarray(self.tolerance), self.solver), np.asarray(self.t1)
+        settings, t1 = self.settings, np.asarray(self.t1)
         grazing, slopes = np.zeros(size, bool), []
         if cells.form.traits.smooth:
             problem, counted = begin, np.asarray(count)

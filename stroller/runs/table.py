@@ -131,8 +131,8 @@ def sweep(
     if not isinstance(axes, dict) or not all(isinstance(number, str) for number in axes):
         raise ValueError(f"axes = {axes!r} must be a dictionary, full name of a parameter -> values")
     require_whole(max_steps, "max_steps", 1)
-    method = Settings(tolerance, solver).for_lanes
-    explicit_tableau(method)
+    settings = Settings(tolerance, solver, max_steps=int(max_steps))
+    explicit_tableau(settings.for_lanes)
     roots = {"scene": scene, "launch": launch} | ({"input": input} if isinstance(input, eqx.Module) else {})
     grid = named_axes(full_axes(axes, variable_numbers(roots)), scene.surface, launch)
     # The modules check every value of every axis here, before anything compiles.
@@ -142,11 +142,11 @@ def sweep(
 
     request = description("scene", scene) | description("launch", dataclasses.replace(launch, place=(0.0, 0.0)))
     request |= {"launch.place": [float(part) for part in launch.place], "t1": float(t1), "tolerance": float(tolerance)}
-    request |= {"solver": type(method).__name__, "input": "none" if input is None else described(input)}
+    request |= {"solver": type(settings.for_lanes).__name__, "input": "none" if input is None else described(input)}
     request |= {grid_axis.number: "an axis" for grid_axis in grid}
     if max_steps != DEFAULT_MAX_STEPS:
         request |= {"max_steps": int(max_steps)}
-    job = RideJob.of(roots, input, float(t1), float(tolerance), method, int(max_steps))
+    job = RideJob.of(roots, input, float(t1), settings)
     return computed(job, grid, VARIABLES, request, path=path, progress=progress, executor=executor)
 
 
@@ -168,23 +168,13 @@ class RideJob(NamedTuple):
     roots: dict[str, Any]
     input: Input | None
     t1: float
-    tolerance: float
-    solver: diffrax.AbstractSolver
-    max_steps: int
+    settings: Settings
     controls: Input | None
 
     @classmethod
-    def of(
-        cls,
-        roots: dict[str, Any],
-        input: Any,
-        t1: float,
-        tolerance: float,
-        solver: diffrax.AbstractSolver,
-        max_steps: int,
-    ) -> "RideJob":
+    def of(cls, roots: dict[str, Any], input: Any, t1: float, settings: Settings) -> "RideJob":
         """The job for a scene, launch and input."""
-        return cls(roots, input, t1, tolerance, solver, max_steps, as_module(input, roots["scene"], roots["launch"]))
+        return cls(roots, input, t1, settings, as_module(input, roots["scene"], roots["launch"]))
 
     def __reduce__(self) -> Any:
         return RideJob.of, tuple(self[:-1])
@@ -195,9 +185,10 @@ class RideJob(NamedTuple):
         size = next((len(values) for values in columns.values()), 1)
         controls = cells.get("input", self.controls)
         problem = RideProblem.of(cells["scene"], cells["launch"], controls, size, watched=True)
-        horizon, settings = as_number(self.t1), Settings(self.tolerance, self.solver, max_steps=self.max_steps)
         # A ride continues if contact is lost, as if the ground could pull.
-        outcome, _ = solve_ensemble(problem, horizon, jnp.asarray(count), settings, nonterminal=problem.watched)
+        outcome, _ = solve_ensemble(
+            problem, as_number(self.t1), jnp.asarray(count), self.settings, nonterminal=problem.watched
+        )
         contact_time = np.asarray(outcome.first_crossing)
         lost = np.isfinite(contact_time)
         words = np.select([outcome.status == FAILED, outcome.status == LEFT_DOMAIN, lost], [3, 2, 1], 0)

@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -151,29 +150,21 @@ def _start(scene: Scene[Top], launch: Launch) -> InversionProblem:
     return InversionProblem(scene.dynamics, jnp.asarray(NO_COSINE), state[:, None], scales[:, None])
 
 
-def simulate_airborne(
-    scene: Scene[Top],
-    launch: Launch,
-    t1: float,
-    times: Any,
-    tolerance: float | Float[Array, ""],
-    solver: diffrax.AbstractSolver | None,
-) -> ArenaTrajectory:
+def simulate_airborne(scene: Scene[Top], launch: Launch, t1: float, times: Any, settings: Settings) -> ArenaTrajectory:
     """Simulate one launch of a hybrid scene whose flights are integrated. **Arguments:** as for `simulate`, already
     checked."""
-    batched_modes, first, state = arena_modes((scene, launch), tolerance)
+    batched_modes, first, state = arena_modes((scene, launch), settings.tolerance)
     exact = scene.friction.set_valued
     start = int(np.asarray(first)[0]), np.asarray(state)[:, 0]
-    path = solve_hybrid_dense(batched_modes, *start, t1, Settings(tolerance, solver), counters=1 + exact)
+    path = solve_hybrid_dense(batched_modes, *start, t1, settings, counters=1 + exact)
     status = STATUS[path.status]
     if status == Status.JAMMED:
         status = LOSSES[int(loss(scene, jnp.asarray(path.state)))]
     hops = np.array(
         [(segment.begin, segment.end) for segment in path.mode_segments if segment.number == FLYING]
     ).reshape(-1, 2)
-    run = flights_of(
-        StickSlipArenaTrajectory if exact else ArenaTrajectory, scene, path, status.word, hops, times, tolerance
-    )
+    kind = StickSlipArenaTrajectory if exact else ArenaTrajectory
+    run = flights_of(kind, scene, path, status.word, hops, times, settings.tolerance)
     if exact:
         run.stats["sticks"] = int(path.counts[1])
     return run

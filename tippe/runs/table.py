@@ -12,7 +12,7 @@ import numpy as np
 
 from nonholonomic.integration import DEFAULT_MAX_STEPS, Settings, explicit_tableau
 from nonholonomic.sweeps import Axis, Table, Variable, sweep
-from nonholonomic.validation import require_flag, require_outside, require_whole
+from nonholonomic.validation import as_number, require_flag, require_outside, require_whole
 
 from ..model.scene import Scene
 from .cells import InversionRuns, too_many_steps
@@ -69,9 +69,9 @@ def inversion_table(
       crossings and can miss a loss of contact shorter than a step.
     - `scattered`: whether the lists are columns of equal length instead of axes of a grid: the k-th cell has the k-th
       number of each list. The only axis of the table is then "cell", and the columns are variables.
-    - `errors`: whether to run every cell again at a hundredth of the tolerance, for bounds of its errors; this costs
-      2.8 times as much as a table without errors. Below a tolerance of 1e-12, the second run has a hundred times the
-      tolerance instead of a hundredth, and the bounds are wider.
+    - `errors`: whether to run every cell again at a hundredth of the tolerance, for error bounds; this costs 2.8 times
+      as much as a table without errors. Below a tolerance of 1e-12, the second run has a hundred times the tolerance
+      instead of a hundredth, and the bounds are wider.
     - `sensitivities`: names of the parameters with respect to which the times are differentiated, such as
       `["scene.friction.mu", "launch.theta"]`; the end of a name is enough if only one parameter matches.
     - `progress`: whether to show progress, on a terminal or in a notebook; `NONHOLONOMIC_PROGRESS=0` hides it
@@ -158,7 +158,7 @@ def event_table(
     """
     roots, grid, units = launches(scene, launch_values, axes, t1, tolerance, scattered=scattered)
     require_whole(max_steps, "max_steps", 1)
-    settings = Settings(tolerance, solver)
+    settings = Settings(tolerance, solver, max_steps=int(max_steps))
     integrator = settings.for_single_runs if method == "diffrax" else settings.for_lanes
     explicit_tableau(integrator)
     paths = sensitivity_names(roots, sensitivities)
@@ -175,8 +175,8 @@ def event_table(
     else:
         warn_if_it_cannot_invert(scene, roots["launch"], looked_at.get("launch.theta", roots["launch"].theta))
         angle = float(angle)
-    runs = InversionRuns(run_kind, float(t1), angle, crossing, integrator, method, paths, int(max_steps))
-    job = InversionJob(runs, roots, float(tolerance), errors)
+    runs = InversionRuns(run_kind, float(t1), angle, crossing, settings, method, paths)
+    job = InversionJob(runs, roots, errors)
 
     event = {"event": "reversal"} if angle is None else {"angle": angle}
     request = {"t1": float(t1), **event, "tolerance": float(tolerance), "crossing": crossing}
@@ -233,7 +233,6 @@ class InversionJob(NamedTuple):
 
     runs: InversionRuns
     roots: dict[str, Any]
-    tolerance: float
     errors: bool
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
@@ -242,9 +241,10 @@ class InversionJob(NamedTuple):
         if runs.method == "diffrax" and count == 0:
             # The reference runs whole chunks: a call that only compiles would compute the first chunk twice.
             return {}
-        variables = runs.results(self.roots, columns, self.tolerance, count)
+        variables = runs.results(self.roots, columns, count)
         if self.errors:
-            second = runs._replace(slopes_by=[]).results(self.roots, columns, second_tolerance(self.tolerance), count)
+            settings = runs.settings.with_tolerance(as_number(second_tolerance(float(runs.settings.tolerance))))
+            second = runs._replace(settings=settings, slopes_by=[]).results(self.roots, columns, count)
             silent = tuple(words.index(word) for word in ("failed", "unresolved") if word in words)
             variables |= errors_of(variables, second, runs.times, runs.run_kind.counts, silent)
         return variables

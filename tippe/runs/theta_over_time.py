@@ -28,12 +28,12 @@ def theta_over_time(
     """
     roots = {"scene": scene, "launch": launch}
     values = {path: value for root, tree in roots.items() for path, value in numbers(root, tree).items()}
-    size, solver = chunk_for(1), Settings(tolerance).for_lanes
+    size, settings = chunk_for(1), Settings(tolerance)
     columns, blocks = {name: np.full(size, float(values[name])) for name in axes}, []
     for first in range(0, len(times), size):
         block = times[first : first + size]
         # No inclination exceeds pi, so no run ends before its time.
         horizons: Any = np.pad(block, (0, size - len(block)))
-        runs = InversionRuns(run_kind_of(scene), horizons, math.pi, "first", solver, "ensemble", [])
-        blocks.append(runs.results(roots, columns, tolerance, len(block))["end_theta"][: len(block)])
+        runs = InversionRuns(run_kind_of(scene), horizons, math.pi, "first", settings, "ensemble", [])
+        blocks.append(runs.results(roots, columns, len(block))["end_theta"][: len(block)])
     return np.concatenate(blocks)

@@ -114,12 +114,13 @@ def trajectory_table(
     variables |= {"end_time": Variable("s", np.float64, long_name="end of the run")}
     variables |= {name: Variable("1", np.int64, long_name=COUNTED[name]) for name in ("steps", "rejected")}
     request = described(roots, grid) | {"quantities": list(names), "tolerance": float(tolerance)}
-    request |= {"solver": type(Settings(tolerance).for_lanes).__name__}
+    settings = Settings(tolerance, max_steps=int(max_steps))
+    request |= {"solver": type(settings.for_lanes).__name__}
     if max_steps != DEFAULT_MAX_STEPS:
         request |= {"max_steps": int(max_steps)}
     # A run has about a dozen components.
     most = max(16, 1 << (MOST_SAMPLED // (12 * len(times))).bit_length() - 1)
-    job = SamplingJob(roots, times, float(tolerance), int(max_steps), names)
+    job = SamplingJob(roots, times, settings, names)
     options = {"path": path, "most": most, "inner": inner, "progress": progress, "executor": executor}
     return sweep(job, grid, variables, request, **options)
 
@@ -129,16 +130,14 @@ class SamplingJob(NamedTuple):
 
     roots: dict[str, Any]
     times: Float[np.ndarray, " times"]
-    tolerance: float
-    max_steps: int
+    settings: Settings
     names: tuple[str, ...]
 
     def __call__(self, columns: dict[str, Any], count: int) -> dict[str, Any]:
         """The variables of some cells, of which only the first `count` are run."""
         cells = with_numbers(self.roots, columns)
         size = next((len(values) for values in columns.values()), 1)
-        settings = Settings(self.tolerance, max_steps=self.max_steps)
-        variables = solve_cells(cells["scene"], cells["launch"], size, self.times, settings, self.names, count)
+        variables = solve_cells(cells["scene"], cells["launch"], size, self.times, self.settings, self.names, count)
         return {name: np.asarray(values, np.int8 if name == "status" else None) for name, values in variables.items()}
 
 

@@ -39,7 +39,7 @@ class HybridSimulator(NamedTuple):
 
     - `start`: function of the numbers of the sliders that returns the modes, the index of the first mode, and the
       initial state, for one cell.
-    - `t1`: horizon [s]; `settings`: with an explicit Runge-Kutta solver of Diffrax; `counters`: rows of
+    - `t1`: horizon [s]; `settings`: settings with an explicit Runge-Kutta solver of Diffrax; `counters`: rows of
       `Transition.counts`.
     - `readings`: results at the end of a run, name -> function of (the sliders' numbers, a `HybridOutcome`).
     - `frame`: function that returns the frame at any time; its arguments are the sliders' numbers, the index of the

@@ -11,6 +11,7 @@ from own_modes import GRAVITY, Ball, Bounces, Sleigh, bounce
 
 import nonholonomic
 from nonholonomic import AbstractMode, Hybrid, sweep
+from nonholonomic.integration import Settings
 from nonholonomic.systems.numbers import Named
 from nonholonomic.systems.sweep import SweepJob
 
@@ -53,7 +54,7 @@ def test_a_table_of_bounces_and_its_derivatives(table):
 
 def test_a_job_may_be_sent_to_another_process():
     named = Named.of({"system": BALL, "start": jnp.array([1.0, 0.0, 0.0]), "event": None})
-    job = SweepJob(named, 1.4, 1e-9, None, ())
+    job = SweepJob(named, 1.4, Settings(1e-9), ())
     sent = pickle.loads(pickle.dumps(job))
     assert sent.named.names == job.named.names
     assert_close(sent.named.values, job.named.values)
